@@ -3,6 +3,7 @@ here: DataFlash by a writer of its own, tlog by pymavlink."""
 
 import math
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -29,19 +30,26 @@ FORMATS = {
     "XKF1": (6, "QBfff", "TimeUS,C,VN,VE,VD"),
     "EV": (7, "QB", "TimeUS,Id"),
 }
-CODES = {"Q": "Q", "N": "16s", "f": "f", "H": "H", "B": "B"}
+OLD = FORMATS | {
+    "IMU": (4, "Qfff", "TimeUS,GyrX,GyrY,GyrZ"),
+    "IMU2": (8, "Qfff", "TimeUS,GyrX,GyrY,GyrZ"),
+    "NKF1": (6, "Qfff", "TimeUS,VN,VE,VD"),
+    "NKF6": (9, "Qfff", "TimeUS,VN,VE,VD"),
+}
+"""before ArduSub 4.1: a message for each IMU and each core of EKF2"""
+CODES = {"I": "I", "~": "f", "Q": "Q", "N": "16s", "f": "f", "H": "H", "B": "B"}
 
 
-def dataflash(rows):
+def dataflash(rows, formats=FORMATS):
     """Bytes of a DataFlash log; rows of (name, values)."""
     out = b""
-    known = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"), **FORMATS}
+    known = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"), **formats}
     for name, (number, form, columns) in known.items():
         length = 89 if name == "FMT" else 3 + struct.calcsize("<" + "".join(CODES[c] for c in form))
         texts = (name.encode(), form.encode(), columns.encode())
         out += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, length, *texts)
     for name, values in rows:
-        number, form, _ = FORMATS[name]
+        number, form, _ = formats[name]
         layout = "<" + "".join(CODES[c] for c in form)
         out += b"\xa3\x95" + bytes([number]) + struct.pack(layout, *values)
     return out
@@ -67,16 +75,17 @@ def drive(velocity="VISO", hole=False, armed=(0.0, SECONDS)):
         for at_s, event in zip(armed, (10, 11), strict=True):
             if step == round(at_s / STEP_S):
                 yield "EV", (now, event)
-        yield "IMU", (now, 0, 0.01, 0.02, 0.03)
-        yield "IMU", (now, 1, 9.0, 9.0, 9.0)
+        old = velocity == "NKF1"
+        yield "IMU", (now, *[0][old:], 0.01, 0.02, 0.03)
+        yield ("IMU2" if old else "IMU"), (now, *[1][old:], 9.0, 9.0, 9.0)
         if step % 5 == 0:
             yield "RCOU", (now, *pulses(time_s))
             yield "ATT", (now, *map(math.degrees, (ROLL, PITCH, YAW)))
             if velocity == "VISO":
                 yield "VISO", (now, 0.1, 0.03, 0.02, 0.01, 100.0)
             else:
-                yield "XKF1", (now, 1, 9.0, 9.0, 9.0)
-                yield "XKF1", (now, 0, 0.3 * math.cos(YAW), 0.3 * math.sin(YAW), 0.0)
+                yield ("NKF6" if old else "XKF1"), (now, *[1][old:], 9.0, 9.0, 9.0)
+                yield velocity, (now, *[0][old:], 0.3 * math.cos(YAW), 0.3 * math.sin(YAW), 0.0)
 
 
 def read(tmp_path, content, name="drive.bin"):
@@ -109,8 +118,10 @@ def test_pulses_turn_the_motors_that_they_are_for(tmp_path):
     assert (np.abs(found.rpm[25]) > 0).sum() == 1
 
 
-def test_the_filters_velocity_where_there_is_no_dvl(tmp_path):
-    (found,) = read(tmp_path, dataflash(drive("XKF1")))
+@pytest.mark.parametrize(("velocity", "formats"), [("XKF1", FORMATS), ("NKF1", OLD)])
+def test_the_filters_velocity_where_there_is_no_dvl(velocity, formats, tmp_path):
+    (found,) = read(tmp_path, dataflash(drive(velocity), formats))
+    np.testing.assert_allclose(found.velocity[:, 3], -0.03, atol=1e-6)
     ahead, right, down = 0.3 * math.cos(PITCH), 0.3 * math.sin(ROLL) * math.sin(PITCH), 0.0
     down = 0.3 * math.cos(ROLL) * math.sin(PITCH)
     np.testing.assert_allclose(found.velocity[50, :3], [ahead, -right, -down], atol=1e-5)
@@ -126,23 +137,163 @@ def test_holes_and_what_was_not_armed_part_a_log(tmp_path):
         read(tmp_path, dataflash(drive(armed=(2.0, 2.02))))
 
 
-def tlog():
-    """What a ground station writes: its own clock before every message; the DVL has another one."""
-    link = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+def test_the_filter_that_steered_is_read(tmp_path):
+    """Both run, each with a velocity of its own; AHRS_EKF_TYPE says which one it was."""
+    formats = FORMATS | {"NKF1": (8, "QBfff", "TimeUS,C,VN,VE,VD")}
+    rows = []
+    for name, values in drive("XKF1"):
+        rows.append((name, values))
+        if name == "XKF1":
+            rows.append(("NKF1", (*values[:2], 0.0, 0.0, 0.5)))
+    slow, steered = ([("PARM", (0, b"AHRS_EKF_TYPE", kind)), *rows] for kind in (3.0, 2.0))
+    for made, down in (
+        (slow, 0.3 * math.cos(ROLL) * math.sin(PITCH)),
+        (steered, 0.5 * math.cos(ROLL) * math.cos(PITCH)),
+    ):
+        (found,) = read(tmp_path, dataflash(made, formats))
+        assert found.velocity[50, 2] == pytest.approx(-down, abs=1e-5)
+
+
+def test_a_hole_takes_no_memory_and_a_parameter_that_is_no_number_says_nothing(tmp_path):
+    """Two readings of each instrument eleven days apart: 48 million rows, none of them known."""
+    rows = [("PARM", (0, b"SERVO1_FUNCTION", math.nan))]
+    for name, values in drive():
+        if name != "EV":
+            rows.append(
+                (name, values if values[0] < 1e6 or name == "PARM" else (values[0] + 10**12, *values[1:]))
+            )
+    tracemalloc.start()
+    first, second = read(tmp_path, dataflash(rows))
+    assert tracemalloc.get_traced_memory()[1] < 20 << 20
+    tracemalloc.stop()
+    assert (len(first.rpm) + len(second.rpm)) * STEP_S == pytest.approx(SECONDS, abs=0.3)
+
+
+def tlog(
+    boot_s=5.0,
+    system=1,
+    seconds=SECONDS,
+    written_s=1_700_000_000.0,
+    dvl=(1, 1),
+    speed=0.3,
+    rates=(),
+    armed=True,
+):
+    """What a ground station writes: its own clock before every message; the DVL has none. The autopilot's
+    counters have 32 bits."""
+    link = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+    others = {one: mavlink.MAVLink(None, srcSystem=one[0], srcComponent=one[1]) for one in (dvl, *rates)}
     out = b""
-    for step in range(round(SECONDS / 0.1)):
-        boot_s = 5.0 + 0.1 * step
+    for step in range(round(seconds / 0.1)):
+        now_s = boot_s + 0.1 * step
         servos = [*pulses(0.1 * step), 0, 0]
-        for message in (
-            mavlink.MAVLink_attitude_message(round(1e3 * boot_s), ROLL, PITCH, YAW, 0.01, 0.02, 0.03),
-            mavlink.MAVLink_servo_output_raw_message(round(1e6 * boot_s), 0, *servos[:8], *servos[8:]),
-            mavlink.MAVLink_heartbeat_message(12, 3, 128 + 1, 4, 4, 3),
-            mavlink.MAVLink_vision_position_delta_message(
-                77_000_000, 100_000, [0.0] * 3, [0.03, 0.02, 0.01], 90.0
+        milli, micro = (round(units * now_s) & 0xFFFFFFFF for units in (1e3, 1e6))
+        delta = [speed / 10, 0.02, 0.01]
+        for message, who in (
+            (mavlink.MAVLink_attitude_message(milli, ROLL, PITCH, YAW, 0.01, 0.02, 0.03), link),
+            (mavlink.MAVLink_servo_output_raw_message(micro, 0, *servos[:8], *servos[8:]), link),
+            (mavlink.MAVLink_heartbeat_message(12, 3, 128 * armed + 1, 4, 4, 3), link),
+            (
+                mavlink.MAVLink_vision_position_delta_message(77_000_000, 100_000, [0.0] * 3, delta, 90.0),
+                others[dvl],
+            ),
+            *(
+                (mavlink.MAVLink_attitude_message(9 + step, 1.0, 1.0, 1.0, 9.0, 9.0, 9.0), others[one])
+                for one in rates
             ),
         ):
-            out += struct.pack(">Q", round(1e6 * (1_700_000_000 + boot_s))) + message.pack(link)
+            out += struct.pack(">Q", round(1e6 * (written_s + 0.1 * step))) + message.pack(who)
     return out
+
+
+def merged(*logs):
+    """Logs of one file in the order in which they were written."""
+    rows = []
+    for log in logs:
+        at = 0
+        while at < len(log):
+            size = 8 + 12 + log[at + 9]
+            rows.append((log[at : at + 8], len(rows), log[at : at + size]))
+            at += size
+    return b"".join(row for *_, row in sorted(rows))
+
+
+T0 = 1_700_000_000.0
+WRAP_S = 2**32 / 1e6
+TLOGS = {
+    "plain": (tlog(), [8.0], ""),
+    "microseconds run over": (tlog(WRAP_S - 3), [8.0], ""),
+    "begun after they ran over": (tlog(WRAP_S + 60), [8.0], ""),
+    "ran over twice": (tlog(2 * WRAP_S - 3), [8.0], ""),
+    "milliseconds run over": (tlog(2**32 / 1e3 - 3), [8.0], ""),
+    "a reboot": (
+        tlog(500.0) + tlog(2.0, seconds=12.0, written_s=T0 + 30),
+        [8.0, 11.6],
+        "the autopilot's clock began anew 1 times; its drives are kept apart",
+    ),
+    "two reboots": (
+        b"".join(tlog(9.0 - 3 * k, written_s=T0 + 30 * k) for k in range(3)),
+        [8.0, 7.6, 7.6],
+        "began anew 2 times",
+    ),
+    "another day, by a later clock": (
+        tlog(5.0) + tlog(500.0, written_s=T0 + 86400),
+        [8.0, 7.6],
+        "began anew 1 times",
+    ),
+    "a reboot without a drive": (
+        tlog(500.0) + tlog(2.0, written_s=T0 + 30, armed=False),
+        [8.0],
+        "left out, ",
+    ),
+    "two vehicles": (
+        merged(tlog(5.0, seconds=10.0), tlog(900.0, system=2, dvl=(2, 1), speed=0.9, written_s=T0 + 0.03)),
+        [10.0],
+        "holds vehicles 1, 2, of which 1 is read; --system names another",
+    ),
+    "a DVL of BlueOS": (tlog(dvl=(255, 0)), [8.0], ""),
+    "a gimbal's attitude": (tlog(rates=[(1, 154)]), [8.0], "left out 80 ATTITUDE of 1/154"),
+    "two DVLs": (
+        merged(tlog(), tlog(dvl=(7, 1), speed=0.9, written_s=T0 + 0.04, system=7, boot_s=50.0, seconds=5.0)),
+        [8.0],
+        "left out 50 VISION_POSITION_DELTA of 7/1",
+    ),
+    "one late datagram": (
+        tlog() + tlog(6.0, seconds=0.1, written_s=T0 + 8) + tlog(13.0, written_s=T0 + 8.02),
+        [16.0],
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TLOGS)
+def test_clocks_and_senders_of_a_tlog(name, tmp_path):
+    content, seconds, says = TLOGS[name]
+    notes = []
+    (tmp_path / "drive.tlog").write_bytes(content)
+    found = read_ardusub(tmp_path / "drive.tlog", VEHICLE, note=notes.append)
+    assert [STEP_S * len(one.rpm) for one in found] == pytest.approx(seconds, abs=0.35)
+    assert says in "; ".join(notes) if says else not notes
+    for one in found:
+        seen = ~np.isnan(one.velocity[:, 0])
+        assert seen.sum() == pytest.approx(10 * STEP_S * len(one.rpm), abs=4)
+        np.testing.assert_allclose(one.velocity[seen][:, :3], [[0.3, -0.2, -0.1]] * seen.sum(), atol=1e-6)
+        np.testing.assert_allclose(one.tilt_rate, [[0.01, -0.02]] * len(one.rpm), atol=1e-6)
+
+
+def test_the_other_vehicle_of_a_tlog(tmp_path, capfd):
+    path = tmp_path / "drive.tlog"
+    path.write_bytes(TLOGS["two vehicles"][0])
+    (found,) = read_ardusub(path, VEHICLE, 2)
+    assert np.nanmax(found.velocity[:, 0]) == pytest.approx(0.9)
+    code, _, err = uuv(capfd, "identify", path, "--system", "3")
+    assert code == 2 and "no motors of --system 3 in it; it has those of 1, 2" in err
+
+
+def test_a_dataflash_log_that_begins_anew(tmp_path):
+    both = dataflash([*drive(), *drive()])
+    found = read(tmp_path, both)
+    assert [STEP_S * len(one.rpm) for one in found] == pytest.approx([SECONDS, SECONDS], abs=0.3)
 
 
 def test_tlog_in_our_axes(tmp_path):
@@ -170,6 +321,14 @@ BAD = {
     "text.tlog": (b"no log at all" * 50, "holds no pulse widths"),
     "empty.tlog": (b"", "holds no pulse widths"),
     "short.bin": (dataflash(drive()), "stretches of 5 s"),
+    "form.bin": (
+        dataflash([], {"PARM": (1, "QN~", "TimeUS,Name,Value")}),
+        "is damaged (Exception: Unsupported format",
+    ),
+    "ancient.bin": (
+        dataflash([("RCOU", (0, 1500))], {"RCOU": (2, "IH", "TimeMS,Ch1")}),
+        "are of a firmware that is not read (TimeUS); give a log of ArduSub 3.5 or later",
+    ),
 }
 
 

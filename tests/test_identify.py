@@ -308,10 +308,13 @@ BAD_TABLES = {
     "t,u,v,w,r,rpm_1\n1,0,0,0,0,0\n1,0,0,0,0,0\n": "times must rise",
     "t,u,v,w,r,rpm_1,asked_1\n0,0,0,0,0,0,0\n": "give one of the two",
     "": "missing: t, u, v, w, r, rpm_1",
+    "t,u,v,w,r,rpm_1\n0,0,0,0,0," + "1" * 200_000 + "\n": "is no table (field larger than field limit",
+    "t,u,v,w,r,rpm_1\n0,0,0,0,0,\0\n": "line 2 must hold 6 numbers",
+    "\ufeff": "missing: t, u, v, w, r, rpm_1",
 }
 
 
-@pytest.mark.parametrize("text", BAD_TABLES, ids=list(BAD_TABLES.values()))
+@pytest.mark.parametrize("text", BAD_TABLES, ids=range(len(BAD_TABLES)))
 def test_bad_tables_are_refused(text, tmp_path, capfd):
     path = tmp_path / "bad.csv"
     path.write_text(text)
@@ -320,8 +323,9 @@ def test_bad_tables_are_refused(text, tmp_path, capfd):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("name", ["none.csv", "none.mcap", "."])
+@pytest.mark.parametrize("name", ["none.csv", "none.mcap", ".", "utf16.csv", "x" * 999 + ".csv"])
 def test_what_is_no_log_is_refused(name, tmp_path, capfd):
+    (tmp_path / "utf16.csv").write_text("t,u,v,w,r,rpm_1", encoding="utf-16")
     code, out, err = uuv(capfd, "identify", tmp_path / name)
     assert (code, out) == (2, "") and str(tmp_path) in err
 
@@ -337,6 +341,20 @@ def test_a_gap_parts_a_table(tmp_path):
     rows = [f"{t:.1f},0,0,0,0,0" for t in [*np.arange(0, 3, 0.1), *np.arange(9, 11, 0.1)]]
     path.write_text("\n".join(["t,u,v,w,r,rpm_1", *rows]))
     assert [len(drive.rpm) for drive in read_drives(path)] == [30, 20]
+
+
+def test_a_mark_of_utf8_hides_no_column(tmp_path):
+    """As Excel writes it."""
+    (tmp_path / "a.csv").write_text("t,u,v,w,r,rpm_1\n0,1,,,,5\n1,2,,,,6\n", encoding="utf-8-sig")
+    (found,) = read_drives(tmp_path / "a.csv")
+    assert found.dt_s == 1.0 and found.velocity[:, 0].tolist() == [1.0, 2.0]
+
+
+def test_a_long_table_is_refused_before_it_fills_the_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr("uuvtai.identify.drive_log.MAX_SAMPLES", 50)
+    (tmp_path / "a.csv").write_text("t,u,v,w,r,rpm_1\n" + "".join(f"{k},,,,,0\n" for k in range(51)))
+    with pytest.raises(DriveError, match="more than 50 samples; cut it"):
+        read_drives(tmp_path / "a.csv")
 
 
 def test_our_logs_are_read_by_their_instruments_or_by_the_truth(tmp_path):

@@ -27,10 +27,11 @@ from tests.mavlink_vehicle import (
 from uuvtai.link import dialect, onboard_loop, orders
 from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import LONGEST, Endpoint, LinkPlace, place_of
-from uuvtai.link.intake import Intake, SourceClock
+from uuvtai.link.intake import MOST_KINDS, Heard, Intake, waiting_for
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.onboard_loop import OnboardLoop
 from uuvtai.link.sectors import ping_of, sectors_of
+from uuvtai.link.senders import KINDS, Senders
 from uuvtai.logs.reader import read_messages
 from uuvtai.pilot import DvlReading, ImuReading, PositionFix, PressureReading, SonarPing
 
@@ -111,7 +112,7 @@ def taken(intake, name, come_s=0.0, system=1, component=1, **fields):
 
 def attitude(intake, yaw=0.0, come_s=0.0, **fields):
     given = {"roll": 0.1, "pitch": 0.2, "yaw": yaw, "rollspeed": 0.01, "pitchspeed": 0.02, "yawspeed": 0.03}
-    return taken(intake, "ATTITUDE", come_s, time_boot_ms=round(1e3 * come_s), **(given | fields))
+    return taken(intake, "ATTITUDE", come_s, **({"time_boot_ms": round(1e3 * come_s)} | given | fields))
 
 
 def test_axes_of_the_attitude():
@@ -202,7 +203,7 @@ def test_there_and_back_keeps_the_nearest_return():
         sonar = config.sensors.sonar
         range_m, hit = rng.uniform(0.5, 12.0, sonar.n_ray), rng.integers(0, 2, sonar.n_ray)
         distances, increment, offset = sectors_of(sonar, range_m, hit)
-        ping = ping_of(sonar, 0.0, np.array(distances), increment, offset, 1200)
+        ping = ping_of(sonar, 0.0, np.array(distances), increment, offset, 1, 1200)
         assert isinstance(ping, SonarPing) and len(distances) == 72
         seen = np.where(hit > 0, range_m, np.inf)
         told = np.where(ping.hit > 0, ping.range_m, np.inf)
@@ -228,10 +229,19 @@ def test_a_scan_that_would_lie_is_refused(fields, says):
     assert re.search(says, reason)
 
 
-def test_a_sector_that_nobody_looked_into_is_no_free_water():
+@pytest.mark.parametrize(
+    ("distance", "hits"),
+    [(300, True), (1200, True), (20, True), (0, True), (1201, False)]
+    + [(blind, None) for blind in (1, 19, 1202, 65534, 65535)],
+)
+def test_a_sector_counts_as_mavlink_says(distance, hits):
+    """0 is a touch, one beyond the maximum is free water; what is unknown, or not measurable, is neither."""
     intake = Intake(CONFIG, START, 0.0)
-    assert obstacles(intake, [300] * 71 + [65535]) == []
-    assert obstacles(intake, [300] * 72) != []
+    found = obstacles(intake, [300] * 71 + [distance])
+    if hits is None:
+        assert found == [] and len(intake.heard.refused) == 1
+    else:
+        assert found[0].hit[0] == hits
 
 
 def test_rangefinders_around_the_hull_are_a_ring():
@@ -250,6 +260,9 @@ def test_rangefinders_around_the_hull_are_a_ring():
     (ping,) = taken(intake, "DISTANCE_SENSOR", orientation=0, current_distance=500, **ranger)
     middle = len(ping.range_m) // 2
     assert ping.range_m[middle] == 5.0 and ping.range_m[0] == 3.0 and ping.hit[-1] == 0
+    for odd in ({"signal_quality": 1}, {"current_distance": 19}, {"current_distance": 65535}):
+        blind = {"orientation": 0, "current_distance": 1200, **ranger, **odd}
+        assert taken(intake, "DISTANCE_SENSOR", **blind) == [], "no free water"
     later = ranger | {"time_boot_ms": 9000}
     assert taken(intake, "DISTANCE_SENSOR", 9.0, orientation=0, current_distance=500, **later) == []
 
@@ -269,14 +282,156 @@ def test_who_is_heard():
     assert attitude(intake) != [] and intake.take("ATTITUDE", 7, 1, {"yaw": 0.0}, 0.0) == []
 
 
-def test_old_data_is_known_to_be_old():
-    clock = SourceClock()
-    assert clock.measured_s(500.0, 10.0) == 10.0
-    assert clock.measured_s(501.0, 11.3) == pytest.approx(11.0, abs=1e-3), "0.3 s under way"
-    assert clock.measured_s(501.1, 12.1) == pytest.approx(11.1, abs=1e-3)
-    assert clock.measured_s(0.2, 13.0) == 13.0, "begun anew"
-    assert clock.measured_s(1000.0, 14.0) == 14.0, "a stranger from the future"
-    assert clock.measured_s(1.3, 14.1) == 14.1, "does not make what comes after him old"
+NAMES = [name for names in KINDS.values() for name in names]
+OF_OTHERS = (*KINDS["dvl"], *KINDS["sonar"])
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("sender", "is_heard"),
+    [((1, 1), True), ((1, 154), "others"), ((255, 0), "others"), ((255, 190), False), ((2, 1), False)],
+)
+def test_each_kind_of_message_counts_from_its_own_senders(name, sender, is_heard):
+    intake = Intake(CONFIG, START, 0.0)
+    intake.take(name, *sender, {"broken": math.nan}, 0.0)
+    (why,) = intake.heard.refused
+    if is_heard is True or (is_heard and name in OF_OTHERS):
+        assert "not finite" in why
+    else:
+        assert f"{name} of {sender[0]}/{sender[1]} (heard by --sender" in why
+        assert why.split("--sender ")[1][:-1] in [f"{kind}={sender[0]}/{sender[1]}" for kind in KINDS]
+
+
+@pytest.mark.parametrize(
+    ("texts", "name", "heard", "left_out"),
+    [
+        (["dvl=1/197"], "VISION_POSITION_DELTA", [(1, 197)], [(255, 0), (1, 1)]),
+        (["dvl=1/197", "dvl=255/0"], "VISION_POSITION_DELTA", [(1, 197), (255, 0)], [(1, 1)]),
+        (["sonar=3/*"], "DISTANCE_SENSOR", [(3, 1), (3, 99)], [(1, 1)]),
+        (["position=2/191"], "LOCAL_POSITION_NED", [(2, 191)], [(1, 1)]),
+        (["position=2/191"], "ATTITUDE", [(1, 1)], [(2, 191)]),
+    ],
+)
+def test_senders_that_are_typed_count_in_place_of_the_usual_ones(texts, name, heard, left_out):
+    senders = Senders.typed(texts, 1)
+    assert all(senders.counts(name, *one) for one in heard)
+    assert not any(senders.counts(name, *one) for one in left_out)
+
+
+def test_what_a_payload_says_of_itself_is_not_the_autopilots():
+    intake = Intake(CONFIG, START, 0.0)
+    attitude(intake)
+    empty = {"id": 0, "voltages": [11000] + [65535] * 9, "battery_remaining": 5}
+    taken(intake, "BATTERY_STATUS", component=100, **empty)
+    intake.take("ATTITUDE", 1, 154, {"time_boot_ms": 9, "roll": 1.5}, 0.1)
+    assert intake.heard.battery_v is None and intake.heard.rpy[0] == pytest.approx(0.1)
+    assert "BATTERY_STATUS of 1/100 (heard by --sender battery=1/100), 1 times" in intake.heard.left_out()
+
+
+def test_what_is_left_out_is_bounded_and_the_commonest_is_named():
+    intake = Intake(CONFIG, START, 0.0)
+    for component in range(2, 200):
+        for _ in range(1 + 2 * (component == 9)):
+            intake.take("ATTITUDE", 1, component, {}, 0.0)
+    assert len(intake.heard.refused) == MOST_KINDS
+    assert intake.heard.left_out().startswith("ATTITUDE of 1/9 (heard by --sender attitude=1/9), 3 times; ")
+    assert intake.heard.left_out().endswith(f"and {MOST_KINDS - 4} more reasons")
+
+
+def dvl(intake, come_s, stamp_s):
+    delta = {"time_delta_usec": 100000, "angle_delta": [0.0] * 3, "confidence": 90.0}
+    stamp = {"time_usec": round(1e6 * stamp_s), "position_delta": [0.03, 0.0, 0.0]}
+    return taken(intake, "VISION_POSITION_DELTA", come_s, 255, 0, **delta, **stamp)
+
+
+@pytest.mark.parametrize("stamp_s", [0.0, 77.0, 1.7e9])
+def test_a_dvl_without_a_clock_is_dated_by_its_arrival(stamp_s):
+    intake = Intake(CONFIG, START, 0.0)
+    assert [dvl(intake, 0.1 * k, stamp_s)[0].time_s for k in range(90)] == [0.1 * k for k in range(90)]
+
+
+def test_a_late_attitude_replaces_no_newer_one_and_a_restart_counts_for_all_messages():
+    intake = Intake(CONFIG, START, 0.0)
+    for k in range(200):
+        attitude(intake, yaw=0.01, come_s=100 + 0.02 * k)
+        dvl(intake, 100 + 0.02 * k, 50 + 0.02 * k)
+    (late,) = attitude(intake, yaw=1.0, come_s=104.0, time_boot_ms=101_000)
+    heard = intake.heard
+    assert late.time_s == pytest.approx(101.0, abs=1e-3) and heard.rpy[2] == pytest.approx(-0.01)
+    assert heard.rpy_s == heard.yaw_rate_s == pytest.approx(103.98) and heard.vel_b_s == pytest.approx(103.98)
+    pressure = {"press_abs": 1000.0, "press_diff": 0.0, "temperature": 20}
+    taken(intake, "SCALED_PRESSURE", 104.1, time_boot_ms=104_100, **pressure)
+    for k in range(10):
+        (imu,) = attitude(intake, yaw=0.02, come_s=120 + 0.02 * k, time_boot_ms=20 * k + 9)
+    assert imu.time_s == pytest.approx(120.18) and heard.rpy[2] == pytest.approx(-0.02)
+    (depth,) = taken(intake, "SCALED_PRESSURE", 120.2, time_boot_ms=209, **pressure)
+    assert depth.time_s == 120.2
+
+
+def test_the_same_message_again_makes_nothing_younger():
+    intake = Intake(CONFIG, START, 0.0)
+    for k in range(10):
+        attitude(intake, come_s=1 + 0.02 * k)
+    for k in range(100):
+        assert attitude(intake, come_s=1.2 + 0.02 * k, time_boot_ms=1180) == []
+    assert intake.heard.rpy_s == pytest.approx(1.18)
+    assert dict(intake.heard.refused) == {"ATTITUDE: the same message again": 100}
+    assert attitude(intake, yaw=0.1, come_s=3.2, time_boot_ms=3200)[0].time_s == 3.2
+
+
+def test_a_battery_that_is_silent_is_known_to_be():
+    """Not told: 0 V, 65535, -1. Of two tellers the lower one counts while it speaks."""
+    intake = Intake(CONFIG, START, 0.0)
+    heard = intake.heard
+
+    def status(come_s, millivolts, share=-1):
+        taken(intake, "SYS_STATUS", come_s, voltage_battery=millivolts, battery_remaining=share)
+
+    def pack(come_s, *cells):
+        cells = [*cells, *[65535] * (10 - len(cells))]
+        taken(intake, "BATTERY_STATUS", come_s, id=0, voltages=cells, battery_remaining=-1)
+
+    for nothing in (0, 65535):
+        status(1.0, nothing)
+        pack(1.0, nothing)
+    assert heard.battery_v is None and heard.battery_s == -math.inf
+    status(2.0, 12000)
+    pack(3.0, 8000, 8000)
+    assert (heard.battery_v, heard.battery_s) == (12.0, 3.0)
+    status(4.0, 0)
+    assert (heard.battery_v, heard.battery_s) == (12.0, 3.0)
+    pack(20.0, 8000, 8000)
+    assert (heard.battery_v, heard.battery_s) == (16.0, 20.0)
+    status(21.0, 65535, share=40)
+    assert (heard.battery_share, heard.battery_s) == (0.4, 21.0)
+
+
+@pytest.mark.parametrize(
+    ("step_m", "step_s", "jumps"),
+    [(0.1, 0.1, False), (3.0, 0.1, True), (-3.0, 0.1, True), (0.8, 0.0, True), (3.0, 5.0, False)],
+)
+def test_a_position_that_jumps_is_noticed(step_m, step_s, jumps):
+    intake = Intake(link_config(**{"sensors.localization": "truth"}), START, 0.0)
+    attitude(intake)
+    place = {"y": 0.0, "z": 0.8, "vx": 0.0, "vy": 0.0, "vz": 0.0}
+    taken(intake, "LOCAL_POSITION_NED", 1.0, x=0.0, time_boot_ms=1000, **place)
+    at_s = 1.0 + step_s
+    found = taken(intake, "LOCAL_POSITION_NED", at_s, x=step_m, time_boot_ms=round(1e3 * at_s), **place)
+    assert (intake.heard.position_jump_s, found == []) == ((at_s, True) if jumps else (-math.inf, False))
+    assert ("LOCAL_POSITION_NED: the position jumped" in intake.heard.refused) == jumps
+    assert bool(intake.heard.jumped) == jumps
+
+
+@pytest.mark.parametrize(
+    ("heard", "messages", "says"),
+    [
+        (Heard(), 0, "nothing has come at HERE yet.*QGroundControl holds port 14550.*port 14551"),
+        (Heard(vehicle_s=1.0), 9, r"id 255 comes\. MAVProxy passes none on.*MAVLink Endpoints.*14551"),
+        (Heard(vehicle_s=1.0, operator_s=1.0), 9, "^$"),
+    ],
+)
+def test_why_it_waits_is_told_with_the_endpoint_to_add(heard, messages, says):
+    assert re.search(says, waiting_for(heard, messages, "HERE", 255))
 
 
 # -------------------------------------------------------------------------------------------------- failsafes
@@ -585,6 +740,9 @@ def test_a_port_that_is_taken_is_told():
 BASE = ["pilot", "--mavlink", "udp:127.0.0.1:14550", "--start", "2,3,-0.8", "--goal", "18,3,-0.8"]
 
 
+BAD_SENDERS = ("dvl", "dvl=1", "dvl=256/0", "gps=1/1", "dvl=1/-1", "=1/1", "dvl=*/1", "")
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -601,6 +759,7 @@ BASE = ["pilot", "--mavlink", "udp:127.0.0.1:14550", "--start", "2,3,-0.8", "--g
         (["--seconds", "0"], "--seconds"),
         (["--heading", "400"], "--heading"),
         (["--mavlink", "serial:/dev/ttyS0"], "udp:HOST:PORT"),
+        *((["--sender", text], "write KIND=SYSTEM/COMPONENT") for text in BAD_SENDERS),
     ],
 )
 def test_what_makes_no_sense_is_refused(capfd, words, says):

@@ -15,6 +15,7 @@ from tests.mavlink_vehicle import FakeSub, WishfulPilot, link_config
 from uuvtai.link.endpoint import Endpoint, LinkPlace
 from uuvtai.link.flight_plan import FlightPlan
 from uuvtai.link.followed_endpoint import SILENT_S, FollowedEndpoint
+from uuvtai.link.intake import Heard
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.link_log import LinkLog
 from uuvtai.link.onboard_loop import DEAF_S, FlightNotes, OnboardLoop
@@ -86,6 +87,20 @@ def test_a_silent_vehicle_does_not_stop_the_dead_mans_time(followed):
     sub.speak(0.02)
     endpoint.receive()
     assert endpoint.now() - begun == pytest.approx(3.02)
+
+
+def test_a_late_datagram_does_not_set_its_clock_forward(followed):
+    endpoint, sub, _ = followed
+    sub.speak(3.0)
+    endpoint.receive()
+    begun = endpoint.now()
+    for _ in range(4):
+        sub.time_s -= 2.0
+        sub.speak(0.0)
+        sub.time_s += 2.0
+        sub.speak(0.02)
+        endpoint.receive()
+    assert endpoint.now() - begun == pytest.approx(0.08)
 
 
 def test_before_it_tells_its_time_heartbeats_alone_are_heard(followed):
@@ -308,19 +323,21 @@ def test_the_operator_beats_by_the_waters_clock_and_tells_the_place_for_a_minute
 
 
 def test_what_the_pilot_says_it_waits_for():
-    notes = FlightNotes("127.0.0.1:14550")
+    notes, heard = FlightNotes("127.0.0.1:14550", 255), Heard()
     hold = SafeDecision(SafeAction.HOLD, STOP, ("operator silent: operator: nothing yet",))
-    assert notes.look(1.0, hold, False, 0, "") == ""
-    assert "nothing has come at 127.0.0.1:14550 yet" in notes.look(DEAF_S, hold, False, 0, "")
-    assert notes.look(DEAF_S + 1, hold, False, 0, "") == "", "once"
+    assert notes.look(1.0, hold, False, 0, heard) == ""
+    assert "nothing has come at 127.0.0.1:14550 yet" in notes.look(DEAF_S, hold, False, 0, heard)
+    assert notes.look(DEAF_S + 1, hold, False, 0, heard) == "", "once"
     wrong = "a ground station has the id 254: --operator 254"
-    assert notes.look(7.0, hold, False, 9, wrong) == f"waits: {hold.reasons[0]} ({wrong})"
-    assert notes.look(9.0, hold, False, 9, "") == ""
+    heard.refused[wrong] += 2
+    assert "MAVProxy passes none on" in notes.look(7.0, hold, False, 9, heard)
+    assert notes.look(7.1, hold, False, 9, heard) == f"waits: {hold.reasons[0]} (not used: {wrong}, 2 times)"
+    assert notes.look(9.0, hold, False, 9, heard) == ""
     drive = SafeDecision(SafeAction.DRIVE, STOP, ())
-    assert "takes the vehicle" in notes.look(10.0, drive, False, 9, "")
-    assert notes.look(10.5, drive, True, 9, "") == "", "no more than one in a second"
-    assert notes.look(11.0, drive, True, 9, "") == "drives"
-    assert notes.look(12.0, hold, True, 9, "") == f"hold: {hold.reasons[0]}"
+    assert "takes the vehicle" in notes.look(10.0, drive, False, 9, heard)
+    assert notes.look(10.5, drive, True, 9, heard) == "", "no more than one in a second"
+    assert notes.look(11.0, drive, True, 9, heard) == "drives"
+    assert notes.look(12.0, hold, True, 9, heard) == f"hold: {hold.reasons[0]}"
 
 
 def test_ids_that_are_others_are_named():

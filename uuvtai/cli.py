@@ -188,6 +188,7 @@ def identify_vehicle(
     truth: opt.IdentifyTruth = False,
     out: opt.IdentifyOut = None,
     overrides: opt.Set = None,
+    system: opt.IdentifySystem = None,
     force: opt.IdentifyForce = False,
 ) -> None:
     """Drag, added mass, buoyancy, thruster gain and rotor lag of a vehicle from logs, with intervals."""
@@ -195,7 +196,7 @@ def identify_vehicle(
 
     target = out or file[0].with_suffix(".vehicle.yaml")
     base = SceneOptions("open", "clean", vehicle, overrides=overrides).config().vehicle
-    document = identify(file, base, vehicle, known, truth, target, force)
+    document = identify(file, base, vehicle, known, truth, target, force, system)
 
     from uuvtai.show.identification import show_identified
 
@@ -563,7 +564,9 @@ def log_convert(
     """Write a log as a ROS 2 bag, or a bag as a log."""
     from uuvtai.logs.rosbag import converted
 
-    target, messages = converted(file, out, to, source, force)
+    target, messages, left_out = converted(file, out, to, source, force)
+    for note in left_out:
+        say(f"{file}: {note}")
     typer.echo(f"{target}: {messages} messages")
 
 

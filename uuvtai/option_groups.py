@@ -305,6 +305,7 @@ class FlightGroup:
     battery: opt.LeastBattery = 13.2
     system: opt.VehicleId = 1
     operator: opt.OperatorId = 255
+    sender: opt.HeardSenders = None
     seconds: opt.PilotSeconds = None
     rate: opt.PilotRate = 1.0
     log: opt.PilotLog = None
@@ -333,6 +334,7 @@ class FlightGroup:
             log=self.log,
             system=self.system,
             operator=self.operator,
+            senders=self.sender or (),
         )
 
 

@@ -274,6 +274,15 @@ OperatorId = Annotated[
     int,
     Option("--operator", min=1, max=255, help="MAVLink id of the ground station whose heartbeat must come."),
 ]
+HeardSenders = Annotated[
+    list[str] | None,
+    Option(
+        "--sender",
+        metavar="KIND=SYSTEM/COMPONENT",
+        help="From whom a kind of message counts, in place of the usual senders: attitude, imu, pressure, "
+        "position, battery, dvl or sonar (repeatable), for example dvl=255/0 or sonar=1/*.",
+    ),
+]
 PilotSeconds = Annotated[
     float | None, Option("--seconds", help="Give the vehicle back after so long \\[default: never].")
 ]
@@ -490,6 +499,16 @@ IdentifyKnown = Annotated[
         "--known",
         ("gain", "added-mass", "buoyancy"),
         "What is taken from --vehicle: speeds and rotor speeds alone tell ratios.",
+    ),
+]
+IdentifySystem = Annotated[
+    int | None,
+    Option(
+        "--system",
+        min=1,
+        max=255,
+        help="Whose drives are read from a .tlog of several vehicles \\[default: whose motors it tells most "
+        "of].",
     ),
 ]
 IdentifyTruth = Annotated[

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from uuvtai.errors import UserError
-from uuvtai.files import read_text
+from uuvtai.files import open_file
 from uuvtai.logs.reader import read_messages
 
 _MAX_CSV_BYTES = 256 << 20
-_MAX_SAMPLES = 2_000_000
+MAX_SAMPLES = 1_000_000
 _GAP = 0.3
 """A step that differs from the usual one by more than this share parts a log in two."""
 _NEEDED = ("t", "u", "v", "w", "r")
@@ -108,7 +110,7 @@ def up_axis(roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:
 
 
 def _log(path: Path, truth: bool) -> np.ndarray:
-    rows, last = [], None
+    cells, width, last = array("d"), 0, None
     for message in read_messages(path, ("/state",)):
         data = message.data
         try:
@@ -125,12 +127,15 @@ def _log(path: Path, truth: bool) -> np.ndarray:
                 "log of uuv eval --record, or a CSV"
             ) from None
         seen = [math.nan] * 3 if held else velocity
-        rows.append([message.time_s, *seen, r, p, q, *up, *rpm])
-        if len(rows) > _MAX_SAMPLES or len(rows[-1]) != len(rows[0]):
-            raise DriveError(f"{path}: is too long, or changes its number of thrusters on the way")
-    if not rows:
+        row = [message.time_s, *seen, r, p, q, *up, *rpm]
+        width = width or len(row)
+        if len(row) != width:
+            raise DriveError(f"{path}: changes its number of thrusters on the way; give a log of one vehicle")
+        cells.extend(row)
+        refuse_long(path, len(cells) // width)
+    if not cells:
         raise DriveError(f"{path}: has no messages on /state; give a log of uuv eval --record, or a CSV")
-    return np.array(rows)
+    return np.frombuffer(cells).reshape(-1, width)
 
 
 def _up_of(quaternion: Sequence[float]) -> list[float]:
@@ -144,37 +149,56 @@ def _up_of(quaternion: Sequence[float]) -> list[float]:
 def _table(path: Path) -> tuple[np.ndarray, bool]:
     """(rows, whether their rotor speeds are as commanded)"""
     try:
-        text = read_text(path, _MAX_CSV_BYTES)
-    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        with io.TextIOWrapper(open_file(path, _MAX_CSV_BYTES), "utf-8-sig", newline="") as file:
+            head, values = _columns(path, csv.reader(file))
+    except OSError as error:
         raise DriveError(f"{path}: cannot be read ({error.strerror}); give a log, .mcap or .csv") from None
-    lines = csv.reader(text.splitlines())
-    head = [name.strip() for name in next(lines, [])]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise DriveError(f"{path}: is no table ({error}); save it as CSV in UTF-8") from None
     asked, turned = ([name for name in head if name.startswith(prefix)] for prefix in ("asked_", "rpm_"))
-    if asked and turned:
-        raise DriveError(
-            f"{path}: names rotor speeds as turned (rpm_1, ..) and as commanded (asked_1, ..); give one of "
-            "the two"
-        )
-    thrusters = turned or asked
-    missing = [name for name in _NEEDED if name not in head] + ([] if thrusters else ["rpm_1"])
-    if missing or len(set(head)) < len(head):
-        raise DriveError(
-            f"{path}: its first line must name the columns t,u,v,w,r,rpm_1,rpm_2,.. (or asked_1,..) once "
-            f"each (also p,q,roll,pitch); missing: {', '.join(missing) or 'none'}"
-        )
-    values = np.array([_numbers(path, number, row, len(head)) for number, row in enumerate(lines, 2) if row])
     if not len(values):
         raise DriveError(f"{path}: has no rows below its first line")
     column = {name: values[:, i] for i, name in enumerate(head)}
     nothing = np.zeros(len(values))
     p, q, roll, pitch = (column.get(name, nothing) for name in ("p", "q", "roll", "pitch"))
     seen = [column[name] for name in _NEEDED]
-    thrusters.sort(key=lambda name: (len(name), name))
-    rpm = [column[name] for name in thrusters]
+    rpm = [column[name] for name in sorted(turned or asked, key=lambda name: (len(name), name))]
     inputs = np.column_stack([p, q, up_axis(roll, pitch), *rpm])
     if not np.isfinite(inputs).all():
         raise DriveError(f"{path}: only u, v, w and r may have empty cells (no reading); fill the others")
     return np.column_stack([*seen, inputs]), bool(asked)
+
+
+def _columns(path: Path, lines: Any) -> tuple[list[str], np.ndarray]:
+    """(names, values (n, names)) of the lines of a ``csv.reader``; NaN in empty cells."""
+    head = [name.strip() for name in next(lines, [])]
+    asked, turned = (any(name.startswith(prefix) for name in head) for prefix in ("asked_", "rpm_"))
+    if asked and turned:
+        raise DriveError(
+            f"{path}: names rotor speeds as turned (rpm_1, ..) and as commanded (asked_1, ..); give one of "
+            "the two"
+        )
+    missing = [name for name in _NEEDED if name not in head] + ([] if asked or turned else ["rpm_1"])
+    if missing or len(set(head)) < len(head):
+        raise DriveError(
+            f"{path}: its first line must name the columns t,u,v,w,r,rpm_1,rpm_2,.. (or asked_1,..) once "
+            f"each (also p,q,roll,pitch); missing: {', '.join(missing) or 'none'}"
+        )
+    cells = array("d")
+    for row in lines:
+        if row:
+            cells.extend(_numbers(path, lines.line_num, row, len(head)))
+            refuse_long(path, len(cells) // len(head))
+    return head, np.frombuffer(cells).reshape(-1, len(head)) if cells else np.empty((0, len(head)))
+
+
+def refuse_long(path: Path, samples: int) -> None:
+    """Raise DriveError for more samples of a log than are fitted."""
+    if samples > MAX_SAMPLES:
+        raise DriveError(
+            f"{path}: holds more than {MAX_SAMPLES:,} samples; cut it, or log fewer rows a second: five "
+            "minutes are enough"
+        )
 
 
 def _numbers(path: Path, number: int, row: list[str], width: int) -> list[float]:

@@ -35,6 +35,8 @@ HORIZONS = (1, 10, 100)
 _STRETCH_S = 5.0
 _HELD_OUT = 5
 """one stretch in so many is predicted by a fit to the others"""
+_MOST_SAMPLES = 150_000
+"""of all stretches that are fitted, for each takes some seven kilobytes; 50 minutes at 50 Hz"""
 _LOOSE = 0.5
 """An interval wider than this share of the value, to either side, is warned of."""
 _OTHERS = {
@@ -90,6 +92,10 @@ def fitted_drives(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = 
             f"the logs hold {count} stretches of {_STRETCH_S:g} s without a gap, {LEAST_STRETCHES} are "
             "needed: drive for five minutes, or give more logs"
         )
+    warnings, most = [], _MOST_SAMPLES // given.wrench.shape[1]
+    if count > most:
+        given = given.some(np.linspace(0, count - 1, most).astype(int))
+        warnings.append(f"of {count} stretches {most} are fitted, evenly spread; five minutes are enough")
     idle = unexcited(given)
     if len(idle) == len(AXES):
         raise DriveError(f"the logs excite no axis; {'; '.join(idle.values())}")
@@ -97,7 +103,7 @@ def fitted_drives(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = 
     first, free = parameters_of(vehicle_cfg), _free(idle, known, not lagless)
     fit = fitted(given, vehicle_cfg, first, free)
     entries = [_entry(place, first, fit, bool(free[place])) for place in range(SIZE)]
-    warnings = [f"{text}; its numbers stay those of the vehicle given" for text in idle.values()]
+    warnings += [f"{text}; its numbers stay those of the vehicle given" for text in idle.values()]
     if lagless:
         warnings.append(f"rotor lag: {lagless}; it stays that of the vehicle given")
     warnings += [text for entry in entries if (text := _warning(entry))]

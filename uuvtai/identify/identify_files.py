@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,27 +26,38 @@ def identify(
     truth: bool,
     out: Path,
     force: bool = False,
+    system: int | None = None,
 ) -> dict[str, Any]:
     """Write ``out`` (YAML that extends ``base``) and its picture; the document of ``uuv identify --json``.
-    ``vehicle_cfg`` is that of ``base``. Raises DriveError, FileError, LogError, OSError."""
+    ``vehicle_cfg`` is that of ``base``; ``system``: as of ``read_ardusub``. Raises DriveError, FileError,
+    LogError, OSError."""
     picture = out.with_suffix(".png")
     if not out.parent.is_dir():
         raise DriveError(f"{out.parent}: is no folder; give --out a name in a folder that is there")
     for path in (out, picture):
         refuse_output(path, files, force)
-    drives = [drive for file in files for drive in _drives(file, vehicle_cfg, truth)]
+    notes: list[str] = []
+    drives = [drive for file in files for drive in _drives(file, vehicle_cfg, truth, system, notes.append)]
     found = identified(drives, vehicle_cfg, known)
     picture_bytes = prediction_png(found)
     out.write_text(vehicle_yaml(found, base, files), encoding="utf-8")
     picture.write_bytes(picture_bytes)
-    return {**found.document, "files": [str(file) for file in files], "vehicle": str(out)}
+    warnings = [*found.document["warnings"], *notes]
+    return {
+        **found.document,
+        "warnings": warnings,
+        "files": [str(file) for file in files],
+        "vehicle": str(out),
+    }
 
 
-def _drives(file: Path, vehicle_cfg: VehicleConfig, truth: bool) -> list[Drive]:
+def _drives(
+    file: Path, vehicle_cfg: VehicleConfig, truth: bool, system: int | None, note: Callable[[str], None]
+) -> list[Drive]:
     if file.suffix.lower() in ENDINGS:
         if truth:
             raise DriveError(f"{file}: a log of ArduSub's holds no truth; leave --truth out")
-        return read_ardusub(file, vehicle_cfg)
+        return read_ardusub(file, vehicle_cfg, system, note)
     return read_drives(file, truth)
 
 

@@ -29,19 +29,23 @@ def mean_wrench(drive: Drive, vehicle_cfg: VehicleConfig, lags_s: np.ndarray) ->
         lag = drive.dt_s / lags_s[:, None, None]
         risen = _risen(drive)
         off = _behind(drive, risen, lags_s)
-        speeds = [
+        speeds = (
             drive.rpm[:-1] + (instant - 1 / lag) * risen + np.exp(-instant * lag) * (off + risen / lag)
             for instant in _INSTANTS
-        ]
+        )
     else:
         lag = np.full((len(lags_s), 1, 1), drive.dt_s / vehicle_cfg.rotor_tau_s)
         before, goal = drive.rpm[None, :-1], drive.rpm[None, 1:]
         if drive.straight:
             lag = np.full_like(lag, _STRAIGHT)
         ways = [np.expm1(-instant * lag) / np.expm1(-lag) for instant in _INSTANTS]
-        speeds = [before + way * (goal - before) for way in ways]
-    pushed = np.stack([thrust_of(speed, vehicle_cfg) for speed in speeds])
-    return np.tensordot(_WEIGHTS, pushed, 1)
+        speeds = (before + way * (goal - before) for way in ways)
+    found = np.zeros((2, len(lags_s), len(drive.rpm) - 1, drive.rpm.shape[1]))
+    for weights, speed in zip(_WEIGHTS.T, speeds, strict=True):
+        pushed = thrust_of(speed, vehicle_cfg)
+        for row, weight in enumerate(weights):
+            found[row] += weight * pushed
+    return found
 
 
 def _risen(drive: Drive) -> np.ndarray:

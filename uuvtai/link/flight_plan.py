@@ -12,6 +12,7 @@ from uuvtai.config import Config
 from uuvtai.link.endpoint import LinkPlace, place_of
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.safety import SafetyLimits, outside_m
+from uuvtai.link.senders import Senders
 from uuvtai.pilot import Mission
 
 EDGE_M = 0.2
@@ -37,6 +38,8 @@ class FlightPlan:
     followed"""
     system: int = 1
     operator: int = 255
+    senders: Senders | None = None
+    """from whom what counts; None = the usual ones of ``system``"""
 
     @classmethod
     def typed(
@@ -57,6 +60,7 @@ class FlightPlan:
         log: Path | None,
         system: int,
         operator: int,
+        senders: Sequence[str] = (),
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
         tank, vehicle = config.world.tank, config.vehicle
@@ -75,10 +79,9 @@ class FlightPlan:
             raise LinkError(f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90")
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
-        deep = (-tank.z_m[1] + EDGE_M, -tank.z_m[0] - EDGE_M)
         limits = SafetyLimits(
             box_m=_four(box or (tank.x_m[0], tank.y_m[0], tank.x_m[1], tank.y_m[1])),
-            depth_m=(depth[0], depth[1]) if depth else deep,
+            depth_m=(depth[0], depth[1]) if depth else (EDGE_M - tank.z_m[1], -tank.z_m[0] - EDGE_M),
             speed_m_s=max_speed,
             heave_m_s=min(max_speed, vehicle.max_heave_m_s),
             yaw_rate_rad_s=vehicle.max_yaw_rate_rad_s,
@@ -97,6 +100,7 @@ class FlightPlan:
             rate,
             system,
             operator,
+            Senders.typed(senders, system),
         )
 
 

@@ -48,6 +48,8 @@ class FollowedEndpoint(Endpoint):
         self._pause = pause or (lambda: self.wait(0.005))
         self._waiting: list[tuple[Address, bytes]] = []
         self._told_s: float | None = None
+        self._before_s = math.inf
+        """what was told before a time that fell"""
         self._time_s, self._heard_s = 0.0, wall()
 
     def receive(self) -> list[tuple[Address, bytes]]:
@@ -83,6 +85,9 @@ class FollowedEndpoint(Endpoint):
 
     def _hear(self, told_s: float) -> None:
         last_s, now_s = self._told_s, self.now()
+        if self._before_s < told_s:  # what came last was late
+            last_s = self._before_s
+        self._before_s = last_s if last_s is not None and told_s < last_s else math.inf
         spent_s = 0.0 if last_s is None else told_s - last_s
         told_now_s = self._time_s + spent_s if 0.0 <= spent_s <= _FARTHEST_S else -math.inf
         self.clock_jumps += told_now_s < now_s

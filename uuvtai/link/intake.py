@@ -15,47 +15,27 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import Config
+from uuvtai.foreign_time import SourceClock, stamp_of
 from uuvtai.link.orders import ARM_DISARM, DO_SET_MODE
-from uuvtai.link.sectors import SECTORS, UNKNOWN_CM, ping_of
+from uuvtai.link.sectors import SECTORS, Rangers, ping_of
+from uuvtai.link.senders import AUTOPILOT, KIND_OF, KINDS, Senders
 from uuvtai.pilot import DvlReading, ImuReading, PositionFix, PressureReading, SensorMessage, SonarPing
 
-RESTART_S = 1.0
-"""a clock that jumps by more has begun anew"""
-_DRIFT = 1e-4
-"""two clocks run apart by no more"""
-
-
-class SourceClock:
-    """Maps the time stamps of one sender, who counts from a moment of its own, to the pilot's clock: the
-    least delay seen counts as none."""
-
-    def __init__(self) -> None:
-        self._offset_s = math.nan
-        self._sent_s = self._come_s = -math.inf
-
-    def measured_s(self, sent_s: float, come_s: float) -> float:
-        """When the message that says ``sent_s`` and came at ``come_s`` was measured: never after it came."""
-        offset = come_s - sent_s
-        jumps = sent_s < self._sent_s - RESTART_S or offset < self._offset_s - RESTART_S
-        if math.isnan(self._offset_s) or jumps:
-            self._offset_s = offset
-        else:
-            drifted = self._offset_s + _DRIFT * max(come_s - self._come_s, 0.0)
-            self._offset_s = min(drifted, offset)
-        self._sent_s, self._come_s = sent_s, come_s
-        return sent_s + self._offset_s
-
-
 SUBMARINE, ARDUPILOT, GROUND_STATION = 12, 3, 6
-AUTOPILOT = 1
 _ARMED = 128
 COMPANION = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER: what we are"""
 _STICK_MOVED = 200
 """of 1000"""
-_MOST_CLOCKS = 64
+MOST_KINDS = 64
+"""senders of a kind of message that are told apart, and reasons why messages are left out"""
 _FRESH_S = 1.0
 """a source that was heard within this time is preferred to a lesser one"""
+_BATTERY_S = 10.0
+"""of two tellers of a voltage the lower one counts, while it is heard so often"""
+_MOST_NAMED = 4
+JUMP_M, _MOST_SPEED_M_S = 0.5, 2.0
+"""a position that moves further than this, and faster than any vehicle, has jumped"""
 _PASCAL, _MILLI_G = 100.0, 9.80665e-3
 
 Fields = Mapping[str, Any]
@@ -72,24 +52,34 @@ class Heard:
     is_armed: bool = False
     battery_v: float | None = None
     battery_share: float | None = None
+    battery_s: float = -math.inf
+    """when a voltage or a charge came last"""
     rpy: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     """of the newest attitude, world axes of ours"""
     rpy_s: float = -math.inf
-    """when attitude and yaw rate were measured"""
+    """when it was measured"""
     vel_b: tuple[float, float, float] | None = None
     vel_b_s: float = -math.inf
     yaw_rate: float = 0.0
-    battery_s: float = -math.inf
+    yaw_rate_s: float = -math.inf
     sticks_s: float = -math.inf
     """when the operator's own sticks came"""
     sticks_moved_s: float = -math.inf
     """and when they were off their middle"""
     granted_s: dict[int, float] = field(default_factory=dict)
     """command -> when the autopilot granted it"""
+    position_jump_s: float = -math.inf
+    """when a position came last that no vehicle reaches from the one before"""
     jumped: str = ""
-    """how the given position jumped; '' = it did not"""
+    """how it jumped; '' = it did not"""
     refused: Counter[str] = field(default_factory=Counter)
-    """why messages were not used -> how many"""
+    """why messages were not used -> how many; at most ``MOST_KINDS`` reasons"""
+
+    def left_out(self) -> str:
+        """The commonest reasons with their numbers, '' = nothing was left out."""
+        named = [f"{why}, {count} times" for why, count in self.refused.most_common(_MOST_NAMED)]
+        more = len(self.refused) - len(named)
+        return "; ".join([*named, f"and {more} more reasons"] if more > 0 else named)
 
 
 class Intake:
@@ -102,34 +92,38 @@ class Intake:
         heading_rad: float | None,
         system: int = 1,
         operator: int = 255,
+        senders: Senders | None = None,
     ) -> None:
         """``start``: where the vehicle is now; ``heading_rad``: compass heading of the world's x axis, None =
-        where the vehicle looks at first. ``system``, ``operator``: their MAVLink ids."""
+        where the vehicle looks at first. ``system``, ``operator``: their MAVLink ids; ``senders``: None = the
+        usual ones."""
         self.heard = Heard()
         self._config, self._start, self._heading = config, start, heading_rad
         self._system, self._operator = system, operator
+        self._senders = senders or Senders(system)
         self._clocks: dict[tuple[int, int, str], SourceClock] = {}
+        self._last: dict[tuple[int, int, str], Fields] = {}
         self._newest: dict[str, float] = {}
         self._force_b: tuple[float, np.ndarray] | None = None
         self._zero: dict[str, float] = {}
         self._depth = -math.inf, 0.0
         """(time, newest depth [m] of the pressure sensor)"""
         self._origin: np.ndarray | None = None
-        self._rangers: dict[int, tuple[float, int, int]] = {}
+        self._place = -math.inf, np.zeros(3)
+        """(time, newest position as it was told)"""
+        self._volts: dict[str, tuple[float, float]] = {}
+        self._rangers = Rangers()
         self._takers: dict[str, Callable[[Fields, float], list[SensorMessage]]] = {
             "ATTITUDE": self._attitude,
             "VISION_POSITION_DELTA": self._vision_delta,
             "LOCAL_POSITION_NED": self._local_position,
             "OBSTACLE_DISTANCE": self._obstacles,
             "DISTANCE_SENSOR": self._ranger,
-            "SYS_STATUS": self._battery,
-            "BATTERY_STATUS": self._battery,
-            "COMMAND_ACK": self._answer,
         }
-        for name in ("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "HIGHRES_IMU"):
-            self._takers[name] = self._acceleration
-        for name in ("SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"):
-            self._takers[name] = self._pressure
+        for kind, taker in (
+            ("imu", self._acceleration), ("pressure", self._pressure), ("battery", self._battery),
+        ):  # fmt: skip
+            self._takers |= dict.fromkeys(KINDS[kind], taker)
 
     def take(
         self, name: str, system: int, component: int, fields: Fields, come_s: float
@@ -140,16 +134,28 @@ class Intake:
             return []
         if name == "MANUAL_CONTROL" and system == self._operator and component != COMPANION:
             self._sticks(fields, come_s)
+        if name == "COMMAND_ACK" and (system, component) == (self._system, AUTOPILOT):
+            if fields["result"] == 0 and fields["command"] in (DO_SET_MODE, ARM_DISARM):
+                self.heard.granted_s[fields["command"]] = come_s
         taker = self._takers.get(name)
-        if taker is None or system != self._system:
+        if taker is None:
             return []
+        if not self._senders.counts(name, system, component):
+            who, kind = f"{system}/{component}", KIND_OF.get(name)
+            return self.refuse(f"{name} of {who}" + (f" (heard by --sender {kind}={who})" if kind else ""))
         if not all(math.isfinite(value) for value in fields.values() if isinstance(value, float)):
             return self.refuse(f"{name}: a number that is not finite")
-        if not self._is_known(system, component, name):
+        key = system, component, name
+        if key not in self._clocks and len(self._clocks) >= MOST_KINDS:
             return self.refuse("too many senders")
-        sent_s = _time_of(fields)
-        clock = self._clocks[system, component, name]
-        time_s = come_s if sent_s is None else clock.measured_s(sent_s, come_s)
+        clock = self._clocks.setdefault(key, SourceClock())
+        sent_s, wrap_s = stamp_of(fields)
+        if sent_s and clock.has_risen and fields == self._last.get(key):
+            return self.refuse(f"{name}: the same message again")
+        self._last[key] = fields
+        time_s = clock.measured_s(sent_s, come_s, wrap_s)
+        if clock.restarts:
+            self._forget(system, component)
         found = taker({**fields, "name": name}, time_s)
         if found:
             self._newest[name] = come_s
@@ -159,15 +165,13 @@ class Intake:
         """Date messages anew: our clock has run on without those of the senders."""
         self._clocks.clear()
 
-    def _is_known(self, system: int, component: int, name: str) -> bool:
-        key = system, component, name
-        if key not in self._clocks and len(self._clocks) < _MOST_CLOCKS:
-            self._clocks[key] = SourceClock()
-        return key in self._clocks
+    def _forget(self, system: int, component: int) -> None:
+        """A sender has begun anew, and with it all its clocks."""
+        self._clocks = {key: clock for key, clock in self._clocks.items() if key[:2] != (system, component)}
 
     def refuse(self, why: str) -> list[SensorMessage]:
         """Count a message that is not used."""
-        if why in self.heard.refused or len(self.heard.refused) < _MOST_CLOCKS:
+        if why in self.heard.refused or len(self.heard.refused) < MOST_KINDS:
             self.heard.refused[why] += 1
         return []
 
@@ -194,11 +198,6 @@ class Intake:
         if off > _STICK_MOVED:
             self.heard.sticks_moved_s = come_s
 
-    def _answer(self, fields: Fields, time_s: float) -> list[SensorMessage]:
-        if fields["result"] == 0 and int(fields["command"]) in (DO_SET_MODE, ARM_DISARM):
-            self.heard.granted_s[int(fields["command"])] = time_s
-        return []
-
     # ------------------------------------------------------------------------------------------- instruments
 
     def _attitude(self, fields: Fields, time_s: float) -> list[SensorMessage]:
@@ -207,8 +206,10 @@ class Intake:
             heading = self._heading = float(fields["yaw"])
         rpy = np.array([fields["roll"], -fields["pitch"], _wrapped(heading - fields["yaw"])])
         rate = np.array([fields["rollspeed"], -fields["pitchspeed"], -fields["yawspeed"]])
-        self.heard.rpy, self.heard.yaw_rate = (float(rpy[0]), float(rpy[1]), float(rpy[2])), float(rate[2])
-        self.heard.rpy_s = time_s
+        heard = self.heard
+        if time_s >= heard.rpy_s:
+            heard.rpy, heard.rpy_s = (float(rpy[0]), float(rpy[1]), float(rpy[2])), time_s
+            heard.yaw_rate, heard.yaw_rate_s = float(rate[2]), time_s
         kept = self._force_b
         gravity = self._config.vehicle.gravity_m_s2
         roll, pitch = rpy[:2]
@@ -234,7 +235,8 @@ class Intake:
         return self._velocity(time_s, (ahead, -right, -down))
 
     def _velocity(self, time_s: float, vel_b: tuple[float, float, float]) -> list[SensorMessage]:
-        self.heard.vel_b, self.heard.vel_b_s = vel_b, time_s
+        if time_s >= self.heard.vel_b_s:
+            self.heard.vel_b, self.heard.vel_b_s = vel_b, time_s
         return [DvlReading(time_s, np.array(vel_b))]
 
     def _local_position(self, fields: Fields, time_s: float) -> list[SensorMessage]:
@@ -242,6 +244,8 @@ class Intake:
             return []
         turn, yaw = self._heading, self.heard.rpy[2]
         place = np.array(_turned(fields["x"], fields["y"], fields["z"], turn))
+        if self._has_jumped(time_s, place):
+            return self.refuse("LOCAL_POSITION_NED: the position jumped")
         if self._origin is None:
             self._origin = place
         found: list[SensorMessage] = []
@@ -255,6 +259,17 @@ class Intake:
             cos, sin = math.cos(yaw), math.sin(yaw)
             found += self._velocity(time_s, (cos * east + sin * north, cos * north - sin * east, up))
         return found
+
+    def _has_jumped(self, time_s: float, place: np.ndarray) -> bool:
+        last_s, last = self._place
+        if time_s < last_s:
+            return False
+        self._place = time_s, place
+        moved, spent_s = float(np.linalg.norm(place - last)), time_s - last_s
+        if has_jumped := moved > JUMP_M + _MOST_SPEED_M_S * spent_s:
+            self.heard.position_jump_s = time_s
+            self.heard.jumped = f"the position moved {moved:.1f} m in {spent_s:.2f} s"
+        return has_jumped
 
     def _pressure(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         """ArduSub's second barometer is the one in the water; with one alone it sends the first."""
@@ -275,26 +290,18 @@ class Intake:
         return self._scan(time_s, distances, increment, float(fields.get("angle_offset", 0.0)), fields)
 
     def _ranger(self, fields: Fields, time_s: float) -> list[SensorMessage]:
-        """Eight rangefinders around the hull make a ring of eight sectors, told when the one ahead speaks."""
-        turn = int(fields["orientation"])
-        if not 0 <= turn < 8 or time_s - self._newest.get("OBSTACLE_DISTANCE", -math.inf) < _FRESH_S:
+        if time_s - self._newest.get("OBSTACLE_DISTANCE", -math.inf) < _FRESH_S:
             return []
-        reach = int(fields["max_distance"])
-        read = int(fields["current_distance"])
-        self._rangers[turn] = time_s, reach + 1 if read >= reach else read, reach
-        if turn != 0:
+        ring = self._rangers.ring(fields, time_s)
+        if ring is None:
             return []
-        recent = {at: row for at, row in self._rangers.items() if abs(time_s - row[0]) <= _FRESH_S}
-        distances = np.array([recent[at][1] if at in recent else UNKNOWN_CM for at in range(8)])
-        least = min(row[2] for row in recent.values())
-        distances = np.where((distances > least) & (distances < UNKNOWN_CM), least + 1, distances)
-        return self._scan(time_s, distances, 45.0, 0.0, {"name": "DISTANCE_SENSOR", "max_distance": least})
+        return self._scan(time_s, ring[0], 45.0, 0.0, {"name": "DISTANCE_SENSOR", "max_distance": ring[1]})
 
     def _scan(
         self, time_s: float, distances: np.ndarray, increment: float, offset: float, fields: Fields
     ) -> list[SensorMessage]:
-        sonar = self._config.sensors.sonar
-        found = ping_of(sonar, time_s, distances, increment, offset, int(fields["max_distance"]))
+        span = int(fields.get("min_distance", 0)), int(fields["max_distance"])
+        found = ping_of(self._config.sensors.sonar, time_s, distances, increment, offset, *span)
         return [found] if isinstance(found, SonarPing) else self.refuse(f"{fields['name']}: {found}")
 
     def _battery(self, fields: Fields, time_s: float) -> list[SensorMessage]:
@@ -304,19 +311,35 @@ class Intake:
             volts = sum(value for value in fields["voltages"] if value < 65535) or 65535
         else:
             return []
-        share = int(fields["battery_remaining"])
-        if 0 < volts < 65535 or 0 <= share <= 100:
-            self.heard.battery_s = time_s
-        self.heard.battery_v = volts / 1e3 if 0 < volts < 65535 else self.heard.battery_v
-        self.heard.battery_share = share / 100 if 0 <= share <= 100 else self.heard.battery_share
+        heard, share = self.heard, int(fields["battery_remaining"])
+        if 0 < volts < 65535:
+            self._volts[str(fields["name"])] = time_s, volts / 1e3
+            told = [value for at_s, value in self._volts.values() if time_s - at_s <= _BATTERY_S]
+            heard.battery_v, heard.battery_s = min(told), time_s
+        if 0 <= share <= 100:
+            heard.battery_share, heard.battery_s = share / 100, time_s
         return []
 
 
-def _time_of(fields: Fields) -> float | None:
-    """[s] of the sender's clock; None where the message has none."""
-    if "time_boot_ms" in fields:
-        return float(fields["time_boot_ms"]) / 1e3
-    return float(fields["time_usec"]) / 1e6 if "time_usec" in fields else None
+def waiting_for(heard: Heard, messages: int, place: str, operator: int) -> str:
+    """Why a flight waits although everything is switched on: nothing comes at ``place``, or no ground station
+    speaks; '' = both do. ``messages``: how many have come."""
+    endpoint = (
+        "BlueOS: Vehicle > Pirate mode > MAVLink Endpoints, add a UDP client to this computer's port 14551 "
+        "and give --mavlink udp:0.0.0.0:14551"
+    )
+    if not messages:
+        return (
+            f"nothing has come at {place} yet: --mavlink names the place that vehicle or router send to. "
+            f"QGroundControl holds port 14550 of its computer ({endpoint}; ardusub: --serial1 "
+            "udpclient:HOST:PORT)"
+        )
+    if heard.operator_s > -math.inf:
+        return ""
+    return (
+        f"no heartbeat of a ground station with the id {operator} comes. MAVProxy passes none on: have the "
+        f"router send here itself ({endpoint}), or name the ground station's id by --operator"
+    )
 
 
 def _turned(north: float, east: float, down: float, heading: float) -> tuple[float, float, float]:

@@ -19,7 +19,7 @@ from uuvtai.link.endpoint import Address, Endpoint
 from uuvtai.link.flight_plan import FlightPlan
 from uuvtai.link.followed_endpoint import FollowedEndpoint
 from uuvtai.link.handover import Handover
-from uuvtai.link.intake import AUTOPILOT, COMPANION, Intake
+from uuvtai.link.intake import COMPANION, Heard, Intake, waiting_for
 from uuvtai.link.link_log import LinkLog
 from uuvtai.link.orders import ALT_HOLD, HARMLESS, MODE_NAMES, Order, ask_for, heartbeat
 from uuvtai.link.safety import (
@@ -33,6 +33,7 @@ from uuvtai.link.safety import (
     Velocity,
     decide,
 )
+from uuvtai.link.senders import AUTOPILOT
 from uuvtai.pilot import Mission, OnboardPilot, PilotCommand
 from uuvtai.pilot.sensor_messages import NAMES, SensorMessage
 from uuvtai.signals import StopEvent
@@ -79,10 +80,12 @@ class OnboardLoop:
     ) -> None:
         self._config, self._pilot, self._plan, self._endpoint, self._log = config, pilot, plan, endpoint, log
         self._now, self._sleep, self._note_to = now, sleep, note
-        self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}")
+        self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}", plan.operator)
         self._rate = plan.rate or 1.0
         self._codec = MavCodec(plan.system, COMPANION, plan.operator)
-        self._intake = Intake(config, plan.mission.start, plan.heading_rad, plan.system, plan.operator)
+        self._intake = Intake(
+            config, plan.mission.start, plan.heading_rad, plan.system, plan.operator, plan.senders
+        )
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
         self._memory, self.tally = SafetyMemory(), FlightTally()
         self._needed = [name for name in NAMES.values() if name != "depth"]
@@ -274,7 +277,7 @@ class OnboardLoop:
         """What may be fed back now; an axis that was not measured lately is NaN."""
         heard, nan = self._intake.heard, math.nan
         is_fresh = heard.vel_b is not None and now_s - heard.vel_b_s <= FEEDBACK_AGE_S
-        turn = heard.yaw_rate if now_s - heard.rpy_s <= FEEDBACK_AGE_S else nan
+        turn = heard.yaw_rate if now_s - heard.yaw_rate_s <= FEEDBACK_AGE_S else nan
         return (*(heard.vel_b if heard.vel_b and is_fresh else (nan, nan, nan)), turn)
 
     def _note_answer(self, decision: SafeDecision, view: VehicleView) -> None:
@@ -319,9 +322,8 @@ class OnboardLoop:
         for reason in decision.reasons:
             self.tally.reasons[reason.partition(":")[0]] += 1
         self._log.decided(now_s, command, decision, heard, speed)
-        wrong = ", ".join(heard.refused)
         engaged, messages = self._handover.engaged, self.tally.heard.total()
-        if text := self._notes.look(now_s, decision, engaged, messages, wrong):
+        if text := self._notes.look(now_s, decision, engaged, messages, heard):
             self.tell(text)
 
     def tell(self, text: str) -> None:
@@ -411,27 +413,30 @@ DEAF_S = 5.0
 class FlightNotes:
     """``look`` is called in every step."""
 
-    def __init__(self, place: str) -> None:
-        self._place = place
+    def __init__(self, place: str, operator: int) -> None:
+        self._place, self._operator = place, operator
         self._told: tuple[str, ...] = ()
         self._told_s = float("-inf")
-        self._is_deaf = False
+        self._missing: set[str] = set()
 
-    def look(self, now_s: float, decision: SafeDecision, is_engaged: bool, messages: int, wrong: str) -> str:
-        """A sentence about what is new, or ''. ``messages``: heard so far; ``wrong``: what was refused."""
+    def look(
+        self, now_s: float, decision: SafeDecision, is_engaged: bool, messages: int, heard: Heard
+    ) -> str:
+        """A sentence about what is new, or ''. ``messages``: heard so far."""
+        if now_s >= DEAF_S and not is_engaged:
+            missing = waiting_for(heard, messages, self._place, self._operator)
+            if missing and missing not in self._missing:
+                self._missing.add(missing)
+                return missing
         if not messages:
-            if now_s < DEAF_S or self._is_deaf:
-                return ""
-            self._is_deaf = True
-            return (
-                f"nothing has come at {self._place} yet: does the vehicle (ardusub --serial1 "
-                "udpclient:HOST:PORT, or the router) send there? --mavlink names the place"
-            )
-        what = (str(is_engaged), decision.action.name, *(r.partition(":")[0] for r in decision.reasons))
+            return ""
+        wrong = heard.left_out() if not is_engaged else ""
+        reasons = (reason.partition(":")[0] for reason in decision.reasons)
+        what = (str(is_engaged), decision.action.name, *reasons, *(heard.refused if wrong else ()))
         if what == self._told or now_s - self._told_s < EVERY_S:
             return ""
         self._told, self._told_s = what, now_s
         if decision.action == SafeAction.DRIVE:
             return "drives" if is_engaged else "nothing is wrong: takes the vehicle"
         doing = decision.action.name.lower().replace("_", " ") if is_engaged else "waits"
-        return f"{doing}: {'; '.join(decision.reasons)}" + (f" ({wrong})" if wrong else "")
+        return f"{doing}: {'; '.join(decision.reasons)}" + (f" (not used: {wrong})" if wrong else "")

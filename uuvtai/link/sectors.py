@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from uuvtai.config.sensors import SonarConfig
@@ -24,12 +27,14 @@ def ping_of(
     distances_cm: np.ndarray,
     increment_deg: float,
     offset_deg: float,
+    min_cm: int,
     max_cm: int,
 ) -> SonarPing | str:
     """A scan in which each beam has the range of the sector that it lies in, or why there is none.
 
     The pilot takes a beam without a return for free water as far as the sonar sees, so a sector that nobody
-    looked into, or a sensor that sees less far than the config says, would be a lie.
+    looked into, or a sensor that sees less far than the config says, would be a lie. By MAVLink 0 is a touch,
+    ``max_cm`` + 1 free water; what else lies outside ``min_cm`` to ``max_cm`` tells nothing.
     """
     if not (np.isfinite(increment_deg) and 0.1 <= abs(increment_deg) <= 90.0 and np.isfinite(offset_deg)):
         return f"sectors of {increment_deg:g} degrees from {offset_deg:g} on make no sense"
@@ -42,8 +47,10 @@ def ping_of(
     index = np.rint(np.mod(turn + 0.5, 360.0 / abs(increment_deg)) - 0.5).astype(int)
     heard = (index >= 0) & (index < len(distances_cm))
     distance = np.where(heard, distances_cm[np.clip(index, 0, len(distances_cm) - 1)], UNKNOWN_CM)
-    if (blind := int((distance == UNKNOWN_CM).sum())) > 0:
-        return f"{blind} of {sonar_cfg.n_ray} beams lie in sectors that nobody looked into"
+    if (distance == UNKNOWN_CM).any():
+        return "beams lie in sectors that nobody looked into"
+    if (((distance != 0) & (distance < min_cm)) | (distance > max_cm + 1)).any():
+        return "distances outside of what the sensor says that it measures"
     return SonarPing(time_s, distance / 100.0, (distance <= max_cm).astype(float), np.zeros(0))
 
 
@@ -63,3 +70,34 @@ def sectors_of(
     empty = np.setdiff1d(np.arange(SECTORS), index)
     found[empty] = found[(empty + 1) % SECTORS]
     return found.tolist(), increment, offset
+
+
+class Rangers:
+    """Eight rangefinders around the hull make a ring of eight sectors, told when the one ahead speaks."""
+
+    _TOGETHER_S = 1.0
+    _INVALID = 1
+    """signal_quality: no return that counts"""
+
+    def __init__(self) -> None:
+        self._rows: dict[int, tuple[float, int, int]] = {}
+
+    def ring(self, fields: Mapping[str, Any], time_s: float) -> tuple[np.ndarray, int] | None:
+        """(8,) [cm] clockwise from ahead, and how far all of them see; None = not yet. ``fields``: of a
+        DISTANCE_SENSOR."""
+        turn = int(fields["orientation"])
+        if not 0 <= turn < 8:
+            return None
+        read, reach = int(fields["current_distance"]), int(fields["max_distance"])
+        is_blind = int(fields.get("signal_quality", 0)) == self._INVALID or read == UNKNOWN_CM
+        if is_blind or read < int(fields.get("min_distance", 0)):
+            read = UNKNOWN_CM
+        elif read >= reach:
+            read = reach + 1
+        self._rows[turn] = time_s, read, reach
+        if turn != 0:
+            return None
+        recent = {at: row for at, row in self._rows.items() if abs(time_s - row[0]) <= self._TOGETHER_S}
+        distances = np.array([recent[at][1] if at in recent else UNKNOWN_CM for at in range(8)])
+        least = min(row[2] for row in recent.values())
+        return np.where((distances > least) & (distances < UNKNOWN_CM), least + 1, distances), least

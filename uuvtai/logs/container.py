@@ -14,9 +14,13 @@ from mcap.writer import Writer
 
 from uuvtai import signals
 from uuvtai.files import flush, open_new
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.reader import MAX_RECORD
 from uuvtai.version import __version__
 
 signals.never_within(__file__)
+MAX_MESSAGE = MAX_RECORD - (2 << 20)
+"""[bytes] of a message, which may share its chunk with one mebibyte of others"""
 LOSS_SHARE = 0.01
 """messages that may be in memory only, as a share of those written; those of one control step always may"""
 
@@ -64,7 +68,12 @@ class McapFile:
         publish_ns: int | None = None,
         sequence: int | None = None,
     ) -> None:
-        """One message; it may stay in memory until ``settle``."""
+        """One message; it may stay in memory until ``settle``. Raises LogError for one too long to read."""
+        if len(data) > MAX_MESSAGE:
+            raise LogError(
+                f"{self.path}: a message has {len(data):,} bytes, more than the {MAX_MESSAGE:,} that are "
+                "read again; if it is the map of a large tank, make it coarser: --set mapping.cell_m=0.2"
+            )
         number = self._counts[channel_id] if sequence is None else sequence
         publish = time_ns if publish_ns is None else publish_ns
         self._writer.add_message(channel_id, time_ns, data, publish, number)

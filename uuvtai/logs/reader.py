@@ -6,11 +6,13 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import lz4.frame
@@ -25,6 +27,8 @@ from uuvtai.logs.log_errors import LogError
 
 MAX_RECORD = 64 << 20
 """[bytes] of a record, and of what a chunk unpacks to: six times the map of a tank of 200 x 100 m"""
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""what a frame of zstd begins with"""
 DAMAGE = (McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError)
 """what the package, zstandard and lz4 raise for bytes that are none of theirs"""
 
@@ -89,18 +93,18 @@ def json_attachment(head: LogHead, name: str) -> Any:
 
 
 def info(path: Path) -> dict[str, Any]:
-    """What is in a log: topics with schema, messages and rate; duration, metadata, attachments, outcome.
-    Raises LogError.
+    """What is in a log: topics with schema, messages and rate; duration, metadata, attachments, outcome (None
+    = it was cut off, or ``is_eval`` says that it is none of uuv eval's). Raises LogError.
     """
     path = Path(path)
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     counts: Counter[int] = Counter()
-    head, last = LogHead(), None
+    head, first, last = LogHead(), math.inf, -math.inf
     for record in records(path):
         if isinstance(record, Message):
             counts[record.channel_id] += 1
-            last = record.log_time if last is None else max(last, record.log_time)
+            first, last = min(first, record.log_time), max(last, record.log_time)
         elif isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel):
@@ -109,7 +113,7 @@ def info(path: Path) -> dict[str, Any]:
             head.metadata[record.name] = record.metadata
         elif isinstance(record, Attachment):
             head.attachments[record.name] = record.data
-    duration = (last or 0) / 1e9
+    duration = max(last - first, 0) / 1e9
     topics = [
         {
             "topic": channel.topic,
@@ -128,6 +132,7 @@ def info(path: Path) -> dict[str, Any]:
         "topics": topics,
         "metadata": head.metadata,
         "attachments": {name: len(data) for name, data in head.attachments.items()},
+        "is_eval": "uuv.run" in head.metadata,
         "outcome": result.get("outcome"),
     }
 
@@ -143,7 +148,13 @@ def records(path: Path, skip_chunks: bool = False, damages: list[str] | None = N
     """
     path = Path(path)
     with opened(path) as file:
-        if file.peek(len(MCAP0_MAGIC))[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
+        if (magic := file.peek(len(MCAP0_MAGIC))[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
+            if magic.startswith(ZSTD):
+                plain = path.with_suffix("" if path.stem.endswith(".mcap") else ".mcap")
+                raise LogError(
+                    f"{path}: is compressed as a whole, which is not read; first: zstd -d {quote(str(path))} "
+                    f"-o {quote(str(plain))}"
+                )
             raise LogError(
                 f"{path}: is not an MCAP file (no magic bytes); give a log that uuv eval --record wrote"
             )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.files import parsed_json
+from uuvtai.foreign_time import JUMP_S
 from uuvtai.logs.encode import dumped
 from uuvtai.logs.moment import time_text
 from uuvtai.logs.ros_types import FRAMES_BACK, SURFACE_PA
@@ -56,18 +57,20 @@ _ODOMETRY = record(
 _IMU = record(
     "uuv.Imu",
     "",
-    {"acceleration": THREE},
+    {"acceleration": THREE, "orientation": POSE["properties"]["orientation"]},
     timestamp=TIME,
     frame_id=STRING,
-    orientation=POSE["properties"]["orientation"],
     rates=THREE,
 )
 _PRESSURE = record("uuv.Pressure", timestamp=TIME, frame_id=STRING, pressure_pa=NUMBER, depth_m=NUMBER)
 _TWIST = record("uuv.Twist", linear=THREE, angular=THREE)
 _TWIST_STAMPED = record("uuv.TwistStamped", timestamp=TIME, frame_id=STRING, linear=THREE, angular=THREE)
 
+_LATE_NS = round(1e9 * JUMP_S)
 NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}
 """ROS topic: the log's, where it is another"""
+_UNIT = 0.1
+"""by which the square of a quaternion's length may be off 1"""
 _TYPES = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 """PointField's codes: Foxglove's"""
 
@@ -81,22 +84,28 @@ class Reading:
 
 
 class Reader:
-    """Of one topic's messages; times count from ``start_ns``."""
+    """Of one message, logged at ``log_ns``; times count from the start of the bag's ``span_ns``."""
 
-    def __init__(self, topic: str, setup: Setup, start_ns: int) -> None:
-        self.topic, self.setup, self._start_ns = topic, setup, start_ns
+    def __init__(self, topic: str, setup: Setup, span_ns: tuple[int, int], log_ns: int) -> None:
+        self.topic, self.setup, self._span_ns, self._log_ns = topic, setup, span_ns, log_ns
+        self.is_foreign = False
+        """whether a stamp was of another clock than the bag's, not just late"""
 
     def head(self, header: Any) -> dict[str, Any]:
-        """timestamp and frame_id; stamps before the start of the bag count as its start."""
+        """timestamp and frame_id."""
         return {
             "timestamp": parsed_json(self.stamp(header), self.topic),
             "frame_id": FRAMES_BACK.get(header.frame_id, header.frame_id),
         }
 
     def stamp(self, header: Any) -> str:
-        """Time as a foxglove time."""
+        """Time as a foxglove time; of a stamp outside of the bag's span that of the log."""
         time_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-        return time_text(max(time_ns - self._start_ns, 0))
+        start_ns, end_ns = self._span_ns
+        if not start_ns <= time_ns <= end_ns:
+            self.is_foreign |= max(start_ns - time_ns, time_ns - end_ns) > _LATE_NS
+            time_ns = self._log_ns
+        return time_text(time_ns - start_ns)
 
 
 def _xyz(value: Any) -> dict[str, float]:
@@ -108,6 +117,8 @@ def _list(value: Any) -> list[float]:
 
 
 def _turn(value: Any) -> dict[str, float]:
+    if abs(value.x**2 + value.y**2 + value.z**2 + value.w**2 - 1) > _UNIT:
+        raise ValueError(f"an orientation that is none ({value.x:g}, {value.y:g}, {value.z:g}, {value.w:g})")
     return {"x": value.x, "y": value.y, "z": value.z, "w": value.w}
 
 
@@ -134,13 +145,17 @@ def _transform(reader: Reader, one: Any) -> dict[str, Any]:
 
 
 def _scan(reader: Reader, message: Any) -> bytes:
-    """No return (not finite, or beyond the range): maximum range with intensity 0, as in our logs."""
+    """REP 117: +inf is no return, as in our logs: maximum range with intensity 0. -inf is too near to
+    measure: a return at the least range. What else is no range (NaN, below the least, beyond the greatest)
+    says nothing: range 0 with intensity 0, so that no water counts as free."""
     ranges = np.asarray(message.ranges, np.float64)
     shine = np.asarray(message.intensities, np.float64)
     if len(shine) not in (0, len(ranges)):
         raise ValueError(f"{len(ranges)} ranges with {len(shine)} intensities")
-    hit = np.isfinite(ranges) & (ranges >= message.range_min) & (ranges <= message.range_max)
-    shine = np.where(hit, np.maximum(shine, 1e-3) if len(shine) else 1.0, 0.0)
+    near, none = np.isneginf(ranges), np.isposinf(ranges)
+    hit = near | ((ranges >= message.range_min) & (ranges <= message.range_max) & ~none)
+    shine = np.where(hit, np.fmax(shine, 1e-3) if len(shine) else 1.0, 0.0)
+    ranges = np.select([near, hit, none], [message.range_min, ranges, message.range_max], 0.0)
     last = message.angle_min + message.angle_increment * max(len(ranges) - 1, 0)
     return dumped(
         {
@@ -148,7 +163,7 @@ def _scan(reader: Reader, message: Any) -> bytes:
             "pose": _HERE,
             "start_angle": message.angle_min,
             "end_angle": last,
-            "ranges": np.where(hit, ranges, message.range_max).tolist(),
+            "ranges": ranges.tolist(),
             "intensities": shine.tolist(),
         }
     )
@@ -158,9 +173,12 @@ def _cloud(reader: Reader, message: Any) -> bytes:
     fields = [
         {"name": one.name, "offset": one.offset, "type": _TYPES[one.datatype]} for one in message.fields
     ]
-    if message.is_bigendian or len(message.data) != message.point_step * message.width * message.height:
-        raise ValueError("a point cloud that is big-endian, padded or cut off")
-    data = base64.b64encode(np.asarray(message.data, np.uint8).tobytes()).decode()
+    points, row = np.asarray(message.data, np.uint8), message.point_step * message.width
+    if row < message.row_step and len(points) == message.row_step * message.height:
+        points = points.reshape(message.height, -1)[:, :row]  # without what fills up the rows
+    if message.is_bigendian or points.size != row * message.height:
+        raise ValueError("a point cloud that is big-endian or cut off")
+    data = base64.b64encode(points.tobytes()).decode()
     head = reader.head(message.header)
     return dumped({**head, "pose": _HERE, "point_stride": message.point_step, "fields": fields, "data": data})
 
@@ -195,13 +213,18 @@ def _odometry(reader: Reader, message: Any) -> bytes:
 
 
 def _imu(reader: Reader, message: Any) -> bytes:
-    known = message.linear_acceleration_covariance[0] != -1
+    """What a covariance of -1, or an orientation of zeros, says is not measured is null."""
+    q, attitude, acceleration = (
+        message.orientation,
+        message.orientation_covariance[0],
+        message.linear_acceleration_covariance[0],
+    )
     return dumped(
         {
             **reader.head(message.header),
-            "orientation": _turn(message.orientation),
+            "orientation": None if attitude == -1 or not any((q.x, q.y, q.z, q.w)) else _turn(q),
             "rates": _list(message.angular_velocity),
-            "acceleration": _list(message.linear_acceleration) if known else None,
+            "acceleration": None if acceleration == -1 else _list(message.linear_acceleration),
         }
     )
 

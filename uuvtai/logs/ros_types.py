@@ -10,8 +10,10 @@ import importlib.util
 from typing import Any
 
 import numpy as np
+import zstandard
 
 from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.reader import MAX_RECORD, ZSTD
 
 EXTRA = "uuvtai[ros]"
 """extra that brings ``rosbags``"""
@@ -44,8 +46,11 @@ class RosMessages:
         return bytes(self._store.serialize_cdr(message, message.__msgtype__))
 
     def unpacked(self, data: bytes, kind: str) -> Any:
-        """Message of CDR. Raises ValueError for bytes that are none of this kind."""
+        """Message of CDR, compressed by itself or not. Raises ValueError for bytes that are none of this
+        kind."""
         try:
+            if data.startswith(ZSTD) and 0 <= zstandard.frame_content_size(data) <= MAX_RECORD:
+                data = zstandard.ZstdDecompressor().decompress(data)
             return self._store.deserialize_cdr(data, kind)
         except MemoryError:
             raise

@@ -183,7 +183,8 @@ def _bearings(scan: dict[str, Any]) -> np.ndarray:
 
 
 def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
-    """Beams without a return are +inf (REP 117)."""
+    """REP 117: -inf where noise puts a return behind the sonar, NaN where nothing is known, +inf where
+    nothing is."""
     ranges, intensities = np.array(scan["ranges"], np.float32), np.array(scan["intensities"], np.float32)
     first, last = float(scan["start_angle"]), float(scan["end_angle"])
     return ros(
@@ -196,7 +197,11 @@ def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
         scan_time=0.0,
         range_min=0.0,
         range_max=setup.max_range_m,
-        ranges=np.where(intensities > 0, ranges, np.float32(math.inf)),
+        ranges=np.select(
+            [(intensities > 0) & (ranges >= 0), intensities > 0, ranges > 0],
+            [ranges, np.float32(-math.inf), np.float32(math.inf)],
+            np.float32(math.nan),
+        ),
         intensities=intensities,
     )
 

@@ -6,9 +6,11 @@ import contextlib
 import json
 import os
 import shutil
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import yaml
@@ -16,9 +18,9 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from uuvtai.files import refuse_output
 from uuvtai.loader import ConfigError, parsed_yaml
-from uuvtai.logs.container import McapFile
+from uuvtai.logs.container import MAX_MESSAGE, McapFile
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.reader import MAX_RECORD, LogHead, read_head, read_messages, records
+from uuvtai.logs.reader import LogHead, read_head, read_messages, records
 from uuvtai.logs.ros_read import NAMES, READ, Reader
 from uuvtai.logs.ros_types import RosMessages
 from uuvtai.logs.ros_write import SOURCES, WRITTEN, Setup, ros_messages
@@ -29,8 +31,11 @@ _ODD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticE
 FORMATS = ("mcap", "rosbag2")
 
 
-def converted(file: Path, out: Path | None, to: str | None, source: str, force: bool) -> tuple[Path, int]:
-    """A log as a bag or a bag as a log: (what was written, how many messages). Raises LogError, FileError."""
+def converted(
+    file: Path, out: Path | None, to: str | None, source: str, force: bool
+) -> tuple[Path, int, list[str]]:
+    """A log as a bag or a bag as a log: (what was written, how many messages, what was left out). Raises
+    LogError, FileError."""
     for option, given in (("--to", to), ("--from", source)):
         if given not in (*FORMATS, None):
             raise LogError(f"{option} {given}: choose one of {', '.join(FORMATS)}")
@@ -38,9 +43,9 @@ def converted(file: Path, out: Path | None, to: str | None, source: str, force: 
         raise LogError(f"--from {source} --to {to}: a log becomes a bag, and a bag a log; leave out --to")
     if source == "rosbag2":
         target = out or file.with_name(f"{file.stem}.log.mcap")
-        return target, from_rosbag2(file, target, force)
+        return target, *from_rosbag2(file, target, force)
     target = out or file.with_name(f"{file.stem}_rosbag2")
-    return target, to_rosbag2(file, target, force)
+    return target, to_rosbag2(file, target, force), []
 
 
 def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
@@ -66,10 +71,11 @@ def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
     return count
 
 
-def from_rosbag2(path: Path, out: Path, force: bool = False) -> int:
-    """Write the bag ``path``, a folder or its .mcap file, as the log ``out``; how many messages. Those
-    that are not in ``READ`` are left out. Raises LogError, and then nothing is left; FileError as
-    ``refuse_output``."""
+def from_rosbag2(path: Path, out: Path, force: bool = False) -> tuple[int, list[str]]:
+    """Write the bag ``path``, a folder or its .mcap file, as the log ``out``; how many messages, and notes:
+    which were left out, for they are odd, and which are dated by the log, for their stamps are of another
+    clock. Those that are not in ``READ`` are left out in silence. Raises LogError, and then nothing is left;
+    FileError as ``refuse_output``."""
     ros, file = RosMessages(), _bag_file(Path(path))
     out = Path(out)
     refuse_output(out, [file], force)
@@ -79,14 +85,23 @@ def from_rosbag2(path: Path, out: Path, force: bool = False) -> int:
         out.parent.mkdir(parents=True, exist_ok=True)
         log = McapFile(out)
         try:
-            count = _Reading(ros, setup, log).run(file, head)
+            reading = _Reading(ros, setup, log)
+            count = reading.run(file, head)
+            if not count and reading.odd:
+                raise ValueError(next(iter(reading.why.values())))
             if not count:
                 raise LogError(f"{file}: none of the messages that can be read; it needs {', '.join(READ)}")
             log.finish()
         except BaseException:
             log.discard()
             raise
-    return count
+    return count, [
+        *(f"{topic}: left out {n} odd, the first: {reading.why[topic]}" for topic, n in reading.odd.items()),
+        *(
+            f"{topic}: {n} with stamps of another clock than the bag's, dated by when they were logged"
+            for topic, n in (+reading.foreign).items()
+        ),
+    ]
 
 
 @contextlib.contextmanager
@@ -116,15 +131,20 @@ def _bag_file(path: Path) -> Path:
     """The one .mcap of a bag."""
     if not path.is_dir():
         return path
-    found = sorted(entry for entry in path.iterdir() if entry.suffix in (".mcap", ".db3"))
+    found = sorted(entry for entry in path.iterdir() if {".mcap", ".db3"} & set(entry.suffixes))
     if len(found) == 1 and found[0].suffix == ".mcap":
         return found[0]
-    if any(entry.suffix == ".db3" for entry in found):
-        raise LogError(
-            f"{path}: is a bag in SQLite, and only MCAP is read; first: rosbags-convert --src {path} --dst "
-            "NEW --dst-storage mcap"
-        )
-    raise LogError(f"{path}: holds {len(found)} .mcap files; name the one to convert")
+    if not found:
+        raise LogError(f"{path}: holds 0 .mcap files; name the folder of a bag, or its file")
+    if any(".db3" in entry.suffixes for entry in found):
+        what = "is a bag in SQLite, and only MCAP is read"
+    elif any(entry.suffix != ".mcap" for entry in found):
+        what = f"holds {found[0].name}, which is compressed as a whole and not read"
+    else:
+        what = f"is a bag of {len(found)} parts, and one file is read at a time"
+    raise LogError(
+        f"{path}: {what}; first: rosbags-convert --src {quote(str(path))} --dst NEW --dst-storage mcap"
+    )
 
 
 # -------------------------------------------------------------------------------------------------- writing
@@ -210,7 +230,7 @@ def _description(file: str, counts: Counter[str], duration_ns: int, start_ns: in
 
 
 class _Reading:
-    """A bag's messages on their way into a log; times count from its first message."""
+    """A bag's messages on their way into a log; times count from the earliest of those that are read."""
 
     def __init__(self, ros: RosMessages, setup: Setup, file: McapFile) -> None:
         self._ros, self._setup, self._log = ros, setup, file
@@ -218,7 +238,14 @@ class _Reading:
         self._channels: dict[int, Channel] = {}
         self._made: dict[int, int] = {}
         self._known: dict[str, int] = {}
-        self._start_ns: int | None = None
+        self._span_ns = 0, 0
+        self._topics: set[str] = set()
+        self.odd: Counter[str] = Counter()
+        """messages of a topic that were left out"""
+        self.why: dict[str, str] = {}
+        """and what was wrong with the first"""
+        self.foreign: Counter[str] = Counter()
+        """messages of a topic that were dated by the log"""
 
     def run(self, file: Path, head: LogHead) -> int:
         """All of it; how many messages."""
@@ -228,25 +255,40 @@ class _Reading:
                 self._log.add_metadata(name, entries)
         for name, data in head.attachments.items():
             self._log.add_attachment(name, "application/octet-stream", data)
+        times_ns = array("Q", self._look(file))
+        self._span_ns = (min(times_ns), max(times_ns)) if times_ns else (0, 0)
+        self._topics = {channel.topic for channel in self._channels.values()}
+        for record in records(file):
+            if isinstance(record, Message):
+                count += self._put(record)
+        return count
+
+    def _look(self, file: Path) -> Iterator[int]:
+        """Log times of the messages that are read; notes schemas and channels."""
         for record in records(file):
             if isinstance(record, Schema):
                 self._schemas[record.id] = record
             elif isinstance(record, Channel):
                 self._channels[record.id] = record
             elif isinstance(record, Message):
-                count += self._put(record)
+                if self._kind(record) in READ:
+                    yield record.log_time
             else:
                 assert isinstance(record, Attachment | Metadata)
-        return count
 
-    def _put(self, record: Message) -> bool:
+    def _kind(self, record: Message) -> str:
+        """Name of a message's schema, '' = it is none of ROS 2's."""
         channel = self._channels.get(record.channel_id)
         schema = None if channel is None else self._schemas.get(channel.schema_id)
-        if channel is None or schema is None or channel.message_encoding != "cdr" or schema.name not in READ:
+        return schema.name if channel and schema and channel.message_encoding == "cdr" else ""
+
+    def _put(self, record: Message) -> bool:
+        if (kind := self._kind(record)) not in READ:
             return False
-        if self._start_ns is None:
-            self._start_ns = record.log_time
-        topic, reading = NAMES.get(channel.topic, channel.topic), READ[schema.name]
+        channel = self._channels[record.channel_id]
+        topic, reading = NAMES.get(channel.topic, channel.topic), READ[kind]
+        if topic in self._topics:  # the bag has it beside: names stay apart
+            topic = channel.topic
         if channel.id not in self._made:
             title = reading.schema["title"]
             if title not in self._known:
@@ -254,9 +296,16 @@ class _Reading:
                     title, "jsonschema", json.dumps(reading.schema).encode()
                 )
             self._made[channel.id] = self._log.add_channel(topic, self._known[title])
-        reader = Reader(topic, self._setup, self._start_ns)
-        data = reading.read(reader, self._ros.unpacked(record.data, schema.name))
-        if len(data) > MAX_RECORD:
-            raise ValueError(f"{channel.topic}: {len(data):,} bytes, more than a log's message may have")
-        self._log.add_message(self._made[channel.id], max(record.log_time - self._start_ns, 0), data)
+        try:
+            reader = Reader(topic, self._setup, self._span_ns, record.log_time)
+            data = reading.read(reader, self._ros.unpacked(record.data, kind))
+            if len(data) > MAX_MESSAGE:
+                raise ValueError(f"{len(data):,} bytes, more than a log's message may have")
+        except _ODD as error:
+            self.odd[channel.topic] += 1
+            reason = str(error) if isinstance(error, ValueError) else repr(error)
+            self.why.setdefault(channel.topic, reason.partition(": {")[0][:200])
+            return False
+        self.foreign[channel.topic] += reader.is_foreign
+        self._log.add_message(self._made[channel.id], record.log_time - self._span_ns[0], data)
         return True

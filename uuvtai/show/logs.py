@@ -20,6 +20,7 @@ _TOPICS = (
 def show_log(screen: Screen, found: dict[str, Any], file: Path) -> None:
     """Topics of a ``uuv log info --json`` document."""
     screen.table(Table(_TOPICS, found["topics"], str(file)))
+    end = f"outcome {found['outcome'] or 'none: the log was cut off'}"
     screen.line(
-        f"duration {found['duration_s']:.2f} s, outcome {found['outcome'] or 'none: the log was cut off'}"
+        f"duration {found['duration_s']:.2f} s, {end if found['is_eval'] else 'not a log of uuv eval'}"
     )
