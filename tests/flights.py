@@ -24,7 +24,7 @@ _SLACK_S = 2 * DT
 
 
 class FaultySub(FakeSub):
-    """Faults are (kind, sensor, begin, end, size), times by the vehicle's clock. It beats every ``beat_s``."""
+    """Faults are (kind, sensor, begin, end, size), by the vehicle's clock. It beats every ``beat_s``."""
 
     def __init__(self, *given, faults=(), beat_s=DT, **more):
         super().__init__(*given, **more)

@@ -274,8 +274,8 @@ def test_water_that_begins_anew_under_a_vehicle_on_its_way_is_noticed(three):
     one.pilot.goal = np.array([9.0, 3.0, one.start[2]])
     one.loop.run()
     found = one.loop.document()
-    assert not found["reached"] and not found["safe"] and "operator silent" in found["ended"], one.said
-    assert found["mode"] == "SURFACE" and one.port.instance.joined_late
+    assert not found["reached"] and not found["safe"] and "position jumped" in found["ended"], one.said
+    assert found["mode"] == "ALT_HOLD" and one.port.instance.joined_late
     one.autopilot.close()
     one.autopilot = StandIn(("127.0.0.1", one.endpoint.port), operates=False)
     begin_anew()

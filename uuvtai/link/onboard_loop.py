@@ -105,7 +105,7 @@ class OnboardLoop:
         """pilot's clock behind ours: what was lost in stalls; how long the vehicle did not move as asked"""
         self._stalls: list[tuple[float, float]] = []
         self.last = SafeDecision(SafeAction.HOLD, STOP, ("nothing was decided yet",))
-        self._is_leaving = False
+        self._is_leaving, self._told = False, ""
         self.failure: BaseException | None = None
         """an error of this program that ended the flight, or came while it ended"""
 
@@ -329,7 +329,9 @@ class OnboardLoop:
     def tell(self, text: str) -> None:
         """A sentence for the operator; a terminal that is gone ends nothing."""
         try:
-            self._note_to(text)
+            if text != self._told:
+                self._told = text
+                self._note_to(text)
         except OSError:  # the terminal is gone
             self._note_to = lambda text: None
 
