@@ -44,7 +44,7 @@ _SWEEP = [
     *("sweep", "--grid", "S=4,8", "--grid", "D=3,6", "--grid", "v=0.6", "--controller", "straight"),
     *("--controller", "bt", "--num-envs", "8"),
 ]
-_HALF = (".tmp", ".part", ".partial", ".repairing", ".part.webm")
+_HALF = (".tmp", ".part", ".tmp.webm")
 _TIMES = ("wall_s", "env_steps_per_s")
 _LONGEST_S, _MOST_BYTES = 60.0, 1 << 30
 
@@ -54,7 +54,7 @@ def measure(job: Job) -> list[Row]:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores Ctrl-C
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), job)
-        return [*bench.killed(), *bench.signalled(), *bench.damaged()]
+        return [*bench.killed(), *bench.signalled(), *bench.damaged(), *remade(12 if job.quick else 200)]
 
 
 class Bench:
@@ -328,12 +328,12 @@ def _result(run: Path) -> dict[str, Any]:
 
 
 def _half_written(place: Path, parts: bool = False) -> list[str]:
-    """Temporary files; of an evaluation that was interrupted ``.mcap.part`` may stay, and it says so."""
+    """Temporary files; of an evaluation that was interrupted ``.part`` files may stay, and it says so."""
     return [
         f"left {path.name}"
         for path in place.rglob("*")
         if (path.name.endswith(_HALF) or path.name.startswith(".partial"))
-        and not (parts and path.name.endswith(".mcap.part"))
+        and not (parts and path.name.endswith(".part"))
     ]
 
 
@@ -411,6 +411,41 @@ def _be_uuv(words: list[str], folder: Path, told: Path) -> None:
     finally:
         sys.stderr.flush()
         os._exit(code)
+
+
+# ----------------------------------------------------------------------------------------------------- memory
+
+
+def remade(rounds: int = 200) -> Iterator[Row]:
+    """Environments made, driven and closed, at 2 and at 64 envs."""
+    for n_env in (2, 64):
+        grown = memory_growth_mib(n_env, rounds, sensors="multibeam", vehicle="bluerov2_16v")
+        what = f"{rounds} environments of {n_env} made and closed: memory that was not given back"
+        yield Row(what, grown, "MiB", less_is_better=True, floor=_MOST_GROWTH_MIB)
+
+
+_MOST_GROWTH_MIB = 50.0
+
+
+def memory_growth_mib(n_env: int, rounds: int, **options: Any) -> float:
+    """What this process holds more after so many environments than after three, each driven for ten steps;
+    ``options``: of ``uuvtai.make``."""
+    import gc
+
+    import torch
+
+    import uuvtai
+
+    held = []
+    for _ in range(3 + rounds):
+        with uuvtai.make(num_envs=n_env, **options) as env:
+            env.reset()
+            for _ in range(10):
+                env.step(torch.zeros(n_env, 4))
+        del env
+        gc.collect()
+        held.append(int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20)
+    return held[-1] - held[2]
 
 
 # ----------------------------------------------------------------------------------------------------- damage

@@ -1,6 +1,7 @@
 """``uuv export --stack``: a folder that decides the same where neither Taichi nor torch can be imported."""
 
 import json
+import platform
 import shutil
 import struct
 import subprocess
@@ -101,6 +102,14 @@ def test_a_folder_that_does_not_fit_says_why(copy, change, said):
         CarriedStack(copy)
     done = alone(copy)
     assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", [f"{platform.machine()}.so", "memory.npz"])
+def test_a_file_that_has_changed_is_not_loaded(copy, name):
+    with (copy / name).open("ab") as file:
+        file.write(b"\0")
+    with pytest.raises(StackFolderError, match=f"{name} has changed since"):
+        CarriedStack(copy)
 
 
 def test_begun_anew_it_decides_the_same_again(folder):

@@ -8,8 +8,9 @@ import torch
 
 from tests import shape_bits
 from tests.small_sim import SmallSim
+from uuvtai import runtime
 from uuvtai.copying import HostCounts
-from uuvtai.errors import SettingError
+from uuvtai.errors import DeviceError, SettingError
 from uuvtai.loader import load_config
 from uuvtai.native import gpu_shape
 from uuvtai.outcomes import RUNNING, TIMEOUT
@@ -69,3 +70,15 @@ def test_kernels_in_the_shape_for_a_gpu_give_the_same_bits(small):
     ours = shape_bits.play(small.sim, 200)
     apart = shape_bits.played_apart("gpu", SmallSim.N, "paper", 200)
     assert len(ours) > 200 and shape_bits.differing(ours, apart) == []
+
+
+def test_a_taichi_that_fell_back_to_the_cpu_is_no_gpu(monkeypatch):
+    """Our tensors would lie where its kernels cannot reach."""
+    runtime.start_taichi("cpu")
+    monkeypatch.setattr(runtime, "_started", [])
+    monkeypatch.setattr(runtime, "_resolved", lambda _device: "cuda")
+    monkeypatch.setattr(runtime.ti, "init", lambda **_: None)
+    monkeypatch.setattr(runtime.ti, "reset", (ended := []).clear)
+    with pytest.raises(DeviceError, match=r"fell back to .*--device cpu"):
+        runtime.start_taichi("cuda")
+    assert not runtime._started and not ended

@@ -1,5 +1,6 @@
 """``uuv examples``: the examples as a folder of one's own."""
 
+import errno
 from pathlib import Path
 
 import pytest
@@ -28,7 +29,16 @@ def test_a_place_that_cannot_be_written_and_a_package_without_examples_are_told(
     (tmp_path / "file").write_text("")
     with pytest.raises(ExampleError, match="cannot write there"):
         copy_examples(tmp_path / "file" / "in")
+    with monkeypatch.context() as full, pytest.raises(ExampleError, match="No space left"):
+        written = iter(range(5))
+        full.setattr("os.fsync", lambda _file: _full_disk() if next(written, None) is None else None)
+        copy_examples(tmp_path / "new")
+    assert not list((tmp_path / "new").iterdir())
     monkeypatch.setattr(example_files, "_CHECKOUT", tmp_path)
     monkeypatch.setattr(example_files.metadata, "files", lambda name: None)
     with pytest.raises(ExampleError, match="source distribution"):
         copy_examples(tmp_path / "new")
+
+
+def _full_disk():
+    raise OSError(errno.ENOSPC, "No space left on device")

@@ -62,6 +62,16 @@ def test_sb3_gets_last_observations_and_statistics(batch, adapter_of):
         < np.abs(obs[5, goal] - first[5, goal]).max()
     )
     assert adapter.env_is_wrapped(object) == [False] * N and adapter.get_attr("num_envs") == [N] * N
+    for indices, count in ((0, 1), ([0, 1], 2), (np.array([1]), 1), (range(2), 2), ([], 0)):
+        assert (
+            len(adapter.env_is_wrapped(object, indices))
+            == len(adapter.get_attr("num_envs", indices))
+            == count
+        )
+    assert adapter.has_attr("num_envs") and not adapter.has_attr("nothing_of_the_kind")
+    for name, indices, error in (("nothing_of_the_kind", None, AttributeError), ("num_envs", N, IndexError)):
+        with pytest.raises(error):
+            adapter.get_attr(name, indices)
     for use in (lambda: adapter.set_attr("x", 1), lambda: adapter.env_method("x")):
         with pytest.raises(NotImplementedError, match="no attributes or methods of single envs"):
             use()

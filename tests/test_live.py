@@ -1,22 +1,27 @@
 """Episodes served while they run: an independent client gets what the log gets, also one that comes late; the
 clock is kept, and what cannot be served is refused."""
 
+import contextlib
 import importlib.util
 import json
+import resource
+import socket
 import struct
+import threading
 import time
 from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
 from foxglove.websocket import ServerListener
-from websockets.exceptions import InvalidHandshake
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
 from tests.command import uuv
 from uuvtai.live import viewer_server
 from uuvtai.live.broadcast import Broadcast, RealTime
-from uuvtai.live.viewer_server import LiveError, ViewerServer
+from uuvtai.live.doorkeeper import MOST_CLIENTS
+from uuvtai.live.viewer_server import BACKLOG, LiveError, ViewerServer
 from uuvtai.logs.log_recorder import EpisodeRecorder
 
 STEPS = 30
@@ -30,8 +35,9 @@ class Job(NamedTuple):
     episode: int
 
 
-def open_socket(port):
-    return connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None).__enter__()
+def open_socket(port, **options):
+    place = f"ws://127.0.0.1:{port}"
+    return connect(place, subprotocols=["foxglove.sdk.v1"], max_size=None, **options).__enter__()
 
 
 class Viewer:
@@ -53,10 +59,11 @@ class Viewer:
             assert time.monotonic() < end, "subscriptions never came"
             time.sleep(0.005)
 
-    def receive(self, count):
-        """Until so many messages have come."""
-        while len(self.messages) < count:
-            self._take(self.socket.recv(10))
+    def receive(self, count, wait=10):
+        """Until so many messages have come, or the server has gone."""
+        with contextlib.suppress(ConnectionClosed):
+            while len(self.messages) < count:
+                self._take(self.socket.recv(wait))
         return self.messages
 
     def _take(self, frame):
@@ -100,9 +107,16 @@ def test_a_viewer_gets_what_the_log_gets(small, server, tmp_path):
     server.begin(shown.sink_for(small.sim, 0, job)._stream.schemas())
     viewer = Viewer(server.port)
     viewer.subscribe(server)
+    reader = threading.Thread(target=viewer.receive, args=(10**6, None))  # who lags loses the oldest
+    reader.start()
     played(small, [shown, recorder], job)
     logged = [(m.topic, m.time_ns, m.data) for m in logged_messages(recorder.paths[job])]
-    got = viewer.receive(len(logged))
+    end = time.monotonic() + 30
+    while len(viewer.messages) < len(logged) and time.monotonic() < end:
+        time.sleep(0.01)
+    got = viewer.messages
+    server.close()
+    reader.join()
     assert sorted(got) == sorted(logged) and len(logged) > 10 * STEPS
     poses = [time_ns for topic, time_ns, _ in got if topic == "/pose"]
     assert poses == [round(step * 0.02e9) for step in range(STEPS + 1)], "50 Hz, more than the 20 of a viewer"
@@ -156,6 +170,83 @@ def test_a_port_that_is_taken_is_refused(server):
 def test_other_protocols_are_turned_away(server):
     with pytest.raises(InvalidHandshake):
         connect(f"ws://127.0.0.1:{server.port}", subprotocols=["mqtt"])
+
+
+@pytest.mark.parametrize(
+    ("origin", "is_let_in"),
+    [
+        (None, True), ("http://localhost:5173", True), ("http://127.0.0.1", True), ("file://", True),
+        ("https://app.foxglove.dev", True), ("https://evil.example", False), ("null", False),
+        ("http://localhost.evil.example", False), ("http://127.0.0.1.evil.example:8765", False),
+        ("http://[", False), ("https://app.foxglove.dev.evil.example", False),
+        ("http://localhost@evil.example", False),
+    ],
+)  # fmt: skip
+def test_a_web_page_of_elsewhere_is_turned_away(origin, is_let_in):
+    with ViewerServer(port=0, origins=["https://app.foxglove.dev"]) as server:
+        if is_let_in:
+            assert json.loads(open_socket(server.port, origin=origin).recv(10))["op"] == "serverInfo"
+        else:
+            with pytest.raises(InvalidHandshake, match="403"):
+                open_socket(server.port, origin=origin)
+
+
+@pytest.mark.parametrize("name", ["localhost.evil.example", "evil.example"])
+def test_a_name_that_leads_here_is_no_origin_of_ours(server, name):
+    """DNS rebinding: page and request name the same host."""
+    host = f"{name}:{server.port}"
+    with pytest.raises(InvalidHandshake, match="403"):
+        open_socket(server.port, origin=f"http://{host}", additional_headers={"Host": host})
+
+
+@pytest.mark.parametrize(
+    "request_line",
+    [
+        b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
+        b"\0" * 20_000,
+        b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n Origin: x\r\n\r\n",
+    ],
+)
+def test_what_is_no_websocket_is_answered_and_ended(server, request_line):
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as client:
+        client.sendall(request_line)
+        assert client.recv(100).startswith(b"HTTP/1.1 4")
+
+
+def test_the_number_of_clients_is_bounded_and_a_place_becomes_free(server):
+    clients = [open_socket(server.port) for _ in range(MOST_CLIENTS)]
+    with pytest.raises(InvalidHandshake, match="503"):
+        open_socket(server.port)
+    clients[0].close()
+    end = time.monotonic() + 30
+    while True:
+        try:
+            return open_socket(server.port)
+        except InvalidHandshake:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+
+
+def test_who_never_reads_takes_no_more_than_the_backlog(small, server):
+    shown = Broadcast(server, "pool", "bt")
+    played(small, [shown], Job(77001, 3), 2)
+    channel = next(iter(server._channels.values()))
+    viewer = Viewer(server.port)
+    viewer.subscribe(server)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for n in range(400):
+        channel.log(bytes(1 << 20), log_time=n)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < (BACKLOG + 40) << 10, "KiB"
+
+
+def test_what_a_client_says_steers_no_terminal(server, capfd):
+    strange = open_socket(server.port)
+    strange.send(json.dumps({"op": "\x1b[2J\x1b]0;owned\x07\nuuv: run this \u202e"}))
+    end, told = time.monotonic() + 30, ""
+    while "owned" not in told and time.monotonic() < end:
+        time.sleep(0.02)
+        told += capfd.readouterr().err
+    assert "owned" in told and not {"\x1b", "\x07", "\u202e"} & {*told} and "\nuuv" not in told
 
 
 def test_nonsense_from_a_client_ends_nothing(small, server):

@@ -5,7 +5,15 @@ import yaml
 
 from uuvtai import loader
 from uuvtai.config import Config
-from uuvtai.loader import ConfigError, load_config, load_training, to_yaml, validated, with_stack
+from uuvtai.loader import (
+    ConfigError,
+    load_config,
+    load_training,
+    preset_names,
+    to_yaml,
+    validated,
+    with_stack,
+)
 
 
 def write(folder, text, name="mine.yaml"):
@@ -309,3 +317,90 @@ def test_a_bad_training_preset_is_named_with_its_line(tmp_path, text, says):
     with pytest.raises(ConfigError) as error:
         load_training(write(tmp_path, text))
     assert says in str(error.value)
+
+
+# ------------------------------------------------------------------------------------ sizes, places, files
+
+_BOX = "{kind: box, x_m: 5.0, y_m: 2.25, half_extents_m: [0.1, 2.25]}"
+_ROUND = "{kind: cylinder, radius_m: 0.2, "
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", r"w\.yaml: is empty"),
+        ("# only words\n", r"w\.yaml: is empty"),
+        ("vehicle: {mass_kg: 11.0}", r"w\.yaml: is no world, .* give it as --vehicle"),
+        ("sensors: {localization: truth}", r"w\.yaml: is no world, .* give it as --sensors"),
+        ("world:\n  tank:\n    x_m: [0, 2000]", r"w\.yaml:2: world\.tank: .*2000 x 6 x 1\.6 m.*in metres"),
+        ("world: {tank: {x_m: [0, 600], y_m: [0, 400]}}", r"40,000 m\^2"),
+        ("world: {tank: {z_m: [-160, 0]}}", r"depth of 100 m"),
+        (f"world:\n  fixed:\n  - {_BOX}\n  - {_ROUND}x_m: 50, y_m: 2}}",
+         r"w\.yaml:4: world\.fixed\.1: \(50, 2\) is"),
+        (f"world: {{fixed: [{_ROUND}x_m: 5, y_m: -0.1}}]}}", r"world\.fixed\.0: .*outside the tank"),
+        (f"world: {{fixed: [{_ROUND}x_m: 5, y_m: 2, z_m: 1}}]}}", r"fixed\.0\.z_m: 1 is outside the water"),
+        (f"world: {{fixed: [{_ROUND}x_m: 5, y_m: 2, path: [{{x_m: 5, y_m: 2}}, {{x_m: 5, y_m: 20}}]}}]}}",
+         r"world\.fixed\.0\.path\.1: \(5, 20\) is outside"),
+        ("world: {fixed: [{kind: cylinder, radius_m: 40, x_m: 5, y_m: 2}]}", r"fixed\.0: is larger than"),
+        ("mapping: {cell_m: 0.001}\nworld: {n_static: 1}", r"w\.yaml:1: mapping\.cell_m: .* cells"),
+    ],
+)  # fmt: skip
+def test_a_world_is_checked_before_anything_is_allocated(tmp_path, text, told):
+    (tmp_path / "w.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=told):
+        load_config(str(tmp_path / "w.yaml"))
+
+
+def test_a_round_tank_has_no_corners():
+    pen = {"shape": "circle", "x_m": [0, 16], "y_m": [0, 16], "z_m": [-6, 0]}
+    corner = [{"kind": "cylinder", "radius_m": 0.1, "x_m": 1, "y_m": 1}]
+    with pytest.raises(ConfigError, match="outside the tank"):
+        load_config("netpen", overrides={"world.tank": pen, "world.fixed": corner})
+
+
+def test_a_large_world_is_none_too_large():
+    size = {"world.tank.x_m": [0, 200], "world.tank.y_m": [0, 100]}
+    assert load_config("pool", overrides=size).world.tank.x_m == (0.0, 200.0)
+
+
+def test_a_world_file_is_no_vehicle(tmp_path):
+    (tmp_path / "w.yaml").write_text("world: {n_static: 1}")
+    with pytest.raises(ConfigError, match=r"is no vehicle, .* give it as --world"):
+        load_config("pool", vehicle=str(tmp_path / "w.yaml"))
+
+
+def test_explicit_obstacles_count():
+    assert load_config("maze").world.bodies == {"S": 11, "D": 6, "fixed_static": 3, "fixed_moving": 0}
+
+
+# ------------------------------------------------------------------------------------------ light vehicles
+
+_SMALL = {
+    "vehicle.mass_kg": 1.2,
+    "vehicle.inertia_kg_m2": [0.003, 0.006, 0.006],
+    "vehicle.added_mass": [0.5, 1.2, 1.4, 0.001, 0.001, 0.001],
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (_SMALL, r"vehicle: roll .* would diverge.* 17 times as many episode\.substeps"),
+        ({**_SMALL, "episode.substeps": 20}, "roll .* would diverge"),
+        ({**_SMALL, "episode.substeps": 40}, None),
+        ({"vehicle.mass_kg": 1.2}, None),
+        ({"vehicle.linear_damping": [4.0, 6.0, 6000.0, 0.1, 0.1, 0.1]}, "heave .* would diverge"),
+        ({"vehicle.mass_kg": 0.01, "vehicle.added_mass": [0] * 6}, "heave .* would diverge"),
+    ],
+)  # fmt: skip
+def test_a_vehicle_that_cannot_be_integrated_is_refused(changes, told):
+    if told is None:
+        load_config("pool", overrides=changes)
+        return
+    with pytest.raises(ConfigError, match=told):
+        load_config("pool", overrides=changes)
+
+
+def test_every_shipped_vehicle_can_be_integrated_in_twice_the_substep():
+    for vehicle in preset_names("vehicle"):
+        load_config("pool", vehicle=vehicle, overrides={"episode.substeps": 1})

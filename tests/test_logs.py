@@ -34,12 +34,14 @@ from uuvtai.logs.log_export import export, file_name
 from uuvtai.logs.log_recorder import NO_POLICY
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.moment import Moment
+from uuvtai.logs.picture import save_image
 from uuvtai.logs.reader import info, read_head, read_messages
 from uuvtai.logs.repair import repair
 from uuvtai.logs.topic_stream import SIGNS
 from uuvtai.logs.topics import TOPICS
 from uuvtai.logs.topics.camera_topics import logged_image
 from uuvtai.logs.topics.map_topics import grid_values, map_origin
+from uuvtai.run_folder import write_atomic
 from uuvtai.stages import SimState
 
 N_STEP = 210
@@ -599,10 +601,11 @@ def _leaves(node):
 
 
 def test_the_file_gets_its_name_only_when_it_is_complete(tmp_path, snaps):
-    path, part = tmp_path / "new" / "a.mcap", tmp_path / "new" / "a.mcap.part"
+    path = tmp_path / "new" / "a.mcap"
     log = McapEpisodeLog(path, episode.header())
     log.write(snaps[0])
-    assert part.exists() and not path.exists()
+    (part,) = path.parent.iterdir()
+    assert part.match("a.mcap.????????.part")
     log.close(episode.result(0))
     assert path.exists() and not part.exists()
 
@@ -614,8 +617,9 @@ def test_an_abandoned_log_stays_as_part_and_can_be_repaired(tmp_path, snaps):
             log.write(snap)
         raise KeyboardInterrupt
     assert not path.exists()
-    saved = repair(tmp_path / "a.mcap.part", path)  # the natural name, whose .part is the input
-    assert (tmp_path / "a.mcap.part").exists()
+    (part,) = tmp_path.iterdir()
+    saved = repair(part, path)
+    assert part.exists()
     assert saved.last_time_s == pytest.approx(29 * episode.DT) and not saved.complete
     assert len(by_topic(path, "/pose")) == 30
 
@@ -653,7 +657,7 @@ def test_sigkill_loses_at_most_one_percent(tmp_path, maps, kill_at):
                 child.send_signal(signal.SIGKILL)
                 break
         sent = int((child.stdout.read().split() or [kill_at])[-1])
-    part = tmp_path / "a.mcap.part"
+    (part,) = tmp_path.iterdir()
     before = part.read_bytes()
     saved = repair(part)
     assert saved.path == tmp_path / "a.repaired.mcap"
@@ -763,13 +767,49 @@ def full_disk(monkeypatch):
     )
 
 
-def test_a_planted_link_is_not_written_through(tmp_path, snaps):
-    (tmp_path / "mine").write_text("precious")
-    (tmp_path / "a.mcap.part").symlink_to(tmp_path / "mine")
-    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
-        log.write(snaps[0])
-        log.close(episode.result(0))
-    assert (tmp_path / "mine").read_text() == "precious" and info(tmp_path / "a.mcap")["messages"] > 0
+WRITERS = {
+    "recording": lambda out: _recorded(McapFile(out)),
+    "repair": lambda out: repair(_sound(out), out),
+    "picture": lambda out: save_image(np.zeros((8, 8, 3), np.uint8), out),
+    "result": lambda out: write_atomic(out, b"new"),
+    "export": lambda out: export(_sound(out), out),
+}
+"""of unfinished files beside ``out``"""
+
+
+def _recorded(file):
+    file.add_message(file.add_channel("/t", 0), 0, b"{}")
+    file.finish()
+
+
+def _sound(out):
+    _recorded(McapFile(out.parent.parent / "sound.mcap"))
+    return out.parent.parent / "sound.mcap"
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_an_unfinished_file_is_never_somebody_elses(tmp_path, monkeypatch, kind):
+    """Where its random part was guessed, too, a planted link is not written through, and no file is lost."""
+    out, mine = tmp_path / "archive" / "a.mcap", tmp_path / "mine"
+    out.parent.mkdir()
+    mine.write_text("precious")
+    names = [
+        f"{hidden}a.mcap{token}{ending}"
+        for hidden in ("", ".")
+        for token in ("", ".00000000", f".{os.getpid()}")
+        for ending in (".part", ".tmp", ".repairing", ".partial")
+    ]
+    for name in names[::2]:
+        (out.parent / name).symlink_to(mine)
+    for name in names[1::2]:
+        (out.parent / name).write_text("precious")
+    with monkeypatch.context() as guessed, pytest.raises((FileExistsError, LogError)):
+        guessed.setattr("secrets.token_hex", lambda _n: "00000000")
+        WRITERS[kind](out)
+    WRITERS[kind](out)
+    assert mine.read_text() == "precious" and out.exists()
+    assert sorted(path.name for path in out.parent.iterdir()) == sorted([*names, "a.mcap"])
+    assert all((out.parent / name).read_text() == "precious" for name in names)
 
 
 def test_a_full_disk_leaves_nothing(tmp_path, snaps, full_disk):

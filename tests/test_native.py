@@ -7,6 +7,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
+import time
+from inspect import getsourcelines
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +20,7 @@ import torch
 import uuvtai
 from uuvtai.config import EpisodeConfig
 from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, FloatVector, In, Out
-from uuvtai.native import keys, making
+from uuvtai.native import keys, making, taichi_code
 from uuvtai.native.keys import KeyNameError, described, digest_of_sources, key_with
 from uuvtai.native.launch import native, quick_launch
 from uuvtai.native.machine import RUNTIME_TYPE, UnfitError, tasks_in
@@ -298,12 +301,26 @@ def test_a_process_killed_while_it_writes_leaves_nothing_that_is_run(place):
     process.communicate(timeout=300)
     assert process.returncode == -signal.SIGKILL
     (part,) = place.iterdir()
-    assert part.suffix == ".part"
+    assert part.suffix == ".tmp"
     [(made, found, _)] = said(begun(place))
     assert (made, found) == (1, 0)
     os.utime(part, (0, 0))
     Store(place).bound()
     assert [path.suffix for path in place.iterdir()] == KEPT, "an old unfinished file goes"
+
+
+def test_folders_of_killed_processes_are_deleted(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    alive = taichi_code.Compiler()
+    (killed := tmp_path / "uuvtai-native-killed").mkdir()
+    (killed / "lock").touch()
+    (killed / "0.ll").touch()
+    (tmp_path / "uuvtai-native-new").mkdir()
+    (tmp_path / "uuvtai-native-link").symlink_to(tmp_path)
+    taichi_code.Compiler().close()
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {alive._folder.name, "uuvtai-native-new", "uuvtai-native-link"}
+    alive.close()
 
 
 def test_where_nothing_can_be_kept_taichi_launches(tmp_path, place, expected, monkeypatch):
@@ -332,7 +349,25 @@ def test_every_source_that_kernels_import_is_part_of_the_key():
         for node in ast.walk(ast.parse(path.read_text())):
             for module in names_of(node):
                 if module.startswith("uuvtai."):
-                    assert module.split(".")[1] in seen | {"errors", "files"}, (path, module)
+                    named = module.split(".")[1]
+                    assert named in seen | {"errors", "files", "version"}, (path, module)
+
+
+def test_the_text_in_the_key_is_the_text_that_is_compiled(tmp_path, monkeypatch):
+    """Whenever a source changes: before it is read for the key, or before Taichi reads it, and back again."""
+    source = tmp_path / "kernels.py"
+    source.write_text("def kernel():\n    return 1\n")
+    space = {}
+    exec(compile(source.read_text(), str(source), "exec"), space)
+    monkeypatch.setattr(keys, "_ROOT", tmp_path)
+    monkeypatch.setattr(keys, "_SEEN_BY_KERNELS", ("kernels.py",))
+    digest = digest_of_sources.__wrapped__
+    with pytest.raises(StoreError, match=r"kernels\.py: has changed since this process began"):
+        digest()
+    monkeypatch.setattr(keys, "BEGUN_NS", time.time_ns() + 10**9)
+    before = digest()
+    source.write_text("def kernel():\n    return 77\n")
+    assert "77" not in "".join(getsourcelines(space["kernel"])[0]) and digest() != before
 
 
 def names_of(node):
@@ -372,6 +407,7 @@ def store(tmp_path):
     return Store(tmp_path / "deep" / "native")
 
 
+K = [f"{number:064x}" for number in range(6)]
 CODE = MachineCode(["a_kernel_0_serial"], b"\x7fELF" + bytes(range(256)) * 40)
 
 
@@ -430,11 +466,15 @@ def test_a_full_disk_leaves_nothing_half(store, monkeypatch):
 
 
 def test_the_folder_is_bounded_and_what_is_used_stays(store):
+    theirs = ("notes.txt", "k.kernel", f"{K[0]}.kernel.bak", "tmp.part", "a.mcap.0a1b2c3d.part")
+    for name in theirs:
+        (store.folder / name).write_text("precious")
+        os.utime(store.folder / name, (0, 0))
     for number in range(6):
-        store.put(f"k{number}", CODE)
-        os.utime(store.folder / f"k{number}.kernel", (number, number))
-    assert store.get("k0") == CODE  # used: newest now
-    size = (store.folder / "k0.kernel").stat().st_size
+        store.put(K[number], CODE)
+        os.utime(store.folder / f"{K[number]}.kernel", (number, number))
+    assert store.get(K[0]) == CODE  # used: newest now
+    size = (store.folder / f"{K[0]}.kernel").stat().st_size
     assert store.bound(3 * size) == 3
-    assert sorted(p.name for p in store.folder.iterdir()) == ["k0.kernel", "k4.kernel", "k5.kernel"]
-    assert store.clear() == 3 and not list(store.folder.iterdir())
+    assert [p.stem for p in sorted(store.files())] == [K[0], K[4], K[5]]
+    assert store.clear() == 3 and sorted(p.name for p in store.folder.iterdir()) == sorted(theirs)

@@ -649,15 +649,22 @@ def test_a_reproduction_compares_pieces_wherever_methods_are_compared(tmp_path):
 # ------------------------------------------------------------------------------------------------------- ONNX
 
 
-def graph_of(n_obs=N_OBS, nodes=(("Gemm", ["obs", "w"], ["action"]),), n_out=4, hold=None, inputs=("obs",)):
+GEMM = (("Gemm", ["obs", "w"], ["action"]),)
+
+
+def graph_of(
+    n_obs=N_OBS, nodes=GEMM, n_out=4, hold=None, inputs=("obs",), outputs=("action",), rows=None,
+    dtype=np.float32, opset=20,
+):  # fmt: skip
     """A policy that multiplies the observation by a small matrix."""
     onnx = pytest.importorskip("onnx", reason="needs the extra uuvtai[export]")
-    weights = onnx.numpy_helper.from_array(np.full((n_obs, n_out), 1e-3, np.float32), "w")
+    weights = onnx.numpy_helper.from_array(np.full((n_obs, n_out), 1e-3, dtype), "w")
     made = [onnx.helper.make_node(*node) for node in nodes]
-    given = [onnx.helper.make_tensor_value_info(name, 1, [None, n_obs]) for name in inputs]
-    out = [onnx.helper.make_tensor_value_info("action", 1, None)]
+    kind = weights.data_type
+    given = [onnx.helper.make_tensor_value_info(name, kind, [rows, n_obs]) for name in inputs]
+    out = [onnx.helper.make_tensor_value_info(name, kind, None) for name in outputs]
     graph = onnx.helper.make_graph(made, "g", given, out, [weights])
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 20)], ir_version=10)
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", opset)], ir_version=10)
     if hold is not None:
         model.metadata_props.add(key="hold_steps", value=hold)
     return model.SerializeToString()
@@ -672,9 +679,83 @@ def test_a_graph_drives(sim, tmp_path, monkeypatch):
     assert driver.code.marks.hold_steps == 5
 
 
+def expected_of(sim):
+    return (1e-3 * sim.observation.sum(1, keepdim=True)).clamp(-1, 1).expand(-1, 4)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"rows": 1}, {"rows": 3}, {"dtype": np.float64}, {"opset": 11}, {"rows": 1, "dtype": np.float64}],
+    ids=str,
+)
+def test_a_graph_of_another_trainer_drives(sim, tmp_path, monkeypatch, changes):
+    monkeypatch.chdir(tmp_path)
+    Path("model.onnx").write_bytes(graph_of(**changes))
+    driver = stepped(sim, "model.onnx", steps=0, kind="policy")
+    torch.testing.assert_close(driver.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
+
+
+def test_other_outputs_are_left_out(sim, tmp_path, monkeypatch):
+    """A critic beside the actor, by an operator that no policy needs."""
+    monkeypatch.chdir(tmp_path)
+    nodes = [*GEMM, ("Atan", ["obs"], ["value"])]
+    Path("model.onnx").write_bytes(graph_of(nodes=nodes, outputs=("value", "action")))
+    driver = stepped(sim, "model.onnx", steps=0, kind="policy")
+    torch.testing.assert_close(driver.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
+
+
+def split(graph, location="model.onnx.data", length=None):
+    """Its weights as a file's content beside it."""
+    import onnx
+
+    model = onnx.load_from_string(graph)
+    (tensor,) = model.graph.initializer
+    content = tensor.raw_data
+    tensor.ClearField("raw_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    told = {"location": location, "offset": "16", "length": str(length or len(content))}
+    for key, value in told.items():
+        tensor.external_data.add(key=key, value=value)
+    return model.SerializeToString(), bytes(16) + content
+
+
+def test_weights_beside_a_graph_are_read(sim, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    graph, weights = split(graph_of())
+    Path("model.onnx").write_bytes(graph)
+    with pytest.raises(PieceError, match=r"its weights are in model\.onnx\.data, .*copy that file too"):
+        found("model.onnx", "policy")
+    Path("model.onnx.data").write_bytes(weights)
+    driver = stepped(sim, "model.onnx", steps=0, kind="policy")
+    torch.testing.assert_close(driver.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
+    before = found("model.onnx", "policy").sha256
+    Path("model.onnx.data").write_bytes(weights[:-1] + b"!")
+    assert found("model.onnx", "policy").sha256 != before, "other weights drive otherwise"
+
+
+@pytest.mark.parametrize(
+    ("location", "length", "says"),
+    [
+        ("../secret", None, "in no other folder"), ("/etc/passwd", None, "in no other folder"),
+        ("sub/w", None, "in no other folder"), ("..", None, "in no other folder"), ("", None, "in no other"),
+        ("link", None, "is a link"), ("short", None, "not whole in short"), ("w", 4, "not whole in w"),
+    ],
+)  # fmt: skip
+def test_weights_of_elsewhere_are_not_read(tmp_path, monkeypatch, location, length, says):
+    monkeypatch.chdir(tmp_path)
+    graph, weights = split(graph_of(), location, length)
+    Path("model.onnx").write_bytes(graph)
+    Path("w").write_bytes(weights)
+    Path("short").write_bytes(weights[:-1])
+    Path("link").symlink_to("w")
+    with pytest.raises(UserError, match=says):
+        found("model.onnx", "policy")
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
+        ({"rows": 10**6}, "takes no observations"),
         ({"n_obs": 40}, f"takes observations of 40 columns, here they have {N_OBS}"),
         ({"nodes": [("Loop", ["obs"], ["action"])]}, "it has onnx.Loop"),
         ({"nodes": [("Atan", ["obs"], ["action"])]}, "it has onnx.Atan"),

@@ -204,7 +204,7 @@ def test_default_names_do_not_collide(tmp_path, monkeypatch):
 def test_the_temporary_neighbour_is_never_somebody_elses_file(tmp_path, monkeypatch):
     monkeypatch.setattr("secrets.token_hex", lambda _n: "0")
     (tmp_path / "victim").write_text("precious")
-    (tmp_path / f".x.{os.getpid()}.0.tmp").symlink_to(tmp_path / "victim")
+    (tmp_path / ".x.0.tmp").symlink_to(tmp_path / "victim")
     with pytest.raises(FileExistsError):
         write_atomic(tmp_path / "x", b"new")
     assert (tmp_path / "victim").read_text() == "precious" and not (tmp_path / "x").exists()
@@ -224,10 +224,10 @@ def test_nothing_is_written_through_a_link_that_came_later(tmp_path, name):
 
 def test_what_a_kill_left_half_written_is_swept_when_the_run_goes_on(tmp_path):
     RunFolder(tmp_path / "run", load_config("pool"), [0]).finish("interrupted", 130)
-    left = tmp_path / "run" / "eval" / ".result.json.4711.0a1b2c3d.tmp"
+    left = tmp_path / "run" / "eval" / ".result.json.0a1b2c3d.tmp"
     theirs = [
         tmp_path / "run" / name
-        for name in (".notes.tmp", "result.json.4711.0a1b2c3d.tmp", ".a.1.0a1b2c3d.tmp.txt")
+        for name in (".notes.tmp", "result.json.0a1b2c3d.tmp", ".a.0a1b2c3.tmp", ".a.0a1b2c3d.tmp.")
     ]
     left.parent.mkdir()
     for file in (left, *theirs):

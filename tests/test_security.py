@@ -799,8 +799,8 @@ def test_chunks_that_unfold(here, command, capfd):
     file = McapFile(here / "a.mcap")
     file.add_attachment("scenario.json", "application/json", json.dumps(episode.scenario()).encode())
     file.leave()
-    (here / "a.mcap").write_bytes((here / "a.mcap.part").read_bytes() + bomb + END)
-    (here / "a.mcap.part").unlink()
+    (here / "a.mcap").write_bytes(file.part.read_bytes() + bomb + END)
+    file.part.unlink()
     assert run_cli(*command[:2], here / "a.mcap", *command[2:]) == 2
     assert "unpack" in capfd.readouterr().err
     assert {path.name for path in here.rglob("*") if path.is_file()} == {"a.mcap"}

@@ -1,12 +1,21 @@
 """The whole step: determinism, independence of envs, zero copy."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from tests.conftest import estimate_pose, launch_one_by_one
+from tests.small_sim import SmallSim
+from uuvtai.errors import DivergenceError
 from uuvtai.loader import load_config
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.sim import Sim
+
+ROOT = Path(__file__).resolve().parent.parent
 
 SENSED = (
     "ego",
@@ -160,3 +169,41 @@ def test_absurd_sizes_are_refused_before_anything_is_allocated():
     with pytest.raises(MemoryError, match="not supported"):
         check_size(config, 10**9, "cpu")
     assert memory_bytes(config, 400) < 2.1 * memory_bytes(config, 200)
+
+
+def test_a_closed_simulator_leaves_its_arrays_to_the_next_one_as_new(small):
+    """Whatever was done in it: no other tree of fields is made, and no byte differs."""
+    first = Sim(small.config, small.N, small.trees["bt"])
+    new, address = first.memory().read().copy(), first.memory().address
+    first.reset(*(torch.ones(small.N, dtype=torch.int32) for _ in range(3)))
+    first.step()
+    assert first.memory().read().tobytes() != new.tobytes()
+    first.close()
+    with pytest.raises(AttributeError):
+        first.step()
+    second = Sim(small.config, small.N, small.trees["bt"])
+    assert second.memory().address == address and second.memory().read().tobytes() == new.tobytes()
+    other = Sim(small.config, small.N, small.trees["bt"])
+    assert other.memory().address != address, "one that is open keeps its own"
+    other.close()
+    second.close()
+
+
+def test_memory_of_closed_environments_is_given_back():
+    """In a process of its own, whose memory is no other test's."""
+    program = (
+        "from benchmarks.robustness import memory_growth_mib\n"
+        f"print(memory_growth_mib({SmallSim.N}, 12, overrides={SmallSim.CHANGES}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    assert float(done.stdout.split()[-1]) < 8.0, "MiB; 12 that are kept take 240"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_vehicle_that_diverges_is_an_error_of_the_user(small, value):
+    small.begin([3, 4])
+    small.sim.memory().live(small.sim.s.vehicle.vel_b)[1, 2] = value
+    with pytest.raises(DivergenceError, match=r"1 of 8 vehicles diverged, first that of env 1.*substeps"):
+        small.sim.step()

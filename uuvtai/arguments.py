@@ -14,16 +14,26 @@ def integers(option: str, text: str) -> list[int]:
     return [_integer(option, item) for item in text.split(",")]
 
 
-def _integer(option: str, text: str) -> int:
-    """A whole number of 32 bits."""
+def seeds(option: str, text: str) -> list[int]:
+    """Seeds, as ``--seeds 0,1,2`` has them, each as kernels count with it."""
+    from uuvtai.config.section import folded_seed
+
+    given = [_integer(option, item, None) for item in text.split(",")]
+    if low := [seed for seed in given if seed < -(2**31)]:
+        raise UsageError(f"{option} {low[0]}: must be 0 or more")
+    return [folded_seed(seed) for seed in given]
+
+
+def _integer(option: str, text: str, bits: int | None = 32) -> int:
+    """A whole number, of so many bits."""
     try:
         value = int(text)
     except ValueError:
         raise UsageError(
             f"{option} {text!r}: whole numbers separated by commas, for example {option} 0,1,2"
         ) from None
-    if not -(2**31) <= value < 2**31:
-        raise UsageError(f"{option} {text}: must fit 32 bits")
+    if bits and not -(2 ** (bits - 1)) <= value < 2 ** (bits - 1):
+        raise UsageError(f"{option} {text}: must fit {bits} bits")
     return value
 
 

@@ -65,7 +65,7 @@ def evaluate(
 
         result, folder = go_on(resume, Progress(), allow_code)
     else:
-        seed_list = arguments.integers("--seeds", seeds)
+        seed_list = arguments.seeds("--seeds", seeds)
         arguments.refuse_less("--episodes", episodes, 1)
         recording = kept.asked()
         from uuvtai.measure.evaluate.compare import compare
@@ -156,11 +156,12 @@ def watch_live(
     rate: opt.Rate = 1.0,
     host: opt.Host = "127.0.0.1",
     port: opt.Port = 8765,
+    origin: opt.Origins = None,
     depth_images: opt.DepthImages = False,
     device: opt.Device = "auto",
 ) -> None:
     """Run episodes in real time and serve them to Foxglove and Lichtblick."""
-    seed_list = arguments.integers("--seeds", seeds)
+    seed_list = arguments.seeds("--seeds", seeds)
     arguments.refuse_odd_live(episodes, rate, port)
     from uuvtai.measure.evaluate.eval_request import Request
     from uuvtai.measure.watching import LiveOptions, watch_episodes
@@ -171,7 +172,7 @@ def watch_live(
         scene, trained, controllers=controllers, seeds=seed_list, episodes=episodes,
         depth_images=depth_images, device=device,
     )  # fmt: skip
-    result = watch_episodes(request, LiveOptions(host, port, rate), Progress())
+    result = watch_episodes(request, LiveOptions(host, port, rate, origin or ()), Progress())
     output.show(result, lambda screen: show_watched(screen, result))
 
 
@@ -240,7 +241,7 @@ def sweep(
         trained, controllers = drivers.named(["bt"])
         request = SweepRequest.typed(
             scene, trained, grid=grid_of(grid or []), controllers=tuple(controllers), episodes=episodes,
-            seeds=tuple(arguments.integers("--seeds", seeds)), num_envs=num_envs, device=device,
+            seeds=tuple(arguments.seeds("--seeds", seeds)), num_envs=num_envs, device=device,
         )  # fmt: skip
         result, folder = play.sweep(request, engine, run_dir, progress)
     _report_if(with_report, folder)

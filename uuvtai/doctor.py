@@ -132,7 +132,7 @@ def _native() -> str:
 
     store = Store(default_folder())
     Machine(1)
-    size = sum(file.stat().st_size for file in store.folder.iterdir())
+    size = sum(file.lstat().st_size for file in store.files())
     return f"{store.folder}, {size / 2**20:.1f} MB; used with --set runtime.native=true"
 
 

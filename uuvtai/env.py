@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,7 @@ import torch
 
 from uuvtai.capture import capture, check_arrays, check_setting, restore
 from uuvtai.config import Config
+from uuvtai.config.section import folded_seed
 from uuvtai.config.task import TERMS
 from uuvtai.kernels.planning.features import placed_columns
 from uuvtai.kernels.task.reward import write_ends, write_results
@@ -29,8 +31,6 @@ from uuvtai.sim import Sim
 
 NUM_ACTIONS = 4
 """surge, sway, heave, yaw rate"""
-
-_MAX_SEED = 2**31 - 1
 
 _STEP_RESULTS = ("reward_terms", "episode_terms", "episode_return", "episode_steps", "outcome")
 """What ``tell_step`` writes, in its order."""
@@ -77,13 +77,19 @@ class VectorEnv:
     """names of the columns of ``info["reward_terms"]`` and ``info["episode_terms"]``"""
 
     def __init__(
-        self, sim: Sim, seed: int = 0, check_actions: bool | None = None, autoreset: bool = True
+        self,
+        sim: Sim,
+        seed: int = 0,
+        check_actions: bool | None = None,
+        autoreset: bool = True,
+        owns_sim: bool = False,
     ) -> None:
         """``check_actions``: refuse actions that are not finite (default: on the CPU; a GPU would wait).
         Unchecked, NaN = stop.
 
         Without ``autoreset`` an env whose episode has ended rests: it earns 0 and tells its end again in
-        every step, until a ``reset`` with a mask begins its next episode.
+        every step, until a ``reset`` with a mask begins its next episode. ``owns_sim``: ``close`` closes the
+        simulator, too.
         """
         self.sim, self.num_envs, self.device = sim, sim.num_envs, sim.device
         self.config, self.autoreset = sim.config, autoreset
@@ -119,6 +125,7 @@ class VectorEnv:
             "episode_steps": torch.zeros_like(self._number),
         }
         self._begun = self._closed = False
+        self._owns_sim = owns_sim
 
     def reset(
         self, seed: int | None = None, mask: torch.Tensor | None = None
@@ -242,10 +249,15 @@ class VectorEnv:
         )
 
     def close(self) -> None:
-        """Stop asking the simulator for observations; may be called again."""
+        """Stop asking the simulator for observations, and give its memory back where it is nobody else's; may
+        be called again."""
+        if self._closed:
+            return
+        self._closed = True
         if self.sim.observation is self._obs:
             self.sim.observation = None
-        self._closed = True
+        if self._owns_sim:
+            self.sim.close()
 
     def __enter__(self) -> VectorEnv:
         """The environment itself."""
@@ -324,9 +336,10 @@ def _described(value: Any) -> str:
 
 
 def checked_seed(seed: int) -> int:
-    """The seed itself; TypeError or ValueError where it cannot be one."""
-    if type(seed) is not int:
+    """The seed as kernels count with it (``folded_seed``); TypeError or ValueError where it cannot be one."""
+    if isinstance(seed, bool) or not hasattr(type(seed), "__index__"):
         raise TypeError(f"seed must be an int, got a {type(seed).__name__}")
-    if not 0 <= seed <= _MAX_SEED:
-        raise ValueError(f"seed {seed} is not in 0 .. {_MAX_SEED}")
-    return seed
+    number = operator.index(seed)
+    if number < 0:
+        raise ValueError(f"seed {number} is negative; give one of 0 and more")
+    return folded_seed(number)

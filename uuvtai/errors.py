@@ -12,6 +12,10 @@ class SettingError(UserError, ValueError):
     """A value that was typed, or that stands in a config, cannot be used."""
 
 
+class DivergenceError(UserError, FloatingPointError):
+    """The vehicle's motion cannot be integrated: numbers that are no numbers came out."""
+
+
 class SizeError(UserError, MemoryError):
     """What was asked for does not fit the memory or any array."""
 

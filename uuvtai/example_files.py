@@ -6,6 +6,7 @@ from importlib import metadata
 from pathlib import Path
 
 from uuvtai.errors import UserError
+from uuvtai.files import whole_file
 
 _CHECKOUT = Path(__file__).parents[1] / "examples"
 _SUFFIXES = (".py", ".yaml", ".xml", ".ipynb", ".parm")
@@ -37,12 +38,17 @@ def copy_examples(folder: Path) -> list[Path]:
         raise ExampleError(
             f"{there[0]}: is there already, and is kept; name another folder: uuv examples NEW"
         )
+    written: list[Path] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for source in sources:
-            (folder / source.name).write_bytes(source.read_bytes())
+            with whole_file(folder / source.name) as (file, _):
+                file.write(source.read_bytes())
+            written.append(folder / source.name)
     except OSError as error:
+        for path in written:
+            path.unlink(missing_ok=True)
         raise ExampleError(
             f"{folder}: cannot write there ({error.strerror}); name another folder: uuv examples FOLDER"
         ) from error
-    return [folder / source.name for source in sources]
+    return written

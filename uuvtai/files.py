@@ -8,12 +8,16 @@ import json
 import math
 import os
 import re
+import secrets
+import shutil
 import stat
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from uuvtai import signals
 from uuvtai.errors import UserError
 
 MAX_BYTES = 1 << 30
@@ -41,6 +45,8 @@ _CREATE = os.O_WRONLY | os.O_CREAT | _NO_FOLLOW | _ALWAYS
 _FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
 _NO_FILE = (errno.ENXIO, errno.ENODEV, errno.EISDIR)
 """what opening a socket, a pipe that nobody reads or a folder may say"""
+UNFINISHED = re.compile(r"\..+\.[0-9a-f]{8}\.tmp(\.\w+)?")
+"""names that ``unfinished`` gives to what goes with its writer"""
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -163,10 +169,51 @@ def refuse_links_in(folder: Path) -> None:
                     waiting.append(entry.path)
 
 
-def open_new(path: Path) -> BinaryIO:
+def open_new(path: Path, mode: int = 0o666) -> BinaryIO:
     """Open a file for writing that did not exist; whatever is there already, a link too, is a
     FileExistsError. Raises OSError."""
-    return os.fdopen(os.open(path, _CREATE | os.O_EXCL, 0o666), "wb")
+    return os.fdopen(os.open(path, _CREATE | os.O_EXCL, mode), "wb")
+
+
+def unfinished(target: Path, ending: str = ".tmp") -> Path:
+    """A name beside ``target`` that nobody can have taken, or made a link of, before. What is to stay where
+    its writer is killed, a recording, ends in '.part' and is not hidden."""
+    hidden = "" if ending == ".part" else "."
+    return target.with_name(f"{hidden}{target.name}.{secrets.token_hex(4)}{ending}")
+
+
+@contextmanager
+def whole_file(target: Path, ending: str = ".tmp") -> Iterator[tuple[BinaryIO, Path]]:
+    """A new file to write, and its name meanwhile; it becomes ``target`` when it is on the disk, and on any
+    error nothing is left. Raises OSError."""
+    signals.engage()
+    place = unfinished(target, ending)
+    opened = open_new(place)
+    try:
+        with opened as file:
+            yield file, place
+            file.flush()
+            os.fsync(file.fileno())
+        place.replace(target)
+    except BaseException:
+        place.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def whole_folder(target: Path) -> Iterator[Path]:
+    """A new folder to fill; it becomes ``target``, which may be an empty folder by then, or nothing is left.
+    Raises OSError."""
+    signals.engage()
+    place = unfinished(target)
+    place.mkdir(parents=True)
+    try:
+        yield place
+        if target.is_dir() and not target.is_symlink():
+            target.rmdir()  # only where it is empty
+        place.rename(target)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
 
 
 def open_to_append(path: Path, folder: Path) -> BinaryIO:

@@ -27,7 +27,7 @@ from uuvtai.errors import UserError
 from uuvtai.files import FileError, read_text
 from uuvtai.shipped import preset_names, shipped_file
 
-DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
+DEFAULT_WORLD, DEFAULT_SENSORS, DEFAULT_VEHICLE = "pool", "paper", "bluerov2"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 STACK_SECTIONS = (
     "pose",
@@ -186,11 +186,12 @@ def _scene(world: str, sensors: str | None, vehicle: str | None) -> _Layer:
     return merged
 
 
-def sensors_of(world: str, sensors: str | None) -> str:
-    """Name of the sensor preset that ``load_config`` takes: the one given, else the world's own, else
-    ``paper``."""
-    own = _read_preset("world", world).tree.get("sensors")
-    return sensors or (own if isinstance(own, str) else DEFAULT_SENSORS)
+def preset_of(kind: str, world: str, given: str | None) -> str:
+    """Name of the preset of sensors or of a vehicle that ``load_config`` takes: the one given, else the
+    world's own, else ``paper`` or ``bluerov2``."""
+    own = _read_preset("world", world).tree.get(kind)
+    default = DEFAULT_SENSORS if kind == "sensors" else DEFAULT_VEHICLE
+    return given or (own if isinstance(own, str) else default)
 
 
 def validated(tree: dict[str, Any], origin: dict[str, str] | None = None) -> Config:
@@ -272,6 +273,7 @@ def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:
         )
     path = preset_path(kind, name)
     own = _read_yaml(path)
+    _refuse_other_kind(kind, path, own)
     if kind == "train":
         _spell_out(own)
     base = own.tree.pop("extends", None)
@@ -283,6 +285,19 @@ def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:
     layer = _read_preset(kind, str(beside) if beside.is_file() else base, depth + 1)
     layer.merge(own)
     return layer
+
+
+def _refuse_other_kind(kind: str, path: Path, layer: _Layer) -> None:
+    """Raise ConfigError for a file that states nothing, or what another option takes."""
+    if not layer.tree:
+        raise ConfigError(f"{path}: is empty; a {kind} preset states sections, or what it extends")
+    if kind not in _SCENE_KINDS or isinstance(layer.tree.get(kind), dict) or "extends" in layer.tree:
+        return
+    for other in _SCENE_KINDS:
+        if isinstance(layer.tree.get(other), dict):
+            raise ConfigError(
+                f"{path}: is no {kind}, it has no '{kind}:', but a {other}: give it as --{other} {path}"
+            )
 
 
 def _spell_out(layer: _Layer) -> None:
@@ -432,6 +447,11 @@ def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
 # --------------------------------------------------------------------------------------------------- messages
 
 
+_WITHIN = re.compile(r"Value error, ([a-z_]+(?:\.[a-z_0-9]+)*): (.+)", re.DOTALL)
+_MOST_GOT = 200
+"""characters of a value that are shown"""
+
+
 def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseModel]) -> str:
     lines = []
     for problem in error.errors():
@@ -442,9 +462,13 @@ def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseM
                 f"{where}unknown key "
                 f"'{dotted}'{nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc'], model))}"
             )
+        elif found := _WITHIN.match(problem["msg"]):  # a check of the whole names the part itself
+            dotted = f"{dotted}.{found[1]}".lstrip(".")
+            lines.append(f"{_origin_of(dotted, origin)}{dotted}: {found[2]}")
         else:
-            got = problem.get("input")
-            lines.append(f"{where}{dotted}: {problem['msg']} (got {got!r})")
+            got = repr(problem.get("input"))
+            shown = got if len(got) <= _MOST_GOT else f"{got[:_MOST_GOT]} ..."
+            lines.append(f"{where}{dotted}: {problem['msg']} (got {shown})")
     return "\n".join(lines) + "\n'uuv presets show NAME --all' prints every key with its value"
 
 

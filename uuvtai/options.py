@@ -228,6 +228,14 @@ Host = Annotated[
     str, Option("--host", help="Address to serve at; 0.0.0.0 shows it to every machine of the network.")
 ]
 Port = Annotated[int, Option("--port", help="Port to serve at; 0 = a free one.")]
+Origins = Annotated[
+    list[str] | None,
+    Option(
+        "--origin",
+        metavar="URL",
+        help="Web page that may connect too, for example https://app.foxglove.dev (repeatable).",
+    ),
+]
 
 # ------------------------------------------------------------------------------------------------ pilot, sitl
 

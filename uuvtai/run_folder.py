@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import re
-import secrets
 import stat
 import subprocess
 import sys
@@ -20,12 +18,19 @@ from typing import Any
 from uuvtai import signals
 from uuvtai.config import Config
 from uuvtai.errors import UserError
-from uuvtai.files import FileError, open_new, open_to_append, read_json, refuse_links, refuse_links_in
+from uuvtai.files import (
+    UNFINISHED,
+    FileError,
+    open_new,
+    open_to_append,
+    read_json,
+    refuse_links,
+    refuse_links_in,
+    whole_file,
+)
 from uuvtai.loader import to_yaml
 from uuvtai.version import __version__
 
-_TEMPORARY = re.compile(r"\..+\.\d+\.[0-9a-f]{8}\.tmp")
-"""names that ``write_atomic`` gives"""
 _RUNS = Path("runs")
 _LOCK, _RECORD = ".lock", "run.json"
 _MAX_RECORD_BYTES = 8 << 20
@@ -133,8 +138,8 @@ class RunFolder:
     def _sweep(self) -> None:
         """Remove what a kill left half-written; whoever holds the folder is the only one that writes
         there."""
-        for place in self.path.rglob(".*.tmp"):
-            if _TEMPORARY.fullmatch(place.name):
+        for place in self.path.rglob(".*.tmp*"):
+            if UNFINISHED.fullmatch(place.name) and place.is_file():
                 place.unlink()
 
     def go_on(self, since: dict[str, Any]) -> None:
@@ -150,6 +155,14 @@ class RunFolder:
         self._record |= {"status": "running", "resumed": [*self._record.get("resumed", []), resumed]}
         self._record.pop("exit", None)
         self.write_json(_RECORD, self._record)
+
+    def settle(self, is_complete: bool) -> None:
+        """Of a held folder with nothing left to do: say how its run ended, where a kill has kept it from
+        doing so."""
+        record = self._read_record()
+        if record.get("status") == "running":
+            ended = ("finished", 0) if is_complete else ("interrupted", signals.exit_code())
+            self.write_json(_RECORD, record | dict(zip(("status", "exit"), ended, strict=True)))
 
     def _read_record(self) -> dict[str, Any]:
         """run.json, as far as it is gone on with."""
@@ -273,20 +286,9 @@ class RunFolder:
 def write_atomic(target: Path, content: bytes) -> None:
     """Write to a new temporary neighbour, flush it to disk, rename; on any error nothing is left behind.
     Raises OSError."""
-    signals.engage()
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(
-        f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp"
-    )  # nobody can have put a link there before
-    try:
-        with open_new(temporary) as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with whole_file(target) as (file, _):
+        file.write(content)
 
 
 def _is_plain(path: Path) -> bool:

@@ -71,6 +71,13 @@ def start_taichi(device: str = "cpu", precision: str = "f32") -> Runtime:
             log_level=ti.WARN,
             **options,
         )
+    arch = impl.current_cfg().arch
+    if wanted.device == "cuda" and arch != ti.cuda:  # our tensors would lie where its kernels cannot reach
+        ti.reset()
+        raise DeviceError(
+            f"--device {device}: torch sees a CUDA device, but Taichi cannot use it and fell back to "
+            f"{str(arch).rpartition('.')[2]}; use --device cpu, or mend the driver"
+        )
     if wanted.device == "cpu":  # its pool has its threads by now, and takes no more than it has
         program: Any = impl.get_runtime().prog
         program.config().cpu_max_num_threads = LOOP_PARTS

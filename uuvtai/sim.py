@@ -7,6 +7,7 @@ mapping -> clearance -> planning -> teacher -> features -> reward. A pass works 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 
@@ -15,10 +16,10 @@ import taichi as ti
 import torch
 
 from uuvtai import stack
-from uuvtai.binding import bind_all
 from uuvtai.config import Config
 from uuvtai.copying import HostCounts
-from uuvtai.initial import allocate_state, fill_constants
+from uuvtai.errors import DivergenceError
+from uuvtai.initial import fill_constants
 from uuvtai.kernels.perception import pose
 from uuvtai.kernels.planning import clearance, features, route
 from uuvtai.kernels.task import episode, reward
@@ -26,12 +27,13 @@ from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
 from uuvtai.kernels.world import scenarios
 from uuvtai.native.in_a_row import Rows
 from uuvtai.native.making import adopt
+from uuvtai.recycling import arrays_for
 from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
 from uuvtai.sensing import SensorSource, SimulatedSensors
 from uuvtai.sizes import array_sizes, check_size
-from uuvtai.stages import Stages, timed_stage
+from uuvtai.stages import timed_stage
 from uuvtai.taichi_patches.memory import Memory, address_of
 from uuvtai.tree import FlatTree, load_tree
 
@@ -51,8 +53,8 @@ class Sim:
         self.config, self.num_envs = config, num_envs
         self.device = torch.device(start_taichi(device).device)
         check_size(config, num_envs, self.device.type)
-        self.s = allocate_state(array_sizes(config, num_envs, self.device.type))
-        self.io = bind_all(Stages, self.s, config.model_copy(update={"world": config.world.compiled()}))
+        self._arrays = arrays_for(config, array_sizes(config, num_envs, self.device.type), self.device)
+        self.s, self.io, self._memory = self._arrays.s, self._arrays.io, self._arrays.memory
         self.action = torch.zeros(num_envs, 4, device=self.device)
         self.reward = torch.zeros(num_envs, device=self.device)
         whole = torch.zeros(5, num_envs, dtype=torch.int32, device=self.device)
@@ -63,8 +65,8 @@ class Sim:
         self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
-        self._memory = self.memory()
         self.put = self._memory.put
+        self._speeds = self._memory.live(self.s.vehicle.vel_b) if self.device.type == "cpu" else None
         self.counts = HostCounts(self._memory, self.s.referee.outcome, num_envs)
         self._rows = Rows() if config.runtime.native and self.device.type == "cpu" else None
         if self._rows:
@@ -95,9 +97,19 @@ class Sim:
         if action is not None:
             self.action.copy_(action)
         self._launched(self._move)
+        if self._speeds is not None and not math.isfinite(np.add.reduce(self._speeds, axis=None)):
+            self._tell_divergence()
         self.perceive()
         with self._stage("reward"):
             reward.compute_reward(self.io.reward, self.reward, self.terminated, self.truncated)
+
+    def _tell_divergence(self) -> None:
+        bad = np.flatnonzero(~np.isfinite(self.rows(self.s.vehicle.vel_b)).all(axis=1))
+        raise DivergenceError(
+            f"the motion of {len(bad)} of {self.num_envs} vehicles diverged, first that of env {bad[0]}: "
+            "inertia, damping and gains of this vehicle do not belong together, or take more "
+            "episode.substeps; look at it alone: uuv simulate --vehicle ..."
+        )
 
     def _move(self) -> None:
         io, c, rules = self.io, self.config, self.config.episode
@@ -207,6 +219,13 @@ class Sim:
     def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
         """Host copy of these rows of a field alone, shape (len(envs), ...); None = all envs."""
         return self.counts.rows(field, envs)
+
+    def close(self) -> None:
+        """Give the memory back; nothing of the simulator can be used afterwards but ``config``."""
+        arrays, config = self._arrays, self.config
+        vars(self).clear()
+        self.config = config
+        arrays.give_back()
 
     def memory(self) -> Memory:
         """Where every array lies, when all kernels are done: for a capture."""

@@ -4,6 +4,7 @@ folder; it knows nothing of the rest of uuvtai but the pilot's frame."""
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import json
 import platform
 from pathlib import Path
@@ -16,7 +17,7 @@ from uuvtai.pilot.fed_sensors import FedSensors
 from uuvtai.pilot.mission import Mission
 from uuvtai.pilot.pilot_numbers import PilotNumbers
 
-SCHEMA = 1
+SCHEMA = 2
 SPEC, MEMORY, GOLDEN = "stack.json", "memory.npz", "golden.npz"
 _PAGE = 4096
 
@@ -32,7 +33,7 @@ class CarriedStack:
         """Raises StackFolderError."""
         self.spec = spec_of(folder)
         self._library = _library_of(folder, self.spec)
-        first = np.load(folder / MEMORY, allow_pickle=False)["memory"]
+        first = np.load(_unchanged(folder, self.spec, MEMORY), allow_pickle=False)["memory"]
         self._block = _aligned(len(first))
         self._block[:] = first
         self.views = {
@@ -170,11 +171,28 @@ def _library_of(folder: Path, spec: dict[str, Any]) -> ctypes.CDLL:
         raise StackFolderError(
             f"{folder}: has no code for {kind}, only for {there}: export it for {kind} too"
         )
+    library = _unchanged(folder, spec, spec["libraries"][kind])
     try:
         ctypes.CDLL("libm.so.6", mode=ctypes.RTLD_GLOBAL)
-        return ctypes.CDLL(str((folder / spec["libraries"][kind]).resolve()))
+        return ctypes.CDLL(str(library.resolve()))
     except OSError as error:
         raise StackFolderError(f"{folder}: its code cannot be loaded ({error})") from None
+
+
+def _unchanged(folder: Path, spec: dict[str, Any], name: str) -> Path:
+    """A file of the folder that is what was exported. Raises StackFolderError."""
+    try:
+        is_same = digest_of(folder / name) == spec["sha256"][name]
+    except (OSError, KeyError) as error:
+        raise StackFolderError(f"{folder}: {name} cannot be loaded ({error})") from None
+    if not is_same:
+        raise StackFolderError(f"{folder}: {name} has changed since it was exported; export the stack anew")
+    return folder / name
+
+
+def digest_of(file: Path) -> str:
+    """sha256 of a file. Raises OSError."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def _aligned(n_bytes: int) -> np.ndarray:

@@ -6,8 +6,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from uuvtai.aboard import carried_stack, stack_check
-from uuvtai.aboard.carried_stack import GOLDEN, MEMORY, SCHEMA, SPEC
+from uuvtai.aboard.carried_stack import GOLDEN, MEMORY, SCHEMA, SPEC, digest_of
 from uuvtai.aboard.cross import KINDS, library_of, linker
 from uuvtai.aboard.stack_check import decided, packed_messages
 from uuvtai.aboard.tape import Tape, record
 from uuvtai.config import Config
 from uuvtai.errors import UserError
+from uuvtai.files import whole_folder
 from uuvtai.kernels.planning.route import keep_route
 from uuvtai.native.machine import UnfitError, runtime_layout
 from uuvtai.pilot import Mission, OnboardPilot, SensorMessage
@@ -72,17 +71,10 @@ def export_stack(
     beside, kept = OnboardPilot(sim, mission), _KeptRoutes()
     sim.fallback = kept  # type: ignore[assignment]
     commands = decided(beside, shown, steps)
-    new = out.parent / f".{out.name}.{os.getpid()}"
-    shutil.rmtree(new, ignore_errors=True)
-    try:
+    with whole_folder(out) as new:
         _write(new, tape, beside, machines)
         packed = {**packed_messages(shown), "commands": commands}
         (new / GOLDEN).write_bytes(_npz(packed))
-        if out.exists():
-            out.rmdir()
-        new.rename(out)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     return {
         "schema": 1,
@@ -136,6 +128,7 @@ def _write(folder: Path, tape: Tape, pilot: OnboardPilot, machines: Sequence[str
         "schema": SCHEMA,
         "uuvtai": __version__,
         "libraries": libraries,
+        "sha256": {name: digest_of(folder / name) for name in (*libraries.values(), MEMORY)},
         "runtime": runtime_layout(),
         "numbers": dataclasses.asdict(pilot.numbers),
         "mission": dataclasses.asdict(pilot.mission),

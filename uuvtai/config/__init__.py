@@ -6,6 +6,8 @@ YAML in and out, and presets, live in ``loader.py``; what training adds is in ``
 
 from __future__ import annotations
 
+from pydantic import model_validator
+
 from uuvtai.config.baselines import (
     BaselinesConfig,
     DynamicWindowConfig,
@@ -34,7 +36,7 @@ from uuvtai.config.sensors import (
 from uuvtai.config.task import EpisodeConfig, RewardConfig
 from uuvtai.config.teacher import TeacherConfig
 from uuvtai.config.tuned import FastConfig, SlowConfig
-from uuvtai.config.vehicle import ActuationConfig, DisturbanceConfig, Thruster, VehicleConfig
+from uuvtai.config.vehicle import ActuationConfig, DisturbanceConfig, Thruster, VehicleConfig, instability
 from uuvtai.config.world import (
     DynamicObstacles,
     FixedObstacle,
@@ -51,6 +53,10 @@ class RuntimeConfig(Section):
 
     native: bool = True
     """by machine code of their own, kept on disk, instead of by Taichi (CPU, Linux): ``docs/native.md``"""
+
+
+MOST_CELLS = 4_000_000
+"""of a map"""
 
 
 class Config(Section):
@@ -80,6 +86,20 @@ class Config(Section):
     reward: RewardConfig = RewardConfig()
     episode: EpisodeConfig = EpisodeConfig()
     runtime: RuntimeConfig = RuntimeConfig()
+
+    @model_validator(mode="after")
+    def _can_be_simulated(self) -> Config:
+        (x_low, x_high), (y_low, y_high) = self.world.tank.x_m, self.world.tank.y_m
+        n_cell = round((x_high - x_low) * (y_high - y_low) / self.mapping.cell_m**2)
+        if n_cell > MOST_CELLS:
+            raise ValueError(
+                f"mapping.cell_m: a map of this tank has {n_cell:,} cells of {self.mapping.cell_m:g} m, more "
+                f"than {MOST_CELLS:,}; give a larger cell or a smaller tank"
+            )
+        substep_s = self.episode.control_dt_s / self.episode.substeps
+        if why := instability(self.vehicle, self.actuation, self.disturbance, substep_s):
+            raise ValueError(f"vehicle: {why}")
+        return self
 
 
 __all__ = [

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from uuvtai.config import Config
-from uuvtai.config.section import Count, Fraction, NonNegative, Positive, PositiveCount, Section
+from uuvtai.config.section import Count, Fraction, NonNegative, Positive, PositiveCount, Section, Seed
 
 Points = tuple[tuple[NonNegative, NonNegative], ...]
 """(share of the run, value): linear in between, constant outside; two points at the same share are a jump"""
@@ -141,7 +141,7 @@ class TrainConfig(Section):
 
     iterations: PositiveCount = 1200
     num_envs: PositiveCount = 8
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: Seed = 0
     scenes: tuple[tuple[Count, Count, NonNegative], ...] = ()
     """(S, D, v [m/s]) dealt out to the envs in turn, slots permitting; none = the world's own, which
     evaluations play in any case"""
@@ -152,7 +152,7 @@ class TrainConfig(Section):
     evaluate_every: Count = 0
     """iterations between evaluations without exploration noise; 0 = none"""
     evaluate_episodes: PositiveCount = 64
-    evaluate_seed: Annotated[int, Field(ge=0, lt=2**31, validate_default=True)] = 500_000
+    evaluate_seed: Annotated[Seed, Field(validate_default=True)] = 500_000
     """scenarios of these evaluations; training never meets them"""
     patience: PositiveCount = 10
     """iterations in a row with values that are not finite before the run stops with an error (EC)"""

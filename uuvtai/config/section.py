@@ -6,6 +6,7 @@ Units stand in the names: ``_m``, ``_s``, ``_m_s``, ``_rad`` and so on; angles t
 
 from __future__ import annotations
 
+import hashlib
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -26,6 +27,19 @@ Count = Annotated[int, Field(ge=0, le=MOST)]
 PositiveCount = Annotated[int, Field(ge=1, le=MOST)]
 Packets = Annotated[int, Field(ge=16, le=MOST, multiple_of=16)]
 """a count in whole packets of lanes"""
+_SEEDS = 2**31
+
+
+def folded_seed(seed: int) -> int:
+    """What kernels count with for a seed of 0 and more: one below 2^31 stands for itself, any other for the
+    first 31 bits of the SHA-256 of its bytes, the highest first."""
+    if seed < _SEEDS:
+        return seed
+    told = seed.to_bytes((seed.bit_length() + 7) // 8, "big")
+    return int.from_bytes(hashlib.sha256(told).digest()[:4], "big") >> 1
+
+
+Seed = Annotated[int, Field(ge=0), AfterValidator(folded_seed)]
 Interval = tuple[Real, Real]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Annotated, Literal
 
@@ -182,3 +183,43 @@ class DisturbanceConfig(Section):
     buoyancy follow the mass"""
     damping_spread: Spread = 0.0
     added_mass_spread: Spread = 0.0
+
+
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+_LIMIT = 2.0
+"""of (damping / inertia) times the substep: beyond it the midpoint rule's error grows in every substep"""
+
+
+def instability(
+    vehicle: VehicleConfig, actuation: ActuationConfig, disturbance: DisturbanceConfig, substep_s: float
+) -> str:
+    """Why the motion of a vehicle cannot be integrated in substeps of so many seconds, '' where it can: the
+    stiffest axis at the speed to which the strongest push of its loop takes it, or at rest. A spread of the
+    parameters counts with its worst draw."""
+    net_n = vehicle.gravity_m_s2 * abs(vehicle.water_density_kg_m3 * vehicle.volume_m3 - vehicle.mass_kg)
+    is_held = vehicle.attitude_hold == "ideal"
+    hold = (actuation.hold_damping if is_held else 0.0, actuation.hold_gain_n_m if is_held else 0.0)
+    surge_n, sway_n, heave_n = actuation.max_force_n
+    push = (surge_n, sway_n, heave_n + net_n, *[actuation.hold_limit_n_m] * 2, actuation.max_moment_n_m)
+    body = (*[vehicle.mass_kg] * 3, *vehicle.inertia_kg_m2)
+    stiffest, found = _LIMIT / substep_s, ""
+    for i, axis in enumerate(AXES):
+        inertia = body[i] * (1 - disturbance.mass_spread)
+        inertia += vehicle.added_mass[i] * (1 - disturbance.added_mass_spread)
+        linear, quadratic = (
+            damping[i] * (1 + disturbance.damping_spread)
+            for damping in (vehicle.linear_damping, vehicle.quadratic_damping)
+        )
+        moving = math.sqrt(linear * linear + 4 * quadratic * push[i])  # slope of drag at that speed
+        damping, spring = hold if axis in ("roll", "pitch") else (0.0, 0.0)
+        rate = max((moving + damping) / inertia, math.sqrt(spring / inertia))
+        if rate > stiffest:
+            stiffest, found = rate, f"{axis} (inertia and added mass {inertia:.3g})"
+    if not found:
+        return ""
+    return (
+        f"{found} would diverge: damping / inertia is {stiffest:.0f} per second, and substeps of "
+        f"{1000 * substep_s:g} ms allow {_LIMIT / substep_s:.0f}; give it inertia, damping and gains "
+        f"(actuation) that belong together, or {math.ceil(stiffest * substep_s / _LIMIT)} times as many "
+        "episode.substeps"
+    )

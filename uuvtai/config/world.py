@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import model_validator
@@ -19,6 +20,8 @@ from uuvtai.config.section import (
 )
 from uuvtai.truth import Truth
 
+_LONGEST_M, _MOST_AREA_M2, _DEEPEST_M = 1000.0, 40_000.0, 100.0
+
 
 class TankConfig(Section):
     """Known bounds of the water."""
@@ -35,7 +38,21 @@ class TankConfig(Section):
             low, high = getattr(self, name)
             if not low < high:
                 raise ValueError(f"{name} must be (low, high) with low < high, got {getattr(self, name)}")
+        x, y, z = (high - low for low, high in (self.x_m, self.y_m, self.z_m))
+        if max(x, y) > _LONGEST_M or x * y > _MOST_AREA_M2 or z > _DEEPEST_M:
+            raise ValueError(
+                f"is {x:g} x {y:g} x {z:g} m, and a tank has at most {_LONGEST_M:,.0f} m, "
+                f"{_MOST_AREA_M2:,.0f} m^2 and a depth of {_DEEPEST_M:,.0f} m; sizes are in metres"
+            )
         return self
+
+    def holds(self, x_m: float, y_m: float) -> bool:
+        """Whether a place is within the walls, or on them."""
+        (x_low, x_high), (y_low, y_high) = self.x_m, self.y_m
+        if self.shape == "circle":
+            off = math.hypot(x_m - 0.5 * (x_low + x_high), y_m - 0.5 * (y_low + y_high))
+            return off <= self.radius_m + 1e-6
+        return x_low <= x_m <= x_high and y_low <= y_m <= y_high
 
     @property
     def radius_m(self) -> float:
@@ -173,7 +190,27 @@ class WorldConfig(Section, Truth):
                 raise ValueError(
                     f"spawn_{axis}_m ({start}, {end}) reaches out of tank.{axis}_m ({low}, {high})"
                 )
+        for i, obstacle in enumerate(self.fixed):
+            self._check_place(f"fixed.{i}", obstacle)
         return self
+
+    def _check_place(self, name: str, obstacle: FixedObstacle) -> None:
+        """ValueError for an explicit obstacle that is not, or does not stay, in the water."""
+        tank, (floor, surface) = self.tank, self.tank.z_m
+        places = [(name, obstacle), *((f"{name}.path.{i}", way) for i, way in enumerate(obstacle.path))]
+        for place, where in places:
+            if not tank.holds(where.x_m, where.y_m):
+                raise ValueError(
+                    f"{place}: ({where.x_m:g}, {where.y_m:g}) is outside the tank, x {tank.x_m}, y "
+                    f"{tank.y_m}, {tank.shape}; places are in metres"
+                )
+        half = obstacle.radius_m if obstacle.kind == "sphere" else 0.5 * (obstacle.height_m or 0.0)
+        if obstacle.z_m is not None and not floor <= obstacle.z_m <= surface:
+            raise ValueError(f"{name}.z_m: {obstacle.z_m:g} is outside the water, z {tank.z_m}")
+        across = max(obstacle.half_extents_m or (obstacle.radius_m or 0.0,))
+        most = max(tank.x_m[1] - tank.x_m[0], tank.y_m[1] - tank.y_m[0])
+        if across > most or (half or 0.0) > surface - floor:
+            raise ValueError(f"{name}: is larger than the tank; sizes are in metres")
 
     @property
     def own_scene(self) -> tuple[int, int, float]:
@@ -199,6 +236,13 @@ class WorldConfig(Section, Truth):
                 "n_dynamic": dynamic, "dynamic_capacity": dynamic, "dynamic_speed_m_s": 0.0,
             }
         )  # fmt: skip
+
+    @property
+    def bodies(self) -> dict[str, int]:
+        """Numbers of all its obstacles, S resting and D moving, and how many of each are explicit."""
+        fixed_static, fixed_moving = self.n_fixed_static, self.n_fixed_moving
+        all_of = {"S": self.n_static + fixed_static, "D": self.n_dynamic + fixed_moving}
+        return all_of | {"fixed_static": fixed_static, "fixed_moving": fixed_moving}
 
     @property
     def n_fixed_static(self) -> int:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from uuvtai.deploy.set_spec import set_specification
 from uuvtai.deploy.spec import ONNX, specification
 from uuvtai.deploy.weights import weights_of
 from uuvtai.errors import UserError
+from uuvtai.files import unfinished, whole_folder
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.pilot import load_pilot
 from uuvtai.loader import ConfigError
@@ -192,21 +192,20 @@ def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
     """Write everything into a neighbour, flush it, give it its name. Raises RunFolderError."""
     spec = spec | {"files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}}
     text = json.dumps(spec, indent=1, allow_nan=False) + "\n"
-    partial, old = (out.with_name(f".{out.name}.{os.getpid()}.{what}") for what in ("partial", "old"))
+    old = unfinished(out)
     try:
-        for name, content in {**files, SPEC: text.encode()}.items():
-            write_atomic(partial / name, content)
-        sync_folder(partial)
-        if out.exists():
-            out.rename(old)
-        partial.rename(out)
+        with whole_folder(out) as partial:
+            for name, content in {**files, SPEC: text.encode()}.items():
+                write_atomic(partial / name, content)
+            sync_folder(partial)
+            if out.exists():
+                out.rename(old)
         sync_folder(out.parent)
     except OSError as error:
         raise RunFolderError(
             f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR"
         ) from None
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
         if out.exists():
             shutil.rmtree(old, ignore_errors=True)
         elif old.exists():

@@ -4,8 +4,10 @@ that are reckoned first."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from uuvtai.errors import UserError
 
@@ -15,14 +17,16 @@ LogSoftmax Pow Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin Relu Shape Sli
 Sub Tanh Unsqueeze Where
 """
 _LIKE_OURS = """
-Abs Constant Equal Flatten Gather GreaterOrEqual Identity LessOrEqual Log MatMul Max Neg Or ReduceSum Reshape
-Sigmoid Sign Transpose
+Abs Celu Constant Equal Erf Expand Flatten Gather Gelu GreaterOrEqual HardSigmoid HardSwish Identity
+LayerNormalization LeakyRelu LessOrEqual Log MatMul Max Mish Neg Or PRelu ReduceProd ReduceSum ReduceSumSquare
+Reshape Selu Sigmoid Sign Softmax Softsign Swish Transpose
 """
 OPERATORS = frozenset((_OURS + _LIKE_OURS).split())
 """What torch's exporter makes of a policy, and what other versions of it make of the same. No loops,
-branches, random numbers or functions, and nothing that repeats or resizes. ConstantOfShape is ours too
-(features before the first decision): what it makes is bounded like all else, by its shape."""
-OPSETS = range(17, 27)
+branches, random numbers or functions. What ConstantOfShape (ours too: features before the first decision) and
+Expand make is bounded like all else, by its shape."""
+OPSETS = range(9, 27)
+_DTYPES = {1: np.float32, 10: np.float16, 11: np.float64}
 MAX_NODES = 5000
 MAX_BYTES = 64 << 20
 """of the graph with its weights: ONNX Runtime holds them about four times"""
@@ -31,7 +35,6 @@ MAX_VALUES = 256 << 20
 MAX_WORK = 1 << 34
 """multiplications of all matrix products, and values as well, of all calls together"""
 _RANK = 8
-_LEAST_ROWS = 1
 
 
 class GraphError(UserError, RuntimeError):
@@ -42,11 +45,21 @@ class GraphError(UserError, RuntimeError):
         self.reason = reason
 
 
+class GraphInput(NamedTuple):
+    """What is to be given."""
+
+    width: int | None
+    """of the last axis; None = any"""
+    rows: int | None
+    """of the first axis; None = any"""
+    dtype: Any
+    """NumPy's; None = no float"""
+
+
 class GraphHead(NamedTuple):
     """What a graph says of itself; nothing of it is believed but names."""
 
-    inputs: dict[str, int | None]
-    """width of the last axis by name; None = any"""
+    inputs: dict[str, GraphInput]
     outputs: list[str]
     metadata: dict[str, str]
 
@@ -58,26 +71,87 @@ def head_of(graph: bytes) -> GraphHead:
     inputs = {}
     for value in model.graph.input:
         if value.name not in weights:
-            sizes = list(value.type.tensor_type.shape.dim)
-            inputs[value.name] = sizes[-1].dim_value if sizes and sizes[-1].HasField("dim_value") else None
+            told = value.type.tensor_type
+            sizes = [size.dim_value if size.HasField("dim_value") else None for size in told.shape.dim]
+            rows = sizes[0] if len(sizes) > 1 else None
+            inputs[value.name] = GraphInput(sizes[-1] if sizes else None, rows, _DTYPES.get(told.elem_type))
     outputs = [value.name for value in model.graph.output]
     if not outputs:
         raise GraphError("gives nothing")
     return GraphHead(inputs, outputs, {entry.key: entry.value for entry in model.metadata_props})
 
 
-def refuse_strange(graph: bytes, inputs: dict[str, tuple[int, ...]], single_calls: int) -> None:
+def with_weights(graph: bytes, read: Callable[[str], bytes]) -> bytes:
+    """A graph whose weights lie in files beside it, whole: ``read`` gives the content of such a file by its
+    plain name. GraphError where a name leads elsewhere, or a weight is not in its file."""
+    model, files = _parsed(graph), {}
+    for tensor in _tensors(model.graph):
+        if not (tensor.external_data or tensor.data_location):
+            continue
+        told = {entry.key: entry.value for entry in tensor.external_data}
+        name = told.get("location", "")
+        if not name or name in (".", "..") or set(name) & {*"/\\:\0"}:
+            raise GraphError(f"has weights in {name[:100]!r}; they may lie beside it, in no other folder")
+        if name not in files:
+            files[name] = read(name)
+        offset, n_bytes = _number(told.get("offset", "0")), math.prod(tensor.dims) * _item_bytes(tensor)
+        content = files[name][offset : offset + n_bytes]
+        if len(content) != n_bytes or told.get("length", str(n_bytes)) != str(n_bytes):
+            raise GraphError(f"has weights {tensor.name[:100]} that are not whole in {name[:100]}")
+        if sum(map(len, files.values())) > MAX_BYTES:
+            raise GraphError(f"has weights of more than {MAX_BYTES >> 20} MiB")
+        tensor.raw_data = content
+        tensor.ClearField("external_data")
+        tensor.ClearField("data_location")
+    return model.SerializeToString() if files else graph
+
+
+def only(graph: bytes, output: str) -> bytes:
+    """The part of a graph that gives this output: value and log-probability of an exported actor are nobody's
+    business here."""
+    model = _parsed(graph)
+    needed, nodes = {output}, []
+    for node in reversed(model.graph.node):  # they stand in the order of their use
+        if needed & {*node.output}:
+            needed |= {*node.input}
+            nodes.append(node)
+    kept = {"node": nodes[::-1]}
+    for part in ("initializer", "input", "output"):
+        kept[part] = [value for value in getattr(model.graph, part) if value.name in needed]
+    for part, values in kept.items():
+        copies = [type(value).FromString(value.SerializeToString()) for value in values]
+        model.graph.ClearField(part)
+        getattr(model.graph, part).extend(copies)
+    return model.SerializeToString()
+
+
+def _number(text: str) -> int:
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 12 else 1 << 40
+
+
+def _item_bytes(tensor: Any) -> int:
+    import onnx
+
+    try:
+        return onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
+    except (KeyError, TypeError, ValueError):
+        raise GraphError(f"has weights {tensor.name[:100]} of no known kind") from None
+
+
+def refuse_strange(
+    graph: bytes, inputs: dict[str, tuple[int, ...]], single_calls: int, rows_of_one: int = 1
+) -> None:
     """Raise GraphError for a graph that reaches beyond itself or may take more memory or time than a policy
     does.
 
     ``inputs``: shapes (rows, ...) with which it will run once; it will run ``single_calls`` times with one
-    row.
+    row, or ``rows_of_one``, where a graph takes no fewer.
     """
     model = _parsed(graph)
     _refuse_parts(model)
     _refuse_interface(model, set(inputs))
     work = 0
-    for rows, calls in ((None, 1), (_LEAST_ROWS, single_calls)):
+    for rows, calls in ((None, 1), (rows_of_one, single_calls)):
         shapes = _shapes(model, {name: (rows or shape[0], *shape[1:]) for name, shape in inputs.items()})
         work += calls * _work(model, shapes)
     if work > MAX_WORK:

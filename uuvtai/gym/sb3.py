@@ -61,11 +61,18 @@ class Sb3VecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """No wrappers."""
-        return [False] * self.num_envs
+        return [False] * len(self._rows(indices))
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The same attribute for every env."""
-        return [getattr(self.envs, attr_name, None)] * self.num_envs
+        """The batch's attribute for each of these envs. Raises AttributeError where it has none."""
+        return [getattr(self.envs, attr_name)] * len(self._rows(indices))
+
+    def _rows(self, indices: Any) -> np.ndarray:
+        """None = all, an int or several. Raises IndexError for an env that is not there."""
+        rows = np.arange(self.num_envs) if indices is None else np.atleast_1d(indices)
+        if odd := [row for row in rows if not -self.num_envs <= row < self.num_envs]:
+            raise IndexError(f"there is no env {odd[0]}: the batch has {self.num_envs}")
+        return rows
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """There are no single envs."""

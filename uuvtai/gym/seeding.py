@@ -16,13 +16,14 @@ _SEEDS = 2**31
 def episode_seed(env: gymnasium.Env | gymnasium.vector.VectorEnv, seed: Any) -> int | None:
     """Seed whose episodes ``env`` is to begin with; None = go on with the episodes that follow.
 
-    An int is that seed. None goes on where the env has been seeded, and draws a seed where it has not. The
-    env's generator is seeded along. Raises TypeError or ValueError for what is no seed; lists are refused,
-    since env i plays episode i of one seed.
+    An int is that seed, folded as ``uuvtai.make`` does. None goes on where the env has been seeded, and draws
+    a seed where it has not. The env's generator is seeded along. Raises TypeError or ValueError for what is
+    no seed; lists are refused, since env i plays episode i of one seed.
     """
     if seed is not None:
-        number = checked_seed(_integer(seed))
-        env._np_random, env._np_random_seed = seeding.np_random(number)
+        given = _integer(seed)
+        number = checked_seed(given)
+        env._np_random, env._np_random_seed = seeding.np_random(given)
         return number
     if env._np_random_seed is not None:
         return None

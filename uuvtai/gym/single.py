@@ -47,7 +47,9 @@ class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode {render_mode!r} does not exist; there are: None, 'rgb_array'")
         self.render_mode, self.hold_steps = render_mode, checked_hold_steps(hold_steps)
         self.native = VectorEnv(
-            sim or simulator(world, 1, sensors, vehicle, overrides, device, teacher), autoreset=False
+            sim or simulator(world, 1, sensors, vehicle, overrides, device, teacher),
+            autoreset=False,
+            owns_sim=sim is None,
         )
         config, n = self.native.config, self.native.num_envs
         fps = round(1 / (config.episode.control_dt_s * hold_steps))

@@ -62,8 +62,9 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # type: ignore[misc]
         self.backend, self.hold_steps = _checked_backend(backend), checked_hold_steps(hold_steps)
+        owns_sim = sim is None
         sim = sim or simulator(world, num_envs, sensors, vehicle, overrides, device, teacher)
-        self.native = VectorEnv(sim, autoreset=False)
+        self.native = VectorEnv(sim, autoreset=False, owns_sim=owns_sim)
         self.num_envs, self.device = sim.num_envs, sim.device
         self.single_observation_space = observation_space(self.native.observation_table, sim.config)
         self.single_action_space = action_space()

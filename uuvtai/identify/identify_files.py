@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import VehicleConfig
-from uuvtai.files import refuse_output
+from uuvtai.files import refuse_output, whole_file
 from uuvtai.identify.ardusub_log import ENDINGS, read_ardusub
 from uuvtai.identify.drive_log import Drive, DriveError, read_drives
 from uuvtai.identify.identified import Identified, identified, vehicle_yaml
@@ -40,8 +40,9 @@ def identify(
     drives = [drive for file in files for drive in _drives(file, vehicle_cfg, truth, system, notes.append)]
     found = identified(drives, vehicle_cfg, known)
     picture_bytes = prediction_png(found)
-    out.write_text(vehicle_yaml(found, base, files), encoding="utf-8")
-    picture.write_bytes(picture_bytes)
+    for path, content in ((out, vehicle_yaml(found, base, files).encode()), (picture, picture_bytes)):
+        with whole_file(path) as (file, _):
+            file.write(content)
     warnings = [*found.document["warnings"], *notes]
     return {
         **found.document,

@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
+import secrets
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -157,7 +157,7 @@ def save(
         refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
         refuse_links_in(checkpoints)
         sweep(checkpoints)
-        partial = checkpoints / f"{_PARTIAL}{target.name}.{os.getpid()}"
+        partial = checkpoints / f"{_PARTIAL}{target.name}.{secrets.token_hex(4)}"
         partial.mkdir()
         described = _write_parts(partial, state)
         manifest = Manifest(
@@ -236,7 +236,7 @@ def _thin(checkpoints: Path, keep: int) -> None:
 
 def _remove(folder: Path) -> None:
     """Under another name first: half a folder must never be taken for a checkpoint."""
-    doomed = folder.with_name(f"{_PARTIAL}{folder.name}.old.{os.getpid()}")
+    doomed = folder.with_name(f"{_PARTIAL}{folder.name}.old.{secrets.token_hex(4)}")
     folder.rename(doomed)
     shutil.rmtree(doomed)
 

@@ -110,6 +110,8 @@ def _train(
     found, config = _begin(request, watch)
     total = request.iterations or config.train.iterations
     if found and found.step >= total:
+        if folder:
+            folder.settle(found.step >= config.train.iterations)
         raise ConfigError(
             f"{request.resume}: has done {found.step} of {total} iterations; to go on give more: "
             f"--iterations {2 * found.step}"

@@ -7,15 +7,21 @@ import importlib.util
 import json
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
+from uuvtai.endings import say
 from uuvtai.errors import UserError
+from uuvtai.live.doorkeeper import Doorkeeper, private_host
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topic_stream import TopicMessage
 
 EXTRA = "uuvtai[live]"
+BACKLOG = 64
+"""messages that wait for a client; when more do, the oldest are dropped"""
 _NEEDED = "foxglove.websocket"
+_MOST_TOLD = 300
+"""characters"""
 
 
 class LiveError(UserError, RuntimeError):
@@ -25,33 +31,42 @@ class LiveError(UserError, RuntimeError):
 class ViewerServer:
     """Sends messages to whoever has subscribed to their topic. Use as a context: it ends with it."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 8765) -> None:
-        """``port`` 0: a free one, see ``port``. Raises LiveError."""
+    def __init__(self, host: str = "127.0.0.1", port: int = 8765, origins: Collection[str] = ()) -> None:
+        """``port`` 0: a free one, see ``port``; ``origins``: as of ``Doorkeeper``. Raises LiveError."""
         _require_sdk()
         import foxglove
         from foxglove.websocket import Capability
 
-        logging.getLogger("foxglove").setLevel(logging.ERROR)
+        log = logging.getLogger("foxglove")
+        log.handlers, log.propagate = [_Told()], False
+        log.setLevel(logging.ERROR)
         self._foxglove, self._context = foxglove, foxglove.Context()
         self._channels: dict[str, Any] = {}
         self._newest: dict[str, TopicMessage] = {}
         self._lock = threading.Lock()
         self._asked: set[str] = set()
+        inner = private_host()
         try:
             self._server = foxglove.start_server(
                 name="uuvtai",
-                host=host,
-                port=port,
+                host=inner,
+                port=0,
                 capabilities=[Capability.Time],
                 server_listener=_listener(self._ask),
                 context=self._context,
+                message_backlog_size=BACKLOG,
             )
+            try:
+                self._door = Doorkeeper(host, port, (inner, self._server.port), origins)
+            except BaseException:
+                self._server.stop()
+                raise
         except (RuntimeError, OSError, ValueError) as error:
             raise LiveError(
                 f"ws://{host}:{port}: cannot listen there ({error}); another program may hold the port: "
                 f"--port {port + 1 if port < 65535 else 8765}"
             ) from None
-        self.port: int = self._server.port
+        self.port: int = self._door.port
 
     def begin(self, schemas: Mapping[str, Schema]) -> None:
         """Another episode: viewers forget the one before."""
@@ -89,12 +104,24 @@ class ViewerServer:
     def close(self) -> None:
         """Let go of the port and of all who are connected."""
         self._server.stop()
+        self._door.close()
 
     def __enter__(self) -> ViewerServer:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class _Told(logging.Handler):
+    """What the SDK says of its clients, who may have worded it; the first lines of it."""
+
+    left = 20
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self.left > 0:
+            self.left -= 1
+            say(f"a viewer: {' '.join(record.getMessage()[:_MOST_TOLD].split())}")
 
 
 def _require_sdk() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from mcap.writer import Writer
 
 from uuvtai import signals
-from uuvtai.files import flush, open_new
+from uuvtai.files import flush, open_new, unfinished
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.reader import MAX_RECORD
 from uuvtai.version import __version__
@@ -26,14 +26,14 @@ LOSS_SHARE = 0.01
 
 
 class McapFile:
-    """One MCAP file under way as ``<path>.part``; ``finish`` makes it whole, durable and gives it its
-    name."""
+    """One MCAP file under way as ``<path>.XXXXXXXX.part`` (eight random digits); ``finish`` makes it whole,
+    durable and gives it its name."""
 
-    def __init__(self, path: Path, suffix: str = ".part", profile: str = "") -> None:
+    def __init__(self, path: Path, profile: str = "") -> None:
         """``profile``: what the file says it keeps to, such as 'ros2'. Raises OSError."""
+        signals.engage()
         self.path = path
-        self.part = path.with_name(path.name + suffix)
-        self.part.unlink(missing_ok=True)
+        self.part = unfinished(path, ".part")
         self._file = open_new(self.part)
         self._writer = Writer(self._file)
         self._writer.start(profile, f"uuvtai {__version__}")

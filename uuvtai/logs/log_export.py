@@ -6,9 +6,7 @@ import contextlib
 import csv
 import itertools
 import json
-import os
 import re
-import shutil
 import struct
 import zipfile
 from collections.abc import Collection, Iterator
@@ -18,7 +16,7 @@ from typing import Any, TextIO
 import cv2
 import numpy as np
 
-from uuvtai.files import refuse_output
+from uuvtai.files import refuse_output, whole_folder
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.reader import info, read_head, read_messages
 from uuvtai.logs.topics.camera_topics import logged_image
@@ -67,16 +65,10 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
     if missing := [topic for topic in topics or () if topic not in known]:
         raise LogError(f"{path}: no messages on {', '.join(missing)}; it has {', '.join(known)}")
     wanted = list(dict.fromkeys(topics or known))
-    staging = out_dir.with_name(f".{out_dir.name}.{os.getpid()}.partial")
-    with _as_log_error(path, out_dir), _removed(staging):
-        out_dir.parent.mkdir(parents=True, exist_ok=True)
-        staging.mkdir()
+    with _as_log_error(path, out_dir), whole_folder(out_dir) as staging:
         names = _Names(staging)
         _write_attachments(path, staging, names)
         {"json": _write_jsonl, "csv": _write_csv, "npz": _write_npz}[fmt](path, wanted, names)
-        if out_dir.is_dir():
-            out_dir.rmdir()  # only where it is empty
-        staging.rename(out_dir)
     return sorted(file for file in out_dir.rglob("*") if file.is_file())
 
 
@@ -103,15 +95,6 @@ def _as_log_error(path: Path, out: Path) -> Iterator[None]:
         raise LogError(
             f"{out}: cannot write the export ({error.strerror}); choose another folder with --out DIR"
         ) from error
-
-
-@contextlib.contextmanager
-def _removed(folder: Path) -> Iterator[None]:
-    """Nothing of ``folder`` is left."""
-    try:
-        yield
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def file_name(name: str) -> str:

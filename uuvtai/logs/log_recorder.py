@@ -164,6 +164,8 @@ class EpisodeRecorder(EpisodeReader):
         """The log of a recorded job."""
         if job not in self.paths:
             return None
+        for left in self.paths[job].parent.glob(f"{self.paths[job].name}.{'[0-9a-f]' * 8}.part"):
+            left.unlink()  # of an interrupted run, whose folder this one holds
         return McapEpisodeLog(self.paths[job], self.header(sim, row, job), self._depth_images)
 
 

@@ -4,7 +4,7 @@
         log.write(values)            # step 0, then after every control step
         log.close(result)
 
-The file grows as ``<path>.part`` and gets its name when it is complete. A killed process leaves the ``.part``
+The file grows as ``<path>.XXXXXXXX.part`` and gets its name when it is complete. A killed process leaves that
 file, which lacks at most the messages of the last control step or the last hundredth, whichever is more;
 ``uuv log repair`` makes it whole.
 """

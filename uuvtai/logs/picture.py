@@ -3,13 +3,13 @@ lines."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from uuvtai.files import whole_file
 from uuvtai.logs.canvas import (
     DYNAMIC,
     FAILED,
@@ -82,18 +82,14 @@ def check_same_episode(recordings: list[Recording]) -> None:
 
 def save_image(image: np.ndarray, out: Path) -> Path:
     """Write an image (height, width, 3), blue green red, as PNG, atomically. Raises LogError."""
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-        os.replace(part, out)
+        with whole_file(out) as (file, _):
+            file.write(cv2.imencode(".png", image)[1].tobytes())
     except OSError as error:
         raise LogError(
             f"{out}: cannot write the picture ({error.strerror}); choose another place with --out FILE"
         ) from error
-    finally:
-        if part.parent.is_dir():
-            part.unlink(missing_ok=True)
     return out
 
 

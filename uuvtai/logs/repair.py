@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ class Repair:
     """what was wrong, with the byte"""
 
 
+_PART = re.compile(r"(\.[0-9a-f]{8})?\.part$")
+"""what an unfinished recording's name ends in, today or before"""
 MAX_DAMAGES = 100
 """that are told one by one"""
 
@@ -45,7 +48,7 @@ def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
     """
     path = Path(path)
     out = (
-        path.with_name(path.name.removesuffix(".part").removesuffix(".mcap") + ".repaired.mcap")
+        path.with_name(_PART.sub("", path.name).removesuffix(".mcap") + ".repaired.mcap")
         if out is None
         else Path(out)
     )
@@ -61,7 +64,7 @@ def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
 
 def _copied(path: Path, declared: list[Any], out: Path) -> Repair:
     damages: list[str] = []
-    copy = _Copy(McapFile(out, ".repairing"))  # not .part: that may be the input
+    copy = _Copy(McapFile(out))
     try:
         for record in itertools.chain(declared, records(path, damages=damages)):
             copy.add(record)

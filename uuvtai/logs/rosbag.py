@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import shutil
 from array import array
 from collections import Counter
 from collections.abc import Iterator
@@ -16,7 +14,7 @@ from typing import Any
 import yaml
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
-from uuvtai.files import refuse_output
+from uuvtai.files import refuse_output, whole_folder
 from uuvtai.loader import ConfigError, parsed_yaml
 from uuvtai.logs.container import MAX_MESSAGE, McapFile
 from uuvtai.logs.log_errors import LogError
@@ -60,15 +58,8 @@ def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
     refuse_output(out, [path], False)
     head = read_head(path)
     setup = _setup(path, head)
-    staging = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    with _as_log_error(path, out):
-        try:
-            staging.mkdir(parents=True)
-            count = _write_bag(path, head, setup, ros, staging, out.name)
-            staging.rename(out)
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
-    return count
+    with _as_log_error(path, out), whole_folder(out) as staging:
+        return _write_bag(path, head, setup, ros, staging, out.name)
 
 
 def from_rosbag2(path: Path, out: Path, force: bool = False) -> tuple[int, list[str]]:

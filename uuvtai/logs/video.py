@@ -3,8 +3,6 @@ lines."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uuvtai.files import whole_file
 from uuvtai.logs.canvas import (
     DYNAMIC,
     FAILED,
@@ -113,22 +112,16 @@ def _filmed(
     out: Path, frames: Iterator[np.ndarray], fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
 ) -> Path:
     """Write frames as the film that the name of ``out`` asks for, whole or not at all. Raises LogError."""
-    part = out.with_name(f".{out.stem}.{os.getpid()}.part{out.suffix.lower()}")
     from uuvtai.logs.film import check_whole, write_film  # PyAV, which takes a third of a second
 
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        part.touch()
-        n_frames = write_film(part, frames, fps, samples, inks)
-        check_whole(part, n_frames, out)
-        os.replace(part, out)
+        with whole_file(out, f".tmp{out.suffix.lower()}") as (_, part):
+            check_whole(part, write_film(part, frames, fps, samples, inks), out)
     except OSError as error:
         raise LogError(
             f"{out}: cannot write the video ({error.strerror}); choose another place with --out FILE"
         ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
     return out
 
 

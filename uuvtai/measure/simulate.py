@@ -11,14 +11,9 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import Config
-from uuvtai.errors import SettingError, UserError
+from uuvtai.errors import DivergenceError, SettingError
 from uuvtai.plant import Plant
 from uuvtai.runtime import Runtime, start_taichi
-
-
-class DivergenceError(UserError, FloatingPointError):
-    """The integration left the finite numbers: its substep is too long for what acts on the vehicle."""
-
 
 CONTROL_DT_S = 0.02
 """Samples are this far apart, or one substep where that is longer."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,8 @@ class LiveOptions:
     port: int = 8765
     rate: float = 1.0
     """seconds of the episode in one of the clock's; 0 = as fast as it goes"""
+    origins: Sequence[str] = ()
+    """of web pages that may connect beside those of this host"""
 
 
 def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) -> list[dict[str, Any]]:
@@ -38,7 +40,7 @@ def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) 
     if ORACLE in request.controllers:
         raise ConfigError("--controller oracle: it drives no vehicle; name who does, for example bt")
     methods = methods_of(request, watch)
-    with ViewerServer(live.host, live.port) as server:
+    with ViewerServer(live.host, live.port, live.origins) as server:
         shown = "localhost" if live.host in ("127.0.0.1", "0.0.0.0", "::") else live.host
         watch.note(f"serving ws://{shown}:{server.port}; in Foxglove or Lichtblick: open a connection,")
         watch.note(f"Foxglove WebSocket, to that address, and import the layout {LAYOUT}")

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import linecache
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ import taichi as ti
 
 from uuvtai.config import Section
 from uuvtai.native.reads import values_of
+from uuvtai.native.store import StoreError
+from uuvtai.version import BEGUN_NS
 
 _SEEN_BY_KERNELS = (
     "kernels", "config", "state", "native", "taichi_patches",
@@ -29,13 +32,22 @@ class KeyNameError(Exception):
     """An argument of a kind that no key can name: Taichi launches this kernel itself."""
 
 
+_ROOT = Path(__file__).parents[1]
+
+
 @functools.cache
 def digest_of_sources() -> str:
-    """Of every source that a kernel can see."""
-    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    """Of every source that a kernel can see, as this process imported it and as Taichi reads it from now on,
+    whatever becomes of the files. Raises StoreError where one has changed since the process began."""
+    digest, texts = hashlib.sha256(), {}
     for name in _SEEN_BY_KERNELS:
-        for path in sorted((root / name).rglob("*.py")) if (root / name).is_dir() else [root / name]:
-            digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes() + b"\0")
+        for path in sorted((_ROOT / name).rglob("*.py")) if (_ROOT / name).is_dir() else [_ROOT / name]:
+            texts[str(path)] = content = path.read_bytes()
+            if path.stat().st_ctime_ns > BEGUN_NS:
+                raise StoreError(f"{path}: has changed since this process began")
+            digest.update(f"{path.relative_to(_ROOT)}\0".encode() + content + b"\0")
+    for file, content in texts.items():  # no time of change: the entry is never looked at again
+        linecache.cache[file] = (len(content), None, content.decode().splitlines(keepends=True), file)
     return digest.hexdigest()
 
 

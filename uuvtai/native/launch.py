@@ -8,7 +8,7 @@ import ctypes
 import dataclasses
 import functools
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import taichi as ti
@@ -95,6 +95,8 @@ class NativeLaunch:
 Launch = TaichiLaunch | NativeLaunch
 native: list[Any] = []
 """the process's ``Native``, when a simulator has asked for it"""
+_tables: list[dict[tuple[int, ...], Launch]] = []
+"""launches of every kernel with ``quick_launch``, by the identities of their arguments"""
 _noting: list[tuple[int, list[Launch | None]]] = []
 """thread whose launches are being noted, and these; at most one"""
 
@@ -109,6 +111,7 @@ def quick_launch(launch: _T) -> _T:
     """
     kernel = launch._primal  # type: ignore[attr-defined]
     known: dict[tuple[int, ...], Launch] = {}
+    _tables.append(known)
 
     def again(*arguments):
         key = tuple(map(id, arguments))
@@ -127,6 +130,14 @@ def quick_launch(launch: _T) -> _T:
     again.__name__, again.__doc__ = launch.__name__, launch.__doc__  # type: ignore[attr-defined]
     again._primal = kernel  # type: ignore[attr-defined]  # as Taichi has it; aboard/tape.py looks for it
     return again  # type: ignore[return-value]
+
+
+def forget(bundles: Iterable[Any]) -> None:
+    """Launch nothing with these again without looking, and keep nothing alive that was launched with them."""
+    gone = {id(bundle) for bundle in bundles}
+    for known in _tables:
+        for key in [key for key in known if not gone.isdisjoint(key)]:
+            del known[key]
 
 
 def noted(work: Callable[[], None]) -> list[Launch | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import hashlib
 import itertools
 import re
 from pathlib import Path
@@ -166,7 +167,7 @@ class Machine:
         self._linker = self.llvm.create_lljit_compiler(
             self._target(), use_jit_link=True, suppress_errors=True
         )
-        self._loaded: list[Any] = []
+        self._loaded: dict[bytes, Any] = {}
         self._number = itertools.count()
         self._pool, self._alone = ctypes.c_int32(threads), ctypes.c_int32(1)
         self._temporaries = ctypes.create_string_buffer(_TEMPORARY_BYTES)
@@ -199,17 +200,23 @@ class Machine:
 
     def tasks_of(self, code: bytes, names: list[str]) -> list[int]:
         """Addresses of the functions of an object, which is loaded. Raises UnfitError."""
+        digest = hashlib.sha256(code).digest()
+        if digest not in self._loaded:
+            self._loaded[digest] = self._linked(code, names)
+        loaded = self._loaded[digest]
+        return [loaded[name] for name in names]
+
+    def _linked(self, code: bytes, names: list[str]) -> Any:
+        """An object in memory, from which it never goes again."""
         library = self.llvm.JITLibraryBuilder().add_object_img(code).add_current_process()
         for name, address in self.symbols.items():
             library.import_symbol(name, address)
         for name in names:
             library.export_symbol(name)
         try:
-            loaded = library.link(self._linker, f"object {next(self._number)}")
+            return library.link(self._linker, f"object {next(self._number)}")
         except RuntimeError as error:
             raise UnfitError(f"LLVM: {error}") from error
-        self._loaded.append(loaded)
-        return [loaded[name] for name in names]
 
     def _target(self) -> Any:
         features = self.llvm.get_host_cpu_features().flatten()

@@ -7,19 +7,21 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import stat
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uuvtai.files import FileError, open_file, parsed_json
+from uuvtai.files import FileError, open_file, open_new, parsed_json, unfinished
 
 _MAGIC = b"UUVNATIVE1\n"
 MOST_BYTES = 512 << 20
 _MOST_FILE_BYTES = 64 << 20
-_SUFFIX, _UNFINISHED = ".kernel", ".part"
+_SUFFIX = ".kernel"
+_OWN = re.compile(r"[0-9a-f]{64}\.kernel|\.[0-9a-f]{64}\.kernel\.[0-9a-f]{8}\.tmp|tmp\w{8}\.part")
+"""names that are given here: whole, unfinished, and unfinished as they were called before"""
 _MOST_NAMES = 16
 """ways through a kernel's source that are remembered: each depends on something else of the config"""
 _STALE_S = 3600.0
@@ -86,16 +88,15 @@ class Store:
         head = json.dumps({"key": key, "tasks": code.tasks, "numbers": code.numbers}).encode() + b"\n"
         digest = hashlib.sha256(head + code.machine).hexdigest().encode()
         content = _MAGIC + digest + b"\n" + head + code.machine
-        temporary = None
+        target = self.folder / (key + _SUFFIX)
+        place = unfinished(target)
         try:
-            handle, temporary = tempfile.mkstemp(dir=self.folder, suffix=_UNFINISHED)
-            with os.fdopen(handle, "wb") as file:
+            with open_new(place, 0o600) as file:
                 file.write(content)
-            os.replace(temporary, self.folder / (key + _SUFFIX))
+            place.replace(target)
         except OSError as error:
-            if temporary:
-                with contextlib.suppress(OSError):
-                    os.unlink(temporary)
+            with contextlib.suppress(OSError):
+                place.unlink()
             raise StoreError(f"{self.folder}: {error.strerror}") from error
 
     def names(self, key: str) -> list[list[str]]:
@@ -109,18 +110,22 @@ class Store:
         others = [known for known in self.names(key) if known != names]
         self.put(key, MachineCode([], b"", [names, *others][:_MOST_NAMES]))
 
+    def files(self) -> list[Path]:
+        """What is kept; the folder may be one where others keep something too."""
+        return [path for path in self.folder.iterdir() if _OWN.fullmatch(path.name)]
+
     def clear(self) -> int:
-        """Delete all; how many files."""
+        """Delete all of them; how many."""
         return self.bound(0)
 
     def bound(self, most_bytes: int = MOST_BYTES) -> int:
         """Delete what killed processes left, then what was used longest ago until the rest fits; how many
         files of the latter."""
         files, now = [], time.time()
-        for path in self.folder.iterdir():
+        for path in self.files():
             with contextlib.suppress(OSError):
                 found = path.lstat()
-                if path.suffix == _UNFINISHED and now - found.st_mtime > _STALE_S:
+                if path.suffix != _SUFFIX and now - found.st_mtime > _STALE_S:
                     path.unlink()
                     continue
                 files.append((found.st_mtime, found.st_size, path))

@@ -6,7 +6,9 @@ import contextlib
 import ctypes
 import os
 import shutil
+import stat
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -21,12 +23,19 @@ _CLONE_FS = 0x200
 """of Linux's ``unshare``: a thread's current folder is its own"""
 
 
+_PREFIX, _LOCK = "uuvtai-native-", "lock"
+_NEW_S = 60.0
+"""a folder of this age may be about to get its lock [s]"""
+
+
 class Compiler:
     """A thread of its own whose current folder is a temporary one: there Taichi writes the text."""
 
     def __init__(self) -> None:
         """Raises UnfitError where threads cannot have folders of their own."""
-        self._folder = Path(tempfile.mkdtemp(prefix="uuvtai-native-"))
+        _sweep()
+        self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+        self._lock = _locked(self._folder)
         self._thread = ThreadPoolExecutor(1, "uuvtai-native")
         try:
             self._wait(self._thread.submit(_enter, self._folder))
@@ -37,6 +46,8 @@ class Compiler:
     def close(self) -> None:
         """End the thread and delete its folder."""
         self._thread.shutdown()
+        if self._lock is not None:
+            os.close(self._lock)
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def compiled(self, kernel: Any) -> tuple[Any, str]:
@@ -72,6 +83,32 @@ class Compiler:
         if interrupted:
             raise interrupted
         return work.result()
+
+
+def _sweep() -> None:
+    """Delete the folders of processes that were killed: nobody holds their locks any more."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            found = folder.lstat()
+            if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid():
+                is_new = time.time() - found.st_mtime < _NEW_S and not (folder / _LOCK).exists()
+                lock = None if is_new else _locked(folder)
+                if lock is not None:
+                    shutil.rmtree(folder, ignore_errors=True)
+                    os.close(lock)
+
+
+def _locked(folder: Path) -> int | None:
+    """The lock of a folder, to be kept open; None where another process has it. Raises OSError."""
+    import fcntl
+
+    lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(lock)
+        return None
+    return lock
 
 
 def _enter(folder: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from uuvtai.deploy import graph_check, onnx_session
+from uuvtai.files import read_bytes
 from uuvtai.learn.pilot import CHUNK
 from uuvtai.own.piece_errors import PieceError
 from uuvtai.own.piece_loading import content_of
@@ -21,10 +22,25 @@ MAX_BYTES = graph_check.MAX_BYTES
 
 
 def graph_of(spec: PieceSpec) -> bytes:
-    """The file, no larger than a graph may be. Raises PieceError, FileError."""
+    """The file, with its weights if they lie beside it, no larger than a graph may be. Raises PieceError,
+    FileError."""
     if not onnx_session.is_installed():
         raise PieceError(f"{spec.option}: needs onnx and onnxruntime: pip install 'uuvtai[export]'")
-    return content_of(spec, MAX_BYTES)
+    graph = content_of(spec, MAX_BYTES)
+
+    def beside(name: str) -> bytes:
+        try:
+            return read_bytes(spec.path.parent / name, MAX_BYTES, spec.path.parent)
+        except OSError as error:
+            raise PieceError(
+                f"{spec.path}: its weights are in {name}, which cannot be read ({error.strerror}); copy that "
+                "file too, beside it"
+            ) from None
+
+    try:
+        return graph_check.with_weights(graph, beside)
+    except graph_check.GraphError as error:
+        raise PieceError(f"{spec.path}: {error.reason}") from None
 
 
 def onnx_policy(spec: PieceSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
@@ -32,18 +48,27 @@ def onnx_policy(spec: PieceSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np
     PieceError for a graph that is strange, or made for another observation."""
     try:
         head = graph_check.head_of(graph)
+        output = next((known for known in _OUTPUTS if known in head.outputs), head.outputs[0])
+        if len(head.outputs) > 1:
+            graph = graph_check.only(graph, output)
         if len(head.inputs) != 1:
             raise PieceError(
                 f"{spec.path}: takes {', '.join(head.inputs) or 'nothing'}; a policy takes one input, "
-                f"observations (n, {n_obs}); of 'uuv export' evaluate the run that it came from"
+                f"observations (n, {n_obs}), and keeps no state; of 'uuv export' evaluate its run"
             )
-        name, width = next(iter(head.inputs.items()))
+        name, (width, rows, dtype) = next(iter(head.inputs.items()))
+        if dtype is None or rows == 0 or (rows or 0) > CHUNK:
+            raise PieceError(
+                f"{spec.path}: {name} takes no observations: a float input (n, {n_obs}) does, n "
+                f"open, 1, or up to {CHUNK}"
+            )
         if width not in (None, n_obs):
             raise PieceError(
                 f"{spec.path}: takes observations of {width} columns, here they have {n_obs} "
                 "(docs/gym.md lists them); --set features.n_track=.. and features.teacher=true add columns"
             )
-        graph_check.refuse_strange(graph, {name: (CHUNK, n_obs)}, 1)
+        calls = -(-CHUNK // (rows or CHUNK))
+        graph_check.refuse_strange(graph, {name: (rows or CHUNK, n_obs)}, calls, rows or 1)
         session = onnx_session.session(graph)
     except graph_check.GraphError as error:
         raise PieceError(f"{spec.path}: {error.reason}") from None
@@ -53,10 +78,15 @@ def onnx_policy(spec: PieceSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np
         raise PieceError(
             f"{spec.path}: ONNX Runtime cannot use it ({' '.join(str(error).split())[:200]})"
         ) from None
-    output = next((known for known in _OUTPUTS if known in head.outputs), head.outputs[0])
 
     def act(obs: np.ndarray) -> np.ndarray:
-        return session.run([output], {name: obs})[0]
+        given = obs.astype(dtype, copy=False)
+        if rows is None:
+            return session.run([output], {name: given})[0]
+        padded = np.zeros((-(-len(obs) // rows) * rows, n_obs), dtype)
+        padded[: len(obs)] = given
+        parts = [session.run([output], {name: part})[0] for part in np.split(padded, len(padded) // rows)]
+        return np.concatenate(parts)[: len(obs)]
 
     return act, _hold(spec, head.metadata)
 

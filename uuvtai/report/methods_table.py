@@ -10,7 +10,7 @@ from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, intervals, rates_text
 from uuvtai.tables.method_tables import causes_table, methods_table, paired_table
 from uuvtai.tables.table import Column, Data, Table
-from uuvtai.tables.wording import number, sensing
+from uuvtai.tables.wording import bodies, number, sensing, vehicle
 
 Method = dict[str, Any]
 
@@ -40,9 +40,9 @@ def conditions(result: dict[str, Any]) -> str:
     speed = f", v = {result['v_m_s']} m/s" if result["D"] else ""
     seeds = ", ".join(map(str, result["seeds"]))
     return (
-        f"World {result['world']}, S = {result['S']} resting and D = {result['D']} moving obstacles{speed}, "
-        f"{sensing(result)}; seeds {seeds}, {result['episodes_per_seed']} episodes each, the same "
-        "ones for every method."
+        f"World {result['world']}, {bodies(result, ' resting', ' moving obstacles')}{speed}, "
+        f"{vehicle(result)}{sensing(result)}; seeds {seeds}, {result['episodes_per_seed']} episodes each, "
+        "the same ones for every method."
     )
 
 

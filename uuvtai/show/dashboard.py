@@ -13,7 +13,7 @@ from rich.text import Text
 
 from uuvtai.endings import plain, say
 from uuvtai.show.progress import Pace, time_left
-from uuvtai.tables.wording import number, percent
+from uuvtai.tables.wording import bodies, number, percent
 
 _PERIOD_S = 5.0
 
@@ -35,8 +35,7 @@ class TrainingProgress:
         self._folder, self._total, self._pace = folder, total, None
         world = config.world
         self._title = (
-            f"{config.train.num_envs} envs, S = {world.n_static}, D = {world.n_dynamic}, v = "
-            f"{world.dynamic_speed_m_s} m/s"
+            f"{config.train.num_envs} envs, {bodies(world.bodies)}, v = {world.dynamic_speed_m_s} m/s"
         )
         if sys.stderr.isatty():
             from rich.live import Live

@@ -10,7 +10,7 @@ from rich.text import Text
 from uuvtai.endings import plain, say
 from uuvtai.show.screen import Screen
 from uuvtai.tables.method_tables import DAGGER, causes_table, methods_table, paired_table
-from uuvtai.tables.wording import sensing
+from uuvtai.tables.wording import bodies, sensing, vehicle
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
@@ -26,7 +26,7 @@ def show_methods(screen: Screen, result: dict[str, Any]) -> None:
     """Table of methods of a ``uuv eval --json`` document, and what belongs below it."""
     speed = f"v = {result['v_m_s']} m/s, " if result["D"] else ""
     title = (
-        f"{result['world']}: S = {result['S']}, D = {result['D']}, {speed}{sensing(result)}, "
+        f"{result['world']}: {bodies(result)}, {speed}{vehicle(result)}{sensing(result)}, "
         f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x "
         f"{result['episodes_per_seed']} episodes"
     )

@@ -3,6 +3,7 @@ units and sources."""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import json
 import re
@@ -16,6 +17,7 @@ from uuvtai.files import read_text
 from uuvtai.shipped import KINDS, preset_names, shipped_file
 from uuvtai.show.screen import Screen
 from uuvtai.tables.table import Column, Table
+from uuvtai.tables.wording import bodies
 
 _PRESETS = (Column("", left=True), Column("", prose=True))
 _MAX_BYTES = 1 << 20
@@ -69,6 +71,11 @@ def show_stated(kind: str, name: str, as_json: bool) -> None:
         typer.echo(json.dumps({"schema": 1, "text": text}, allow_nan=False))
         return
     typer.echo(text)
+    if kind == "world":
+        with contextlib.suppress(loader.ConfigError):  # a file is shown although it cannot be used
+            told = bodies(loader.load_config(name).world.bodies)
+            vehicle, sensors = (loader.preset_of(other, name, None) for other in ("vehicle", "sensors"))
+            say(f"{told}, vehicle {vehicle}, sensors {sensors}")
     if (base := loader.base_of(path)) is not None:
         say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
 

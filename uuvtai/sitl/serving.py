@@ -14,6 +14,7 @@ import numpy as np
 
 from uuvtai import signals
 from uuvtai.config import Config
+from uuvtai.config.section import folded_seed
 from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import Address, Endpoint, LinkPlace, place_of
 from uuvtai.link.link_errors import LinkError
@@ -179,7 +180,7 @@ def serve_water(
 ) -> dict[str, Any]:
     """Serve until Ctrl-C, ``seconds`` or ``once``; the document of ``uuv sitl --json``. Raises LinkError,
     SettingError."""
-    water = WaterRows(Sim(config, plan.instances, tree), plan.seed, plan.episode)
+    water = WaterRows(Sim(config, plan.instances, tree), folded_seed(plan.seed), plan.episode)
     ports: list[SitlPort] = []
     begun = time.monotonic()
     try:

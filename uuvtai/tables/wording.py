@@ -34,6 +34,20 @@ def sensing(result: Mapping[str, Any]) -> str:
     return f"{result['sensors']} sensing" + (f", {where}" if where else "")
 
 
+def bodies(result: Mapping[str, Any], resting: str = "", moving: str = "") -> str:
+    """'S = 11 (3 fixed), D = 6' of a result, or of a world; old versions did not count the fixed ones."""
+    told = []
+    for name, fixed, kind in (("S", "fixed_static", resting), ("D", "fixed_moving", moving)):
+        explicit = f" ({result[fixed]} fixed)" if result.get(fixed) else ""
+        told.append(f"{name} = {result[name]}{explicit}{kind}")
+    return ", ".join(told)
+
+
+def vehicle(result: Mapping[str, Any]) -> str:
+    """'vehicle bluerov2, ', '' of results of old versions."""
+    return f"vehicle {result['vehicle']}, " if result.get("vehicle") else ""
+
+
 def number(value: float | None, digits: int = 1) -> str:
     """Fixed digits, thousands apart."""
     return "-" if value is None else f"{value:,.{digits}f}"

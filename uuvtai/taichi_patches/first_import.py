@@ -3,6 +3,7 @@ for each searches all loaded modules for the source of the frame around it."""
 
 from __future__ import annotations
 
+import os
 import sys
 
 _MODULE = "taichi.lang.kernel_impl"
@@ -39,6 +40,11 @@ class TaichiFinder:
 
 
 def watch_for_taichi() -> None:
-    """Have Taichi patched when it is imported, unless it is there already."""
+    """Have Taichi patched when it is imported, unless it is there already. Without a home folder its C++ ends
+    the process: where the environment names none, it is the system's entry, or else the current folder."""
+    if not os.environ.get("HOME"):
+        os.environ.pop("HOME", None)
+        home = os.path.expanduser("~")
+        os.environ["HOME"] = os.getcwd() if home == "~" else home
     if _MODULE not in sys.modules and not any(isinstance(one, TaichiFinder) for one in sys.meta_path):
         sys.meta_path.insert(0, TaichiFinder())  # type: ignore[arg-type]

@@ -8,6 +8,8 @@ kernels for each of some 270 arrays.
 import ctypes
 import dataclasses
 import math
+import mmap
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +22,8 @@ from uuvtai.state import PACKET
 if TYPE_CHECKING:
     import torch
 
+_MADV_DONTNEED = 4
+"""of Linux: private memory reads as zero afterwards"""
 Put = Callable[[Any, np.ndarray], None]
 """Fills a field from an array of its shape (vectors add a last axis) and dtype."""
 
@@ -131,6 +135,22 @@ class Memory:
             import torch
 
             self._on_device().copy_(torch.from_numpy(content))
+
+    def clear(self) -> None:
+        """All zero, as new; the system gets the pages back where it takes them."""
+        if self.device.type != "cpu":
+            self._on_device().zero_()
+            return
+        content, page = self.read(), mmap.PAGESIZE
+        begin = -self.address % page
+        count = max(0, (self.n_bytes - begin) // page) * page
+        if sys.platform == "linux" and count:
+            free = ctypes.CDLL(None).madvise
+            free.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+            if free(self.address + begin, count, _MADV_DONTNEED) == 0:
+                content[:begin], content[begin + count :] = 0, 0
+                return
+        content[:] = 0
 
     def rows(self, field: Any, rows: list[int] | slice) -> np.ndarray:
         """Copy of these rows of a field, shape (len(rows), ...), vectors with a last axis. CPU

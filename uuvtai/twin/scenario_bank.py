@@ -51,6 +51,7 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
             rows = drawn(sim, scene, seed, count)
             parts.append((*rows, torch.full((count,), len(names), dtype=torch.int32)))
             names.append(f"{Path(world).stem}_{scene[1]}_{scene[2]:g}")
+        sim.close()
     widest = [max(part[i].shape[1] for part in parts) for i in range(2)]
     rest = max(part[0].shape[1] - part[1].shape[1] for part in parts)
     body = torch.cat([_padded(part[0], rest + widest[1], part[1].shape[1], rest) for part in parts])

@@ -175,9 +175,8 @@ def _compared(comparison: Comparison, folder: RunFolder) -> dict[str, Any]:
     scenarios = scenarios_of(comparison.any_simulator(), jobs)
     if ORACLE in request.controllers:
         entries.append(_ask_oracle(comparison, jobs, scenarios))
-    result = document(
-        request.config, request.world, request.sensors, request.seeds, request.episodes, entries
-    )
+    named = request.world, request.sensors, request.vehicle
+    result = document(request.config, *named, request.seeds, request.episodes, entries)
     result |= {"remainder": remainder_of(entries), "scenarios_sha256": scenarios_sha256(scenarios)}
     _write_results(folder, result, runs)
     if request.explain:

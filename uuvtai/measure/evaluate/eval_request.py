@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.config import Config
 from uuvtai.files import read_text
-from uuvtai.loader import ConfigError, read_preset, sensors_of, validated
+from uuvtai.loader import ConfigError, preset_of, read_preset, validated
 from uuvtai.own.piece_spec import is_piece, piece_spec
 from uuvtai.run_folder import RunFolderError
 
@@ -43,6 +43,8 @@ class Request:
     of the user's (``own.piece_spec``)"""
     seeds: list[int]
     episodes: int
+    vehicle: str = ""
+    """name of its preset; of old requests ''"""
     policies: tuple[str, ...] = ()
     """run folders or checkpoint folders"""
     num_envs: int | None = None
@@ -62,8 +64,8 @@ class Request:
 
         config = scene.config(features_of(policies) if policies else [])
         world = scene.world_name
-        sensors = sensors_of(world, scene.sensors)
-        return cls(config=config, world=world, sensors=sensors, policies=tuple(policies), **rest)
+        named = {kind: preset_of(kind, world, getattr(scene, kind)) for kind in ("sensors", "vehicle")}
+        return cls(config=config, world=world, **named, policies=tuple(policies), **rest)
 
 
 class _Document(BaseModel):
@@ -75,6 +77,7 @@ class _Document(BaseModel):
     config: dict[str, Any]
     world: str
     sensors: str
+    vehicle: str = ""
     controllers: list[str]
     seeds: list[int] = Field(min_length=1)
     episodes: int = Field(ge=1)

@@ -85,16 +85,22 @@ def tree_use(sim: Sim, results: list[EpisodeResult]) -> list[dict[str, Any]]:
 
 
 def document(
-    config: Config, world: str, sensors: str, seeds: list[int], episodes: int, methods: list[dict[str, Any]]
+    config: Config,
+    world: str,
+    sensors: str,
+    vehicle: str,
+    seeds: list[int],
+    episodes: int,
+    methods: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """The whole ``uuv eval --json`` document."""
     return {
         "schema": 1,
         "world": world,
-        "S": config.world.n_static,
-        "D": config.world.n_dynamic,
+        **config.world.bodies,
         "v_m_s": config.world.dynamic_speed_m_s,
         "sensors": sensors,
+        "vehicle": vehicle,
         "localization": config.sensors.localization,
         "seeds": seeds,
         "episodes_per_seed": episodes,

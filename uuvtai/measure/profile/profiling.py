@@ -95,8 +95,7 @@ def _row(
     return {
         "num_envs": sim.num_envs,
         "controller": controller,
-        "S": config.world.n_static,
-        "D": config.world.n_dynamic,
+        **config.world.bodies,
         "depth_every": config.sensors.depth.period_steps,
         "env_steps_per_s": {"step": step, "tree": driven},
         "compile_s": compile_s,
