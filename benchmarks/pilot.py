@@ -203,6 +203,6 @@ def flown(job: Job) -> Row:
             job.say(f"VIOLATION {text}")
         wrong += found
     return Row(
-        f"{count} flights with faults: orders outside the limits, in hold, by old values, against the operator",
+        f"{count} flights with faults: orders beyond limits, while held, by old values, against the operator",
         len(wrong), "violations", less_is_better=True, floor=0, details={"violations": wrong},
     )  # fmt: skip
