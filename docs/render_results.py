@@ -1,13 +1,14 @@
-"""README's tables and the page of results, from the results in docs/data, and the table of safety rules:
-``python -m docs.render_results``.
+"""Tables of the pages and the page of results, from committed results: ``python -m docs.render_results``.
 
 ``--check`` changes nothing and lists what differs. ``--keep RUN`` first takes in a finished run: of
-``uuv reproduce``, or with ``--row NAME`` of the ``uuv eval --explain`` that the row's command gives.
+``uuv reproduce``, with ``--row NAME`` of the ``uuv eval --explain`` that the row's command gives, or with
+``--sweep NAME`` of the ``uuv sweep`` that docs/data/sweeps.json gives.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import difflib
 import json
 import re
@@ -17,18 +18,24 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.link.safety import RULES
-from uuvtai.measure.reproduce.claims import pooled
+from uuvtai.measure.reproduce import paper
+from uuvtai.measure.reproduce.claims import ends_of, pooled
 from uuvtai.measure.reproduce.markdown import results_page
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
-from uuvtai.outcomes import COLLIDED
-from uuvtai.tables.heatmap import cell_name
+from uuvtai.outcomes import COLLIDED, ENDINGS, LETTERS
+from uuvtai.tables.heatmap import cell_name, place_of
 from uuvtai.tables.table import text_table
+from uuvtai.tables.wording import seconds
 
 Document = dict[str, Any]
+Cells = list[Document]
 
 ROOT = Path(__file__).resolve().parents[1]
 EVALUATIONS, REPRODUCTION = "docs/data/evaluations_90007.json", "docs/data/reproduce.json"
-README, RESULTS, SAFETY = "README.md", "docs/results.md", "docs/safety.md"
+SWEEPS, BENCHMARKS = "docs/data/sweeps.json", "benchmarks/results"
+README, RESULTS = "README.md", "docs/results.md"
+ROBUSTNESS, BASELINES, SPEEDS = "docs/robustness.md", "docs/baselines.md", "benchmarks/README.md"
+SAFETY = "docs/safety.md"
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(?P<foot>^<!-- end -->)", re.M | re.S
 )
@@ -39,8 +46,9 @@ LITERATURE = {"mppi", "dwa", "potential_field", "velocity_obstacle"}
 # ----------------------------------------------------------------------------------------------------- README
 
 
-def measured(document: Document) -> str:
+def measured(root: Path) -> str:
     """The lines above README's table."""
+    document = _read(root / EVALUATIONS)
     seed = document["seed"]
     seen = (
         "This seed was looked at while tuning."
@@ -56,8 +64,9 @@ def measured(document: Document) -> str:
     )
 
 
-def evaluations(document: Document) -> str:
+def evaluations(root: Path) -> str:
     """README's table: the tree in every world, other agents beside it, and why the rest failed."""
+    document = _read(root / EVALUATIONS)
     head = [
         "world (D, v in m/s)",
         "success",
@@ -69,7 +78,7 @@ def evaluations(document: Document) -> str:
         "`straight`",
         "most frequent causes of failure",
     ]
-    shown = [row for row in document["rows"] if LITERATURE.isdisjoint(row["methods"])]
+    shown = [row for row in document["rows"] if row["methods"] and LITERATURE.isdisjoint(row["methods"])]
     return text_table(head, [_evaluated(row) for row in shown])
 
 
@@ -95,22 +104,169 @@ def _percent(method: Document, *outcomes: str) -> str:
     return f"{100 * pooled([method], *outcomes).rate:.1f}"
 
 
-def safety_rules(document: Document) -> str:
-    """The table of ``uuv pilot``'s rules, as they are in the code."""
-    rows = []
+# --------------------------------------------------------------------------------------------- other pages
+
+
+def local_planners(root: Path) -> str:
+    """Planners of the literature and the paper's stack beside the tree."""
+    rows = {row["name"]: row for row in _read(root / EVALUATIONS)["rows"]}
+    worlds = [rows[name] for name in ("pool_6_local", "pool_9_fast_local", "gauntlet_9_fast_local")]
+    worlds[0] = worlds[0] | {
+        "methods": worlds[0]["methods"] | {"paper": rows["pool_6_paper"]["methods"]["paper"]},
+        "paired": [*worlds[0]["paired"], *rows["pool_6_paper"]["paired"]],
+    }
+    names = ("bt", "capped", "paper", "mppi", "dwa", "potential_field", "velocity_obstacle")
+    lines = [[f"`{name}`", *(_beside_bt(row, name) for row in worlds)] for name in names]
+    return text_table(["", *(row["title"] for row in worlds)], lines)
+
+
+def _beside_bt(row: Document, name: str) -> str:
+    if name not in row["methods"]:
+        return "-"
+    own = row["methods"][name]
+    said = f"{_both(own)}, {own['time_to_success_mean_s']:.1f} s"
+    pair = next((pair for pair in row["paired"] if {pair["a"], pair["b"]} == {"bt", name}), None)
+    return said + (f", p = {pair['mcnemar_p']:.2g}" if pair else "")
+
+
+def _both(method: Document) -> str:
+    return f"{_percent(method, 'success')} / {_percent(method, *COLLIDED)}"
+
+
+def grid(root: Path) -> str:
+    """The paper's grid in two worlds: rates over many cells, and cells without a collision."""
+    pool, gauntlet = (_cells(root, name) for name in ("pool", "gauntlet"))
+    moderate = "S <= 8, D <= 9, v <= 1.5"
+    theirs = f"{paper.WITHOUT_COLLISION} of {paper.MODERATE_CONDITIONS}"
+    few, corner = [c for c in pool if c["D"] <= paper.FEW_MOVERS], [c for c in pool if _is_corner(c)]
+    lines = [
+        [f"`pool`, {moderate}: the paper", f"{100 * paper.MODERATE_SUCCESS:.1f} %",
+         f"{100 * paper.MODERATE_COLLISION:.1f} %", "", theirs],
+        *_by_method(_moderate(pool), f"`pool`, {moderate}", True),
+        ["`pool`, D <= 3, all S and v: the paper", "",
+         f"below {100 * paper.FEW_MOVERS_COLLISION:.1f} %", "", ""],
+        *_by_method(few, "`pool`, D <= 3, all S and v"),
+        *_by_method(corner, "the corner S = 12, D = 15, v = 3.0"),
+        *_by_method(_moderate(gauntlet), f"`gauntlet`, {moderate}", True),
+        *_by_method(gauntlet, "`gauntlet`, all cells"),
+    ]  # fmt: skip
+    head = ["", "success", "collision", "weighted as the paper's 40 conditions", "cells without a collision"]
+    return text_table(head, lines)
+
+
+def _by_method(cells: Cells, where: str, weighted: bool = False) -> list[list[str]]:
+    return [
+        [
+            f"{where}: `{method}`",
+            str(pooled(own, "success")),
+            str(pooled(own, *COLLIDED)).partition(" = ")[2],
+            _weighted(own) if weighted else "",
+            f"{sum(not any(cell['outcomes'][o] for o in COLLIDED) for cell in own)} of {len(own)}",
+        ]
+        for method, own in _of_methods(cells).items()
+    ]
+
+
+def _of_methods(cells: Cells) -> dict[str, Cells]:
+    names = sorted({cell["method"] for cell in cells}, key=lambda name: (name != "bt", name))
+    return {name: [cell for cell in cells if cell["method"] == name] for name in names}
+
+
+def _weighted(cells: Cells) -> str:
+    """Success / collision [%] where a cell in which nothing moves counts once for each of the paper's five
+    speeds."""
+    weights = [5 if cell["v_m_s"] is None else 1 for cell in cells]
+    rates = [
+        sum(w * pooled([cell], *ends).rate for w, cell in zip(weights, cells, strict=True)) / sum(weights)
+        for ends in (("success",), COLLIDED)
+    ]
+    return " / ".join(f"{100 * share:.1f}" for share in rates)
+
+
+def _moderate(cells: Cells) -> Cells:
+    return [cell for cell in cells if all((cell[name] or 0) <= most for name, most in paper.MODERATE.items())]
+
+
+def _is_corner(cell: Document) -> bool:
+    return all(cell[name] == value for name, value in paper.CORNER.items())
+
+
+def caution(root: Path) -> str:
+    """The tree from fast to careful, over the paper's moderate conditions."""
+    cells, lines = _moderate(_cells(root, "caution")), []
+    for value in dict.fromkeys(cell["teacher.caution"] for cell in cells):
+        own = [cell for cell in cells if cell["teacher.caution"] == value]
+        (row,) = _by_method(own, "", True)
+        arrived = sum(cell["outcomes"]["success"] for cell in own)
+        total_s = sum(cell["outcomes"]["success"] * (cell["time_to_success_mean_s"] or 0.0) for cell in own)
+        named = f"{value}" + (" (default)" if value == 1.0 else "")
+        lines.append([named, *row[1:4], seconds(total_s / arrived if arrived else None)])
+    return text_table(["caution", "success", "collision", "weighted", "time to success"], lines)
+
+
+def one_at_a_time(root: Path) -> str:
+    """What else may go wrong: a row a change, each a cell of its own."""
+    lines: dict[str, dict[str, list[str]]] = {}
+    for name in ("robustness", "dead_reckoning"):
+        for cell in _cells(root, name):
+            changes = [f"`{axis}={cell[axis]}`" for axis in place_of(cell)]
+            shown = [
+                str(pooled([cell], "success")).partition(" = ")[2],
+                str(pooled([cell], *COLLIDED)).partition(" = ")[2],
+                str(cell["outcomes"]["timeout"]),
+                seconds(cell["time_to_success_mean_s"]),
+            ]
+            lines.setdefault(", ".join(changes) or "nothing", {})[cell["method"]] = shown
+    columns = ["success [95 %]", "collision [95 %]", "timeouts", "time"]
+    head = ["changed", *(f"`{m}`: {c}" if c == columns[0] else c for m in ("bt", "best") for c in columns)]
+    return text_table(head, [[name, *row["bt"], *row["best"]] for name, row in lines.items()])
+
+
+def speeds(root: Path) -> str:
+    """The newest kept speeds, each with its date and the commit that was timed."""
+    kept = {}
+    for path in sorted((root / BENCHMARKS).glob("*.json")):
+        _date, device, what = path.stem.split("_", 2)
+        kept[what, device] = _read(path)
+    lines = [
+        [f"`{what}`", row["what"], _figure(row["ours"], row["unit"]), _peer(row), document["date"][:10],
+         document["commit"][:7], f"{document['machine'].get('gpu', document['machine']['device'])}"]
+        for (what, device), document in sorted(kept.items()) if what in TIMED
+        for row in document["rows"][: TIMED[what]]
+    ]  # fmt: skip
+    return text_table(["benchmark", "what", "here", "peer", "measured", "commit", "device"], lines)
+
+
+TIMED = {"scale": 3, "own": 2, "sonar": 2, "clearance": 2, "dynamics": 2, "route": 2, "tick": 1, "paced": 2}
+"""benchmarks of speed, and how many of their rows the page shows"""
+
+
+def _figure(value: float, unit: str) -> str:
+    return f"{value:,.0f} {unit}" if value >= 100 else f"{value:.2f} {unit}"
+
+
+def _peer(row: Document) -> str:
+    return "-" if row["peer"] is None else f"{_figure(row['peer'], '').strip()} ({row['peer_name']})"
+
+
+def safety_rules(root: Path) -> str:
+    """The rules of ``uuv pilot``, as they are in the code."""
+    lines = []
     for rule in RULES:
         actions = (
             action.name.lower().replace("_", " ") + (f" after {seconds:g} s" if seconds else "")
             for seconds, action in rule.actions
         )
-        rows.append(f"| {rule.name} | {rule.meaning} | {', '.join(actions)} | `-k {rule.case}` |")
-    return "\n".join(["| what | when | action | its test |", "| --- | --- | --- | --- |", *rows])
+        lines.append([rule.name, rule.meaning, ", ".join(actions), f"`-k {rule.case}`"])
+    return text_table(["what", "when", "action", "its test"], lines)
 
 
-TABLES: dict[str, Callable[[Document], str]] = {
-    "measured": measured,
-    "evaluations": evaluations,
-    "safety_rules": safety_rules,
+TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
+    README: {"measured": measured, "evaluations": evaluations},
+    ROBUSTNESS: {"grid": grid, "caution": caution, "one_at_a_time": one_at_a_time},
+    BASELINES: {"local_planners": local_planners},
+    SPEEDS: {"speeds": speeds},
+    SAFETY: {"safety_rules": safety_rules},
 }
 
 
@@ -118,16 +274,19 @@ TABLES: dict[str, Callable[[Document], str]] = {
 
 
 def pages(root: Path = ROOT) -> dict[str, str]:
-    """What README, the page of results and the page of safety should say, by path."""
-    shown, reproduced = (json.loads((root / name).read_text("utf-8")) for name in (EVALUATIONS, REPRODUCTION))
-    readme, safety = (
-        TABLE.sub(
-            lambda found: f"{found['head']}{TABLES[found['name']](shown)}\n{found['foot']}",
-            (root / name).read_text("utf-8"),
+    """What the pages should say, by path."""
+    found = {
+        page: TABLE.sub(
+            lambda found, made=made: f"{found['head']}{made[found['name']](root)}\n{found['foot']}",
+            (root / page).read_text("utf-8"),
         )
-        for name in (README, SAFETY)
-    )
-    return {README: readme, RESULTS: results_page(reproduced), SAFETY: safety}
+        for page, made in TABLES.items()
+    }
+    return found | {RESULTS: results_page(_read(root / REPRODUCTION))}
+
+
+def _read(path: Path) -> Document:
+    return json.loads(path.read_text("utf-8"))
 
 
 def differences(root: Path = ROOT) -> list[str]:
@@ -146,9 +305,7 @@ def differences(root: Path = ROOT) -> list[str]:
 
 def keep_row(name: str, run: Path, root: Path = ROOT) -> None:
     """Put the agents of an evaluation in their row. Raises ValueError for an unknown row."""
-    files = ("eval/result.json", "run.json")
-    result, record = (json.loads((run / file).read_text("utf-8")) for file in files)
-    document = json.loads((root / EVALUATIONS).read_text("utf-8"))
+    result, record, document = map(_read, (run / "eval/result.json", run / "run.json", root / EVALUATIONS))
     row = next((row for row in document["rows"] if row["name"] == name), None)
     if row is None:
         raise ValueError(f"no row {name!r}; there are {', '.join(row['name'] for row in document['rows'])}")
@@ -164,7 +321,7 @@ def keep_row(name: str, run: Path, root: Path = ROOT) -> None:
 
 def keep_reproduction(run: Path, root: Path = ROOT) -> None:
     """Keep what the page of results needs of a reproduction."""
-    document = json.loads((run / "reproduce.json").read_text("utf-8"))
+    document = _read(run / "reproduce.json")
     names = ("schema", "budget", "seed", "notes", "started", "git_sha", "hardware", "commands", "claims")
     small = {name: document[name] for name in (*names, "inconsistencies") if name in document}
     small["table_main"] = {
@@ -183,7 +340,7 @@ def keep_reproduction(run: Path, root: Path = ROOT) -> None:
     _write(root / REPRODUCTION, small)
 
 
-_KEPT = ("name", "episodes", "outcomes", "time_mean_s", "time_to_success_mean_s", "causes")
+_KEPT = ("name", "episodes", "outcomes", "ends", "time_mean_s", "time_to_success_mean_s", "causes")
 
 
 def _kept(entry: Document) -> Document:
@@ -193,7 +350,60 @@ def _kept(entry: Document) -> Document:
 def _small_sweep(sweep: Document) -> Document:
     names = {cell_name(axis) for axis in sweep["axes"]} | {"S", "D", "v_m_s", "method", *_KEPT}
     rest = {name: sweep[name] for name in ("axes", "one_at_a_time", "unchanged") if name in sweep}
-    return rest | {"cells": [{k: cell[k] for k in cell if k in names} for cell in sweep["cells"]]}
+    return rest | {
+        "cells": [{k: cell[k] for k in cell if k in names} | _ends(cell) for cell in sweep["cells"]]
+    }
+
+
+def _ends(cell: Document) -> dict[str, str]:
+    """How its episodes ended, a letter each; nothing where that was not kept."""
+    ends = ends_of(cell)
+    return {"ends": "".join(LETTERS[end] for end in ends.values())} if ends else {}
+
+
+_COUNTS = dict(zip(("success", "contact", "ttc_stop", "out_of_tank", "timeout"), ENDINGS, strict=True))
+"""columns of a kept sweep"""
+
+
+def keep_sweep(name: str, run: Path, root: Path = ROOT) -> None:
+    """Keep the cells of a sweep, and how each episode ended. Raises KeyError for an unknown sweep."""
+    sweep, record, known = map(_read, (run / "sweep.json", run / "run.json", root / SWEEPS))
+    how = {"commit": record["git_sha"], "date": record["started"], "cpu": record["hardware"]["cpu"]}
+    known[name] |= how | {"episodes": sweep["episodes_per_seed"], "seeds": sweep["seeds"]}
+    axes = [cell_name(axis) for axis in sweep["axes"]]
+    axes = [axis for axis in axes if any(cell.get(axis) is not None for cell in sweep["cells"])]
+    last = "time_to_success_mean_s"
+    with (root / f"docs/data/sweep_{name}.csv").open("w", newline="", encoding="utf-8") as stream:
+        rows = csv.writer(stream, lineterminator="\n")
+        rows.writerow([*axes, "method", "episodes", *_COUNTS, last, "ends"])
+        for cell in sweep["cells"]:
+            values = ["" if cell.get(axis) is None else cell[axis] for axis in axes]
+            counts = [cell["outcomes"][end] for end in _COUNTS.values()]
+            mean_s = cell[last] if cell[last] is None else round(cell[last], 2)
+            rows.writerow(
+                [*values, cell["method"], cell["episodes"], *counts, mean_s, _ends(cell).get("ends")]
+            )
+    _write(root / SWEEPS, known)
+
+
+def _cells(root: Path, name: str) -> Cells:
+    """Of a kept sweep, as ``uuv sweep --json`` has them."""
+    with (root / f"docs/data/sweep_{name}.csv").open(encoding="utf-8") as stream:
+        return [_cell(row) for row in csv.DictReader(stream)]
+
+
+def _cell(row: dict[str, str]) -> Document:
+    outcomes = {end: int(row.pop(column)) for column, end in _COUNTS.items()}
+    ends = {name: row.pop(name, "") for name in ("method", "ends")}
+    ends = {name: text for name, text in ends.items() if text}
+    return {name: _value(text) for name, text in row.items()} | ends | {"outcomes": outcomes}
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text) if text else None
+    except ValueError:
+        return text
 
 
 def _write(path: Path, document: Document) -> None:
@@ -211,10 +421,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="change nothing, list what differs")
     parser.add_argument("--keep", type=Path, metavar="RUN", help="run folder whose results to keep")
     parser.add_argument("--row", help="row of README's table that the kept run evaluated")
+    parser.add_argument("--sweep", help="sweep of docs/data/sweeps.json that the kept run is")
     chosen = parser.parse_args(arguments)
     if chosen.keep:
         try:
-            keep_row(chosen.row, chosen.keep) if chosen.row else keep_reproduction(chosen.keep)
+            if chosen.sweep:
+                keep_sweep(chosen.sweep, chosen.keep)
+            else:
+                keep_row(chosen.row, chosen.keep) if chosen.row else keep_reproduction(chosen.keep)
         except (OSError, ValueError, KeyError) as error:
             print(f"{chosen.keep}: not kept: {error}", file=sys.stderr)
             return 1

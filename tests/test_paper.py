@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from uuvtai.config import TankConfig
 from uuvtai.config.learning import LearningConfig
+from uuvtai.kernels.vehicle.rotor import KGF, thrust_limits
+from uuvtai.learn.world_model import LOG_VAR_BOUNDS
 from uuvtai.loader import STACK_SECTIONS, load_config, load_training, with_stack
 
 PAGE = (Path(__file__).parents[1] / "docs/paper.md").read_text()
@@ -70,6 +73,21 @@ def test_learning_is_as_listed(key):
         values(config)[key]
         for config in (LearningConfig(), load_training("curriculum"), load_training("paper"))
     ]
+
+
+def test_values_that_the_page_names_are_those_of_the_preset():
+    named = re.findall(r"`(\w+\.\w+)` = ([\d.]+)", PAGE)
+    assert len(named) >= 3
+    assert all(values(load_training("paper"))[key] == float(value) for key, value in named)
+    v = load_training("paper").vehicle
+    assert f"{thrust_limits(v)[0]:.1f} N at {v.rotor_max_rpm:.0f} rpm" in PAGE
+    assert f"K_F n^2 is {4.4e-7 * v.rotor_max_rpm**2 * KGF:.1f} N" in PAGE
+    assert [high - low for low, high in (TankConfig().x_m, TankConfig().y_m, TankConfig().z_m)] == [
+        20,
+        6,
+        1.6,
+    ]
+    assert f"{LOG_VAR_BOUNDS[0]:.0f} .. {LOG_VAR_BOUNDS[1]:.0f}" in PAGE
 
 
 def test_the_papers_own_numbers_are_the_presets():

@@ -7,23 +7,37 @@ import shutil
 import pytest
 
 from docs import render_results
-from docs.render_results import EVALUATIONS, README, REPRODUCTION, RESULTS, ROOT, SAFETY
+from docs.render_results import (
+    BASELINES,
+    BENCHMARKS,
+    EVALUATIONS,
+    README,
+    REPRODUCTION,
+    RESULTS,
+    ROBUSTNESS,
+    ROOT,
+    SPEEDS,
+    SWEEPS,
+)
 from tests.test_docs import fault
+from uuvtai.measure.reproduce.claims import Share
 
 
 def test_the_pages_are_those_of_the_results(capsys):
     """Where this fails: ``python -m docs.render_results``."""
     assert render_results.differences() == []
     assert render_results.main(["--check"]) == 0
-    tables = render_results.TABLE.findall((ROOT / README).read_text() + (ROOT / SAFETY).read_text())
-    assert {name for _head, name, _body, _foot in tables} == set(render_results.TABLES)
+    for page, wanted in render_results.TABLES.items():
+        tables = render_results.TABLE.findall((ROOT / page).read_text())
+        assert [name for _head, name, _body, _foot in tables] == list(wanted)
 
 
 @pytest.fixture
 def copy(tmp_path, monkeypatch):
     """Pages and results in a folder of their own."""
-    for name in (README, RESULTS, SAFETY, EVALUATIONS, REPRODUCTION):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    for name in ("docs/data", BENCHMARKS):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    for name in (*render_results.TABLES, RESULTS):
         shutil.copy(ROOT / name, tmp_path / name)
     return tmp_path
 
@@ -33,7 +47,10 @@ def copy(tmp_path, monkeypatch):
     [
         (README, "| `pool` (6, 0.6) | 990/1000 = 99.0 %", "| `pool` (6, 0.6) | 991/1000 = 99.1 %"),
         (README, "of seed 90007", "of seed 90001"),
-        (RESULTS, "| holds |", "| does not hold |"),
+        (RESULTS, "| withdrawn |", "| holds |"),
+        (ROBUSTNESS, "2037/2048 = 99.5 %", "2048/2048 = 100.0 %"),
+        (BASELINES, "| `paper` | 93.0 / 7.0", "| `paper` | 83.0 / 7.0"),
+        (SPEEDS, "| 2026-11-22 | 46e0ba7 |", "| 2026-11-27 | 46e0ba7 |"),
     ],
 )
 def test_a_cell_that_was_changed_by_hand_is_caught(copy, page, cell, changed):
@@ -57,8 +74,38 @@ def test_results_that_move_on_leave_the_pages_behind(copy):
 
 def test_a_seed_that_was_tuned_on_is_called_so(copy):
     document = json.loads((copy / EVALUATIONS).read_text())
-    assert "No tuning used this seed" in render_results.measured(document)
-    assert "was looked at while tuning" in render_results.measured(document | {"seed": 90001})
+    assert "No tuning used this seed" in render_results.measured(copy)
+    (copy / EVALUATIONS).write_text(json.dumps(document | {"seed": 90001}))
+    assert "was looked at while tuning" in render_results.measured(copy)
+
+
+def test_the_newest_speed_of_a_kind_is_shown_with_its_date_and_commit(copy):
+    new = json.loads((copy / BENCHMARKS / "2026-11-22_cpu_tick.json").read_text())
+    new |= {"date": "2026-12-01T00:00:00+0000", "commit": "abcdef0123"}
+    (copy / BENCHMARKS / "2026-12-01_cpu_tick.json").write_text(json.dumps(new))
+    (row,) = [line for line in render_results.speeds(copy).splitlines() if line.startswith("| `tick` |")]
+    assert "| 2026-12-01 | abcdef0 | cpu |" in row
+
+
+def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
+    """Then rates over many cells have an interval, by episode number."""
+    assert "`bt` | 2037/2048 = 99.5 % |" in render_results.grid(copy), "without: none"
+    cells = [
+        {"S": 8, "D": d, "v_m_s": v, "method": "bt", "episodes": 40, "time_to_success_mean_s": 9.0,
+         "outcomes": {"success": 39, "collision": 0, "ttc": 1, "out_of_tank": 0, "timeout": 0},
+         "episode_outcomes": ["ttc", *["success"] * 39]}
+        for d, v in ((0, None), (9, 0.6), (9, 1.5))
+    ]  # fmt: skip
+    document = {"axes": {"S": [8], "D": [0, 9], "v": [0.6, 1.5]}, "seeds": [7], "episodes_per_seed": 40}
+    (tmp_path / "sweep.json").write_text(json.dumps(document | {"cells": cells}))
+    record = {"git_sha": "abc", "started": "today", "hardware": {"cpu": "a"}}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    render_results.keep_sweep("pool", tmp_path, copy)
+    assert json.loads((copy / SWEEPS).read_text())["pool"]["commit"] == "abc"
+    low, high = Share(39, 40).interval
+    assert f"`bt` | 117/120 = 97.5 % [{100 * low - 1:.0f}" in render_results.grid(copy), (low, high)
+    with pytest.raises(KeyError):
+        render_results.keep_sweep("puddle", tmp_path, copy)
 
 
 def test_every_row_says_how_it_can_be_evaluated_again():
@@ -100,7 +147,7 @@ def test_an_evaluation_is_kept_in_its_row_alone(copy, tmp_path):
 def test_a_reproduction_is_kept_as_small_as_it_is(copy, tmp_path):
     document = json.loads((copy / REPRODUCTION).read_text())
     for cell in document["sweeps"]["pool"]["cells"]:
-        cell["episodes_detail"] = [{}]
+        cell["episode_times_s"] = [9.0] * cell["episodes"]
     (tmp_path / "reproduce.json").write_text(json.dumps(document | {"figures": []}))
     render_results.keep_reproduction(tmp_path, copy)
     assert render_results.differences(copy) == []

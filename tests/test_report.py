@@ -384,6 +384,9 @@ def test_an_evaluation_in_between_is_shown_with_its_count_and_interval():
         [*samples.metrics(9), {**samples.metrics(9)[-1], "eval/success_rate": 0.75}],
     )
     assert rows(tables(training([run]))[0])[0][6] == "48/64 = 75.0 % [63.2, 84.0]"
+    of_scenes = {"eval/success_pool_6_0.6": 0.9, "eval/success_pool_9_1.5": 0.6}
+    run = Training("a", run.config, [run.metrics[-1] | of_scenes])
+    assert rows(tables(training([run]))[0])[0][6] == "48/64 = 75.0 %", "scenes share their episodes' numbers"
 
 
 def test_a_training_without_iterations_says_so():

@@ -2,6 +2,7 @@
 
 import json
 import math
+import random
 
 import pytest
 
@@ -128,12 +129,55 @@ def test_who_never_arrives_takes_for_ever():
     assert claims.of_table_main(table_main | {"curriculum": never, "ppo": never})[4].verdict == FAILS
 
 
-def test_training_seeds_are_pooled():
-    assert claims.pooled([entry(50), entry(70, n=200)], "success") == Share(120, 300)
+def ended(word, **more):
+    """An entry whose episodes ended so, a letter each."""
+    return entry(word.count("s"), n=len(word), collision=word.count("c")) | {"ends": word} | more
+
+
+def test_entries_of_the_same_episodes_count_by_episode_number():
+    alike, apart = [ended("sssc" * 10)] * 4, [ended("sssc" * 10), ended("cs" * 20), ended("csss" * 10)]
+    assert claims.pooled(alike[:1], "success").interval == Share(30, 40).interval
+    four = claims.pooled(alike, "success")
+    assert (four.k, four.n, four.counts()) == (120, 160, (27, 36)), "four times the same say hardly more"
+    assert claims.pooled(apart, "success").design < 1.5
+    for form in (
+        {"episode_outcomes": ["success", "success", "success", "collision"] * 10},
+        {"episodes_detail": [{"seed": 1, "episode": i, "outcome": "collision" if i % 4 == 3 else "success"}
+         for i in range(40)]},
+    ):  # fmt: skip
+        told = [{k: v for k, v in e.items() if k != "ends"} | form for e in alike]
+        assert claims.pooled(told, "success") == four
+
+
+def test_the_same_episodes_again_decide_nothing():
+    """Tests over a grid that count each cell for itself would decide all of these."""
+    word = "s" * 29 + "c"
+    once, often = claims.pooled([ended(word)], "success"), claims.pooled([ended(word)] * 32, "success")
+    for test in (claims.at_least, claims.at_most):
+        assert test(Share(often.k, often.n), 0.9).p < 1e-9 and test(often, 0.9).p > 0.1
+    other = claims.pooled([ended("s" * 27 + "ccc")] * 32, "success")
+    assert claims.larger(Share(often.k, often.n), Share(other.k, other.n)).p < 1e-6
+    assert claims.larger(often, other).p == pytest.approx(claims.larger(once, Share(27, 30)).p, rel=0.3)
+    assert claims.near(other, often).p > 0.1 > claims.near(Share(other.k, other.n), Share(often.k, often.n)).p
+
+
+def test_episodes_that_were_not_kept_allow_neither_interval_nor_test():
+    lost = claims.pooled([entry(50), entry(70, n=200)], "success")
+    assert str(lost) == "120/300 = 40.0 %" and lost.interval is None and lost.counts() is None
+    found = [claims.larger(lost, Share(9, 10)), claims.near(lost, Share(5, 10)), claims.at_least(lost, 0.3)]
+    found += [claims.at_most(lost, 0.3), claims.times_as_large(lost, Share(1, 10), 2.0)]
+    assert found == [claims.Finding(OPEN, None)] * 5
 
 
 def cell(n_static, n_dynamic, speed, method="best", **more):
-    return entry(**more) | {"S": n_static, "D": n_dynamic, "v_m_s": speed, "method": method}
+    """Cells of one sweep, whose episodes do not go together."""
+    found = entry(**more)
+    ends = ["success"] * found["outcomes"]["success"] + ["collision"] * found["outcomes"]["collision"]
+    ends += ["timeout"] * found["outcomes"]["timeout"]
+    shuffled = random.Random(f"{n_static} {n_dynamic} {speed}").sample(ends, len(ends))
+    return found | {
+        "S": n_static, "D": n_dynamic, "v_m_s": speed, "method": method, "episode_outcomes": shuffled
+    }  # fmt: skip
 
 
 def test_claims_of_the_sweep_take_the_papers_conditions():
@@ -278,7 +322,10 @@ def printed(arguments):
     policies = [part.rpartition("/")[2] for part in arguments[1:options]]
     if arguments[0] == "eval":
         names = policies + [arguments[i + 1] for i, part in enumerate(arguments) if part == "--controller"]
-        return {"methods": [entry(50) | {"name": name, "episodes_detail": []} for name in names]}
+        details = [
+            {"seed": 1, "episode": i, "outcome": "success" if i < 50 else "timeout"} for i in range(100)
+        ]
+        return {"methods": [entry(50) | {"name": name, "episodes_detail": details} for name in names]}
     if arguments[0] == "sweep":
         cells = [cell(8, 6, 0.6, method=name, success=90) for name in (*policies, "bt")]
         return {"axes": {"S": [8], "D": [6], "v": [0.6]}, "cells": cells}

@@ -107,7 +107,9 @@ def test_the_card_says_where_it_was_judged(whole, kind):
             "the kinematic twin, pool and gauntlet, S = 8, D = 9, v = 1.5 m/s; S = 8, D = 9, v = 1 m/s; "
             in card
         )
-        assert "| 768/1536 = 50.0 %" in card and "| 384/1536 = 25.0 %" in card
+        assert "| 768/1536 = 50.0 % | 384/1536 = 25.0 % |" in card, (
+            "no interval: scenes share their episodes' numbers"
+        )
     assert "the simulator of uuvtai" not in card
 
 

@@ -7,6 +7,7 @@ from uuvtai.measure.evaluate.paired import paired
 from uuvtai.statistics import (
     binomial_p,
     bootstrap_interval,
+    design_effect,
     fisher_p,
     holm_adjusted,
     mcnemar_p,
@@ -45,6 +46,55 @@ def test_no_trials_is_none_not_nan():
 def test_impossible_counts_are_refused(k, n):
     with pytest.raises(ValueError, match="k must lie"):
         wilson_interval(k, n)
+
+
+@pytest.mark.parametrize(
+    ("won", "trials", "effect"),
+    [
+        ([1, 0, 1, 1], [1, 1, 1, 1], 1.0),  # clusters of one: the usual interval, to the last bit
+        ([0, 4, 4, 0] * 8, [4] * 32, 32 / 31 * 4 * (2.0395 / 1.96) ** 2),  # all or none: a cluster is a trial
+        ([2, 2] * 20, [4, 4] * 20, (2.0227 / 1.96) ** 2),  # more alike than chance: never less than 1
+        ([4] * 30, [4] * 30, 4.0),  # all of them: nothing says how far they go together
+        ([0] * 30, [4] * 30, 4.0),
+        ([3], [5], 5.0),  # one cluster is one trial
+        ([], [], 1.0),
+    ],
+)
+def test_design_effect_by_hand(won, trials, effect):
+    """Student's quantiles from a table: 2.0395 for 31 degrees of freedom, 2.0227 for 39."""
+    assert design_effect(won, trials) == pytest.approx(effect, rel=1e-3)
+
+
+def episodes_of_a_grid(rng, n_cell, n_episode, rate, correlation):
+    """(n_cell, n_episode) bool: how hard an episode is counts in all cells (beta-binomial)."""
+    hard = np.full(n_episode, rate)
+    if correlation:
+        scale = 1 / correlation - 1
+        hard = rng.beta(rate * scale, (1 - rate) * scale, n_episode)
+    return rng.random((n_cell, n_episode)) < hard
+
+
+@pytest.mark.parametrize("n_episode", [8, 64])
+@pytest.mark.parametrize(("rate_", "correlation"), [(0.95, 0.0), (0.95, 0.12), (0.8, 0.2), (0.6, 0.05)])
+def test_intervals_over_a_grid_cover_the_rate_as_often_as_they_say(rate_, correlation, n_episode):
+    rng, covered, naive, n = np.random.default_rng(5), 0, 0, 400
+    for _ in range(n):
+        won = episodes_of_a_grid(rng, 32, n_episode, rate_, correlation).sum(axis=0)
+        effect, k, trials = design_effect(list(won), [32] * n_episode), int(won.sum()), 32 * n_episode
+        low, high = wilson_interval(k / effect, trials / effect)
+        covered += low <= rate_ <= high
+        low, high = wilson_interval(k, trials)
+        naive += low <= rate_ <= high
+    assert 0.91 <= covered / n <= 0.995, "95 % nominal; 400 trials have an error of 1.1 %"
+    assert correlation < 0.1 or naive / n < 0.75, "cells taken for independent cover far less"
+
+
+def test_where_episodes_do_not_go_together_the_interval_is_the_usual_one():
+    rng, widths = np.random.default_rng(6), []
+    for _ in range(100):
+        won = episodes_of_a_grid(rng, 32, 200, 0.9, 0.0).sum(axis=0)
+        widths.append(design_effect(list(won), [32] * 200) ** 0.5)
+    assert 1.0 <= np.mean(widths) < 1.06
 
 
 def test_tts_of_the_papers_first_row():

@@ -12,8 +12,9 @@ Z95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal."""
 
 
-def wilson_interval(k: int, n: int) -> tuple[float, float] | None:
-    """95 % Wilson score interval of k successes in n trials (Wilson 1927); None when there are no trials.
+def wilson_interval(k: float, n: float) -> tuple[float, float] | None:
+    """95 % Wilson score interval of k successes in n independent trials (Wilson 1927); None when there are no
+    trials. Trials that go together count as k / ``design_effect`` of n / ``design_effect``.
 
     Raises ValueError unless 0 <= k <= n.
     """
@@ -27,6 +28,35 @@ def wilson_interval(k: int, n: int) -> tuple[float, float] | None:
     half = scale * Z95 * math.sqrt(p * (1 - p) / n + Z95 * Z95 / (4 * n * n))
     # the bounds are exact at the ends; rounding must not leave 0.9999999 for 10/10
     return (0.0 if k == 0 else max(0.0, centre - half), 1.0 if k == n else min(1.0, centre + half))
+
+
+def design_effect(won: Sequence[int], trials: Sequence[int]) -> float:
+    """How many times fewer independent trials would say as much: won[i] of trials[i] in cluster i.
+
+    Trials of one cluster go together, as episodes of one number do in all cells of a grid: same start, same
+    goal, same layout. Ratio of the variance between clusters to the binomial one (Kish 1965), with Student's
+    quantile for few clusters (Korn and Graubard 1998); at least 1, and 1 where no cluster has two trials.
+    Where all or none succeeded nothing says how far trials go together: then a cluster counts as one trial.
+    """
+    n_all, k_all, m = sum(trials), sum(won), len(trials)
+    if n_all == m:
+        return 1.0
+    if m < 2 or k_all in (0, n_all):
+        return n_all / max(1, m)
+    p = k_all / n_all
+    spread = m / (m - 1) * sum((k - p * n) ** 2 for k, n in zip(won, trials, strict=True))
+    return max(1.0, spread / (n_all * p * (1 - p))) * (_student95(m - 1) / Z95) ** 2
+
+
+def _student95(freedom: int) -> float:
+    """Two-sided 95 % quantile of Student's t (Abramowitz and Stegun 26.7.5), to 0.2 % from five on."""
+    z = Z95
+    terms = (
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+    )
+    return z + sum(term / freedom**power for power, term in enumerate(terms, start=1))
 
 
 def rate(k: int, n: int) -> float | None:

@@ -32,10 +32,14 @@ class Evaluation:
     successes: int
     collisions: int
     """contacts, TTC stops and leaving the tank"""
+    repeated: bool = False
+    """worlds or scenes had episodes of the same numbers, which go together; single ends were not kept"""
 
     def rates(self) -> tuple[str, str]:
-        """Success and collision as k/n with their 95 % Wilson intervals."""
-        return _rate(self.successes, self.episodes), _rate(self.collisions, self.episodes)
+        """Success and collision as k/n with their 95 % Wilson intervals; without where episodes are
+        ``repeated``."""
+        n, bare = self.episodes, self.repeated
+        return _rate(self.successes, n, bare), _rate(self.collisions, n, bare)
 
 
 def during_training(checkpoint: Checkpoint) -> Evaluation | None:
@@ -46,7 +50,8 @@ def during_training(checkpoint: Checkpoint) -> Evaluation | None:
         return None
     where, n = _held_out_in_worlds(config) if config.twin.enabled else _held_out(config)
     where += f", seed {config.train.evaluate_seed}"
-    return Evaluation(where, n, round(success * n), round(collision * n))
+    repeated = config.twin.enabled and len(config.twin.worlds) * max(1, len(config.train.scenes)) > 1
+    return Evaluation(where, n, round(success * n), round(collision * n), repeated)
 
 
 def _held_out(config: LearningConfig) -> tuple[str, int]:
@@ -128,10 +133,9 @@ def _word(name: Any) -> str:
     return "".join(c for c in Path(str(name)).stem if c.isalnum() or c in "-_ ") or "unnamed"
 
 
-def _rate(k: int, n: int) -> str:
+def _rate(k: int, n: int, bare: bool) -> str:
     bounds = wilson_interval(k, n)
-    return (
-        "-"
-        if bounds is None
-        else f"{k}/{n} = {100 * k / n:.1f} % [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"
-    )
+    if bounds is None:
+        return "-"
+    share = f"{k}/{n} = {100 * k / n:.1f} %"
+    return share if bare else f"{share} [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"

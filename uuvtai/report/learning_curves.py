@@ -149,13 +149,14 @@ def _points(line: Line) -> list[list[float]]:
 
 def _judged(run: Training) -> str | Cell:
     """Success in the last evaluation in between, with its count and interval; the config says of how many
-    episodes."""
-    shares = [row["eval/success_rate"] for row in run.metrics if _is_number(row.get("eval/success_rate"))]
+    episodes. Without an interval where several scenes have the same episode numbers, which go together."""
+    rows = [row for row in run.metrics if _is_number(row.get("eval/success_rate"))]
+    share = rows[-1]["eval/success_rate"] if rows else None
     n = _section(_config_of(run)).get("evaluate_episodes")
-    if not shares or not isinstance(n, int):
-        return percent(shares[-1] if shares else None)
-    k = round(shares[-1] * n)
-    return rate(k, n, wilson_interval(k, n))
+    if share is None or not isinstance(n, int):
+        return percent(share)
+    k, scenes = round(share * n), [key for key in rows[-1] if key.startswith("eval/success_")]
+    return rate(k, n, None if len(scenes) > 2 else wilson_interval(k, n))
 
 
 def _last(key: str, form: Callable[..., str], *digits: int) -> Callable[[Training], str]:

@@ -42,8 +42,11 @@ def _claims(document: dict[str, Any]) -> str:
     note = (
         "A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, is "
         f"below {LEVEL}; else it cannot be judged. Rates are compared by Fisher's exact test, with a printed "
-        "value by the exact binomial test. Claims without a p value set one number beside another: one run, "
-        "one machine, no test."
+        "value by the exact binomial test. Episodes of one number go together in all cells of a grid: only "
+        "as many count as independent ones would say the same. Where single episodes were not kept, there is "
+        "neither interval nor test. Claims without a p value set one number beside another: one run, one "
+        "machine, no test. The paper's rates are of another simulator: one that is reached says nothing "
+        "about who is better."
     )
     return f"## The paper's claims\n{note}\n\n{markdown(claim_table(document))}"
 

@@ -26,6 +26,7 @@ from uuvtai.measure.reproduce.steps import (
     run_step,
     steps_of,
 )
+from uuvtai.outcomes import LETTERS
 from uuvtai.own.piece_spec import is_piece, piece_spec, refuse_code
 from uuvtai.report.build import report
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
@@ -156,9 +157,11 @@ def _shown(part: str, root: Path) -> str:
 
 
 def _by_preset(main: dict[str, Any], budget: Budget, own: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """Entries of the methods' table by preset, without their single episodes."""
+    """Entries of the methods' table by preset; of their single episodes how each ended."""
     entries = {
-        entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"} for entry in main["methods"]
+        entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"}
+        | {"ends": "".join(LETTERS[e["outcome"]] for e in entry["episodes_detail"])}
+        for entry in main["methods"]
     }
     trained = {
         preset: [entries[f"{preset}-{seed}"] for seed in range(budget.training_seeds)] for preset in TRAINED
