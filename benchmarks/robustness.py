@@ -9,6 +9,7 @@ written elsewhere.
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import resource
@@ -54,7 +55,111 @@ def measure(job: Job) -> list[Row]:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores Ctrl-C
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), job)
-        return [*bench.killed(), *bench.signalled(), *bench.damaged(), *remade(12 if job.quick else 200)]
+        found = [*bench.killed(), *bench.signalled(), *bench.damaged()]
+        found += remade(12 if job.quick else 200)
+    return [*found, *starts(job)]  # last: Taichi's threads do not survive a fork
+
+
+# ---------------------------------------------------------------------------------------- starts of uuv pilot
+
+_WRONG = {"right": (0.0, 0.0), "0.5 m": (0.5, 0.0), "15 degrees": (0.0, 15.0), "both": (0.5, 15.0)}
+"""by how much typed starts and headings are wrong, in directions drawn at random"""
+_RESTS_S, _TURNS_RAD_S = 4.0, 0.35
+"""the vehicle rests, then its operator turns it around"""
+
+
+def starts(
+    job: Job, world: str = "pool", sensors: str = "multibeam", overrides: dict[str, Any] | None = None
+) -> Iterator[Row]:
+    """Starts typed rightly and wrongly, and what the fix makes of them, from the scans of the simulated sonar
+    as MAVLink tells them."""
+    ends = _starts_fixed(world, sensors, 4 if job.quick else 50, overrides or {})
+    for kind, found in ends.items():
+        count, n = Counter(end for end, *_ in found), len(found)
+        for end, told, *_ in found:
+            if end != "fixed":
+                job.say(f"{world}, {sensors}: start wrong by {kind}: {end}: {told}")
+        fixed = [numbers for end, _, *numbers in found if end == "fixed"] or [(math.nan,) * 3]
+        worst = [max(column) for column in zip(*fixed, strict=True)]
+        note = f"worst {worst[0]:.2f} m, {worst[1]:.1f} degrees; last after {worst[2]:.0f} s, "
+        note += f"{sum(numbers[2] <= _RESTS_S for numbers in fixed)} before it was turned"
+        row = f"{world}, {sensors}: start, {kind}" + (" wrong" if kind != "right" else "")
+        least = n if kind == "right" else round(0.9 * n)
+        yield Row(
+            f"{row}: fixed within 0.1 m and 2 degrees", count["fixed"], f"of {n}", floor=least, note=note
+        )
+        yield Row(f"{row}: wrong and accepted", count["wrong"], f"of {n}", less_is_better=True, floor=0)
+
+
+def _starts_fixed(
+    world: str, sensors: str, n: int, overrides: dict[str, Any]
+) -> dict[str, list[tuple[str, str, float, float, float]]]:
+    """By kind, of every start: fixed, wrong or refused; what was found; off by [m, degrees]; after [s]."""
+    import torch
+
+    from uuvtai.link.start_fix import LONGEST_S, StartFix
+    from uuvtai.loader import load_config
+    from uuvtai.sim import Sim
+    from uuvtai.tree import read_tree
+
+    config = load_config(world, sensors, overrides={"sensors.localization": "truth", **overrides})
+    sim, rng = Sim(config, n, read_tree("straight")), random.Random(_SEED)
+    ones, action, dt = torch.ones(n, dtype=torch.int32), torch.zeros(n, 4), config.episode.control_dt_s
+    sim.reset(ones, 77 * ones, torch.arange(n, dtype=torch.int32))
+    memory = sim.memory()
+    views = memory.views(memory.read(), scratch=True)
+    waiting, ends = [], {kind: [("", "", 0.0, 0.0, 0.0)] * n for kind in _WRONG}
+    for kind, (metres, degrees) in _WRONG.items():
+        for row, (x, y, z) in enumerate(views["vehicle.pos_w"][:n].tolist()):
+            way, turn = rng.uniform(0, math.tau), rng.choice((-1, 1)) * math.radians(degrees)
+            typed = x + metres * math.cos(way), y + metres * math.sin(way), z
+            waiting.append((kind, row, turn, StartFix(config, typed)))
+    for step in range(round((LONGEST_S + 2.0) / dt)):
+        if step:
+            action[:, 3] = (step * dt > _RESTS_S) * _TURNS_RAD_S / config.vehicle.max_yaw_rate_rad_s
+            sim.step(action)
+        told = [_told(config, views, row) for row in range(n)]
+        for kind, row, turn, fix in waiting:
+            for message in told[row](turn):
+                fix.feed(message)
+            if found := fix.result:
+                truth, yaw = views["vehicle.pos_w"][row], float(views["ego.imu_rpy"][row][2])
+                off_m, off = math.dist(found.place, truth[:2]), abs(math.degrees(found.turn_rad + turn))
+                said = f"start {truth[:2].round(2)}, yaw {yaw:.2f}, after {step * dt:.1f} s: "
+                end = "refused" if found.refusal else "fixed" if off_m < 0.1 and off < 2.0 else "wrong"
+                said += found.refusal or f"off by {off_m:.2f} m and {off:.1f} degrees"
+                ends[kind][row] = end, said, off_m, off, step * dt
+        waiting = [row for row in waiting if row[-1].result is None]
+        if not waiting:
+            break
+    return ends
+
+
+def _told(config: Any, views: dict[str, Any], row: int) -> Callable[[float], list[Any]]:
+    """What a vehicle's sensors say in this step, as messages of the pilot; the yaw wrong by what is asked."""
+    import numpy as np
+
+    from uuvtai.link.sectors import ping_of, sectors_of
+    from uuvtai.pilot import DvlReading, ImuReading, SonarPing
+
+    sonar, dt, step = config.sensors.sonar, config.episode.control_dt_s, int(views["clock.step"][row])
+    now_s, rpy, rest = step * dt, views["ego.imu_rpy"][row].copy(), []
+    if views["ego.dvl_fresh"][row] and step % 5 == 0:
+        rest.append(DvlReading(now_s, views["ego.dvl_b"][row].copy()))
+    if views["scan.fresh"][row] and (step % 5 == 0 or sonar.mechanical):
+        ranges, hit = (views[f"scan.{name}"][row][: sonar.n_ray] for name in ("range_m", "hit"))
+        ping_s = float(views["scan.ping_step"][row]) * dt
+        if sonar.mechanical:
+            first = int(views["scan.new_from"][row])
+            beams = (first + np.arange(int(views["scan.new_count"][row]))) % sonar.n_ray
+            rest.append(SonarPing(ping_s, ranges[beams], hit[beams], np.zeros(0), first))
+        else:
+            distances, increment, offset = sectors_of(sonar, ranges, hit)
+            reach = round(100 * sonar.max_range_m)
+            ping = ping_of(sonar, ping_s, np.array(distances), increment, offset, reach)
+            rest += [ping] if isinstance(ping, SonarPing) else []
+    zero = np.zeros(3)
+    return lambda turn: [ImuReading(now_s, rpy + np.array([0.0, 0.0, turn]), zero, zero), *rest]
 
 
 class Bench:

@@ -150,6 +150,19 @@ def test_axes_of_velocity_depth_and_position():
     assert found[1].vel_b == pytest.approx([0.5, 0.0, -0.1]), "no DVL for two seconds"
 
 
+def test_a_start_that_is_corrected_moves_and_turns_what_is_told():
+    intake = Intake(link_config(**{"sensors.localization": "truth"}), START, math.radians(90))
+    attitude(intake, yaw=math.radians(90))
+    place = {"vx": 0.0, "vy": 0.5, "vz": 0.0, "y": 7.0, "z": 0.0}
+    taken(intake, "LOCAL_POSITION_NED", x=5.0, time_boot_ms=0, **place)
+    assert intake.correct((2.4, 3.1), math.radians(90)) == (2.4, 3.1, START[2])
+    assert attitude(intake, yaw=math.radians(90))[0].rpy[2] == pytest.approx(math.radians(90))
+    taken(intake, "LOCAL_POSITION_NED", 2.0, x=5.0, time_boot_ms=2000, **place)
+    found = taken(intake, "LOCAL_POSITION_NED", 4.0, x=6.0, time_boot_ms=4000, **place)
+    assert found[0].pos_w == pytest.approx([1.4, 3.1, START[2]]), "the x axis looks to the south now"
+    assert found[1].vel_b == pytest.approx([0.5, 0.0, 0.0]), "to the east is still ahead"
+
+
 def test_the_height_of_a_position_is_the_pressure_sensors():
     """The autopilot's own lags: ArduSub's by 0.24 m after two seconds of climbing."""
     intake = Intake(link_config(**{"sensors.localization": "truth"}), START, math.radians(90))

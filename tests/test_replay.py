@@ -3,6 +3,7 @@ where messages are lost, late or nonsense."""
 
 import dataclasses
 import json
+import math
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -95,6 +96,26 @@ def test_the_same_with_an_estimated_pose_and_late_scans(small, build, monkeypatc
     found = replay(log, build=build)
     assert found["equal"] and found["messages"]["dvl"]["used"] < STEPS / 5
     assert "position" not in {name for name, row in found["messages"].items() if row["fed"]}
+
+
+def test_a_pilot_that_begins_again_knows_nothing_of_before(small, build, monkeypatch, tmp_path):
+    """From a start that is not exactly known a scan corrects the place; by none told it is believed."""
+    estimate_pose(monkeypatch, small)
+    feed = read_feed(recorded(small, tmp_path))
+    first, pilot = commands(feed, build)
+    again = build(feed)
+    again.tick()
+    again.begin_again(feed.mission)
+    again, _ = replaying._played(again, feed, disturbed(feed.arrivals, Faults()))
+    assert all(np.array_equal(a.action, b.action) for a, b in zip(first, again, strict=True))
+    x, y, z = feed.mission.start
+    off = dataclasses.replace(feed.mission, start=(x + 0.1, y, z))
+    ends = {}
+    for spread in ((), (0.01, 0.0, 0.0, 0.01, 0.0, 1e-4)):
+        pilot.begin_again(dataclasses.replace(off, spread=spread))
+        ends[spread] = replaying._played(pilot, feed, disturbed(feed.arrivals, Faults()))[0][-1].pos_w
+    wrong_m = [math.dist(end[:2], first[-1].pos_w[:2]) for end in ends.values()]
+    assert wrong_m[0] > 0.05 > wrong_m[1]
 
 
 def test_late_readings_are_carried_to_now(small, build, monkeypatch, tmp_path):

@@ -169,6 +169,18 @@ class Intake:
         """A sender has begun anew, and with it all its clocks."""
         self._clocks = {key: clock for key, clock in self._clocks.items() if key[:2] != (system, component)}
 
+    def correct(self, place: tuple[float, float], turn_rad: float) -> tuple[float, float, float]:
+        """Count from where the vehicle is now on: it is at ``place`` [m], and ``turn_rad`` is added to its
+        yaw. Where it is, with its depth."""
+        if self._heading is not None:
+            self._heading += turn_rad
+        roll, pitch, yaw = self.heard.rpy
+        self.heard.rpy = roll, pitch, _wrapped(yaw + turn_rad)
+        told_s, depth = self._depth
+        self._start = (*place, -depth if told_s > -math.inf else self._start[2])
+        self._origin = None
+        return self._start
+
     def refuse(self, why: str) -> list[SensorMessage]:
         """Count a message that is not used."""
         if why in self.heard.refused or len(self.heard.refused) < MOST_KINDS:

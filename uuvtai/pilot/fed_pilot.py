@@ -16,6 +16,9 @@ from uuvtai.pilot.pilot_numbers import PilotNumbers
 from uuvtai.pilot.sensor_messages import SensorMessage, SonarPing
 from uuvtai.plan_codes import TRIGGERS
 
+_START = [0, 1, 2, 9, 10, 17]
+"""places of the covariance of x, y and heading in the pose filter's (perception/pose.py)"""
+
 
 @dataclass(frozen=True)
 class StaleLimits:
@@ -79,15 +82,19 @@ class FedPilot:
     def __init__(
         self, numbers: PilotNumbers, stack: StackRunner, mission: Mission, limits: StaleLimits | None = None
     ) -> None:
-        self.mission, self.limits = mission, limits or StaleLimits()
-        self.numbers, self.stack, self._begun = numbers, stack, False
+        self.limits, self.numbers, self.stack = limits or StaleLimits(), numbers, stack
         views = stack.views
-        self._inbox = Inbox(_shapes(numbers))
-        self.sensors = FedSensors(numbers, views, self._inbox)
+        self.begin_again(mission)
         self._teacher = {name: views[f"teacher.{name}"] for name in ("action", "last_vel_w", "leaf")}
         self._route = {name: views[f"route.{name}"] for name in ("n_way", "plan_step", "trigger")}
         self._pos_w = views["ego.pos_w"]
         self._top = np.array(numbers.top, np.float32)
+
+    def begin_again(self, mission: Mission) -> None:
+        """Forget everything: the next ``tick`` is the first one, of ``mission``."""
+        self.mission, self._begun = mission, False
+        self._inbox = Inbox(_shapes(self.numbers))
+        self.sensors = FedSensors(self.numbers, self.stack.views, self._inbox)
 
     @property
     def tallies(self) -> dict[str, Tally]:
@@ -107,6 +114,8 @@ class FedPilot:
         else:
             self.stack.begin(self.mission, self.sensors)
             self._begun = True
+            if self.mission.spread and self.numbers.estimated:
+                self.stack.views["pose.cov"][0, _START] = self.mission.spread
         return self._command()
 
     def _command(self) -> PilotCommand:

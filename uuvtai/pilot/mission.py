@@ -16,6 +16,8 @@ class Mission:
     seed: int = 0
     """with ``episode``: of the fallback planner's random numbers"""
     episode: int = 0
+    spread: tuple[float, ...] = ()
+    """covariance of start and heading (x, y [m], yaw [rad]), upper triangle of six; none = exactly known"""
 
     def places(self) -> dict[str, tuple[float, float, float]]:
         """By the array that holds it."""

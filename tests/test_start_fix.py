@@ -1,0 +1,125 @@
+"""Starts that were typed, against the walls that a sonar sees from them: corrected, or refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from uuvtai.link.sectors import ping_of, sectors_of
+from uuvtai.link.start_fix import LONGEST_S, MISFIT, StartFix, WallWatch, expected
+from uuvtai.loader import load_config
+from uuvtai.pilot import DvlReading, ImuReading, SonarPing
+
+BODIES = ((9.0, 4.4, 0.35), (12.0, 1.2, 0.3), (6.0, 5.0, 0.25), (15.5, 3.2, 0.4), (3.6, 1.4, 0.3))
+"""(x, y, radius) [m] of what stands in the tank, unknown to the fix"""
+
+
+def ranges(config, pose, rng, bodies=BODIES):
+    """(range, hit) of a scan from ``pose`` (x, y, yaw), with the sonar's noise."""
+    sonar = config.sensors.sonar
+    bearing = pose[2] + sonar.first_beam_rad + sonar.beam_step_rad * np.arange(sonar.n_ray)
+    r = expected(config.world.tank, np.tile(pose[:2], (sonar.n_ray, 1)), bearing)[0]
+    for x, y, radius in bodies:
+        along = (x - pose[0]) * np.cos(bearing) + (y - pose[1]) * np.sin(bearing)
+        room = radius**2 - (x - pose[0]) ** 2 - (y - pose[1]) ** 2 + along**2
+        near = along - np.sqrt(np.maximum(room, 0.0))
+        r = np.where((room > 0) & (near > 0), np.minimum(r, near), r)
+    hit = (r < sonar.max_range_m) & (rng.random(sonar.n_ray) >= sonar.missed_return)
+    noise = (sonar.range_sigma_m + sonar.range_sigma_slope * r) * rng.standard_normal(sonar.n_ray)
+    return r + noise + sonar.range_jitter_m * rng.exponential(size=sonar.n_ray), hit
+
+
+def played(config, true, typed, turn, seed=0, rate=0.35, bodies=BODIES, coarse=False, dt=0.1):
+    """(fix, pose at its end) of a vehicle at ``true`` (x, y, yaw) that takes its yaw for larger by ``turn``
+    and its place for ``typed``; after 3 s it is turned around at ``rate`` [rad/s]. ``coarse``: by sectors, as
+    MAVLink tells it."""
+    fix, rng, sonar = StartFix(config, (*typed, -0.8)), np.random.default_rng(seed), config.sensors.sonar
+    pose = np.array(true, float)
+    for k in range(round(LONGEST_S / dt) + 20):
+        pose[2] = true[2] + rate * max(0.0, dt * k - 3.0)
+        rpy = np.array([0.0, 0.0, math.remainder(pose[2] + turn, math.tau)])
+        fix.feed(ImuReading(dt * k, rpy, np.zeros(3), np.zeros(3)))
+        fix.feed(DvlReading(dt * k, np.zeros(3)))
+        r, hit = ranges(config, pose, rng, bodies)
+        ping = SonarPing(dt * k, r, hit, np.zeros(0))
+        if coarse:
+            distances, increment, offset = sectors_of(sonar, r, hit)
+            reach = round(100 * sonar.max_range_m)
+            ping = ping_of(sonar, dt * k, np.array(distances), increment, offset, reach)
+        fix.feed(ping)
+        if fix.result is not None:
+            return fix, pose
+    raise AssertionError("neither fixed nor refused")
+
+
+def off(found, pose, turn):
+    """(m, degrees) by which a fix is wrong."""
+    return math.dist(found.place, pose[:2]), abs(math.degrees(found.turn_rad + turn))
+
+
+@pytest.mark.parametrize(
+    ("sensors", "true", "told", "turn_deg", "coarse"),
+    [
+        ("multibeam", (2.0, 3.0, 0.0), (0.0, 0.0), 0, False),
+        ("multibeam", (2.0, 3.0, 0.0), (0.5, 0.0), 0, True),
+        ("multibeam", (2.5, 2.0, 0.3), (-0.3, 0.4), 0, False),
+        ("multibeam", (11.0, 3.4, 2.8), (0.0, -0.5), 15, True),
+        ("multibeam", (17.0, 4.6, -0.6), (0.0, 0.0), -15, False),
+        ("nominal", (5.0, 2.0, 1.2), (0.35, 0.35), 15, False),
+        ("harsh", (7.0, 3.1, 2.5), (-0.5, 0.0), -15, False),
+    ],
+)
+def test_what_was_typed_wrongly_is_corrected(sensors, true, told, turn_deg, coarse):
+    config, turn = load_config("pool", sensors), math.radians(turn_deg)
+    typed = (true[0] + told[0], true[1] + told[1])
+    fix, pose = played(config, true, typed, turn, coarse=coarse)
+    assert not fix.result.refusal, fix.result.refusal
+    far, degrees = off(fix.result, pose, turn)
+    assert far < 0.1 and degrees < 2.0
+    assert np.allclose(fix.result.shift, -np.array(told), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("true", "typed", "rate", "why"),
+    [
+        ((2.0, 3.0, 0.0), (2.0, 3.0), 0.0, "x 0 nor at x 20"),
+        ((5.0, 3.0, 0.0), (2.0, 3.0), 0.35, "do not fit"),
+        ((17.0, 3.0, 0.0), (15.0, 3.0), 0.0, "do not fit"),
+    ],
+)
+def test_what_cannot_be_checked_is_refused(true, typed, rate, why):
+    fix, _ = played(load_config("pool", "multibeam"), true, typed, 0.0, rate=rate, dt=0.5)
+    assert why in fix.result.refusal and "--start" in fix.result.refusal
+
+
+def watched(config, true, believed, bodies=BODIES):
+    """What the watch says after 4 s at ``true`` (x, y, yaw), which is taken for ``believed``."""
+    watch, rng, n = WallWatch(config), np.random.default_rng(3), config.sensors.sonar.n_ray
+    views = {
+        "clock.step": np.zeros(1, int),
+        "scan.fresh": np.ones(1, int),
+        "scan.ping_yaw": np.array([believed[2]]),
+    }
+    views["scan.ping_pos_w"], views["scan.new_count"] = np.array([[*believed[:2], -0.8]]), np.array([n])
+    views["scan.new_from"] = np.zeros(1, int)
+    for views["clock.step"][0] in range(0, 200, 10):
+        r, hit = ranges(config, true, rng, bodies)
+        views["scan.range_m"], views["scan.hit"] = r[None], hit[None].astype(int)
+        found = watch.look(views)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("sensors", "wrong", "fits"),
+    [
+        ("multibeam", (0.0, 0.0, 0.0), True),
+        ("nominal", (0.0, 0.0, 0.0), True),
+        ("multibeam", (0.5, 0.0, 0.0), False),
+        ("nominal", (-0.5, 0.0, 0.0), False),
+        ("multibeam", (0.0, -0.5, 0.0), False),
+        ("multibeam", (0.0, 0.0, 0.26), False),
+    ],
+)
+def test_a_place_that_the_walls_do_not_fit_is_noticed_under_way(sensors, wrong, fits):
+    true = np.array([13.0, 2.6, 0.4])
+    assert (watched(load_config("pool", sensors), true, true + wrong) < MISFIT) == fits
