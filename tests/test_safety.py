@@ -82,6 +82,7 @@ WRONG = [
     ("computer slow", {"late_s": 0.6}, {0: HOLD, 4.5: HOLD, 5.5: HAND_BACK}),
     ("battery silent", {"battery_age_s": 11.0}, {0: HOLD, 29: HOLD, 30.5: HAND_BACK}),
     ("position jumped", {"moved": "by 3.0 m in 0.1 s"}, {0: HAND_BACK}),
+    ("start unchecked", {"unchecked": "no wall is seen"}, {0: HOLD, 59: HOLD}),
     ("walls misfit", {"misfit": "by 0.5 m"}, {0: HOLD, 4.5: HOLD, 5.5: HAND_BACK}),
     ("no answer", {"unanswered_s": 4.1}, {0: HOLD, 4.5: HOLD, 5.5: HAND_BACK}),
     ("battery low", {"battery_v": 13.1}, {0: DRIVE, 4.5: DRIVE, 5.5: SURFACE}),

@@ -34,6 +34,7 @@ from uuvtai.link.safety import (
     decide,
 )
 from uuvtai.link.senders import AUTOPILOT
+from uuvtai.link.start_fix import MISFIT, StartFix, StartFound, WallWatch
 from uuvtai.pilot import Mission, OnboardPilot, PilotCommand
 from uuvtai.pilot.sensor_messages import NAMES, SensorMessage
 from uuvtai.signals import StopEvent
@@ -77,7 +78,9 @@ class OnboardLoop:
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
         note: Callable[[str], None] = lambda text: None,
+        fix: StartFix | None = None,
     ) -> None:
+        """``fix``: checks the start by the walls before the vehicle is taken; None = it is believed."""
         self._config, self._pilot, self._plan, self._endpoint, self._log = config, pilot, plan, endpoint, log
         self._now, self._sleep, self._note_to = now, sleep, note
         self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}", plan.operator)
@@ -106,6 +109,7 @@ class OnboardLoop:
         self._stalls: list[tuple[float, float]] = []
         self.last = SafeDecision(SafeAction.HOLD, STOP, ("nothing was decided yet",))
         self._is_leaving, self._told = False, ""
+        self._fix, self._start, self._walls = fix, StartFound(), WallWatch(config) if fix else None
         self.failure: BaseException | None = None
         """an error of this program that ended the flight, or came while it ended"""
 
@@ -134,6 +138,8 @@ class OnboardLoop:
             if stalled_s > STALL_S:
                 self._lag_s, due_s = self._lag_s + stalled_s, now_s
             command = self.step(now_s, stalled_s)
+            if self._start.refusal:
+                return (f"start refused: {self._start.refusal}",)
             if farewell := self._farewell(now_s, command):
                 return (farewell,)
             if self._handover.ended or (
@@ -178,6 +184,7 @@ class OnboardLoop:
         """One step: hear, think, decide, speak."""
         self._log.begin_step()
         self._hear(now_s)
+        self._find_start(now_s)
         command = self._pilot.tick()
         self._note_scan()
         view = self._view(now_s, stalled_s, command)
@@ -232,7 +239,30 @@ class OnboardLoop:
         self._intake.refuse(f"a second sender speaks as system {self._plan.system}: {sender[0]}:{sender[1]}")
         return True
 
+    def _find_start(self, now_s: float) -> None:
+        """Begin where the walls say that the vehicle is."""
+        if self._fix is None or self._fix.result is None:
+            return
+        self._start, self._fix = self._fix.result, None
+        if self._start.refusal:
+            return
+        mission = self._plan.mission
+        place = self._intake.correct(self._start.place, self._start.turn_rad)
+        self._pilot.begin_again(dataclasses.replace(mission, start=place, spread=self._start.spread))
+        self._lag_s, self._scans, self._measured_s["sonar"] = now_s, 0, -math.inf
+        off_m, off = math.hypot(*self._start.shift), math.degrees(self._start.turn_rad)
+        self.tell(f"start found by the walls, {off_m:.2f} m and {off:.1f} degrees from what was typed")
+
+    def _misfit(self) -> str:
+        """How the scans disagree with the walls; before the start was found nothing is compared."""
+        if self._walls is None or self._fix is not None or self._start.refusal:
+            return ""
+        share = self._walls.look(self._pilot.stack.views)
+        return f"{100 * share:.0f} % of the returns miss a wall" if share > MISFIT else ""
+
     def _feed(self, reading: SensorMessage) -> None:
+        if self._fix is not None:
+            self._fix.feed(reading)
         name = NAMES[type(reading)]
         if name == "sonar":
             self._scan_s = max(self._scan_s, reading.time_s)
@@ -261,7 +291,7 @@ class OnboardLoop:
             operator_age_s=now_s - heard.operator_s,
             sensor_age_s={name: now_s - self._measured_s[name] for name in self._needed},
             pos_w=(x, y, z),
-            rpy=heard.rpy if now_s - heard.rpy_s <= limits.sensor_s["imu"] else (math.nan,) * 3,
+            rpy=heard.rpy if now_s - heard.rpy_s <= limits.sensor_s["imu"] else (math.nan, math.nan, math.nan),
             speed_m_s=math.hypot(*heard.vel_b) if heard.vel_b and is_fresh else None,
             battery_v=heard.battery_v,
             battery_share=heard.battery_share,
@@ -271,6 +301,8 @@ class OnboardLoop:
             battery_age_s=now_s - heard.battery_s,
             unanswered_s=self._unanswered_s,
             moved=heard.jumped,
+            misfit=self._misfit(),
+            unchecked="" if self._fix is None else self._fix.waits_for,
         )
 
     def _measured(self, now_s: float) -> Velocity | None:
@@ -354,6 +386,7 @@ class OnboardLoop:
             "ended": "; ".join(reasons) or "it was driving",
             "reached": reasons == [_REACHED],
             "safe": self.failure is None
+            and not self._start.refusal
             and (not self._handover.engaged or bool(reasons and reasons[0] in _FAREWELLS)),
             "interrupted": _INTERRUPTED in reasons,
             "mode": MODE_NAMES.get(heard.mode, "none"),
@@ -380,9 +413,12 @@ def fly(
         about = {"dry_run": str(not plan.arms), "limits": str(plan.limits), "mission": str(plan.mission)}
         with StopEvent(is_last=False) as stop:
             log = LinkLog(plan.log, about)
-            clock = (followed.now, partial(followed.sleep, stop=stop)) if followed else ()
+            now, sleep = time.monotonic, time.sleep
+            if followed:
+                now, sleep = followed.now, partial(followed.sleep, stop=stop)
             endpoint.forget()  # what came while kernels were compiled
-            loop = OnboardLoop(config, pilot, plan, endpoint, log, *clock, note=note)
+            fix = StartFix(config, plan.mission.start)
+            loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix)
             what = (
                 "ARMS AND DRIVES the vehicle"
                 if plan.arms

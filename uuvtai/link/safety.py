@@ -100,6 +100,8 @@ class VehicleView:
     """how the given position jumped; '' = it did not"""
     misfit: str = ""
     """how the scans disagree with the known walls; '' = they do not"""
+    unchecked: str = ""
+    """what is missing to check the start by the walls; '' = nothing"""
 
 
 @dataclass(frozen=True)
@@ -194,6 +196,10 @@ def _position_jumped(view: VehicleView, limits: SafetyLimits) -> str:
     return view.moved
 
 
+def _start_unchecked(view: VehicleView, limits: SafetyLimits) -> str:
+    return view.unchecked
+
+
 def _walls_misfit(view: VehicleView, limits: SafetyLimits) -> str:
     return view.misfit
 
@@ -240,6 +246,8 @@ RULES = (
                "attitude, velocity, depth or a needed position is missing or old"),
     SafetyRule("position jumped", _position_jumped, ((0.0, _A.HAND_BACK),),
                "the given position changed by more than the vehicle can move"),
+    SafetyRule("start unchecked", _start_unchecked, ((0.0, _A.HOLD),),
+               "the walls have not confirmed the start yet; after 60 s it is refused"),
     SafetyRule("walls misfit", _walls_misfit, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
                "the scans do not fit the known walls where the vehicle takes itself to be"),
     SafetyRule("sonar lost", _sonar_lost, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
