@@ -181,6 +181,11 @@ class Intake:
         self._origin = None
         return self._start
 
+    def forget_jump(self) -> None:
+        """A position that jumped before the vehicle was taken (its autopilot has found an origin): count from
+        the start once more."""
+        self.heard.jumped, self._origin = "", None
+
     def refuse(self, why: str) -> list[SensorMessage]:
         """Count a message that is not used."""
         if why in self.heard.refused or len(self.heard.refused) < MOST_KINDS:

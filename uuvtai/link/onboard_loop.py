@@ -184,6 +184,8 @@ class OnboardLoop:
         """One step: hear, think, decide, speak."""
         self._log.begin_step()
         self._hear(now_s)
+        if self._intake.heard.jumped and not self._handover.has_asked:
+            self._intake.forget_jump()
         self._find_start(now_s)
         command = self._pilot.tick()
         self._note_scan()
