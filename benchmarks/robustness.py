@@ -156,7 +156,7 @@ def _told(config: Any, views: dict[str, Any], row: int) -> Callable[[float], lis
         else:
             distances, increment, offset = sectors_of(sonar, ranges, hit)
             reach = round(100 * sonar.max_range_m)
-            ping = ping_of(sonar, ping_s, np.array(distances), increment, offset, reach)
+            ping = ping_of(sonar, ping_s, np.array(distances), increment, offset, 1, reach)
             rest += [ping] if isinstance(ping, SonarPing) else []
     zero = np.zeros(3)
     return lambda turn: [ImuReading(now_s, rpy + np.array([0.0, 0.0, turn]), zero, zero), *rest]

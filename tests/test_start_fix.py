@@ -45,7 +45,7 @@ def played(config, true, typed, turn, seed=0, rate=0.35, bodies=BODIES, coarse=F
         if coarse:
             distances, increment, offset = sectors_of(sonar, r, hit)
             reach = round(100 * sonar.max_range_m)
-            ping = ping_of(sonar, dt * k, np.array(distances), increment, offset, reach)
+            ping = ping_of(sonar, dt * k, np.array(distances), increment, offset, 1, reach)
         fix.feed(ping)
         if fix.result is not None:
             return fix, pose

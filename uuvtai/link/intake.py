@@ -178,7 +178,7 @@ class Intake:
         self.heard.rpy = roll, pitch, _wrapped(yaw + turn_rad)
         told_s, depth = self._depth
         self._start = (*place, -depth if told_s > -math.inf else self._start[2])
-        self._origin = None
+        self._origin, self._place = None, (-math.inf, np.zeros(3))
         return self._start
 
     def forget_jump(self) -> None:
