@@ -122,7 +122,8 @@ def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "ga
     axis in which the fit is no better on stretches that it has not seen. Raises DriveError, also where it is
     better nowhere."""
     try:
-        made, horizons, kept = _judged(drives, vehicle_cfg, known)
+        with np.errstate(all="ignore"):
+            made, horizons, kept = _judged(drives, vehicle_cfg, known)
     except np.linalg.LinAlgError:
         raise DriveError(
             "no vehicle moves as the logs say: see that the rotor speeds are in the thrusters' order and "
