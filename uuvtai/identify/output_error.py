@@ -173,8 +173,9 @@ def horizon_errors(
     found = {}
     for ahead in (h for h in horizons if h <= steps):
         errors, last = [], np.full(len(whole), -steps)
-        ready = whole[:, : steps + 1 - ahead]
-        ready = both if (both := ready & whole[:, ahead:]).any() else ready
+        ready: np.ndarray = whole[:, : steps + 1 - ahead]
+        both: np.ndarray = ready & whole[:, ahead:]
+        ready = both if both.any() else ready
         for begin in range(steps + 1 - ahead):
             picked = np.flatnonzero(ready[:, begin] & (begin - last >= max(ahead, steps // 10)))
             last[picked] = begin
