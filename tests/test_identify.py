@@ -12,10 +12,12 @@ from tests.reference import dynamics as oracle
 from tests.reference import logs as episode
 from uuvtai.allocation import allocation_matrices
 from uuvtai.config import VehicleConfig
+from uuvtai.identify import identified as identified_module
 from uuvtai.identify.drive_log import Drive, DriveError, read_drives
 from uuvtai.identify.excitation import unexcited, unstepped
-from uuvtai.identify.identified import KNOWN, identified
+from uuvtai.identify.identified import KNOWN, _worse, identified
 from uuvtai.identify.motion_model import (
+    AXES,
     GAIN,
     LAG,
     LATE,
@@ -26,6 +28,7 @@ from uuvtai.identify.motion_model import (
     readings,
     stretches,
 )
+from uuvtai.identify.output_error import horizon_errors
 from uuvtai.identify.rotor_lag import mean_wrench
 from uuvtai.identify.stretch_starts import first_readings, grown_starts
 from uuvtai.loader import load_config
@@ -289,11 +292,81 @@ def test_short_logs_and_other_thrusters_are_refused():
         stretches([drive, Drive(0.1, drive.velocity, drive.tilt_rate, drive.up, drive.rpm)], TOLD, 5.0)
 
 
-def test_a_vehicle_file_has_no_negative_numbers_and_its_own_trim():
+def test_the_vehicle_given_is_kept_where_no_fit_is_better(table, capfd):
+    """It is the one that was driven."""
+    picked = {"added_mass": TRUE.added, "linear_damping": TRUE.linear, "quadratic_damping": TRUE.quadratic}
+    volume = TRUE.buoyancy / TOLD.gravity_m_s2 / TOLD.water_density_kg_m3
+    text = json.dumps({"vehicle": {"volume_m3": volume, **{name: list(row) for name, row in picked.items()}}})
+    given, out = table.with_name("given.yaml"), table.with_name("new.yaml")
+    given.write_text(text)
+    code, _, err = uuv(capfd, "identify", table, "--vehicle", given, "--out", out)
+    said = " ".join(err.split())
+    assert code == 2 and "improve no number of the vehicle given, and nothing is written" in said
+    assert all(f"{axis} is no better (" in said for axis in AXES)
+    assert not out.exists() and not out.with_suffix(".png").exists()
+
+
+AHEAD = {
+    "better": ((0.9, 0.5), True),
+    "a little better": ((0.99, 0.99), False),
+    "better at one, hardly worse at the other": ((1.01, 0.5), True),
+    "worse at ten": ((1.1, 0.5), False),
+    "worse at a hundred": ((0.5, 1.1), False),
+    "no number": ((math.nan, 0.5), False),
+    "no reading": ((None, None), False),
+    "one horizon": ((None, 0.5), True),
+}
+"""errors 10 and 100 steps ahead, in those of the vehicle given: whether the fit is kept"""
+
+
+@pytest.mark.parametrize(("shares", "is_better"), AHEAD.values(), ids=AHEAD)
+def test_a_fit_has_to_be_better_ahead(shares, is_better):
+    rows = dict(zip(("1", "10", "100"), ((9.0,) * 4, *((share,) * 4 for share in shares)), strict=True))
+    horizons = {"identified": rows, "given": dict.fromkeys(rows, (1.0,) * 4)}
+    free = np.ones(17, bool)
+    for axis, places in enumerate(([0, 4, 8], [1, 5, 9], [2, 6, 10, NET], [3, 7, 11])):
+        found = [places for _, places in _worse(axis, horizons, free)]
+        assert found == ([] if is_better else [places])
+    assert _worse(0, horizons, ~free) == []
+
+
+def test_numbers_that_come_out_negative_stay_as_given_and_the_others_are_fitted_anew(table, monkeypatch):
+    """A first fit has negative numbers; the next one is told to hold them."""
+    held, real = [], identified_module.fitted
+
+    def wrong(given, vehicle_cfg, first, free):
+        fit, low = real(given, vehicle_cfg, first, free), np.zeros(17)
+        low[[0, 4, LAG]] = -30.0, -5.0, -1.0
+        held.append(~free[[0, 4, LAG]])
+        return replace(fit, value=np.where(free, fit.value + low, fit.value))
+
+    monkeypatch.setattr(identified_module, "fitted", wrong)
+    found = identified(read_drives(table), TOLD)
+    assert found.keys["added_mass"][0] == TOLD.added_mass[0]
+    assert found.keys["linear_damping"][0] == TOLD.linear_damping[0]
+    assert [row.tolist() for row in held] == [[False, False, True], *[[True] * 3] * 3]
+    said = [text for text in found.document["warnings"] if "came out negative (" in text]
+    assert [text.partition(":")[0] for text in said] == ["added mass, surge", "linear damping, surge"]
+
+
+@pytest.mark.parametrize("every", [1, 5, 7])
+def test_errors_ahead_begin_and_end_at_readings(every, table):
+    (drive,) = read_drives(table)
+    seen = drive.velocity.copy()
+    seen[np.arange(len(seen)) % every != 0, :3] = np.nan
+    seen[np.isnan(seen)] = np.where(np.arange(len(seen)) % every == 0, 0.1, np.nan)[:, None].repeat(4, 1)[
+        np.isnan(seen)
+    ]
+    given = stretches([replace(drive, velocity=seen)], TOLD, 5.0)
+    found = horizon_errors(given, TOLD, parameters_of(TOLD), (every, 10 * every))
+    assert all(value is not None for row in found.values() for value in row)
+
+
+def test_a_vehicle_file_has_its_own_trim():
     found = parameters_of(TOLD)
-    found[[4, NET, GAIN]] = -0.2, 1.5, 0.9
+    found[[NET, GAIN]] = 1.5, 0.9
     keys = changed(TOLD, found)
-    assert keys["linear_damping"][0] == 0.0 and keys["thrust_scale"] == 0.9
+    assert keys["thrust_scale"] == 0.9
     again = VehicleConfig(**keys)
     assert abs(parameters_of(again)[NET] - 1.5) < 1e-3
 
@@ -307,6 +380,7 @@ BAD_TABLES = {
     "t,u,v,w,r,rpm_1\n0,0,0,0,0,\n1,0,0,0,0,0\n": "only u, v, w and r may have empty cells",
     "t,u,v,w,r,rpm_1\n1,0,0,0,0,0\n1,0,0,0,0,0\n": "times must rise",
     "t,u,v,w,r,rpm_1,asked_1\n0,0,0,0,0,0,0\n": "give one of the two",
+    "t,u,v,w,r,rpm_1\n" + "".join(f"{k}000,0,0,0,0,0\n" for k in range(9)): "a sample every 1000 s",
     "": "missing: t, u, v, w, r, rpm_1",
     "t,u,v,w,r,rpm_1\n0,0,0,0,0," + "1" * 200_000 + "\n": "is no table (field larger than field limit",
     "t,u,v,w,r,rpm_1\n0,0,0,0,0,\0\n": "line 2 must hold 6 numbers",
@@ -345,9 +419,9 @@ def test_a_gap_parts_a_table(tmp_path):
 
 def test_a_mark_of_utf8_hides_no_column(tmp_path):
     """As Excel writes it."""
-    (tmp_path / "a.csv").write_text("t,u,v,w,r,rpm_1\n0,1,,,,5\n1,2,,,,6\n", encoding="utf-8-sig")
+    (tmp_path / "a.csv").write_text("t,u,v,w,r,rpm_1\n0,1,,,,5\n0.1,2,,,,6\n", encoding="utf-8-sig")
     (found,) = read_drives(tmp_path / "a.csv")
-    assert found.dt_s == 1.0 and found.velocity[:, 0].tolist() == [1.0, 2.0]
+    assert found.dt_s == 0.1 and found.velocity[:, 0].tolist() == [1.0, 2.0]
 
 
 def test_a_long_table_is_refused_before_it_fills_the_memory(tmp_path, monkeypatch):

@@ -21,6 +21,7 @@ _MAX_CSV_BYTES = 256 << 20
 MAX_SAMPLES = 1_000_000
 _GAP = 0.3
 """A step that differs from the usual one by more than this share parts a log in two."""
+_SLOWEST_S = 0.5
 _NEEDED = ("t", "u", "v", "w", "r")
 
 
@@ -91,6 +92,10 @@ def drives_of(
     if len(rows) < 2 or not np.isfinite(time_s).all() or (np.diff(time_s) <= 0).any():
         raise DriveError(f"{path}: times must rise from row to row; give a log of one drive")
     dt_s = float(np.median(np.diff(time_s)))
+    if dt_s > _SLOWEST_S:
+        raise DriveError(
+            f"{path}: has a sample every {dt_s:g} s, and two a second are needed; give times in seconds"
+        )
     cuts = np.flatnonzero(np.abs(np.diff(time_s) / dt_s - 1) > _GAP) + 1
     late = np.zeros((len(rows), 2)) if after is None else after
     other = [None] * (len(cuts) + 1) if jumped is None else np.split(jumped, cuts)

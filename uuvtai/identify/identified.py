@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,9 @@ _HELD_OUT = 5
 """one stretch in so many is predicted by a fit to the others"""
 _MOST_SAMPLES = 150_000
 """of all stretches that are fitted, for each takes some seven kilobytes; 50 minutes at 50 Hz"""
+_NOTHING = 0.02
+"""share of an error ahead that is no difference: a fit is better where it is so by more at one horizon, and
+worse by more at none"""
 _LOOSE = 0.5
 """An interval wider than this share of the value, to either side, is warned of."""
 _OTHERS = {
@@ -79,8 +82,11 @@ class FittedDrives:
     warnings: list[str]
 
 
-def fitted_drives(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain") -> FittedDrives:
-    """Parameters with intervals, without errors ahead; as ``identified``. Raises DriveError."""
+def fitted_drives(
+    drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain", held: Collection[int] = ()
+) -> FittedDrives:
+    """Parameters with intervals, without errors ahead; as ``identified``. ``held``: places that stay as
+    given. Raises DriveError."""
     if known not in KNOWN:
         raise DriveError(f"--known must be one of {', '.join(KNOWN)}, got {known!r}")
     if not drives:
@@ -101,6 +107,7 @@ def fitted_drives(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = 
         raise DriveError(f"the logs excite no axis; {'; '.join(idle.values())}")
     lagless = unstepped(drives)
     first, free = parameters_of(vehicle_cfg), _free(idle, known, not lagless)
+    free[list(held)] = False
     fit = fitted(given, vehicle_cfg, first, free)
     entries = [_entry(place, first, fit, bool(free[place])) for place in range(SIZE)]
     warnings += [f"{text}; its numbers stay those of the vehicle given" for text in idle.values()]
@@ -111,8 +118,17 @@ def fitted_drives(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = 
 
 
 def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain") -> Identified:
-    """Fit a vehicle to drives; ``vehicle_cfg`` gives mass, thrusters, the ``known``. Raises DriveError."""
-    made = fitted_drives(drives, vehicle_cfg, known)
+    """Fit a vehicle to drives; ``vehicle_cfg`` gives mass, thrusters, the ``known``, and the numbers of each
+    axis in which the fit is no better on stretches that it has not seen. Raises DriveError, also where it is
+    better nowhere."""
+    try:
+        with np.errstate(all="ignore"):
+            made, horizons, kept = _judged(drives, vehicle_cfg, known)
+    except np.linalg.LinAlgError:
+        raise DriveError(
+            "no vehicle moves as the logs say: see that the rotor speeds are in the thrusters' order and "
+            "signed as their thrust, and all units are SI"
+        ) from None
     given, fit = made.given, made.fit
     count = len(given.velocity)
     document: dict[str, Any] = {
@@ -121,12 +137,73 @@ def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "ga
         "stretches": count,
         "parameters": made.entries,
         "residual_rms": dict(zip(AXES, fit.noise.tolist(), strict=True)),
-        "horizons": _horizons(given, vehicle_cfg, (made.first, fit.value), made.free),
-        "warnings": made.warnings,
+        "horizons": horizons,
+        "warnings": [*kept, *made.warnings],
     }
     given = given.at_lag(fit.value[LAG], vehicle_cfg)
     predicted = readings(fit.value[None], fit.start[None], given, vehicle_cfg)[0]
     return Identified(document, changed(vehicle_cfg, fit.value), given.velocity, predicted, given.dt_s)
+
+
+def _judged(
+    drives: list[Drive], vehicle_cfg: VehicleConfig, known: str
+) -> tuple[FittedDrives, dict[str, Any], list[str]]:
+    """(what was fitted, its errors ahead, why numbers stay as given): what came out negative, or is worse
+    than the vehicle given on stretches that were not fitted, stays, and the others are fitted anew."""
+    held: set[int] = set()
+    kept, given = [], []
+    while True:
+        made = fitted_drives(drives, vehicle_cfg, known, held)
+        negative = [entry for entry in made.entries if entry["fitted"] and _is_negative(entry)]
+        if negative:
+            held.update(entry["place"] for entry in negative)
+            kept += [
+                f"{entry['name']}: came out negative ({entry['value']:.3g} {entry['unit']}) and stays that "
+                f"of the vehicle given; {MORE[entry['kind']]}"
+                for entry in negative
+            ]
+            continue
+        values = made.first, made.fit.value
+        horizons = _horizons(made.given, vehicle_cfg, values, made.free)
+        worse = {text: places for i in range(len(AXES)) for text, places in _worse(i, horizons, made.free)}
+        given += worse
+        held.update(place for places in worse.values() for place in (*places, GAIN))  # what it is given for
+        left = made.free.copy()
+        left[list(held)] = False
+        if not left[: NET + 1].any():
+            raise DriveError(
+                "the logs improve no number of the vehicle given, and nothing is written; on stretches that "
+                f"were not fitted: {'; '.join(given) or 'no axis is left'}. Keep that vehicle, or see that "
+                "the rotor speeds' order and signs are right and drive longer, on each axis, slowly and fast"
+            )
+        if not worse:
+            kept += [f"{text} on stretches that were not fitted; the axis stays as given" for text in given]
+            return made, horizons, kept
+
+
+def _is_negative(entry: dict[str, Any]) -> bool:
+    return entry["value"] < 0 and entry["place"] not in (NET, *LATE)
+
+
+def _worse(axis: int, horizons: dict[str, Any], free: np.ndarray) -> list[tuple[str, list[int]]]:
+    """[] where the fit is better on an axis than the vehicle given, or nothing of it is fitted; else how much
+    worse it is, and the places of the axis."""
+    places = [
+        place for place in (axis, axis + 4, axis + 8, NET) if free[place] and (place != NET or axis == 2)
+    ]
+    pairs = [
+        (steps, ours[axis], horizons["given"][steps][axis])
+        for steps, ours in horizons["identified"].items()
+        if steps != "1" and ours[axis] is not None
+    ]
+    shares = [ours / max(given, 1e-9) for _, ours, given in pairs]
+    if not places or (shares and min(shares) < 1 - _NOTHING and max(shares) < 1 + _NOTHING):
+        return []
+    unit = "rad/s" if AXES[axis] == "yaw" else "m/s"
+    said = ", ".join(
+        f"{ours:.3g} against {given:.3g} {unit} {steps} steps ahead" for steps, ours, given in pairs
+    )
+    return [(f"{AXES[axis]} is no better ({said or 'no readings'})", places)]
 
 
 def _free(idle: dict[str, str], known: str, shows_lag: bool) -> np.ndarray:
@@ -170,8 +247,6 @@ def _warning(entry: dict[str, Any]) -> str:
     size = max(abs(entry["value"]), abs(entry["given"]), float(SCALE[entry["place"]]))
     if half > _LOOSE * size:
         return f"{entry['name']}: known to {half:.2g} {entry['unit']} only; {MORE[entry['kind']]}"
-    if entry["value"] < 0 and entry["place"] not in (NET, *LATE):
-        return f"{entry['name']}: came out negative, 0 is written; {MORE[entry['kind']]}"
     return ""
 
 
@@ -181,13 +256,14 @@ def _horizons(
     values: tuple[np.ndarray, np.ndarray],
     free: np.ndarray,
 ) -> dict[str, Any]:
-    """Rms errors ahead on stretches that a fit of its own has not seen, beside the vehicle given. ``values``:
-    of that vehicle, and of the fit to all stretches, where this one sets out."""
+    """Rms errors ahead on stretches that a fit of its own has not seen, beside the vehicle given, for which
+    the instruments' delays are fitted alone. ``values``: of that vehicle, and of the fit to all stretches,
+    where this one sets out."""
     held = np.arange(len(given.velocity)) % _HELD_OUT == _HELD_OUT - 1
     first, found = values
-    fit = fitted(given.some(~held), vehicle_cfg, found, free)
-    unseen = given.some(held)
-    models = {"identified": fit.value, "given": first}
+    seen, unseen, late = given.some(~held), given.some(held), free & np.isin(np.arange(SIZE), LATE)
+    fits = (("identified", found, free), ("given", first, late))
+    models = {name: fitted(seen, vehicle_cfg, begin, which).value for name, begin, which in fits}
     return {
         name: {str(k): v for k, v in horizon_errors(unseen, vehicle_cfg, theta, HORIZONS).items()}
         for name, theta in models.items()

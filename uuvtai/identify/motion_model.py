@@ -99,12 +99,12 @@ def parameters_of(vehicle_cfg: VehicleConfig) -> np.ndarray:
 
 
 def changed(vehicle_cfg: VehicleConfig, found: np.ndarray) -> dict[str, object]:
-    """Keys of the vehicle section that ``found`` (17,) changes; negative damping and added mass become 0."""
+    """Keys of the vehicle section that ``found`` (17,) changes."""
     keys: dict[str, object] = {}
     for row, name in enumerate(("added_mass", "linear_damping", "quadratic_damping")):
         values = list(getattr(vehicle_cfg, name))
         for i, place in enumerate(_OF_SIX):
-            values[place] = max(0.0, round(float(found[4 * row + i]), 5))
+            values[place] = round(float(found[4 * row + i]), 5)
         keys[name] = values
     heavy = vehicle_cfg.mass_kg + float(found[NET]) / vehicle_cfg.gravity_m_s2
     keys["volume_m3"] = round(heavy / vehicle_cfg.water_density_kg_m3, 8)
@@ -197,6 +197,17 @@ def readings(
             if late_s != 0.0 or after.any():
                 out[run, :, :, axes] = _earlier(out[run, :, :, axes], (late_s - after) / given.dt_s)
     return out
+
+
+def undelayed(given: Stretches, theta: np.ndarray) -> np.ndarray:
+    """(s, n + 1, 4) readings at the samples at which it was so, by the delays in ``theta``; NaN = none."""
+    found = np.full_like(given.velocity, np.nan)
+    for place, axes in zip(LATE, _READ, strict=True):
+        steps, count = round(float(theta[place]) / given.dt_s), found.shape[1]
+        to, begin = max(0, -steps), max(0, steps)
+        length = max(0, count - abs(steps))
+        found[:, to : to + length, axes] = given.velocity[:, begin : begin + length, axes]
+    return found
 
 
 def _earlier(rows: np.ndarray, steps: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from uuvtai.config import VehicleConfig
 from uuvtai.identify.linearised import SCALE, linearised
-from uuvtai.identify.motion_model import AXES, LAG, SIZE, Stretches, motion, readings
+from uuvtai.identify.motion_model import AXES, LAG, SIZE, Stretches, motion, readings, undelayed
 from uuvtai.identify.stretch_starts import first_readings, grown_starts, settled_starts
 
 _ROUNDS = 25
@@ -160,20 +160,30 @@ def horizon_errors(
     given: Stretches, vehicle_cfg: VehicleConfig, theta: np.ndarray, horizons: tuple[int, ...]
 ) -> dict[int, list[float | None]]:
     """Rms error (surge, sway, heave, yaw) of what is predicted that many steps ahead of a reading, by
-    ``theta`` (17,); None where no reading stands there. Horizons longer than a stretch are left out."""
+    ``theta`` (17,), whose delays tell when it was so; None where no reading stands there. Horizons longer
+    than a stretch are left out."""
     steps = given.wrench.shape[1]
     assert theta.shape == (SIZE,)
     given = given.at_lag(theta[LAG], vehicle_cfg)
     inputs = ("tilt_rate", "up", "wrench", "slope")
+    early = undelayed(given, theta)
+    if not np.isnan(early).any(axis=2).all():
+        given = replace(given, velocity=early)
+    whole = ~np.isnan(given.velocity).any(axis=2)
     found = {}
     for ahead in (h for h in horizons if h <= steps):
-        errors = []
-        for begin in range(0, steps - ahead + 1, max(ahead, steps // 10)):
-            cut = {name: getattr(given, name)[:, begin : begin + ahead] for name in inputs}
-            part = replace(given, velocity=given.velocity[:, begin : begin + ahead + 1], **cut)
-            whole = np.flatnonzero(~np.isnan(part.velocity[:, 0]).any(axis=1))
-            part = part.some(whole)
-            if len(whole):
+        errors, last = [], np.full(len(whole), -steps)
+        ready: np.ndarray = whole[:, : steps + 1 - ahead]
+        both: np.ndarray = ready & whole[:, ahead:]
+        ready = both if both.any() else ready
+        for begin in range(steps + 1 - ahead):
+            picked = np.flatnonzero(ready[:, begin] & (begin - last >= max(ahead, steps // 10)))
+            last[picked] = begin
+            if len(picked):
+                cut = {name: getattr(given, name)[:, begin : begin + ahead] for name in inputs}
+                part = replace(given, velocity=given.velocity[:, begin : begin + ahead + 1], **cut).some(
+                    picked
+                )
                 end = motion(theta[None], part.velocity[None, :, 0], part, vehicle_cfg)[0, :, -1]
                 errors.append(end - part.velocity[:, -1])
         if errors:
