@@ -48,6 +48,7 @@ FEEDBACK_AGE_S = 0.5
 """a velocity that is older is not fed back to the sticks"""
 _LEAST_ASKED_M_S, _ANSWER = 0.15, 0.2
 """a vehicle that is asked for so much, and has less than this share of it, does not answer"""
+_UNKNOWN = (math.nan, math.nan, math.nan)
 _REACHED, _INTERRUPTED = "goal reached", "interrupted"
 _T = TypeVar("_T")
 _FAREWELLS = (_REACHED, "time is up", _INTERRUPTED)
@@ -293,7 +294,7 @@ class OnboardLoop:
             operator_age_s=now_s - heard.operator_s,
             sensor_age_s={name: now_s - self._measured_s[name] for name in self._needed},
             pos_w=(x, y, z),
-            rpy=heard.rpy if now_s - heard.rpy_s <= limits.sensor_s["imu"] else (math.nan, math.nan, math.nan),
+            rpy=heard.rpy if now_s - heard.rpy_s <= limits.sensor_s["imu"] else _UNKNOWN,
             speed_m_s=math.hypot(*heard.vel_b) if heard.vel_b and is_fresh else None,
             battery_v=heard.battery_v,
             battery_share=heard.battery_share,
@@ -309,10 +310,10 @@ class OnboardLoop:
 
     def _measured(self, now_s: float) -> Velocity | None:
         """What may be fed back now; an axis that was not measured lately is NaN."""
-        heard, nan = self._intake.heard, math.nan
+        heard = self._intake.heard
         is_fresh = heard.vel_b is not None and now_s - heard.vel_b_s <= FEEDBACK_AGE_S
-        turn = heard.yaw_rate if now_s - heard.yaw_rate_s <= FEEDBACK_AGE_S else nan
-        return (*(heard.vel_b if heard.vel_b and is_fresh else (nan, nan, nan)), turn)
+        turn = heard.yaw_rate if now_s - heard.yaw_rate_s <= FEEDBACK_AGE_S else math.nan
+        return (*(heard.vel_b if heard.vel_b and is_fresh else _UNKNOWN), turn)
 
     def _note_answer(self, decision: SafeDecision, view: VehicleView) -> None:
         """For how long the vehicle was asked to move and did not; while it is held nothing is known."""
