@@ -169,7 +169,7 @@ def horizon_errors(
     early = undelayed(given, theta)
     if not np.isnan(early).any(axis=2).all():
         given = replace(given, velocity=early)
-    whole: np.ndarray = ~np.isnan(given.velocity).any(axis=2)
+    whole = np.asarray(~np.isnan(given.velocity).any(axis=2))
     found = {}
     for ahead in (h for h in horizons if h <= steps):
         errors, last = [], np.full(len(whole), -steps)
