@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from uuvtai.logs.reader import read_messages
 LONGEST_S = 7200
 _ROOT = Path(__file__).resolve().parent.parent
 _SEED = 20261127
+_NUMBERS, _AT_ONCE = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP), 2
 _SIGNALS, _FLIGHTS, _FIRST_FLIGHT = 100, 500, 1000
 """flights of the gate have lower numbers"""
 _LEAVE_S, _LONGEST_FLIGHT_S = 0.5, 25.0
@@ -74,29 +76,32 @@ class SwimmingSub(FakeSub):
 
 def signalled(job: Job) -> list[Row]:
     """SIGINT, SIGTERM and SIGHUP in turn, each in a process of its own."""
-    luck, wrong, waits, driving = random.Random(_SEED), [], [], 0
-    count = 3 if job.quick else _SIGNALS
-    for i in range(count):
-        number = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)[i % 3]
-        with tempfile.TemporaryDirectory() as folder:
-            found, wait_s, drove = _signalled(Path(folder), number, luck.uniform(0.0, _LONGEST_FLIGHT_S))
-        driving += drove
-        waits += [wait_s] if drove else []
-        for text in found:
-            job.say(f"VIOLATION {i}: {number.name}: {text}")
-        wrong += found
+    luck, count = random.Random(_SEED), 3 if job.quick else _SIGNALS
+    tries = [(_NUMBERS[i % 3], luck.uniform(0.0, _LONGEST_FLIGHT_S)) for i in range(count)]
+    with ThreadPoolExecutor(_AT_ONCE) as threads:
+        ends = list(threads.map(lambda given: _signalled(*given), tries))
+    wrong = [f"{number.name} after {after_s:.1f} s: {text}"
+             for (number, after_s), (found, *_) in zip(tries, ends, strict=True) for text in found]  # fmt: skip
+    for text in wrong:
+        job.say(f"VIOLATION {text}")
+    waits = [wait_s for _, wait_s, drove in ends if drove]
     slowest = max(waits, default=math.nan)
     return [
         Row(
             f"{count} signals: orders other than stop and mode, halves, other exit codes", len(wrong),
             "violations", less_is_better=True, floor=0, details={"violations": wrong, "seed": _SEED},
         ),
-        Row("of them while it was driven", driving, f"of {count}"),
+        Row("of them while it was driven", len(waits), f"of {count}"),
         Row("from the signal to the first stop, longest", slowest, "s", less_is_better=True, floor=_LEAVE_S),
     ]  # fmt: skip
 
 
-def _signalled(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[str], float, bool]:
+def _signalled(number: signal.Signals, after_s: float) -> tuple[list[str], float, bool]:
+    with tempfile.TemporaryDirectory() as folder:
+        return _ended(Path(folder), number, after_s)
+
+
+def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[str], float, bool]:
     """(what was wrong, seconds to the first stop, whether the vehicle was driven) of one process; the signal
     comes ``after_s`` seconds after its port is open."""
     port, log = free_port(), folder / "flight.mcap"
