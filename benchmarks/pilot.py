@@ -80,8 +80,9 @@ def signalled(job: Job) -> list[Row]:
     tries = [(_NUMBERS[i % 3], luck.uniform(0.0, _LONGEST_FLIGHT_S)) for i in range(count)]
     with ThreadPoolExecutor(_AT_ONCE) as threads:
         ends = list(threads.map(lambda given: _signalled(*given), tries))
-    wrong = [f"{number.name} after {after_s:.1f} s: {text}"
-             for (number, after_s), (found, *_) in zip(tries, ends, strict=True) for text in found]  # fmt: skip
+    wrong = [
+        f"{tries[i][0].name} after {tries[i][1]:.1f} s: {text}" for i in range(count) for text in ends[i][0]
+    ]
     for text in wrong:
         job.say(f"VIOLATION {text}")
     waits = [wait_s for _, wait_s, drove in ends if drove]
