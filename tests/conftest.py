@@ -84,14 +84,16 @@ def launch_one_by_one(monkeypatch, sim):
     monkeypatch.setattr(sim, "_rows", None)
 
 
-def estimate_pose(monkeypatch, small):
-    """Have its simulator find out where it is from harsh readings: only kernels of proprioception and pose
-    are compiled for it."""
+def estimate_pose(monkeypatch, small, **other):
+    """Have its simulator find out where it is from harsh readings, or ``other`` ones: only kernels of
+    proprioception and pose are compiled for it."""
     from uuvtai.loader import load_config
+    from uuvtai.sensing import SimulatedSensors
 
     harsh = load_config("pool", "harsh").sensors
     changed = {name: getattr(harsh, name) for name in ("localization", "dvl", "imu", "pressure")}
-    sensors = small.config.sensors.model_copy(update=changed)
+    sensors = small.config.sensors.model_copy(update=changed | other)
+    monkeypatch.setattr(small.sim, "sensors", SimulatedSensors(sensors))
     configure(monkeypatch, small.sim, small.sim.config.model_copy(update={"sensors": sensors}))
 
 

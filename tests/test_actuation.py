@@ -108,7 +108,7 @@ def set_ego(plant, vel, rate, rpy, valid=1):
     plant.ego.vel_valid.from_numpy(np.full(N_ENV, valid, np.int32))
 
 
-@pytest.mark.parametrize("valid", [1, 0])
+@pytest.mark.parametrize("valid", [1, 0, 2])
 def test_loop_equals_the_oracle(plant, valid):
     rng = np.random.default_rng(5)
     cfg, gains = plant.config.vehicle, plant.config.actuation
@@ -136,7 +136,7 @@ def test_loop_equals_the_oracle(plant, valid):
                 *sensed,
                 wrench_of_thrust,
                 thrust_of_wrench,
-                bool(valid),
+                valid,
             )
             assert np.abs(got_integral[env] - wanted).max() < 1e-4
             smooth = (

@@ -49,11 +49,12 @@ class Stage:
         self.teacher = allocate(TeacherState, SIZES)
         self.ego, self.mission = allocate(Proprioception, SIZES), allocate(MissionState, SIZES)
 
-    def choose(self, goal_z, away_m=10.0, before_z=-0.8, sigma_m=0.0, cfg=None):
+    def choose(self, goal_z, away_m=10.0, before_z=-0.8, sigma_m=0.0, cfg=None, given_up=0):
         """Depth to steer for of vehicles at -0.8 m whose goals lie so far ahead."""
         cfg = cfg or config()
         n = np.zeros(N_ENV, np.float32)
         self.ego.z_var.fill(sigma_m**2)
+        self.ego.given_up.fill(given_up)
         self.ego.pos_w.from_numpy(np.stack([n + 4, n + 3, n - 0.8], 1))
         goal = np.stack([n + 4 + np.float32(away_m), n + 3, n + np.asarray(goal_z, np.float32)], 1)
         self.mission.goal_w.from_numpy(goal.astype(np.float32))
@@ -97,6 +98,13 @@ def test_the_less_sure_of_its_depth_the_farther_from_the_edges(stage):
     expected = np.array([LOW + 0.15] * 3 + [HIGH - 0.15] * 3)
     np.testing.assert_allclose(stage.choose(goal_z, sigma_m=0.05), expected, atol=1e-5)
     np.testing.assert_allclose(stage.choose(goal_z, sigma_m=1.0), -0.8, atol=1e-5)
+
+
+@pytest.mark.parametrize(("edge_gap_m", "kept_m"), [(0.2, 0.35), (0.4, 0.4)])
+def test_with_a_dead_vertical_thruster_it_cruises_at_the_goals_depth_farther_off(stage, edge_gap_m, kept_m):
+    goal_z = np.array([-1.5, -1.2, -1.0, -0.6, -0.3, -0.1])
+    found = stage.choose(goal_z, cfg=config(edge_gap_m=edge_gap_m), given_up=5)
+    np.testing.assert_allclose(found, np.clip(goal_z, -1.6 + kept_m, -kept_m), atol=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.7, 0.2, 0.0])

@@ -66,6 +66,7 @@ class Story:
         self.conflict = np.ones(self.n, bool)
         self.believed_gap = 0.0
         self.place_error = np.zeros(3)
+        self.vel_valid = np.ones(self.n, int)
         self.coarse = None
         self.look, self.config = 0.0, CONFIG
 
@@ -104,6 +105,7 @@ class Story:
             t_s=self.t,
             pos_w=self.pos,
             believed_pos_w=self.pos + self.place_error,
+            vel_valid=self.vel_valid,
             quat_wb=np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1),
             vel_b=self.hull_vel,
             rate_b=np.zeros((self.n, 3)),
@@ -214,6 +216,7 @@ STORIES = {
     "out_of_tank": (lambda: change(at_wall(Story()), pos=np.tile([-0.1, 3.0, -0.8], (41, 1))), "out_of_tank"),
     "depth_misjudged": (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, 0.06])), "collision"),
     "lost_place": (lambda: change(hit_static(), place_error=np.array([0.08, 0.08, 0])), "collision"),
+    "velocity_lost": (lambda: change(hit_static(), vel_valid=np.full(41, 2)), "collision"),
     "depth_change": (diving_into_it, "collision"),
     "turned_back": (lambda: Story().turn(1.1, before=(1.0, 0.1)), "collision"),
     "depth_edge": (above_the_floor, "collision"),
@@ -288,6 +291,9 @@ def test_a_timeout_gets_its_label(label):
             "wrong_evasion",
         ),  # the forecast knew of the turn
         (lambda: Story(end_s=2.1), "wrong_evasion"),  # old enough not to have started in danger
+        (lambda: change(at_depth(-1.5), vel_valid=np.zeros(41)), "velocity_lost"),
+        (lambda: change(at_depth(-1.5), vel_valid=np.full(41, 2)), "hit_floor"),  # heave is known
+        (lambda: change(hit_static(), vel_valid=np.where(np.arange(41) < 35, 0, 1)), "hit_static"),  # again
         (lambda: hit_static(moving_m=0.9), "pushed_into_static"),
         (lambda: hit_static(moving_m=1.1), "hit_static"),
         (

@@ -22,6 +22,7 @@ GAINS = {
     DEAD_LEVEL: {0: 0.0},
 }
 STEPS = 60
+SMOOTH_S = 0.4
 
 
 def weave(step):
@@ -43,7 +44,7 @@ def driven(small, gains):
     for step in range(STEPS):
         small.sim.step(weave(step))
         asked.append(s.actuation.rpm_command.to_numpy()[:8].copy())
-    return s.actuation.given_up.to_numpy()[:8].copy(), np.array(asked)
+    return s.ego.given_up.to_numpy()[:8].copy(), np.array(asked)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,7 @@ def test_both_share_what_the_pair_was_asked_for(small):
     asked = {}
     for given_up in (0, 1 + LEFT, 1 + RIGHT):
         small.begin([0], seed=SEED)
-        small.sim.s.actuation.given_up[0] = given_up
+        small.sim.s.ego.given_up[0] = given_up
         small.sim.step(weave(0))
         rpm = small.sim.s.actuation.rpm_command.to_numpy()[0]
         asked[given_up] = rpm, thrust_of_rpm(rpm, small.config.vehicle)
@@ -94,13 +95,12 @@ def test_both_share_what_the_pair_was_asked_for(small):
 
 def test_it_is_forgotten_with_the_episode(small):
     small.begin([0], seed=SEED)
-    small.sim.s.actuation.given_up[0] = 1 + LEFT
+    small.sim.s.ego.given_up[0] = 1 + LEFT
     small.sim.step(weave(0))
     small.sim.step(weave(1))
-    assert small.sim.s.actuation.response.to_numpy()[0, 9] == 0, "nothing is weighed after the verdict"
+    assert small.sim.s.actuation.response.to_numpy()[0, 7] == 0, "nothing is weighed after the verdict"
     small.begin([0], seed=SEED)
-    actuation = small.sim.s.actuation
-    assert actuation.given_up[0] == 0 and not actuation.response.to_numpy()[0].any()
+    assert small.sim.s.ego.given_up[0] == 0 and not small.sim.s.actuation.response.to_numpy()[0].any()
 
 
 # ---------------------------------------------------------------------------------------------- the equations
@@ -123,23 +123,27 @@ def test_the_sums_are_those_of_the_oracle(small):
     vel, rate, rpy = (random.normal(0, size, (8, 3)).astype(np.float32) for size in (0.3, 0.3, 0.2))
     force = random.normal([0, 0, 9.81], 0.5, (8, 3)).astype(np.float32)
     rpm = random.uniform(-3000, 3000, (8, 6)).astype(np.float32)
-    before = random.uniform(0, 1, (8, 10)).astype(np.float32)
+    before = random.uniform(0, 1, (8, 12)).astype(np.float32)
     for row in range(8):
         s.clock.step[row], s.ego.vel_valid[row] = 1, int(row != 7)
         for name, value in (("vel_b", vel), ("rate_b", rate), ("rpy", rpy), ("specific_force_b", force)):
             getattr(s.ego, name)[row] = value[row].tolist()
         for i in range(6):
             s.actuation.rpm_queue[row, 0, i] = rpm[row, i]
-        for i in range(10):
+        for i in range(12):
             s.actuation.response[row, i] = before[row, i]
     lost_thruster.watch_thrusters(small.sim.io.thrusters)
     after = s.actuation.response.to_numpy()[:8]
-    kept = np.exp(-0.02 / cfg.actuation.watch_s)
+    kept, stays = np.exp(-0.02 / cfg.actuation.watch_s), np.exp(-0.02 / SMOOTH_S)
     for row in range(7):
-        a, b = thrust_of_rpm(rpm[row, LEFT], cfg.vehicle), thrust_of_rpm(rpm[row, RIGHT], cfg.vehicle)
-        r = felt(cfg.vehicle, *(x[row].astype(float) for x in (vel, rate, rpy, force))) - a - b
-        new = np.array([r * r, r * a, r * b, a * a, a * b, b * b, r, a, b, 1.0])
-        np.testing.assert_allclose(after[row], kept * before[row] + 0.02 * new, rtol=2e-4, atol=2e-3)
+        asked = [thrust_of_rpm(rpm[row, thruster], cfg.vehicle) for thruster in (LEFT, RIGHT)]
+        force_n = felt(cfg.vehicle, *(x[row].astype(float) for x in (vel, rate, rpy, force)))
+        smooth = stays * before[row, :3] + (1 - stays) * np.array([force_n, *asked])
+        a, b, total = smooth[1], smooth[2], smooth[1] + smooth[2]
+        r = smooth[0] - total
+        new = np.array([r * r, r * total, total * total, r, 1.0, (r + a) ** 2, a, (r + b) ** 2, b])
+        np.testing.assert_allclose(after[row, :3], smooth, rtol=2e-4, atol=2e-3)
+        np.testing.assert_allclose(after[row, 3:], kept * before[row, 3:] + 0.02 * new, rtol=2e-4, atol=2e-3)
     assert np.array_equal(after[7], before[7]), "without a DVL nothing is weighed"
 
 
@@ -148,18 +152,18 @@ def test_the_first_step_has_nothing_to_weigh(small):
     small.sim.step(weave(0))
     assert not small.sim.s.actuation.response.to_numpy()[0].any()
     small.sim.step(weave(1))
-    assert small.sim.s.actuation.response.to_numpy()[0, 9] == pytest.approx(0.02)
+    assert small.sim.s.actuation.response.to_numpy()[0, 7] == pytest.approx(0.02)
 
 
 # --------------------------------------------------------------------------------------------- who is watched
 
 
-def test_frames_with_two_vertical_thrusters_are_watched():
+def test_frames_with_two_or_more_vertical_thrusters_are_watched():
     six, eight = (load_config("open", vehicle=name) for name in ("bluerov2", "bluerov2_heavy"))
     assert lost_thruster.vertical_pair(six.vehicle) == (LEFT, RIGHT)
     assert lost_thruster.vertical_pair(eight.vehicle) == ()
-    assert lost_thruster.is_watched(six.vehicle, six.actuation)
-    assert not lost_thruster.is_watched(eight.vehicle, eight.actuation)
+    assert lost_thruster.vertical_group(eight.vehicle) == (4, 5, 6, 7)
+    assert all(lost_thruster.is_watched(one.vehicle, one.actuation) for one in (six, eight))
     off = load_config("open", overrides={"actuation.watch_s": 0})
     assert not lost_thruster.is_watched(off.vehicle, off.actuation)
     *level, left, right = six.vehicle.thrusters

@@ -6,10 +6,10 @@ import pytest
 from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference.proprioception import dead_reckoned, roll_pitch_yaw, specific_force, zeroed_depth
-from tests.reference.scenes import quaternions
+from tests.reference.scenes import quaternions, rotation
 from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, SensorsConfig, VehicleConfig
 from uuvtai.kernels.sensors import proprioception
-from uuvtai.kernels.sensors.bundles import ProprioceptionIO
+from uuvtai.kernels.sensors.bundles import ProprioceptionIO, VelocityIO
 from uuvtai.loader import load_config
 from uuvtai.state import (
     ClockState,
@@ -85,6 +85,12 @@ class Rig:
             )
         )
         return {name: getattr(self.ego, name).to_numpy() for name in names}
+
+    def find(self, sensors, step):
+        """(vel_b, vel_valid) of a step as the stack has them."""
+        self.sense(sensors, step, ())
+        proprioception.find_velocity(io_for(VelocityIO, self.ego, self.clock, sensors, RULES))
+        return self.ego.vel_b.to_numpy(), self.ego.vel_valid.to_numpy()
 
 
 @pytest.fixture(scope="module")
@@ -240,6 +246,38 @@ def test_truth_localization_ignores_the_errors_of_the_readings(rig):
     for step in range(20):
         rig.move(pos_w=(5 + 0.1 * step, 3, -1))
         assert np.allclose(rig.sense(sensors, step)["pos_w"], (5 + 0.1 * step, 3, -1))
+
+
+def lost(localization, **sensors):
+    """Sensors of a DVL that is silent from step 1 on."""
+    silent = DvlConfig(dropout=1.0, dropout_s=(90.0, 90.0))
+    return SensorsConfig(localization=localization, dvl=silent, **sensors)
+
+
+def test_a_given_position_tells_the_velocity_while_the_dvl_is_silent(rig):
+    sensors, truth = lost("truth"), random_motion(np.random.default_rng(6))
+    rig.start(sensors, **truth)
+    found, valid = rig.find(sensors, 0)
+    assert np.array_equal(found, rig.ego.dvl_b.to_numpy()) and np.all(valid == 1)
+    vel_w = np.random.default_rng(7).normal(0, 0.5, (N_ENV, 3))
+    rig.move(pos_w=truth["pos_w"] + vel_w * DT)
+    found, valid = rig.find(sensors, 1)
+    want = [rotation(quat).T @ vel for quat, vel in zip(truth["quat_wb"], vel_w, strict=True)]
+    assert np.all(valid == 1) and np.abs(found - want).max() < 2e-6 / DT
+
+
+def test_dead_reckoning_knows_heave_alone_while_the_dvl_is_silent(rig):
+    """At 0.1 m/s upwards, by a pressure sensor with 2 cm of noise, listing and pitched."""
+    sensors = lost("dead_reckoning", pressure=PressureConfig(bias_m=0.5, sigma_m=0.02))
+    quat = quaternions(np.tile([0.1, 0.2, 1.0], (N_ENV, 1)))
+    rig.start(sensors, quat_wb=quat, vel_b=(0.3, -0.1, 0.05))
+    rig.find(sensors, 0)
+    for step in range(1, 151):
+        rig.move(pos_w=(5, 3, -1 + 0.1 * step * DT))
+        found, valid = rig.find(sensors, step)
+    assert np.all(valid == 2) and np.allclose(found[:, :2], (0.3, -0.1), atol=1e-6), "the last reading"
+    rises = found @ rotation(quat[0])[2] - 0.1
+    assert abs(rises.mean()) < 0.01 and 0.005 < rises.std() < 0.03
 
 
 def test_dead_reckoning_with_clean_sensors_is_the_integral_of_the_motion(rig):

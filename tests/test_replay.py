@@ -14,6 +14,7 @@ import torch
 from tests.command import uuv
 from tests.conftest import estimate_pose
 from uuvtai.errors import SettingError
+from uuvtai.loader import load_config
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.log_recorder import EpisodeRecorder
@@ -23,7 +24,15 @@ from uuvtai.measure.replay import replaying
 from uuvtai.measure.replay.faults import Faults, Outage, disturbed, outage_of
 from uuvtai.measure.replay.log_feed import Delivery, read_feed
 from uuvtai.measure.replay.replaying import replay
-from uuvtai.pilot import DepthShot, DvlReading, ImuReading, OnboardPilot, PressureReading, SonarPing
+from uuvtai.pilot import (
+    DepthShot,
+    DvlReading,
+    ImuReading,
+    OnboardPilot,
+    PositionFix,
+    PressureReading,
+    SonarPing,
+)
 
 STEPS, SEED = 90, 77001
 END = SimpleNamespace(
@@ -36,14 +45,16 @@ class Job(NamedTuple):
     episode: int
 
 
-def recorded(small, folder, depth_images=True, steps=STEPS):
-    """Path of a log of row 0."""
+def recorded(small, folder, depth_images=True, steps=STEPS, lost_at=None):
+    """Path of a log of row 0, in which a thruster is taken for dead from step ``lost_at`` on."""
     job = Job(SEED, 3)
     recorder = EpisodeRecorder(folder, "pool", "bt", [job], depth_images)
     small.sim.sleep()
     small.begin([job.episode], seed=job.seed)
     recorder.begin(small.sim, 0, job)
-    for _ in range(steps):
+    for step in range(steps):
+        if step == lost_at:
+            small.sim.s.ego.given_up[0] = 5
         small.sim.step()
         recorder.step(small.sim)
     recorder.end(small.sim, 0, END)
@@ -78,6 +89,7 @@ def test_a_log_gives_the_same_commands(log, build):
     assert [row["equal_steps"] for row in found["agreement"]] == [STEPS + 1] * 4
     assert found["change"]["largest"] == 0 and found["change"]["held_steps"] == 0
     counts = found["messages"]
+    assert counts.pop("thruster")["fed"] == 0
     assert all(row["used"] == row["fed"] > 0 and row["bad"] == row["late"] == 0 for row in counts.values())
     assert counts["depth"]["fed"] == STEPS // 5 + 1
 
@@ -116,6 +128,20 @@ def test_a_pilot_that_begins_again_knows_nothing_of_before(small, build, monkeyp
         ends[spread] = replaying._played(pilot, feed, disturbed(feed.arrivals, Faults()))[0][-1].pos_w
     wrong_m = [math.dist(end[:2], first[-1].pos_w[:2]) for end in ends.values()]
     assert wrong_m[0] > 0.05 > wrong_m[1]
+
+
+@pytest.mark.parametrize("localization", ["truth", "dead_reckoning"])
+def test_the_same_while_the_dvl_is_silent(small, build, monkeypatch, tmp_path, localization):
+    silent = load_config("pool", "harsh", overrides={"sensors.dvl.dropout": 0.5}).sensors.dvl
+    estimate_pose(monkeypatch, small, localization=localization, dvl=silent)
+    found = replay(recorded(small, tmp_path), build=build)
+    assert found["equal"] and 0 < found["messages"]["dvl"]["used"] < STEPS / 20
+
+
+def test_the_same_once_a_thruster_is_taken_for_dead(small, build, tmp_path):
+    found = replay(recorded(small, tmp_path, lost_at=20), build=build)
+    assert found["equal"] and found["messages"]["thruster"]["used"] == STEPS - 20
+    assert small.arrays("ego")["ego.given_up"][0] == 5
 
 
 def test_late_readings_are_carried_to_now(small, build, monkeypatch, tmp_path):
@@ -222,11 +248,35 @@ def test_a_dead_sensor_stops_the_vehicle_with_a_reason(log, build, sensor, limit
     assert all(command.held[0].startswith(f"{sensor}: ") for command in stopped)
 
 
-def test_without_a_dvl_it_goes_on(log, build):
+@pytest.mark.parametrize(
+    ("lost", "known"), [(["dvl:0.2:9"], 1), (["dvl:0.2:9", "position:1.4:9"], 0), (["dvl:0.2:1.5"], 1)]
+)
+def test_without_a_dvl_it_goes_on_by_the_given_position(log, build, small, lost, known):
     feed = read_feed(log)
-    left = disturbed(feed.arrivals, Faults(outages=(outage_of("dvl:0.2:9"),))).arrivals
+    usual, _ = commands(feed, build)
+    truth = small.arrays("ego")["ego.vel_b"][0].copy()
+    left = disturbed(feed.arrivals, Faults(outages=tuple(map(outage_of, lost)))).arrivals
     found, _ = commands(feed, build, left)
     assert not any(command.held for command in found) and found[-1].action.any()
+    ego = small.arrays("ego")
+    assert ego["ego.vel_valid"][0] == known
+    if known:
+        assert np.abs(ego["ego.vel_b"][0] - truth).max() < 0.02
+        apart = [np.abs(one.action - two.action).max() for one, two in zip(usual, found, strict=True)]
+        assert np.median(apart) < 0.01
+
+
+def test_a_position_that_jumps_is_no_velocity(log, build, small):
+    feed = read_feed(log)
+    left = disturbed(feed.arrivals, Faults(outages=(outage_of("dvl:0.2:9"),))).arrivals
+    jump = [
+        dataclasses.replace(a, message=dataclasses.replace(a.message, pos_w=a.message.pos_w + np.float32(1)))
+        if isinstance(a.message, PositionFix) and a.time_s > 1.79
+        else a
+        for a in left
+    ]
+    commands(feed, build, jump)
+    assert small.arrays("ego")["ego.vel_valid"][0] == 0
 
 
 def test_nothing_at_all_is_a_stop(log, build):

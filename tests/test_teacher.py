@@ -26,7 +26,8 @@ TEACHER = {
     "n_heading": 12, "n_speed": 3, "evade_m_s": 0.8, "heave_m_s": 0.35, "n_heave_heading": 7, "burst_s": 0.75,
     "hull_reach_m": 0.22, "contact_m": 0.1, "margin_m": 0.25, "margin_growth_m_s": 0.1, "closing_s": 0.25,
     "vertical_weight": 1.4,
-    "caution": 1.2, "static_margin_m": 0.1, "static_horizon_s": 1.5, "static_dt_s": 0.25, "weight_peak": 6.0,
+    "caution": 1.2, "patience_s": 2.0, "waiting_m_s": 0.25, "lost_edge_gap_m": 0.35,
+    "static_margin_m": 0.1, "static_horizon_s": 1.5, "static_dt_s": 0.25, "weight_peak": 6.0,
     "weight_mean": 6.0,
     "weight_contact": 12.0, "weight_static": 12.0, "weight_static_contact": 30.0, "weight_deviation": 1.0,
     "weight_change": 0.3,
@@ -115,6 +116,7 @@ def scene(stage):
     fill(stage.ego.vel_b, (0, 0, 0))
     fill(stage.ego.rpy, (0, 0, 0))
     fill(stage.ego.pose_cov, [0] * 6)
+    stage.ego.given_up.fill(0)
     fill(stage.mission.goal_w, (15.0, 3.0, -0.8))
     fill(stage.route.lookahead_w, (6.0, 3.0, -0.8))
     stage.route.n_way.fill(10)
@@ -623,7 +625,43 @@ def test_climbs_or_dives_past_what_fills_the_way(scene):
     assert acting(scene) == ["Evade"] * 4 + ["FollowRoute"] * 2
     assert heave[0] > 0.9 * CFG.teacher.heave_m_s and heave[1] < -0.9 * CFG.teacher.heave_m_s
     assert abs(heave[2]) <= 0.05 + 1e-5
+    scene.ego.given_up.fill(5)
+    decide(scene)
+    assert scene.t.evade_vel_w.to_numpy()[2, 2] < -0.01, "out of the wider gap"
     assert abs(heave[3]) < 0.1  # level with it at any depth: heave only leads away from the route
+
+
+def test_patience_falls_while_it_does_not_come_on_and_comes_back(scene):
+    """At rest, slow, at the speed that is no waiting, driving, going astern; its caution falls with it."""
+    speeds = np.array([0.0, 0.125, 0.25, 0.6, -0.25, 0.0])
+    put(scene.ego.vel_b, speeds, slice(None), 0)
+    step_s = CFG.teacher.decide_period_steps * CFG.episode.control_dt_s
+    for _ in range(50):
+        assess(scene)
+    waited = 50 * step_s * np.maximum(1 - speeds / CFG.teacher.waiting_m_s, 0)
+    np.testing.assert_allclose(scene.t.waited_s.to_numpy(), waited, atol=1e-4)
+    patience = np.minimum(1, CFG.teacher.patience_s / np.maximum(waited, 1e-3))
+    np.testing.assert_allclose(scene.t.patience.to_numpy(), patience, atol=1e-4)
+    put(scene.ego.vel_b, 0.5, slice(None), 0)
+    for _ in range(100):
+        assess(scene)
+    assert np.all(scene.t.patience.to_numpy() == 1)
+    endless = CFG.teacher.model_copy(update={"patience_s": 0.0})
+    fill(scene.ego.vel_b, (0, 0, 0))
+    for _ in range(50):
+        assess(scene, endless)
+    assert np.all(scene.t.patience.to_numpy() == 1)
+
+
+def test_margins_shrink_with_patience(scene):
+    """What is no conflict any more for a vehicle that has waited."""
+    body(scene, 0, 0, (7.0, 3.75), (0.0, 0.0))
+    body(scene, 1, 0, (7.0, 3.75), (0.0, 0.0))
+    assess(scene)
+    assert np.all(scene.t.conflict_s.to_numpy()[:2] < FAR_M)
+    put(scene.t.waited_s, 8 * CFG.teacher.patience_s, 1)
+    assess(scene)
+    assert scene.t.conflict_s[0] < FAR_M == scene.t.conflict_s[1]
 
 
 def test_what_is_far_enough_below_is_no_conflict(scene):

@@ -18,6 +18,7 @@ from uuvtai.kernels.sensors import proprioception
 from uuvtai.kernels.sensors.bundles import ExactProprioceptionIO
 from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO
+from uuvtai.kernels.vehicle.lost_thruster import response_size
 from uuvtai.runtime import Runtime
 from uuvtai.taichi_patches.memory import HostFields
 
@@ -35,7 +36,7 @@ class Plant:
             "n_env": n_env,
             "n_thruster": len(config.vehicle.thrusters),
             "n_wrench": 6,
-            "n_response": 10,
+            "n_response": response_size(config.vehicle),
             "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
         }
         self.clock = self._allocated(state.ClockState)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from uuvtai.config import SonarConfig
+from uuvtai.config import SensorsConfig
 from uuvtai.kernels.sensors import depth, head, proprioception, sonar, sonar_image
 from uuvtai.stages import Stages
 
 
 class SensorSource(Protocol):
     """Fills readings of the awake rows, in this order in every control step."""
+
+    loses_velocity: bool
+    """the DVL may be silent where no filter estimates the velocity: then ``find_velocity`` runs"""
 
     def sense_motion(self, stages: Stages) -> None:
         """Readings of ``ego``: DVL, IMU, pressure, a position where it is given. The pose filter, if any,
@@ -29,8 +32,10 @@ class SensorSource(Protocol):
 class SimulatedSensors:
     """The simulator's own: from the truth, with errors as configured."""
 
-    def __init__(self, sonar_cfg: SonarConfig) -> None:
+    def __init__(self, sensors_cfg: SensorsConfig) -> None:
+        sonar_cfg = sensors_cfg.sonar
         self._mechanical, self._detects = sonar_cfg.mechanical, sonar_cfg.detector != "none"
+        self.loses_velocity = proprioception.loses_velocity(sensors_cfg)
 
     def sense_motion(self, stages: Stages) -> None:
         """All instruments but sonar and camera."""

@@ -22,6 +22,7 @@ from uuvtai.errors import DivergenceError
 from uuvtai.initial import fill_constants
 from uuvtai.kernels.perception import pose
 from uuvtai.kernels.planning import clearance, features, route
+from uuvtai.kernels.sensors import proprioception
 from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
 from uuvtai.kernels.world import scenarios
@@ -62,7 +63,7 @@ class Sim:
         self.observation: torch.Tensor | None = None
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
-        self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar)
+        self.sensors: SensorSource = SimulatedSensors(config.sensors)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self.put = self._memory.put
@@ -132,6 +133,8 @@ class Sim:
         io, c = self.io, self.config
         with self._stage("proprioception"):
             self.sensors.sense_motion(io)
+            if self.sensors.loses_velocity:
+                proprioception.find_velocity(io.velocity)
         estimated = c.sensors.localization == "estimated"
         if estimated:
             with self._stage("pose"):

@@ -17,6 +17,7 @@ from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception.mapping import look_period_s, scans_in
 from uuvtai.kernels.planning.clearance_keys import offset_bits
+from uuvtai.kernels.vehicle.lost_thruster import response_size
 from uuvtai.multibeam import elevations, heard_bearings
 from uuvtai.native.gpu_shape import is_gpu_shaped
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
@@ -51,7 +52,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_env": n_env,
         "n_thruster": len(config.vehicle.thrusters),
         "n_wrench": 6,
-        "n_response": 10,
+        "n_response": response_size(config.vehicle),
         "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
         **scenario_sizes(config.world),
         "n_ray": sensors.sonar.n_ray,

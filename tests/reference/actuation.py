@@ -14,11 +14,12 @@ def thrust_of_rpm(rpm, cfg):
 
 
 def control(
-    cfg, gains, dt, command, integral, vel, rate, rpy, wrench_of_thrust, thrust_of_wrench, vel_valid=True
+    cfg, gains, dt, command, integral, vel, rate, rpy, wrench_of_thrust, thrust_of_wrench, vel_valid=1
 ):
-    """(thrusts (n,) wanted after the limits, new integral (4,)) of the velocity loop."""
-    if not vel_valid:
-        vel = command[:3]
+    """(thrusts (n,) wanted after the limits, new integral (4,)) of the velocity loop; ``vel_valid`` 2 = heave
+    alone."""
+    known = {0: [0, 0, 0, 1], 1: [1, 1, 1, 1], 2: [0, 0, 1, 1]}[vel_valid]
+    vel = np.where(known[:3], vel, command[:3])
     mass = np.array([cfg.mass_kg] * 3) + np.array(cfg.added_mass[:3])
     inertia = np.array(cfg.inertia_kg_m2) + np.array(cfg.added_mass[3:])
     up = np.array([-np.sin(rpy[1]), np.sin(rpy[0]) * np.cos(rpy[1]), np.cos(rpy[0]) * np.cos(rpy[1])])
@@ -54,4 +55,4 @@ def control(
         error * integral < 0, 1.0, np.where(saturated, 0.0, np.maximum(0, 1 - np.abs(error) / band))
     )
     new = np.clip(integral + ki * part * error * dt, -bound, bound)
-    return share * thrust, np.where(vel_valid | (np.arange(4) == 3), new, integral)
+    return share * thrust, np.where(known, new, integral)

@@ -28,15 +28,16 @@ def decisions(log):
         own.tracks, own.grid = seen[step]["tracks"], grids.get(step)
         c, s = math.cos(own.yaw), math.sin(own.yaw)
         own.vel = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ own.own_velocity
-        own.low, own.high = band(log, float(own.z_variance))
+        own.low, own.high = band(log, float(own.z_variance), asked[step]["given_up"] != 0)
         found.append(own)
     return found
 
 
-def band(log, z_variance):
-    """(lowest, highest) z that is steered for."""
+def band(log, z_variance, lost):
+    """(lowest, highest) z that is steered for; ``lost``: with a dead vertical thruster."""
     t, (floor, surface) = log.config["teacher"], log.scenario["tank"]["z_m"]
-    gap = min(t["edge_gap_m"] + t["edge_sigmas"] * math.sqrt(z_variance), (surface - floor) / 2)
+    edge = max(t["edge_gap_m"], t["lost_edge_gap_m"] if lost else 0)
+    gap = min(edge + t["edge_sigmas"] * math.sqrt(z_variance), (surface - floor) / 2)
     return floor + gap, surface - gap
 
 
@@ -136,8 +137,8 @@ def moving_depths(log, own, velocities, lasts):
             body = np.array([path["x"], path["y"]]).T
             rel = at[..., :2] - body[1 : n + 1]
             closing = moving[..., :2] - np.diff(body[: n + 1], axis=0) / dt
-            free = free_m(rel, closing, gap, radius, t)
-            margin = t["caution"] * (t["margin_m"] + t["margin_growth_m_s"] * times)
+            free = free_m(rel, closing, gap, radius, t, own.patience)
+            margin = own.patience * t["caution"] * (t["margin_m"] + t["margin_growth_m_s"] * times)
             depth = np.maximum(t["contact_m"] + share * margin - free, 0)
             deepest += weight * depth.max(1)
             touching += weight * np.maximum(t["contact_m"] - free, 0).max(1)
@@ -146,7 +147,7 @@ def moving_depths(log, own, velocities, lasts):
     return peak, mean, contact
 
 
-def free_m(rel, closing, gap, radius, t):
+def free_m(rel, closing, gap, radius, t, patience):
     """(n, n_t) [m] free water between hull and body, less what closing in takes."""
     away = np.hypot(rel[..., 0], rel[..., 1])
     beside = np.maximum(away - radius, 0)
@@ -155,7 +156,7 @@ def free_m(rel, closing, gap, radius, t):
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = np.where(level, 1.0, beside / slant)
     nearing = np.maximum(-(rel * closing).sum(-1) / away, 0) * slope
-    return np.where(level, away - radius, slant) - t["hull_reach_m"] - t["closing_s"] * nearing
+    return np.where(level, away - radius, slant) - t["hull_reach_m"] - patience * t["closing_s"] * nearing
 
 
 def static_depths(log, own, velocities, lasts):

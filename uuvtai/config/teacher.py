@@ -53,6 +53,11 @@ class TeacherConfig(Section):
     """margin kept from a body that does something else than is forecast, as a share of the usual one"""
     caution: Positive = 1.0
     """factor of both margins from moving bodies: more trades time and success for fewer collisions"""
+    patience_s: NonNegative = 3.0
+    """a vehicle that has waited longer, before crossing traffic say, is less cautious: by this over the time
+    that it has waited; 0 = it waits for ever"""
+    waiting_m_s: Positive = 0.2
+    """as long as it comes on along its way more slowly than this it waits; faster, it forgets that it did"""
     body_doubt: Positive = 1.0
     """factor of what a body's radius grows by in its forecast, as that is less and less sure"""
     static_margin_m: NonNegative = 0.1
@@ -99,6 +104,9 @@ class TeacherConfig(Section):
     """share of cruise speed left at contact"""
     edge_gap_m: NonNegative = 0.2
     """hull centre to surface or floor, at least: the hull's radius of 0.17 m and 0.03 m,"""
+    lost_edge_gap_m: NonNegative = 0.35
+    """the same, if it is more, once a vertical thruster is suspected to be dead; the vehicle then cruises at
+    the goal's depth"""
     edge_sigmas: NonNegative = 3.0
     """and so many standard deviations of the own depth"""
     free_depth: bool = True

@@ -146,7 +146,7 @@ class ActuationConfig(Section):
     """covers the drag at full speed of every published BlueROV2 parameter set (59, 78 and 44 N)"""
     max_moment_n_m: Positive = 8.0
     watch_s: NonNegative = 2.0
-    """memory of the watch over the vertical thrusters, which gives up a dead one (frames with two of them);
+    """memory of the watch over the vertical thrusters, which notices a dead one and of two gives it up;
     0 = no watch"""
     watch_ratio: Fraction = 0.3
     """a thruster is given up when its death leaves less than this share of what any other explanation leaves

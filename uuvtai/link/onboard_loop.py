@@ -92,7 +92,7 @@ class OnboardLoop:
         )
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
         self._memory, self.tally = SafetyMemory(), FlightTally()
-        self._needed = [name for name in NAMES.values() if name != "depth"]
+        self._needed = [name for name in NAMES.values() if name not in ("depth", "thruster")]
         if config.sensors.localization == "estimated":
             self._needed.remove("position")
         self._measured_s = dict.fromkeys(NAMES.values(), -math.inf)

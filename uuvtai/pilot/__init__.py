@@ -15,6 +15,7 @@ from uuvtai.pilot.sensor_messages import (
     PressureReading,
     SensorMessage,
     SonarPing,
+    ThrusterLoss,
 )
 
 __all__ = [
@@ -31,4 +32,5 @@ __all__ = [
     "SonarPing",
     "StaleLimits",
     "Tally",
+    "ThrusterLoss",
 ]

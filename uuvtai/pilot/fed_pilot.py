@@ -25,7 +25,8 @@ class StaleLimits:
     """[s] how old the newest message of a sensor may be; beyond, the pilot stops. Infinite: it goes on.
 
     The DVL has none: without it the pose filter goes on by the accelerometer, and the stack knows
-    (``vel_valid``) when the velocity is no longer sure. So has the camera, which only adds to the sonar.
+    (``vel_valid``) when the velocity is no longer sure. So has the camera, which only adds to the sonar, and
+    who tells of dead thrusters, which most never do.
     """
 
     imu: float = 0.5
@@ -35,6 +36,7 @@ class StaleLimits:
     """where the pilot does not estimate its own"""
     dvl: float = math.inf
     depth: float = math.inf
+    thruster: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,9 @@ What each stage reads (``kernels/*/bundles.py``), and where it comes from here:
 
 Nobody behind the sensors reads the truth (``tests/test_observation_only.py``). Between two messages the last
 one is held, and one that comes late is carried forward to this step (``carrying.py``); a DVL without a
-message in its turn has lost the bottom. Nothing late is compared with, or carried by, corrections that came
-after it (``own_motion.py``). Sonar intensity is read by nobody.
+message in its turn has lost the bottom. Until its next message how the given position changes stands for it,
+as that was told and not as it was carried (``find_velocity`` takes it). Nothing late is compared with, or
+carried by, corrections that came after it (``own_motion.py``). Sonar intensity is read by nobody.
 """
 
 from __future__ import annotations
@@ -31,11 +32,15 @@ from uuvtai.pilot.sensor_messages import (
     PositionFix,
     PressureReading,
     SonarPing,
+    ThrusterLoss,
 )
 
 FIX_AGE_S = 0.3
 """[s] a scan or an image taken while attitude or position was older than this is not used: it would be drawn
-at the wrong place of the map. A velocity or depth later than this is not carried forward"""
+at the wrong place of the map. A velocity or depth later than this is not carried forward, and a velocity by
+positions is no older"""
+FASTEST_M_S = 3.0
+"""a position that changes faster was corrected, not driven"""
 
 
 class FedSensors:
@@ -56,6 +61,12 @@ class FedSensors:
         self._pressure: PressureReading | None = None
         """until the first one comes: where the start is known to be"""
         self._fixes = ("imu",) if numbers.estimated else ("imu", "position")
+        self.loses_velocity = not numbers.estimated
+        self._dvl_valid, self._dvl_step = 0, -KEPT
+        """what the DVL has said in its last turn, and when it last said anything"""
+        self._fix_step, self._fix_w, self._fix_steps = -KEPT, np.zeros(3, np.float32), KEPT
+        self._fix_vel_w = np.zeros(3, np.float32)
+        """[m/s] change up to the newest position, from the one so many steps before it"""
 
     @property
     def step(self) -> int:
@@ -79,14 +90,20 @@ class FedSensors:
         ego["rpy"][0] = ego["imu_rpy"][0] = rpy
         ego["rate_b"][0], ego["specific_force_b"][0] = imu.rate_b, imu.specific_force_b
         ego["dvl_fresh"][0] = 0
+        if isinstance(position := self._inbox.newest("position", self.now_s), PositionFix):
+            self._take_change(position)
         if self.step % self._dvl_period == 0:
             self._take_velocity()
+        if self.loses_velocity:
+            self._offer_change()
+        if isinstance(loss := self._inbox.newest("thruster", self.now_s), ThrusterLoss):
+            ego["given_up"][0] = int(loss.thruster)
         if isinstance(pressure := self._inbox.newest("pressure", self.now_s), PressureReading):
             self._pressure = pressure
         self._take_pressure(
             self._pressure or PressureReading(self.step * self._dt, -float(ego["pos_w"][0, 2]))
         )
-        if isinstance(position := self._inbox.newest("position", self.now_s), PositionFix):
+        if isinstance(position, PositionFix):
             late_s = self._steps_since(position.time_s) * self._dt
             moved = to_world(ego["vel_b"][0], ego["rpy"][0]) * late_s if late_s else 0.0
             ego["pos_w"][0] = position.pos_w + moved
@@ -103,6 +120,23 @@ class FedSensors:
                 ego["vel_valid"][0] = ego["dvl_fresh"][0] = then is not None
                 velocity = velocity + self._watch.sums.won_b - then["won_b"] if then else ego["vel_b"][0]
             ego["vel_b"][0] = ego["dvl_b"][0] = velocity
+        self._dvl_valid = ego["vel_valid"][0]
+        self._dvl_step = self.step if self._dvl_valid else self._dvl_step
+
+    def _offer_change(self) -> None:
+        """A velocity by positions that are younger than the DVL's reading, if they are not old themselves."""
+        steps = self._fix_steps + self.step - self._fix_step
+        known = np.abs(self._fix_vel_w).max() < FASTEST_M_S and steps * self._dt <= FIX_AGE_S
+        self._ego["vel_valid"][0], self._ego["fix_vel_w"][0] = self._dvl_valid, self._fix_vel_w
+        self._ego["fix_valid"][0] = known and self._fix_step > self._dvl_step
+
+    def _take_change(self, fix: PositionFix) -> None:
+        """[m/s] by the newest two positions, in float32 as the simulator's own kernel has it."""
+        step, pos_w = self._step_of(fix.time_s), np.asarray(fix.pos_w, np.float32)
+        if step > self._fix_step:
+            self._fix_steps = step - self._fix_step
+            self._fix_vel_w = (pos_w - self._fix_w) * np.float32(1.0 / (self._fix_steps * self._dt))
+            self._fix_step, self._fix_w = step, pos_w
 
     def _take_pressure(self, pressure: PressureReading) -> None:
         """A late one, or one held, changes by what the vehicle has risen since."""

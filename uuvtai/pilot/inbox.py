@@ -91,7 +91,7 @@ class Inbox:
         return now_s - self._used_s[name]
 
     def _check_shape(self, name: str, key: str, shape: tuple[int, ...]) -> None:
-        wanted = self._shapes.get(f"{name}.{key}", () if name == "pressure" else (3,))
+        wanted = self._shapes.get(f"{name}.{key}", () if name in ("pressure", "thruster") else (3,))
         if len(shape) != len(wanted) or any(w not in (s, ANY) for s, w in zip(shape, wanted, strict=True)):
             raise ValueError(f"{name}: {key} must have the shape {wanted}, got {shape}")
 

@@ -77,7 +77,16 @@ class DepthShot:
     """(rows, columns) [m] z-depth, row 0 at the top; no return = maximum range"""
 
 
-SensorMessage = ImuReading | DvlReading | PressureReading | PositionFix | SonarPing | DepthShot
+@dataclass(frozen=True, eq=False)
+class ThrusterLoss:
+    """A vertical thruster is dead, until the end."""
+
+    time_s: float
+    thruster: float
+    """its number, counted from 1; -1 = not known, or only suspected"""
+
+
+SensorMessage = ImuReading | DvlReading | PressureReading | PositionFix | SonarPing | DepthShot | ThrusterLoss
 KINDS: dict[str, type] = {
     "imu": ImuReading,
     "dvl": DvlReading,
@@ -85,6 +94,7 @@ KINDS: dict[str, type] = {
     "position": PositionFix,
     "sonar": SonarPing,
     "depth": DepthShot,
+    "thruster": ThrusterLoss,
 }
 """what a message is called where it is counted, lost or old"""
 NAMES = {kind: name for name, kind in KINDS.items()}
@@ -99,6 +109,7 @@ LIMITS = {
     "range_m": 1e5,
     "doppler_m_s": 1e3,
     "hit": 1.0,
+    "thruster": 100.0,
     "first_beam": 1e5,
 }
 """largest size that is believed, far above what any of these instruments says: a number that is larger, or

@@ -16,11 +16,19 @@ class Proprioception:
     invalid."""
 
     vel_b: ti.Field = array("n_env", vec=3)
-    """[m/s] DVL, where it is invalid the last reading; where the pose is estimated the filter's, in every
-    step"""
+    """[m/s] DVL; in steps without a reading how the given position changes, with dead reckoning the last
+    reading, once that is lost with the heave by pressure; where the pose is estimated the filter's"""
     vel_valid: ti.Field = array("n_env", dtype=ti.i32)
-    """1 = the DVL has a reading no older than its own period; where the pose is estimated: the filter is sure
-    of the velocity (``pose.sure_speed_m_s``)"""
+    """1 = known: by the DVL, no longer ago than its period, or by the given position; where the pose is
+    estimated the filter is sure of it (``pose.sure_speed_m_s``); 2 = heave alone is; 0 = the last reading"""
+    fix_vel_w: ti.Field = array("n_env", vec=3)
+    """[m/s] how the given position changes,"""
+    fix_valid: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = which is the velocity in this step: the DVL has said nothing"""
+    rise_m_s: ti.Field = array("n_env")
+    """[m/s] how z changes: by the DVL, while it is silent by pressure (dead reckoning)"""
+    rise_z_m: ti.Field = array("n_env")
+    """[m] z by pressure, smoothed (dead reckoning)"""
     rpy: ti.Field = array("n_env", vec=3)
     """[rad] roll, pitch, yaw of the IMU; yaw corrected where the pose is estimated"""
     rate_b: ti.Field = array("n_env", vec=3)
@@ -40,6 +48,9 @@ class Proprioception:
     """[rad] roll, pitch, yaw as the IMU itself says, without the filter's correction: for logs"""
     dvl_b: ti.Field = array("n_env", vec=3)
     """[m/s] newest reading of the DVL itself, which the filter does not overwrite: for logs"""
+    given_up: ti.Field = array("n_env", dtype=ti.i32)
+    """number, counted from 1, of the vertical thruster that is taken for dead by what the vehicle does
+    (``lost_thruster``); -1 = one of them is suspected to be, 0 = none"""
     dvl_fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = ``dvl_b`` was read in this very step"""
 

@@ -72,6 +72,10 @@ class TeacherState:
     """[s] time of the first predicted conflict of stopping here, geometry.FAR_M = none"""
     body_near_m: ti.Field = array("n_env", beside="danger")
     """[m] distance to the nearest forecast body now, hull to surface"""
+    waited_s: ti.Field = array("n_env")
+    """[s] for how long it has hardly come on along its way,"""
+    patience: ti.Field = array("n_env")
+    """and the share of its caution that this leaves"""
     steer_w: ti.Field = array("n_env", vec=2)
     """[m] horizontal way to the point that is steered for: the look-ahead point, or a nearer one where the
     straight way there is narrow"""

@@ -66,11 +66,9 @@ class ActuationState(Truth):
     """[rpm] what the rotors are told now (after the delay)"""
     rpm_queue: ti.Field = array("n_env", "n_delay", "n_thruster")
     """[rpm] commands under way, a ring indexed by episode step"""
-    given_up: ti.Field = array("n_env", dtype=ti.i32)
-    """number, counted from 1, of the vertical thruster that is taken for dead; 0 = none"""
     response: ti.Field = array("n_env", "n_response")
-    """[N^2 s] sums of r r, r a, r b, a a, a b, b b, older ones counting less: vertical thrust felt beyond
-    what was asked for (r), and what was asked of the two vertical thrusters (``lost_thruster``)"""
+    """what the watch remembers (``lost_thruster``): [N] vertical thrust felt, and asked of each vertical
+    thruster, smoothed; then sums over time of these and their products, older ones counting less"""
     thrust_n: ti.Field = array("n_env", "n_thruster")
     """[N] thrust of each rotor in the last substep"""
     hold_moment_b: ti.Field = array("n_env", vec=3)

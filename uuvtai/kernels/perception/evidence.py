@@ -184,7 +184,7 @@ def own_motion(env, io: Bundle[MappingIO]):
         ti.Vector([io.scan.ping_vel_b[env][0], io.scan.ping_vel_b[env][1]]),
         ti.static(doppler_threshold(io.mapping_cfg, io.sonar_cfg)),
     )
-    held = io.scan.ping_vel_valid[env] == 0
+    held = io.scan.ping_vel_valid[env] != 1
     if held or io.clusters.scan_step[env] == io.scan.ping_step[env]:
         vel -= turned_z(io.clusters.slip_w[env], -io.scan.ping_yaw[env])
     if held:

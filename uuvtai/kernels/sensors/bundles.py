@@ -49,6 +49,16 @@ class ProprioceptionIO:
 
 
 @dataclass(frozen=True, eq=False)
+class VelocityIO:
+    """The own velocity while the DVL is silent."""
+
+    ego: Out[Proprioception]
+    clock: In[ClockState]
+    episode_cfg: Const[EpisodeConfig]
+    sensors_cfg: Const[SensorsConfig]
+
+
+@dataclass(frozen=True, eq=False)
 class SonarIO:
     """The imaging sonar."""
 
@@ -79,5 +89,6 @@ class SensorStages:
     """Bundles of this room, by the noun of their stage."""
 
     proprioception: ProprioceptionIO
+    velocity: VelocityIO
     sonar: SonarIO
     depth: DepthIO

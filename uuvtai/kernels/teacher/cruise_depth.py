@@ -1,5 +1,5 @@
 """Which depth to cruise at: where the fewest moving bodies are to be met, as far as the goal's depth can
-still be reached in time."""
+still be reached in time; with a dead vertical thruster at the goal's."""
 
 import taichi as ti
 
@@ -7,7 +7,7 @@ from uuvtai.config import ElevationConfig, TeacherConfig, TrafficConfig, Vehicle
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.teacher.bundles import ThreatsIO
-from uuvtai.kernels.teacher.trajectories import depth_band, tuned
+from uuvtai.kernels.teacher.trajectories import depth_band, edge_gap, tuned
 from uuvtai.tuned_numbers import ARRIVAL, DEPTH_CHANGE, GOAL_DEPTH, SLOPE
 
 _BLUR_M = 0.1
@@ -17,7 +17,7 @@ _BLUR_M = 0.1
 @ti.func
 def choose_depth(env, io: Bundle[ThreatsIO]):
     """Set ``cruise_z_m``: the cheapest of ``depth_choices`` depths from edge to edge."""
-    low, high = depth_band(io.ego.z_var[env], io.tank_cfg, io.teacher_cfg)
+    low, high = depth_band(edge_gap(env, io.ego, io.teacher_cfg), io.tank_cfg)
     goal, pos = io.mission.goal_w[env], io.ego.pos_w[env]
     wanted = ti.math.clamp(goal[2], low, high)
     if ti.static(io.teacher_cfg.free_depth):
@@ -41,7 +41,8 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
         share = io.teacher_cfg.arrival_depth_share * tuned(env, ARRIVAL, io.teacher)
         off = share * radius + slope * ti.max(away - radius, 0.0)
         io.teacher.cruise_z_m[env] = best
-        wanted = ti.math.clamp(ti.math.clamp(best, goal[2] - off, goal[2] + off), low, high)
+        if io.ego.given_up[env] == 0:
+            wanted = ti.math.clamp(ti.math.clamp(best, goal[2] - off, goal[2] + off), low, high)
     return wanted
 
 

@@ -11,6 +11,7 @@ from uuvtai.kernels.teacher.trajectories import (
     body_depths,
     depth_band,
     drive_of,
+    edge_gap,
     place_doubt,
     static_depths,
     tuned,
@@ -80,13 +81,13 @@ def candidate(env, index, io: Bundle[EvasionIO]):
         out = _towards(env, turn, speed, follow[2], io)
     elif index == n_level + 1:
         out = io.teacher.last_vel_w[env]
-        out[2] = edge_limited(out[2], io.ego.pos_w[env][2], io.ego.z_var[env], io)
+        out[2] = edge_limited(env, out[2], io)
     elif index == n_level + 2:
         out = follow
     elif index > n_level + 2 and index < ti.static(io.teacher_cfg.n_held):
         nth = index - n_level - 3
         heave = ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s * tuned(env, HEAVE, io.teacher)
-        heave = edge_limited(heave, io.ego.pos_w[env][2], io.ego.z_var[env], io)
+        heave = edge_limited(env, heave, io)
         turn = ti.static(TWO_PI / io.teacher_cfg.n_heave_heading) * (nth // 2)
         out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, io)
     return out
@@ -102,9 +103,10 @@ def _towards(env, turn, share, heave, io: Bundle[EvasionIO]):
 
 
 @ti.func
-def edge_limited(heave, own_z, z_var, io: Bundle[EvasionIO]):
+def edge_limited(env, heave, io: Bundle[EvasionIO]):
     """Heave [m/s] that stops at the band's edges instead of running into floor or surface."""
-    low, high = depth_band(z_var, io.tank_cfg, io.teacher_cfg)
+    low, high = depth_band(edge_gap(env, io.ego, io.teacher_cfg), io.tank_cfg)
+    own_z = io.ego.pos_w[env][2]
     return ti.math.clamp(heave, ti.min(low - own_z, 0.0), ti.max(high - own_z, 0.0))
 
 

@@ -66,6 +66,7 @@ def _reset_blackboard(env, io: Bundle[TeacherIO]):
     )
     io.teacher.calm_steps[env], io.teacher.evading_steps[env] = 0, 0
     io.teacher.alert[env] = -1.0
+    io.teacher.waited_s[env], io.teacher.patience[env] = 0.0, 1.0
     io.teacher.speed_share[env], io.teacher.cruise_z_m[env] = 0.0, io.mission.goal_w[env][2]
 
 

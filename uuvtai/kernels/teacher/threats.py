@@ -5,7 +5,7 @@ import taichi as ti
 
 from uuvtai.config import TeacherConfig, VehicleConfig
 from uuvtai.kernels.core.beams import beam_bearing
-from uuvtai.kernels.core.geometry import FAR_M, wrapped_angle
+from uuvtai.kernels.core.geometry import FAR_M, turned_z3, wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, centre_of
 from uuvtai.kernels.core.lanes import filled, n_lane
 from uuvtai.kernels.core.signature import Bundle, Const, spread
@@ -210,6 +210,18 @@ def _note_speeds(env, io: Bundle[ThreatsIO]):
 
 
 @ti.func
+def _note_waiting(env, io: Bundle[ThreatsIO]):
+    """Count the time in which the vehicle does not come on along its way, and what patience it leaves."""
+    vel, way = turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2]), _unit(io.teacher.steer_w[env])
+    slow = 1.0 - ti.Vector([vel[0], vel[1]]).dot(way) / io.teacher_cfg.waiting_m_s
+    period_s = ti.static(io.teacher_cfg.decide_period_steps * io.episode_cfg.control_dt_s)
+    waited = ti.max(io.teacher.waited_s[env] + period_s * slow, 0.0)
+    io.teacher.waited_s[env] = waited
+    if io.teacher_cfg.patience_s > 0:
+        io.teacher.patience[env] = ti.min(1.0, io.teacher_cfg.patience_s / ti.max(waited, 1.0e-3))
+
+
+@ti.func
 def _foresee_conflict(env, io: Bundle[ThreatsIO]):
     """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change
     of depth; and a stop.
@@ -220,6 +232,7 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
     io.teacher.calm_steps[env] += 1
     if io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0:
         _note_speeds(env, io)
+        _note_waiting(env, io)
         pos = io.ego.pos_w[env]
         follow = io.teacher.follow_vel_w[env]
         heave = held_heave(choose_depth(env, io) - pos[2], io.teacher_cfg, io.vehicle_cfg)

@@ -48,10 +48,10 @@ def drive_of(
         burst_s=burst_s,
         pos=ego.pos_w[env],
         vel=turned_z3(ego.vel_b[env], ego.rpy[env][2]),
-        z_var=ego.z_var[env],
-        caution=teacher_cfg.caution * tuned(env, CAUTION, teacher),
+        gap=edge_gap(env, ego, teacher_cfg),
+        caution=teacher_cfg.caution * tuned(env, CAUTION, teacher) * teacher.patience[env],
         growth_m_s=teacher_cfg.margin_growth_m_s * tuned(env, GROWTH, teacher),
-        closing_s=teacher_cfg.closing_s * tuned(env, CLOSING, teacher),
+        closing_s=teacher_cfg.closing_s * tuned(env, CLOSING, teacher) * teacher.patience[env],
         horizon_s=teacher_cfg.horizon_s * tuned(env, HORIZON, teacher) + _SLACK_S,
         slower=tuned(env, LAG, teacher),
         vertical=teacher_cfg.vertical_weight * tuned(env, VERTICAL, teacher),
@@ -73,14 +73,14 @@ def body_depths(
     """How deep each commanded velocity violates the wanted clearance from the forecast bodies.
 
     ``drive``: struct of the velocities (lanes x, y, z [m/s]), which are commanded for ``burst_s`` [s], then
-    stop, and of the own position ``pos`` [m], velocity ``vel`` [m/s] and variance of z ``z_var`` [m^2] now,
-    world, and the row's own margins, weights, horizon and lag (``drive_of``). Returns lanes: largest depth
-    [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m];
-    time of the first violation [s], FAR_M = none. Each body counts with the mean of its futures, weighted by
-    their probabilities; a future that is less probable than ``heed_share`` has no first violation. The
-    clearance is reduced by closing_s times the closing speed, as the referee also stops at a small time to
-    collision. Bodies are upright cylinders; water known to be free above or below them (``above_w``,
-    ``below_w``) adds to the distance.
+    stop, and of the own position ``pos`` [m] and velocity ``vel`` [m/s] now, world, the ``gap`` [m] kept from
+    floor and surface, and the row's own margins, weights, horizon and lag (``drive_of``). Returns lanes:
+    largest depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact
+    [m]; time of the first violation [s], FAR_M = none. Each body counts with the mean of its futures,
+    weighted by their probabilities; a future that is less probable than ``heed_share`` has no first
+    violation. The clearance is reduced by closing_s times the closing speed, as the referee also stops at a
+    small time to collision. Bodies are upright cylinders; water known to be free above or below them
+    (``above_w``, ``below_w``) adds to the distance.
     """
     found = _no_depths(drive)
     for track in range(ti.static(forecast.radius_m.shape[1])):
@@ -159,7 +159,7 @@ def _future_depths(
     """The lanes' depths for one future of one body; -1 = its forecast."""
     n_sample = ti.static(_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
     dt = ti.static(tracking_cfg.forecast_dt_s)
-    low, high = depth_band(drive.z_var, tank_cfg, teacher_cfg)
+    low, high = depth_band(drive.gap, tank_cfg)
     found = _no_depths(drive)
     level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
     reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
@@ -314,11 +314,17 @@ def held_heave(error_m, teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[Ve
 
 
 @ti.func
-def depth_band(z_var, tank_cfg: Const[TankConfig], teacher_cfg: Const[TeacherConfig]):
-    """(lowest, highest) own z [m] that the teacher steers for, the less sure of it (``z_var`` [m^2]) the
-    farther from floor and surface."""
+def edge_gap(env, ego: In[Proprioception], teacher_cfg: Const[TeacherConfig]):
+    """[m] to keep from floor and surface: the less sure of the own z, and with a dead vertical thruster, the
+    more."""
+    least = ti.select(ego.given_up[env] != 0, teacher_cfg.lost_edge_gap_m, 0.0)
+    return ti.max(teacher_cfg.edge_gap_m, least) + teacher_cfg.edge_sigmas * ti.sqrt(ego.z_var[env])
+
+
+@ti.func
+def depth_band(gap, tank_cfg: Const[TankConfig]):
+    """(lowest, highest) own z [m] that the teacher steers for, ``gap`` [m] off floor and surface."""
     floor, top = ti.static(tank_cfg.z_m)
-    gap = teacher_cfg.edge_gap_m + teacher_cfg.edge_sigmas * ti.sqrt(z_var)
     gap = ti.min(gap, ti.static(0.5 * (tank_cfg.z_m[1] - tank_cfg.z_m[0])))
     return floor + gap, top - gap
 

@@ -12,7 +12,7 @@ import taichi as ti
 from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_column
 from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, In, Out, spread
 from uuvtai.kernels.vehicle.bundles import ActuationIO
-from uuvtai.kernels.vehicle.lost_thruster import is_watched, vertical_pair
+from uuvtai.kernels.vehicle.lost_thruster import vertical_pair
 from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits, thrust_of_rpm
 from uuvtai.native.launch import quick_launch
 
@@ -61,7 +61,6 @@ def reset_actuation(io: Bundle[ActuationIO]):
         if pad == 0 and io.clock.awake[env] == 1:
             io.actuation.command[env] = 0.0
             io.actuation.integral[env] = 0.0
-            io.actuation.given_up[env] = 0
             for i in ti.static(range(io.actuation.response.shape[1])):
                 io.actuation.response[env, i] = 0.0
             io.actuation.hold_moment_b[env] = 0.0
@@ -135,7 +134,7 @@ def _drive(first, lanes: Const[int], io: Bundle[ActuationIO]):
         rate=ti.Matrix([[0.0] * lanes for _ in range(3)]),
         up=ti.Matrix([[0.0] * lanes for _ in range(3)]),
         integral=ti.Matrix([[0.0] * lanes for _ in range(4)]),
-        seen=ti.Matrix([[0.0] * lanes for _ in range(1)]),
+        seen=ti.Matrix([[0.0] * lanes for _ in range(4)]),
         rpm=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
     )
     for lane in range(lanes):
@@ -155,11 +154,13 @@ def _load_vehicle(lane, env, fleet: Out[Any], io: Bundle[ActuationIO]):
     """Copy what one vehicle wants and senses into its column."""
     command, vel = io.actuation.command[env], io.ego.vel_b[env]
     # a lost DVL holds an old velocity: feeding that back would run away, so the feed-forward drives alone
-    # until it is back
-    seen = io.ego.vel_valid[env] == 1
+    # until it is back, but in heave where that is known (2)
+    seen = io.ego.vel_valid[env]
     for axis in ti.static(range(3)):
-        fleet.vel[axis, lane] = ti.select(seen, vel[axis], command[axis])
-    fleet.seen[0, lane] = ti.select(seen, 1.0, 0.0)
+        known = seen == 1 or (axis == 2 and seen == 2)
+        fleet.vel[axis, lane] = ti.select(known, vel[axis], command[axis])
+        fleet.seen[axis, lane] = ti.select(known, 1.0, 0.0)
+    fleet.seen[3, lane] = 1.0
     put_column(fleet.command, lane, command)
     put_column(fleet.rate, lane, io.ego.rate_b[env])
     put_column(fleet.up, lane, _up_b(io.ego.rpy[env]))
@@ -176,7 +177,7 @@ def _store_vehicle(lane, env, fleet: In[Any], io: Bundle[ActuationIO]):
     due = (io.clock.step[env] - io.params.delay_steps[env]) % n_slot
     for i in ti.static(range(io.actuation.rpm_command.shape[1])):
         io.actuation.rpm_queue[env, slot, i] = fleet.rpm[i, lane]
-    if ti.static(is_watched(io.vehicle_cfg, io.actuation_cfg)):
+    if ti.static(io.actuation_cfg.watch_s > 0 and len(vertical_pair(io.vehicle_cfg)) == 2):
         _spare_given_up(env, slot, io)
     for i in ti.static(range(io.actuation.rpm_command.shape[1])):
         io.actuation.rpm_command[env, i] = io.actuation.rpm_queue[env, due, i]
@@ -187,12 +188,12 @@ def _spare_given_up(env, slot, io: Bundle[ActuationIO]):
     """Tell a thruster that is given up nothing, and its mate the thrust of both: the heave stays, the roll
     moment is left to the hold."""
     pair = ti.static(vertical_pair(io.vehicle_cfg))
-    if io.actuation.given_up[env] > 0:
+    if io.ego.given_up[env] > 0:
         both = thrust_of_rpm(io.actuation.rpm_queue[env, slot, pair[0]], io.vehicle_cfg) + thrust_of_rpm(
             io.actuation.rpm_queue[env, slot, pair[1]], io.vehicle_cfg
         )
         alone = rpm_of_thrust(both, io.vehicle_cfg)
-        dead_first = io.actuation.given_up[env] == ti.static(1 + pair[0])
+        dead_first = io.ego.given_up[env] == ti.static(1 + pair[0])
         io.actuation.rpm_queue[env, slot, pair[0]] = ti.select(dead_first, 0.0, alone)
         io.actuation.rpm_queue[env, slot, pair[1]] = ti.select(dead_first, alone, 0.0)
 
@@ -223,7 +224,7 @@ def _control(lane, fleet: Out[Any], inverse: In[Any], io: Bundle[ActuationIO]):
         after = integrated(
             integral[axis], error[axis], saturated, per_step, loops[axis].band, loops[axis].bound
         )
-        fleet.integral[axis, lane] = ti.select(fleet.seen[0, lane] == 1.0 or axis == 3, after, integral[axis])
+        fleet.integral[axis, lane] = ti.select(fleet.seen[axis, lane] == 1.0, after, integral[axis])
 
 
 @ti.func

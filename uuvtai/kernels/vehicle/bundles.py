@@ -38,8 +38,8 @@ class ThrusterWatchIO:
     """What the vertical thrusters were told, and what the vehicle did."""
 
     actuation: Out[ActuationState]
+    ego: Out[Proprioception]
     clock: In[ClockState]
-    ego: In[Proprioception]
     actuation_cfg: Const[ActuationConfig]
     episode_cfg: Const[EpisodeConfig]
     sensors_cfg: Const[SensorsConfig]

@@ -26,6 +26,9 @@ _ACTION = record(
     applied=described(FOUR, "what drove the step that led here"),
     asked=described(THREE, "[m/s] velocity that the tree asks for, world"),
     thrust=described(array_of(NUMBER), "[N] of each thruster"),
+    given_up=described(
+        INT, "number from 1 of the vertical thruster taken for dead; -1 = one is suspected, 0 = none"
+    ),
     leaf=described(STRING, "node of the tree that sets the teacher's action"),
 )
 _SAFETY = record(
@@ -56,6 +59,7 @@ _EVASION = record(
     position=described(THREE, "[m] own, as estimated"),
     own_velocity=described(THREE, "[m/s] body frame, as measured or estimated"),
     yaw=described(NUMBER, "[rad] own, as estimated"),
+    patience=described(NUMBER, "share of caution and closing_s that waiting has left"),
     z_variance=described(NUMBER, "[m^2] of the estimated z"),
     place_variance=described(NUMBER, "[m^2] of the estimated x and y in their worst direction"),
 )
@@ -84,7 +88,8 @@ def _action(moment: Moment) -> bytes:
         f'"teacher":{numbers(moment["teacher.action"])},'
         f'"applied":{numbers(moment["driver.applied"])},'
         f'"asked":{numbers(moment["teacher.last_vel_w"])},'
-        f'"thrust":{numbers(moment["actuation.thrust_n"])},"leaf":{json.dumps(leaf)}}}'
+        f'"thrust":{numbers(moment["actuation.thrust_n"])},"given_up":{int(moment["ego.given_up"])},'
+        f'"leaf":{json.dumps(leaf)}}}'
     ).encode()
 
 
@@ -122,7 +127,8 @@ def _evasion(moment: Moment) -> bytes:
         f'"cost":{number(moment["teacher.evade_cost"])},"candidate":{int(moment["teacher.evade_candidate"])},'
         f'"costs":{numbers(moment["teacher.candidate_cost"])},'
         f'"position":{numbers(moment["ego.pos_w"])},"own_velocity":{numbers(moment["ego.vel_b"])},'
-        f'"yaw":{number(moment["ego.rpy"][2])},"z_variance":{number(moment["ego.z_var"])},'
+        f'"yaw":{number(moment["ego.rpy"][2])},"patience":{number(moment["teacher.patience"])},'
+        f'"z_variance":{number(moment["ego.z_var"])},'
         f'"place_variance":{number(_worst_variance(moment["ego.pose_cov"]))}}}'
     ).encode()
 
@@ -149,7 +155,7 @@ def _tree_text(nodes: tuple[str, ...], codes: tuple[int, ...]) -> bytes:
 
 _DECISION = (
     *("conflict_s", "hold_conflict_s", "follow_vel_w", "cruise_z_m", "evade_vel_w", "evade_cost"),
-    *("evade_candidate", "candidate_cost"),
+    *("evade_candidate", "candidate_cost", "patience"),
 )
 _OWN = ("ego.pos_w", "ego.vel_b", "ego.rpy", "ego.z_var", "ego.pose_cov")
 
@@ -161,7 +167,7 @@ ROWS = (
         _action,
         (
             *("driver.action", "driver.applied", "teacher.action", "teacher.last_vel_w", "teacher.leaf"),
-            "actuation.thrust_n",
+            *("actuation.thrust_n", "ego.given_up"),
         ),
         lambda data: data.get("leaf", ""),
     ),

@@ -34,7 +34,7 @@ _MEASURED = tuple(f"ego.{name}" for name in ("vel_b", "vel_valid", "rate_b", "de
 
 def _state(moment: Moment) -> bytes:
     position, orientation, velocity, rates, rpm = (numbers(moment[name]) for name in _TRUTH)
-    valid = "true" if moment["ego.vel_valid"] else "false"
+    valid = "true" if moment["ego.vel_valid"] == 1 else "false"
     return (
         f'{{"position":{position},"orientation":{orientation},"velocity":{velocity},"rates":{rates},'
         f'"current":{numbers(moment["current.vel_w"])},"rpm":{rpm},'

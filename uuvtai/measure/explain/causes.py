@@ -17,6 +17,7 @@ from typing import Any
 from uuvtai.config import Config
 from uuvtai.measure.explain.facts import (
     BACK_RAD,
+    BLIND_S,
     CLIMB_S,
     LAST_S,
     LEAD_S,
@@ -67,9 +68,11 @@ STUCK_M = 0.5
 CAUSES: dict[str, str] = {
     "out_of_tank": "left the tank",
     "depth_misjudged": f"touched floor or surface, the own depth off by > {DEPTH_M:g} m towards it",
+    "lost_place": f"touched a static or wall, the own position off by > {PLACE_M:g} m",
+    "velocity_lost": "touched floor, surface, a static or wall, the own velocity unknown in most of the last "
+    f"{BLIND_S:g} s",
     "hit_floor": "touched the floor",
     "hit_surface": "touched the surface",
-    "lost_place": f"touched a static or wall, the own position off by > {PLACE_M:g} m",
     "pushed_into_static": f"touched a static or wall while evading, or with a moving body within {NEAR_M:g} "
     "m",
     "hit_static": "touched a static obstacle, no moving body near",
@@ -175,10 +178,14 @@ def label_of(outcome: str, killer: Killer, facts: Fact) -> str:
         return "out_of_tank"
     if killer.name in ("floor", "surface"):
         towards = facts["depth_error_m"] * (1 if killer.name == "floor" else -1)
-        return "depth_misjudged" if towards > DEPTH_M else f"hit_{killer.name}"
+        if towards > DEPTH_M:
+            return "depth_misjudged"
+        return "velocity_lost" if facts["blind_share"] > 0.5 else f"hit_{killer.name}"
     if not killer.moving:
         if facts["place_error_m"] > PLACE_M:
             return "lost_place"
+        if facts["blind_share"] > 0.5:
+            return "velocity_lost"
         pushed = facts["evading_s"] > 0 or _within(facts["moving_near_m"], NEAR_M)
         return "pushed_into_static" if pushed else "hit_wall" if killer.name == "wall" else "hit_static"
     return _knowledge_label(facts) or _pilot_label(facts)

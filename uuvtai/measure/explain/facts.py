@@ -50,6 +50,9 @@ NEAR_S = 1.5
 CHANCES_S = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 """The last chance is the latest of these times before the end from which some velocity still escaped
 (``escape.py``)."""
+BLIND_S = 1.0
+"""The own velocity is lost when it was unknown in most of this time before the end; for floor and surface
+heave is enough."""
 BREAK_S = 0.3
 """A leaf that lost charge for no longer than this still counts as in charge."""
 LAST_S = 10.0
@@ -135,9 +138,11 @@ class Scene:
         still = (self.bodies.kind != NONE) & ~moving
         ago = h.t_s[-1] - h.t_s
         off = h.believed_pos_w[-1] - h.pos_w[-1]
+        blind = h.vel_valid == 0 if killer.name in ("floor", "surface") else h.vel_valid != 1
         return {
             "place_error_m": _round(np.hypot(off[0], off[1])),
             "depth_error_m": _round(off[2]),
+            "blind_share": _round(blind[ago <= BLIND_S].mean()),
             "climbed_m": _round(h.pos_w[-1, 2] - h.pos_w[int(np.abs(ago - CLIMB_S).argmin()), 2]),
             "age_s": _round(h.t_s[-1]),
             "leaf": h.leaf[-1],

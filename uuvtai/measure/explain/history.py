@@ -54,6 +54,8 @@ class History:
     pos_w: Array
     believed_pos_w: Array
     """(n, 3) own position as the vehicle estimates it"""
+    vel_valid: Array
+    """(n,) whether it knows its velocity: 1, 2 = heave alone, 0 = not"""
     quat_wb: Array
     vel_b: Array
     rate_b: Array

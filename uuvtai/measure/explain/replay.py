@@ -27,7 +27,7 @@ are read together."""
 
 _WINDOW_FIELDS = {
     "vehicle": ("pos_w", "quat_wb", "vel_b", "rate_b"),
-    "ego": ("pos_w",),
+    "ego": ("pos_w", "vel_valid"),
     "world": ("pos_w", "vel_w"),
     "scan": ("ping_step", "range_m"),
     "tracks": ("alive", "moving", "state"),
@@ -122,6 +122,7 @@ class FailureRecorder:
             t_s=w["step"] * self._dt,
             pos_w=w["vehicle.pos_w"].astype(float),
             believed_pos_w=w["ego.pos_w"].astype(float),
+            vel_valid=w["ego.vel_valid"],
             quat_wb=w["vehicle.quat_wb"].astype(float),
             vel_b=w["vehicle.vel_b"].astype(float),
             rate_b=w["vehicle.rate_b"].astype(float),

@@ -24,6 +24,7 @@ from uuvtai.pilot import (
     PressureReading,
     SensorMessage,
     SonarPing,
+    ThrusterLoss,
 )
 from uuvtai.tree import FlatTree, parse_tree, read_tree
 
@@ -221,6 +222,8 @@ class _FeedReader:
             )
         if step > _MAX_STEPS:
             raise LogError(f"{self._feed.path}: is longer than {_MAX_STEPS} steps; no episode of ours is")
+        if given_up := m.data.get("given_up"):
+            self._arrives(m, ThrusterLoss(m.time_s, float(given_up)))
         logged = LoggedStep(_array(m.data["teacher"]), _array(m.data["asked"]), m.data["leaf"], self._pos_w)
         self._feed.steps.append(logged)
 
