@@ -22,7 +22,7 @@ GAINS = {
     DEAD_LEVEL: {0: 0.0},
 }
 STEPS = 60
-SMOOTH_S = 0.4
+SMOOTH_S = 0.1
 
 
 def weave(step):

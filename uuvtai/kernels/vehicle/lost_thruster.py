@@ -7,8 +7,8 @@ against each other the roll moment of the horizontal ones, with 20 N each where 
 of two dead that is heave.
 
 In every step the vertical thrust that the vehicle felt, from accelerometer, gyro and DVL by its nominal
-parameters, is compared with what was asked for of each thruster, a_i; both are smoothed, for commands may
-come late. r is the difference of the felt thrust and the sum A of all a_i. Of several explanations each
+parameters, is compared with what was asked for of each thruster, a_i; both are smoothed, for rotors follow
+late. r is the difference of the felt thrust and the sum A of all a_i. Of several explanations each
 leaves a sum of squares, forgotten after ``watch_s``:
 
 - all is well: sum r^2
@@ -18,8 +18,8 @@ leaves a sum of squares, forgotten after ``watch_s``:
 
 each about its own mean, as far as the accelerometer's data sheet allows a constant error. Of two a thruster
 is given up, until the episode ends, when its death leaves less than ``watch_ratio`` of what the best of the
-others leaves. When any death explains more than half of what whole or weak ones leave, one is suspected: the
-pilot keeps away, which of them it is nobody needs to know.
+others leaves. Where any death leaves far less than whole or weak thrusters do, one is suspected: the pilot
+keeps away, which of them it is nobody needs to know.
 """
 
 import taichi as ti
@@ -32,10 +32,10 @@ from uuvtai.native.launch import quick_launch
 _OFFSET_NOISE_N2_S = 2.5
 """How much squared residual tells as much of the offset as the accelerometer's data sheet."""
 
-_SMOOTH_S = 0.4
-"""Time constant of felt and asked thrusts: commands that come 0.2 s late look alike to it."""
+_SMOOTH_S = 0.1
+"""Time constant of felt and asked thrusts."""
 
-_SUSPECT, _SUSPECT_RATIO = 0.3, 0.5
+_SUSPECT, _SUSPECT_RATIO = 0.3, 0.4
 """Share of ``watch_doubt_n2_s``, and what stands for ``watch_ratio``, where one is only suspected."""
 
 _UPRIGHT = 0.99
