@@ -37,7 +37,7 @@ from uuvtai.show.screen import Screen
         (["eval", "--episodes", "-3"], "must be at least 1"),
         (["eval", "--record", "-1"], "--record -1"),
         (["eval", "--seeds", "1,a"], "whole numbers separated by commas"),
-        (["eval", "--seeds", "99999999999"], "32 bits"),
+        (["eval", "--seeds", "-99999999999"], "must be 0 or more"),
         (["eval", "--seeds", "1,1"], "given twice"),
         (["eval", "--num-envs", "0"], "at least 1 env"),
         (["eval", "--num-envs", "-5"], "at least 1 env"),
@@ -249,7 +249,7 @@ def test_results_that_cannot_be_written_are_told_once(tmp_path):
 def test_closed_streams_are_like_the_null_device(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])}
     for closed in (">&-", ">&- 2>&-", "<&- >&- 2>&-"):
-        command = f"exec {sys.executable} -m uuvtai presets show pool {closed}"
+        command = f"exec {sys.executable} -m uuvtai presets show sensors/clean {closed}"
         done = subprocess.run(
             ["sh", "-c", command], capture_output=True, cwd=tmp_path, env=environment, check=False
         )

@@ -12,11 +12,11 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from taichi.lang import impl
 
-from uuvtai.files import read_text
+from uuvtai.files import FileError, open_to_append, read_text
 from uuvtai.native.machine import UnfitError
 
 _CLONE_FS = 0x200
@@ -47,7 +47,7 @@ class Compiler:
         """End the thread and delete its folder."""
         self._thread.shutdown()
         if self._lock is not None:
-            os.close(self._lock)
+            self._lock.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def compiled(self, kernel: Any) -> tuple[Any, str]:
@@ -88,25 +88,25 @@ class Compiler:
 def _sweep() -> None:
     """Delete the folders of processes that were killed: nobody holds their locks any more."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, FileError):
             found = folder.lstat()
             if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid():
                 is_new = time.time() - found.st_mtime < _NEW_S and not (folder / _LOCK).exists()
                 lock = None if is_new else _locked(folder)
                 if lock is not None:
                     shutil.rmtree(folder, ignore_errors=True)
-                    os.close(lock)
+                    lock.close()
 
 
-def _locked(folder: Path) -> int | None:
-    """The lock of a folder, to be kept open; None where another process has it. Raises OSError."""
+def _locked(folder: Path) -> BinaryIO | None:
+    """The lock of a folder, to be kept open; None where another process has it. Raises OSError, FileError."""
     import fcntl
 
-    lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    lock = open_to_append(folder / _LOCK, folder)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        os.close(lock)
+        lock.close()
         return None
     return lock
 
