@@ -77,7 +77,7 @@ class Exported:
 LOG = {
     "topics": [{"topic": f"/topic/{i}", "schema": "foxglove.CompressedImage", "messages": 10**i,
     "rate_hz": 50.0} for i in range(6)],
-    "duration_s": 12.0, "outcome": "success",
+    "duration_s": 12.0, "outcome": "success", "is_eval": True,
 }  # fmt: skip
 CHECKS = [{"name": "kernel cache", "ok": False, "detail": "word " * 60}]
 CLAIMS = {
