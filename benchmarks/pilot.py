@@ -113,7 +113,7 @@ def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[s
             *("--start", ",".join(map(str, _START)), "--goal", ",".join(map(str, _GOAL))),
             *("--set", "sensors.localization=estimated"),
         ],
-        env=os.environ | {"PYTHONPATH": str(_ROOT)},
+        env=os.environ | {"PYTHONPATH": str(_ROOT), "PYTHONFAULTHANDLER": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -142,7 +142,7 @@ def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[s
             sent_s = time.monotonic()
             child.send_signal(number)
         wait_s = _first_stop_s(sub, told, sent_s) if drove else 0.0
-        out, err = child.communicate(timeout=60)
+        out, err = _result(child)
         time.sleep(0.3)
     finally:
         over.set()
@@ -152,6 +152,15 @@ def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[s
     after = [message for message in sub.told[told:] if orders(message)]
     found = _wrong(after, asked, sub) + _not_whole(log, out, err, child.returncode, number)
     return found, wait_s, drove
+
+
+def _result(child: subprocess.Popen[str]) -> tuple[str, str]:
+    """What it printed; of one that does not end where it hangs."""
+    try:
+        return child.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        child.send_signal(signal.SIGABRT)
+        return child.communicate()
 
 
 def _first_stop_s(sub: FakeSub, told: int, sent_s: float) -> float:
@@ -180,7 +189,7 @@ def _wrong(after: list[Any], asked: bool, sub: FakeSub) -> list[str]:
 
 
 def _not_whole(log: Path, out: str, err: str, code: int, number: int) -> list[str]:
-    found = [] if code == 128 + number else [f"exit code {code}: {err[-300:]}"]
+    found = [] if code == 128 + number else [f"exit code {code}: {err[-2000:]}"]
     if "Traceback" in err or "a bug of ours" in err:
         found.append(err[-600:])
     parts = [path.name for path in log.parent.iterdir() if path != log]

@@ -2,6 +2,7 @@
 it is held, nothing old that drives it, and the operator obeyed at the next heartbeat."""
 
 import random
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,6 +16,25 @@ from uuvtai.logs.reader import read_messages
 @pytest.mark.parametrize("first", range(0, 50, 10))
 def test_whatever_breaks_the_vehicle_is_safe(first):
     assert [text for seed in range(first, first + 10) for text in violations(seed)] == []
+
+
+class Fix(SimpleNamespace):
+    """A start that no scan tells."""
+
+    def feed(self, message):
+        pass
+
+
+def test_until_the_start_is_known_it_only_turns(tmp_path):
+    flight = Flight(tmp_path)
+    flight.loop._fix = Fix(result=None, waits_for="no wall is seen", first_s=0.0)
+    flight.run(4)
+    assert flight.sub.moved_by() == [] and flight.loop.last.action.name == "HOLD"
+    flight.run(6)
+    told = [m for m in flight.sub.told if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
+    assert told and {(m.vx, m.vy, m.vz) for m in told} == {(0.0, 0.0, 0.0)}
+    assert told[-1].yaw_rate == pytest.approx(-0.3)
+    flight.close()
 
 
 class Clock:

@@ -395,7 +395,7 @@ def pilot_vehicle(
     output: groups.OutputGroup,
     controller: opt.PilotTree = "bt",
 ) -> None:
-    """Drive a real vehicle, or ArduSub's simulated one, by MAVLink: a dry run, for --arm is refused for now
+    """Drive a real vehicle, or ArduSub's simulated one, by MAVLink: a dry run unless --arm is given
     (docs/safety.md). Exit code 3: it ended by a safe action."""
     from uuvtai.link.onboard_loop import fly
     from uuvtai.show.flights import show_flight

@@ -48,6 +48,8 @@ FEEDBACK_AGE_S = 0.5
 """a velocity that is older is not fed back to the sticks"""
 _LEAST_ASKED_M_S, _ANSWER = 0.15, 0.2
 """a vehicle that is asked for so much, and has less than this share of it, does not answer"""
+_REST_S, _LOOK_RAD_S = 5.0, 0.3
+"""where the walls that are seen at rest do not tell the start for so long, the vehicle turns on the spot"""
 _UNKNOWN = (math.nan, math.nan, math.nan)
 _REACHED, _INTERRUPTED = "goal reached", "interrupted"
 _T = TypeVar("_T")
@@ -286,9 +288,10 @@ class OnboardLoop:
         if stalled_s > STALL_S:
             self._stalls.append((now_s, stalled_s))
         is_fresh = now_s - heard.vel_b_s <= limits.sensor_s["dvl"]
+        looks_around = self._fix is not None and self._plan.arms and now_s - self._fix.first_s >= _REST_S
         return VehicleView(
             now_s=now_s,
-            wanted=(surge, sway, heave, turn),
+            wanted=(0.0, 0.0, 0.0, _LOOK_RAD_S) if looks_around else (surge, sway, heave, turn),
             held=command.held,
             vehicle_age_s=now_s - heard.vehicle_s,
             operator_age_s=now_s - heard.operator_s,
@@ -305,7 +308,7 @@ class OnboardLoop:
             unanswered_s=self._unanswered_s,
             moved=heard.jumped,
             misfit=self._misfit(),
-            unchecked="" if self._fix is None else self._fix.waits_for,
+            unchecked="" if self._fix is None or looks_around else self._fix.waits_for,
         )
 
     def _measured(self, now_s: float) -> Velocity | None:

@@ -295,12 +295,14 @@ class StartFix:
     def __init__(self, config: Config, typed: tuple[float, float, float]) -> None:
         """``typed``: start (x, y, z) [m] world; the attitudes fed have the heading as typed."""
         self.result: StartFound | None = None
+        self.first_s = math.inf
+        """time of the first scan that counts"""
         self.waits_for = "nothing has been seen yet"
         """why there is no result yet, and what the operator may do"""
         self._config, self._typed = config, np.array(typed[:2])
         self._track, self._rays = _Track(), deque[tuple[float, float, Rays]]()
         """scans that are kept: (time, yaw, rays)"""
-        self._first_s, self._next_s, self._scans = math.inf, -math.inf, 0
+        self._next_s, self._scans = -math.inf, 0
 
     def feed(self, message: SensorMessage) -> None:
         """A message of the pilot's, in any order."""
@@ -317,9 +319,9 @@ class StartFix:
     def _see(self, ping: SonarPing) -> None:
         if (then := self._track.then(ping.time_s)) is None:
             return
-        self._first_s = min(self._first_s, ping.time_s)
+        self.first_s = min(self.first_s, ping.time_s)
         self._keep(ping, *then)
-        since_s, sonar = ping.time_s - self._first_s, self._config.sensors.sonar
+        since_s, sonar = ping.time_s - self.first_s, self._config.sensors.sonar
         if ping.time_s >= self._next_s and since_s >= max(_LEAST_S, sonar.sweep_s) and self._rays:
             self._next_s = ping.time_s + max(_EVERY_S, 0.05 * since_s)
             self.result = self._sought()
