@@ -105,7 +105,8 @@ def _signalled(number: signal.Signals, after_s: float) -> tuple[list[str], float
 def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[str], float, bool]:
     """(what was wrong, seconds to the first stop, whether the vehicle was driven) of one process; the signal
     comes ``after_s`` seconds after its port is open."""
-    port, log = free_port(), folder / "flight.mcap"
+    port, log = free_port(), folder / "flight/flight.mcap"
+    out, err = folder / "out", folder / "err"  # no pipes: a process that it began may hold them longer
     child = subprocess.Popen(
         [
             *(sys.executable, "-m", "uuvtai", "pilot", "--arm", "--json", "--log", str(log)),
@@ -114,8 +115,8 @@ def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[s
             *("--set", "sensors.localization=estimated"),
         ],
         env=os.environ | {"PYTHONPATH": str(_ROOT), "PYTHONFAULTHANDLER": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stdout=out.open("w"),
+        stderr=err.open("w"),
         text=True,
     )
     sub = SwimmingSub(port)
@@ -137,30 +138,32 @@ def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[s
             time.sleep(0.01)
         time.sleep(after_s)
         with lock:
-            told, drove = len(sub.told), any(map(moves, sub.told))
+            before, drove = len(sub.told), any(map(moves, sub.told))
             asked = any(map(orders, sub.told))
             sent_s = time.monotonic()
             child.send_signal(number)
-        wait_s = _first_stop_s(sub, told, sent_s) if drove else 0.0
-        out, err = _result(child)
+        wait_s = _first_stop_s(sub, before, sent_s) if drove else 0.0
+        _wait(child)
         time.sleep(0.3)
     finally:
         over.set()
         vehicle.join()
         sub.close()
         child.kill()
-    after = [message for message in sub.told[told:] if orders(message)]
-    found = _wrong(after, asked, sub) + _not_whole(log, out, err, child.returncode, number)
+    after = [message for message in sub.told[before:] if orders(message)]
+    found = _wrong(after, asked, sub) + _not_whole(
+        log, out.read_text(), err.read_text(), child.returncode, number
+    )
     return found, wait_s, drove
 
 
-def _result(child: subprocess.Popen[str]) -> tuple[str, str]:
-    """What it printed; of one that does not end where it hangs."""
+def _wait(child: subprocess.Popen[str]) -> None:
+    """Until it ends; one that does not says where it hangs."""
     try:
-        return child.communicate(timeout=60)
+        child.wait(60)
     except subprocess.TimeoutExpired:
         child.send_signal(signal.SIGABRT)
-        return child.communicate()
+        child.wait()
 
 
 def _first_stop_s(sub: FakeSub, told: int, sent_s: float) -> float:
@@ -192,7 +195,7 @@ def _not_whole(log: Path, out: str, err: str, code: int, number: int) -> list[st
     found = [] if code == 128 + number else [f"exit code {code}: {err[-2000:]}"]
     if "Traceback" in err or "a bug of ours" in err:
         found.append(err[-600:])
-    parts = [path.name for path in log.parent.iterdir() if path != log]
+    parts = [path.name for path in log.parent.glob("*") if path != log]
     found += [f"left {parts}"] if parts else []
     if log.exists():
         try:
