@@ -222,7 +222,7 @@ def test_the_number_of_clients_is_bounded_and_a_place_becomes_free(server):
     while True:
         try:
             return open_socket(server.port)
-        except InvalidHandshake:
+        except (InvalidHandshake, ConnectionClosed):
             assert time.monotonic() < end
             time.sleep(0.05)
 

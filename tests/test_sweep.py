@@ -90,7 +90,8 @@ def test_a_grid_file_says_what_is_wrong(tmp_path):
     for text, said in [
         ("axes: {S: 4}", "each a list"),
         ("axis: {S: [4]}", "axis is not known"),
-        ("{}", "needs 'axes:'"),
+        ("{}", "is empty"),
+        ("what: a grid", "needs 'axes:'"),
     ]:
         file.write_text(text)
         with pytest.raises(ConfigError, match=said):

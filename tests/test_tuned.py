@@ -304,7 +304,7 @@ def test_the_shipped_stack_holds_factors_that_a_training_can_find():
     changed = ("slow", "fast", "tracking", "forecast", "quiet", "route", "teacher")
     own = {name: getattr(usual, name) for name in changed}
     assert ours.model_copy(update=own) == usual
-    brisk = {"gaze_clearance_m": 0.48, "slow_fraction": 1.0}
+    brisk = {"gaze_clearance_m": 0.48, "slow_fraction": 1.0, "patience_s": 0.0}
     assert ours.teacher == usual.teacher.model_copy(update=brisk)
     assert ours.route == usual.route.model_copy(update={"lookahead_m": 0.8})
     assert ours.quiet == usual.quiet.model_copy(update={"room_m": 0.8})

@@ -138,8 +138,10 @@ def _relay(source: socket.socket, target: socket.socket) -> None:
 
 
 def _refuse(client: socket.socket, status: str) -> None:
+    with contextlib.suppress(OSError):  # what is left unread resets the connection before its answer is read
+        client.settimeout(0.2)
+        client.recv(_REQUEST_BYTES)
     with contextlib.suppress(OSError):
-        client.settimeout(1.0)
         client.sendall(f"HTTP/1.1 {status}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n".encode())
     _ended(client)
 
