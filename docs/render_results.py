@@ -60,7 +60,8 @@ def measured(root: Path) -> str:
         "S = 8.\n"
         f"{seen} Success, collision and endings are\n"
         "those of `bt`, in the last row of `paper`. `-` = not evaluated or not kept.\n"
-        f"Commands and counts of all rows: `{EVALUATIONS}`."
+        "Since then `bt` steers without a DVL and grows less cautious while it waits: its rows on seed 90009\n"
+        f"are in `research/LOG.md`. Commands and counts of all rows: `{EVALUATIONS}`."
     )
 
 
