@@ -58,10 +58,10 @@ def measured(root: Path) -> str:
     return (
         f"Measured here: {document['episodes']:,} episodes of seed {seed} in each row, paper sensing, "
         "S = 8.\n"
-        f"{seen} Success, collision and endings are\n"
-        "those of `bt`, in the last row of `paper`. `-` = not evaluated or not kept.\n"
-        "Since then `bt` steers without a DVL and grows less cautious while it waits: its rows on seed 90009\n"
-        f"are in `research/LOG.md`. Commands and counts of all rows: `{EVALUATIONS}`."
+        f"{seen} Success, collision and endings are those of\n"
+        "`bt`, in the last row of `paper`. `-` = not evaluated or not kept. Since then `bt` steers without a "
+        "DVL and grows less cautious\n"
+        f"while it waits: its rows on seed 90009 are in `research/LOG.md`. Counts: `{EVALUATIONS}`."
     )
 
 
