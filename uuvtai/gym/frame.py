@@ -31,7 +31,7 @@ def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     time_s = int(read("clock.step")) * config.episode.control_dt_s
     pos_w, cell_m = read("vehicle.pos_w"), config.mapping.cell_m
     static, dynamic = (
-        Layer(read(occupancy), grid_origin(config.world.tank, cell_m), cell_m)
+        Layer.of(read(occupancy), grid_origin(config.world.tank, cell_m), cell_m)
         for occupancy in ("grid_map.static_occ", "grid_map.dynamic_occ")
     )
     canvas = map_canvas(scenario["tank"], width_px, _MARGINS)

@@ -154,8 +154,6 @@ class Intake:
             return self.refuse(f"{name}: the same message again")
         self._last[key] = fields
         time_s = clock.measured_s(sent_s, come_s, wrap_s)
-        if clock.restarts:
-            self._forget(system, component)
         found = taker({**fields, "name": name}, time_s)
         if found:
             self._newest[name] = come_s
@@ -164,10 +162,6 @@ class Intake:
     def forget_clocks(self) -> None:
         """Date messages anew: our clock has run on without those of the senders."""
         self._clocks.clear()
-
-    def _forget(self, system: int, component: int) -> None:
-        """A sender has begun anew, and with it all its clocks."""
-        self._clocks = {key: clock for key, clock in self._clocks.items() if key[:2] != (system, component)}
 
     def correct(self, place: tuple[float, float], turn_rad: float) -> tuple[float, float, float]:
         """Count from where the vehicle is now on: it is at ``place`` [m], and ``turn_rad`` is added to its

@@ -3,6 +3,7 @@ lines."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -136,7 +137,7 @@ def _paint_occupancy(canvas: Canvas, recording: Recording, trace: bool) -> None:
     """The last map; ``trace`` adds in pink where anything moving was ever mapped."""
     static, dynamic = recording["/map/static"], recording["/map/dynamic"]
     if static.values and dynamic.values:
-        ever = np.max([layer.values for layer in dynamic.values], axis=0) if trace else None
+        ever = functools.reduce(np.maximum, (layer.values for layer in dynamic.values)) if trace else None
         paint_layers(canvas, static.values[-1], dynamic.values[-1], ever)
 
 

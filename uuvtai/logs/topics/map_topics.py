@@ -4,6 +4,7 @@ vehicle has."""
 from __future__ import annotations
 
 import base64
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -29,18 +30,31 @@ _FIELDS.append({"name": "value", "offset": 4, "type": FLOAT32})
 
 @dataclass(frozen=True)
 class Layer:
-    """One map of the vehicle."""
+    """One map of the vehicle, packed: a recording holds hundreds, and most of their cells are alike."""
 
-    values: np.ndarray
-    """(n_row, n_col), row along y, column along x"""
+    packed: bytes
+    shape: tuple[int, int]
+    kind: str
+    """NumPy's name of the type of the values"""
     origin_m: tuple[float, float]
     """world x, y of the outer corner of cell [0, 0]"""
     cell_m: float
 
+    @classmethod
+    def of(cls, values: np.ndarray, origin_m: tuple[float, float], cell_m: float) -> Layer:
+        """``values``: (n_row, n_col), row along y, column along x."""
+        n_row, n_col = values.shape
+        return cls(zlib.compress(values.tobytes(), 1), (n_row, n_col), values.dtype.str, origin_m, cell_m)
+
+    @property
+    def values(self) -> np.ndarray:
+        """(n_row, n_col), row along y, column along x."""
+        return np.frombuffer(zlib.decompress(self.packed), self.kind).reshape(self.shape)
+
     @property
     def nbytes(self) -> int:
-        """Bytes of its values."""
-        return self.values.nbytes
+        """Bytes that it takes."""
+        return len(self.packed)
 
 
 def _static(moment: Moment) -> bytes:
@@ -156,7 +170,7 @@ def grid_values(data: dict[str, Any]) -> np.ndarray:
 
 def _read_layer(data: dict[str, Any]) -> Layer:
     origin = data["pose"]["position"]
-    return Layer(grid_values(data), (origin["x"], origin["y"]), data["cell_size"]["x"])
+    return Layer.of(grid_values(data), (origin["x"], origin["y"]), data["cell_size"]["x"])
 
 
 _LAYERS = ("grid_map.static_occ", "grid_map.dynamic_occ", "clearance.clearance_m")
