@@ -12,10 +12,13 @@ from uuvtai.link import onboard_loop
 from uuvtai.link.onboard_loop import OnboardLoop
 from uuvtai.logs.reader import read_messages
 
+FOUND = (1125,)
+"""seeds that once found something"""
 
-@pytest.mark.parametrize("first", range(0, 50, 10))
-def test_whatever_breaks_the_vehicle_is_safe(first):
-    assert [text for seed in range(first, first + 10) for text in violations(seed)] == []
+
+@pytest.mark.parametrize("seeds", [*(range(first, first + 10) for first in range(0, 50, 10)), FOUND], ids=str)
+def test_whatever_breaks_the_vehicle_is_safe(seeds):
+    assert [text for seed in seeds for text in violations(seed)] == []
 
 
 class Fix(SimpleNamespace):

@@ -12,6 +12,7 @@ from uuvtai.errors import UserError
 from uuvtai.logs import canvas, film
 from uuvtai.logs.picture import paint_picture, picture
 from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
+from uuvtai.logs.topics.map_topics import Layer
 from uuvtai.logs.video import FrameArtist, video
 from uuvtai.report.colours import PALETTE, contrast, method_colours
 
@@ -204,3 +205,10 @@ def test_methods_of_a_user_keep_the_colour_that_they_have_beside_each_other(tmp_
     assert tuple(canvas.method_inks(names)["second"]) in pixels
     image = paint_picture([load_recording(path, PICTURE_TOPICS)], methods=names).image
     assert tuple(canvas.method_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))
+
+
+def test_maps_of_a_harbour_are_kept_packed():
+    values = np.zeros((1000, 2000), np.float32)
+    values[3, 4] = 0.75
+    layer = Layer.of(values, (0.0, 0.0), 0.1)
+    assert layer.nbytes < values.nbytes / 100 and np.array_equal(layer.values, values)
