@@ -12,6 +12,7 @@ import csv
 import difflib
 import json
 import re
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -132,6 +133,11 @@ def _beside_bt(row: Document, name: str) -> str:
 
 def _both(method: Document) -> str:
     return f"{_percent(method, 'success')} / {_percent(method, *COLLIDED)}"
+
+
+def sweep_commands(root: Path) -> str:
+    """How each of the kept sweeps was run."""
+    return "\n".join(["```sh", *(sweep["command"] for sweep in _read(root / SWEEPS).values()), "```"])
 
 
 def grid(root: Path) -> str:
@@ -264,7 +270,12 @@ def safety_rules(root: Path) -> str:
 
 TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
     README: {"measured": measured, "evaluations": evaluations},
-    ROBUSTNESS: {"grid": grid, "caution": caution, "one_at_a_time": one_at_a_time},
+    ROBUSTNESS: {
+        "sweep_commands": sweep_commands,
+        "grid": grid,
+        "caution": caution,
+        "one_at_a_time": one_at_a_time,
+    },
     BASELINES: {"local_planners": local_planners},
     SPEEDS: {"speeds": speeds},
     SAFETY: {"safety_rules": safety_rules},
@@ -369,8 +380,11 @@ _COUNTS = dict(zip(("success", "contact", "ttc_stop", "out_of_tank", "timeout"),
 def keep_sweep(name: str, run: Path, root: Path = ROOT) -> None:
     """Keep the cells of a sweep, and how each episode ended. Raises KeyError for an unknown sweep."""
     sweep, record, known = map(_read, (run / "sweep.json", run / "run.json", root / SWEEPS))
+    left_out = re.compile(r" --(run-dir|workers|num-envs) ('[^']*'|\S+)| --json")
+    command = left_out.sub("", shlex.join(record["argv"][1:]))
     how = {"commit": record["git_sha"], "date": record["started"], "cpu": record["hardware"]["cpu"]}
-    known[name] |= how | {"episodes": sweep["episodes_per_seed"], "seeds": sweep["seeds"]}
+    how |= {"command": f"uuv {command}", "episodes": sweep["episodes_per_seed"], "seeds": sweep["seeds"]}
+    known[name] |= how
     axes = [cell_name(axis) for axis in sweep["axes"]]
     axes = [axis for axis in axes if any(cell.get(axis) is not None for cell in sweep["cells"])]
     last = "time_to_success_mean_s"
@@ -408,7 +422,9 @@ def _value(text: str) -> Any:
 
 
 def _write(path: Path, document: Document) -> None:
-    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    """With every innermost object on a line of its own."""
+    text = re.sub(r"\{[^{}]*\}", lambda found: re.sub(r"\n *", "", found[0]), json.dumps(document, indent=1))
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 # ---------------------------------------------------------------------------------------------------- command

@@ -9,5 +9,5 @@ ENDINGS = OUTCOMES[1:]
 COLLIDED = ("collision", "ttc", "out_of_tank")
 """what counts as a collision in every rate: contact, a stop for the time to collision, and leaving the
 tank"""
-LETTERS = dict(zip(ENDINGS, "scxot", strict=True))
+LETTERS: dict[str, str] = dict(zip(ENDINGS, "scxot", strict=True))
 """of the endings, for a row of episodes as one word"""
