@@ -7,7 +7,7 @@ import importlib
 from functools import cache
 from pathlib import Path
 
-from uuvtai.binding import members_of
+from uuvtai.sim.stages import members_of
 
 KERNELS = Path(__file__).parent.parent / "uuvtai/kernels"
 FILES = sorted(path for path in KERNELS.rglob("*.py") if path.stem not in ("__init__", "bundles"))

@@ -15,8 +15,8 @@ from tests import signatures
 from tests.signatures import BUNDLES, FILES, KERNELS, ROOMS, functions, is_kernel
 from tests.sources import nodes_of
 from uuvtai import config, state
-from uuvtai.binding import members_of
-from uuvtai.truth import Truth
+from uuvtai.common.enums import Truth
+from uuvtai.sim.stages import members_of
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "uuvtai"

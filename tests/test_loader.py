@@ -3,9 +3,8 @@
 import pytest
 import yaml
 
-from uuvtai import loader
-from uuvtai.config import Config
-from uuvtai.loader import (
+from uuvtai.config import Config, loader
+from uuvtai.config.loader import (
     ConfigError,
     load_config,
     load_training,
@@ -188,7 +187,7 @@ def test_paper_is_the_table_to_the_letter():
 def test_the_paper_schedule_meets_the_equation():
     """lambda_t: 1 up to 800, 0.2 (1 - (t - 800) / 800) up to 1600, then 0 (paper, equation of the staged
     schedule)."""
-    from uuvtai.learn.distill import piecewise_linear
+    from uuvtai.learning.distillation import piecewise_linear
 
     points = load_training("paper").distill.schedule
     for t in (0, 400, 800, 801, 1000, 1199, 1500, 1600, 2000):

@@ -32,28 +32,25 @@ from tests.command import Quiet, run_cli
 from tests.reference import logs as episode
 from tests.test_checkpoint import rewritten
 from tests.test_hostile_logs import END, chunk_of
-from uuvtai.deploy import run_policy
-from uuvtai.deploy.agreement import of_onnx
-from uuvtai.errors import UserError
-from uuvtai.learn import checkpoint
-from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.manifest import config_sha256, sha256_of
-from uuvtai.learn.pilot import load_pilot
-from uuvtai.learn.recorder import MetricsRecorder
-from uuvtai.learn.run import TrainRequest, train
-from uuvtai.loader import ConfigError, _SafeLoader, load_config, load_resolved, parsed_yaml
+from uuvtai.common.errors import UserError
+from uuvtai.config.loader import ConfigError, _SafeLoader, load_config, load_resolved, parsed_yaml
+from uuvtai.evaluation.evaluate import evaluate_now
+from uuvtai.evaluation.reproduce import resume as resume_reproduction
+from uuvtai.evaluation.sweep import resume as resume_sweep
+from uuvtai.learning import checkpoint
+from uuvtai.learning.checkpoint import CheckpointError, config_sha256, sha256_of
+from uuvtai.learning.export import run_policy
+from uuvtai.learning.export.folder import of_onnx
+from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.runner import MetricsRecorder, TrainRequest, train
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.drawing import load_recording
+from uuvtai.logs.encode import LogError
 from uuvtai.logs.picture import picture
-from uuvtai.logs.recording import load_recording
-from uuvtai.logs.topics.camera_topics import logged_image
-from uuvtai.measure.evaluate.while_training import evaluate_now
-from uuvtai.measure.reproduce.paper_run import resume as resume_reproduction
-from uuvtai.measure.sweep.play import resume as resume_sweep
-from uuvtai.report.build import report
-from uuvtai.report.media import media
-from uuvtai.run_folder import RunFolder, RunFolderError
-from uuvtai.tree import TreeError, parse_tree
+from uuvtai.logs.run_folder import RunFolder, RunFolderError
+from uuvtai.logs.topics.sensors import logged_image
+from uuvtai.report.build import media, report
+from uuvtai.sim.behavior_tree import TreeError, parse_tree
 
 PACKAGE = Path(__file__).parent.parent / "uuvtai"
 
@@ -186,7 +183,7 @@ def reads_of(tree):
     imported = {
         alias.asname or alias.name
         for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module == "uuvtai.files"
+        if isinstance(node, ast.ImportFrom) and node.module == "uuvtai.common.files"
         for alias in node.names
     }
     ours = {"files"} | ({"read_text", "read_bytes", "read_json"} & imported)

@@ -14,8 +14,8 @@ import pytest
 
 import uuvtai
 from tests.small_sim import SmallSim
-from uuvtai import signals
-from uuvtai.logs.repair import repair
+from uuvtai.common import signals
+from uuvtai.logs.export import repair
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
@@ -167,7 +167,7 @@ def test_while_nothing_is_kept_it_ends_in_the_middle_of_an_import(tmp_path, numb
 KEEPS = """
 import os, sys, time
 from uuvtai import signals
-from uuvtai.endings import guarded
+from uuvtai.common.errors import guarded
 signals.install(); signals.end_at_second(); signals.engage()
 def work():
     try:
@@ -270,7 +270,7 @@ def test_nobody_is_told_by_a_library(tmp_path):
     program = (
         "import signal; before = signal.getsignal(2), signal.getsignal(15)\nimport uuvtai, "
         "uuvtai.cli, "
-        "uuvtai.signals\n"
+        "uuvtai.common.signals\n"
     )
     program += "assert before == (signal.getsignal(2), signal.getsignal(15))"
     subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, check=True)

@@ -32,7 +32,7 @@ FILES = {
     ),
     "reward": ("reward",),
 }
-"""kernel files of each stage, by the names of ``uuvtai.stages.STAGES``"""
+"""kernel files of each stage, by the names of ``uuvtai.sim.stages.STAGES``"""
 
 
 def page() -> str:
