@@ -264,9 +264,7 @@ def _unpacked(content: bytes, key: str) -> MachineCode | None:
 
 
 _SEEN_BY_KERNELS = (
-    "kernels", "config", "state", "native", "taichi_patches",
-    "forecast_codes.py", "multibeam.py", "outcomes.py", "plan_codes.py", "tree_codes.py", "truth.py",
-    "tuned_numbers.py",
+    "kernels", "config", "state", "compile", "common/enums.py", "common/tree_codes.py",
 )  # fmt: skip
 """files and folders of the package that a kernel's code can depend on (``tests/test_native.py`` compares them
 with what the kernels import)"""

@@ -30,7 +30,7 @@ from uuvtai.config.learning import LearningConfig
 # Names of the presets that are shipped: what the help, the completion and the loader all read, quickly.
 
 
-PRESET_DIR = Path(__file__).parent / "presets"
+PRESET_DIR = Path(__file__).parents[1] / "presets"
 KINDS = {
     "world": "worlds",
     "sensors": "sensors",

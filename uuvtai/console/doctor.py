@@ -169,7 +169,7 @@ def _runs() -> str:
 # The examples of the documentation, which are installed beside the package, as a folder of one's own.
 
 
-_CHECKOUT = Path(__file__).parents[1] / "examples"
+_CHECKOUT = Path(__file__).parents[2] / "examples"
 _SUFFIXES = (".py", ".yaml", ".xml", ".ipynb", ".parm")
 
 

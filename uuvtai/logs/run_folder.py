@@ -325,7 +325,7 @@ def hardware() -> dict[str, Any]:
 
 def git_sha() -> str | None:
     """Commit of the source tree this package runs from; None outside a checkout."""
-    here = Path(__file__).resolve().parent.parent
+    here = Path(__file__).resolve().parents[2]
     try:
         done = subprocess.run(
             ["git", "-C", str(here), "rev-parse", "HEAD"],

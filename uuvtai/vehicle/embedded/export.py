@@ -369,11 +369,10 @@ def _object(text: str, kind: MachineKind, public: str) -> bytes:
 PACKAGE = "uuv_stack"
 """of the copied files"""
 CHECKED_STEPS = 500
-_ROOT = Path(__file__).parents[1]
+_ROOT = Path(__file__).parents[2]
 _COPIED = (
-    "pilot/carrying.py", "pilot/fed_pilot.py", "pilot/fed_sensors.py", "pilot/inbox.py", "pilot/mission.py",
-    "pilot/motion_watch.py", "pilot/own_motion.py", "pilot/pilot_numbers.py", "pilot/sensor_messages.py",
-    "plan_codes.py", "aboard/carried_stack.py", "aboard/stack_check.py",
+    "vehicle/messages.py", "vehicle/onboard_core.py", "vehicle/sensor_inputs.py", "common/enums.py",
+    "vehicle/embedded/runtime.py",
 )  # fmt: skip
 """the frame around the kernels"""
 
@@ -452,7 +451,7 @@ def _write(folder: Path, tape: Tape, pilot: OnboardPilot, machines: Sequence[str
     package.mkdir(parents=True)
     for name in _COPIED:
         text = (_ROOT / name).read_text(encoding="utf-8")
-        for folder_name in ("uuvtai.vehicle.onboard.", "uuvtai.vehicle.embedded.", "uuvtai."):
+        for folder_name in ("uuvtai.vehicle.embedded.", "uuvtai.vehicle.", "uuvtai.common."):
             text = text.replace(f"from {folder_name}", f"from {PACKAGE}.")
         (package / Path(name).name).write_text(text, encoding="utf-8")
     (package / "__init__.py").write_text('"""The stack of uuvtai without Taichi and torch."""\n')
@@ -501,8 +500,7 @@ decides anew on the messages of `{GOLDEN}` and compares (exit code 3: it decides
 ```python
 from pathlib import Path
 from {PACKAGE}.{Path(runtime.__file__).stem} import carried_pilot
-from {PACKAGE}.mission import Mission
-from {PACKAGE}.sensor_messages import ImuReading
+from {PACKAGE}.messages import ImuReading, Mission
 
 pilot = carried_pilot(Path("."), Mission(start=(2, 3, -0.8), goal=(18, 3, -0.8)))
 pilot.feed(ImuReading(0.0, rpy, rate_b, specific_force_b))  # whenever a message comes
