@@ -293,9 +293,9 @@ def test_every_refusal_of_the_package_is_of_one_type():
 
 
 PLAIN = {
-    "measure/explain/replay.py": ["RuntimeError"],  # a replay that ends otherwise: a bug of ours
+    "evaluation/failure_causes.py": ["RuntimeError"],  # a replay that ends otherwise: a bug of ours
     "statistics.py": ["ValueError"],  # counts that cannot be: a bug of ours
-    "measure/evaluate/tree_report.py": ["ValueError"],  # told by its caller, with the file that it comes from
+    "evaluation/results.py": ["ValueError"],  # told by its caller, with the file that it comes from
     "runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
 }
 

@@ -518,8 +518,8 @@ def test_gymnasium_finds_the_env_without_an_import_of_ours(make):
     """A world that does not exist is refused by us, before anything is compiled."""
     code = (
         f"import gymnasium, sys\nassert 'uuvtai' not in sys.modules\n"
-        f"try: gymnasium.{make}('uuvtai.envs.gymnasium:uuvtai/Nav-v0', world='pol')\nexcept ValueError as error: "
-        "print(type(error).__name__, error)"
+        f"try: gymnasium.{make}('uuvtai.envs.gymnasium:uuvtai/Nav-v0', world='pol')\n"
+        "except ValueError as error: print(type(error).__name__, error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "ConfigError" in done.stdout and "did you mean 'pool'" in done.stdout, done.stderr

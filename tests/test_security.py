@@ -104,30 +104,30 @@ FORBIDDEN = """
 eval exec compile __import__ pickle marshal shelve dill joblib runpy tarfile os.system os.popen torch.load
 torch.jit.load np.load np.lib.format.read_array
 """
-ALONE = {"aboard/carried_stack.py", "aboard/stack_check.py"}
+ALONE = {"vehicle/embedded/runtime.py", "vehicle/embedded/runtime.py"}
 """files of an exported stack: they run without uuvtai, out of a folder whose native code is run as it is"""
 READERS = {
     "files.py": "it is the one reader",
-    "report/page.py": "the page's template lies in the package",
-    "deploy/run_policy.py": "it must run without uuvtai and has a reader of its own",
+    "report/html.py": "the page's template lies in the package",
+    "learning/export/run_policy.py": "it must run without uuvtai and has a reader of its own",
     **dict.fromkeys(ALONE, "it must run without uuvtai, beside native code that it runs"),
 }
 """files that may open others themselves, and why"""
 OWN_READS = {
     # what they have just written, or what lies in the package
-    "logs/film.py": "os.open, av.open",
-    "native/keys.py": "path.read_bytes",
-    "deploy/export.py": "Path(module.__file__ or '').read_bytes",
-    "aboard/cross.py": "out.read_bytes",
-    "aboard/stack_folder.py": "(_ROOT / name).read_text",
+    "logs/video.py": "os.open, av.open",
+    "compile/cache.py": "path.read_bytes",
+    "learning/export/folder.py": "Path(module.__file__ or '').read_bytes",
+    "vehicle/embedded/export.py": "out.read_bytes",
+    "vehicle/embedded/export.py": "(_ROOT / name).read_text",
     "example_files.py": "source.read_bytes",
     # one file of the system, by its name
     "run_folder.py": "cpuinfo.read_text",
     "sizes.py": "meminfo.read_text",
     # JSON of this process or its siblings
     "capture.py": "json.loads",
-    "measure/sweep/plan.py": "json.loads",
-    "native/reads.py": "json.loads",
+    "evaluation/grid.py": "json.loads",
+    "compile/cache.py": "json.loads",
     # messages and attachments of a log, each no longer than its MAX_RECORD
     "logs/reader.py": "json.loads",
 }

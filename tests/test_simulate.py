@@ -82,8 +82,8 @@ def test_double_precision_process():
     """Without a runtime the function starts Taichi in double precision; 0.01 s agrees with RK4 far below
     single precision."""
     code = (
-        "import json, sys\nfrom uuvtai.config.loader import load_config\nfrom uuvtai.evaluation.simulate import "
-        "Trial, simulate\n"
+        "import json, sys\nfrom uuvtai.config.loader import load_config\n"
+        "from uuvtai.evaluation.simulate import Trial, simulate\n"
         "c = load_config('open', overrides={'vehicle.attitude_hold': 'none'})\n"
         "print('RESULT' + json.dumps(simulate(c, Trial(1.0, dt=0.004, wrench=(1, 2, 3, 0, 0, "
         "0.1)))['nu'][-1]))"

@@ -38,7 +38,8 @@ def make(
     ``overrides`` maps dotted config keys to values, ``{"world.n_dynamic": 9}``; ``teacher`` is the behaviour
     tree behind ``info["teacher_action"]``; ``device`` is 'cpu', 'cuda' or 'auto'. Raises ConfigError, a
     ValueError, for presets, keys and values that do not exist or fit, ValueError or MemoryError for
-    impossible sizes, RuntimeError for a missing device. The rest is told at ``uuvtai.envs.vector_env.VectorEnv``.
+    impossible sizes, RuntimeError for a missing device. The rest is told at
+    ``uuvtai.envs.vector_env.VectorEnv``.
     """
     from uuvtai.config.loader import load_config
     from uuvtai.envs.vector_env import VectorEnv, checked_seed

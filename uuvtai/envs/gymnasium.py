@@ -1,8 +1,8 @@
 """Gymnasium's interfaces: the batch ``UuvVectorEnv`` and the single env ``uuvtai/Nav-v0``, registered when
 this is imported.
 
-``gymnasium.make("uuvtai.envs.gymnasium:uuvtai/Nav-v0")`` imports it by itself; Gymnasium reads no entry points from 1.0
-on.
+``gymnasium.make("uuvtai.envs.gymnasium:uuvtai/Nav-v0")`` imports it by itself; Gymnasium reads no
+entry points from 1.0 on.
 """
 
 from __future__ import annotations

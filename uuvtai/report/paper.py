@@ -608,7 +608,7 @@ def _tex(items: Sequence[PaperItem]) -> str:
             width = r"\textwidth" if wide else r"\columnwidth"
             file = f"figures/{item.name}_{'2col' if wide else '1col'}.pdf"
             body = [rf"\includegraphics[width={width}]{{{file}}}"]
-        parts.append("\n".join([*remarks, float_of(kind, item.name, item.caption, body, is_wide)]))
+        parts.append("\n".join([*remarks, float_of(kind, item.name, item.caption, body, wide)]))
     return "\n\n".join(parts)
 
 

@@ -133,7 +133,8 @@ class Sim:
         """Sensing to teacher for the rows that are awake.
 
         Behind ``sensors`` only yardsticks read the truth, and only the fallback planner draws random numbers
-        by the episode's key (``_plan_seed``): the same readings give the same commands (``uuvtai.vehicle.onboard``).
+        by the episode's key (``_plan_seed``): the same readings give the same commands
+        (``uuvtai.vehicle.onboard``).
         """
         io, c = self.io, self.config
         with self._stage("proprioception"):
