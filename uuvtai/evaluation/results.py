@@ -19,10 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.common.enums import COLLIDED, ENDINGS, PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.files import (
-    FileError,
     open_to_append,
     read_bytes,
-    read_json,
     read_text,
     refuse_links,
     truncate,
@@ -40,15 +38,7 @@ from uuvtai.config.loader import ConfigError, preset_names, preset_of, read_pres
 from uuvtai.evaluation.episodes import EpisodeObserver, EpisodeResult, Job
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins.api import is_piece, piece_spec
-from uuvtai.sim.behavior_tree import (
-    FlatTree,
-    NodeUse,
-    node_use,
-    read_tree,
-    read_tree_file,
-    tree_dot,
-    tree_text,
-)
+from uuvtai.sim.behavior_tree import node_use
 from uuvtai.sim.sim import Sim
 
 if TYPE_CHECKING:
@@ -342,94 +332,13 @@ def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, i
 
 
 # ------------------------------------------------------------------------------------------------------------
-# ``uuv tree``: a behaviour tree as text, DOT or JSON, with how it was used in an evaluation.
-
-
-@dataclass(frozen=True)
-class TreeReport:
-    """The same tree three ways."""
-
-    text: str
-    """one line per node"""
-    dot: str
-    document: dict[str, Any]
-    """nodes in the order of the lines, with their use where a run was given"""
-
-
-def tree_report(controller: str, run: Path | None) -> TreeReport:
-    """Report of a controller's tree; with a run folder, the use of its nodes there. Raises ConfigError."""
-    use = None
-    if run is not None:
-        used = _record(run)
-        if controller not in used:
-            raise ConfigError(
-                f"{run}: has no controller {controller!r}; there are: {', '.join(used)} (--controller NAME)"
-            )
-        tree = read_tree_file(run / "eval" / "trees" / f"{controller}.xml", folder=run)
-        use = used[controller]
-        if len(use) != len(tree.names):
-            raise ConfigError(
-                f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv "
-                "eval'"
-            )
-    else:
-        tree = read_tree(controller)
-    return TreeReport(tree_text(tree), tree_dot(tree, use), _document(controller, tree, use))
-
-
-def _record(run: Path) -> dict[str, list[NodeUse]]:
-    """Use of every node by controller."""
-    path = run / "eval" / "tree.json"
-    if not run.is_dir():
-        shipped = (
-            f"; the tree alone: 'uuv tree --controller {run}'" if str(run) in preset_names("tree") else ""
-        )
-        raise ConfigError(
-            f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}"
-        )
-    try:
-        record = read_json(path, folder=run)
-        return {name: [_use(node) for node in nodes] for name, nodes in record["use"].items()}
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' "
-            "prints it)"
-        ) from None
-    except FileError as error:
-        raise ConfigError(f"{error}; run the evaluation again with 'uuv eval'") from None
-    except (ValueError, OverflowError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ConfigError(
-            f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'"
-        ) from None
-
-
-def _use(node: dict[str, Any]) -> NodeUse:
-    share, ticks, acted = node["share"], int(node["ticks"]), int(node["acted"])
-    if not (isinstance(share, int | float) and 0.0 <= share <= 1.0 and 0 <= acted <= ticks):
-        raise ValueError(
-            f"a node ticked in {share!r:.40} of the episodes, {ticks} times, {acted} of which acted"
-        )
-    return NodeUse(float(share), ticks, acted)
-
-
-def _document(controller: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:
-    nodes = []
-    for i, name in enumerate(tree.names):
-        node: dict[str, Any] = {"id": i, "name": name, "type": tree.types[i], "parent": tree.parent[i]}
-        if use is not None:
-            node |= vars(use[i])
-        nodes.append(node)
-    return {"schema": 1, "controller": controller, "source": tree.source, "nodes": nodes}
-
-
-# ------------------------------------------------------------------------------------------------------------
 # What ``uuv eval`` was asked for, as an object and as the file from which an interrupted evaluation goes
 # on.
 
 
 REQUEST_FILE = "eval/request.json"
 ORACLE = "oracle"
-"""controller that is asked, not driven: the privileged upper bound"""
+"""agent that is asked, and does not drive: the privileged upper bound"""
 
 _MAX_BYTES = 1 << 22
 _GIVE = "give the folder that an interrupted 'uuv eval' printed"
@@ -442,15 +351,12 @@ class Request:
     config: Config
     world: str
     sensors: str
-    controllers: list[str]
-    """names of trees or stacks, paths of XML or YAML files, each perhaps with ``+truth``; ``oracle``; pieces
-    of the user's (``own.piece_spec``)"""
+    agents: list[str]
+    """as ``agents.load_agents`` takes them, and ``oracle``"""
     seeds: list[int]
     episodes: int
     vehicle: str = ""
     """name of its preset; of old requests ''"""
-    policies: tuple[str, ...] = ()
-    """run folders or checkpoint folders"""
     num_envs: int | None = None
     record: int = 0
     video: bool = False
@@ -461,15 +367,14 @@ class Request:
     run_dir: Path | None = None
 
     @classmethod
-    def typed(cls, scene: SceneOptions, policies: list[str], **rest: Any) -> Request:
+    def typed(cls, scene: SceneOptions, agents: list[str], **rest: Any) -> Request:
         """What a command line asks for: the scene as it was typed, observed as the policies were trained.
         Raises ConfigError, CheckpointError."""
         from uuvtai.evaluation.agents import features_of
 
-        config = scene.config(features_of(policies) if policies else [])
-        world = scene.world_name
+        config, world = scene.config(features_of(agents)), scene.world_name
         named = {kind: preset_of(kind, world, getattr(scene, kind)) for kind in ("sensors", "vehicle")}
-        return cls(config=config, world=world, **named, policies=tuple(policies), **rest)
+        return cls(config=config, world=world, **named, agents=agents, **rest)
 
 
 class _Document(BaseModel):
@@ -482,10 +387,9 @@ class _Document(BaseModel):
     world: str
     sensors: str
     vehicle: str = ""
-    controllers: list[str]
+    agents: list[str]
     seeds: list[int] = Field(min_length=1)
     episodes: int = Field(ge=1)
-    policies: list[str]
     num_envs: int = Field(ge=1)
     record: int = Field(ge=0)
     video: bool
@@ -504,7 +408,7 @@ def document_of(request: Request, num_envs: int, device: str, drivers: dict[str,
         for field in dataclasses.fields(request)
         if field.name not in ("config", "run_dir")
     }
-    document |= {"policies": list(request.policies), "num_envs": num_envs, "device": device}
+    document |= {"num_envs": num_envs, "device": device}
     return {
         "schema": 1,
         **document,
@@ -531,24 +435,20 @@ def read_request(place: Path) -> tuple[Request, dict[str, str]]:
             f"{file}: is no request of this version of 'uuv eval' ({reason}); {_GIVE}"
         ) from None
     given = found.model_dump(exclude={"schema_", "config", "cwd", "drivers"})
-    request = Request(config=config, **given)
-    return _found_again(replace(request, policies=tuple(found.policies)), Path(found.cwd)), found.drivers
+    return _found_again(Request(config=config, **given), Path(found.cwd)), found.drivers
 
 
 def _found_again(request: Request, cwd: Path) -> Request:
     """Paths that were typed in another folder, seen from this one; names of what is shipped stay names."""
 
     def seen(name: str) -> str:
-        file = name.removesuffix("+truth")
-        return name if Path(file).exists() else str(cwd / name)
-
-    def seen_driver(name: str) -> str:
         if is_piece(name):
             return piece_spec(name).located(cwd).text
-        return seen(name) if name.removesuffix("+truth").endswith((".xml", ".yaml", ".yml")) else name
+        file = name.removesuffix("+truth")
+        is_shipped = file in (ORACLE, *preset_names("tree"), *preset_names("stack"))
+        return name if is_shipped or Path(file).exists() else str(cwd / name)
 
-    controllers = [seen_driver(name) for name in request.controllers]
-    return replace(request, controllers=controllers, policies=tuple(map(seen, request.policies)))
+    return replace(request, agents=list(map(seen, request.agents)))
 
 
 def drivers_of(methods: list[Method]) -> dict[str, str]:

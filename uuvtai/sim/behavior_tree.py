@@ -11,13 +11,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 from xml.parsers import expat
 
 import numpy as np
 
 from uuvtai.common import tree_codes as codes
-from uuvtai.common.files import FileError, read_bytes
+from uuvtai.common.files import FileError, read_bytes, read_json
 from uuvtai.common.tree_codes import CONTROLS, DECORATORS, LEAVES, MAX_PORTS, Leaf
 from uuvtai.config.loader import ConfigError, preset_path
 
@@ -438,6 +438,81 @@ def tree_dot(tree: FlatTree, use: Sequence[NodeUse] | None = None) -> str:
 
 
 # ------------------------------------------------------------------------------------------------------------
+# ``uuv presets show TREE``: a tree as text, DOT or JSON, with how an evaluation used it.
+
+
+@dataclass(frozen=True)
+class TreeReport:
+    """The same tree three ways."""
+
+    text: str
+    """one line per node"""
+    dot: str
+    document: dict[str, Any]
+    """nodes in the order of the lines, with their use where a run was given"""
+    is_used: bool
+
+
+def tree_report(name: str, run: Path | None) -> TreeReport:
+    """Report of a tree, given by name or path; with a run folder, of the tree of that name there and the use
+    of its nodes. Raises ConfigError."""
+    use = None
+    if run is not None:
+        used = _record(run)
+        if name not in used:
+            raise ConfigError(f"{run}: has no tree {name!r}; there are: {', '.join(used)}")
+        tree = read_tree_file(run / "eval" / "trees" / f"{name}.xml", folder=run)
+        use = used[name]
+        if len(use) != len(tree.names):
+            raise ConfigError(
+                f"{run}: the tree {name!r} has changed since that evaluation; run it again with 'uuv eval'"
+            )
+    else:
+        tree = read_tree(name)
+    return TreeReport(tree_text(tree), tree_dot(tree, use), _document(name, tree, use), use is not None)
+
+
+def _record(run: Path) -> dict[str, list[NodeUse]]:
+    """Use of every node by tree."""
+    path = run / "eval" / "tree.json"
+    if not run.is_dir():
+        raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it)")
+    try:
+        record = read_json(path, folder=run)
+        return {name: [_use(node) for node in nodes] for name, nodes in record["use"].items()}
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' "
+            "prints it)"
+        ) from None
+    except FileError as error:
+        raise ConfigError(f"{error}; run the evaluation again with 'uuv eval'") from None
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ConfigError(
+            f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'"
+        ) from None
+
+
+def _use(node: dict[str, Any]) -> NodeUse:
+    share, ticks, acted = node["share"], int(node["ticks"]), int(node["acted"])
+    if not (isinstance(share, int | float) and 0.0 <= share <= 1.0 and 0 <= acted <= ticks):
+        raise ValueError(
+            f"a node ticked in {share!r:.40} of the episodes, {ticks} times, {acted} of which acted"
+        )
+    return NodeUse(float(share), ticks, acted)
+
+
+def _document(name: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:
+    nodes = []
+    for i, label in enumerate(tree.names):
+        node: dict[str, Any] = {"id": i, "name": label, "type": tree.types[i], "parent": tree.parent[i]}
+        if use is not None:
+            node |= vars(use[i])
+        nodes.append(node)
+    return {"schema": 1, "tree": name, "source": tree.source, "nodes": nodes}
+
+
+# ------------------------------------------------------------------------------------------------------------
 
 
 __all__ = [
@@ -448,11 +523,13 @@ __all__ = [
     "Leaf",
     "NodeUse",
     "TreeError",
+    "TreeReport",
     "load_tree",
     "node_use",
     "parse_tree",
     "read_tree",
     "read_tree_file",
     "tree_dot",
+    "tree_report",
     "tree_text",
 ]
