@@ -28,7 +28,7 @@ COMMAND = ("eval", "--episodes", "3", "--seeds", str(SEED), *SmallSim.OPTIONS)
 
 def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
     code, out, err = uuv(
-        capfd, *COMMAND, "--controller", "bt,bt+truth,oracle", "--run-dir", str(tmp_path / "run"), "--json"
+        capfd, *COMMAND, "--agent", "bt,bt+truth,oracle", "--run-dir", str(tmp_path / "run"), "--json"
     )
     assert code == 0, err
     document = json.loads(out)
@@ -55,7 +55,7 @@ def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
 
 
 def test_the_oracle_alone_is_printed_with_a_dagger(borrowed, capfd, tmp_path):
-    code, out, err = uuv(capfd, *COMMAND, "--controller", "oracle", "--run-dir", str(tmp_path / "run"))
+    code, out, err = uuv(capfd, *COMMAND, "--agent", "oracle", "--run-dir", str(tmp_path / "run"))
     assert code == 0, err
     assert "oracle †" in out and "† oracle is privileged" in out
 
@@ -63,10 +63,10 @@ def test_the_oracle_alone_is_printed_with_a_dagger(borrowed, capfd, tmp_path):
 def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, capfd, tmp_path):
     """The rows of one evaluation do not leak into each other, whatever their order."""
     code, out, err = uuv(
-        capfd, *COMMAND, "--controller", "bt+truth,bt", "--run-dir", str(tmp_path / "a"), "--json"
+        capfd, *COMMAND, "--agent", "bt+truth,bt", "--run-dir", str(tmp_path / "a"), "--json"
     )
     assert code == 0, err
-    code, alone, err = uuv(capfd, *COMMAND, "--controller", "bt", "--run-dir", str(tmp_path / "b"), "--json")
+    code, alone, err = uuv(capfd, *COMMAND, "--agent", "bt", "--run-dir", str(tmp_path / "b"), "--json")
     assert code == 0, err
     truth, bt = json.loads(out)["methods"]
     assert (
@@ -80,7 +80,7 @@ def test_failures_of_a_privileged_tree_are_replayed_with_the_truth(borrowed, cap
     """A replay that ended otherwise than the episode would be refused."""
     command = (
         *COMMAND,
-        "--controller",
+        "--agent",
         "straight+truth,oracle",
         "--explain",
         "--explain-record",

@@ -46,24 +46,24 @@ from uuvtai.console.views import show_evaluation
         (["eval", "--num-envs", "900000"], "GiB"),
         (["eval", "--world", "pol"], "did you mean 'pool'"),
         (["eval", "--sensors", "nominl"], "did you mean 'nominal'"),
-        (["eval", "--controller", "btt"], "did you mean 'bt'"),
-        (["eval", "--controller", "nowhere.xml"], "no such file"),
+        (["eval", "--agent", "btt"], "did you mean 'bt'"),
+        (["eval", "--agent", "nowhere.xml"], "no such file"),
         (
-            ["eval", "--controller", "bt+trut"],
+            ["eval", "--agent", "bt+trut"],
             "'+trut' is unknown; the one suffix is +truth, for example bt+truth",
         ),
-        (["eval", "--controller", "btt+truth"], "did you mean 'bt'"),
-        (["eval", "--controller", "orakel"], "'orakel' is no preset"),
-        (["eval", "--controller", "oracle", "--record", "1"], "the oracle drives no vehicle"),
+        (["eval", "--agent", "btt+truth"], "did you mean 'bt'"),
+        (["eval", "--agent", "orakel"], "'orakel' is no preset"),
+        (["eval", "--agent", "oracle", "--record", "1"], "the oracle drives no vehicle"),
         (["eval", "--set", "world.n_dynmic=1"], "did you mean 'n_dynamic'"),
         (["eval", "--set", "mapping.static_hit=.nan"], "finite"),
         (["eval", "-S", "-1"], "greater than or equal to 0"),
-        (["eval", "-v", "nan"], "finite"),
+        (["eval", "--speed", "nan"], "finite"),
         (["eval", "--device", "tpu"], "use auto, cpu or cuda"),
         (["eval", "no/such/run"], "is no trained policy"),
         (["eval", "bestt"], "is no trained policy"),
-        (["sweep", "best", "--grid", "D=0"], "it drives by itself: --controller best"),
-        (["eval", "--controller", "none"], "'none' is no preset"),
+        (["sweep", "best", "--grid", "D=0"], "it drives by itself: --agent best"),
+        (["eval", "--agent", "none"], "'none' is no preset"),
         (["train", "curiculum"], "did you mean 'curriculum'"),
         (["train", "nowhere.yaml"], "no such file"),
         (["train", "smoke", "--set", "ppo.gama=1"], "did you mean 'gamma'"),
@@ -72,7 +72,7 @@ from uuvtai.console.views import show_evaluation
         (["train", "smoke", "--num-envs", "900000"], "GiB"),
         (["train", "smoke", "--seed", "-1"], "train.seed"),
         (["train", "smoke", "--seed", "500000"], "must differ from train.seed"),
-        (["train", "smoke", "-v", "nan"], "finite"),
+        (["train", "smoke", "--speed", "nan"], "finite"),
         (["train", "smoke", "--world", "pol"], "did you mean 'pool'"),
         (["train", "smoke", "--device", "tpu"], "use auto, cpu or cuda"),
         (["train", "--resume", "no/such/run"], "is no run folder"),
@@ -375,7 +375,7 @@ def test_tree_is_printed_and_drawn(capfd):
     code, out, _ = uuv(capfd, "tree")
     assert code == 0
     assert "FollowRoute" in out
-    code, out, _ = uuv(capfd, "tree", "--dot", "--controller", "straight")
+    code, out, _ = uuv(capfd, "tree", "--dot", "--agent", "straight")
     assert code == 0
     assert out.startswith("digraph")
 
@@ -399,7 +399,7 @@ def evaluation(tmp_path_factory):
     """One real evaluation in a process of its own: two controllers, recorded, as JSON."""
     folder = tmp_path_factory.mktemp("eval") / "run"
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "straight,bt", "--episodes", "4", "--seeds",
+        sys.executable, "-m", "uuvtai", "eval", "--agent", "straight,bt", "--episodes", "4", "--seeds",
         "3", *SmallSim.OPTIONS,
         "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder),
         "--report", "--json",
@@ -445,7 +445,7 @@ def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, tmp_pa
     """Outcomes of four episodes, and all that one of them wrote down on its way."""
     folder, document, _ = evaluation
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3",
+        sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "4", "--seeds", "3",
         *SmallSim.OPTIONS,
         "--record", "1", "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json",
     ]  # fmt: skip
@@ -485,13 +485,13 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     # the tree is ticked once when the episode begins and after every step
     assert nodes[0]["ticks"] == bt["env_steps"] + bt["episodes"]
     assert sum(n["acted"] for n in nodes) <= nodes[0]["ticks"]
-    code, _, err = uuv(capfd, "tree", str(folder), "--controller", "planner")
+    code, _, err = uuv(capfd, "tree", str(folder), "--agent", "planner")
     assert code == 2
     assert "has no controller 'planner'" in err
     code, out, _ = uuv(capfd, "tree", str(folder))
     assert code == 0 and "acted: control steps whose action the leaf set" in out
     code, _, err = uuv(capfd, "tree", "bt")
-    assert code == 2 and "bt: is no run folder" in err and "uuv tree --controller bt" in err
+    assert code == 2 and "bt: is no run folder" in err and "uuv presets show bt" in err
 
 
 def test_without_a_preset_the_papers_learner_trains(capfd, monkeypatch):
@@ -562,7 +562,7 @@ def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path,
     not listen."""
     folder = tmp_path / "run"
     process = subprocess.Popen(
-        [sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "400", "--seeds", "3",
+        [sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "400", "--seeds", "3",
         *SmallSim.OPTIONS,
          "--set", "episode.horizon_steps=400", "--record", "400", "--run-dir", str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

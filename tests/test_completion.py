@@ -45,7 +45,7 @@ def modules_after(*arguments, **environment):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["tree"], ["tree", "--dot", "--controller", "planner"], ["tree", "--json"]]
+    "arguments", [["tree"], ["tree", "--dot", "--agent", "planner"], ["tree", "--json"]]
 )
 def test_a_tree_is_printed_without_torch_and_taichi(arguments):
     code, modules = modules_after(*arguments)
@@ -151,10 +151,10 @@ def runs(tmp_path):
         (["eval", "--world", "mi"], ["mixed", "mine.yaml"]),
         (["eval", "--sensors", "n"], ["nominal"]),
         (["train", "curr"], ["curriculum"]),
-        (["tree", "--controller", "pl"], ["planner"]),
-        (["tree", "--controller", "mi"], ["mine.xml"]),
+        (["tree", "--agent", "pl"], ["planner"]),
+        (["tree", "--agent", "mi"], ["mine.xml"]),
         (["sweep", "--grid", "cau"], ["caution"]),
-        (["eval", "--controller", "bt,str"], ["bt,straight", "bt,straight+truth"]),
+        (["eval", "--agent", "bt,str"], ["bt,straight", "bt,straight+truth"]),
         (["eval", "runs/f"], ["runs/first", "runs/first_eval/"]),
         (["train", "--resume", "runs/"], ["runs/first", "runs/first_eval"]),
         (["tree", "runs/"], ["runs/first/", "runs/first_eval"]),

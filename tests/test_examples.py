@@ -255,7 +255,7 @@ def test_own_astar_goes_around_what_is_in_the_way(example):
 
 @pytest.mark.parametrize("name", TRAINERS)
 def test_what_a_trainer_saved_drives_as_an_own_policy(short, example, tmp_path, name):
-    """``uuv eval --policy examples/own_NAME.py:load=FOLDER`` does what the trainer's own policy does."""
+    """``uuv eval --agent examples/own_NAME.py:load=FOLDER`` does what the trainer's own policy does."""
     pytest.importorskip(TRAINERS[name], reason=f"{TRAINERS[name]} is not installed")
     example(name).train(short, 0, tmp_path)
     spec = f"policy:{EXAMPLES / name.replace('train', 'own')}.py:load={tmp_path}"

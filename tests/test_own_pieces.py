@@ -100,8 +100,8 @@ def test_what_is_no_piece_stays_what_it_was(text):
     [
         ("mine", "planner", "--planner 'mine': names no piece; for example --planner mine.py:plan"),
         ("mine.py:1x", "controller", "'1x' is no name of Python"),
-        ("model.onnx", "controller", "names no piece; for example --controller mine.py:act"),
-        ("policy:model.pt", "controller", "--policy 'model.pt': names no piece"),
+        ("model.onnx", "controller", "names no piece; for example --agent mine.py:act"),
+        ("policy:model.pt", "controller", "--agent 'model.pt': names no piece"),
     ],
 )
 def test_a_name_that_names_nothing_is_refused(text, kind, says):
@@ -145,7 +145,7 @@ def test_two_rows_never_share_a_name(write):
         (
             "x = 1\nprint(y)\n",
             "mine.py:act",
-            "mine.py:2: NameError: name 'y' is not defined (while --controller",
+            "mine.py:2: NameError: name 'y' is not defined (while --agent",
         ),
         ("raise SystemExit(3)\n", "mine.py:act", "mine.py:1: SystemExit: 3"),
         ("def drive(view): ...\n", "mine.py:act", "mine.py has no 'act'; it has drive"),
@@ -345,10 +345,10 @@ def test_an_exception_names_the_line_where_her_code_was(sim, write):
     assert (
         told.startswith("mine.py:4: KeyError: ") and "no column 'gaol'; there are goal, heading_error" in told
     )
-    assert told.endswith("(--controller mine.py:act)") and isinstance(refused.value.__cause__, KeyError)
+    assert told.endswith("(--agent mine.py:act)") and isinstance(refused.value.__cause__, KeyError)
     write("def act(view): ...\ndef reset(rows):\n    raise ValueError('no')\n", "other.py")
     with pytest.raises(
-        PieceError, match=r"other.py:3: ValueError: no \(in reset of --controller other.py:act\)"
+        PieceError, match=r"other.py:3: ValueError: no \(in reset of --agent other.py:act\)"
     ):
         stepped(sim, "other.py:act")
 
@@ -509,7 +509,7 @@ def test_a_call_that_does_not_come_back_is_told_by_its_line(sim, write):
     driver.code.meter._stall_s = 0.01
     Stepper(sim, driver).reset(*(torch.ones(8, dtype=torch.int32) for _ in range(3)))
     own.close()
-    assert notes[0].startswith("mine.py:2: a call of --controller mine.py:act has not come back for")
+    assert notes[0].startswith("mine.py:2: a call of --agent mine.py:act has not come back for")
 
 
 def test_the_table_has_a_column_for_the_time_of_own_code():
@@ -598,11 +598,11 @@ def test_failures_that_are_played_otherwise_are_told_and_left_out():
 
 def test_the_command_line_tells_in_one_line_and_keeps_the_traceback(write, capfd, tmp_path):
     write("def act(view):\n    return nothing\n\nprint(1 / 0)\n")
-    code, out, err = uuv(capfd, "eval", "--controller", "mine.py:act", "--episodes", "1", "--run-dir", "run")
+    code, out, err = uuv(capfd, "eval", "--agent", "mine.py:act", "--episodes", "1", "--run-dir", "run")
     assert code == 2 and out == "" and not Path("run").exists()
     line = err.strip().splitlines()[-1]
     assert line.startswith(
-        "uuv: mine.py:4: ZeroDivisionError: division by zero (while --controller mine.py:act"
+        "uuv: mine.py:4: ZeroDivisionError: division by zero (while --agent mine.py:act"
     )
     kept = Path(line.rpartition("its traceback: ")[2])
     assert "print(1 / 0)" in kept.read_text()
@@ -614,12 +614,12 @@ def test_the_command_line_tells_in_one_line_and_keeps_the_traceback(write, capfd
     [
         (["eval", "--planner", "none.py"], "none.py cannot be read"),
         (["eval", "--planner", "bt"], "--planner 'bt': names no piece; for example --planner mine.py:plan"),
-        (["sweep", "--policy", "none.onnx", "--grid", "D=0"], "none.onnx cannot be read"),
-        (["reproduce", "--controller", "bt"], "bt: is no piece of yours"),
+        (["sweep", "--agent", "none.onnx", "--grid", "D=0"], "none.onnx cannot be read"),
+        (["reproduce", "--agent", "bt"], "bt: is no piece of yours"),
         (["reproduce", "--planner", "none.py"], "none.py cannot be read"),
-        (["simulate", "--seconds", "1", "--controller", "none.py"], "none.py cannot be read"),
+        (["simulate", "--seconds", "1", "--agent", "none.py"], "none.py cannot be read"),
         (
-            ["simulate", "--seconds", "1", "--controller", "bt", "--wrench", "1,0,0,0,0,0"],
+            ["simulate", "--seconds", "1", "--agent", "bt", "--wrench", "1,0,0,0,0,0"],
             "--wrench: not beside",
         ),
     ],
@@ -792,4 +792,4 @@ def test_a_graph_with_too_few_outputs_is_told(sim, tmp_path, monkeypatch):
 
 
 def test_the_spec_of_a_command_is_what_a_request_keeps():
-    assert PieceSpec("policy", Path("m.onnx")).option == "--policy m.onnx" and "m/s" in COMMAND
+    assert PieceSpec("policy", Path("m.onnx")).option == "--agent m.onnx" and "m/s" in COMMAND

@@ -321,7 +321,7 @@ def printed(arguments):
     options = next((i for i, part in enumerate(arguments) if part.startswith("--")), len(arguments))
     policies = [part.rpartition("/")[2] for part in arguments[1:options]]
     if arguments[0] == "eval":
-        names = policies + [arguments[i + 1] for i, part in enumerate(arguments) if part == "--controller"]
+        names = policies + [arguments[i + 1] for i, part in enumerate(arguments) if part == "--agent"]
         details = [
             {"seed": 1, "episode": i, "outcome": "success" if i < 50 else "timeout"} for i in range(100)
         ]

@@ -295,7 +295,7 @@ def test_the_workers_of_a_sweep_end_with_it(tmp_path):
         "D=0,3,6,9",
         "--grid",
         "v=0.5,1.5",
-        "--controller",
+        "--agent",
         "bt",
         "--episodes",
         "64",

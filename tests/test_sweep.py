@@ -293,7 +293,7 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
     """To the last digit, also after SIGKILL."""
     place, command = (
         tmp_path / "sweep",
-        ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--controller", "bt", *OPTIONS],
+        ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--agent", "bt", *OPTIONS],
     )
     child = subprocess.Popen(
         [sys.executable, "-m", "uuvtai", *command, "--run-dir", str(place)],
@@ -327,7 +327,7 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
         (["--resume", "/nosuch"], "give the folder that 'uuv sweep' printed"),
         (["--resume", "x", "--grid", "S=4"], "a resumed run keeps its own"),
         (["nosuch"], "no trained policy"),
-        (["--controller", "nosuch"], "nosuch"),
+        (["--agent", "nosuch"], "nosuch"),
     ],
 )
 def test_bad_input_is_one_message_and_no_folder(arguments, said, tmp_path, capfd):

@@ -26,11 +26,9 @@ SEE = {
     "replay": ("replay", "viewers"),
     "pilot": ("safety", "sitl"),
     "sitl": ("sitl",),
-    "presets": ("reference/configuration",),
+    "presets": ("reference/configuration", "simulator"),
     "examples": ("own_pieces", "gym", "python"),
     "doctor": ("quickstart", "native"),
-    "warm": ("native",),
-    "tree": ("simulator",),
     "log": ("viewers", "reference/topics", "security"),
 }
 """prose about a command"""

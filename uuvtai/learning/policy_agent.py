@@ -193,7 +193,7 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     if config.tuner.enabled:
         raise CheckpointError(
             f"{checkpoint.path}: numbers for the behaviour tree, no network that could be "
-            "exported; any stack takes them: --stack best, or stack.yaml of the run"
+            "exported; they drive as --agent best, or as stack.yaml of the run"
         )
     if config.twin.enabled:
         raise CheckpointError(

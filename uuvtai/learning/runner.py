@@ -335,7 +335,7 @@ class _Run:
         self._folder.write_bytes(WEIGHTS, self._trainer.exported())
 
     def _write_stack(self) -> None:
-        """The stack that drives with the tree's numbers as they are now, where ``--stack`` is taken."""
+        """The stack that drives with the tree's numbers as they are now, for ``--agent``."""
         from uuvtai.learning.agents import tuned_sections
         from uuvtai.learning.parameter_search import TunerTrainer
 

@@ -221,7 +221,7 @@ class _FeedReader:
         if m.data["planner"] == "own":
             raise LogError(
                 f"{self._feed.path}: its routes come from a planner of the user's, which no log holds; "
-                "replay a log of --controller"
+                "replay a log without --planner"
             )
 
     def _action(self, m: LogMessage) -> None:
