@@ -7,7 +7,7 @@ import pytest
 
 from tests.command import uuv
 from tests.small_sim import SmallSim
-from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.episodes import Job
 from uuvtai.evaluation.evaluate import remainder_of, scenarios_of
 
@@ -131,7 +131,7 @@ def test_scenarios_are_those_that_are_played_in_any_batch(small):
 def test_a_tree_of_the_users_own_may_have_a_plus_in_its_name(tmp_path):
     file = tmp_path / "mine+yours.xml"
     file.write_text('<root BTCPP_format="4"><BehaviorTree ID="t"><DriveStraight/></BehaviorTree></root>')
-    plain, answer = trees_of([str(file), f"{file}+truth"], 64)
+    plain, answer = load_agents([str(file), f"{file}+truth"], 64)
     assert (plain.name, plain.privileged, answer.name, answer.privileged) == (
         "mine+yours",
         False,

@@ -53,17 +53,30 @@ from uuvtai.console.views import show_evaluation
             "'+trut' is unknown; the one suffix is +truth, for example bt+truth",
         ),
         (["eval", "--agent", "btt+truth"], "did you mean 'bt'"),
-        (["eval", "--agent", "orakel"], "'orakel' is no preset"),
+        (["eval", "--agent", "orakel"], "--agent orakel: is no preset"),
         (["eval", "--agent", "oracle", "--record", "1"], "the oracle drives no vehicle"),
         (["eval", "--set", "world.n_dynmic=1"], "did you mean 'n_dynamic'"),
         (["eval", "--set", "mapping.static_hit=.nan"], "finite"),
         (["eval", "-S", "-1"], "greater than or equal to 0"),
         (["eval", "--speed", "nan"], "finite"),
         (["eval", "--device", "tpu"], "use auto, cpu or cuda"),
-        (["eval", "no/such/run"], "is no trained policy"),
-        (["eval", "bestt"], "is no trained policy"),
-        (["sweep", "best", "--grid", "D=0"], "it drives by itself: --agent best"),
-        (["eval", "--agent", "none"], "'none' is no preset"),
+        (["eval", "--agent", "no/such/run"], "is no preset, file or run folder"),
+        (["eval", "--agent", "."], "is no trained policy"),
+        (["eval", "runs/mine"], "Got unexpected extra argument(s) (runs/mine); now it is --agent NAME|FILE"),
+        (["sweep", "--controller", "best"], "No such option: --controller; now it is --agent NAME"),
+        (["eval", "--policy=model.onnx"], "No such option: --policy; now it is --agent FILE"),
+        (["eval", "-v", "1"], "No such option: -v; now it is --speed"),
+        (
+            ["train", "--stack", "paper"],
+            "No such option: --stack; now it is --agent NAME, or --set stack=NAME",
+        ),
+        (["warm"], "No such command 'warm'; now it is uuv doctor --compile"),
+        (["tree", "--dot"], "No such command 'tree'; now it is uuv presets show bt"),
+        (["log", "video", "a.mcap"], "now it is uuv log render FILE --out NAME.webm"),
+        (["presets", "show", "pool", "--dot"], "--run, --dot: are of a tree"),
+        (["log", "render", "a.mcap", "--fps", "5"], "--speed, --fps: are of a video"),
+        (["log", "render", "a.mcap", "--out", "a.gif", "--clearance"], "are of a picture"),
+        (["eval", "--agent", "none"], "--agent none: is no preset"),
         (["train", "curiculum"], "did you mean 'curriculum'"),
         (["train", "nowhere.yaml"], "no such file"),
         (["train", "smoke", "--set", "ppo.gama=1"], "did you mean 'gamma'"),
@@ -89,7 +102,7 @@ from uuvtai.console.views import show_evaluation
         (["profile", "--seconds", "0"], "positive"),
         (["presets", "show"], "uuv presets show NAME"),
         (["presets", "show", "nothing"], "is no preset"),
-        (["tree", "no/such/run"], "is no run folder"),
+        (["presets", "show", "bt", "--run", "no/such/run"], "is no run folder"),
         (["report", "no/such/run"], "is no run folder"),
         (["report", "."], "has nothing to report yet"),
         (["report", ".", "."], "--out FILE"),
@@ -106,7 +119,7 @@ def test_bad_usage_is_one_message_and_exit_2(capfd, tmp_path, monkeypatch, argum
     assert not list(tmp_path.iterdir()), "nothing may be left behind"
 
 
-@pytest.mark.parametrize("command", ["info", "repair", "video", "picture"])
+@pytest.mark.parametrize("command", ["info", "repair", "render"])
 @pytest.mark.parametrize("content", [None, b"", b"not a log", b"\x89MCAP0\r\n" + b"\x00" * 40])
 def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content):
     log = tmp_path / "broken.mcap"
@@ -372,10 +385,10 @@ def test_a_start_removes_the_lock_of_a_killed_process_and_no_other(tmp_path):
 
 
 def test_tree_is_printed_and_drawn(capfd):
-    code, out, _ = uuv(capfd, "tree")
+    code, out, _ = uuv(capfd, "presets", "show", "bt")
     assert code == 0
     assert "FollowRoute" in out
-    code, out, _ = uuv(capfd, "tree", "--dot", "--agent", "straight")
+    code, out, _ = uuv(capfd, "presets", "show", "straight", "--dot")
     assert code == 0
     assert out.startswith("digraph")
 
@@ -477,7 +490,7 @@ def test_eval_leaves_a_complete_run_folder(evaluation):
 
 def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     folder, document, _ = evaluation
-    code, out, _ = uuv(capfd, "tree", str(folder), "--json")
+    code, out, _ = uuv(capfd, "presets", "show", "bt", "--run", str(folder), "--json")
     assert code == 0
     nodes = json.loads(out)["nodes"]
     assert nodes[0]["share"] == 1.0
@@ -485,13 +498,13 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     # the tree is ticked once when the episode begins and after every step
     assert nodes[0]["ticks"] == bt["env_steps"] + bt["episodes"]
     assert sum(n["acted"] for n in nodes) <= nodes[0]["ticks"]
-    code, _, err = uuv(capfd, "tree", str(folder), "--agent", "planner")
+    code, _, err = uuv(capfd, "presets", "show", "planner", "--run", str(folder))
     assert code == 2
-    assert "has no controller 'planner'" in err
-    code, out, _ = uuv(capfd, "tree", str(folder))
+    assert "has no tree 'planner'" in err
+    code, out, _ = uuv(capfd, "presets", "show", "bt", "--run", str(folder))
     assert code == 0 and "acted: control steps whose action the leaf set" in out
-    code, _, err = uuv(capfd, "tree", "bt")
-    assert code == 2 and "bt: is no run folder" in err and "uuv presets show bt" in err
+    code, _, err = uuv(capfd, "presets", "show", "bt", "--run", "bt")
+    assert code == 2 and "bt: is no run folder" in err
 
 
 def test_without_a_preset_the_papers_learner_trains(capfd, monkeypatch):

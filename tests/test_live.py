@@ -345,7 +345,7 @@ def test_as_fast_as_it_goes():
         (("--port", "70000"), "--port 70000"),
         (("--episodes", "-1"), "--episodes -1"),
         (("--agent", "oracle"), "drives no vehicle"),
-        (("--agent", "nobody"), "'nobody' is no preset"),
+        (("--agent", "nobody"), "--agent nobody: is no preset"),
     ],
 )
 def test_what_makes_no_sense_is_refused(typed, told, capfd):

@@ -132,7 +132,7 @@ def test_a_signal_within_a_write_loses_no_message(tmp_path, call):
         ("simulate", "--seconds", "1"),
         ("sweep", "--grid", "D=0,3", "--run-dir", "run"), ("profile",), ("report", "nowhere"),
         ("export", "nowhere", "--out", "out"),
-        ("presets",), ("doctor",), ("tree",), ("log", "info", "nowhere.mcap"),
+        ("presets",), ("doctor",), ("presets", "show", "bt"), ("log", "info", "nowhere.mcap"),
         ("reproduce", "--run-dir", "run"),
     ],
 )  # fmt: skip
@@ -316,7 +316,7 @@ def test_the_workers_of_a_sweep_end_with_it(tmp_path):
 
 def test_ctrl_c_ends_what_compiles_side_by_side(tmp_path):
     """A terminal sends it to every process of the command."""
-    command = [sys.executable, "-m", "uuvtai", "warm", "--workers", "2", *SmallSim.OPTIONS[:4]]
+    command = [sys.executable, "-m", "uuvtai", "doctor", "--compile", "--workers", "2", *SmallSim.OPTIONS[:4]]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True
     )

@@ -109,7 +109,7 @@ def test_shipped_grids_load_and_every_cell_has_a_config(name):
 def asked(grid, **changes):
     given = {
         "grid": grid, "world": "pool", "sensors": None, "vehicle": None, "overrides": (),
-        "controllers": ("bt",), "policies": (),
+        "agents": ("bt",),
         "seeds": (3,), "episodes": 4,
     }  # fmt: skip
     return SweepRequest(**(given | changes))

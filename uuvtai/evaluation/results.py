@@ -428,9 +428,10 @@ def read_request(place: Path) -> tuple[Request, dict[str, str]]:
     except OSError as error:
         raise RunFolderError(f"{file}: cannot be read ({error.strerror}); {_GIVE}") from None
     except (ValidationError, ConfigError) as error:
-        reason = (
-            error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error).splitlines()[0]
-        )
+        reason = str(error).splitlines()[0]
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise RunFolderError(
             f"{file}: is no request of this version of 'uuv eval' ({reason}); {_GIVE}"
         ) from None
