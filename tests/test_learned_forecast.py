@@ -22,7 +22,7 @@ from uuvtai.learning.forecast import ForecastTrainer, TrackMoments, column_row, 
 from uuvtai.learning.networks import TIMES_S, Mixture, MixtureNet, negative_log_likelihood
 from uuvtai.learning.policy_agent import load_pilot
 from uuvtai.learning.runner import TrainRequest, train
-from uuvtai.sim.setup import packed_weights, read_weights
+from uuvtai.sim.forecast_weights import packed_weights, read_weights
 from uuvtai.state.obstacle_motion import describe_scenario, path_positions
 from uuvtai.surrogate.world import scenario_rows
 

@@ -104,7 +104,7 @@ FORBIDDEN = """
 eval exec compile __import__ pickle marshal shelve dill joblib runpy tarfile os.system os.popen torch.load
 torch.jit.load np.load np.lib.format.read_array
 """
-ALONE = {"vehicle/embedded/runtime.py", "vehicle/embedded/runtime.py"}
+ALONE = {"vehicle/embedded/runtime.py"}
 """files of an exported stack: they run without uuvtai, out of a folder whose native code is run as it is"""
 READERS = {
     "files.py": "it is the one reader",
