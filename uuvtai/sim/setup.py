@@ -31,6 +31,7 @@ from uuvtai.common.enums import (
     RUNNING,
 )
 from uuvtai.common.errors import SettingError, SizeError, UserError
+from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.compile.launch import forget, is_gpu_shaped
 from uuvtai.compile.memory import Memory, Put, address_of, put_by_kernel
 from uuvtai.config import Config, FixedObstacle, ForecastConfig, SonarConfig, VehicleConfig, WorldConfig
@@ -47,7 +48,6 @@ from uuvtai.kernels.world.motion import FAULT_MOVING
 from uuvtai.kernels.world.scenario import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
 from uuvtai.sim.stages import SimState, Stages, bind_all
 from uuvtai.state import FixedTable, GridMask, SceneState
-from uuvtai.state.obstacle_motion import KIND_NAMES
 
 if TYPE_CHECKING:
     pass
