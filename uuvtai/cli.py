@@ -15,12 +15,12 @@ from typing import Annotated
 import typer
 
 from uuvtai.common import signals
-from uuvtai.common.errors import FAILED, GATE, UsageError, guarded, plain, say
+from uuvtai.common.exits import FAILED, GATE, UsageError, guarded, plain, say
 from uuvtai.common.version import __version__
-from uuvtai.config.scene import SceneOptions
 from uuvtai.console import groups, parsing
 from uuvtai.console import options as opt
 from uuvtai.console.screen import Progress, counted
+from uuvtai.sim.scene import SceneOptions
 
 app = typer.Typer(
     name="uuv",

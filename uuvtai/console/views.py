@@ -13,17 +13,17 @@ from typing import Any
 import typer
 from rich.text import Text
 
-from uuvtai.common.errors import UsageError, plain, say
+from uuvtai.common.exits import UsageError, plain, say
 from uuvtai.common.files import read_text
+from uuvtai.common.presets import KINDS, preset_names, shipped_file
 from uuvtai.common.tree_codes import ACTION, LEAVES
 from uuvtai.config import loader
-from uuvtai.config.loader import KINDS, preset_names, shipped_file
-from uuvtai.config.scene import SceneOptions
 from uuvtai.console.screen import Screen, print_heat_maps
 from uuvtai.report.evaluation import DAGGER, causes_table, methods_table, paired_table
 from uuvtai.report.sweep import cell_table
 from uuvtai.report.tables import Column, Table, bodies, number, sensing, varies_alone, varying, vehicle
 from uuvtai.report.timing import density_table, latency_table
+from uuvtai.sim.scene import SceneOptions
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
