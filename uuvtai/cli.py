@@ -443,7 +443,7 @@ def presets(
     kind, name = shown.kind_and_name(action, name)
     if not everything or kind == "tree":  # a tree has no keys
         return shown.show_stated(kind, name, output.as_json)
-    from uuvtai.console.views import whole_preset
+    from uuvtai.sim.scene import whole_preset
 
     found, text = whole_preset(kind, name)
     output.show(found, lambda _screen: typer.echo(text))

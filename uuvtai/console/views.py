@@ -23,7 +23,6 @@ from uuvtai.report.evaluation import DAGGER, causes_table, methods_table, paired
 from uuvtai.report.sweep import cell_table
 from uuvtai.report.tables import Column, Table, bodies, number, sensing, varies_alone, varying, vehicle
 from uuvtai.report.timing import density_table, latency_table
-from uuvtai.sim.scene import SceneOptions
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
@@ -247,7 +246,6 @@ def show_presets(screen: Screen) -> None:
 
 def show_stated(kind: str, name: str, as_json: bool) -> None:
     """A preset as it is written, its comments included. Raises ConfigError, FileError, OSError."""
-    from uuvtai.config import loader
 
     path = loader.preset_path(kind, name)
     if as_json and path.suffix not in (".xml", ".md"):
@@ -628,23 +626,3 @@ def show_simulation(screen: Screen, result: dict[str, Any], title: str, driven: 
 
 def _picked(n: int, wanted: int) -> list[int]:
     return sorted({round(i * (n - 1) / max(1, wanted - 1)) for i in range(wanted)}) if n else []
-
-
-# ------------------------------------------------------------------------------------------------------------
-# Every key that a preset gives, its own, those it builds on and the defaults: ``uuv presets show --all``.
-
-
-def whole_preset(kind: str, name: str) -> tuple[Any, str]:
-    """As a document and as YAML. Raises ConfigError, CheckpointError."""
-    if kind == "grid":
-        found = loader.read_preset(kind, name)
-        return found, loader.dumped(found)
-    config = _config_of(kind, name)
-    return config.model_dump(mode="json"), loader.to_yaml(config)
-
-
-def _config_of(kind: str, name: str) -> Any:
-    if kind == "train":
-        return SceneOptions().training(name)
-    chosen: dict[str, Any] = {kind: name}
-    return SceneOptions(**chosen).config()
