@@ -167,7 +167,7 @@ def test_while_nothing_is_kept_it_ends_in_the_middle_of_an_import(tmp_path, numb
 KEEPS = """
 import os, sys, time
 from uuvtai import signals
-from uuvtai.common.errors import guarded
+from uuvtai.common.exits import guarded
 signals.install(); signals.end_at_second(); signals.engage()
 def work():
     try:

@@ -15,12 +15,12 @@ from typing import Annotated, Any
 import typer
 
 from uuvtai.common import signals
-from uuvtai.common.errors import FAILED, GATE, UsageError, guarded, say
+from uuvtai.common.exits import FAILED, GATE, UsageError, guarded, say
 from uuvtai.common.version import __version__
-from uuvtai.config.scene import SceneOptions
 from uuvtai.console import groups, parsing
 from uuvtai.console import options as opt
 from uuvtai.console.screen import Progress, counted
+from uuvtai.sim.scene import SceneOptions
 
 app = typer.Typer(
     name="uuv",
@@ -291,7 +291,9 @@ def presets(
         return output.show(report.document, lambda screen: shown.show_tree_report(screen, report, dot))
     if not everything or kind == "tree":  # a tree has no keys
         return shown.show_stated(kind, name, output.as_json)
-    found, text = shown.whole_preset(kind, name)
+    from uuvtai.sim.scene import whole_preset
+
+    found, text = whole_preset(kind, name)
     output.show(found, lambda _screen: typer.echo(text))
 
 

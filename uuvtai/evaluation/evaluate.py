@@ -18,6 +18,7 @@ import torch
 
 from uuvtai.common.enums import PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.errors import SettingError
+from uuvtai.common.obstacle_motion import describe_scenario
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError
@@ -52,7 +53,6 @@ from uuvtai.logs.writer import EpisodeRecorder, PolicyNote
 from uuvtai.plugins.api import refuse_code
 from uuvtai.sim.rrt import RoutePlanner
 from uuvtai.sim.sim import Sim
-from uuvtai.state.obstacle_motion import describe_scenario
 
 if TYPE_CHECKING:
     from uuvtai.learning.runner import AnyTrainer, Metrics
@@ -170,7 +170,7 @@ def comparison_of(
 
 def _any_tree() -> FlatTree:
     """The oracle drives no vehicle, but a simulator wants a tree."""
-    from uuvtai.config.loader import TRAINING_TREE
+    from uuvtai.common.presets import TRAINING_TREE
     from uuvtai.sim.behavior_tree import read_tree
 
     return read_tree(TRAINING_TREE)

@@ -25,6 +25,7 @@ from uuvtai.common.files import (
     refuse_links,
     truncate,
 )
+from uuvtai.common.presets import preset_names
 from uuvtai.common.statistics import (
     bootstrap_interval,
     mcnemar_p,
@@ -34,7 +35,7 @@ from uuvtai.common.statistics import (
     wilson_interval,
 )
 from uuvtai.config import Config
-from uuvtai.config.loader import ConfigError, preset_names, preset_of, read_preset, validated
+from uuvtai.config.loader import ConfigError, preset_of, read_preset, validated
 from uuvtai.evaluation.episodes import EpisodeObserver, EpisodeResult, Job
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins.api import is_piece, piece_spec
@@ -42,8 +43,8 @@ from uuvtai.sim.behavior_tree import node_use
 from uuvtai.sim.sim import Sim
 
 if TYPE_CHECKING:
-    from uuvtai.config.scene import SceneOptions
     from uuvtai.evaluation.agents import Method
+    from uuvtai.sim.scene import SceneOptions
 
 
 JOURNAL_FILE = "eval/episodes.jsonl"

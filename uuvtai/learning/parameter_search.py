@@ -158,7 +158,8 @@ def best_near(
 def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
     """A simulator of a world with room for every scene, on the run's sensors and stack. Raises
     ConfigError."""
-    from uuvtai.config.loader import TRAINING_TREE, load_config
+    from uuvtai.common.presets import TRAINING_TREE
+    from uuvtai.config.loader import load_config
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim
 
@@ -250,7 +251,7 @@ class TunerTrainer:
         config, n = self.config, len(self._part)
         rounds = sum(self._part[i % n] == part for i in range(config.train.iterations))
         return NumberSearch(
-            torch.from_numpy(configured_factors(config)[:, part]),
+            torch.from_numpy(configured_factors(config.slow, config.fast)[:, part]),
             torch.tensor(log_bounds()),
             config.tuner.spread,
             rounds * config.train.num_envs,
