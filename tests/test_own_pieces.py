@@ -112,8 +112,8 @@ def test_a_name_that_names_nothing_is_refused(text, kind, says):
 def test_options_become_names_of_agents():
     typed = ["bt,mine.py:act", "best,bt", "m.onnx", "q.py:load=a,b", "q.py", "runs/first"]
     assert parsing.agents(typed, ["p.py"], ["bt"]) == [
-        "bt", "controller:mine.py:act", "best", "policy:m.onnx", "policy:q.py:load=a,b", "controller:q.py:act",
-        "runs/first", "planner:p.py:plan",
+        "bt", "controller:mine.py:act", "best", "policy:m.onnx", "policy:q.py:load=a,b",
+        "controller:q.py:act", "runs/first", "planner:p.py:plan",
     ]  # fmt: skip
     assert parsing.agents(["policy:q.py:net"], None, []) == ["policy:q.py:net"]
     assert parsing.agents(None, ["p.py"], ["bt"]) == ["planner:p.py:plan"]
