@@ -75,22 +75,11 @@ class Method:
             return None if driver is None else PolicyNote(driver, self.own.sha256, None)
         if self.checkpoint is None:
             return None
-        from uuvtai.envs.vector_env import VectorEnv
-        from uuvtai.learning.policy_agent import load_pilot, refuse_forecaster
+        from uuvtai.learning.agents import load_driver
         from uuvtai.logs.writer import PolicyNote
 
-        if self.checkpoint.config.tuner.enabled:
-            from uuvtai.learning.agents import load_tuned
-
-            return PolicyNote(load_tuned(self.checkpoint, sim), self.checkpoint.sha256, None)
-        if self.checkpoint.config.twin.enabled:
-            from uuvtai.learning.agents import load_set_pilot
-
-            return PolicyNote(load_set_pilot(self.checkpoint, sim), self.checkpoint.sha256, None)
-        refuse_forecaster(self.checkpoint)
-        self.checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
+        pilot = load_driver(self.checkpoint, sim)
         weight = self.checkpoint.manifest.metrics.get("distill/lambda")
-        pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
         return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
 
     def planner_for(self, sim: Sim) -> RoutePlanner | None:

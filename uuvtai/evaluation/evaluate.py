@@ -371,12 +371,10 @@ def _recorder(
 def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been."""
-    from uuvtai.learning.forecast import ForecastTrainer
-    from uuvtai.learning.parameter_search import TunerTrainer
     from uuvtai.learning.policy_agent import Pilot
-    from uuvtai.learning.surrogate_trainer import TwinTrainer
+    from uuvtai.learning.trainer import Trainer
 
-    if isinstance(trainer, TwinTrainer | TunerTrainer | ForecastTrainer):  # they play by themselves
+    if not isinstance(trainer, Trainer):  # the others run episodes by themselves
         return trainer.evaluate()
     env = trainer.env
     model = trainer.world_model if config.world_model.as_features else None
