@@ -153,10 +153,8 @@ def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[s
         sub.close()
         child.kill()
     after = [message for message in sub.told[before:] if orders(message)]
-    found = _wrong(after, asked, sub) + _not_whole(
-        log, out.read_text(), err.read_text(), child.returncode, number
-    )
-    return found, wait_s, drove
+    found = _wrong(after, asked, sub)
+    return found + _not_whole(log, out.read_text(), err.read_text(), child.returncode, number), wait_s, drove
 
 
 def _wait(child: subprocess.Popen[str]) -> None:
