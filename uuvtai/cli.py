@@ -505,7 +505,7 @@ def tree(
     dot: opt.Dot = False,
 ) -> None:
     """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
-    from uuvtai.evaluation.results import tree_report
+    from uuvtai.sim.behavior_tree import tree_report
 
     report = tree_report(controller, run)
     if dot or run is None:
