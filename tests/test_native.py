@@ -382,6 +382,8 @@ def test_the_text_in_the_key_is_the_text_that_is_compiled(tmp_path, monkeypatch)
 
 def names_of(node):
     """Modules that a statement imports."""
+    if isinstance(node, ast.ImportFrom) and node.module == "uuvtai.common":
+        return [f"{node.module}.{alias.name}" for alias in node.names]
     if isinstance(node, ast.ImportFrom) and node.module:
         return [node.module]
     return [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
