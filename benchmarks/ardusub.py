@@ -22,17 +22,14 @@ from pymavlink import mavutil
 from benchmarks.closed_loop import SEED, ends_row, simulated
 from benchmarks.common import Job, Row
 from uuvtai.config import Config
-from uuvtai.link.endpoint import Endpoint, LinkPlace
-from uuvtai.link.flight_plan import FlightPlan
-from uuvtai.link.link_log import LinkLog
-from uuvtai.link.onboard_loop import OnboardLoop
-from uuvtai.loader import load_config
-from uuvtai.pilot import Mission, OnboardPilot
-from uuvtai.sim import Sim
-from uuvtai.sitl.instance import Instance
-from uuvtai.sitl.rows_of_water import WaterRows
-from uuvtai.sitl.serving import PLACE, PLACE_S, PLACED_S, SitlPlan, SitlPort
-from uuvtai.tree import read_tree
+from uuvtai.config.loader import load_config
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.sim import Sim
+from uuvtai.vehicle.control_loop import FlightPlan, OnboardLoop
+from uuvtai.vehicle.mavlink import Endpoint, LinkPlace
+from uuvtai.vehicle.onboard import Mission, OnboardPilot
+from uuvtai.vehicle.pilot_log import LinkLog
+from uuvtai.vehicle.sitl import PLACE, PLACE_S, PLACED_S, Instance, SitlPlan, SitlPort, WaterRows
 
 THREADS = 1
 LONGEST_S = 7200

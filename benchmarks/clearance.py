@@ -10,15 +10,15 @@ from scipy.ndimage import distance_transform_edt
 from benchmarks.common import Job, Row, seconds_per_call
 from tests.map_bits import put_layers
 from uuvtai import state
-from uuvtai.binding import bind
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import ClearanceConfig
-from uuvtai.initial import load_bounds
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.grid import outside_cells
-from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.planning import clearance
-from uuvtai.kernels.planning.bundles import ClearanceIO
-from uuvtai.loader import load_config
-from uuvtai.runtime import start_taichi
+from uuvtai.kernels.planning.io import ClearanceIO
+from uuvtai.sim.setup import load_bounds
+from uuvtai.sim.stages import bind
 
 THREADS = 1
 FLOOR = 1.0

@@ -17,21 +17,17 @@ import torch
 
 from benchmarks.common import Job, Row
 from benchmarks.peers.stand_in_autopilot import StandIn
+from uuvtai.common.enums import OUTCOMES, RUNNING
+from uuvtai.common.statistics import wilson_interval
 from uuvtai.config import Config
-from uuvtai.link.dialect import MavCodec
-from uuvtai.link.endpoint import Endpoint, LinkPlace
-from uuvtai.link.flight_plan import FlightPlan
-from uuvtai.link.link_log import LinkLog
-from uuvtai.link.onboard_loop import OnboardLoop
-from uuvtai.link.orders import Order
-from uuvtai.loader import load_config
-from uuvtai.outcomes import OUTCOMES, RUNNING
-from uuvtai.pilot import Mission, OnboardPilot
-from uuvtai.sim import Sim
-from uuvtai.sitl.instance import Instance
-from uuvtai.sitl.rows_of_water import WaterRows
-from uuvtai.statistics import wilson_interval
-from uuvtai.tree import read_tree
+from uuvtai.config.loader import load_config
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.sim import Sim
+from uuvtai.vehicle.control_loop import FlightPlan, OnboardLoop
+from uuvtai.vehicle.mavlink import Endpoint, LinkPlace, MavCodec, Order
+from uuvtai.vehicle.onboard import Mission, OnboardPilot
+from uuvtai.vehicle.pilot_log import LinkLog
+from uuvtai.vehicle.sitl import Instance, WaterRows
 
 THREADS = 1
 LONGEST_S = 3600

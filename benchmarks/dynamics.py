@@ -14,10 +14,10 @@ import torch
 
 from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.vehicle_arrays import Vehicles
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
-from uuvtai.kernels.vehicle import actuation, dynamics
-from uuvtai.plant import Plant
-from uuvtai.runtime import start_taichi
+from uuvtai.kernels.vehicle import control, dynamics
+from uuvtai.sim.plant import Plant
 
 DEVICES = ("cpu", "cuda")
 FLOOR = 4e6
@@ -72,7 +72,7 @@ def _step_of(config: Config, plant: Plant, shared: torch.Tensor) -> Callable[[],
     rules = config.episode
 
     def step() -> None:
-        actuation.command_thrusters(plant.actuation_io, shared)
+        control.command_thrusters(plant.actuation_io, shared)
         dynamics.move_vehicle(plant.dynamics_io, rules.control_dt_s, rules.substeps)
         if shared.is_cuda:
             torch.cuda.synchronize()

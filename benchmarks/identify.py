@@ -15,15 +15,15 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.common import Job, Row
+from uuvtai.common.statistics import wilson_interval
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config, VehicleConfig
-from uuvtai.identify.drive_log import Drive, up_axis
-from uuvtai.identify.identified import KNOWN, fitted_drives
-from uuvtai.identify.motion_model import GAIN, LAG, LATE, NET, SIZE, parameters_of
-from uuvtai.loader import load_config
-from uuvtai.measure.simulate import roll_pitch_yaw
-from uuvtai.plant import Plant
-from uuvtai.runtime import start_taichi
-from uuvtai.statistics import wilson_interval
+from uuvtai.config.loader import load_config
+from uuvtai.evaluation.simulate import roll_pitch_yaw
+from uuvtai.sim.plant import Plant
+from uuvtai.vehicle.identify.drive_log import Drive, up_axis
+from uuvtai.vehicle.identify.fit import KNOWN, fitted_drives
+from uuvtai.vehicle.identify.model import GAIN, LAG, LATE, NET, SIZE, parameters_of
 
 LONGEST_S = 3600
 VEHICLES, MINUTES, SEED = 18, 5.0, 77301

@@ -9,11 +9,10 @@ from pathlib import Path
 import torch
 
 from benchmarks.common import Job, Row
-from uuvtai.loader import load_config
-from uuvtai.measure.episodes.methods import Method, trees_of
-from uuvtai.measure.profile.profiling import WARM_STEPS
-from uuvtai.measure.profile.sim_batch import SimBatch
-from uuvtai.sim import Sim
+from uuvtai.config.loader import load_config
+from uuvtai.evaluation.agents import Method, trees_of
+from uuvtai.evaluation.profile import WARM_STEPS, SimBatch
+from uuvtai.sim.sim import Sim
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 PIECES = (

@@ -12,21 +12,19 @@ import numpy as np
 import torch
 
 from benchmarks.common import Job, Row
+from uuvtai.common.enums import RUNNING, SUCCESS
+from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learn.checkpoint import Checkpoint
-from uuvtai.learn.set_networks import actor_of
-from uuvtai.learn.set_pilot import load_set_pilot
-from uuvtai.learn.set_policy import MOST_WISH, SetActor
-from uuvtai.learn.world_sims import simulator_of
-from uuvtai.measure.episodes.methods import find_policy
-from uuvtai.measure.episodes.playing import Job as Episode
-from uuvtai.measure.episodes.playing import run_episodes
-from uuvtai.outcomes import RUNNING, SUCCESS
-from uuvtai.scenario import Scene
-from uuvtai.sim import Sim
-from uuvtai.statistics import wilson_interval
-from uuvtai.twin.scenario_bank import draw_bank
-from uuvtai.twin.twin_world import Twin
+from uuvtai.evaluation.agents import find_policy
+from uuvtai.evaluation.episodes import Job as Episode
+from uuvtai.evaluation.episodes import run_episodes
+from uuvtai.learning.agents import load_set_pilot
+from uuvtai.learning.checkpoint import Checkpoint
+from uuvtai.learning.parameter_search import simulator_of
+from uuvtai.learning.set_networks import MOST_WISH, SetActor, actor_of
+from uuvtai.sim.setup import Scene
+from uuvtai.sim.sim import Sim
+from uuvtai.surrogate.world import Twin, draw_bank
 
 LONGEST_S = 3600
 THREADS = 1

@@ -16,11 +16,9 @@ from mcap.records import Channel, Message
 
 from benchmarks.common import Job, Row
 from uuvtai.logs.reader import records
-from uuvtai.measure.replay.faults import Faults, outage_of
-from uuvtai.measure.replay.log_feed import LogFeed
-from uuvtai.measure.replay.replaying import replay
-from uuvtai.pilot import OnboardPilot
-from uuvtai.sim import Sim
+from uuvtai.sim.sim import Sim
+from uuvtai.vehicle.onboard import OnboardPilot
+from uuvtai.vehicle.replay import Faults, LogFeed, outage_of, replay
 
 THREADS = 1
 LONGEST_S = 10800

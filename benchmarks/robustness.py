@@ -97,10 +97,10 @@ def _starts_fixed(
     """By kind, of every start: fixed, wrong or refused; what was found; off by [m, degrees]; after [s]."""
     import torch
 
-    from uuvtai.link.start_fix import LONGEST_S, StartFix
-    from uuvtai.loader import load_config
-    from uuvtai.sim import Sim
-    from uuvtai.tree import read_tree
+    from uuvtai.config.loader import load_config
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.sim.sim import Sim
+    from uuvtai.vehicle.start_fix import LONGEST_S, StartFix
 
     config = load_config(world, sensors, overrides={"sensors.localization": "truth", **overrides})
     sim, rng = Sim(config, n, read_tree("straight")), random.Random(_SEED)
@@ -139,8 +139,8 @@ def _told(config: Any, views: dict[str, Any], row: int) -> Callable[[float], lis
     """What a vehicle's sensors say in this step, as messages of the pilot; the yaw wrong by what is asked."""
     import numpy as np
 
-    from uuvtai.link.sectors import ping_of, sectors_of
-    from uuvtai.pilot import DvlReading, ImuReading, SonarPing
+    from uuvtai.vehicle.onboard import DvlReading, ImuReading, SonarPing
+    from uuvtai.vehicle.telemetry import ping_of, sectors_of
 
     sonar, dt, step = config.sensors.sonar, config.episode.control_dt_s, int(views["clock.step"][row])
     now_s, rpy, rest = step * dt, views["ego.imu_rpy"][row].copy(), []

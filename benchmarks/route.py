@@ -10,13 +10,14 @@ import numpy as np
 from benchmarks.common import Job, Row, seconds_per_call
 from tests import planning_maps as maps
 from tests.reference.voronoi import clearance_of
-from uuvtai import rrt, state
-from uuvtai.binding import bind
+from uuvtai import state
+from uuvtai.common.enums import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
 from uuvtai.kernels.planning import route, voronoi
-from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
-from uuvtai.plan_codes import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
-from uuvtai.runtime import start_taichi
+from uuvtai.kernels.planning.io import RouteIO, VoronoiIO
+from uuvtai.sim import rrt
+from uuvtai.sim.stages import bind
 
 THREADS = 1
 FLOOR = 4.0

@@ -159,7 +159,7 @@ def _work(chosen: argparse.Namespace) -> int:
 
 
 def _machine(device: str) -> dict[str, Any]:
-    from uuvtai.run_folder import hardware, versions
+    from uuvtai.logs.run_folder import hardware, versions
 
     found = {**versions()}
     for name in PEERS:
@@ -185,7 +185,7 @@ def _memory_gib() -> float | None:
 
 def _commit() -> str | None:
     """Commit of the checkout, with '+' where files of the package or the benchmarks differ from it."""
-    from uuvtai.run_folder import git_sha
+    from uuvtai.logs.run_folder import git_sha
 
     sha = git_sha()
     if sha is None:

@@ -6,13 +6,12 @@ from __future__ import annotations
 import time
 
 from benchmarks.common import Job, Row
-from uuvtai.loader import load_config
-from uuvtai.measure.profile.profiling import WARM_STEPS, env_steps_per_s
-from uuvtai.measure.profile.sim_batch import SimBatch
-from uuvtai.sim import Sim
-from uuvtai.sizes import memory_bytes
-from uuvtai.stages import STAGES
-from uuvtai.tree import read_tree
+from uuvtai.config.loader import load_config
+from uuvtai.evaluation.profile import WARM_STEPS, SimBatch, env_steps_per_s
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.setup import memory_bytes
+from uuvtai.sim.sim import Sim
+from uuvtai.sim.stages import STAGES
 
 DEVICES = ("cpu", "cuda")
 FLOORS = {"paper": 15_000.0, "nominal": 30_000.0}

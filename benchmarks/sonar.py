@@ -10,11 +10,11 @@ from benchmarks.common import Job, Row, seconds_per_call
 from tests.reference import scenes
 from tests.reference.sonar import beam_headings
 from uuvtai import state
-from uuvtai.binding import bind
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
 from uuvtai.kernels.sensors import sonar
-from uuvtai.kernels.sensors.bundles import SonarIO
-from uuvtai.runtime import start_taichi
+from uuvtai.kernels.sensors.io import SonarIO
+from uuvtai.sim.stages import bind
 
 THREADS = 1
 FLOOR = 8.0

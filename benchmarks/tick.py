@@ -11,13 +11,13 @@ import torch
 from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.tick_py_trees import PyTree
 from uuvtai import state
-from uuvtai.binding import bind
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
-from uuvtai.kernels.teacher import tree_tick
-from uuvtai.kernels.teacher.bundles import TeacherIO
-from uuvtai.runtime import start_taichi
-from uuvtai.sizes import array_sizes
-from uuvtai.tree import load_tree, read_tree
+from uuvtai.kernels.behavior import tree as tree_tick
+from uuvtai.kernels.behavior.io import TeacherIO
+from uuvtai.sim.behavior_tree import load_tree, read_tree
+from uuvtai.sim.setup import array_sizes
+from uuvtai.sim.stages import bind
 
 THREADS = 1
 FLOOR = 200.0

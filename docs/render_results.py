@@ -18,15 +18,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uuvtai.link.safety import RULES
-from uuvtai.measure.reproduce import paper
-from uuvtai.measure.reproduce.claims import ends_of, pooled
-from uuvtai.measure.reproduce.markdown import results_page
-from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
-from uuvtai.outcomes import COLLIDED, ENDINGS, LETTERS
-from uuvtai.tables.heatmap import cell_name, place_of
-from uuvtai.tables.table import text_table
-from uuvtai.tables.wording import seconds
+from uuvtai.common.enums import COLLIDED, ENDINGS, LETTERS
+from uuvtai.evaluation import claims
+from uuvtai.evaluation.claims import ends_of, pooled
+from uuvtai.evaluation.reproduce import results_page
+from uuvtai.evaluation.reproduce_steps import RETIRED_SEEDS
+from uuvtai.report.tables import cell_name, place_of, seconds, text_table
+from uuvtai.vehicle.safety import RULES
 
 Document = dict[str, Any]
 Cells = list[Document]
@@ -142,14 +140,14 @@ def grid(root: Path) -> str:
     """The paper's grid in two worlds: rates over many cells, and cells without a collision."""
     pool, gauntlet = (_cells(root, name) for name in ("pool", "gauntlet"))
     moderate = "S <= 8, D <= 9, v <= 1.5"
-    theirs = f"{paper.WITHOUT_COLLISION} of {paper.MODERATE_CONDITIONS}"
-    few, corner = [c for c in pool if c["D"] <= paper.FEW_MOVERS], [c for c in pool if _is_corner(c)]
+    theirs = f"{claims.WITHOUT_COLLISION} of {claims.MODERATE_CONDITIONS}"
+    few, corner = [c for c in pool if c["D"] <= claims.FEW_MOVERS], [c for c in pool if _is_corner(c)]
     lines = [
-        [f"`pool`, {moderate}: the paper", f"{100 * paper.MODERATE_SUCCESS:.1f} %",
-         f"{100 * paper.MODERATE_COLLISION:.1f} %", "", theirs],
+        [f"`pool`, {moderate}: the paper", f"{100 * claims.MODERATE_SUCCESS:.1f} %",
+         f"{100 * claims.MODERATE_COLLISION:.1f} %", "", theirs],
         *_by_method(_moderate(pool), f"`pool`, {moderate}", True),
         ["`pool`, D <= 3, all S and v: the paper", "",
-         f"below {100 * paper.FEW_MOVERS_COLLISION:.1f} %", "", ""],
+         f"below {100 * claims.FEW_MOVERS_COLLISION:.1f} %", "", ""],
         *_by_method(few, "`pool`, D <= 3, all S and v"),
         *_by_method(corner, "the corner S = 12, D = 15, v = 3.0"),
         *_by_method(_moderate(gauntlet), f"`gauntlet`, {moderate}", True),
@@ -189,11 +187,13 @@ def _weighted(cells: Cells) -> str:
 
 
 def _moderate(cells: Cells) -> Cells:
-    return [cell for cell in cells if all((cell[name] or 0) <= most for name, most in paper.MODERATE.items())]
+    return [
+        cell for cell in cells if all((cell[name] or 0) <= most for name, most in claims.MODERATE.items())
+    ]
 
 
 def _is_corner(cell: Document) -> bool:
-    return all(cell[name] == value for name, value in paper.CORNER.items())
+    return all(cell[name] == value for name, value in claims.CORNER.items())
 
 
 def caution(root: Path) -> str:

@@ -10,8 +10,8 @@ import numpy as np
 from judge import judge
 
 import uuvtai
-from uuvtai.env import VectorEnv
-from uuvtai.sim import Sim
+from uuvtai.envs.vector_env import VectorEnv
+from uuvtai.sim.sim import Sim
 
 MAX_HEAVE_M = 0.4
 """height error [m] at which heave is full"""

@@ -8,10 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import uuvtai
-from uuvtai.measure.episodes.playing import jobs_of, run_episodes
-from uuvtai.measure.evaluate.summary import summary
-from uuvtai.sim import Sim
-from uuvtai.tree import read_tree
+from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.evaluation.results import summary
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.sim import Sim
 
 TREES = (str(Path(__file__).with_name("patient.xml")), "bt", "planner")
 

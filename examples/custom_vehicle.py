@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from uuvtai.loader import load_config
-from uuvtai.measure.simulate import Trial, simulate
-from uuvtai.runtime import Runtime
+from uuvtai.compile.runtime import Runtime
+from uuvtai.config.loader import load_config
+from uuvtai.evaluation.simulate import Trial, simulate
 
 VEHICLES = ("bluerov2", str(Path(__file__).with_name("heavy_pack.yaml")))
 TIMES_S = (0.2, 0.5, 1.0, 2.0, 4.0)

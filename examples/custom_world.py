@@ -9,9 +9,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from uuvtai.gym import UuvEnv
+from uuvtai.envs.gymnasium import UuvEnv
 from uuvtai.logs.picture import save_image
-from uuvtai.sim import Sim
+from uuvtai.sim.sim import Sim
 
 WORLD = Path(__file__).with_name("harbour.yaml")
 

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 import uuvtai
-from uuvtai.gym import UuvVectorEnv
-from uuvtai.run_folder import default_run_dir, refuse_place
-from uuvtai.sim import Sim
-from uuvtai.statistics import wilson_interval
+from uuvtai.common.statistics import wilson_interval
+from uuvtai.envs.gymnasium import UuvVectorEnv
+from uuvtai.logs.run_folder import default_run_dir, refuse_place
+from uuvtai.sim.sim import Sim
 
 HOLD_STEPS = 10
 """control steps per decision: noise drawn anew every 0.02 s would average out before the vehicle has moved"""

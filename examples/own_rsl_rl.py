@@ -9,7 +9,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from train_rsl_rl import CONFIG
 
-from uuvtai.own import About, piece
+from uuvtai.plugins import About, piece
 
 
 @piece(arrays="torch", hold_steps=HOLD_STEPS)

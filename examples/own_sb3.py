@@ -7,7 +7,7 @@ from pathlib import Path
 from judge import HOLD_STEPS
 from stable_baselines3 import PPO
 
-from uuvtai.own import About, piece
+from uuvtai.plugins import About, piece
 
 
 @piece(hold_steps=HOLD_STEPS)

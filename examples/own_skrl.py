@@ -10,7 +10,7 @@ from judge import HOLD_STEPS
 from skrl.resources.preprocessors.torch import RunningStandardScaler
 from train_skrl import Policy
 
-from uuvtai.own import About, piece
+from uuvtai.plugins import About, piece
 
 
 @piece(arrays="torch", hold_steps=HOLD_STEPS)

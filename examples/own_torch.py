@@ -2,7 +2,7 @@
 
 import torch
 
-from uuvtai.own import View, piece
+from uuvtai.plugins import View, piece
 
 
 @piece(arrays="torch")

@@ -7,7 +7,7 @@ import torch
 from judge import HOLD_STEPS
 from train_torchrl import policy
 
-from uuvtai.own import About, piece
+from uuvtai.plugins import About, piece
 
 
 @piece(arrays="torch", hold_steps=HOLD_STEPS)

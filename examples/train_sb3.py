@@ -9,8 +9,8 @@ from judge import HOLD_STEPS, Act, Watched, main
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from uuvtai.gym.sb3 import Sb3VecEnv
-from uuvtai.sim import Sim
+from uuvtai.envs.sb3 import Sb3VecEnv
+from uuvtai.sim.sim import Sim
 
 ROLLOUT_STEPS = 64
 

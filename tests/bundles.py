@@ -3,7 +3,7 @@ compiled anew for another bundle)."""
 
 import numpy as np
 
-from uuvtai.binding import bind
+from uuvtai.sim.stages import bind
 
 _made = {}
 

@@ -48,7 +48,7 @@ def taichi_runtime(request):
     """
     from tests.field_memory import look_in_memory
     from tests.small_sim import SmallSim
-    from uuvtai.runtime import start_taichi
+    from uuvtai.compile.runtime import start_taichi
 
     start_taichi("cpu")
     look_in_memory()
@@ -64,9 +64,8 @@ def set_step(clock, step):
 def configure(monkeypatch, sim, config):
     """Give a simulator another config for a test; stages whose sections stay keep their compiled kernels, and
     others are found where the config's numbers alone are others."""
-    from uuvtai.binding import bind_all
-    from uuvtai.native.making import adopt
-    from uuvtai.stages import Stages
+    from uuvtai.compile.codegen import adopt
+    from uuvtai.sim.stages import Stages, bind_all
 
     new = vars(bind_all(Stages, sim.s, config))
     same = {
@@ -87,8 +86,8 @@ def launch_one_by_one(monkeypatch, sim):
 def estimate_pose(monkeypatch, small, **other):
     """Have its simulator find out where it is from harsh readings, or ``other`` ones: only kernels of
     proprioception and pose are compiled for it."""
-    from uuvtai.loader import load_config
-    from uuvtai.sensing import SimulatedSensors
+    from uuvtai.config.loader import load_config
+    from uuvtai.sim.stack import SimulatedSensors
 
     harsh = load_config("pool", "harsh").sensors
     changed = {name: getattr(harsh, name) for name in ("localization", "dvl", "imu", "pressure")}
@@ -115,7 +114,7 @@ def small(taichi_runtime):
 @pytest.fixture
 def no_onnx(monkeypatch):
     """As if the extra were not installed; ONNX takes seconds."""
-    monkeypatch.setattr("uuvtai.deploy.export.missing_packages", lambda: ["onnx"])
+    monkeypatch.setattr("uuvtai.learning.export.folder.missing_packages", lambda: ["onnx"])
 
 
 @pytest.fixture(autouse=True)

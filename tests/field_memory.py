@@ -10,7 +10,7 @@ from taichi.lang.field import ScalarField
 from taichi.lang.matrix import MatrixField
 from taichi.lang.util import in_python_scope
 
-from uuvtai.taichi_patches.memory import HostFields
+from uuvtai.compile.memory import HostFields
 
 KINDS = (ScalarField, MatrixField)
 _own_copy = {kind: kind.to_numpy for kind in KINDS}

@@ -9,14 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from uuvtai.link.endpoint import Endpoint, LinkPlace
-from uuvtai.link.flight_plan import FlightPlan
-from uuvtai.link.link_log import LinkLog
-from uuvtai.link.onboard_loop import OnboardLoop
-from uuvtai.link.safety import SafetyLimits
-from uuvtai.loader import load_config
-from uuvtai.pilot import KINDS, Mission, Tally
-from uuvtai.pilot.sensor_messages import NAMES
+from uuvtai.config.loader import load_config
+from uuvtai.vehicle.control_loop import FlightPlan, OnboardLoop
+from uuvtai.vehicle.mavlink import Endpoint, LinkPlace
+from uuvtai.vehicle.messages import NAMES
+from uuvtai.vehicle.onboard import KINDS, Mission, Tally
+from uuvtai.vehicle.pilot_log import LinkLog
+from uuvtai.vehicle.safety import SafetyLimits
 
 START, GOAL = (2.0, 3.0, -0.8), (18.0, 3.0, -0.8)
 LIMITS = SafetyLimits(box_m=(0.0, 0.0, 20.0, 6.0), depth_m=(0.2, 1.4))

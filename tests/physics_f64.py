@@ -13,10 +13,10 @@ import sys
 
 import numpy as np
 
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config, VehicleConfig
-from uuvtai.measure.simulate import quaternion, roll_pitch_yaw
-from uuvtai.plant import Plant
-from uuvtai.runtime import start_taichi
+from uuvtai.evaluation.simulate import quaternion, roll_pitch_yaw
+from uuvtai.sim.plant import Plant
 
 
 def main() -> None:

@@ -10,8 +10,8 @@ from tests.bundles import io_for
 from tests.reference.voronoi import clearance_of
 from uuvtai import state
 from uuvtai.config import Config
-from uuvtai.initial import load_bounds
-from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
+from uuvtai.kernels.planning.io import RouteIO, VoronoiIO
+from uuvtai.sim.setup import load_bounds
 
 N_ENV = 8
 N_PLAN = 3

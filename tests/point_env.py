@@ -3,7 +3,7 @@ same rules of resetting."""
 
 import torch
 
-from uuvtai.env import ObservationColumn
+from uuvtai.envs.vector_env import ObservationColumn
 
 OUTCOMES = ("running", "success", "collision", "ttc", "out_of_tank", "timeout")
 CONTROL_DT_S, GOAL_M, EDGE_M, HORIZON = 0.2, 0.3, 3.0, 60

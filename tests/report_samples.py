@@ -2,7 +2,7 @@
 
 import json
 
-from uuvtai.statistics import wilson_interval
+from uuvtai.common.statistics import wilson_interval
 
 N = 16
 SPEEDS = (0.2, 0.4, 0.6, 0.8, 1.5, 3.0)

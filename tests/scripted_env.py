@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 
-from uuvtai.env import ObservationColumn
+from uuvtai.envs.vector_env import ObservationColumn
 
 N_TARGET = 24
 """columns that the world model predicts; column 24 says which moment it is"""

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from uuvtai.loader import load_config
-from uuvtai.native.gpu_shape import VARIABLE
-from uuvtai.sim import Sim
-from uuvtai.tree import read_tree
+from uuvtai.compile.launch import VARIABLE
+from uuvtai.config.loader import load_config
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.sim import Sim
 
 ROOT = Path(__file__).resolve().parents[1]
 _LONGEST_S = 1200

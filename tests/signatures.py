@@ -7,10 +7,10 @@ import importlib
 from functools import cache
 from pathlib import Path
 
-from uuvtai.binding import members_of
+from uuvtai.sim.stages import members_of
 
 KERNELS = Path(__file__).parent.parent / "uuvtai/kernels"
-FILES = sorted(path for path in KERNELS.rglob("*.py") if path.stem not in ("__init__", "bundles"))
+FILES = sorted(path for path in KERNELS.rglob("*.py") if path.stem not in ("__init__", "io"))
 ROOMS = sorted(path.name for path in KERNELS.iterdir() if path.is_dir() and path.name[0] != "_")
 
 
@@ -22,8 +22,8 @@ def bundles():
     """Every bundle of every room, by name."""
     found = {}
     for room in ROOMS:
-        if (KERNELS / room / "bundles.py").exists():
-            module = importlib.import_module(f"uuvtai.kernels.{room}.bundles")
+        if (KERNELS / room / "io.py").exists():
+            module = importlib.import_module(f"uuvtai.kernels.{room}.io")
             found |= {
                 name: kind
                 for name, kind in vars(module).items()

@@ -6,9 +6,9 @@ import torch
 
 def sim_with_one_beam():
     """A simulator of one vehicle with a mechanical sonar; ``tests/warm.py`` compiles it beforehand too."""
-    from uuvtai.loader import load_config
-    from uuvtai.sim import Sim
-    from uuvtai.tree import read_tree
+    from uuvtai.config.loader import load_config
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.sim.sim import Sim
 
     return Sim(load_config("pool", "ping360"), 1, read_tree("bt"))
 
@@ -34,9 +34,9 @@ class SmallSim:
     )
 
     def __init__(self, sensors="paper"):
-        from uuvtai.loader import load_config
-        from uuvtai.sim import Sim
-        from uuvtai.tree import read_tree
+        from uuvtai.config.loader import load_config
+        from uuvtai.sim.behavior_tree import read_tree
+        from uuvtai.sim.sim import Sim
 
         self.config = load_config("pool", sensors, overrides=self.CHANGES)
         self.trees = {name: read_tree(name) for name in ("straight", "planner", "bt")}
@@ -58,7 +58,7 @@ class SmallSim:
 
     def scenario_bank(self):
         """The scenarios of episodes 0 .. N - 1 of seed 5, for the twin."""
-        from uuvtai.twin.scenario_bank import ScenarioBank, scenario_rows
+        from uuvtai.surrogate.world import ScenarioBank, scenario_rows
 
         self.begin(range(self.N), seed=5)
         rows = [torch.from_numpy(rows.copy()) for rows in scenario_rows(self.sim)]

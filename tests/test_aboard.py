@@ -17,10 +17,17 @@ if sys.platform != "linux":
 from benchmarks.aboard import _EMPTY
 from tests.command import uuv
 from tests.test_replay import recorded
-from uuvtai.aboard import cross
-from uuvtai.aboard.carried_stack import CarriedStack, StackFolderError, carried_pilot
-from uuvtai.aboard.stack_check import AGREES, compare, messages_in, packed_messages
-from uuvtai.pilot import DepthShot, DvlReading, ImuReading, Mission, PressureReading, SonarPing
+from uuvtai.vehicle.embedded import export
+from uuvtai.vehicle.embedded.runtime import (
+    AGREES,
+    CarriedStack,
+    StackFolderError,
+    carried_pilot,
+    compare,
+    messages_in,
+    packed_messages,
+)
+from uuvtai.vehicle.onboard import DepthShot, DvlReading, ImuReading, Mission, PressureReading, SonarPing
 
 STEPS = 60
 MACHINES = {"x86_64.so": 62, "aarch64.so": 183}
@@ -162,7 +169,7 @@ def test_what_cannot_be_written_is_refused_before_the_work(log, tmp_path, capfd,
     assert code == 2 and "none.mcap" in err
     code, _, err = uuv(capfd, "export", "--stack", tmp_path / "new")
     assert code == 2 and "RUN" in err
-    monkeypatch.setattr(cross.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(export.importlib.util, "find_spec", lambda name: None)
     code, _, err = uuv(capfd, "export", log, "--stack", tmp_path / "new")
     assert code == 2 and "uuvtai[aboard]" in err
     assert not (tmp_path / "new").exists()

@@ -6,14 +6,14 @@ import pytest
 import taichi as ti
 
 from tests.reference import actuation as oracle
-from uuvtai.allocation import allocation_matrices, controllable_axes
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config, Thruster, VehicleConfig
-from uuvtai.kernels.core.signature import Const
-from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits, thrust_of_rpm
-from uuvtai.loader import load_config
-from uuvtai.measure.simulate import roll_pitch_yaw
-from uuvtai.plant import Plant
-from uuvtai.runtime import start_taichi
+from uuvtai.config.loader import load_config
+from uuvtai.evaluation.simulate import roll_pitch_yaw
+from uuvtai.kernels.core.stage import Const
+from uuvtai.kernels.vehicle.dynamics import rpm_of_thrust, thrust_limits, thrust_of_rpm
+from uuvtai.sim.plant import Plant
+from uuvtai.sim.setup import allocation_matrices, controllable_axes
 
 STEADY = 0.05
 """Share of the commanded value (or of the axis limit) that the design allows at steady state."""

@@ -13,10 +13,10 @@ pytest.importorskip("pymavlink")
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.command import uuv
-from uuvtai.identify.ardusub_log import STEP_S, read_ardusub
-from uuvtai.identify.drive_log import DriveError
-from uuvtai.link.motors import Motors
-from uuvtai.loader import load_config
+from uuvtai.config.loader import load_config
+from uuvtai.vehicle.identify.ardusub_log import STEP_S, read_ardusub
+from uuvtai.vehicle.identify.drive_log import DriveError
+from uuvtai.vehicle.telemetry import Motors
 
 SECONDS = 8.0
 ROLL, PITCH, YAW = 0.1, -0.2, 1.0

@@ -12,14 +12,14 @@ from tests.command import uuv
 from tests.conftest import launch_one_by_one
 from tests.small_sim import SmallSim
 from uuvtai import state
-from uuvtai.kernels.baselines.bundles import PathIntegralIO
-from uuvtai.kernels.baselines.dynamic_window import plan_dynamic_window
-from uuvtai.kernels.baselines.path_integral import plan_path_integral
+from uuvtai.kernels.baselines.dwa import plan_dynamic_window
+from uuvtai.kernels.baselines.io import PathIntegralIO
+from uuvtai.kernels.baselines.mppi import plan_path_integral
 from uuvtai.kernels.baselines.potential_field import plan_potential_field
 from uuvtai.kernels.baselines.velocity_obstacle import plan_velocity_obstacle
 from uuvtai.kernels.core.grid import grid_origin
-from uuvtai.sizes import array_sizes
-from uuvtai.tree import read_tree
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.setup import array_sizes
 
 PLANNERS = {
     "dwa": (plan_dynamic_window, "dynamic_window"),
@@ -273,7 +273,7 @@ def test_mppi_is_the_same_in_a_batch_of_another_size(scene):
 @pytest.fixture
 def borrowed(small, monkeypatch):
     """``uuv eval`` plays on the session's small simulator."""
-    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: small.sim)
+    monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_: small.sim)
     yield small
     small.sim.use_tree(small.trees["bt"])
 
@@ -294,9 +294,9 @@ def test_nothing_of_them_runs_under_another_tree(small, monkeypatch):
     """Kernels are launched, and their arrays written, only where the tree has their leaf."""
     launched = []
     launch_one_by_one(monkeypatch, small.sim)
-    for name, (kernel, noun) in PLANNERS.items():
+    for name, (kernel, _noun) in PLANNERS.items():
         monkeypatch.setattr(
-            f"uuvtai.stack.{noun}.{kernel.__name__}", lambda io, name=name: launched.append(name)
+            f"uuvtai.sim.stack.{name}.{kernel.__name__}", lambda io, name=name: launched.append(name)
         )
     for name in ("bt", "planner", "straight", *PLANNERS):
         small.sim.use_tree(read_tree(name))

@@ -14,9 +14,9 @@ import torch
 from benchmarks import before, dynamics, parity, run, tick
 from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.vehicle_arrays import Vehicles
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
-from uuvtai.plant import Plant
-from uuvtai.runtime import start_taichi
+from uuvtai.sim.plant import Plant
 
 FOLDER = Path(run.__file__).parent
 NAMES = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in run.NOT_BENCHMARKS)

@@ -5,10 +5,10 @@ import torch
 
 from tests.command import uuv
 from uuvtai.config.learning import PpoConfig
-from uuvtai.learn import bfloat16
-from uuvtai.learn.bfloat16 import in_bfloat16, multiplies_bfloat16
-from uuvtai.learn.set_losses import coarse
-from uuvtai.loader import load_training
+from uuvtai.config.loader import load_training
+from uuvtai.learning import networks
+from uuvtai.learning.networks import in_bfloat16, multiplies_bfloat16
+from uuvtai.learning.surrogate_trainer import coarse
 
 QUICK = load_training("quick")
 
@@ -18,14 +18,14 @@ def cpu(monkeypatch):
     """Function: another CPU, as torch tells of it."""
 
     def other(**capabilities):
-        monkeypatch.setattr(bfloat16.torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
+        monkeypatch.setattr(networks.torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
         multiplies_bfloat16.cache_clear()
 
     yield other
     multiplies_bfloat16.cache_clear()
 
 
-@pytest.mark.parametrize("name", bfloat16.INSTRUCTIONS)
+@pytest.mark.parametrize("name", networks.INSTRUCTIONS)
 def test_a_cpu_that_has_the_instructions_uses_them(cpu, name):
     cpu(avx2=True, **{name: True})
     assert in_bfloat16(PpoConfig(bfloat16=True), "cpu")
@@ -46,7 +46,7 @@ def test_a_cpu_without_them_multiplies_in_float32(cpu):
 
 def test_a_torch_that_cannot_tell_counts_as_without(cpu, monkeypatch):
     cpu(avx512_bf16=True)
-    monkeypatch.delattr(bfloat16.torch.cpu, "get_capabilities")
+    monkeypatch.delattr(networks.torch.cpu, "get_capabilities")
     assert not multiplies_bfloat16("cpu")
 
 

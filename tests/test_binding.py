@@ -6,9 +6,9 @@ import dataclasses
 
 import pytest
 
-from uuvtai.binding import bind, bind_all, members_of
 from uuvtai.config import Config, SonarConfig, TankConfig
-from uuvtai.kernels.core.signature import Const, Out
+from uuvtai.kernels.core.stage import Const, Out
+from uuvtai.sim.stages import bind, bind_all, members_of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

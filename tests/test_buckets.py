@@ -10,15 +10,14 @@ import pytest
 import torch
 
 from tests.command import uuv
-from uuvtai.initial import LENGTHENED, rank
-from uuvtai.kernels.core.signature import spread
-from uuvtai.loader import load_config
-from uuvtai.native.launch import native
-from uuvtai.sim import Sim
-from uuvtai.sizes import array_sizes, rows_for
-from uuvtai.stages import SimState
+from uuvtai.compile.launch import native
+from uuvtai.config.loader import load_config
+from uuvtai.kernels.core.stage import spread
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.setup import LENGTHENED, array_sizes, rank, rows_for
+from uuvtai.sim.sim import Sim
+from uuvtai.sim.stages import SimState
 from uuvtai.state import bytes_of
-from uuvtai.tree import read_tree
 
 STEPS = 12
 
@@ -116,6 +115,7 @@ def test_one_vehicle_has_no_idle_items():
 
 def test_sizes_are_known_before_taichi_has_started():
     """``uuv profile`` asks whether all sizes fit before it makes the first simulator."""
-    code = "from uuvtai import loader, sizes; sizes.check_size(loader.load_config(), 8, 'cpu')"
+    code = "from uuvtai.config import loader; from uuvtai.sim import setup; "
+    code += "setup.check_size(loader.load_config(), 8, 'cpu')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from tests.field_memory import FIELDS, copied_by_taichi
-from uuvtai.copying import copied_rows
-from uuvtai.env import VectorEnv
-from uuvtai.outcomes import OUTCOMES
+from uuvtai.common.enums import OUTCOMES
+from uuvtai.envs.vector_env import VectorEnv
+from uuvtai.sim.setup import copied_rows
 
 N, SEED = 8, 11
 BEFORE, AFTER = 37, 200

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uuvtai.pilot.carrying import acceleration_b, to_world, turned_on
-from uuvtai.pilot.sensor_messages import ImuReading
+from uuvtai.vehicle.messages import ImuReading
+from uuvtai.vehicle.sensor_inputs import acceleration_b, to_world, turned_on
 
 G = 9.81
 CASES = np.random.default_rng(0).uniform([-0.5, -0.5, -3, -1, -1, -1], [0.5, 0.5, 3, 1, 1, 1], (20, 6))

@@ -7,9 +7,9 @@ import pytest
 
 from tests.command import uuv
 from tests.small_sim import SmallSim
-from uuvtai.measure.episodes.methods import trees_of
-from uuvtai.measure.episodes.playing import Job
-from uuvtai.measure.evaluate.ceilings import remainder_of, scenarios_of
+from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.episodes import Job
+from uuvtai.evaluation.evaluate import remainder_of, scenarios_of
 
 SEED = 3
 
@@ -17,7 +17,7 @@ SEED = 3
 @pytest.fixture
 def borrowed(small, monkeypatch):
     """``uuv eval`` plays on the session's small simulator."""
-    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: small.sim)
+    monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_: small.sim)
     yield small.sim
     small.sim.privileged = False
     small.sim.use_tree(small.trees["bt"])

@@ -11,10 +11,10 @@ import pytest
 import torch
 from safetensors.torch import save as safetensors_bytes
 
-from uuvtai.env import ObservationColumn
-from uuvtai.learn import checkpoint, manifest, packing
-from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.loader import load_training
+from uuvtai.config.loader import load_training
+from uuvtai.envs.vector_env import ObservationColumn
+from uuvtai.learning import checkpoint
+from uuvtai.learning.checkpoint import CheckpointError
 
 TABLE = (
     ObservationColumn("goal", slice(0, 3), "m", "body", ""),
@@ -102,7 +102,7 @@ def test_state_comes_back_to_the_last_bit(tmp_path):
 
 
 def test_what_cannot_be_kept_is_named(tmp_path):
-    with pytest.raises(packing.PackingError, match=r"counters.thing: a object cannot be kept"):
+    with pytest.raises(checkpoint.PackingError, match=r"counters.thing: a object cannot be kept"):
         checkpoint.save(tmp_path, 1, state_of(1) | {"counters": {"thing": object()}}, CONFIG, TABLE)
 
 
@@ -167,7 +167,7 @@ def test_a_config_key_that_is_younger_than_a_checkpoint_has_its_default(tmp_path
 
     def older(document):
         del document["config"]["world_model"]["error_unit"]
-        document["config_sha256"] = manifest.config_sha256(document["config"])
+        document["config_sha256"] = checkpoint.config_sha256(document["config"])
 
     rewritten(path, older)
     assert checkpoint.open_checkpoint(path).config == CONFIG
@@ -186,9 +186,9 @@ def test_a_simulator_of_another_size_is_refused(tmp_path):
 
 @pytest.mark.parametrize(("size", "says"), [(599, "ends within"), (601, "more than its layout says")])
 def test_a_stream_unfolds_to_what_is_expected_and_no_more(tmp_path, size, says):
-    packing.write_stream(tmp_path / "s.zst", {"x": torch.zeros(size, dtype=torch.uint8)})
-    with pytest.raises(packing.PackingError, match=says):
-        packing.read_stream(tmp_path / "s.zst", [("x", "uint8", [600])])
+    checkpoint.write_stream(tmp_path / "s.zst", {"x": torch.zeros(size, dtype=torch.uint8)})
+    with pytest.raises(checkpoint.PackingError, match=says):
+        checkpoint.read_stream(tmp_path / "s.zst", [("x", "uint8", [600])])
 
 
 def test_a_bomb_stays_small(tmp_path):
@@ -199,8 +199,8 @@ def test_a_bomb_stays_small(tmp_path):
         for _ in range(64):
             stream.write(bytes(1 << 20))
     assert (tmp_path / "s.zst").stat().st_size < 1 << 14
-    with pytest.raises(packing.PackingError, match="more than"):
-        packing.read_stream(tmp_path / "s.zst", [("x", "uint8", [1000])])
+    with pytest.raises(checkpoint.PackingError, match="more than"):
+        checkpoint.read_stream(tmp_path / "s.zst", [("x", "uint8", [1000])])
 
 
 # ---------------------------------------------------------------------------------------------------- SIGKILL
@@ -212,7 +212,7 @@ KILLED = """
     torch.set_num_threads(1)
     sys.path.insert(0, {root!r})
     from tests.test_checkpoint import CONFIG, TABLE, state_of
-    from uuvtai.learn import checkpoint
+    from uuvtai.learning import checkpoint
 
     def killed_at(run, count):
         left = [count]

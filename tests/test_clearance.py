@@ -10,11 +10,11 @@ from tests.bundles import io_for
 from tests.map_bits import put_layers
 from tests.reference.clearance import clearance_of, sites_of
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
-from uuvtai.initial import load_bounds
 from uuvtai.kernels.core.grid import grid_shape, outside_cells
-from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.planning import clearance
-from uuvtai.kernels.planning.bundles import ClearanceIO
+from uuvtai.kernels.planning.io import ClearanceIO
+from uuvtai.sim.setup import load_bounds
 from uuvtai.state import PACKET, ClearanceMemory, ClearanceState, ClockState, GridMask, MapState, allocate
 
 N_ENV = 8

@@ -21,11 +21,13 @@ from taichi.lang.impl import default_cfg
 import uuvtai
 from tests.command import uuv
 from tests.small_sim import SmallSim
-from uuvtai import doctor, endings, loader
-from uuvtai.errors import SettingError, SizeError
-from uuvtai.runtime import _thread_count
-from uuvtai.show.evaluation import show_evaluation
-from uuvtai.show.screen import Screen
+from uuvtai.common import exits
+from uuvtai.common.errors import SettingError, SizeError
+from uuvtai.compile.runtime import _thread_count
+from uuvtai.config import loader
+from uuvtai.console import doctor
+from uuvtai.console.screen import Screen
+from uuvtai.console.views import show_evaluation
 
 
 @pytest.mark.parametrize(
@@ -205,13 +207,13 @@ def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluat
 def test_a_bug_is_one_line_exit_1_and_a_file_with_the_traceback(error, capfd, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("UUV_DEBUG", raising=False)
-    assert endings.guarded(lambda: _fail(error)) == 1
+    assert exits.guarded(lambda: _fail(error)) == 1
     _, err = capfd.readouterr()
     [kept] = tmp_path.iterdir()
     assert len(err.splitlines()) == 1 and str(kept) in err and type(error).__name__ in err
     assert "Traceback" in kept.read_text() and "_fail" in kept.read_text()
     monkeypatch.setenv("UUV_DEBUG", "1")
-    assert endings.guarded(lambda: _fail(error)) == 1
+    assert exits.guarded(lambda: _fail(error)) == 1
     assert "Traceback" in capfd.readouterr().err and list(tmp_path.iterdir()) == [kept]
 
 
@@ -233,7 +235,7 @@ def _fail(error):
 )
 def test_what_the_machine_refuses_is_no_bug(error, code, capfd, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    assert endings.guarded(lambda: _fail(error)) == code
+    assert exits.guarded(lambda: _fail(error)) == code
     assert len(capfd.readouterr().err.splitlines()) == 1
     assert not list(tmp_path.iterdir())
 
@@ -270,13 +272,13 @@ def test_every_refusal_of_the_package_is_of_one_type():
     }
     found = {}
     for path in [
-        *root.glob("measure/**/*.py"),
-        *root.glob("tree/*.py"),
+        *root.glob("evaluation/*.py"),
         *root.glob("report/*.py"),
-        root / "sizes.py",
-        root / "runtime.py",
-        root / "statistics.py",
-        root / "learn" / "run.py",
+        root / "sim/behavior_tree.py",
+        root / "sim/setup.py",
+        root / "compile/runtime.py",
+        root / "common/statistics.py",
+        root / "learning/runner.py",
     ]:
         raised = [
             node.exc.func.id
@@ -291,10 +293,10 @@ def test_every_refusal_of_the_package_is_of_one_type():
 
 
 PLAIN = {
-    "measure/explain/replay.py": ["RuntimeError"],  # a replay that ends otherwise: a bug of ours
-    "statistics.py": ["ValueError"],  # counts that cannot be: a bug of ours
-    "measure/evaluate/tree_report.py": ["ValueError"],  # told by its caller, with the file that it comes from
-    "runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
+    "evaluation/failure_causes.py": ["RuntimeError"],  # a replay that ends otherwise: a bug of ours
+    "common/statistics.py": ["ValueError"],  # counts that cannot be: a bug of ours
+    "sim/behavior_tree.py": ["ValueError"],  # told by its caller, with the file that it comes from
+    "compile/runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
 }
 
 
@@ -360,7 +362,7 @@ def test_a_start_removes_the_lock_of_a_killed_process_and_no_other(tmp_path):
     for lock in (old, fresh):
         lock.touch()
     os.utime(old, (time.time() - 3600,) * 2)
-    start = "from uuvtai.runtime import start_taichi; start_taichi('cpu')"
+    start = "from uuvtai.compile.runtime import start_taichi; start_taichi('cpu')"
     environment = os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-c", start], env=environment, capture_output=True, text=True, check=True
@@ -494,7 +496,9 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
 
 def test_without_a_preset_the_papers_learner_trains(capfd, monkeypatch):
     asked = []
-    monkeypatch.setattr("uuvtai.learn.run.train", lambda request, *_: (asked.append(request) or {}, Path()))
+    monkeypatch.setattr(
+        "uuvtai.learning.runner.train", lambda request, *_: (asked.append(request) or {}, Path())
+    )
     assert uuv(capfd, "train")[0] == 0
     assert [(request.preset, request.config) for request in asked] == [
         ("paper", loader.load_training("paper"))
@@ -515,7 +519,7 @@ def test_a_place_without_room_for_a_run_folder_is_refused_before_anything_is_com
     tmp_path, capfd, monkeypatch
 ):
     (tmp_path / "file").write_text("mine")
-    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: pytest.fail("compiles"))
+    monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_: pytest.fail("compiles"))
     for command in (["eval", "--episodes", "1"], ["train", "smoke"]):
         code, _, err = uuv(capfd, *command, "--run-dir", str(tmp_path / "file/run"))
         assert code == 2

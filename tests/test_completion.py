@@ -12,8 +12,8 @@ import pytest
 from docs.writers import commands
 from tests.command import uuv
 from tests.test_docs import fault
-from uuvtai.shipped import KINDS, preset_names
-from uuvtai.show import choices
+from uuvtai.common.presets import KINDS, preset_names
+from uuvtai.console import parsing
 
 HEAVY = {"taichi", "torch", "cv2", "ompl", "numpy", "yaml", "matplotlib", "tensorboard", "mcap"}
 """Pydantic is not among them: Typer loads it where it is there."""
@@ -182,13 +182,13 @@ def test_completion_is_shown_for_a_shell():
 
 
 def test_everything_that_can_be_shown_is_offered():
-    assert set(choices.shown("")) == {name for kind in KINDS for name in preset_names(kind)} | {
+    assert set(parsing.shown("")) == {name for kind in KINDS for name in preset_names(kind)} | {
         f"{kind}/" for kind in KINDS
     }
 
 
 def test_a_folder_that_cannot_be_read_offers_nothing(tmp_path):
-    assert choices.presets("world")(f"{tmp_path}/no/such/") == []
+    assert parsing.presets("world")(f"{tmp_path}/no/such/") == []
 
 
 @pytest.mark.parametrize(

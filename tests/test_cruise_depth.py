@@ -6,12 +6,12 @@ import taichi as ti
 
 from tests.bundles import io_for
 from uuvtai.config import Config
-from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.core.signature import AnyTensor, Bundle
-from uuvtai.kernels.teacher.bundles import ThreatsIO
-from uuvtai.kernels.teacher.cruise_depth import choose_depth, level_share
+from uuvtai.config.behavior import TUNED
+from uuvtai.kernels.behavior.io import ThreatsIO
+from uuvtai.kernels.behavior.threats import choose_depth, level_share
+from uuvtai.kernels.core.simd import LANES
+from uuvtai.kernels.core.stage import AnyTensor, Bundle
 from uuvtai.state import MissionState, Proprioception, TeacherState, allocate
-from uuvtai.tuned_numbers import TUNED
 
 N_ENV = 6
 SIZES = {

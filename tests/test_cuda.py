@@ -8,14 +8,12 @@ import torch
 
 from tests import shape_bits
 from tests.small_sim import SmallSim
-from uuvtai import runtime
-from uuvtai.copying import HostCounts
-from uuvtai.errors import DeviceError, SettingError
-from uuvtai.loader import load_config
-from uuvtai.native import gpu_shape
-from uuvtai.outcomes import RUNNING, TIMEOUT
-from uuvtai.sizes import array_sizes
-from uuvtai.taichi_patches.memory import Memory
+from uuvtai.common.enums import RUNNING, TIMEOUT
+from uuvtai.common.errors import DeviceError, SettingError
+from uuvtai.compile import launch, runtime
+from uuvtai.compile.memory import Memory
+from uuvtai.config.loader import load_config
+from uuvtai.sim.setup import HostCounts, array_sizes
 
 
 class DevicesMemory(Memory):
@@ -57,16 +55,16 @@ def test_sizes_of_a_gpu_grow_with_the_batch(monkeypatch):
     assert array_sizes(config, 65536, "cuda")["n_plan"] == 4096
     assert array_sizes(config, 64, "cuda")["n_plan"] == 16 and array_sizes(config, 8, "cuda")["n_plan"] == 8
     assert array_sizes(config, 4096)["n_plan"] == array_sizes(config, 4096)["n_slot"] == 64
-    monkeypatch.setenv(gpu_shape.VARIABLE, "gpu")
+    monkeypatch.setenv(launch.VARIABLE, "gpu")
     assert array_sizes(config, 4096) == array_sizes(config, 4096, "cuda")
-    monkeypatch.setenv(gpu_shape.VARIABLE, "quantum")
+    monkeypatch.setenv(launch.VARIABLE, "quantum")
     with pytest.raises(SettingError, match="UUV_KERNELS='quantum': must be cpu or gpu"):
         array_sizes(config, 8)
 
 
 def test_kernels_in_the_shape_for_a_gpu_give_the_same_bits(small):
     """200 steps with resets; the whole stack, so that no kernel can be forgotten."""
-    assert os.environ.get(gpu_shape.VARIABLE) in (None, "", "cpu")
+    assert os.environ.get(launch.VARIABLE) in (None, "", "cpu")
     ours = shape_bits.play(small.sim, 200)
     apart = shape_bits.played_apart("gpu", SmallSim.N, "paper", 200)
     assert len(ours) > 200 and shape_bits.differing(ours, apart) == []

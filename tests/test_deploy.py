@@ -16,22 +16,21 @@ import torch
 
 from tests.command import run_cli
 from uuvtai.config import FeaturesConfig
-from uuvtai.deploy import export as deploy
-from uuvtai.deploy import run_policy
-from uuvtai.deploy.agreement import of_torch
-from uuvtai.deploy.evaluations import evaluations_of
-from uuvtai.deploy.golden import TOLERANCE, golden_of
-from uuvtai.deploy.graph import OneDecision, missing_packages
-from uuvtai.deploy.weights import weights_of
-from uuvtai.kernels.planning.features import observation_width, placed_columns
-from uuvtai.learn import checkpoint
-from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.pilot import TEACHER_COLUMN, Pilot, load_pilot
-from uuvtai.learn.policy import ActorCritic
-from uuvtai.learn.world_model import N_TARGET, WorldModel
-from uuvtai.loader import ConfigError, load_training
-from uuvtai.own.onnx_policy import graph_of, onnx_policy
-from uuvtai.own.piece_spec import piece_spec
+from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.kernels.planning.observation import observation_width, placed_columns
+from uuvtai.learning import checkpoint
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.export import folder as deploy
+from uuvtai.learning.export import run_policy
+from uuvtai.learning.export.card import evaluations_of
+from uuvtai.learning.export.folder import of_torch
+from uuvtai.learning.export.graph import TOLERANCE, OneDecision, golden_of, missing_packages
+from uuvtai.learning.export.spec import weights_of
+from uuvtai.learning.networks import ActorCritic
+from uuvtai.learning.policy_agent import TEACHER_COLUMN, Pilot, load_pilot
+from uuvtai.learning.world_model import N_TARGET, WorldModel
+from uuvtai.plugins.api import piece_spec
+from uuvtai.plugins.loading import graph_of, onnx_policy
 
 N_OBS = 40
 TEACHER = slice(30, 34)
@@ -254,7 +253,7 @@ def test_the_folder_drives_where_there_is_numpy_alone(folder):
 
 
 def test_constants_that_the_driver_repeats_are_those_of_the_package():
-    from uuvtai.learn import world_model
+    from uuvtai.learning import world_model
 
     assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, world_model.N_ACTION)
     assert (run_policy._LOG_VAR, run_policy._MAX_DEVIATIONS) == (

@@ -8,8 +8,8 @@ from tests.conftest import set_step
 from tests.reference import scenes
 from tests.reference.depth import camera_position, camera_rays, z_depths
 from uuvtai.config import DepthConfig, TankConfig
-from uuvtai.kernels.sensors import depth
-from uuvtai.kernels.sensors.bundles import DepthIO
+from uuvtai.kernels.sensors import depth_camera
+from uuvtai.kernels.sensors.io import DepthIO
 from uuvtai.state import (
     ClockState,
     DepthImage,
@@ -60,13 +60,13 @@ class Rig:
         self.episode.key.from_numpy((np.arange(N_ENV) + key).astype(np.uint32))
         self.clock.awake.fill(1)
         self.clock.step.fill(0)
-        depth.reset_depth(io_for(DepthIO, self.image, self.clock))
+        depth_camera.reset_depth(io_for(DepthIO, self.image, self.clock))
 
     def shoot(self, config=CLEAN, tank=TANK):
         io = io_for(
             DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank
         )
-        depth.cast_depth(io)
+        depth_camera.cast_depth(io)
         return self.image.depth_m.to_numpy()
 
 

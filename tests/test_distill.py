@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from uuvtai.config.learning import DistillConfig
-from uuvtai.learn.distill import (
+from uuvtai.learning.distillation import (
     MAX_WEIGHT_RATIO,
     LeafErrors,
     TeacherBatches,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
-from uuvtai.plant import Plant
-from uuvtai.runtime import start_taichi
+from uuvtai.sim.plant import Plant
 
 N_ENV = 4096
 """Rows of one plant: the standard error of a standard deviation is 1.1 %."""

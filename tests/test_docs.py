@@ -20,7 +20,7 @@ from docs.writers.markdown import FENCE, shell_blocks
 from tests.browser import brightness, look
 from tests.command import uuv
 from uuvtai.config.learning import LearningConfig
-from uuvtai.env import VectorEnv
+from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.logs.topics import TOPICS
 
 ROOT = Path(__file__).parents[1]
@@ -77,11 +77,11 @@ def test_the_page_of_the_python_api_has_what_programs_use(site):
     page = (site / "python.html").read_text()
     for name in (
         "uuvtai.make",
-        "uuvtai.env.VectorEnv.step",
-        "uuvtai.gym.UuvVectorEnv.step",
-        "uuvtai.gym.UuvEnv.step",
-        "uuvtai.learn.pilot.Pilot.act",
-        "uuvtai.deploy.run_policy.Policy.act",
+        "uuvtai.envs.vector_env.VectorEnv.step",
+        "uuvtai.envs.gymnasium.UuvVectorEnv.step",
+        "uuvtai.envs.gymnasium.UuvEnv.step",
+        "uuvtai.learning.policy_agent.Pilot.act",
+        "uuvtai.learning.export.run_policy.Policy.act",
         "uuvtai.logs.reader.read_messages",
     ):
         described = page.partition(f'id="{name}"')[2].partition('id="uuvtai.')[0]
@@ -158,7 +158,7 @@ def test_what_a_help_text_says_is_no_markup():
 
 
 def test_every_stage_of_the_simulator_is_told():
-    from uuvtai.stages import STAGES
+    from uuvtai.sim.stages import STAGES
 
     assert tuple(stages.FILES) == STAGES
 

@@ -29,16 +29,16 @@ from uuvtai.config import (
     TankConfig,
     VehicleConfig,
 )
-from uuvtai.kernels.core.signature import AnyTensor, Const, In
-from uuvtai.kernels.perception import pose
-from uuvtai.kernels.perception.bundles import PoseIO
-from uuvtai.kernels.perception.range_rate import range_rate
-from uuvtai.loader import load_config
-from uuvtai.logs.moment import EpisodeHeader, Moment
-from uuvtai.logs.topics.sonar_topics import ROWS
-from uuvtai.own.piece_view import Readings
-from uuvtai.pilot import Mission, OnboardPilot, SonarPing
+from uuvtai.config.loader import load_config
+from uuvtai.kernels.core.beams import range_rate
+from uuvtai.kernels.core.stage import AnyTensor, Const, In
+from uuvtai.kernels.perception import localization
+from uuvtai.kernels.perception.io import PoseIO
+from uuvtai.logs.encode import EpisodeHeader, Moment
+from uuvtai.logs.topics.sensors import SONAR_ROWS
+from uuvtai.plugins.adapters import Readings
 from uuvtai.state import ClockState, PoseState, Proprioception, SonarScan, TrackState, allocate
+from uuvtai.vehicle.onboard import Mission, OnboardPilot, SonarPing
 
 DEAF = PAPER.model_copy(update={"doppler": False})
 NOT_MEASURED = np.nan
@@ -150,7 +150,7 @@ def test_walls_tell_the_place_and_not_the_speed():
     clock.awake.fill(1)
     ego.pos_w.from_numpy(np.array([[10.0, 3.0, -0.8]], np.float32))
     ego.specific_force_b.from_numpy(np.array([[0.0, 0.0, 9.81]], np.float32))
-    pose.reset_pose(io)
+    localization.reset_pose(io)
     cov = np.zeros(45, np.float32)
     cov[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
     state.cov.from_numpy(cov[None])
@@ -164,7 +164,7 @@ def test_walls_tell_the_place_and_not_the_speed():
     scan.doppler_m_s.fill(NOT_MEASURED)
     scan.ping_pos_w.from_numpy(ego.pos_w.to_numpy())
     scan.fresh.fill(1)
-    pose.correct_pose(io)
+    localization.correct_pose(io)
     after = state.cov.to_numpy()[0]
     assert np.isfinite(after).all() and np.isfinite(state.mean.to_numpy()).all()
     assert after[0] < 1e-3 and after[9] < 1e-3, "x, y"
@@ -188,7 +188,7 @@ def told(sonar):
     }
     config = Config(sensors=SensorsConfig(sonar=sonar))
     moment = Moment(EpisodeHeader("bt", config, "", {}), values)
-    return [json.loads(row.encode(moment)) for row in ROWS[:2]]
+    return [json.loads(row.encode(moment)) for row in SONAR_ROWS[:2]]
 
 
 def test_a_log_tells_angles_and_no_speed_that_was_not_measured():

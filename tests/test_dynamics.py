@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from tests.reference import dynamics as oracle
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config, VehicleConfig
-from uuvtai.plant import Plant
-from uuvtai.runtime import start_taichi
+from uuvtai.sim.plant import Plant
 
 POSITION_M, SPEED_M_S, ANGLE_DEG = 0.01, 0.01, 0.3
 """What the design page asks for at the 0.01 s substep."""

@@ -7,11 +7,11 @@ from tests.bundles import io_for
 from tests.map_bits import get_map
 from tests.test_tracking import CONFIG, ELEVATION, FORECAST
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, PoseConfig, TankConfig, VehicleConfig
-from uuvtai.initial import load_bounds
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
-from uuvtai.kernels.perception import echoes, mapping, pose, tracking
-from uuvtai.kernels.perception.bundles import EchoesIO, MappingIO, PoseIO, TrackingIO
-from uuvtai.loader import load_config
+from uuvtai.kernels.perception import localization, mapping, sensor_model, tracking
+from uuvtai.kernels.perception.io import EchoesIO, MappingIO, PoseIO, TrackingIO
+from uuvtai.sim.setup import load_bounds
 from uuvtai.state import (
     ClockState,
     ClusterState,
@@ -58,7 +58,7 @@ class Head:
             self.clock, CONFIG, FORECAST, ELEVATION, SONAR, POND, RULES,
         )  # fmt: skip
         self.mapping = io_for(MappingIO, *self.made.values(), MAP, SONAR, CAMERA, POND, RULES)
-        echoes.reset_echoes(self.io)
+        sensor_model.reset_echoes(self.io)
         tracking.reset_tracks(self.tracking)
         mapping.reset_map(self.mapping)
         self.taken, self.step = 0, 0
@@ -82,7 +82,7 @@ class Head:
         self.scan.range_m[0, beam] = SONAR.max_range_m if range_m is None else range_m
         self.scan.hit[0, beam] = int(range_m is not None)
         self.clock.step.fill(self.step)
-        echoes.recall_echoes(self.io)
+        sensor_model.recall_echoes(self.io)
 
     def bearing(self, beam):
         return SONAR.first_beam_rad + SONAR.beam_step_rad * beam
@@ -188,7 +188,7 @@ def test_the_pose_filter_uses_a_beam_once():
     clock.awake.fill(1)
     ego.pos_w.from_numpy(np.array([[9.0, 4.0, -0.8]], np.float32))
     ego.specific_force_b.from_numpy(np.array([[0.0, 0.0, 9.81]], np.float32))
-    pose.reset_pose(io)
+    localization.reset_pose(io)
     cov = np.zeros(45, np.float32)
     cov[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
     away = SONAR.first_beam_rad + SONAR.beam_step_rad * np.arange(64)
@@ -201,7 +201,7 @@ def test_the_pose_filter_uses_a_beam_once():
         scan.fresh.fill(1)
         scan.new_from.fill(32)
         scan.new_count.fill(count)
-        pose.correct_pose(io)
+        localization.correct_pose(io)
         left[count] = state.cov.to_numpy()[0, 0]
     one = 1 / (1 / 0.01 + 1 / (0.02**2 + 0.005**2 / 12 + PoseConfig().wall_sigma_m ** 2))
     assert left[1] == pytest.approx(one, rel=0.4), "what one range tells, and no more"

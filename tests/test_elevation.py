@@ -8,12 +8,12 @@ import taichi as ti
 from tests.bundles import clear, io_for, put
 from tests.reference import elevation as oracle
 from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
-from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.core.signature import Const, In, Out
-from uuvtai.kernels.perception import elevation
-from uuvtai.kernels.perception.bundles import HeightsIO, TrackingIO
-from uuvtai.kernels.perception.track_slots import prune_tracks
-from uuvtai.loader import ConfigError, load_config
+from uuvtai.config.loader import ConfigError, load_config
+from uuvtai.kernels.core.simd import LANES
+from uuvtai.kernels.core.stage import Const, In, Out
+from uuvtai.kernels.perception import height
+from uuvtai.kernels.perception.io import HeightsIO, TrackingIO
+from uuvtai.kernels.perception.tracking import prune_tracks
 from uuvtai.state import ClockState, ForecastState, Proprioception, SonarScan, TrackState, allocate
 
 N_ENV, N_TRACK, N_RAY = 8, 32, 64
@@ -55,11 +55,11 @@ def weigh(
     for env, track in ti.ndrange(N_ENV, N_TRACK):
         eye = ti.Vector([own[env, 0], own[env, 1], own[env, 2]])
         if what[env, track] == BEGIN:
-            elevation.begin_height(env, track, tracks, cfg)
+            height.begin_height(env, track, tracks, cfg)
         elif what[env, track] == HIT:
-            elevation.weigh_seen(env, track, eye, tracks, cfg, sonar, tank)
+            height.weigh_seen(env, track, eye, tracks, cfg, sonar, tank)
         else:
-            elevation.weigh_unseen(env, track, eye, dt, tracks, cfg, sonar, tank)
+            height.weigh_unseen(env, track, eye, dt, tracks, cfg, sonar, tank)
 
 
 @ti.kernel
@@ -120,9 +120,7 @@ class Stage:
 
     def bound(self, cfg=CFG):
         """(above_w, below_w) as the kernel writes them."""
-        elevation.bound_heights(
-            io_for(HeightsIO, self.forecast, self.tracks, self.ego, self.clock, cfg, TANK)
-        )
+        height.bound_heights(io_for(HeightsIO, self.forecast, self.tracks, self.ego, self.clock, cfg, TANK))
         return self.forecast.above_w.to_numpy().astype(float), self.forecast.below_w.to_numpy().astype(float)
 
     def set_share(self, share):

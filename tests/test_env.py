@@ -11,9 +11,9 @@ import torch
 
 import uuvtai
 from tests.conftest import configure, near_horizon
-from uuvtai.env import VectorEnv, observation_sha256
-from uuvtai.loader import ConfigError
-from uuvtai.outcomes import OUTCOMES
+from uuvtai.common.enums import OUTCOMES
+from uuvtai.config.loader import ConfigError
+from uuvtai.envs.vector_env import VectorEnv, observation_sha256
 
 N = 8
 SEED = 3

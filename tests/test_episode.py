@@ -7,20 +7,11 @@ import torch
 from tests.bundles import clear, io_for
 from tests.reference import noise as noise_reference
 from uuvtai import state
+from uuvtai.common.enums import COLLIDED, COLLISION, ENDINGS, OUT_OF_TANK, OUTCOMES, SUCCESS, TIMEOUT, TTC
 from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, SPHERE
 from uuvtai.kernels.task import episode
-from uuvtai.kernels.task.bundles import EpisodeIO
-from uuvtai.outcomes import (
-    COLLIDED,
-    COLLISION,
-    ENDINGS,
-    OUT_OF_TANK,
-    OUTCOMES,
-    SUCCESS,
-    TIMEOUT,
-    TTC,
-)
+from uuvtai.kernels.task.io import EpisodeIO
 
 N, N_BODY = 8, 3
 TOL = 1e-5

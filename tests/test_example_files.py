@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from tests.command import uuv
-from uuvtai import example_files
-from uuvtai.example_files import ExampleError, copy_examples
+from uuvtai.console import doctor
+from uuvtai.console.doctor import ExampleError, copy_examples
 
 ROOT = Path(__file__).parents[1]
 
@@ -34,8 +34,8 @@ def test_a_place_that_cannot_be_written_and_a_package_without_examples_are_told(
         full.setattr("os.fsync", lambda _file: _full_disk() if next(written, None) is None else None)
         copy_examples(tmp_path / "new")
     assert not list((tmp_path / "new").iterdir())
-    monkeypatch.setattr(example_files, "_CHECKOUT", tmp_path)
-    monkeypatch.setattr(example_files.metadata, "files", lambda name: None)
+    monkeypatch.setattr(doctor, "_CHECKOUT", tmp_path)
+    monkeypatch.setattr(doctor.metadata, "files", lambda name: None)
     with pytest.raises(ExampleError, match="source distribution"):
         copy_examples(tmp_path / "new")
 

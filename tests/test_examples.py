@@ -11,13 +11,13 @@ import torch
 
 from tests.conftest import configure
 from tests.test_world import Drawn
-from uuvtai.env import VectorEnv
-from uuvtai.gym import UuvVectorEnv
-from uuvtai.loader import load_config
-from uuvtai.measure.episodes.methods import trees_of
-from uuvtai.measure.episodes.playing import jobs_of, run_episodes
-from uuvtai.run_folder import RunFolderError
-from uuvtai.runtime import start_taichi
+from uuvtai.compile.runtime import start_taichi
+from uuvtai.config.loader import load_config
+from uuvtai.envs.gymnasium import UuvVectorEnv
+from uuvtai.envs.vector_env import VectorEnv
+from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.logs.run_folder import RunFolderError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 N = 8

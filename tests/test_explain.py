@@ -10,21 +10,33 @@ from tests.command import Quiet
 from tests.reference import hull as hull_reference
 from tests.reference import sonar as sonar_reference
 from uuvtai.config import Config, TankConfig
-from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
-from uuvtai.measure.episodes.playing import EpisodeResult, jobs_of, run_episodes
-from uuvtai.measure.explain import hindsight
-from uuvtai.measure.explain.causes import CAUSES, REMARKS, Explanation, Killer, explain, timeout_label
-from uuvtai.measure.explain.escape import candidates, escapes, motion, rolled_out
-from uuvtai.measure.explain.facts import WINDOW_S
-from uuvtai.measure.explain.failures import (
+from uuvtai.evaluation import failure_facts
+from uuvtai.evaluation.episodes import EpisodeResult, jobs_of, run_episodes
+from uuvtai.evaluation.failure_causes import (
+    CAUSES,
+    REMARKS,
+    Explanation,
+    Killer,
     Row,
     chosen_for_recording,
+    explain,
     explain_failures,
     failures,
     record_worst,
     table_of,
+    timeout_label,
 )
-from uuvtai.measure.explain.history import Bodies, CoarseHistory, History
+from uuvtai.evaluation.failure_facts import (
+    WINDOW_S,
+    Bodies,
+    CoarseHistory,
+    History,
+    candidates,
+    escapes,
+    motion,
+    rolled_out,
+)
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 
 CONFIG = Config()
 HERE = np.array([10.0, 3.0, -0.8])
@@ -459,14 +471,14 @@ def test_hull_gaps_equal_the_reference():
     axis = rng.normal(size=(20, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     body = rng.uniform(-1, 1, (20, 12, 3)) + 1.2 * np.sign(rng.normal(size=(20, 12, 3)))
-    gap, normal, along = hindsight.hull_gaps(pos, axis, kind, body, size, yaw, 0.17, 0.10)
+    gap, normal, along = failure_facts.hull_gaps(pos, axis, kind, body, size, yaw, 0.17, 0.10)
     expected = [
         [hull_reference.clearance(pos[i], axis[i], kind[j], body[i, j], size[j], yaw[j]) for j in range(12)]
         for i in range(len(pos))
     ]
     np.testing.assert_allclose(gap, expected, atol=HULL_TOLERANCE_M)
     step = 1e-4
-    pushed, _, _ = hindsight.hull_gaps(pos, axis, kind, body + step * normal, size, yaw, 0.17, 0.10)
+    pushed, _, _ = failure_facts.hull_gaps(pos, axis, kind, body + step * normal, size, yaw, 0.17, 0.10)
     np.testing.assert_allclose(
         (pushed - gap) / step, 1.0, atol=0.02
     )  # moving a body along the normal opens the gap
@@ -482,12 +494,12 @@ def test_wall_gaps_equal_the_reference(shape):
     expected = [
         hull_reference.wall_clearance(p, a, shape, tank.x_m, tank.y_m) for p, a in zip(pos, axis, strict=True)
     ]
-    np.testing.assert_allclose(hindsight.wall_gaps(pos, axis, tank, 0.17, 0.10), expected, atol=1e-9)
+    np.testing.assert_allclose(failure_facts.wall_gaps(pos, axis, tank, 0.17, 0.10), expected, atol=1e-9)
 
 
 def test_floor_and_surface_gaps_of_a_tilted_hull():
     axis = np.array([[1.0, 0, 0], [np.sqrt(0.5), 0, np.sqrt(0.5)]])
-    floor, surface = hindsight.floor_and_surface_gaps(
+    floor, surface = failure_facts.floor_and_surface_gaps(
         np.tile([1.0, 1, -0.5], (2, 1)), axis, CONFIG.world.tank, 0.17, 0.10
     )
     np.testing.assert_allclose(floor, [1.1 - 0.17, 1.1 - 0.17 - 0.1 * np.sqrt(0.5)])
@@ -514,7 +526,7 @@ def test_beam_entries_equal_the_reference():
         expected, _ = sonar_reference.body_hits(
             scene, 0, 0, pos, u, np.tan(np.radians(sonar.vertical_half_aperture_deg))
         )
-        found = hindsight.beam_entries(
+        found = failure_facts.beam_entries(
             pos[None], np.array([heading]), kind[j], body[None], size[j], yaw[j], sonar
         )[0]
         np.testing.assert_allclose(found, expected, atol=1e-9)
@@ -682,9 +694,9 @@ def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
 @pytest.fixture
 def request_of(small, tmp_path, monkeypatch):
     """A request for a short comparison that runs on the session's simulator."""
-    from uuvtai.measure.evaluate.compare import Request
+    from uuvtai.evaluation.evaluate import Request
 
-    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: small.sim)
+    monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_: small.sim)
 
     def build(**options):
         asked = {
@@ -704,7 +716,7 @@ def request_of(small, tmp_path, monkeypatch):
 
 
 def test_a_comparison_carries_its_causes(request_of):
-    from uuvtai.measure.evaluate.compare import compare
+    from uuvtai.evaluation.evaluate import compare
 
     result, folder = compare(request_of(explain_record=1), Quiet())
     method = result["methods"][0]
@@ -723,7 +735,7 @@ def test_a_comparison_carries_its_causes(request_of):
 
 
 def test_without_explain_the_document_has_no_causes(request_of):
-    from uuvtai.measure.evaluate.compare import compare
+    from uuvtai.evaluation.evaluate import compare
 
     result, folder = compare(request_of(explain=False), Quiet())
     assert not {"causes", "explain"} & set(result["methods"][0])
@@ -731,12 +743,12 @@ def test_without_explain_the_document_has_no_causes(request_of):
 
 
 def test_an_interrupted_explanation_leaves_the_results(request_of, monkeypatch):
-    from uuvtai.measure.evaluate.compare import compare
+    from uuvtai.evaluation.evaluate import compare
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("uuvtai.measure.explain.failures.explain_failures", interrupted)
+    monkeypatch.setattr("uuvtai.evaluation.failure_causes.explain_failures", interrupted)
     request = request_of()
     with pytest.raises(KeyboardInterrupt):
         compare(request, Quiet())
@@ -761,8 +773,8 @@ def test_bad_combinations_are_one_message(capfd, arguments, says):
 
 
 def test_the_table_is_printed_and_no_failure_is_said(capfd):
-    from uuvtai.show.evaluation import show_causes
-    from uuvtai.show.screen import Screen
+    from uuvtai.console.screen import Screen
+    from uuvtai.console.views import show_causes
 
     causes_found = table_of(
         [row("late", 0, 0.2, forecast_error_m=0.1, seen_ago_s=0.0, evading_s=0.4, last_chance_s=0.5)]

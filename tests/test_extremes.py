@@ -5,11 +5,11 @@ import math
 
 import pytest
 
+from uuvtai.common.errors import UserError
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
-from uuvtai.errors import UserError
-from uuvtai.loader import _checked, load_config, load_training
-from uuvtai.sizes import array_sizes, check_size, memory_bytes
+from uuvtai.config.loader import _checked, load_config, load_training
+from uuvtai.sim.setup import array_sizes, check_size, memory_bytes
 
 EXTREMES = (
     0,
@@ -127,10 +127,10 @@ def test_what_once_overflowed_is_refused_by_its_name(key, value):
 def test_where_not_even_one_env_fits_no_smaller_number_is_advised(monkeypatch):
     config = load_config()
     alone = memory_bytes(config, 1)
-    monkeypatch.setattr("uuvtai.sizes.free_memory_bytes", lambda _device: alone)
+    monkeypatch.setattr("uuvtai.sim.setup.free_memory_bytes", lambda _device: alone)
     with pytest.raises(MemoryError, match="not even one env fits"):
         check_size(config, 1, "cpu")
-    monkeypatch.setattr("uuvtai.sizes.free_memory_bytes", lambda _device: 20 * alone)
+    monkeypatch.setattr("uuvtai.sim.setup.free_memory_bytes", lambda _device: 20 * alone)
     with pytest.raises(MemoryError, match="use --num-envs") as refused:
         check_size(config, 100_000, "cpu")
     advised = int(str(refused.value).rsplit("use --num-envs ", maxsplit=1)[-1].split()[0])

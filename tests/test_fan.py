@@ -9,6 +9,7 @@ from tests.bundles import io_for
 from tests.map_bits import get_map
 from tests.reference import scenes
 from tests.reference.sonar import body_hits, doppler_by_differences, wall_hits
+from uuvtai.common.errors import UserError
 from uuvtai.config import (
     DepthConfig,
     EpisodeConfig,
@@ -17,18 +18,17 @@ from uuvtai.config import (
     SonarConfig,
     TankConfig,
 )
-from uuvtai.errors import UserError
-from uuvtai.initial import load_bounds
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.beams import beam_bearing, beam_there, beam_towards
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
-from uuvtai.kernels.core.signature import AnyTensor, Const
+from uuvtai.kernels.core.stage import AnyTensor, Const
 from uuvtai.kernels.perception import mapping
-from uuvtai.kernels.perception.bundles import MappingIO
-from uuvtai.kernels.planning.bundles import FeaturesIO
-from uuvtai.kernels.planning.features import sense_sectors
+from uuvtai.kernels.perception.io import MappingIO
+from uuvtai.kernels.planning.io import FeaturesIO
+from uuvtai.kernels.planning.observation import sense_sectors
 from uuvtai.kernels.sensors import sonar
-from uuvtai.kernels.sensors.bundles import SonarIO
-from uuvtai.loader import load_config
+from uuvtai.kernels.sensors.io import SonarIO
+from uuvtai.sim.setup import load_bounds
 from uuvtai.state import (
     ClockState,
     ClusterState,

@@ -6,7 +6,7 @@ import torch
 
 from tests.bundles import io_for
 from tests.reference import features as oracle
-from uuvtai import tree_codes as codes
+from uuvtai.common import tree_codes as codes
 from uuvtai.config import (
     EpisodeConfig,
     FeaturesConfig,
@@ -15,9 +15,10 @@ from uuvtai.config import (
     TankConfig,
     TrackingConfig,
 )
+from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.planning.bundles import FeaturesIO
-from uuvtai.kernels.planning.features import (
+from uuvtai.kernels.planning.io import FeaturesIO
+from uuvtai.kernels.planning.observation import (
     COLUMNS,
     columns,
     observation_width,
@@ -40,7 +41,6 @@ from uuvtai.state import (
     TreeTable,
     allocate,
 )
-from uuvtai.tuned_numbers import TUNED
 
 N_ENV, N_RAY, N_SECTOR, N_TRACK = 20, 256, 12, 5
 FEATURES, SONAR = FeaturesConfig(), SonarConfig()

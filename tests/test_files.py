@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from uuvtai import files
-from uuvtai.errors import UserError
-from uuvtai.files import (
+from uuvtai.common import files
+from uuvtai.common.errors import UserError
+from uuvtai.common.files import (
     FileError,
     open_file,
     open_new,

@@ -8,9 +8,9 @@ import pytest
 
 from tests.flights import DT, moves, orders, violations
 from tests.mavlink_vehicle import Flight, link_config, plan_of
-from uuvtai.link import onboard_loop
-from uuvtai.link.onboard_loop import OnboardLoop
 from uuvtai.logs.reader import read_messages
+from uuvtai.vehicle import control_loop
+from uuvtai.vehicle.control_loop import OnboardLoop
 
 FOUND = (1125,)
 """seeds that once found something"""
@@ -85,7 +85,7 @@ def test_an_error_of_ours_stops_the_vehicle_and_gives_it_back(tmp_path, monkeypa
         return works(*given, **more)
 
     monkeypatch.setattr(broken, name, fails)
-    monkeypatch.setattr(onboard_loop, "_GIVE_BACK_S", 0.3 if lasts else 6.0)
+    monkeypatch.setattr(control_loop, "_GIVE_BACK_S", 0.3 if lasts else 6.0)
     loop.run()
     flight.sub.listen()
     after = [message for message in flight.sub.told[raised[0] :] if orders(message)]

@@ -5,7 +5,7 @@ import pytest
 import taichi as ti
 
 from tests.reference import world as reference
-from uuvtai.kernels.core import footprint
+from uuvtai.kernels.core import geometry
 from uuvtai.kernels.core.geometry import BOX, CYLINDER
 
 N = 512
@@ -22,21 +22,21 @@ def compare(kinds: ti.template(), rows: ti.template(), out: ti.template()):
         a = footprint_row(2 * i, kinds, rows)
         b = footprint_row(2 * i + 1, kinds, rows)
         center = ti.Vector([b[0], b[1]])
-        out[i][0] = ti.sqrt(footprint.between_squared(a, b)) - a[6] - b[6]
-        out[i][1] = footprint.is_off_ring(a, center, 1.0, 0.2)
-        out[i][2] = footprint.is_apart(a, b, 0.3)
+        out[i][0] = ti.sqrt(geometry.between_squared(a, b)) - a[6] - b[6]
+        out[i][1] = geometry.is_off_ring(a, center, 1.0, 0.2)
+        out[i][2] = geometry.is_apart(a, b, 0.3)
 
 
 @ti.func
 def footprint_row(i, kinds: ti.template(), rows: ti.template()):
     pos = ti.Vector([rows[i, 0], rows[i, 1], 0.0])
-    return footprint.footprint_of(kinds[i], pos, ti.Vector([rows[i, 2], rows[i, 3], 1.0]), rows[i, 4])
+    return geometry.footprint_of(kinds[i], pos, ti.Vector([rows[i, 2], rows[i, 3], 1.0]), rows[i, 4])
 
 
 @ti.kernel
 def turn(angles: ti.template(), out: ti.template()):
     for i in angles:
-        out[i] = footprint.steady_direction(angles[i])
+        out[i] = geometry.steady_direction(angles[i])
 
 
 def test_distances_between_bodies_and_from_rings():

@@ -7,9 +7,9 @@ from tests.bundles import clear, io_for, put
 from tests.reference import forecast as oracle
 from tests.reference import habits as habit_oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
-from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.perception import forecast
-from uuvtai.kernels.perception.bundles import ForecastIO
+from uuvtai.kernels.core.simd import LANES
+from uuvtai.kernels.perception import prediction
+from uuvtai.kernels.perception.io import ForecastIO
 from uuvtai.state import ClockState, ClusterState, DepthImage, ForecastState, HabitState, TrackState, allocate
 
 N_ENV, N_TRACK = 6, 5
@@ -57,14 +57,14 @@ class Stage:
         self.clock.awake.fill(1)
         self.clusters.fresh.fill(1)
         self.image.fresh.fill(0)
-        forecast.reset_forecast(io_for(ForecastIO, self.forecast, self.habits, self.clock))
+        prediction.reset_forecast(io_for(ForecastIO, self.forecast, self.habits, self.clock))
         return self
 
     def put(self, **fields):
         put(self.tracks, **fields)
 
     def predict(self):
-        forecast.forecast_tracks(
+        prediction.forecast_tracks(
             io_for(
                 ForecastIO,
                 self.forecast,
@@ -163,7 +163,7 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
     assert (then[awake == 1][:, [0, 3, 4]] > 0).all()
     np.testing.assert_array_equal(then[awake == 0], first[awake == 0])
     stage.clock.awake.fill(1)
-    forecast.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
+    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
     assert (stage.forecast.radius_m.to_numpy() < 0).all()
     assert (stage.forecast.pos_w.to_numpy() == 0).all()
 
@@ -196,7 +196,7 @@ def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
         x = state[env, track].astype(float)
         times = AHEAD + 2 * RULES.control_dt_s
         where, last = habit_oracle.walk(
-            turns[env], x, float(radius[env, track]), times, stage.cfg, TANK, forecast.MOST_LEGS
+            turns[env], x, float(radius[env, track]), times, stage.cfg, TANK, prediction.MOST_LEGS
         )
         np.testing.assert_allclose(pos[env, track], where, atol=WALK_TOLERANCE)
         turned += last @ habit_oracle.unit(x[2:]) < 0.9

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from uuvtai.foreign_time import SEVERAL, SourceClock, stamp_of
+from uuvtai.common.clocks import SEVERAL, SourceClock, stamp_of
 
 NONE, INF = None, math.inf
 WRAP_MS, WRAP_US = 2**32 / 1e3, 2**32 / 1e6

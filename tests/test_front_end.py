@@ -12,8 +12,8 @@ import taichi as ti
 from taichi.lang import kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-from uuvtai.taichi_patches import front_end
-from uuvtai.taichi_patches.front_end import remember_sources
+from uuvtai.compile import taichi_frontend
+from uuvtai.compile.taichi_frontend import remember_sources
 
 
 @ti.func
@@ -103,11 +103,11 @@ def test_kernels_in_classes_are_still_told_apart():
         def inside(self):
             return 1
 
-        assert front_end.inside_class(2) is True  # 0: itself, 1: the class's body, 2: the test
+        assert taichi_frontend.inside_class(2) is True  # 0: itself, 1: the class's body, 2: the test
 
     assert Body.inside.func.classfunc is True
     assert halved.func.classfunc is False
-    assert kernel_impl._inside_class is front_end.inside_class
+    assert kernel_impl._inside_class is taichi_frontend.inside_class
 
 
 def test_a_taichi_without_these_names_is_left_alone():
@@ -117,7 +117,7 @@ def test_a_taichi_without_these_names_is_left_alone():
         "from taichi.lang import impl, snode\n"
         "del C.get_pos_info, k.getsourcefile, k.getsourcelines, k._inside_class, k.textwrap, k.ast\n"
         "del impl.get_traceback, snode.get_traceback\n"
-        "from uuvtai.taichi_patches.front_end import remember_sources\n"
+        "from uuvtai.compile.taichi_frontend import remember_sources\n"
         "remember_sources()\n"
         "assert not any(hasattr(k, n) for n in ('getsourcefile', 'getsourcelines', '_inside_class', "
         "'textwrap', 'ast'))"

@@ -20,9 +20,9 @@ in them."""
 
 STATE_PROGRAM = """
 import sys, numpy as np, torch
-from uuvtai.loader import load_config
-from uuvtai.sim import Sim
-from uuvtai.tree import read_tree
+from uuvtai.config.loader import load_config
+from uuvtai.sim.sim import Sim
+from uuvtai.sim.behavior_tree import read_tree
 sim = Sim(load_config("pool", "clean"), 64, read_tree("straight"), sys.argv[1])
 ones = torch.ones(64, dtype=torch.int32, device=sim.device)
 sim.reset(ones, 0 * ones, torch.arange(64, dtype=torch.int32, device=sim.device))

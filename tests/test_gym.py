@@ -15,11 +15,12 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from tests.conftest import near_horizon
-from uuvtai.env import VectorEnv
-from uuvtai.gym import ENV_ID, UuvEnv, UuvVectorEnv, single, vector
-from uuvtai.gym.spaces import bounds, observation_space
-from uuvtai.kernels.planning.features import placed_columns
-from uuvtai.loader import ConfigError
+from uuvtai.config.loader import ConfigError
+from uuvtai.envs import gymnasium as single
+from uuvtai.envs import gymnasium as vector
+from uuvtai.envs.gymnasium import ENV_ID, UuvEnv, UuvVectorEnv, bounds, observation_space
+from uuvtai.envs.vector_env import VectorEnv
+from uuvtai.kernels.planning.observation import placed_columns
 
 N = 8
 SEED = 3
@@ -504,11 +505,11 @@ def test_the_picture_shows_the_tank_in_its_shape(small):
 
 
 def test_without_gymnasium_one_error_says_what_to_install():
-    code = "import sys; sys.modules['gymnasium'] = None; import uuvtai.gym"
+    code = "import sys; sys.modules['gymnasium'] = None; import uuvtai.envs.gymnasium"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].endswith(
-        "uuvtai.gym needs Gymnasium; install it with: pip install 'uuvtai[gym]'"
+        "uuvtai.envs.gymnasium needs Gymnasium; install it with: pip install 'uuvtai[gym]'"
     )
 
 
@@ -517,8 +518,8 @@ def test_gymnasium_finds_the_env_without_an_import_of_ours(make):
     """A world that does not exist is refused by us, before anything is compiled."""
     code = (
         f"import gymnasium, sys\nassert 'uuvtai' not in sys.modules\n"
-        f"try: gymnasium.{make}('uuvtai.gym:uuvtai/Nav-v0', world='pol')\nexcept ValueError as error: "
-        "print(type(error).__name__, error)"
+        f"try: gymnasium.{make}('uuvtai.envs.gymnasium:uuvtai/Nav-v0', world='pol')\n"
+        "except ValueError as error: print(type(error).__name__, error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "ConfigError" in done.stdout and "did you mean 'pool'" in done.stdout, done.stderr

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.conftest import near_horizon
-from uuvtai.gym import UuvVectorEnv
+from uuvtai.envs.gymnasium import UuvVectorEnv
 
 N = 8
 SEED = 3
@@ -19,10 +19,10 @@ def adapter_of():
     def of(trainer):
         pytest.importorskip(trainer, reason=f"{trainer} is not installed")
         if trainer == "rsl_rl":
-            from uuvtai.gym.rsl_rl import RslRlVecEnv
+            from uuvtai.envs.rsl_rl import RslRlVecEnv
 
             return RslRlVecEnv
-        from uuvtai.gym.sb3 import Sb3VecEnv
+        from uuvtai.envs.sb3 import Sb3VecEnv
 
         return Sb3VecEnv
 

@@ -8,10 +8,10 @@ import taichi as ti
 from tests.bundles import clear, io_for
 from tests.reference import habits as oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig
-from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.core.signature import In
-from uuvtai.kernels.perception import forecast, habits
-from uuvtai.kernels.perception.bundles import ForecastIO
+from uuvtai.kernels.core.simd import LANES
+from uuvtai.kernels.core.stage import In
+from uuvtai.kernels.perception import prediction
+from uuvtai.kernels.perception.io import ForecastIO
 from uuvtai.state import ClockState, ClusterState, ForecastState, HabitState, TrackState, allocate
 
 N_ENV, N_TRACK, PERIOD = 6, 5, 3
@@ -45,7 +45,7 @@ class Stage:
         self.tracks.moving.fill(1)
         self.tracks.alive.fill(1)
         self.step = 0
-        forecast.reset_forecast(io_for(ForecastIO, self.forecast, self.habits, self.clock))
+        prediction.reset_forecast(io_for(ForecastIO, self.forecast, self.habits, self.clock))
         return self
 
     def put(self, **fields):
@@ -66,7 +66,7 @@ class Stage:
             scan_step=self.step,
             **{"age": self.step, **fields},
         )
-        forecast.learn_habits(
+        prediction.learn_habits(
             io_for(ForecastIO, self.habits, self.tracks, self.clusters, self.clock, CONFIG, RULES)
         )
 
@@ -274,10 +274,10 @@ def test_only_awake_rows_learn_and_forget(stage):
         stage.watch(state, alive=alive)
     assert [len(stage.turns(env)) for env in range(N_ENV)] == list(awake)
     stage.clock.awake.from_numpy((1 - awake).astype(np.int32))
-    forecast.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
+    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
     assert [len(stage.turns(env)) for env in range(N_ENV)] == list(awake)
     stage.clock.awake.fill(1)
-    forecast.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
+    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
     assert (stage.read()["leg_step"] == -1).all()
     for name, value in stage.read().items():
         assert name == "leg_step" or (value == 0).all(), f"{name} keeps a trace of the last episode"
@@ -297,7 +297,7 @@ def test_coasting_equals_the_oracle(stage, shape):
     @ti.kernel
     def coast(tracks: In[TrackState], memory: In[HabitState]):
         for i in range(n):
-            out[i] = habits.coasted(i % N_ENV, 0, mean[i], time[i], memory, tracks, CONFIG, tank)
+            out[i] = prediction.coasted(i % N_ENV, 0, mean[i], time[i], memory, tracks, CONFIG, tank)
 
     course, speed = rng.uniform(-np.pi, np.pi, n), rng.uniform(0.2, 3, n)
     high = [19, 5] if shape == "rectangle" else [15, 15]
@@ -339,7 +339,7 @@ def test_coasting_equals_the_oracle(stage, shape):
 def test_a_way_remembers_what_kind_of_turn_began_it(stage):
     """Bodies that have swum to and fro, and round corners, for some ways: 2 = began with a turn back, 3 = a
     corner."""
-    for corners, kind in ((2, habits.BEGIN_SEEN), (3, habits.CORNER_SEEN)):
+    for corners, kind in ((2, prediction.BEGIN_SEEN), (3, prediction.CORNER_SEEN)):
         stage.begin()
         paths = Loops(np.random.default_rng(4), corners, 1.5)
         if corners == 3:  # no corner leads back or straight on

@@ -7,12 +7,12 @@ import taichi as ti
 from tests.bundles import io_for
 from tests.reference import scenes
 from tests.reference.sonar import body_hits, wall_hits
+from uuvtai.common.errors import UserError
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
-from uuvtai.errors import UserError
-from uuvtai.kernels.core.signature import AnyTensor, Const
-from uuvtai.kernels.sensors import head, sonar
-from uuvtai.kernels.sensors.bundles import SonarIO
-from uuvtai.loader import load_config
+from uuvtai.config.loader import load_config
+from uuvtai.kernels.core.stage import AnyTensor, Const
+from uuvtai.kernels.sensors import mechanical_sonar, sonar
+from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.state import (
     ClockState,
     EpisodeState,
@@ -64,7 +64,7 @@ def looked_along(config, steps):
 @ti.kernel
 def ask(begin: AnyTensor, out: AnyTensor, n_ray: Const[int], is_ring: Const[bool]):
     for i in range(begin.shape[0]):
-        first, count = head.new_beams(ti.i64(begin[i, 0]), ti.i64(begin[i, 1]), n_ray, is_ring)
+        first, count = mechanical_sonar.new_beams(ti.i64(begin[i, 0]), ti.i64(begin[i, 1]), n_ray, is_ring)
         out[i, 0], out[i, 1] = first, count
 
 
@@ -115,7 +115,7 @@ def test_beams_come_in_turn_and_hear_what_is_nearest_within_them(scene, config):
     wrong = heard = 0
     for step, beams in enumerate(looked_along(config, STEPS)):
         clock.step.fill(step)
-        head.turn_head(io)
+        mechanical_sonar.turn_head(io)
         assert (scan.fresh.to_numpy() == bool(beams)).all()
         if not beams:
             continue

@@ -8,10 +8,10 @@ import torch
 
 from tests.test_pilot import N_OBS, networks
 from tests.test_train import config_of, same
-from uuvtai.learn.hold import Hold
-from uuvtai.learn.pilot import Pilot
-from uuvtai.learn.policy import NUM_ACTIONS
-from uuvtai.learn.train import Trainer
+from uuvtai.learning.networks import NUM_ACTIONS
+from uuvtai.learning.policy_agent import Pilot
+from uuvtai.learning.rollout import Hold
+from uuvtai.learning.trainer import Trainer
 
 N = 3
 

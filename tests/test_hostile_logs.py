@@ -20,21 +20,21 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 from tests import test_deploy as deployed
 from tests.command import run_cli
 from tests.reference import logs as episode
-from uuvtai.deploy import graph_check, run_policy
-from uuvtai.deploy.agreement import of_onnx
-from uuvtai.deploy.graph_check import GraphError, refuse_strange
-from uuvtai.errors import UserError
-from uuvtai.files import FileError
+from uuvtai.common.errors import UserError
+from uuvtai.common.files import FileError
+from uuvtai.learning.export import graph as graph_check
+from uuvtai.learning.export import run_policy
+from uuvtai.learning.export.folder import of_onnx
+from uuvtai.learning.export.graph import GraphError, refuse_strange
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.log_export import export
-from uuvtai.logs.mcap_log import McapEpisodeLog
+from uuvtai.logs.drawing import Recording, load_recording
+from uuvtai.logs.encode import LogError
+from uuvtai.logs.export import export, repair
 from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import LogHead, info, read_messages
-from uuvtai.logs.recording import Recording, load_recording
-from uuvtai.logs.repair import repair
 from uuvtai.logs.rosbag import from_rosbag2
 from uuvtai.logs.video import frame_times, video
+from uuvtai.logs.writer import McapEpisodeLog
 
 N_STEP = 60
 BOUND_S, BOUND_MIB = 30, 1024
@@ -58,8 +58,8 @@ def bounded(work, tmp_path):
     import resource
     from pathlib import Path
     import pytest
-    from uuvtai.errors import UserError
-    from uuvtai.logs import log_export, reader, repair
+    from uuvtai.common.errors import UserError
+    from uuvtai.logs import export, reader
     here = Path({str(tmp_path)!r})
     begun = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
@@ -163,7 +163,7 @@ def test_bombs_take_no_memory(tmp_path):
     (tmp_path / "a.ok").write_bytes(MAGIC + chunk_of(record_of(0x85, bytes(60 << 20))) * 8 + END)
     work = "[reader.info(path)['messages'] for path in here.glob('*.ok')]"
     assert bounded(work, tmp_path) == "accepted [0]"
-    for tool in ("reader.info", "repair.repair"):
+    for tool in ("reader.info", "export.repair"):
         work = f"len([pytest.raises(UserError, {tool}, path) for path in here.glob('*.bad')])"
         assert bounded(work, tmp_path) == f"accepted {len(SPOILT)}"
 
@@ -280,7 +280,7 @@ def test_a_table_that_grows_with_every_message(tmp_path, monkeypatch):
     file.finish()
     with pytest.raises(LogError, match="more than 20,000 columns"):
         export(tmp_path / "a.mcap", tmp_path / "out", fmt="csv")
-    monkeypatch.setattr("uuvtai.logs.log_export.MAX_ARRAYS", 100_000)
+    monkeypatch.setattr("uuvtai.logs.export.MAX_ARRAYS", 100_000)
     with pytest.raises(LogError, match="use --format json"):
         export(tmp_path / "a.mcap", tmp_path / "out", fmt="npz")
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
@@ -454,7 +454,7 @@ STRANGE = {
 @pytest.mark.parametrize(("nodes", "weights", "says"), STRANGE.values(), ids=STRANGE)
 def test_graphs_that_take_memory_or_time_never_reach_onnx_runtime(nodes, weights, says, monkeypatch):
     monkeypatch.setattr(
-        "uuvtai.deploy.onnx_session.session", lambda _graph: pytest.fail("ONNX Runtime saw it")
+        "uuvtai.learning.export.graph.session", lambda _graph: pytest.fail("ONNX Runtime saw it")
     )
     graph = graph_of(nodes, weights)
     with pytest.raises(GraphError, match=says):

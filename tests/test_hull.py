@@ -6,9 +6,9 @@ import taichi as ti
 
 from tests.reference import hull as reference
 from uuvtai.config import TankConfig, VehicleConfig
-from uuvtai.kernels.core import hull
+from uuvtai.kernels.core import geometry
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
-from uuvtai.kernels.core.signature import Const
+from uuvtai.kernels.core.stage import Const
 
 N = 1024
 DISTANCE_TOL_M = 1e-3
@@ -39,16 +39,16 @@ def measure(
         axis = ti.Vector([hulls[i, 3], hulls[i, 4], hulls[i, 5]])
         center = ti.Vector([bodies[i, 0], bodies[i, 1], bodies[i, 2]])
         size = ti.Vector([bodies[i, 3], bodies[i, 4], bodies[i, 5]])
-        gap, normal, along = hull.hull_to_body(pos, axis, kinds[i], center, size, bodies[i, 6], vehicle)
+        gap, normal, along = geometry.hull_to_body(pos, axis, kinds[i], center, size, bodies[i, 6], vehicle)
         out[i, 0] = gap
         for j in ti.static(range(3)):
             out[i, 1 + j] = normal[j]
         out[i, 4] = along
-        out[i, 5] = hull.hull_to_side_wall(pos, axis, vehicle, pool)
-        out[i, 6] = hull.hull_to_side_wall(pos, axis, vehicle, pen)
-        out[i, 7] = hull.hull_to_floor_or_surface(pos, axis, vehicle, pool)
-        out[i, 8] = hull.is_in_tank(pos, pool)
-        out[i, 9] = hull.is_in_tank(pos, pen)
+        out[i, 5] = geometry.hull_to_side_wall(pos, axis, vehicle, pool)
+        out[i, 6] = geometry.hull_to_side_wall(pos, axis, vehicle, pen)
+        out[i, 7] = geometry.hull_to_floor_or_surface(pos, axis, vehicle, pool)
+        out[i, 8] = geometry.is_in_tank(pos, pool)
+        out[i, 9] = geometry.is_in_tank(pos, pen)
 
 
 @pytest.fixture(scope="module")

@@ -10,28 +10,28 @@ import pytest
 from tests.command import uuv
 from tests.reference import dynamics as oracle
 from tests.reference import logs as episode
-from uuvtai.allocation import allocation_matrices
 from uuvtai.config import VehicleConfig
-from uuvtai.identify import identified as identified_module
-from uuvtai.identify.drive_log import Drive, DriveError, read_drives
-from uuvtai.identify.excitation import unexcited, unstepped
-from uuvtai.identify.identified import KNOWN, _worse, identified
-from uuvtai.identify.motion_model import (
+from uuvtai.config.loader import load_config
+from uuvtai.sim.setup import allocation_matrices
+from uuvtai.vehicle.identify import fit as identified_module
+from uuvtai.vehicle.identify.drive_log import Drive, DriveError, mean_wrench, read_drives
+from uuvtai.vehicle.identify.fit import KNOWN, _worse, horizon_errors, identified
+from uuvtai.vehicle.identify.model import (
     AXES,
     GAIN,
     LAG,
     LATE,
     NET,
     changed,
+    first_readings,
+    grown_starts,
     motion,
     parameters_of,
     readings,
     stretches,
+    unexcited,
+    unstepped,
 )
-from uuvtai.identify.output_error import horizon_errors
-from uuvtai.identify.rotor_lag import mean_wrench
-from uuvtai.identify.stretch_starts import first_readings, grown_starts
-from uuvtai.loader import load_config
 
 DT_S, SECONDS = 0.02, 65.1
 NOISE = 0.004
@@ -425,7 +425,7 @@ def test_a_mark_of_utf8_hides_no_column(tmp_path):
 
 
 def test_a_long_table_is_refused_before_it_fills_the_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr("uuvtai.identify.drive_log.MAX_SAMPLES", 50)
+    monkeypatch.setattr("uuvtai.vehicle.identify.drive_log.MAX_SAMPLES", 50)
     (tmp_path / "a.csv").write_text("t,u,v,w,r,rpm_1\n" + "".join(f"{k},,,,,0\n" for k in range(51)))
     with pytest.raises(DriveError, match="more than 50 samples; cut it"):
         read_drives(tmp_path / "a.csv")

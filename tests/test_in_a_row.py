@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from tests.conftest import configure, launch_one_by_one
-from uuvtai.kernels.planning import features
-from uuvtai.native.in_a_row import Rows
-from uuvtai.native.launch import NativeLaunch, noted
+from uuvtai.compile.launch import NativeLaunch, Rows, noted
+from uuvtai.kernels.planning import observation as features
 
 STEPS = 40
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="own machine code is for Linux")

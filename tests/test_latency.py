@@ -4,8 +4,8 @@ of."""
 import pytest
 import torch
 
-from uuvtai.measure.profile import latency
-from uuvtai.measure.profile.sim_batch import SimBatch
+from uuvtai.evaluation import profile
+from uuvtai.evaluation.profile import SimBatch
 
 PLANNING = [0.010, 0.0, 0.020, 0.0, 0.0, 0.030]
 """[s] of the planning stage, step after step; where it is not 0 a route is planned"""
@@ -41,23 +41,23 @@ class Sim:
 @pytest.fixture
 def samples(monkeypatch):
     sim = Sim()
-    monkeypatch.setattr(latency.time, "perf_counter", lambda: sim.now)
+    monkeypatch.setattr(profile.time, "perf_counter", lambda: sim.now)
 
     def network():
         sim.now += 0.1
 
-    return latency._loop_samples(SimBatch(sim), 60.0, [network, network])
+    return profile._loop_samples(SimBatch(sim), 60.0, [network, network])
 
 
 def test_the_planner_is_the_mean_over_steps_that_plan(samples):
-    every = samples[latency.EVERY_STEP]
+    every = samples[profile.EVERY_STEP]
     assert samples["Global planner"] == [value for value in every if value > 0] and 0.0 in every
     assert set(samples["Global planner"]) <= {10.0, 20.0, 30.0}
     assert samples["Mapping update"] == pytest.approx([1.0] * len(every)), "mapping and clearance together"
 
 
 def test_the_full_loop_holds_the_networks_and_no_new_scenario(samples):
-    bare, full = samples[latency.NO_NETWORKS], samples["Full loop"]
+    bare, full = samples[profile.NO_NETWORKS], samples["Full loop"]
     assert [b - a for a, b in zip(bare, full, strict=True)] == pytest.approx([200.0] * len(bare)), (
         "two networks of 100 ms"
     )
@@ -67,13 +67,13 @@ def test_the_full_loop_holds_the_networks_and_no_new_scenario(samples):
 def test_stages_are_timed_for_longer_where_few_routes_were_planned(monkeypatch):
     sim = Sim()
     sim.every = 1_000_000
-    monkeypatch.setattr(latency.time, "perf_counter", lambda: sim.now)
-    found = latency._loop_samples(SimBatch(sim), 0.1, [])
-    assert len(found[latency.EVERY_STEP]) > len(found["Full loop"]) + 2 and len(found["Global planner"]) > 0
+    monkeypatch.setattr(profile.time, "perf_counter", lambda: sim.now)
+    found = profile._loop_samples(SimBatch(sim), 0.1, [])
+    assert len(found[profile.EVERY_STEP]) > len(found["Full loop"]) + 2 and len(found["Global planner"]) > 0
 
 
 def test_a_row_without_samples_has_no_mean():
-    row = latency._row("Global planner", [])
+    row = profile._latency_row("Global planner", [])
     assert row["mean_ms"] is None and row["paper_mean_ms"] == 5.22
-    assert latency._row(latency.NO_NETWORKS, [2.0, 4.0])["mean_ms"] == 3.0
-    assert latency._row(latency.NO_NETWORKS, [2.0])["paper_mean_ms"] is None
+    assert profile._latency_row(profile.NO_NETWORKS, [2.0, 4.0])["mean_ms"] == 3.0
+    assert profile._latency_row(profile.NO_NETWORKS, [2.0])["paper_mean_ms"] is None

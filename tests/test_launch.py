@@ -5,9 +5,9 @@ import pytest
 import taichi as ti
 import torch
 
-from uuvtai.kernels.core.signature import Const, In
-from uuvtai.native.launch import quick_launch
-from uuvtai.runtime import start_taichi
+from uuvtai.compile.launch import quick_launch
+from uuvtai.compile.runtime import start_taichi
+from uuvtai.kernels.core.stage import Const, In
 
 N = 4
 

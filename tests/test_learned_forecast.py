@@ -12,20 +12,19 @@ import torch
 from tests.command import Quiet
 from tests.small_sim import SmallSim
 from tests.test_observation_only import compared
-from uuvtai.closed_form import describe_scenario, path_positions
-from uuvtai.errors import UserError
-from uuvtai.forecast_codes import ANCHORS, COLUMNS, N_COLUMN, N_MODE
-from uuvtai.learn import checkpoint, forecast_trainer
-from uuvtai.learn.forecast_scores import scores_of
-from uuvtai.learn.forecast_trainer import ForecastTrainer, column_row
-from uuvtai.learn.manifest import CheckpointError
-from uuvtai.learn.mixture_net import TIMES_S, Mixture, MixtureNet, negative_log_likelihood
-from uuvtai.learn.pilot import load_pilot
-from uuvtai.learn.run import TrainRequest, train
-from uuvtai.learn.track_futures import TrackMoments, path_places, watch
-from uuvtai.loader import ConfigError, load_training
-from uuvtai.mixture_weights import packed_weights, read_weights
-from uuvtai.twin.scenario_bank import scenario_rows
+from uuvtai.common.enums import ANCHORS, COLUMNS, N_COLUMN, N_MODE
+from uuvtai.common.errors import UserError
+from uuvtai.common.obstacle_motion import describe_scenario, path_positions
+from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.learning import checkpoint
+from uuvtai.learning import forecast as forecast_trainer
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.forecast import ForecastTrainer, TrackMoments, column_row, path_places, scores_of, watch
+from uuvtai.learning.networks import TIMES_S, Mixture, MixtureNet, negative_log_likelihood
+from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.runner import TrainRequest, train
+from uuvtai.sim.forecast_weights import packed_weights, read_weights
+from uuvtai.surrogate.world import scenario_rows
 
 SMALL = {
     "train.num_envs": 8,

@@ -24,16 +24,21 @@ from tests.mavlink_vehicle import (
     link_config,
     plan_of,
 )
-from uuvtai.link import dialect, onboard_loop, orders
-from uuvtai.link.dialect import MavCodec
-from uuvtai.link.endpoint import LONGEST, Endpoint, LinkPlace, place_of
-from uuvtai.link.intake import MOST_KINDS, Heard, Intake, waiting_for
-from uuvtai.link.link_errors import LinkError
-from uuvtai.link.onboard_loop import OnboardLoop
-from uuvtai.link.sectors import ping_of, sectors_of
-from uuvtai.link.senders import KINDS, Senders
 from uuvtai.logs.reader import read_messages
-from uuvtai.pilot import DvlReading, ImuReading, PositionFix, PressureReading, SonarPing
+from uuvtai.vehicle import control_loop, mavlink
+from uuvtai.vehicle.control_loop import OnboardLoop
+from uuvtai.vehicle.mavlink import LONGEST, Endpoint, LinkError, LinkPlace, MavCodec, place_of
+from uuvtai.vehicle.onboard import DvlReading, ImuReading, PositionFix, PressureReading, SonarPing
+from uuvtai.vehicle.telemetry import (
+    KINDS,
+    MOST_KINDS,
+    Heard,
+    Intake,
+    Senders,
+    ping_of,
+    sectors_of,
+    waiting_for,
+)
 
 DT = 0.02
 CONFIG = link_config()
@@ -57,18 +62,18 @@ def flight(tmp_path):
 
 def test_golden_bytes():
     """Packed by hand here, by MAVLink's own description: header, payload in order of size, checksum X.25."""
-    order = orders.set_velocity((0.3, -0.1, 0.05, 0.25), 1.5, 1, LIMITS)
+    order = mavlink.set_velocity((0.3, -0.1, 0.05, 0.25), 1.5, 1, LIMITS)
     payload = struct.pack(
         "<I11fHBBB", 1500, 0, 0, 0, 0.3, 0.1, -0.05, 0, 0, 0, 0, -0.25, 0x5C7, 1, 1, 8
     )  # fmt: skip
     assert MavCodec(1, 191).encode(order) == framed(payload, 84, 143, 1, 191)
-    stick = orders.push_sticks((0.25, 0.1, 0.06, -0.4), None, 1, LIMITS)
+    stick = mavlink.push_sticks((0.25, 0.1, 0.06, -0.4), None, 1, LIMITS)
     payload = struct.pack("<4hHB", 150, -60, 530, 120, 0, 1)
     assert MavCodec(1, 191).encode(stick) == framed(payload, 69, 243, 255, 191)
     payload = struct.pack("<7fHBBB", 1, 4, 0, 0, 0, 0, 0, 176, 1, 1, 0)
-    assert MavCodec(1, 191).encode(orders.set_mode(4, 1)) == framed(payload, 76, 152, 1, 191)
+    assert MavCodec(1, 191).encode(mavlink.set_mode(4, 1)) == framed(payload, 76, 152, 1, 191)
     payload = struct.pack("<7fHBBB", 1, 0, 0, 0, 0, 0, 0, 400, 1, 1, 0)
-    assert MavCodec(1, 191).encode(orders.arm(1)) == framed(payload, 76, 152, 1, 191)
+    assert MavCodec(1, 191).encode(mavlink.arm(1)) == framed(payload, 76, 152, 1, 191)
 
 
 def framed(payload, number, extra, system, component):
@@ -85,7 +90,7 @@ def framed(payload, number, extra, system, component):
 
 def test_what_is_asked_for_is_what_a_client_reads():
     message = mav.MAVLink(None).parse_buffer(
-        MavCodec(1, 191).encode(orders.set_velocity((9.0, 0.0, 9.0, -9.0), 0.0, 1, LIMITS))
+        MavCodec(1, 191).encode(mavlink.set_velocity((9.0, 0.0, 9.0, -9.0), 0.0, 1, LIMITS))
     )[0]
     assert (message.vx, message.vy, message.get_srcComponent()) == (0.5, 0.0, 191)
     assert (message.vz, message.yaw_rate) == (pytest.approx(-0.3), pytest.approx(0.8))
@@ -94,13 +99,13 @@ def test_what_is_asked_for_is_what_a_client_reads():
 
 def test_sticks_push_harder_where_the_vehicle_lags():
     asked = (0.3, 0.0, 0.0, 0.0)
-    alone = orders.push_sticks(asked, None, 1, LIMITS).fields["x"]
-    slow = orders.push_sticks(asked, (0.1, 0.0, 0.0, 0.0), 1, LIMITS).fields["x"]
-    fast = orders.push_sticks(asked, (0.9, 0.0, 0.0, 0.0), 1, LIMITS).fields["x"]
-    most = round(orders.STICK * LIMITS.speed_m_s / orders.FULL_STICK[0])
+    alone = mavlink.push_sticks(asked, None, 1, LIMITS).fields["x"]
+    slow = mavlink.push_sticks(asked, (0.1, 0.0, 0.0, 0.0), 1, LIMITS).fields["x"]
+    fast = mavlink.push_sticks(asked, (0.9, 0.0, 0.0, 0.0), 1, LIMITS).fields["x"]
+    most = round(mavlink.STICK * LIMITS.speed_m_s / mavlink.FULL_STICK[0])
     assert (alone, slow, most) == (180, 300, 300) and fast < 0
-    assert orders.push_sticks(asked, (math.nan,) * 4, 1, LIMITS).fields["x"] == alone
-    assert orders.push_sticks(asked, (-1e9,) * 4, 1, LIMITS).fields["x"] == most, "whatever is measured"
+    assert mavlink.push_sticks(asked, (math.nan,) * 4, 1, LIMITS).fields["x"] == alone
+    assert mavlink.push_sticks(asked, (-1e9,) * 4, 1, LIMITS).fields["x"] == most, "whatever is measured"
 
 
 # ---------------------------------------------------------------------------------------------------- meaning
@@ -782,7 +787,7 @@ def test_what_makes_no_sense_is_refused(capfd, words, says):
 
 @pytest.mark.parametrize("words", [["--json"], []])
 def test_the_command_flies_and_tells(capfd, monkeypatch, tmp_path, words):
-    monkeypatch.setattr(onboard_loop, "warmed", lambda config, tree, mission: WishfulPilot())
+    monkeypatch.setattr(control_loop, "warmed", lambda config, tree, mission: WishfulPilot())
     place = [
         "--mavlink",
         f"udp:127.0.0.1:{free_port()}",
@@ -802,7 +807,7 @@ def test_the_command_flies_and_tells(capfd, monkeypatch, tmp_path, words):
 
 
 def test_a_log_that_is_there_is_not_replaced(capfd, monkeypatch, tmp_path):
-    monkeypatch.setattr(onboard_loop, "fly", lambda *_: pytest.fail("it flies"))
+    monkeypatch.setattr(control_loop, "fly", lambda *_: pytest.fail("it flies"))
     old = tmp_path / "a.mcap"
     old.write_text("an older flight")
     code, _, err = uuv(capfd, *BASE[:1], *BASE[3:], "--mavlink", "udp:127.0.0.1:14550", "--log", str(old))
@@ -822,6 +827,6 @@ def test_a_log_that_cannot_be_written_any_more_does_not_stop_the_flight(flight, 
 
 
 def test_without_pymavlink_it_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(dialect, "_NEEDED", "pymavlink_is_not_here.dialects")
+    monkeypatch.setattr(mavlink, "_NEEDED", "pymavlink_is_not_here.dialects")
     with pytest.raises(LinkError, match=r"pip install 'uuvtai\[mavlink\]'"):
         MavCodec(1, 191)

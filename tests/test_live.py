@@ -18,11 +18,9 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
 from tests.command import uuv
-from uuvtai.live import viewer_server
-from uuvtai.live.broadcast import Broadcast, RealTime
-from uuvtai.live.doorkeeper import MOST_CLIENTS
-from uuvtai.live.viewer_server import BACKLOG, LiveError, ViewerServer
-from uuvtai.logs.log_recorder import EpisodeRecorder
+from uuvtai.live import server as viewer_server
+from uuvtai.live.server import BACKLOG, MOST_CLIENTS, Broadcast, LiveError, RealTime, ViewerServer
+from uuvtai.logs.writer import EpisodeRecorder
 
 STEPS = 30
 END = SimpleNamespace(

@@ -3,17 +3,9 @@
 import pytest
 import yaml
 
-from uuvtai import loader
-from uuvtai.config import Config
-from uuvtai.loader import (
-    ConfigError,
-    load_config,
-    load_training,
-    preset_names,
-    to_yaml,
-    validated,
-    with_stack,
-)
+from uuvtai.common.presets import preset_names
+from uuvtai.config import Config, loader
+from uuvtai.config.loader import ConfigError, load_config, load_training, to_yaml, validated, with_stack
 
 
 def write(folder, text, name="mine.yaml"):
@@ -188,7 +180,7 @@ def test_paper_is_the_table_to_the_letter():
 def test_the_paper_schedule_meets_the_equation():
     """lambda_t: 1 up to 800, 0.2 (1 - (t - 800) / 800) up to 1600, then 0 (paper, equation of the staged
     schedule)."""
-    from uuvtai.learn.distill import piecewise_linear
+    from uuvtai.learning.distillation import piecewise_linear
 
     points = load_training("paper").distill.schedule
     for t in (0, 400, 800, 801, 1000, 1199, 1500, 1600, 2000):

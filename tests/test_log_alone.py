@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader
 from tests.command import read_by_viewer
 from tests.reference import decision_alone, log_alone
 from tests.small_sim import SmallSim
-from uuvtai.loader import load_config, load_resolved
+from uuvtai.config.loader import load_config, load_resolved
 
 HORIZON = 200
 """as in test_cli.py: the same kernels are compiled once"""

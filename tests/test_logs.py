@@ -24,25 +24,21 @@ from mcap.writer import CompressionType, IndexType, Writer
 from tests.command import read_by_viewer
 from tests.reference import logs as episode
 from tests.reference.world import path_position
-from uuvtai.closed_form import KIND_NAMES, body_positions
-from uuvtai.files import FileError
+from uuvtai.common.files import FileError
+from uuvtai.common.obstacle_motion import KIND_NAMES, body_positions
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.core import geometry, grid
-from uuvtai.loader import load_config
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.log_export import export, file_name
-from uuvtai.logs.log_recorder import NO_POLICY
-from uuvtai.logs.mcap_log import McapEpisodeLog
-from uuvtai.logs.moment import Moment
+from uuvtai.logs.encode import LogError, Moment
+from uuvtai.logs.export import export, file_name, repair
 from uuvtai.logs.picture import save_image
 from uuvtai.logs.reader import info, read_head, read_messages
-from uuvtai.logs.repair import repair
-from uuvtai.logs.topic_stream import SIGNS
+from uuvtai.logs.run_folder import write_atomic
 from uuvtai.logs.topics import TOPICS
-from uuvtai.logs.topics.camera_topics import logged_image
-from uuvtai.logs.topics.map_topics import grid_values, map_origin
-from uuvtai.run_folder import write_atomic
-from uuvtai.stages import SimState
+from uuvtai.logs.topics.perception import grid_values, map_origin
+from uuvtai.logs.topics.sensors import logged_image
+from uuvtai.logs.writer import NO_POLICY, SIGNS, McapEpisodeLog
+from uuvtai.sim.stages import SimState
 
 N_STEP = 210
 DEPTH_ROUNDING_MM = 0.5 + 1e-3
@@ -630,7 +626,7 @@ from pathlib import Path
 from tests.reference import logs as episode
 from tests.reference.world import path_position
 from uuvtai.logs import container
-from uuvtai.logs.mcap_log import McapEpisodeLog
+from uuvtai.logs.writer import McapEpisodeLog
 sent, add = 0, container.McapFile.add_message
 def counted(self, *arguments):
     global sent

@@ -10,9 +10,9 @@ from tests.reference import look as oracle
 from tests.reference.depth import camera_position, camera_rays, z_depths
 from tests.reference.scenes import BOX, CYLINDER, SPHERE, quaternions
 from uuvtai.config import DepthConfig, ElevationConfig, EpisodeConfig, TankConfig
-from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.perception import look
-from uuvtai.kernels.perception.bundles import LookIO
+from uuvtai.kernels.core.simd import LANES
+from uuvtai.kernels.perception import camera_tracking
+from uuvtai.kernels.perception.io import LookIO
 from uuvtai.state import ClockState, DepthImage, TrackState, allocate
 
 N_ENV, N_TRACK = 12, 3
@@ -104,7 +104,9 @@ class Rig:
 
     def look(self):
         """(shares, presences) after the kernel."""
-        look.look_at_bodies(io_for(LookIO, self.tracks, self.image, self.clock, CFG, CAMERA, TANK, RULES))
+        camera_tracking.look_at_bodies(
+            io_for(LookIO, self.tracks, self.image, self.clock, CFG, CAMERA, TANK, RULES)
+        )
         return self.tracks.height.to_numpy()[:, :, 0].astype(float), self.tracks.present.to_numpy().astype(
             float
         )

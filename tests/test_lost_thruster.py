@@ -7,8 +7,8 @@ import torch
 
 from tests.reference.actuation import thrust_of_rpm
 from uuvtai.config import Thruster, VehicleConfig
-from uuvtai.kernels.vehicle import lost_thruster
-from uuvtai.loader import ConfigError, load_config
+from uuvtai.config.loader import ConfigError, load_config
+from uuvtai.kernels.vehicle import thruster_fault
 
 SEED = 77002
 LEFT, RIGHT = 4, 5
@@ -132,7 +132,7 @@ def test_the_sums_are_those_of_the_oracle(small):
             s.actuation.rpm_queue[row, 0, i] = rpm[row, i]
         for i in range(12):
             s.actuation.response[row, i] = before[row, i]
-    lost_thruster.watch_thrusters(small.sim.io.thrusters)
+    thruster_fault.watch_thrusters(small.sim.io.thrusters)
     after = s.actuation.response.to_numpy()[:8]
     kept, stays = np.exp(-0.02 / cfg.actuation.watch_s), np.exp(-0.02 / SMOOTH_S)
     for row in range(7):
@@ -160,17 +160,17 @@ def test_the_first_step_has_nothing_to_weigh(small):
 
 def test_frames_with_two_or_more_vertical_thrusters_are_watched():
     six, eight = (load_config("open", vehicle=name) for name in ("bluerov2", "bluerov2_heavy"))
-    assert lost_thruster.vertical_pair(six.vehicle) == (LEFT, RIGHT)
-    assert lost_thruster.vertical_pair(eight.vehicle) == ()
-    assert lost_thruster.vertical_group(eight.vehicle) == (4, 5, 6, 7)
-    assert all(lost_thruster.is_watched(one.vehicle, one.actuation) for one in (six, eight))
+    assert thruster_fault.vertical_pair(six.vehicle) == (LEFT, RIGHT)
+    assert thruster_fault.vertical_pair(eight.vehicle) == ()
+    assert thruster_fault.vertical_group(eight.vehicle) == (4, 5, 6, 7)
+    assert all(thruster_fault.is_watched(one.vehicle, one.actuation) for one in (six, eight))
     off = load_config("open", overrides={"actuation.watch_s": 0})
-    assert not lost_thruster.is_watched(off.vehicle, off.actuation)
+    assert not thruster_fault.is_watched(off.vehicle, off.actuation)
     *level, left, right = six.vehicle.thrusters
     turned = Thruster(position_m=right.position_m, direction=(0.0, 0.0, -1.0))
     leaning = Thruster(position_m=right.position_m, direction=(0.0, 0.5, 1.0))
     for other in (turned, leaning):
-        assert lost_thruster.vertical_pair(VehicleConfig(thrusters=(*level, left, other))) == ()
+        assert thruster_fault.vertical_pair(VehicleConfig(thrusters=(*level, left, other))) == ()
 
 
 @pytest.mark.parametrize(

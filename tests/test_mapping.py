@@ -10,13 +10,13 @@ from tests.bundles import io_for
 from tests.map_bits import check_bits, get_map, put_map
 from tests.reference.mapping import MapOracle, rotation
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
-from uuvtai.initial import load_bounds
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
+from uuvtai.kernels.oracle import true_state
+from uuvtai.kernels.oracle.io import TrueMapIO
 from uuvtai.kernels.perception import mapping
-from uuvtai.kernels.perception.bundles import MappingIO
-from uuvtai.kernels.privileged import true_map
-from uuvtai.kernels.privileged.bundles import TrueMapIO
+from uuvtai.kernels.perception.io import MappingIO
+from uuvtai.sim.setup import load_bounds
 from uuvtai.state import (
     ClockState,
     ClusterState,
@@ -705,7 +705,7 @@ def test_debugging_stamp_is_off_by_default_and_marks_moving_bodies_only(stage):
     world.yaw.fill(np.pi / 2)
     cfg = MappingConfig(stamp=0.7)
     for _ in range(2):
-        true_map.stamp_truth(io_for(TrueMapIO, stage.grid_map, world, stage.clock, cfg, TANK))
+        true_state.stamp_truth(io_for(TrueMapIO, stage.grid_map, world, stage.clock, cfg, TANK))
     dynamic = stage.read()["dynamic"][0]
     assert dynamic[cell(3.05, 1.05)] == 1.0 and dynamic[cell(5.05, 3.35)] == 1.0
     for x, y in ((1.05, 1.05), (5.35, 3.05), (3.05, 3.05), (3.05, 1.45)):

@@ -8,13 +8,14 @@ from PIL import Image
 
 from tests.reference import logs as episode
 from uuvtai.cli import main
-from uuvtai.errors import UserError
-from uuvtai.logs import canvas, film
+from uuvtai.common.colours import PALETTE, contrast, method_colours
+from uuvtai.common.errors import UserError
+from uuvtai.logs import drawing
+from uuvtai.logs import video as film
+from uuvtai.logs.drawing import PICTURE_TOPICS, load_recording
 from uuvtai.logs.picture import paint_picture, picture
-from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
-from uuvtai.logs.topics.map_topics import Layer
+from uuvtai.logs.topics.perception import Layer
 from uuvtai.logs.video import FrameArtist, video
-from uuvtai.report.colours import PALETTE, contrast, method_colours
 
 N_STEP = 60
 DURATION_S = N_STEP * episode.DT
@@ -97,7 +98,7 @@ def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
             seen |= set(map(tuple, np.array(image.convert("RGB")).reshape(-1, 3)))
         assert image.info["loop"] == 0 and image.size[0] == 800
     assert sum(durations) == pytest.approx(1000 * (image.n_frames / 15), abs=40)
-    assert {color[::-1] for color in (canvas.GOAL, canvas.ROUTE, canvas.method_inks(["bt"])["bt"])} <= seen
+    assert {color[::-1] for color in (drawing.GOAL, drawing.ROUTE, drawing.method_inks(["bt"])["bt"])} <= seen
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path):
@@ -148,7 +149,7 @@ def test_videos_of_a_run_folder_are_small(folder, logs):
 
 
 def test_the_command_takes_speed_rate_and_width_and_tells_its_progress(tmp_path, logs, capfd, monkeypatch):
-    monkeypatch.setattr("uuvtai.show.progress._PERIOD_S", 0.0)
+    monkeypatch.setattr("uuvtai.console.screen._PERIOD_S", 0.0)
     out = tmp_path / "talk.gif"
     with pytest.raises(SystemExit) as left:
         main(
@@ -187,13 +188,13 @@ def test_other_methods_take_what_is_free_in_their_order():
 def test_every_method_stands_out_from_what_a_map_shows():
     for colour in method_colours(METHODS).values():
         assert contrast(colour, "#ffffff") > 1.9
-        for meaning in (canvas.DYNAMIC, canvas.MOVER):
-            assert np.abs(np.array(canvas.bgr(colour)) - meaning).max() > 60
+        for meaning in (drawing.DYNAMIC, drawing.MOVER):
+            assert np.abs(np.array(drawing.bgr(colour)) - meaning).max() > 60
 
 
 def test_a_video_draws_its_method_in_its_colour(folder, logs):
     recording = load_recording(logs[1])
-    own, other = canvas.method_inks(["straight"])["straight"], canvas.method_inks(["bt"])["bt"]
+    own, other = drawing.method_inks(["straight"])["straight"], drawing.method_inks(["bt"])["bt"]
     pixels = set(map(tuple, FrameArtist(recording).frame(1.0).reshape(-1, 3)))
     assert tuple(own) in pixels and tuple(other) not in pixels
 
@@ -202,9 +203,9 @@ def test_methods_of_a_user_keep_the_colour_that_they_have_beside_each_other(tmp_
     path = episode.record(tmp_path / "b.mcap", N_STEP, episode.header("second"))
     names = ["bt", "first", "second"]
     pixels = set(map(tuple, FrameArtist(load_recording(path), methods=names).frame(1.0).reshape(-1, 3)))
-    assert tuple(canvas.method_inks(names)["second"]) in pixels
+    assert tuple(drawing.method_inks(names)["second"]) in pixels
     image = paint_picture([load_recording(path, PICTURE_TOPICS)], methods=names).image
-    assert tuple(canvas.method_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))
+    assert tuple(drawing.method_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))
 
 
 def test_maps_of_a_harbour_are_kept_packed():

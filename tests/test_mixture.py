@@ -6,14 +6,14 @@ import torch
 from safetensors.numpy import save
 
 from tests.bundles import clear, io_for
-from uuvtai import forecast_codes
+from uuvtai.common import enums
+from uuvtai.common.errors import UserError
 from uuvtai.config import Config
-from uuvtai.errors import UserError
-from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.perception import mixture, motion_columns
-from uuvtai.kernels.perception.bundles import MixtureIO, PastIO
-from uuvtai.learn.mixture_net import TIMES_S, MixtureNet, mirrored
-from uuvtai.mixture_weights import SHAPES, SPREADS, packed_weights, put_weights, read_weights
+from uuvtai.kernels.core.simd import LANES
+from uuvtai.kernels.perception import prediction_network
+from uuvtai.kernels.perception.io import MixtureIO, PastIO
+from uuvtai.learning.networks import TIMES_S, MixtureNet, mirrored
+from uuvtai.sim.forecast_weights import SHAPES, SPREADS, packed_weights, put_weights, read_weights
 from uuvtai.state import (
     ClockState,
     ClusterState,
@@ -30,10 +30,10 @@ CFG = Config()
 N_ENV, N_TRACK, N_SAMPLE = 3, 4, 26
 SIZES = {
     "n_env": N_ENV, "n_ray": 16, "n_track": N_TRACK, "n_cluster": 1, "n_height": LANES, "n_turn_row": 7,
-    "n_turn": 48, "n_forecast": N_SAMPLE, "n_future": forecast_codes.N_MODE, "n_past": forecast_codes.N_PAST,
-    "n_bend": forecast_codes.N_BEND, "n_frame": forecast_codes.N_FRAME, "n_column": forecast_codes.N_COLUMN,
-    "n_hidden": 2 * forecast_codes.N_HIDDEN, "n_said": forecast_codes.N_SAID,
-    "n_weight": forecast_codes.N_WEIGHT,
+    "n_turn": 48, "n_forecast": N_SAMPLE, "n_future": enums.N_MODE, "n_past": enums.N_PAST,
+    "n_bend": enums.N_BEND, "n_frame": enums.N_FRAME, "n_column": enums.N_COLUMN,
+    "n_hidden": 2 * enums.N_HIDDEN, "n_said": enums.N_SAID,
+    "n_weight": enums.N_WEIGHT,
 }  # fmt: skip
 TOLERANCE = 2e-5
 """float32 sums of 64 in another order"""
@@ -58,7 +58,7 @@ class Stage:
         self.tracks.moving.fill(1)
         self.tracks.age.fill(9)
         self.tracks.radius_m.fill(0.2)
-        motion_columns.reset_past(self.past_io())
+        prediction_network.reset_past(self.past_io())
         return self
 
     def past_io(self):
@@ -86,15 +86,15 @@ class Stage:
         self.clock.step.fill(step)
         self.tracks.scan_step.fill(step)
         self.tracks.seen_step.fill(step)
-        motion_columns.remember_past(self.past_io())
+        prediction_network.remember_past(self.past_io())
 
     def columns(self):
-        motion_columns.describe_motion(self.past_io())
+        prediction_network.describe_motion(self.past_io())
         return self.mixture.column.to_numpy()
 
     def mix(self):
         structs = (self.forecast, self.futures, self.mixture, self.clock, CFG)
-        mixture.mix_futures(io_for(MixtureIO, *structs))
+        prediction_network.mix_futures(io_for(MixtureIO, *structs))
         return self.futures.share.to_numpy(), self.futures.pos_w.to_numpy(), self.forecast.pos_w.to_numpy()
 
 
@@ -129,7 +129,7 @@ def test_the_kernel_says_what_the_network_says(stage, net):
     stage.begin()
     put_weights(stage.mixture, net.weights(), put)
     rng = np.random.default_rng(1)
-    told = rng.normal(0, 0.5, (N_ENV, N_TRACK, forecast_codes.N_COLUMN)).astype(np.float32)
+    told = rng.normal(0, 0.5, (N_ENV, N_TRACK, enums.N_COLUMN)).astype(np.float32)
     course, speed = rng.uniform(-np.pi, np.pi, (N_ENV, N_TRACK)), rng.uniform(0.3, 1.5, (N_ENV, N_TRACK))
     place = rng.uniform(1, 5, (N_ENV, N_TRACK, 2))
     frame = np.concatenate([place, np.stack([np.cos(course), np.sin(course), speed], -1)], -1)
@@ -139,7 +139,7 @@ def test_the_kernel_says_what_the_network_says(stage, net):
     said = net(torch.from_numpy(told).view(-1, told.shape[-1]), torch.from_numpy(speed).float().view(-1))
     weight = said.log_weight.exp().detach().numpy().reshape(share.shape)
     likeliest = weight.argmax(-1)
-    others = np.arange(forecast_codes.N_MODE) != likeliest[..., None]
+    others = np.arange(enums.N_MODE) != likeliest[..., None]
     np.testing.assert_allclose(share, weight * others, atol=TOLERANCE)
     places = said.place.detach().numpy().reshape(*share.shape, len(TIMES_S), 2)
     for env, track, mode in np.ndindex(share.shape):
@@ -177,15 +177,15 @@ def test_a_straight_way_is_told_by_its_places_and_walls(stage):
     last = drive(stage, begin, velocity, 4.0)
     columns = stage.columns()[0, 0]
     assert columns[0] == pytest.approx(1.0)
-    at = forecast_codes.N_MOTION
+    at = enums.N_MOTION
     x, y = begin + 0.02 * last * velocity
-    far = forecast_codes.FAR
+    far = enums.FAR
     walls = [LENGTH_M - x - 0.2, x - 0.2, WIDTH_M - y - 0.2, y - 0.2]
     np.testing.assert_allclose(columns[at : at + 4], np.minimum(np.array(walls) / 4, far), atol=1e-5)
-    past = columns[forecast_codes.COLUMNS - 1 - 2 * forecast_codes.N_PAST : forecast_codes.COLUMNS - 1]
+    past = columns[enums.COLUMNS - 1 - 2 * enums.N_PAST : enums.COLUMNS - 1]
     apart = np.diff(past.reshape(-1, 2), axis=0)
     np.testing.assert_allclose(apart, np.tile([-0.3 / 4, 0.0], (len(apart), 1)), atol=1e-5)
-    late = columns[forecast_codes.COLUMNS - 1]
+    late = columns[enums.COLUMNS - 1]
     assert past[0] == pytest.approx(-late / 4, abs=1e-5)
     assert 0 <= late < 0.3
 
@@ -214,7 +214,7 @@ def test_a_mirrored_track_has_mirrored_columns(stage):
         drive(
             stage, np.where(flip > 0, 0, WIDTH_M) * np.array([0, 1]) + begin * mirror, velocity * mirror, 2.0
         )
-        told.append(stage.columns().reshape(-1, forecast_codes.N_COLUMN))
+        told.append(stage.columns().reshape(-1, enums.N_COLUMN))
     straight, other = (torch.from_numpy(part) for part in told)
     nothing = torch.zeros(len(straight), len(TIMES_S), 2)
     torch.testing.assert_close(mirrored(straight, nothing)[0], other, atol=1e-5, rtol=0)
@@ -224,14 +224,14 @@ def test_a_mirrored_track_has_mirrored_columns(stage):
 def test_a_new_track_remembers_nothing(stage):
     stage.begin()
     drive(stage, np.array([3.0, 2.0]), np.array([1.0, 0.0]), 3.0)
-    assert (stage.past.past_count.to_numpy() == forecast_codes.N_PAST).all()
+    assert (stage.past.past_count.to_numpy() == enums.N_PAST).all()
     age = np.full((N_ENV, N_TRACK), 9, np.int32)
     age[:, 2] = 0
     stage.tracks.age.from_numpy(age)
     stage.scan(153)
     count = stage.past.past_count.to_numpy()
     assert (count[:, 2] == 1).all()
-    assert (count[:, [0, 1, 3]] == forecast_codes.N_PAST).all()
+    assert (count[:, [0, 1, 3]] == enums.N_PAST).all()
 
 
 def test_turns_are_remembered_newest_first(stage):
@@ -242,7 +242,7 @@ def test_turns_are_remembered_newest_first(stage):
         for again in range(2):
             put(stage.habits.run_from_w, np.broadcast_to(bend, (N_ENV, N_TRACK, 2)))
             stage.scan(30 * nth + 3 * again)
-    n = forecast_codes.N_BEND
+    n = enums.N_BEND
     np.testing.assert_allclose(stage.past.bend_w.to_numpy()[0, 0], bends[::-1][:n], atol=1e-6)
     assert (stage.past.bend_count.to_numpy() == n).all()
 

@@ -18,16 +18,22 @@ import taichi as ti
 import torch
 
 import uuvtai
+from uuvtai.compile import cache, codegen
+from uuvtai.compile.cache import (
+    KeyNameError,
+    MachineCode,
+    Store,
+    StoreError,
+    described,
+    digest_of_sources,
+    key_with,
+)
+from uuvtai.compile.codegen import RUNTIME_TYPE, Native, UnfitError, tasks_in
+from uuvtai.compile.launch import native, quick_launch
+from uuvtai.compile.memory import Memory, address_of
 from uuvtai.config import EpisodeConfig
-from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, FloatVector, In, Out
-from uuvtai.native import keys, making, taichi_code
-from uuvtai.native.keys import KeyNameError, described, digest_of_sources, key_with
-from uuvtai.native.launch import native, quick_launch
-from uuvtai.native.machine import RUNTIME_TYPE, UnfitError, tasks_in
-from uuvtai.native.making import Native
-from uuvtai.native.store import MachineCode, Store, StoreError
+from uuvtai.kernels.core.stage import Bundle, Const, FloatMatrix, FloatVector, In, Out
 from uuvtai.state.arrays import allocate, array
-from uuvtai.taichi_patches.memory import Memory, address_of
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -176,7 +182,7 @@ def changed(text):
 
 FAR_APART = """
 import ctypes, mmap
-from uuvtai.native.machine import Machine
+from uuvtai.compile.codegen import Machine
 
 libc = ctypes.CDLL(None)
 libc.mmap.restype = ctypes.c_void_p
@@ -236,12 +242,12 @@ def test_adopt_says_in_one_line_why_not(place, monkeypatch):
     place.chmod(0o777)
     scene = Scene()
     with pytest.warns(RuntimeWarning, match=r"others could have written it.*; Taichi launches all kernels"):
-        making.adopt([scene.io], scene.memory)
+        codegen.adopt([scene.io], scene.memory)
     assert not native
     place.chmod(0o700)
-    monkeypatch.setattr(making.ti, "__version__", (1, 8, 0))
+    monkeypatch.setattr(codegen.ti, "__version__", (1, 8, 0))
     with pytest.warns(RuntimeWarning, match=r"Taichi 1\.8\.0 is not 1\.7\.4"):
-        making.adopt([scene.io], scene.memory)
+        codegen.adopt([scene.io], scene.memory)
     assert not native
 
 
@@ -250,8 +256,8 @@ def test_adopt_says_in_one_line_why_not(place, monkeypatch):
 _PROCESS = """
 import hashlib, os, signal, sys
 from tests.test_native import Scene
-from uuvtai.native import making, store
-from uuvtai.runtime import start_taichi
+from uuvtai.compile import cache, codegen
+from uuvtai.compile.runtime import start_taichi
 how, crowd = sys.argv[1], int(sys.argv[2])
 children = []
 while len(children) < crowd and (not children or children[-1]):
@@ -260,12 +266,12 @@ if children and children[-1]:
     sys.exit(any([os.waitpid(child, 0)[1] for child in children]))
 start_taichi("cpu")
 if how == "killed":
-    store.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    cache.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 scene = Scene()
-making.adopt([scene.io], scene.memory)
+codegen.adopt([scene.io], scene.memory)
 for _ in range(2):
     total, out = scene.launch()
-found = making.native[0]
+found = codegen.native[0]
 told = f"{found.made} {found.found} {hashlib.sha256(total.tobytes() + out.tobytes()).hexdigest()}\\n"
 os.write(1, told.encode())
 """
@@ -311,13 +317,13 @@ def test_a_process_killed_while_it_writes_leaves_nothing_that_is_run(place):
 
 def test_folders_of_killed_processes_are_deleted(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    alive = taichi_code.Compiler()
+    alive = codegen.Compiler()
     (killed := tmp_path / "uuvtai-native-killed").mkdir()
     (killed / "lock").touch()
     (killed / "0.ll").touch()
     (tmp_path / "uuvtai-native-new").mkdir()
     (tmp_path / "uuvtai-native-link").symlink_to(tmp_path)
-    taichi_code.Compiler().close()
+    codegen.Compiler().close()
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {alive._folder.name, "uuvtai-native-new", "uuvtai-native-link"}
     alive.close()
@@ -329,19 +335,23 @@ def test_where_nothing_can_be_kept_taichi_launches(tmp_path, place, expected, mo
     monkeypatch.setenv("UUV_NATIVE_CACHE", str(tmp_path / "home" / "native"))
     scene = Scene()
     with pytest.warns(RuntimeWarning, match=r"Not a directory; Taichi launches all kernels"):
-        making.adopt([scene.io], scene.memory)
+        codegen.adopt([scene.io], scene.memory)
     np.testing.assert_array_equal(scene.launch(), expected[0])
 
 
 # ------------------------------------------------------------------------------------------------- keys
 
 
+BESIDE = ("errors", "files", "presets", "version")
+"""what no kernel's code depends on"""
+
+
 def test_every_source_that_kernels_import_is_part_of_the_key():
     root = Path(uuvtai.__file__).parent
-    seen = {name.removesuffix(".py") for name in keys._SEEN_BY_KERNELS}
+    seen = {name.removesuffix(".py") for name in cache._SEEN_BY_KERNELS}
     files = [
         p
-        for name in keys._SEEN_BY_KERNELS
+        for name in cache._SEEN_BY_KERNELS
         for p in ([root / name] if name.endswith(".py") else (root / name).rglob("*.py"))
     ]
     assert len(files) > 80
@@ -349,8 +359,8 @@ def test_every_source_that_kernels_import_is_part_of_the_key():
         for node in ast.walk(ast.parse(path.read_text())):
             for module in names_of(node):
                 if module.startswith("uuvtai."):
-                    named = module.split(".")[1]
-                    assert named in seen | {"errors", "files", "version"}, (path, module)
+                    named = "/".join(module.split(".")[1 : 3 if module.startswith("uuvtai.common") else 2])
+                    assert named in seen | {f"common/{name}" for name in BESIDE}, (path, module)
 
 
 def test_the_text_in_the_key_is_the_text_that_is_compiled(tmp_path, monkeypatch):
@@ -359,12 +369,12 @@ def test_the_text_in_the_key_is_the_text_that_is_compiled(tmp_path, monkeypatch)
     source.write_text("def kernel():\n    return 1\n")
     space = {}
     exec(compile(source.read_text(), str(source), "exec"), space)
-    monkeypatch.setattr(keys, "_ROOT", tmp_path)
-    monkeypatch.setattr(keys, "_SEEN_BY_KERNELS", ("kernels.py",))
+    monkeypatch.setattr(cache, "_ROOT", tmp_path)
+    monkeypatch.setattr(cache, "_SEEN_BY_KERNELS", ("kernels.py",))
     digest = digest_of_sources.__wrapped__
     with pytest.raises(StoreError, match=r"kernels\.py: has changed since this process began"):
         digest()
-    monkeypatch.setattr(keys, "BEGUN_NS", time.time_ns() + 10**9)
+    monkeypatch.setattr(cache, "BEGUN_NS", time.time_ns() + 10**9)
     before = digest()
     source.write_text("def kernel():\n    return 77\n")
     assert "77" not in "".join(getsourcelines(space["kernel"])[0]) and digest() != before
@@ -372,6 +382,8 @@ def test_the_text_in_the_key_is_the_text_that_is_compiled(tmp_path, monkeypatch)
 
 def names_of(node):
     """Modules that a statement imports."""
+    if isinstance(node, ast.ImportFrom) and node.module == "uuvtai.common":
+        return [f"{node.module}.{alias.name}" for alias in node.names]
     if isinstance(node, ast.ImportFrom) and node.module:
         return [node.module]
     return [alias.name for alias in node.names] if isinstance(node, ast.Import) else []

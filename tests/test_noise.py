@@ -11,7 +11,7 @@ import taichi as ti
 
 from tests.reference import noise as reference
 from uuvtai.kernels.core import noise
-from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.core.simd import LANES
 
 N = 1 << 16
 BINS = 256

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from uuvtai.learn.normalise import MIN_STD, Moments, RunningNorm, combined, moments_of
+from uuvtai.learning.networks import MIN_STD, Moments, RunningNorm, combined, moments_of
 
 EXACT = 1e-12
 """relative; float64 sums in another order"""

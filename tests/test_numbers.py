@@ -13,15 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.test_native import N, Scene, Source, Sums, place, started  # noqa: F401
+from uuvtai.compile import launch as module
+from uuvtai.compile.cache import ALL, key_of, noted, sections_in, value_of, values_of
+from uuvtai.compile.launch import Number, Numbers, native, quick_launch, worked_out
 from uuvtai.config import Config, EpisodeConfig, SonarConfig, TeacherConfig
-from uuvtai.kernels.core.signature import Bundle, Const, In, Out
-from uuvtai.native import numbers as module
-from uuvtai.native.keys import key_of
-from uuvtai.native.launch import native, quick_launch
-from uuvtai.native.numbers import Number, Numbers, worked_out
-from uuvtai.native.reads import ALL, noted, sections_in, value_of, values_of
-from uuvtai.other_end import calls_of
-from uuvtai.sim import Sim
+from uuvtai.envs.warm_up import calls_of
+from uuvtai.kernels.core.stage import Bundle, Const, In, Out
+from uuvtai.sim.sim import Sim
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

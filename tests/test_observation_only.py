@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from tests.conftest import configure, estimate_pose, launch_one_by_one
-from uuvtai import stack
-from uuvtai.capture import capture
-from uuvtai.kernels.perception import pose
-from uuvtai.kernels.planning import features
+from uuvtai.kernels.perception import localization
+from uuvtai.kernels.planning import observation
 from uuvtai.kernels.sensors import proprioception
-from uuvtai.stages import SimState
+from uuvtai.sim import stack
+from uuvtai.sim.snapshot import capture
+from uuvtai.sim.stages import SimState
 
 KNOWN = {
     "clock", "mission", "ego", "scan", "echoes", "image", "pose", "tracks", "clusters", "spots", "habits",
@@ -52,7 +52,7 @@ class Poison:
     def during(self, sim, patch):
         """From now on be on from the first kernel of tracking to the last that writes the observation."""
         track, observe, planned_with = stack.track, stack.observe, sim._plan_seed
-        predict, correct = pose.predict_pose, pose.correct_pose
+        predict, correct = localization.predict_pose, localization.correct_pose
 
         def poisoned(stage):
             """The pose filter runs before and after the sonar, which needs the truth."""
@@ -81,8 +81,8 @@ class Poison:
             self.arrays["episode.key"][env] = poisoned
             return seed
 
-        patch.setattr(pose, "predict_pose", poisoned(predict))
-        patch.setattr(pose, "correct_pose", poisoned(correct))
+        patch.setattr(localization, "predict_pose", poisoned(predict))
+        patch.setattr(localization, "correct_pose", poisoned(correct))
         patch.setattr(stack, "track", poisoned_track)
         patch.setattr(stack, "observe", poisoned_observe)
         patch.setattr(sim, "_plan_seed", seed_of)
@@ -95,7 +95,9 @@ def watched(small, monkeypatch):
     launch_one_by_one(monkeypatch, small.sim)
     columns = small.config.features.model_copy(update={"n_track": 4, "teacher": True})
     configure(monkeypatch, small.sim, small.config.model_copy(update={"features": columns}))
-    monkeypatch.setattr(small.sim, "observation", torch.zeros(small.N, features.observation_width(columns)))
+    monkeypatch.setattr(
+        small.sim, "observation", torch.zeros(small.N, observation.observation_width(columns))
+    )
     memory = small.sim.memory()
     before = memory.read().copy()
     yield small
@@ -196,12 +198,12 @@ def test_the_poison_reaches_whoever_reads_the_truth(watched):
 
 def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
     """With exact sensors the estimate equals the truth: nothing but the poison tells them apart."""
-    from uuvtai.kernels.perception import elevation
+    from uuvtai.kernels.perception import height
 
     honest, leaking = (
-        elevation.bound_heights,
+        height.bound_heights,
         dataclasses.replace(watched.sim.io.heights, ego=watched.sim.s.vehicle),
     )
-    monkeypatch.setattr("uuvtai.stack.elevation.bound_heights", lambda _io: honest(leaking))
+    monkeypatch.setattr("uuvtai.sim.stack.height.bound_heights", lambda _io: honest(leaking))
     _, differing, _ = compared(watched)
     assert {"forecast.above_w", "observation"} & set(differing)

@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from uuvtai.learn.optimiser import PlainAdam
+from uuvtai.learning.networks import PlainAdam
 
 
 @pytest.mark.parametrize("fused", [False, True])
@@ -37,7 +37,7 @@ def test_a_state_of_torchs_is_taken():
 
 def test_the_compiler_is_not_imported():
     code = (
-        "import sys, torch\nfrom uuvtai.learn.mlp import mlp\nfrom uuvtai.learn.optimiser import PlainAdam\n"
+        "import sys, torch\nfrom uuvtai.learning.networks import PlainAdam, mlp\n"
         "net = mlp([3, 4, 1], 'elu', torch.Generator())\nadam = PlainAdam(net.parameters(), fused=True)\n"
         "net(torch.ones(2, 3)).sum().backward()\nadam.step()\nadam.zero_grad()\nadam.state_dict()\n"
         "assert 'torch._dynamo' not in sys.modules"

@@ -6,19 +6,22 @@ import numpy as np
 import pytest
 
 from tests.reference.world import path_position
-from uuvtai.closed_form import path_positions
+from uuvtai.common.obstacle_motion import path_positions
 from uuvtai.config import Config, DisturbanceConfig
-from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
-from uuvtai.measure.explain import hindsight
-from uuvtai.privileged.lattice import CELL_M, MOVES, Referee, lattice_of
-from uuvtai.privileged.obstacles import (
+from uuvtai.evaluation import failure_facts
+from uuvtai.evaluation.oracle import (
+    CELL_M,
+    MOVES,
     Obstacle,
+    Referee,
+    earliest_arrival,
+    lattice_of,
     level_excess,
     obstacles_of,
     rounding_m,
     upright_excess,
 )
-from uuvtai.privileged.oracle import earliest_arrival
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
 
 CONFIG = Config()
 TOP_SPEED = math.hypot(0.6, 0.6)
@@ -104,7 +107,7 @@ def test_distances_are_those_of_the_hindsight(name, kind):
     ox, oy = level_excess(shape, off[:, 0], off[:, 1])
     gaps = np.sqrt(ox**2 + oy**2 + upright_excess(shape, off[:, 2]) ** 2) - rounding_m(shape) - 0.17
     axis = np.tile([1.0, 0.0, 0.0], (500, 1))
-    expected, _, _ = hindsight.hull_gaps(
+    expected, _, _ = failure_facts.hull_gaps(
         points, axis, np.array([kind]), np.tile(at, (500, 1, 1)), size[None], np.array([yaw]), 0.17, 0.0
     )
     assert gaps == pytest.approx(expected[:, 0], abs=1e-9)

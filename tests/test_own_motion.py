@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from uuvtai.pilot.carrying import to_world
-from uuvtai.pilot.own_motion import MotionSums, OwnPose, to_body
+from uuvtai.vehicle.sensor_inputs import MotionSums, OwnPose, to_body, to_world
 
 RPY = np.array([0.1, -0.2, 2.5])
 

@@ -12,24 +12,22 @@ import torch
 from tests.command import uuv
 from tests.test_observation_only import KNOWN, Poison
 from tests.test_resume_eval import Watch
-from uuvtai import arguments
+from uuvtai.common.errors import SettingError, UserError
 from uuvtai.config import Config, FeaturesConfig
-from uuvtai.errors import SettingError, UserError
-from uuvtai.kernels.planning.features import observation_width
-from uuvtai.loader import ConfigError
-from uuvtai.measure.episodes.methods import trees_of
-from uuvtai.measure.episodes.playing import Job, Stepper, jobs_of, run_episodes
-from uuvtai.measure.evaluate.compare import Request, compare, resume
-from uuvtai.measure.explain.replay import FailureRecorder
-from uuvtai.measure.reproduce.steps import BUDGETS, steps_of
-from uuvtai.own import answers, own_piece, piece, piece_view
-from uuvtai.own.call_meter import CallMeter
-from uuvtai.own.piece_errors import PieceError
-from uuvtai.own.piece_spec import PieceSpec, is_piece, piece_spec
-from uuvtai.own.protocol import COMMAND
-from uuvtai.run_folder import RunFolderError
-from uuvtai.tables.method_tables import methods_table
-from uuvtai.tables.table import TERMINAL
+from uuvtai.config.loader import ConfigError
+from uuvtai.console import parsing
+from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.episodes import Job, Stepper, jobs_of, run_episodes
+from uuvtai.evaluation.evaluate import Request, compare, resume
+from uuvtai.evaluation.failure_causes import FailureRecorder
+from uuvtai.evaluation.reproduce_steps import BUDGETS, steps_of
+from uuvtai.kernels.planning.observation import observation_width
+from uuvtai.logs.run_folder import RunFolderError
+from uuvtai.plugins import adapters, loading, piece
+from uuvtai.plugins.adapters import CallMeter
+from uuvtai.plugins.api import COMMAND, PieceError, PieceSpec, is_piece, piece_spec
+from uuvtai.report.evaluation import methods_table
+from uuvtai.report.tables import TERMINAL
 
 AWAY = "import numpy as np\n\ndef act(view):\n    return np.tile([0.6, 0.0, 0.0, 0.0], (len(view.rows), 1))\n"
 N_OBS = observation_width(FeaturesConfig())
@@ -59,7 +57,7 @@ def sim(small):
 
 
 def found(text, kind="controller"):
-    return own_piece.own_piece(piece_spec(text, kind))
+    return loading.own_piece(piece_spec(text, kind))
 
 
 def stepped(sim, text, steps=3, kind="controller", rows=None):
@@ -112,22 +110,20 @@ def test_a_name_that_names_nothing_is_refused(text, kind, says):
 
 
 def test_options_become_controllers_and_runs():
-    trained, names = arguments.drivers(
-        ["best"], ["bt,mine.py:act"], ["p.py"], ["m.onnx", "runs/first", "q.py"]
-    )
+    trained, names = parsing.drivers(["best"], ["bt,mine.py:act"], ["p.py"], ["m.onnx", "runs/first", "q.py"])
     assert trained == ["best", "runs/first"]
     assert names == ["bt", "controller:mine.py:act", "planner:p.py:plan", "policy:m.onnx", "policy:q.py:load"]
-    assert arguments.drivers(None, None, ["p.py"], None) == ([], ["bt", "planner:p.py:plan"])
-    assert arguments.drivers(None, ["none"], None, ["m.onnx"]) == ([], ["policy:m.onnx"])
-    assert arguments.drivers(None, None, None, None)[1] == ["straight", "planner", "bt"]
-    assert arguments.own_pieces(None, ["p.py"], None) == ["planner:p.py:plan"]
-    assert arguments.own_pieces(None, None, None) == [] and arguments.one_driver(None, None, None) is None
-    assert arguments.one_driver("mine.py", None, None) == "controller:mine.py:act"
+    assert parsing.drivers(None, None, ["p.py"], None) == ([], ["bt", "planner:p.py:plan"])
+    assert parsing.drivers(None, ["none"], None, ["m.onnx"]) == ([], ["policy:m.onnx"])
+    assert parsing.drivers(None, None, None, None)[1] == ["straight", "planner", "bt"]
+    assert parsing.own_pieces(None, ["p.py"], None) == ["planner:p.py:plan"]
+    assert parsing.own_pieces(None, None, None) == [] and parsing.one_driver(None, None, None) is None
+    assert parsing.one_driver("mine.py", None, None) == "controller:mine.py:act"
     for given in (("bt", ["p.py"], None), (None, ["p.py", "q.py"], None), (None, None, ["best"])):
-        with pytest.raises(arguments.UsageError, match="give one of them"):
-            arguments.one_driver(*given)
-    with pytest.raises(arguments.UsageError, match="bt: is no piece of yours"):
-        arguments.own_pieces(["bt"], None, None)
+        with pytest.raises(parsing.UsageError, match="give one of them"):
+            parsing.one_driver(*given)
+    with pytest.raises(parsing.UsageError, match="bt: is no piece of yours"):
+        parsing.own_pieces(["bt"], None, None)
 
 
 def test_two_rows_never_share_a_name(write):
@@ -221,7 +217,7 @@ def test_what_lies_beside_the_file_can_be_imported_and_no_bytecode_is_left(sim, 
 
 COUNTING = """
 import numpy as np
-from uuvtai.own import piece
+from uuvtai.plugins import piece
 asked, begun = [], []
 @piece(rows={rows!r}, arrays={arrays!r}, hold_steps={hold})
 def act(view):
@@ -274,7 +270,7 @@ def test_one_by_one_and_torch_give_what_the_batch_gives(sim, write):
     parts = "v.obs[..., 0] * 0 + 0.3, v.goal[..., 0] * 0, v.ego.depth * 0 + 0.1, v.ego.rpy[..., 2] * 0.1"
     rule = f"np.stack([{parts}], -1)"
     write(
-        "import numpy as np\nimport torch\nfrom uuvtai.own import piece\n"
+        "import numpy as np\nimport torch\nfrom uuvtai.plugins import piece\n"
         f"def batch(v):\n    return {rule}\n"
         "@piece(rows='one')\ndef one(v):\n    assert v.scan.range_m.ndim == 1 and isinstance(v.rows, int)\n"
         f"    return {rule}\n"
@@ -379,7 +375,7 @@ def test_ends_that_are_missing_are_added():
     ends = np.array([1.0, 1.0]), np.array([4.0, 1.0])
 
     def route(found):
-        return answers.waypoints(found, ends, (20.0, 6.0), "here").tolist()
+        return adapters.waypoints(found, ends, (20.0, 6.0), "here").tolist()
 
     assert route(np.zeros((0, 2))) == route([[4, 1]]) == route([[1, 1]]) == [[1, 1], [4, 1]]
     assert route([[2, 2]]) == route([[1, 1], [2, 2], [4, 1]]) == [[1, 1], [2, 2], [4, 1]]
@@ -427,7 +423,7 @@ def test_a_planner_plans_every_route_from_what_the_map_says(sim, write):
 
 
 def test_a_view_reads_nothing_but_what_the_vehicle_knows():
-    named = {path for group in piece_view.FIELDS.values() for path in group}
+    named = {path for group in adapters.FIELDS.values() for path in group}
     assert {path.partition(".")[0] for path in named} <= KNOWN
 
 
@@ -439,12 +435,12 @@ def values_of(view):
 def test_a_view_is_the_same_where_the_truth_is_spoilt(sim):
     begin(sim)
     sim.observe()
-    about = own_piece.about_of(sim)
-    fixed = piece_view.Fixed(sim, about.columns, about.limits, "numpy")
+    about = loading.about_of(sim)
+    fixed = adapters.Fixed(sim, about.columns, about.limits, "numpy")
 
     def seen():
         return values_of(
-            piece_view.PieceView(piece_view.Readings(sim, [0, 2, 5], sim.observation[[0, 2, 5]]), fixed)
+            adapters.PieceView(adapters.Readings(sim, [0, 2, 5], sim.observation[[0, 2, 5]]), fixed)
         )
 
     poison, before = Poison(sim), seen()
@@ -532,7 +528,7 @@ def test_the_table_has_a_column_for_the_time_of_own_code():
 def ask(small, monkeypatch, write):
     """Requests on the session's simulator."""
     monkeypatch.setattr(
-        "uuvtai.sim.Sim", lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim
+        "uuvtai.sim.sim.Sim", lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim
     )
 
     begin_whole = small.sim.reset
@@ -769,7 +765,7 @@ def test_a_strange_graph_never_reaches_onnx_runtime(sim, tmp_path, monkeypatch, 
     Path("model.onnx").write_bytes(graph_of(**changes))
     if "hold" not in changes:
         monkeypatch.setattr(
-            "uuvtai.deploy.onnx_session.session", lambda _graph: pytest.fail("ONNX Runtime saw it")
+            "uuvtai.learning.export.graph.session", lambda _graph: pytest.fail("ONNX Runtime saw it")
         )
     with pytest.raises(PieceError) as refused:
         found("model.onnx", "policy").driver(sim)

@@ -9,9 +9,9 @@ import pytest
 
 from uuvtai.config import TankConfig
 from uuvtai.config.learning import LearningConfig
-from uuvtai.kernels.vehicle.rotor import KGF, thrust_limits
-from uuvtai.learn.world_model import LOG_VAR_BOUNDS
-from uuvtai.loader import STACK_SECTIONS, load_config, load_training, with_stack
+from uuvtai.config.loader import STACK_SECTIONS, load_config, load_training, with_stack
+from uuvtai.kernels.vehicle.dynamics import KGF, thrust_limits
+from uuvtai.learning.world_model import LOG_VAR_BOUNDS
 
 PAGE = (Path(__file__).parents[1] / "docs/paper.md").read_text()
 SAME = {"distill.schedule", "sensors.sonar"}

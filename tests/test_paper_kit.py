@@ -13,17 +13,17 @@ from tests import report_samples as samples
 from tests.command import uuv
 from tests.reference import logs as episode
 from tests.test_pictures import N_STEP
-from uuvtai.errors import UserError
-from uuvtai.loader import ConfigError
-from uuvtai.logs.log_errors import LogError
-from uuvtai.measure.evaluate.paired import paired
-from uuvtai.report import latex, paper_kit
-from uuvtai.report.paper_items import items_of
-from uuvtai.report.paper_kit import paper
+from uuvtai.common.errors import UserError
+from uuvtai.common.statistics import holm_adjusted
+from uuvtai.config.loader import ConfigError
+from uuvtai.evaluation.results import paired
+from uuvtai.logs.encode import LogError
+from uuvtai.logs.run_folder import RunFolderError
+from uuvtai.report import paper as latex
+from uuvtai.report import paper as paper_kit
+from uuvtai.report.paper import items_of, paper
 from uuvtai.report.paper_style import sheets
-from uuvtai.run_folder import RunFolderError
-from uuvtai.statistics import holm_adjusted
-from uuvtai.tables.table import Table, heads
+from uuvtai.report.tables import Table, heads
 
 EVIL = "a_b&c%d#e$f{g}h~i^j\\input{/etc/passwd}|<k>\n\x1b[2J"
 POINTS = 72.0

@@ -5,15 +5,21 @@ import numpy as np
 import pytest
 
 from tests.reference import logs as episode
-from uuvtai.closed_form import body_positions
-from uuvtai.logs import canvas as ink
-from uuvtai.logs.canvas import Canvas
-from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.mcap_log import McapEpisodeLog
-from uuvtai.logs.painting import map_canvas, paint_truth, paint_walls, paint_water
+from uuvtai.common.obstacle_motion import body_positions
+from uuvtai.logs import drawing as ink
+from uuvtai.logs.drawing import (
+    PICTURE_TOPICS,
+    Canvas,
+    load_recording,
+    map_canvas,
+    paint_truth,
+    paint_walls,
+    paint_water,
+)
+from uuvtai.logs.encode import LogError
 from uuvtai.logs.picture import paint_picture, picture
-from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
 from uuvtai.logs.video import FrameArtist, video
+from uuvtai.logs.writer import McapEpisodeLog
 
 INKS = ink.method_inks(["bt", "straight", "planner"])
 N_STEP = 110

@@ -7,16 +7,16 @@ import json
 import pytest
 import torch
 
-from uuvtai.env import VectorEnv
-from uuvtai.learn import checkpoint, manifest
-from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.pilot import CHUNK, Pilot, load_pilot
-from uuvtai.learn.policy import ActorCritic
-from uuvtai.learn.world_model import WorldModel
-from uuvtai.loader import load_training
-from uuvtai.logs.log_recorder import EpisodeRecorder
-from uuvtai.measure.episodes.methods import Method, features_of, find_policy, policies_of
-from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.config.loader import load_training
+from uuvtai.envs.vector_env import VectorEnv
+from uuvtai.evaluation.agents import Method, features_of, find_policy, policies_of
+from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.learning import checkpoint
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.networks import ActorCritic
+from uuvtai.learning.policy_agent import CHUNK, Pilot, load_pilot
+from uuvtai.learning.world_model import WorldModel
+from uuvtai.logs.writer import EpisodeRecorder
 
 N_OBS = 60
 
@@ -235,7 +235,7 @@ def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
     assert (
         by_run.sha256
         == by_step.sha256
-        == manifest.sha256_of(folder / "checkpoints" / "step_000005" / "manifest.json")
+        == checkpoint.sha256_of(folder / "checkpoints" / "step_000005" / "manifest.json")
     )
     assert policies_of([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
     assert features_of([str(folder)]) == [("features", config.features.model_dump(mode="json"))]

@@ -10,14 +10,14 @@ import torch
 
 from tests.small_sim import sim_with_one_beam
 from uuvtai.config import Config, SensorsConfig
-from uuvtai.loader import load_config
-from uuvtai.logs.log_recorder import EpisodeRecorder
-from uuvtai.logs.moment import EpisodeHeader, Moment
-from uuvtai.logs.recording import load_recording
-from uuvtai.logs.topics.sonar_topics import ROWS
+from uuvtai.config.loader import load_config
+from uuvtai.logs.drawing import load_recording
+from uuvtai.logs.encode import EpisodeHeader, Moment
+from uuvtai.logs.topics.sensors import SONAR_ROWS
 from uuvtai.logs.video import _ECHO, FrameArtist
-from uuvtai.measure.replay.replaying import replay
-from uuvtai.pilot import Mission, OnboardPilot, SonarPing
+from uuvtai.logs.writer import EpisodeRecorder
+from uuvtai.vehicle.onboard import Mission, OnboardPilot, SonarPing
+from uuvtai.vehicle.replay import replay
 
 STEPS, SEED, EPISODE = 200, 77001, 3
 END = SimpleNamespace(
@@ -99,7 +99,7 @@ def test_a_log_tells_the_beams_of_this_step_alone():
     values |= {"scan.intensity": np.full(64, 0.5, np.float32), "scan.doppler_m_s": np.zeros(64, np.float32)}
     values |= {"scan.ping_vel_b": np.zeros(3, np.float32)}
     moment = Moment(EpisodeHeader("bt", Config(sensors=SensorsConfig(sonar=SONAR)), "", {}), values)
-    scan, doppler = (json.loads(row.encode(moment)) for row in ROWS[:2])
+    scan, doppler = (json.loads(row.encode(moment)) for row in SONAR_ROWS[:2])
     assert scan["ranges"] == [2.0] and scan["intensities"] == [0.5] and doppler["velocity"] == []
     assert scan["start_angle"] == scan["end_angle"] == pytest.approx(np.radians(56.7))
 

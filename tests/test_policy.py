@@ -8,9 +8,7 @@ import torch
 from torch import nn
 
 from uuvtai.config.learning import PolicyConfig
-from uuvtai.learn.mlp import mlp
-from uuvtai.learn.normalise import moments_of
-from uuvtai.learn.policy import ActorCritic, entropy, log_prob
+from uuvtai.learning.networks import ActorCritic, entropy, log_prob, mlp, moments_of
 
 N_IN = 7
 FLOAT32 = 1e-5

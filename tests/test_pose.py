@@ -8,9 +8,9 @@ from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import pose as oracle
 from uuvtai.config import EpisodeConfig, PoseConfig, TankConfig, VehicleConfig
-from uuvtai.kernels.perception import pose
-from uuvtai.kernels.perception.bundles import PoseIO
-from uuvtai.loader import load_config
+from uuvtai.config.loader import load_config
+from uuvtai.kernels.perception import localization
+from uuvtai.kernels.perception.io import PoseIO
 from uuvtai.state import ClockState, PoseState, Proprioception, SonarScan, allocate
 
 N_ENV, STEPS = 200, 201
@@ -62,7 +62,7 @@ class Rig:
         set_step(self.clock, 0)
         self.ego.pos_w.from_numpy(voyage.pos[0].astype(np.float32))
         self.ego.vel_b.fill(0)
-        pose.reset_pose(self.io)
+        localization.reset_pose(self.io)
 
     def sense(self, k):
         """What the instruments say in step k; while the DVL is lost it says nonsense."""
@@ -76,7 +76,7 @@ class Rig:
             ego.vel_valid.from_numpy(v.valid[k])
             seen = v.valid[k][:, None] == 1
             ego.vel_b.from_numpy(np.where(seen, v.reading[k], WRONG).astype(np.float32))
-        pose.predict_pose(self.io)
+        localization.predict_pose(self.io)
 
     def ping(self, k):
         """Take a scan, deliver what is due; (ping step, range, Doppler, hit), or None."""
@@ -103,7 +103,7 @@ class Rig:
         for k in range(since, until):
             self.sense(k)
             self.ping(k)
-            pose.correct_pose(self.io)
+            localization.correct_pose(self.io)
         return self.errors(until - 1)
 
     def errors(self, k):
@@ -179,7 +179,7 @@ def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
         middle = rig.state()
         assert_close(middle, filters, rows)
         due = rig.ping(k)
-        pose.correct_pose(rig.io)
+        localization.correct_pose(rig.io)
         if due is not None:
             late, clear = (k - int(rig.scan.ping_step[0])) * RULES.control_dt_s, []
             for row, ours in filters.items():
@@ -267,7 +267,7 @@ def test_what_stands_before_the_walls_makes_them_count_less(rig):
         for field, values in zip(("mean", "cov", "depth", "depth_cov", "motion"), before, strict=True):
             getattr(rig.pose, field).from_numpy(values)
         rig.deliver(5, (ranges, doppler, hit, *told))
-        pose.correct_pose(rig.io)
+        localization.correct_pose(rig.io)
         sure.append(rig.ego.pose_cov.to_numpy()[:, [0, 3, 5]])
     assert np.all(sure[1] > sure[0])
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from uuvtai.config.learning import PolicyConfig, PpoConfig
-from uuvtai.learn import ppo as ppo_module
-from uuvtai.learn.policy import ActorCritic, log_prob
-from uuvtai.learn.ppo import Ppo, adapted_rate, approximate_kl, gae, surrogate_loss, value_loss
-from uuvtai.learn.rollout import Rollout, final_value
+from uuvtai.learning import ppo as ppo_module
+from uuvtai.learning.networks import ActorCritic, log_prob
+from uuvtai.learning.ppo import Ppo, adapted_rate, approximate_kl, gae, surrogate_loss, value_loss
+from uuvtai.learning.rollout import Rollout, final_value
 
 FLOAT32 = 1e-5
 """relative and absolute; a few hundred float32 operations on numbers near one"""

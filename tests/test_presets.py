@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from tests.command import uuv
-from uuvtai.shipped import KINDS, preset_names, shipped_file
-from uuvtai.show.presets import near, sentences
+from uuvtai.common.presets import KINDS, preset_names, shipped_file
+from uuvtai.console.views import near, sentences
 
 
 def test_the_list_has_every_preset_with_its_sentence(capfd):

@@ -5,11 +5,9 @@ import numpy as np
 import pytest
 
 from tests import report_samples as samples
-from uuvtai.measure.episodes.playing import jobs_of, run_episodes
-from uuvtai.measure.episodes.stopwatch import StepClock, env_steps_left
-from uuvtai.show import progress as module
-from uuvtai.show.dashboard import training_rows
-from uuvtai.show.progress import Pace, Progress, time_left
+from uuvtai.console import screen as module
+from uuvtai.console.screen import Pace, Progress, time_left, training_rows
+from uuvtai.evaluation.episodes import StepClock, env_steps_left, jobs_of, run_episodes
 
 
 class Time:
@@ -156,7 +154,7 @@ def test_the_first_iteration_of_a_training_has_no_speed():
 def test_made_kernels_are_counted():
     import taichi as ti
 
-    from uuvtai.taichi_patches.front_end import kernels_made
+    from uuvtai.compile.taichi_frontend import kernels_made
 
     @ti.kernel
     def fill(x: ti.types.ndarray(dtype=ti.f32, ndim=1), value: ti.f32):  # pyright: ignore

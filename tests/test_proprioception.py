@@ -8,9 +8,9 @@ from tests.conftest import set_step
 from tests.reference.proprioception import dead_reckoned, roll_pitch_yaw, specific_force, zeroed_depth
 from tests.reference.scenes import quaternions, rotation
 from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, SensorsConfig, VehicleConfig
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.sensors import proprioception
-from uuvtai.kernels.sensors.bundles import ProprioceptionIO, VelocityIO
-from uuvtai.loader import load_config
+from uuvtai.kernels.sensors.io import ProprioceptionIO, VelocityIO
 from uuvtai.state import (
     ClockState,
     EpisodeState,

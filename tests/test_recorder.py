@@ -6,7 +6,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer import event_file_writer
 
-from uuvtai.learn.recorder import MetricsRecorder, read_metrics
+from uuvtai.learning.runner import MetricsRecorder, read_metrics
 
 
 def record(run, done, iterations, factor=1.0):

@@ -20,7 +20,7 @@ from docs.render_results import (
     SWEEPS,
 )
 from tests.test_docs import fault
-from uuvtai.measure.reproduce.claims import Share
+from uuvtai.evaluation.claims import Share
 
 
 def test_the_pages_are_those_of_the_results(capsys):

@@ -13,18 +13,15 @@ import torch
 
 from tests.command import uuv
 from tests.conftest import estimate_pose
-from uuvtai.errors import SettingError
-from uuvtai.loader import load_config
+from uuvtai.common.errors import SettingError
+from uuvtai.config.loader import load_config
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.log_recorder import EpisodeRecorder
+from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import records
-from uuvtai.logs.topics.camera_topics import exact_image
-from uuvtai.measure.replay import replaying
-from uuvtai.measure.replay.faults import Faults, Outage, disturbed, outage_of
-from uuvtai.measure.replay.log_feed import Delivery, read_feed
-from uuvtai.measure.replay.replaying import replay
-from uuvtai.pilot import (
+from uuvtai.logs.topics.sensors import exact_image
+from uuvtai.logs.writer import EpisodeRecorder
+from uuvtai.vehicle import replay as replaying
+from uuvtai.vehicle.onboard import (
     DepthShot,
     DvlReading,
     ImuReading,
@@ -33,6 +30,7 @@ from uuvtai.pilot import (
     PressureReading,
     SonarPing,
 )
+from uuvtai.vehicle.replay import Delivery, Faults, Outage, disturbed, outage_of, read_feed, replay
 
 STEPS, SEED = 90, 77001
 END = SimpleNamespace(

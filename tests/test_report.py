@@ -21,25 +21,22 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from tests import report_samples as samples
-from uuvtai.errors import UserError
-from uuvtai.loader import ConfigError
-from uuvtai.measure.evaluate.paired import paired
-from uuvtai.report import ink
+from uuvtai.common.colours import contrast, ink_on, shade
+from uuvtai.common.errors import UserError
+from uuvtai.config.loader import ConfigError
+from uuvtai.console.screen import print_heat_maps
+from uuvtai.evaluation.results import paired
+from uuvtai.logs.run_folder import RunFolderError
+from uuvtai.report import figures as ink
 from uuvtai.report.blocks import Figure, Gallery
-from uuvtai.report.build import report
-from uuvtai.report.colours import contrast, ink_on, shade
+from uuvtai.report.build import media, report
+from uuvtai.report.evaluation import evaluation, paired_table
 from uuvtai.report.figures import Line, curves, heat_map, intervals
-from uuvtai.report.learning_curves import Training, grouped, training
-from uuvtai.report.media import media
-from uuvtai.report.methods_table import evaluation
-from uuvtai.report.page import Page, render
+from uuvtai.report.html import Page, render
 from uuvtai.report.sweep import sweep
+from uuvtai.report.tables import PAGE, Data, Table, pivot
 from uuvtai.report.timing import timing
-from uuvtai.run_folder import RunFolderError
-from uuvtai.show.heat_maps import print_heat_maps
-from uuvtai.tables.heatmap import pivot
-from uuvtai.tables.method_tables import paired_table
-from uuvtai.tables.table import PAGE, Data, Table
+from uuvtai.report.training import Training, grouped, training
 
 READABLE = 4.5
 """contrast of small text, WCAG 2.2 level AA"""
@@ -152,7 +149,7 @@ def test_a_cell_without_episodes_is_a_dash():
 def test_nothing_draws_that_only_prints():
     heavy = ("matplotlib", "jinja2", "torch", "taichi")
     code = (
-        f"import sys, uuvtai.show.heat_maps, uuvtai.report.build; print([m for m in {heavy} if m in "
+        f"import sys, uuvtai.console.screen, uuvtai.report.build; print([m for m in {heavy} if m in "
         "sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -612,7 +609,7 @@ def test_pairs_of_methods_are_told_with_p_and_interval():
 
 
 def test_a_method_has_its_colour_in_charts_and_tables(tmp_path):
-    from uuvtai.report.colours import method_colours
+    from uuvtai.common.colours import method_colours
 
     names = ["straight", "planner", "bt", "mine"]
     colours = method_colours(names)
@@ -641,7 +638,7 @@ def test_a_method_has_its_colour_in_charts_and_tables(tmp_path):
 
 
 def test_every_colour_of_a_line_has_a_lighter_one_for_the_dark():
-    from uuvtai.report.colours import PALETTE
+    from uuvtai.common.colours import PALETTE
 
     template = (files("uuvtai") / "presets/report/page.html.j2").read_text()
     lighter = dict(re.findall(r"--series-(\d+): (#\w{6})", template))

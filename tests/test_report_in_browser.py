@@ -7,8 +7,8 @@ import pytest
 
 from tests import report_samples as samples
 from tests.browser import VIEWS, brightness, look
-from uuvtai.logs.film import write_film
-from uuvtai.measure.evaluate.paired import paired
+from uuvtai.evaluation.results import paired
+from uuvtai.logs.video import write_film
 from uuvtai.report.build import report
 
 BAD = """<!DOCTYPE html><title>bad</title><div id="a" style="width: 3000px">wide</div><p id="a"></p>

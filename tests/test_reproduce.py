@@ -8,13 +8,13 @@ import pytest
 
 from tests.command import Quiet
 from tests.report_samples import robustness_sweep
-from uuvtai.loader import preset_names
-from uuvtai.measure.reproduce import claims, paper, paper_run, steps
-from uuvtai.measure.reproduce.claims import FAILS, HOLDS, OPEN, Share
-from uuvtai.measure.reproduce.markdown import _sweep, results_page
-from uuvtai.measure.reproduce.paper_run import reproduce, resume
-from uuvtai.run_folder import RunFolderError
-from uuvtai.tables.table import text_table
+from uuvtai.common.presets import preset_names
+from uuvtai.evaluation import claims, reproduce_steps
+from uuvtai.evaluation import reproduce as paper_run
+from uuvtai.evaluation.claims import FAILS, HOLDS, OPEN, Share
+from uuvtai.evaluation.reproduce import _sweep_lines, reproduce, results_page, resume
+from uuvtai.logs.run_folder import RunFolderError
+from uuvtai.report.tables import text_table
 
 
 def alone(finding):
@@ -262,7 +262,7 @@ def test_the_page_tells_p_values_and_an_evaluation_seed_that_was_tuned_on():
     )
     assert "seed, 90007, was never trained or tuned on" in text
     assert "seed, 90001, was looked at while tuning" in results_page(minimal() | {"seed": 90001})
-    assert steps.EVALUATION_SEED not in steps.RETIRED_SEEDS
+    assert reproduce_steps.EVALUATION_SEED not in reproduce_steps.RETIRED_SEEDS
 
 
 def test_losses_must_fall():
@@ -276,7 +276,7 @@ def test_losses_must_fall():
 def test_the_papers_own_time_to_success_is_as_inconsistent_as_we_say():
     off = {
         name: round(row.mean_time_s / row.success, 1)
-        for name, row in paper.TABLE_MAIN.items()
+        for name, row in claims.TABLE_MAIN.items()
         if abs(row.mean_time_s / row.success - row.tts_s) > 0.1
     }
     assert off == {"distill_20": 29.2, "curriculum": 13.1, "bt": 18.1}
@@ -285,13 +285,13 @@ def test_the_papers_own_time_to_success_is_as_inconsistent_as_we_say():
 # ------------------------------------------------------------------------------------------------------ steps
 
 
-@pytest.mark.parametrize("budget", list(steps.BUDGETS))
+@pytest.mark.parametrize("budget", list(reproduce_steps.BUDGETS))
 def test_steps_have_folders_of_their_own_and_known_presets(budget, tmp_path):
-    found = steps.steps_of(steps.BUDGETS[budget], tmp_path)
+    found = reproduce_steps.steps_of(reproduce_steps.BUDGETS[budget], tmp_path)
     assert len({step.folder for step in found}) == len(found)
     trained = [step.command[1] for step in found if step.command[0] == "train"]
     assert set(trained) <= set(preset_names("train"))
-    assert len(trained) == len(steps.TRAINED) * steps.BUDGETS[budget].training_seeds
+    assert len(trained) == len(reproduce_steps.TRAINED) * reproduce_steps.BUDGETS[budget].training_seeds
     grids = [step.command[step.command.index("--grid") + 1] for step in found if "--grid" in step.command]
     assert set(grids) <= set(preset_names("grid"))
 
@@ -301,7 +301,7 @@ class Uuv:
 
     def __init__(self, monkeypatch, fail_at=None):
         self.ran, self.fail_at = [], fail_at
-        monkeypatch.setattr(steps, "launch", self)
+        monkeypatch.setattr(reproduce_steps, "launch", self)
 
     def __call__(self, arguments):
         self.ran.append(arguments)
@@ -310,7 +310,7 @@ class Uuv:
             (arguments[i + 1] for i, part in enumerate(arguments) if part in ("--run-dir", "--resume")), None
         )
         if place:
-            folder = steps.Path(place)
+            folder = reproduce_steps.Path(place)
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "run.json").write_text(json.dumps({"status": "interrupted" if code else "finished"}))
             (folder / "metrics.jsonl").write_text("")
@@ -357,7 +357,7 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
     assert any(f"--resume {place}" in text for text in watch.answer)
     second = Uuv(monkeypatch)
     document, _ = resume(place, Quiet())
-    wanted = steps.steps_of(steps.BUDGETS["quick"], place)
+    wanted = reproduce_steps.steps_of(reproduce_steps.BUDGETS["quick"], place)
     assert len(first.ran) + len(second.ran) == len(wanted) + 1, "the interrupted step alone runs again"
     assert (place / "results.md").read_text() == results_page(document)
     assert str(place) not in json.dumps(document["commands"]), "commands are told without the machine's paths"
@@ -369,7 +369,7 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
 
 def test_a_step_that_fails_says_which(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        steps, "launch", lambda _arguments: type("Done", (), {"returncode": 2, "stdout": b""})()
+        reproduce_steps, "launch", lambda _arguments: type("Done", (), {"returncode": 2, "stdout": b""})()
     )
     with pytest.raises(RunFolderError, match="train ppo, seed 0: 'uuv train ppo"):
         reproduce("quick", tmp_path / "run", Quiet())
@@ -384,7 +384,7 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path):
 
 
 def test_a_sweep_of_one_axis_at_a_time_is_a_row_a_change():
-    lines = _sweep(robustness_sweep()).splitlines()
+    lines = _sweep_lines(robustness_sweep()).splitlines()
     assert lines[2] == "| changed | bt | best |"
     assert lines[4:7] == [
         "| nothing | 100 / 0 | 94 / 0 |",

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from uuvtai.errors import UserError
-from uuvtai.loader import preset_path
+from uuvtai.common.errors import UserError
+from uuvtai.config.loader import preset_path
+from uuvtai.evaluation import results
+from uuvtai.evaluation.evaluate import Request, compare, resume
+from uuvtai.evaluation.results import REQUEST_FILE as REQUEST
 from uuvtai.logs import reader
-from uuvtai.measure.evaluate import ledger
-from uuvtai.measure.evaluate.compare import Request, compare, resume
-from uuvtai.measure.evaluate.eval_request import FILE as REQUEST
 
 TIMES = ("wall_s", "env_steps_per_s")
 """of the machine, not of the vehicles"""
@@ -61,7 +61,8 @@ def ask(small, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "uuvtai.sim.Sim", lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim
+            "uuvtai.sim.sim.Sim",
+            lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim,
         )
         yield request
     small.sim.use_tree(small.trees["bt"])
@@ -89,7 +90,7 @@ def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_pa
     assert f"finished episodes are kept; go on with: uuv eval --resume {run}" in watch.notes
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
     assert not (run / "eval/result.json").exists()
-    kept = (run / ledger.FILE).read_bytes()
+    kept = (run / results.JOURNAL_FILE).read_bytes()
     finished = sum(json.loads(line)["method"] == method for line in kept.splitlines())
     assert after <= finished <= EPISODES
     old = {log.name: log.stat().st_mtime_ns for log in (run / "logs").glob("*.mcap")}
@@ -98,7 +99,7 @@ def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_pa
     assert outcome(result) == outcome(whole[0])
     assert json.loads((run / "eval/result.json").read_text()) == result
     assert (run / "eval/tree.json").read_bytes() == (whole[1] / "eval/tree.json").read_bytes()
-    assert (run / ledger.FILE).read_bytes().startswith(kept), "nothing that is over is played again"
+    assert (run / results.JOURNAL_FILE).read_bytes().startswith(kept), "nothing that is over is played again"
     assert watch.begun[method] is None or watch.begun[method] >= finished
     logs = sorted((run / "logs").iterdir())
     assert [log.name for log in logs] == sorted(log.name for log in (whole[1] / "logs").iterdir()), (
@@ -114,7 +115,7 @@ def test_a_line_that_a_kill_cut_off_and_a_lost_log_are_played_again(ask, whole, 
     run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         compare(ask(run), Watch("second", EPISODES))
-    file = run / ledger.FILE
+    file = run / results.JOURNAL_FILE
     file.write_bytes(file.read_bytes()[:-30])
     next((run / "logs").glob("straight*.mcap")).unlink()
     result, _ = resume(run, Watch())
@@ -147,8 +148,8 @@ def test_another_tree_under_the_same_name_is_refused(ask, tmp_path):
         (REQUEST, b"{", "is no request"),
         (REQUEST, b"[1]", "is no request"),
         (REQUEST, None, "cannot be read"),
-        (ledger.FILE, b'{"method": "straight"}\n', "line 1: is no finished episode"),
-        (ledger.FILE, b"\xff\xfe\n", "line 1: is no finished episode"),
+        (results.JOURNAL_FILE, b'{"method": "straight"}\n', "line 1: is no finished episode"),
+        (results.JOURNAL_FILE, b"\xff\xfe\n", "line 1: is no finished episode"),
     ],
 )
 def test_a_damaged_folder_is_refused(ask, tmp_path, file, content, says):
@@ -165,8 +166,8 @@ def test_a_ledger_that_is_a_link_is_not_written_through(ask, tmp_path):
     run, victim = tmp_path / "run", tmp_path / "victim"
     interrupted(ask, run, record=0)
     victim.write_text("mine, without an end of line")
-    (run / ledger.FILE).unlink()
-    (run / ledger.FILE).symlink_to(victim)
+    (run / results.JOURNAL_FILE).unlink()
+    (run / results.JOURNAL_FILE).symlink_to(victim)
     with pytest.raises(UserError, match="is a link"):
         resume(run, Watch())
     assert victim.read_text() == "mine, without an end of line"

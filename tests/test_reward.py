@@ -11,8 +11,8 @@ from tests.reference import reward as reference
 from uuvtai import state
 from uuvtai.config import EpisodeConfig, RewardConfig, VehicleConfig
 from uuvtai.kernels.task import reward
-from uuvtai.kernels.task.bundles import RewardIO
 from uuvtai.kernels.task.episode import OUTCOMES
+from uuvtai.kernels.task.io import RewardIO
 
 N = 64
 TOL = 2e-5

@@ -11,19 +11,19 @@ from mcap.reader import make_reader
 
 from tests.command import run_cli
 from tests.reference import logs as episode
-from uuvtai.logs import ros_types, ros_write
+from uuvtai.logs import ros2
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import info, read_head, read_messages
-from uuvtai.logs.ros_write import WRITTEN
+from uuvtai.logs.ros2 import WRITTEN
 from uuvtai.logs.rosbag import from_rosbag2, to_rosbag2
-from uuvtai.logs.topics.map_topics import grid_values
+from uuvtai.logs.topics.perception import grid_values
 
 if any(importlib.util.find_spec(name) is None for name in ("rosbags", "mcap_ros2")):
     pytest.skip("needs the extra uuvtai[ros]", allow_module_level=True)
 
 N_STEP = 30
-ROS = ros_types.RosMessages()
+ROS = ros2.RosMessages()
 INF, NAN = math.inf, math.nan
 
 
@@ -128,7 +128,7 @@ def test_scans_and_clouds(ros, recorded):
 def test_a_cloud_of_a_sonar_without_doppler_says_no_speed():
     scan = {"timestamp": {"sec": 1, "nsec": 5}, "frame_id": "sonar", "start_angle": -0.5, "end_angle": 0.5}
     scan |= {"ranges": [1.0, 12.0, 3.0], "intensities": [0.5, 0.0, 0.2]}
-    cloud = ros_write._cloud(ros_types.RosMessages(), scan, [])
+    cloud = ros2._cloud(ros2.RosMessages(), scan, [])
     points = np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, 5)
     assert not cloud.is_dense and np.isnan(points[:, 4]).all()
     np.testing.assert_allclose(points[:, 1], [np.sin(-0.5), 3.0 * np.sin(0.5)], rtol=1e-6)
@@ -385,7 +385,7 @@ def test_only_plus_infinity_is_free_water(tmp_path):
         (found,) = by_topic(out, "/sonar/scan")
         hits = [value > 0 for value in found["intensities"]]
         assert list(zip(found["ranges"], hits, strict=True)) == list(RANGES.values())
-    again = ros_write._scan(ROS, ros_write.Setup.of({}), found | {"ranges": [-0.1, *found["ranges"][1:]]})
+    again = ros2._scan(ROS, ros2.Setup.of({}), found | {"ranges": [-0.1, *found["ranges"][1:]]})
     assert again.ranges[:5].tolist() == [-INF, 0.75, 20.0, 0.75, INF]
     assert np.isnan(again.ranges[5:]).all()
 
@@ -463,6 +463,6 @@ def test_hostile_messages_leave_nothing(tmp_path, kind, data):
 
 
 def test_without_the_extra_it_says_what_to_install(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr(ros_types, "_PACKAGE", "nothing_of_this_name")
+    monkeypatch.setattr(ros2, "_PACKAGE", "nothing_of_this_name")
     with pytest.raises(LogError, match=r"pip install 'uuvtai\[ros\]'"):
         to_rosbag2(recorded, tmp_path / "b")

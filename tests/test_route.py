@@ -8,9 +8,9 @@ from tests import planning_maps as maps
 from tests.bundles import io_for
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, stage, way_of
 from tests.reference import route as oracle
-from uuvtai import plan_codes as codes
+from uuvtai.common import enums as codes
 from uuvtai.kernels.planning import route, triggers
-from uuvtai.kernels.planning.bundles import RouteIO, TriggersIO
+from uuvtai.kernels.planning.io import RouteIO, TriggersIO
 
 POSITION_M = 2e-5
 """float32 at 20 m resolves 1e-6 m; lengths are sums of a hundred such steps."""

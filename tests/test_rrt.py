@@ -12,9 +12,9 @@ from tests.bundles import io_for
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, way_of
 from tests.reference.voronoi import clearance_of, line_points
 from tests.test_voronoi import STRICT, wall
-from uuvtai import plan_codes as codes
-from uuvtai import rrt
-from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
+from uuvtai.common import enums as codes
+from uuvtai.kernels.planning.io import RouteIO, VoronoiIO
+from uuvtai.sim import rrt
 
 pytest.importorskip("ompl")
 

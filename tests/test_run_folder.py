@@ -14,10 +14,10 @@ import pytest
 import torch
 
 from tests.command import Quiet
-from uuvtai import signals
-from uuvtai.errors import UserError
-from uuvtai.loader import load_config, load_resolved
-from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place, write_atomic
+from uuvtai.common import signals
+from uuvtai.common.errors import UserError
+from uuvtai.config.loader import load_config, load_resolved
+from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place, write_atomic
 
 
 def files_in(folder):
@@ -111,8 +111,8 @@ def test_of_two_processes_that_begin_in_one_folder_exactly_one_does(tmp_path):
     script = """if True:
         import sys
         from pathlib import Path
-        from uuvtai.loader import load_config
-        from uuvtai.run_folder import RunFolder, RunFolderError
+        from uuvtai.config.loader import load_config
+        from uuvtai.logs.run_folder import RunFolder, RunFolderError
         config = load_config("pool")
         print("ready", flush=True)
         sys.stdin.readline()
@@ -159,27 +159,27 @@ def test_what_is_no_run_folder_is_left_as_it_is(tmp_path):
 
 def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
     """Of 25 pairs of evaluations that began in one folder all 50 succeeded, and their files were mixed."""
-    from uuvtai.measure.evaluate import compare
+    from uuvtai.evaluation import evaluate
 
     made = []
     monkeypatch.setattr(
-        compare, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0]
+        evaluate, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0]
     )
-    monkeypatch.setattr(compare, "methods_of", lambda *_: [])
-    monkeypatch.setattr(compare, "_any_tree", lambda: None)
-    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: SimpleNamespace(device=torch.device("cpu")))
+    monkeypatch.setattr(evaluate, "methods_of", lambda *_: [])
+    monkeypatch.setattr(evaluate, "_any_tree", lambda: None)
+    monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_: SimpleNamespace(device=torch.device("cpu")))
 
     def scenarios(_sim, _jobs):
         with pytest.raises(RunFolderError, match="another process"):
             RunFolder.held(tmp_path / "run")
         raise LookupError("seen")
 
-    monkeypatch.setattr("uuvtai.measure.evaluate.ceilings.scenarios_of", scenarios)
-    request = compare.Request(
+    monkeypatch.setattr("uuvtai.evaluation.evaluate.scenarios_of", scenarios)
+    request = evaluate.Request(
         load_config("pool"), "pool", "paper", ["oracle"], [77], 1, run_dir=tmp_path / "run"
     )
     with pytest.raises(LookupError, match="seen"):
-        compare.compare(request, Quiet())
+        evaluate.compare(request, Quiet())
     RunFolder.held(tmp_path / "run").release()
 
 

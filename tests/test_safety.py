@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uuvtai.link.safety import (
+from uuvtai.vehicle.safety import (
     FENCE_RATE_HZ,
     RULES,
     STOP,

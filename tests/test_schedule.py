@@ -3,7 +3,7 @@
 import pytest
 
 from uuvtai.config.learning import DistillConfig
-from uuvtai.learn.distill import piecewise_linear
+from uuvtai.learning.distillation import piecewise_linear
 
 
 @pytest.mark.parametrize(

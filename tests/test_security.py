@@ -32,28 +32,25 @@ from tests.command import Quiet, run_cli
 from tests.reference import logs as episode
 from tests.test_checkpoint import rewritten
 from tests.test_hostile_logs import END, chunk_of
-from uuvtai.deploy import run_policy
-from uuvtai.deploy.agreement import of_onnx
-from uuvtai.errors import UserError
-from uuvtai.learn import checkpoint
-from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.manifest import config_sha256, sha256_of
-from uuvtai.learn.pilot import load_pilot
-from uuvtai.learn.recorder import MetricsRecorder
-from uuvtai.learn.run import TrainRequest, train
-from uuvtai.loader import ConfigError, _SafeLoader, load_config, load_resolved, parsed_yaml
+from uuvtai.common.errors import UserError
+from uuvtai.config.loader import ConfigError, _SafeLoader, load_config, load_resolved, parsed_yaml
+from uuvtai.evaluation.evaluate import evaluate_now
+from uuvtai.evaluation.reproduce import resume as resume_reproduction
+from uuvtai.evaluation.sweep import resume as resume_sweep
+from uuvtai.learning import checkpoint
+from uuvtai.learning.checkpoint import CheckpointError, config_sha256, sha256_of
+from uuvtai.learning.export import run_policy
+from uuvtai.learning.export.folder import of_onnx
+from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.runner import MetricsRecorder, TrainRequest, train
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.drawing import load_recording
+from uuvtai.logs.encode import LogError
 from uuvtai.logs.picture import picture
-from uuvtai.logs.recording import load_recording
-from uuvtai.logs.topics.camera_topics import logged_image
-from uuvtai.measure.evaluate.while_training import evaluate_now
-from uuvtai.measure.reproduce.paper_run import resume as resume_reproduction
-from uuvtai.measure.sweep.play import resume as resume_sweep
-from uuvtai.report.build import report
-from uuvtai.report.media import media
-from uuvtai.run_folder import RunFolder, RunFolderError
-from uuvtai.tree import TreeError, parse_tree
+from uuvtai.logs.run_folder import RunFolder, RunFolderError
+from uuvtai.logs.topics.sensors import logged_image
+from uuvtai.report.build import media, report
+from uuvtai.sim.behavior_tree import TreeError, parse_tree
 
 PACKAGE = Path(__file__).parent.parent / "uuvtai"
 
@@ -107,30 +104,28 @@ FORBIDDEN = """
 eval exec compile __import__ pickle marshal shelve dill joblib runpy tarfile os.system os.popen torch.load
 torch.jit.load np.load np.lib.format.read_array
 """
-ALONE = {"aboard/carried_stack.py", "aboard/stack_check.py"}
-"""files of an exported stack: they run without uuvtai, out of a folder whose native code is run as it is"""
+ALONE = {"vehicle/embedded/runtime.py"}
+"""file of an exported stack: it runs without uuvtai, out of a folder whose native code is run as it is"""
 READERS = {
-    "files.py": "it is the one reader",
-    "report/page.py": "the page's template lies in the package",
-    "deploy/run_policy.py": "it must run without uuvtai and has a reader of its own",
+    "common/files.py": "it is the one reader",
+    "report/html.py": "the page's template lies in the package",
+    "learning/export/run_policy.py": "it must run without uuvtai and has a reader of its own",
     **dict.fromkeys(ALONE, "it must run without uuvtai, beside native code that it runs"),
 }
 """files that may open others themselves, and why"""
 OWN_READS = {
     # what they have just written, or what lies in the package
-    "logs/film.py": "os.open, av.open",
-    "native/keys.py": "path.read_bytes",
-    "deploy/export.py": "Path(module.__file__ or '').read_bytes",
-    "aboard/cross.py": "out.read_bytes",
-    "aboard/stack_folder.py": "(_ROOT / name).read_text",
-    "example_files.py": "source.read_bytes",
+    "logs/video.py": "os.open, av.open",
+    "compile/cache.py": "path.read_bytes, json.loads",
+    "learning/export/folder.py": "Path(module.__file__ or '').read_bytes",
+    "vehicle/embedded/export.py": "out.read_bytes, (_ROOT / name).read_text",
+    "console/doctor.py": "source.read_bytes",
     # one file of the system, by its name
-    "run_folder.py": "cpuinfo.read_text",
-    "sizes.py": "meminfo.read_text",
+    "logs/run_folder.py": "cpuinfo.read_text",
+    "sim/setup.py": "meminfo.read_text",
     # JSON of this process or its siblings
-    "capture.py": "json.loads",
-    "measure/sweep/plan.py": "json.loads",
-    "native/reads.py": "json.loads",
+    "sim/snapshot.py": "json.loads",
+    "evaluation/grid.py": "json.loads",
     # messages and attachments of a log, each no longer than its MAX_RECORD
     "logs/reader.py": "json.loads",
 }
@@ -178,7 +173,7 @@ def test_nothing_in_the_package_can_execute_what_it_reads():
     assert loaders == ["_SafeLoader(text)"] and issubclass(_SafeLoader, yaml.SafeLoader)
     assert importers <= {"doctor.py", "__init__.py"}, "modules are never imported by names from files"
     loaders = [path.name for path in PACKAGE.rglob("*.py") if "module_from_spec" in path.read_text()]
-    assert loaders == ["piece_loading.py"], "Python of the user's is run in one place, which she has named"
+    assert loaders == ["loading.py"], "Python of the user's is run in one place, which she has named"
 
 
 def reads_of(tree):
@@ -186,7 +181,7 @@ def reads_of(tree):
     imported = {
         alias.asname or alias.name
         for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module == "uuvtai.files"
+        if isinstance(node, ast.ImportFrom) and node.module == "uuvtai.common.files"
         for alias in node.names
     }
     ours = {"files"} | ({"read_text", "read_bytes", "read_json"} & imported)

@@ -13,24 +13,29 @@ import torch
 from tests.command import run_cli
 from tests.reference import hull_rule as reference
 from tests.test_deploy import resigned
+from uuvtai.common.enums import BODY_WIDTH, COLUMNS, EGO_COLUMNS, N_BODY, N_COLUMN
 from uuvtai.config import TankConfig, VehicleConfig
-from uuvtai.deploy import export as deploy
-from uuvtai.deploy import run_policy, run_set_policy, set_columns_text
-from uuvtai.deploy.golden import TOLERANCE
-from uuvtai.deploy.graph import missing_packages
-from uuvtai.deploy.set_graph import golden_rows, kind_of, module_of, set_weights
-from uuvtai.deploy.set_spec import hull_rule_of
-from uuvtai.forecast_codes import COLUMNS, N_COLUMN
-from uuvtai.learn import checkpoint, mixture_net, set_policy
-from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.forecast_trainer import column_row
-from uuvtai.learn.mixture_net import MixtureNet
-from uuvtai.learn.set_pilot import load_set_pilot
-from uuvtai.learn.set_policy import SetActor, SetCritic
-from uuvtai.loader import load_training
-from uuvtai.twin.observer import SET_TABLE
-from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY
-from uuvtai.twin.twin_arrays import TRUTH_WIDTH
+from uuvtai.config.loader import load_training
+from uuvtai.learning import checkpoint, networks, set_networks
+from uuvtai.learning.agents import load_set_pilot
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.export import folder as deploy
+from uuvtai.learning.export import run_policy, run_set_policy
+from uuvtai.learning.export import spec as set_columns_text
+from uuvtai.learning.export.graph import (
+    TOLERANCE,
+    golden_rows,
+    kind_of,
+    missing_packages,
+    module_of,
+    set_weights,
+)
+from uuvtai.learning.export.spec import hull_rule_of
+from uuvtai.learning.forecast import column_row
+from uuvtai.learning.networks import MixtureNet
+from uuvtai.learning.set_networks import SetActor, SetCritic
+from uuvtai.surrogate.arrays import TRUTH_WIDTH
+from uuvtai.surrogate.observation import SET_TABLE
 
 NET = {"twin.body_hidden": 8, "twin.head_hidden": 8}
 
@@ -176,7 +181,7 @@ def test_the_graph_says_the_same(kind, tmp_path):
     assert set(spec["graph"]["outputs"]) == set(policy.said(golden_inputs(out, policy)))
     if kind == "forecast":
         return
-    from uuvtai.deploy.onnx_session import session
+    from uuvtai.learning.export.graph import session
 
     rng = np.random.default_rng(0)
     few = {name: rng.normal(size=(3, policy.widths[name])).astype(np.float32) for name in policy.inputs[1:]}
@@ -272,11 +277,11 @@ def test_words_and_constants_are_those_of_the_package():
     names = [row["name"] for columns in (text.BODY_COLUMNS, text.OWN_COLUMNS) for row in columns]
     assert names[12] == "way_in_1s.x" and names[BODY_WIDTH + 3] == "goal_direction.x"
     for own, theirs in (
-        (run_set_policy.AT_DIRECTION, set_policy.AT_DIRECTION),
-        (run_set_policy.SUM_SCALE, set_policy._SUM_SCALE),
-        (run_set_policy.MOST_WISH, set_policy.MOST_WISH),
-        (run_set_policy.LEAST_M, mixture_net._LEAST_M),
-        (run_set_policy.LOG_BOUNDS[1], np.log(mixture_net._MOST)),
+        (run_set_policy.AT_DIRECTION, set_networks.AT_DIRECTION),
+        (run_set_policy.SUM_SCALE, set_networks._SUM_SCALE),
+        (run_set_policy.MOST_WISH, set_networks.MOST_WISH),
+        (run_set_policy.LEAST_M, networks._LEAST_M),
+        (run_set_policy.LOG_BOUNDS[1], np.log(networks._MOST)),
     ):
         assert own == theirs
 
@@ -404,7 +409,7 @@ def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
     ],
 )
 def test_golden_pairs_are_read_without_trust(change, tmp_path, no_onnx, capfd):
-    from uuvtai.deploy.golden import npz_bytes
+    from uuvtai.learning.export.graph import npz_bytes
 
     found, _, out = exported("set", tmp_path)
     golden = golden_rows(module_of(found, "set"))

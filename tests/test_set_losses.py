@@ -5,12 +5,11 @@ import pytest
 import torch
 
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learn import side_by_side as pieces
-from uuvtai.learn.policy import log_prob
-from uuvtai.learn.ppo import surrogate_loss
-from uuvtai.learn.set_losses import CACHE_ROWS, SetLosses, by_part
-from uuvtai.learn.set_policy import MaxAndSum, SetActor, SetCritic
-from uuvtai.learn.side_by_side import side_by_side
+from uuvtai.learning import surrogate_trainer as pieces
+from uuvtai.learning.networks import log_prob
+from uuvtai.learning.ppo import surrogate_loss
+from uuvtai.learning.set_networks import MaxAndSum, SetActor, SetCritic
+from uuvtai.learning.surrogate_trainer import CACHE_ROWS, SetLosses, by_part, side_by_side
 
 ROWS, LANES, N_BODY, N_OWN, N_TRUTH = CACHE_ROWS + 77, 3, 5, 7, 4
 

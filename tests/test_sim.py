@@ -10,10 +10,10 @@ import torch
 
 from tests.conftest import estimate_pose, launch_one_by_one
 from tests.small_sim import SmallSim
-from uuvtai.errors import DivergenceError
-from uuvtai.loader import load_config
-from uuvtai.measure.episodes.playing import jobs_of, run_episodes
-from uuvtai.sim import Sim
+from uuvtai.common.errors import DivergenceError
+from uuvtai.config.loader import load_config
+from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.sim.sim import Sim
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -89,9 +89,9 @@ def test_the_camera_is_asked_about_heights_only_if_the_config_says_so(small, mon
     asked, sim = [], small.sim
     launch_one_by_one(monkeypatch, sim)
     small.begin([0])
-    monkeypatch.setattr("uuvtai.stack.tracking.track_bodies", lambda *_: None)
-    monkeypatch.setattr("uuvtai.stack.elevation.bound_heights", lambda *_: None)
-    monkeypatch.setattr("uuvtai.stack.look.look_at_bodies", lambda *_: asked.append(1))
+    monkeypatch.setattr("uuvtai.sim.stack.tracking.track_bodies", lambda *_: None)
+    monkeypatch.setattr("uuvtai.sim.stack.height.bound_heights", lambda *_: None)
+    monkeypatch.setattr("uuvtai.sim.stack.camera_tracking.look_at_bodies", lambda *_: asked.append(1))
     for use, calls in ((True, 3), (False, 0)):
         changed = small.config.elevation.model_copy(update={"use_camera": use})
         monkeypatch.setattr(sim, "config", small.config.model_copy(update={"elevation": changed}))
@@ -150,7 +150,7 @@ def test_scene_is_data(small):
 
 
 def test_another_kind_of_runtime_in_one_process_is_refused():
-    from uuvtai.runtime import start_taichi
+    from uuvtai.compile.runtime import start_taichi
 
     with pytest.raises(RuntimeError, match="already runs"):
         start_taichi("cpu", precision="f64")
@@ -159,7 +159,7 @@ def test_another_kind_of_runtime_in_one_process_is_refused():
 
 
 def test_absurd_sizes_are_refused_before_anything_is_allocated():
-    from uuvtai.sizes import check_size, memory_bytes
+    from uuvtai.sim.setup import check_size, memory_bytes
 
     config = load_config("pool")
     with pytest.raises(ValueError, match="at least 1 env"):

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from tests.reference import dynamics as oracle
-from uuvtai.loader import load_config
-from uuvtai.measure.simulate import Trial, control_step, quaternion, roll_pitch_yaw, simulate
-from uuvtai.runtime import start_taichi
-from uuvtai.shipped import preset_names
+from uuvtai.common.presets import preset_names
+from uuvtai.compile.runtime import start_taichi
+from uuvtai.config.loader import load_config
+from uuvtai.evaluation.simulate import Trial, control_step, quaternion, roll_pitch_yaw, simulate
 
 F32_POSITION_M = 2e-3
 """Single precision over some hundred substeps, far below the design's 1 cm."""
@@ -83,8 +83,8 @@ def test_double_precision_process():
     """Without a runtime the function starts Taichi in double precision; 0.01 s agrees with RK4 far below
     single precision."""
     code = (
-        "import json, sys\nfrom uuvtai.loader import load_config\nfrom uuvtai.measure.simulate import "
-        "Trial, simulate\n"
+        "import json, sys\nfrom uuvtai.config.loader import load_config\n"
+        "from uuvtai.evaluation.simulate import Trial, simulate\n"
         "c = load_config('open', overrides={'vehicle.attitude_hold': 'none'})\n"
         "print('RESULT' + json.dumps(simulate(c, Trial(1.0, dt=0.004, wrench=(1, 2, 3, 0, 0, "
         "0.1)))['nu'][-1]))"

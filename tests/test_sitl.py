@@ -15,21 +15,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.command import uuv
 from tests.mavlink_vehicle import START, free_port, link_config
-from uuvtai import signals
-from uuvtai.errors import SettingError
-from uuvtai.link.dialect import MavCodec
-from uuvtai.link.endpoint import LinkPlace
-from uuvtai.link.intake import Intake
-from uuvtai.link.link_errors import LinkError
-from uuvtai.link.motors import Motors
-from uuvtai.loader import load_config
-from uuvtai.pilot import DvlReading, SonarPing
-from uuvtai.sitl import serving
-from uuvtai.sitl.fdm_reply import Motion, euler_of, reply_of
-from uuvtai.sitl.instance import Instance, frame_of, turn_of
-from uuvtai.sitl.reported_sensors import ReportedSensors
-from uuvtai.sitl.rows_of_water import WaterRows
-from uuvtai.sitl.serving import SitlPlan, SitlPort
+from uuvtai.common import signals
+from uuvtai.common.errors import SettingError
+from uuvtai.config.loader import load_config
+from uuvtai.vehicle import sitl
+from uuvtai.vehicle.mavlink import LinkError, LinkPlace, MavCodec
+from uuvtai.vehicle.onboard import DvlReading, SonarPing
+from uuvtai.vehicle.sitl import Instance, SitlPlan, SitlPort, WaterRows, frame_of, turn_of
+from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, euler_of, reply_of
+from uuvtai.vehicle.telemetry import Intake, Motors
 
 NEUTRAL = (1500,) * 16
 GOLDEN_PACKET = bytes.fromhex(
@@ -342,7 +336,7 @@ def test_a_step_is_a_step_of_the_simulators_own_dynamics(small, water):
 
 def test_a_step_is_launched_again_without_another_look(water, monkeypatch):
     """A kernel looks at arguments that it has not seen, by identity: 10 ms instead of 0.1."""
-    from uuvtai.native import launch
+    from uuvtai.compile import launch
 
     looked = []
     first = launch._first
@@ -489,16 +483,16 @@ def test_what_makes_no_sense_is_refused(capfd, words, says):
 
 def test_the_water_waits_for_the_clock(served, monkeypatch):
     port, slept = served().port, []
-    monkeypatch.setattr(serving.time, "sleep", slept.append)
-    monkeypatch.setattr(serving.time, "monotonic", lambda: 100.0)
+    monkeypatch.setattr(sitl.time, "sleep", slept.append)
+    monkeypatch.setattr(sitl.time, "monotonic", lambda: 100.0)
     port.paced_from_s = 100.0
     port.instance.time_s = 0.05
-    serving._pace(port, 0.0)
+    sitl._pace(port, 0.0)
     assert slept == []
-    serving._pace(port, 0.5)
+    sitl._pace(port, 0.5)
     assert slept == pytest.approx([0.1]), "0.05 s of water take 0.1 s of the clock at half the pace"
     port.instance.time_s = 50.0
-    serving._pace(port, 1.0)
+    sitl._pace(port, 1.0)
     assert len(slept) == 1 and port.paced_from_s == 50.0, "begun anew, or held up: nothing to catch up with"
 
 
@@ -510,8 +504,8 @@ def test_an_interrupted_water_tells_what_happened(capfd, monkeypatch, small):
         raise signals.Interrupted
 
     monkeypatch.setattr(signals, "_engaged", [])
-    monkeypatch.setattr(serving, "Sim", lambda config, rows, tree: small.sim)
-    monkeypatch.setattr(serving, "_serve", stopped)
+    monkeypatch.setattr(sitl, "Sim", lambda config, rows, tree: small.sim)
+    monkeypatch.setattr(sitl, "_serve", stopped)
     place = ["--port", str(free_port()), "--mavlink", "udpout:127.0.0.1:9", "--json"]
     code, out, err = uuv(capfd, "sitl", *place)
     assert code == 0 and "interrupted" in err and len(json.loads(out)["instances"]) == 1
@@ -519,7 +513,7 @@ def test_an_interrupted_water_tells_what_happened(capfd, monkeypatch, small):
 
 @pytest.mark.parametrize("words", [["--json"], []])
 def test_the_command_serves_and_tells(capfd, monkeypatch, small, words):
-    monkeypatch.setattr(serving, "Sim", lambda config, rows, tree: small.sim)
+    monkeypatch.setattr(sitl, "Sim", lambda config, rows, tree: small.sim)
     number = free_port()
     place = ["--port", str(number), "--mavlink", "udpout:127.0.0.1:9", "--seconds", "0.2"]
     code, out, err = uuv(capfd, "sitl", *place, *words)

@@ -9,12 +9,12 @@ from tests.conftest import set_step
 from tests.reference import scenes
 from tests.reference.sonar import WALL, beam_headings, doppler_by_differences, sonar_scan
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Const
-from uuvtai.kernels.sensors import sonar, sonar_error
-from uuvtai.kernels.sensors.bundles import SonarIO
-from uuvtai.loader import load_config
+from uuvtai.kernels.core.simd import LANES, f16x
+from uuvtai.kernels.core.stage import Const
+from uuvtai.kernels.sensors import sonar
+from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.state import (
     ClockState,
     EpisodeState,
@@ -254,19 +254,19 @@ def apply_error(
         r, rate, bright = f16x(range_m), f16x(1.0), f16x(cosine)
         reported, speed, lit = r + 0.0, rate + 0.0, bright + 0.0
         if ti.static(which == 0):
-            reported = sonar_error.range_noisy(r, key, step, ray, io_for(SonarIO, config))
+            reported = sonar.range_noisy(r, key, step, ray, io_for(SonarIO, config))
         elif ti.static(which == 1):
-            reported = sonar_error.missed(r, key, step, ray, io_for(SonarIO, config))
+            reported = sonar.missed(r, key, step, ray, io_for(SonarIO, config))
         elif ti.static(which == 2):
-            reported, speed, lit = sonar_error.falsely_returned(
+            reported, speed, lit = sonar.falsely_returned(
                 r, rate, bright, key, step, ray, io_for(SonarIO, config)
             )
         elif ti.static(which == 3):
-            reported = sonar_error.grazing_lost(r, bright, io_for(SonarIO, config))
+            reported = sonar.grazing_lost(r, bright, io_for(SonarIO, config))
         elif ti.static(which == 4):
-            reported = sonar_error.cut_off(r, io_for(SonarIO, config))
+            reported = sonar.cut_off(r, io_for(SonarIO, config))
         else:
-            speed = sonar_error.doppler_noisy(rate, key, step, ray, io_for(SonarIO, config))
+            speed = sonar.doppler_noisy(rate, key, step, ray, io_for(SonarIO, config))
         for i in ti.static(range(LANES)):
             out[row, ray + i, 0] = reported[i]
             out[row, ray + i, 1] = speed[i]

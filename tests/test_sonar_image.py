@@ -12,17 +12,10 @@ from tests.bundles import io_for
 from tests.reference import scenes
 from tests.reference.cfar import first_cells, side_lobe_level
 from tests.reference.sonar_image import cast_rays, echo_power
+from uuvtai.common.errors import UserError
 from uuvtai.config import Config, EpisodeConfig, SensorsConfig, TankConfig
-from uuvtai.errors import UserError
-from uuvtai.kernels.core.signature import Bundle
-from uuvtai.kernels.sensors import sonar, sonar_image
-from uuvtai.kernels.sensors.bundles import SonarIO
-from uuvtai.kernels.sensors.cfar import cfar_factor, level_beside
-from uuvtai.loader import load_config
-from uuvtai.logs.moment import EpisodeHeader, Moment
-from uuvtai.logs.topics.camera_topics import logged_image
-from uuvtai.logs.topics.sonar_topics import ROWS
-from uuvtai.multibeam import (
+from uuvtai.config.loader import load_config
+from uuvtai.config.multibeam import (
     ABSORPTION_NP_M,
     beam_pattern,
     elevation_pattern,
@@ -30,6 +23,12 @@ from uuvtai.multibeam import (
     heard_bearings,
     noise_power,
 )
+from uuvtai.kernels.core.stage import Bundle
+from uuvtai.kernels.sensors import sonar, sonar_image
+from uuvtai.kernels.sensors.cfar import cfar_factor, level_beside
+from uuvtai.kernels.sensors.io import SonarIO
+from uuvtai.logs.encode import EpisodeHeader, Moment
+from uuvtai.logs.topics.sensors import SONAR_ROWS, logged_image
 from uuvtai.state import (
     ClockState,
     EpisodeState,
@@ -360,7 +359,7 @@ def test_beams_have_side_lobes_13_db_down():
 # -------------------------------------------------------------------------------------------------------- log
 
 
-ROW = next(row for row in ROWS if row.name == "/sonar/image")
+ROW = next(row for row in SONAR_ROWS if row.name == "/sonar/image")
 
 
 def moment_of(sonar, heard=None):

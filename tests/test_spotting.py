@@ -19,10 +19,10 @@ from uuvtai.config import (
     TankConfig,
     TrackingConfig,
 )
-from uuvtai.kernels.perception import spotting
-from uuvtai.kernels.perception.bundles import SpottingIO
-from uuvtai.kernels.sensors import depth
-from uuvtai.kernels.sensors.bundles import DepthIO
+from uuvtai.kernels.perception import camera_tracking
+from uuvtai.kernels.perception.io import SpottingIO
+from uuvtai.kernels.sensors import depth_camera
+from uuvtai.kernels.sensors.io import DepthIO
 
 N_ENV, N_TRACK, N_BODY = 12, 3, 3
 TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
@@ -156,12 +156,14 @@ class Rig:
         io = io_for(
             DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, CAMERA, TANK
         )
-        depth.cast_depth(io)
+        depth_camera.cast_depth(io)
         return self.follow()
 
     def follow(self):
-        spotting.scan_columns(io_for(SpottingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK))
-        spotting.follow_spots(
+        camera_tracking.scan_columns(
+            io_for(SpottingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK)
+        )
+        camera_tracking.follow_spots(
             io_for(
                 SpottingIO,
                 self.tracks,
@@ -572,7 +574,7 @@ def test_sleeping_rows_old_images_and_other_rows(rig):
         rig.awake[rows] = still == "stale"
         rig.load()
         before = {name: field.to_numpy() for name, field in vars(rig.tracks).items()}
-        depth.cast_depth(
+        depth_camera.cast_depth(
             io_for(DepthIO, rig.image, rig.ego, rig.vehicle, rig.world, rig.episode, rig.clock, CAMERA, TANK)
         )
         fresh = np.ones(N_ENV)

@@ -6,9 +6,9 @@ import json
 import pytest
 
 from tests.command import Quiet
-from uuvtai.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
-from uuvtai.measure.episodes.methods import trees_of
-from uuvtai.measure.evaluate.compare import Request, compare
+from uuvtai.config.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
+from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.evaluate import Request, compare
 
 
 def test_a_stacks_name_is_a_controller_with_its_own_config_and_tree(tmp_path):
@@ -73,7 +73,7 @@ def compared(small, tmp_path_factory):
         return small.sim
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("uuvtai.sim.Sim", made)
+        patch.setattr("uuvtai.sim.sim.Sim", made)
         found = compare(request, Quiet())
     small.sim.use_tree(small.trees["bt"])
     assert asked == [small.config, with_stack(small.config, "paper")]

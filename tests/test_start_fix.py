@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from uuvtai.link.sectors import ping_of, sectors_of
-from uuvtai.link.start_fix import LONGEST_S, MISFIT, StartFix, WallWatch, expected
-from uuvtai.loader import load_config
-from uuvtai.pilot import DvlReading, ImuReading, SonarPing
+from uuvtai.config.loader import load_config
+from uuvtai.vehicle.onboard import DvlReading, ImuReading, SonarPing
+from uuvtai.vehicle.start_fix import LONGEST_S, MISFIT, StartFix, WallWatch, expected
+from uuvtai.vehicle.telemetry import ping_of, sectors_of
 
 BODIES = ((9.0, 4.4, 0.35), (12.0, 1.2, 0.3), (6.0, 5.0, 0.25), (15.5, 3.2, 0.4), (3.6, 1.4, 0.3))
 """(x, y, radius) [m] of what stands in the tank, unknown to the fix"""

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from uuvtai.measure.evaluate.paired import paired
-from uuvtai.statistics import (
+from uuvtai.common.statistics import (
     binomial_p,
     bootstrap_interval,
     design_effect,
@@ -17,6 +16,7 @@ from uuvtai.statistics import (
     time_to_success_s,
     wilson_interval,
 )
+from uuvtai.evaluation.results import paired
 
 
 @pytest.mark.parametrize(

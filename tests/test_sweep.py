@@ -12,17 +12,15 @@ from tests import worker_work
 from tests.command import Quiet, uuv
 from tests.report_samples import robustness_sweep
 from tests.small_sim import SmallSim
-from uuvtai.loader import ConfigError
-from uuvtai.measure.episodes.playing import Job, run_episodes
-from uuvtai.measure.sweep import play as sweep_run
-from uuvtai.measure.sweep.cells import Grid, grid_of
-from uuvtai.measure.sweep.engines import RayEngine
-from uuvtai.measure.sweep.plan import SweepRequest, base_config, request_of, tasks_of
-from uuvtai.measure.sweep.play import ROWS, read_rows, resume, sweep
-from uuvtai.run_folder import RunFolderError
-from uuvtai.show.screen import Screen
-from uuvtai.show.sweeping import show_sweep
-from uuvtai.workers import EngineError
+from uuvtai.common.processes import EngineError
+from uuvtai.config.loader import ConfigError
+from uuvtai.console.screen import Screen
+from uuvtai.console.views import show_sweep
+from uuvtai.evaluation import sweep as sweep_run
+from uuvtai.evaluation.episodes import Job, run_episodes
+from uuvtai.evaluation.grid import Grid, SweepRequest, base_config, grid_of, request_of, tasks_of
+from uuvtai.evaluation.sweep import ROWS, RayEngine, read_rows, resume, sweep
+from uuvtai.logs.run_folder import RunFolderError
 
 # ------------------------------------------------------------------------------------------------------- grid
 

@@ -9,19 +9,23 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from tests import report_samples as samples
-from uuvtai.measure.evaluate.paired import paired
-from uuvtai.show.evaluation import show_causes, show_methods, show_pairs
-from uuvtai.show.exports import show_export
-from uuvtai.show.health import show_checks
-from uuvtai.show.logs import show_log
-from uuvtai.show.presets import sentences, show_presets
-from uuvtai.show.profile import show_profile
-from uuvtai.show.screen import Screen
-from uuvtai.show.simulation import show_simulation
-from uuvtai.show.sweeping import show_sweep
-from uuvtai.tables.claim_table import claim_table
-from uuvtai.tables.table import PAGE, TERMINAL, Cell, Column, Table, markdown
-from uuvtai.tables.wording import sensing
+from uuvtai.console.doctor import show_checks
+from uuvtai.console.screen import Screen
+from uuvtai.console.views import (
+    sentences,
+    show_causes,
+    show_export,
+    show_log,
+    show_methods,
+    show_pairs,
+    show_presets,
+    show_profile,
+    show_simulation,
+    show_sweep,
+)
+from uuvtai.evaluation.results import paired
+from uuvtai.report.reproduction import claim_table
+from uuvtai.report.tables import PAGE, TERMINAL, Cell, Column, Table, markdown, sensing
 
 WIDTHS = (80, 100, 120)
 

@@ -13,12 +13,12 @@ from tests.bundles import io_for
 from tests.reference import teacher as oracle
 from uuvtai import state
 from uuvtai.config import Config, TeacherConfig
+from uuvtai.config.behavior import TUNED
+from uuvtai.kernels.behavior import avoidance, threats, tree
+from uuvtai.kernels.behavior.io import EvasionIO, TeacherIO, ThreatsIO
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
-from uuvtai.kernels.teacher import evasion, leaves, threats
-from uuvtai.kernels.teacher.bundles import EvasionIO, TeacherIO, ThreatsIO
-from uuvtai.tree import load_tree, parse_tree, read_tree
-from uuvtai.tuned_numbers import TUNED
+from uuvtai.sim.behavior_tree import load_tree, parse_tree, read_tree
 
 N_ENV, N_TRACK, N_RAY = 6, 4, 64
 TEACHER = {
@@ -137,7 +137,7 @@ def scene(stage):
     stage.clearance.site_row.fill(-1)
     stage.clearance.site_col.fill(-1)
     use(stage, "bt")
-    leaves.reset_teacher(io_for(TeacherIO, stage.t, stage.table, stage.mission, stage.clock))
+    tree.reset_teacher(io_for(TeacherIO, stage.t, stage.table, stage.mission, stage.clock))
     return stage
 
 
@@ -195,7 +195,7 @@ def assess(stage, cfg=CFG.teacher, sonar=CFG.sensors.sonar):
 
 
 def plan(stage):
-    evasion.plan_evasion(
+    avoidance.plan_evasion(
         io_for(
             EvasionIO,
             stage.t,
@@ -220,7 +220,7 @@ def decide(stage):
 
 
 def tick(stage, sonar=CFG.sensors.sonar):
-    leaves.tick_tree(
+    tree.tick_tree(
         io_for(
             TeacherIO,
             stage.t,
@@ -1053,7 +1053,7 @@ def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
         scene.clock.awake.fill(1)
         scene.clock.step.fill(0)
         scene.forecast.radius_m.fill(-1.0)
-        leaves.reset_teacher(io_for(TeacherIO, scene.t, scene.table, scene.mission, scene.clock))
+        tree.reset_teacher(io_for(TeacherIO, scene.t, scene.table, scene.mission, scene.clock))
         body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
         for env in range(1, N_ENV):
             if others:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests import test_deploy as deployed
-from uuvtai.deploy import onnx_session
+from uuvtai.learning.export import graph
 
 ROOT = Path(__file__).parent.parent
 
@@ -72,7 +72,7 @@ def watched(work, home):
         "XDG_STATE_HOME": home / "state",
         "XDG_DATA_HOME": home / "state",
     }
-    environment = {name: value for name, value in os.environ.items() if name != onnx_session.VARIABLE}
+    environment = {name: value for name, value in os.environ.items() if name != graph.VARIABLE}
     environment |= {name: str(place) for name, place in places.items()} | {
         "TMPDIR": str(home / "tmp"),
         "PYTHONPATH": str(ROOT),
@@ -141,16 +141,16 @@ def test_the_watch_sees_a_native_socket_of_a_network(tmp_path, family, is_seen):
 def test_the_call_is_made_before_a_session(monkeypatch):
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra uuvtai[export]")
     order = []
-    monkeypatch.delenv(onnx_session.VARIABLE, raising=False)
+    monkeypatch.delenv(graph.VARIABLE, raising=False)
     monkeypatch.setattr(
         onnxruntime,
         "disable_telemetry_events",
-        lambda: order.append(f"off {os.environ.get(onnx_session.VARIABLE)}"),
+        lambda: order.append(f"off {os.environ.get(graph.VARIABLE)}"),
     )
     monkeypatch.setattr(
         onnxruntime, "InferenceSession", lambda *_arguments, **_words: order.append("session")
     )
-    onnx_session.session(b"")
+    graph.session(b"")
     assert order == ["off 1", "session"]
 
 
@@ -167,7 +167,7 @@ def test_one_place_imports_onnx_runtime():
                     if any(name.split(".")[0] == "onnxruntime" for name in names)
                     else []
                 )
-    assert places == ["uuvtai/deploy/onnx_session.py"]
+    assert places == ["uuvtai/learning/export/graph.py"]
 
 
 def test_only_versions_that_were_checked_are_installed():
@@ -182,4 +182,4 @@ def test_the_library_reads_the_variable():
     libraries = list((Path(onnxruntime.__file__).parent / "capi").glob("*onnxruntime*.so*"))
     content = b"".join(path.read_bytes() for path in libraries)
     assert content, "no library found"
-    assert b"mobile.events.data.microsoft.com" not in content or onnx_session.VARIABLE.encode() in content
+    assert b"mobile.events.data.microsoft.com" not in content or graph.VARIABLE.encode() in content

@@ -12,19 +12,13 @@ import pytest
 
 from benchmarks.peers.stand_in_autopilot import StandIn
 from tests.mavlink_vehicle import FakeSub, WishfulPilot, link_config
-from uuvtai.link.endpoint import Endpoint, LinkPlace
-from uuvtai.link.flight_plan import FlightPlan
-from uuvtai.link.followed_endpoint import SILENT_S, FollowedEndpoint
-from uuvtai.link.intake import Heard
-from uuvtai.link.link_errors import LinkError
-from uuvtai.link.link_log import LinkLog
-from uuvtai.link.onboard_loop import DEAF_S, FlightNotes, OnboardLoop
-from uuvtai.link.safety import STOP, SafeAction, SafeDecision, SafetyLimits
-from uuvtai.pilot import ImuReading, Mission, PositionFix
-from uuvtai.sitl.instance import Instance
-from uuvtai.sitl.rows_of_water import WaterRows
-from uuvtai.sitl.serving import SimulatedOperator, SitlPlan, SitlPort
-from uuvtai.sitl.serving_notes import ServingNotes
+from uuvtai.vehicle.control_loop import DEAF_S, FlightNotes, FlightPlan, OnboardLoop
+from uuvtai.vehicle.mavlink import SILENT_S, Endpoint, FollowedEndpoint, LinkError, LinkPlace
+from uuvtai.vehicle.onboard import ImuReading, Mission, PositionFix
+from uuvtai.vehicle.pilot_log import LinkLog
+from uuvtai.vehicle.safety import STOP, SafeAction, SafeDecision, SafetyLimits
+from uuvtai.vehicle.sitl import Instance, ServingNotes, SimulatedOperator, SitlPlan, SitlPort, WaterRows
+from uuvtai.vehicle.telemetry import Heard
 
 HERE = LinkPlace("127.0.0.1", 0, False)
 ROW = 2
@@ -342,7 +336,7 @@ def test_what_the_pilot_says_it_waits_for():
 
 def test_ids_that_are_others_are_named():
     """A vehicle and a ground station that are there, but are not the ones that were typed."""
-    from uuvtai.link.intake import Intake
+    from uuvtai.vehicle.telemetry import Intake
 
     intake = Intake(link_config(), (0.0, 0.0, 0.0), 0.0)
     intake.take("HEARTBEAT", 3, 1, {"type": 12, "autopilot": 3, "base_mode": 0, "custom_mode": 0}, 1.0)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uuvtai.kernels.vehicle.rotor import KGF, edge_rpm, thrust_at, thrust_limits
-from uuvtai.loader import ConfigError, load_config
+from uuvtai.config.loader import ConfigError, load_config
+from uuvtai.kernels.vehicle.dynamics import KGF, edge_rpm, thrust_at, thrust_limits
 
 TABLE = Path(__file__).parents[1] / "docs" / "data" / "t200.csv"
 RMS_KGF = 0.05

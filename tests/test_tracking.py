@@ -20,7 +20,7 @@ from uuvtai.config import (
 )
 from uuvtai.kernels.core import kalman
 from uuvtai.kernels.perception import tracking
-from uuvtai.kernels.perception.bundles import TrackingIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import ClockState, ClusterState, HabitState, SonarScan, TrackState, allocate
 
 N_ENV = 16

@@ -9,9 +9,9 @@ import torch
 
 from tests.point_env import PointEnv
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learn.guard import Guard, TrainingError
-from uuvtai.learn.packing import pack
-from uuvtai.learn.train import Trainer
+from uuvtai.learning.checkpoint import pack
+from uuvtai.learning.networks import Guard, TrainingError
+from uuvtai.learning.trainer import Trainer
 
 ROOT = Path(__file__).parent.parent
 WALL_TIMES = "time/simulate_s", "time/infer_s", "time/learn_s", "time/env_steps_per_s"

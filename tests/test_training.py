@@ -13,17 +13,16 @@ import torch
 
 from tests.point_env import PointEnv
 from tests.small_sim import SmallSim
-from uuvtai.env import VectorEnv
-from uuvtai.learn import checkpoint
-from uuvtai.learn import run as training
-from uuvtai.learn.guard import TrainingError
-from uuvtai.learn.packing import pack
-from uuvtai.learn.recorder import read_metrics
-from uuvtai.learn.run import TrainRequest
-from uuvtai.learn.train import Trainer
-from uuvtai.loader import ConfigError, load_training
-from uuvtai.measure.evaluate.while_training import evaluate_now
-from uuvtai.run_folder import RunFolder, RunFolderError
+from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.envs.vector_env import VectorEnv
+from uuvtai.evaluation.evaluate import evaluate_now
+from uuvtai.learning import checkpoint
+from uuvtai.learning import runner as training
+from uuvtai.learning.checkpoint import pack
+from uuvtai.learning.networks import TrainingError
+from uuvtai.learning.runner import TrainRequest, read_metrics
+from uuvtai.learning.trainer import Trainer
+from uuvtai.logs.run_folder import RunFolder, RunFolderError
 
 TINY = {
     "policy.hidden": [8, 8], "world_model.hidden": [8], "world_model.latent": 4,
@@ -207,7 +206,7 @@ def test_a_run_that_cannot_go_on_says_why_and_loses_nothing(points, tmp_path, mo
 
 
 def test_an_evaluation_is_no_training_run(tmp_path):
-    from uuvtai.loader import load_config
+    from uuvtai.config.loader import load_config
 
     RunFolder(tmp_path / "run", load_config("pool"), [0])
     with pytest.raises(ConfigError, match="is no training run"):
@@ -219,7 +218,7 @@ def test_two_processes_do_not_train_in_one_folder(points, tmp_path):
     script = """if True:
         import sys
         from pathlib import Path
-        from uuvtai.run_folder import RunFolder
+        from uuvtai.logs.run_folder import RunFolder
         folder = RunFolder.__new__(RunFolder)
         folder.path = Path(sys.argv[1])
         folder.hold()

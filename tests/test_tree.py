@@ -12,14 +12,16 @@ from benchmarks.peers.tick_py_trees import PyTree
 from docs.writers.palettes import with_palette
 from tests.bundles import io_for
 from uuvtai import state
-from uuvtai import tree_codes as codes
+from uuvtai.common import tree_codes as codes
+from uuvtai.common.presets import preset_names
 from uuvtai.config import TeacherConfig
-from uuvtai.kernels.teacher.bundles import TeacherIO
-from uuvtai.kernels.teacher.tree_tick import tick_with_given_statuses
-from uuvtai.loader import ConfigError, preset_names, preset_path
-from uuvtai.show.screen import Screen
-from uuvtai.show.trees import show_tree
-from uuvtai.tree import (
+from uuvtai.config.behavior import TUNED
+from uuvtai.config.loader import ConfigError, preset_path
+from uuvtai.console.screen import Screen
+from uuvtai.console.views import show_tree
+from uuvtai.kernels.behavior.io import TeacherIO
+from uuvtai.kernels.behavior.tree import tick_with_given_statuses
+from uuvtai.sim.behavior_tree import (
     CONTROLS,
     DECORATORS,
     LEAVES,
@@ -32,7 +34,6 @@ from uuvtai.tree import (
     tree_dot,
     tree_text,
 )
-from uuvtai.tuned_numbers import TUNED
 
 N_BOARD = 20
 """Random blackboards per tree: one env each."""

@@ -12,11 +12,11 @@ from tests.sources import nodes_of
 from tests.test_architecture import PACKAGE
 from uuvtai import state
 from uuvtai.config import Config, TrackingConfig, WorldConfig
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.geometry import NONE, SPHERE
-from uuvtai.kernels.privileged import true_tracks
-from uuvtai.kernels.privileged.bundles import TrueTracksIO
-from uuvtai.loader import load_config
-from uuvtai.sizes import array_sizes
+from uuvtai.kernels.oracle import true_state
+from uuvtai.kernels.oracle.io import TrueTracksIO
+from uuvtai.sim.setup import array_sizes
 
 HEIGHT_STEP_M = 1.6 / 15
 """Between two hypotheses of a body's height in a tank 1.6 m deep."""
@@ -124,7 +124,7 @@ def test_where_tracks_are_too_few_the_nearest_bodies_get_them():
         world.size[0, first + lane] = (0.2, 0.2, 0.2)
         world.vel_w[0, first + lane] = (0.5, 0.0, 0.0)
         path.n_way[0, lane] = 2
-    true_tracks.know_bodies(
+    true_state.know_bodies(
         io_for(TrueTracksIO, tracks, clusters, world, path, ego, clock, config.elevation, config.world.tank)
     )
     ti.sync()
@@ -141,5 +141,5 @@ def test_only_an_evaluation_that_is_asked_to_switches_it_on(small):
         if isinstance(node, ast.Assign)
         and any(getattr(target, "attr", "") == "privileged" for target in node.targets)
     }
-    assert setters == {"sim.py", "method_run.py"}
+    assert setters == {"sim.py", "evaluate.py"}
     assert "privileged" not in load_config("pool", "paper").model_dump_json()

@@ -7,21 +7,20 @@ import pytest
 import taichi as ti
 import torch
 
+from uuvtai.common.errors import UserError
 from uuvtai.config import FastConfig, SlowConfig
-from uuvtai.errors import UserError
-from uuvtai.initial import fill_constants
-from uuvtai.kernels.core.signature import AnyTensor, In
-from uuvtai.kernels.teacher.trajectories import tuned
-from uuvtai.learn import checkpoint
-from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.number_search import BEND_MEAN, NumberSearch, best_near, fitted
-from uuvtai.learn.pilot import load_pilot
-from uuvtai.learn.tuned_pilot import TunedPilot, load_tuned, tuned_sections
-from uuvtai.learn.tuner_trainer import TunerTrainer
-from uuvtai.loader import load_config, load_training, with_stack
-from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.config.behavior import CALM, DEVIATION, FAST, GAZE, HORIZON, RANGE, SLOW, TTC, TUNED, log_bounds
+from uuvtai.config.loader import load_config, load_training, with_stack
+from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.kernels.behavior.rollout import tuned
+from uuvtai.kernels.core.stage import AnyTensor, In
+from uuvtai.learning import checkpoint
+from uuvtai.learning.agents import TunedPilot, load_tuned, tuned_sections
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.parameter_search import BEND_MEAN, NumberSearch, TunerTrainer, best_near, fitted
+from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.sim.setup import fill_constants
 from uuvtai.state import TeacherState, allocate
-from uuvtai.tuned_numbers import CALM, DEVIATION, FAST, GAZE, HORIZON, RANGE, SLOW, TTC, TUNED, log_bounds
 
 SMALL = {
     "train.num_envs": 8,
@@ -200,7 +199,7 @@ def test_a_scene_that_is_neither_slow_nor_fast_is_refused():
 
 
 def test_arrivals_count_and_early_ones_more(trainer):
-    from uuvtai.outcomes import COLLISION, SUCCESS
+    from uuvtai.common.enums import COLLISION, SUCCESS
 
     outcome, steps = torch.tensor([SUCCESS, SUCCESS, COLLISION]), torch.tensor([500, 1000, 100])
     assert trainer._scored(outcome, steps, FAST).tolist() == pytest.approx([1 - 0.05, 1 - 0.1, 0.0])

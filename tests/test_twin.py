@@ -9,29 +9,27 @@ import torch
 
 from tests.reference import hull_rule as reference
 from tests.test_architecture import TRUTH
-from uuvtai.binding import bind, members_of
-from uuvtai.closed_form import describe_scenario, path_positions
+from uuvtai.common.enums import BODY_WIDTH, COLLISION, EGO_COLUMNS, N_RAY, RUNNING, SUCCESS, TIMEOUT
+from uuvtai.common.errors import UserError
+from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.config.learning import LearningConfig
-from uuvtai.errors import UserError
+from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.evaluation.episodes import jobs_of, run_episodes
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
 from uuvtai.kernels.core.noise import episode_key
-from uuvtai.kernels.core.signature import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
-from uuvtai.learn import checkpoint, twin_trainer, warm_start
-from uuvtai.learn.manifest import CheckpointError
-from uuvtai.learn.pilot import load_pilot
-from uuvtai.learn.run import TrainRequest, train
-from uuvtai.learn.set_pilot import load_set_pilot
-from uuvtai.learn.set_policy import SetActor
-from uuvtai.learn.twin_trainer import TwinTrainer
-from uuvtai.learn.warm_start import Student, imitate, wish_of_command
-from uuvtai.loader import ConfigError, load_training
-from uuvtai.measure.episodes.playing import jobs_of, run_episodes
-from uuvtai.outcomes import COLLISION, RUNNING, SUCCESS, TIMEOUT
-from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
-from uuvtai.twin.scenario_bank import draw_bank
-from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
-from uuvtai.twin.twin_arrays import TRACK_WIDTH, ObserverIO, TwinRules
+from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
+from uuvtai.learning import checkpoint, surrogate_trainer
+from uuvtai.learning.agents import load_set_pilot
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.runner import TrainRequest, train
+from uuvtai.learning.set_networks import SetActor
+from uuvtai.learning.surrogate_trainer import Student, TwinTrainer, imitate, wish_of_command
+from uuvtai.sim.stages import bind, members_of
+from uuvtai.surrogate import motion, observation, sensing
+from uuvtai.surrogate.arrays import TRACK_WIDTH, ObserverIO, TwinRules
+from uuvtai.surrogate.world import draw_bank
 
 CLEARANCE_TOL_M = 0.01
 """the simulator's hull leans by a few degrees, the twin's does not"""
@@ -58,7 +56,7 @@ SMALL = {
 def lay(wishes: FloatMatrix, vehicle: Const[VehicleConfig], tank: Const[TankConfig], out: FloatMatrix):
     for i in range(wishes.shape[0]):
         wish = ti.Vector([wishes[i, 0], wishes[i, 1], wishes[i, 2]])
-        command = hull_rule.hull_command(wish, wishes[i, 3], wishes[i, 4], 0.25, vehicle, tank)
+        command = motion.hull_command(wish, wishes[i, 3], wishes[i, 4], 0.25, vehicle, tank)
         for j in ti.static(range(4)):
             out[i, j] = command[j]
 
@@ -66,7 +64,7 @@ def lay(wishes: FloatMatrix, vehicle: Const[VehicleConfig], tank: Const[TankConf
 @ti.kernel
 def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
     for row, lane in ti.ndrange(path.shape[0], path.shape[1]):
-        place = kinematics.path_place(row, lane, times[row], path)
+        place = motion.path_place(row, lane, times[row], path)
         for i in ti.static(range(4)):
             out[row, lane, i] = place[i]
 
@@ -74,7 +72,7 @@ def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
 @ti.kernel
 def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[TwinRules], ray: FloatMatrix):
     for i in range(place.shape[0]):
-        sensing_model.write_rays(i, i, body.shape[1], place[i, 0], place[i, 1], body, ray, io)
+        sensing.write_rays(i, i, body.shape[1], place[i, 0], place[i, 1], body, ray, io)
 
 
 @ti.kernel
@@ -92,12 +90,12 @@ def threats(
     for i in range(pose.shape[0]):
         before = ti.Vector([pose[i, k] for k in ti.static(range(3))])
         after = before + ti.Vector([moved[i, k] for k in ti.static(range(3))])
-        near = kinematics.EVERY_SLOT + 0
+        near = motion.EVERY_SLOT + 0
         if near_only == 1:
-            near = kinematics.near_slots(i, before, pose[i, 3], body, path, io)
+            near = motion.near_slots(i, before, pose[i, 3], body, path, io)
         ahead = ti.Vector([1.0, 0.0, 0.0])
         t_s = pose[i, 3] + moved[i, 3]
-        threat = kinematics.nearest_of(near, i, after, ahead, ahead, 0.0, t_s, body, path, io)
+        threat = motion.nearest_of(near, i, after, ahead, ahead, 0.0, t_s, body, path, io)
         out[i, 0], out[i, 1] = threat[0], threat[1]
 
 
@@ -107,9 +105,9 @@ def watch(at: FloatMatrix, is_seen: int, steps: int, bend_m: float, track: AnyTe
     for i in range(at.shape[0]):
         place = ti.Vector([at[i, 0], at[i, 1], at[i, 2], at[i, 3]])
         for step in range(steps):
-            key = episode_key(step // sensing_model.SPELL, i)
+            key = episode_key(step // sensing.SPELL, i)
             old = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
-            new = sensing_model.updated_track(
+            new = sensing.updated_track(
                 old, 0, place, bend_m, 1.0, ti.Vector([0.0, 0.0]), is_seen == 1, 0, 1, key
             )
             for k in ti.static(range(TRACK_WIDTH)):
@@ -120,13 +118,13 @@ def watch(at: FloatMatrix, is_seen: int, steps: int, bend_m: float, track: AnyTe
 def tracked(track: AnyTensor, out: AnyTensor):
     for i in range(track.shape[0]):
         row = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
-        out[i] = sensing_model.is_tracked(row)
+        out[i] = sensing.is_tracked(row)
 
 
 @ti.kernel
 def velocities(wish: FloatMatrix, flip: FloatMatrix, vehicle: Const[VehicleConfig], out: FloatMatrix):
     for i in range(wish.shape[0]):
-        found = hull_rule.wished_velocity(wish[i, 0], wish[i, 1], wish[i, 2], flip[i, 0], flip[i, 1], vehicle)
+        found = motion.wished_velocity(wish[i, 0], wish[i, 1], wish[i, 2], flip[i, 0], flip[i, 1], vehicle)
         for j in ti.static(range(3)):
             out[i, j] = found[j]
 
@@ -136,7 +134,7 @@ def earn(
     nearer: FloatVector, nearest: FloatVector, ended: IntVector, io: Bundle[TwinRules], out: FloatVector
 ):
     for i in range(out.shape[0]):
-        out[i] = kinematics.earned(nearer[i], nearest[i], ended[i], io)
+        out[i] = motion.earned(nearer[i], nearest[i], ended[i], io)
 
 
 @pytest.fixture(scope="module")
@@ -237,9 +235,9 @@ def test_the_referee_is_the_simulators(small, bank, config):
             continue
         rows, referee = small.sim.rows, small.sim.s.referee
         seen, outcome = torch.zeros(small.N, 2), torch.zeros(small.N, dtype=torch.int32)
-        kinematics.judge_states(rules, states_of(small.sim), bank.body, bank.path, seen, outcome)
+        motion.judge_states(rules, states_of(small.sim), bank.body, bank.path, seen, outcome)
         clearance, ttc, ended = rows(referee.clearance_m), rows(referee.ttc_s), rows(referee.outcome)
-        near, soon = clearance < kinematics.NEAR_M, (ttc < SOON_S) & (ttc > 0.0)
+        near, soon = clearance < motion.NEAR_M, (ttc < SOON_S) & (ttc > 0.0)
         np.testing.assert_allclose(seen[near, 0], clearance[near], atol=CLEARANCE_TOL_M)
         np.testing.assert_allclose(seen[soon, 1], ttc[soon], atol=TTC_TOL_S)
         edge = (abs(clearance - 0.1) < CLEARANCE_TOL_M) | (abs(ttc - 0.18) < TTC_TOL_S)
@@ -254,7 +252,7 @@ def test_far_bodies_are_left_out(config):
     far[0, 0] = torch.tensor([1.0, 15.0, 3.0, -0.8, 0.2, 0.2, 0.2, 0.0])
     pose = torch.tensor([[5.0, 3.0, -0.8, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 18.0, 3.0, -0.8]])
     seen, outcome = torch.zeros(1, 2), torch.zeros(1, dtype=torch.int32)
-    kinematics.judge_states(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
+    motion.judge_states(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
     assert seen[0, 1] == FAR_M and outcome[0] == 0
     assert seen[0, 0] == pytest.approx(3.0 - 0.17, abs=FLOAT_TOL)  # the side walls
 
@@ -445,11 +443,11 @@ def test_a_command_becomes_the_wish_with_its_velocity():
 
 
 def test_it_learns_what_the_tree_says(small, monkeypatch):
-    monkeypatch.setattr(warm_start, "PASSES", 1)
+    monkeypatch.setattr(surrogate_trainer, "PASSES", 1)
     losses, decisions = [], []
     config = load_training("twin", overrides=SMALL | {"train.num_envs": small.N, "twin.warm_start_waves": 2})
     for passes in (1, 20):
-        monkeypatch.setattr(warm_start, "LAST_PASSES", passes)
+        monkeypatch.setattr(surrogate_trainer, "LAST_PASSES", passes)
         actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
         std = actor.log_std.detach().clone()
         found = imitate(actor, config, ((8, 6, 0.6),), {"pool": small.sim})
@@ -505,7 +503,7 @@ def test_rays_end_at_the_walls(small):
     small.begin(range(small.N), seed=5)
     io = bind(ObserverIO, small.sim.s, small.sim.config)
     ego, raw, ray = torch.zeros(small.N, 21), torch.zeros(small.N, 9, 14), torch.zeros(small.N, 24)
-    observer.observe_bodies(io, torch.ones(small.N, dtype=torch.int32), ego, raw, ray)
+    observation.observe_bodies(io, torch.ones(small.N, dtype=torch.int32), ego, raw, ray)
     y = small.sim.rows(small.sim.s.ego.pos_w)[:, 1]
     assert (ray[:, 6].numpy() <= 6.0 - y + 0.2).all() and (ray[:, 18].numpy() <= y + 0.2).all()
     assert bool((ray > 0.3).all())
@@ -543,8 +541,8 @@ def test_what_the_twin_lacks_is_refused(bank, key, value, says):
 
 
 def test_the_trainer_knows_how_long_the_twin_holds_a_decision():
-    assert twin_trainer.HOLD_STEPS == kinematics.STEPS
-    assert twin_trainer.DECISION_S == sensing_model.DT_S
+    assert surrogate_trainer.HOLD_STEPS == motion.STEPS
+    assert surrogate_trainer.DECISION_S == sensing.DT_S
 
 
 def test_it_is_no_policy_of_one_observation(saved):

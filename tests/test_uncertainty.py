@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from uuvtai.config.learning import UncertaintyConfig
-from uuvtai.learn.distill import Uncertainty
+from uuvtai.learning.distillation import Uncertainty
 
 
 def after(config, *batches):

@@ -10,11 +10,11 @@ import taichi as ti
 from tests.bundles import clear, io_for
 from tests.reference import habits as habit_oracle
 from uuvtai.config import Config
-from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.core.signature import AnyTensor, Bundle
-from uuvtai.kernels.perception.bundles import TrackingIO
+from uuvtai.kernels.core.simd import LANES
+from uuvtai.kernels.core.stage import AnyTensor, Bundle
+from uuvtai.kernels.perception.io import TrackingIO
+from uuvtai.kernels.perception.track_filter import turn_back_rate, turned_back
 from uuvtai.kernels.perception.tracking import predict_tracks
-from uuvtai.kernels.perception.unseen import turn_back_rate, turned_back
 from uuvtai.state import ClusterState, HabitState, SonarScan, TrackState, allocate
 
 N = 64

@@ -10,10 +10,10 @@ import taichi as ti
 from tests import planning_maps as maps
 from tests.planning_stage import CONFIG, N_ENV, N_PLAN, clean, plan, put_ends, put_maps, stage, way_of
 from tests.reference import voronoi as oracle
-from uuvtai import plan_codes
-from uuvtai.kernels.core import heap
-from uuvtai.kernels.core.signature import Out
-from uuvtai.kernels.planning import medial
+from uuvtai.common import enums
+from uuvtai.kernels.core import grid
+from uuvtai.kernels.core.stage import Out
+from uuvtai.kernels.planning import medial_axis
 from uuvtai.state import VoronoiState
 
 N_MAP = 300
@@ -78,10 +78,10 @@ def test_a_route_is_found_exactly_where_there_is_one():
     solvable = [row for row in planned_maps() if np.isfinite(row[1])]
     assert 200 < len(solvable) < len(planned_maps())
     for seed, exact, reason, way, *_ in planned_maps():
-        assert (reason == plan_codes.FAIL_NONE) == np.isfinite(exact), (
+        assert (reason == enums.FAIL_NONE) == np.isfinite(exact), (
             f"map {seed}: reason {reason}, exact cost {exact}"
         )
-        assert reason in (plan_codes.FAIL_NONE, plan_codes.FAIL_DISCONNECTED)
+        assert reason in (enums.FAIL_NONE, enums.FAIL_DISCONNECTED)
         assert (len(way) > 0) == np.isfinite(exact)
 
 
@@ -142,8 +142,8 @@ def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
                 other_row, other_col = np.roll(row, step, axis), np.roll(col, step, axis)
                 gap = np.hypot(other_row - row, other_col - col)
                 expected |= (row >= 0) & (other_row >= 0) & (gap > V.site_gap_cells)
-            known = bits & medial.KNOWN != 0
-            assert np.array_equal((bits & medial.SKELETON != 0)[known], expected[known])
+            known = bits & medial_axis.KNOWN != 0
+            assert np.array_equal((bits & medial_axis.SKELETON != 0)[known], expected[known])
             asked, on_it = asked + known.sum(), on_it + expected[known].sum()
     assert asked > 10_000 and 0 < on_it < asked
 
@@ -161,7 +161,7 @@ def test_the_first_plan_knows_nothing():
     put_ends([(2.0, 1.2)] * N_ENV, [(18.0, 4.8)] * N_ENV)
     plan([0])
     assert s.route.n_way[0] > 16.0 / CONFIG.route.spacing_m
-    assert s.route.planner[0] == plan_codes.PLANNER_VORONOI and s.route.planned_by[0, 0] == 1
+    assert s.route.planner[0] == enums.PLANNER_VORONOI and s.route.planned_by[0, 0] == 1
     assert s.voronoi.pops[0] < 1500, "open water is crossed without visiting all of it"
 
 
@@ -198,8 +198,8 @@ def test_a_gap_of_exactly_d_min_is_passable_and_a_cell_less_is_not():
     put_maps([wide, tight] + [wide] * (N_ENV - 2))
     put_ends([(18.2, 2.25)] * N_ENV, [(19.4, 2.25)] * N_ENV)
     plan([0, 1], STRICT)
-    assert s.route.fallback_reason[0] == plan_codes.FAIL_NONE
-    assert s.route.fallback_reason[1] == plan_codes.FAIL_DISCONNECTED
+    assert s.route.fallback_reason[0] == enums.FAIL_NONE
+    assert s.route.fallback_reason[1] == enums.FAIL_DISCONNECTED
     assert s.route.n_way[1] == 0
 
 
@@ -210,7 +210,7 @@ def test_start_or_goal_outside_is_named():
         [(18.0, 3.0), (18.0, 5.9)] + [(18.0, 3.0)] * 6,
     )
     plan([0, 1, 2, 3])
-    start, goal, none = plan_codes.FAIL_START_OUTSIDE, plan_codes.FAIL_GOAL_OUTSIDE, plan_codes.FAIL_NONE
+    start, goal, none = enums.FAIL_START_OUTSIDE, enums.FAIL_GOAL_OUTSIDE, enums.FAIL_NONE
     assert [s.route.fallback_reason[env] for env in range(4)] == [start, goal, start, none]
     assert [s.route.fallbacks[env, start - 1] for env in range(4)] == [1, 0, 1, 0]
     assert s.route.n_failed[None] == 3 and sorted(s.route.failed[i] for i in range(3)) == [0, 1, 2]
@@ -222,7 +222,7 @@ def test_a_failed_plan_keeps_the_old_route():
     before = way_of(0)
     put_maps([np.abs(maps.X - 10.0) < 0.2] * N_ENV)
     plan([0])
-    assert s.route.fallback_reason[0] == plan_codes.FAIL_DISCONNECTED
+    assert s.route.fallback_reason[0] == enums.FAIL_DISCONNECTED
     assert np.array_equal(way_of(0), before) and s.route.planned_by[0, 0] == 1
 
 
@@ -231,9 +231,9 @@ def test_the_dynamic_layer_counts_only_when_asked_for():
     s.grid_map.dynamic_occ.from_numpy(np.array([np.abs(maps.X - 18.7) < 0.1] * N_ENV, np.float32))
     put_ends([(18.0, 3.0)] * N_ENV, [(19.5, 3.0)] * N_ENV)
     plan([0])
-    assert s.route.fallback_reason[0] == plan_codes.FAIL_NONE
+    assert s.route.fallback_reason[0] == enums.FAIL_NONE
     plan([0], STRICT)
-    assert s.route.fallback_reason[0] == plan_codes.FAIL_DISCONNECTED
+    assert s.route.fallback_reason[0] == enums.FAIL_DISCONNECTED
 
 
 def test_clearance_beyond_room_m_is_worth_no_detour():
@@ -254,9 +254,9 @@ def test_the_budget_ends_the_search():
     )  # the search runs from the goal and visits all of its side
     put_ends([(19.4, 3.0)] * N_ENV, [(2.0, 3.0)] * N_ENV)
     plan([0], STRICT)
-    assert s.route.fallback_reason[0] == plan_codes.FAIL_BUDGET
+    assert s.route.fallback_reason[0] == enums.FAIL_BUDGET
     plan([0])
-    assert s.route.fallback_reason[0] == plan_codes.FAIL_DISCONNECTED
+    assert s.route.fallback_reason[0] == enums.FAIL_DISCONNECTED
 
 
 def test_a_route_too_long_for_its_waypoints_is_spaced_wider():
@@ -270,7 +270,7 @@ def test_a_route_too_long_for_its_waypoints_is_spaced_wider():
     fine = CONFIG.model_copy(update={"route": CONFIG.route.model_copy(update={"spacing_m": 0.05})})
     plan([0], fine)
     length = np.linalg.norm(np.diff(way_of(0), axis=0), axis=1)
-    assert s.route.fallback_reason[0] == plan_codes.FAIL_NONE
+    assert s.route.fallback_reason[0] == enums.FAIL_NONE
     assert length.sum() / 0.05 > CONFIG.route.n_way >= s.route.n_way[0] > 0.5 * CONFIG.route.n_way
     assert length.max() > 0.05
 
@@ -293,14 +293,14 @@ def sorted_by_heap(
     for _ in range(1):
         size, taken = 0, 0
         for i in range(key.shape[0]):
-            size = heap.heap_after_push(voronoi, 0, size, i, key[i])
+            size = grid.heap_after_push(voronoi, 0, size, i, key[i])
             if i % 2 == 1:
-                out[taken] = heap.top_cell(voronoi, 0)
-                size = heap.heap_after_pop(voronoi, 0, size)
+                out[taken] = grid.top_cell(voronoi, 0)
+                size = grid.heap_after_pop(voronoi, 0, size)
                 taken += 1
         while size > 0:
-            out[taken] = heap.top_cell(voronoi, 0)
-            size = heap.heap_after_pop(voronoi, 0, size)
+            out[taken] = grid.top_cell(voronoi, 0)
+            size = grid.heap_after_pop(voronoi, 0, size)
             taken += 1
 
 

@@ -8,7 +8,7 @@ import torch
 
 from tests.scripted_env import JUMP, N_TARGET, ScriptedEnv
 from tests.test_train import config_of
-from uuvtai.learn.train import Trainer
+from uuvtai.learning.trainer import Trainer
 
 STEPS, ITERATIONS = 16, 8
 LAMBDA = [1.0, 0.9]

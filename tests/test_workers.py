@@ -12,7 +12,7 @@ import pytest
 
 import uuvtai
 from tests import worker_work
-from uuvtai.workers import EngineError, LocalEngine
+from uuvtai.common.processes import EngineError, LocalEngine
 
 
 def test_local_workers_give_every_result_once():
@@ -80,8 +80,8 @@ def _gone(pid, patience_s=30.0):
 _SIGNALLED_WHILE_ONE_STARTS = """
 import os, signal, sys
 from multiprocessing import util
-from uuvtai import signals
-from uuvtai.workers import LocalEngine
+from uuvtai.common import signals
+from uuvtai.common.processes import LocalEngine
 
 spawn, sent = util.spawnv_passfds, []
 

@@ -14,16 +14,17 @@ import yaml
 from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import world as reference
-from uuvtai import scenario, state
-from uuvtai.closed_form import KIND_NAMES, describe_scenario, path_positions
+from uuvtai import state
+from uuvtai.common.obstacle_motion import KIND_NAMES, describe_scenario, path_positions
+from uuvtai.common.presets import PRESET_DIR, preset_names
 from uuvtai.config import EpisodeConfig, TrafficConfig, WorldConfig
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.task import episode
-from uuvtai.kernels.task.bundles import EpisodeIO
-from uuvtai.kernels.world import scenarios
-from uuvtai.kernels.world.bundles import WorldIO
-from uuvtai.loader import load_config
-from uuvtai.shipped import PRESET_DIR, preset_names
+from uuvtai.kernels.task.io import EpisodeIO
+from uuvtai.kernels.world import scenario as scenarios
+from uuvtai.kernels.world.io import WorldIO
+from uuvtai.sim import setup
 
 RULES = EpisodeConfig()
 """one object: a kernel is compiled anew for another"""
@@ -61,18 +62,18 @@ class Drawn:
 
     def __init__(self, cfg, n_env=N):
         self.cfg, self.n_env = cfg, n_env
-        sizes = {"n_env": n_env, **scenario.scenario_sizes(cfg)}
+        sizes = {"n_env": n_env, **setup.scenario_sizes(cfg)}
         self.structs = [state.allocate(struct, sizes) for struct in STRUCTS]
         self.world, self.path, self.mission, _, self.scene, self.fixed, self.episode, self.clock = (
             self.structs
         )
-        self.slots = scenario.body_slots(cfg)
-        scenario.load_fixed(self.fixed, cfg)
+        self.slots = setup.body_slots(cfg)
+        setup.load_fixed(self.fixed, cfg)
 
     def draw(self, seed=0, numbers=None, mask=None, scene=None):
         """Arrays by name of the episodes ``numbers`` (default 0 .. n_env - 1)."""
         cfg, n = self.cfg, self.n_env
-        scenario.set_scenes(self.scene, cfg, [scene or (cfg.n_static, cfg.n_dynamic, cfg.dynamic_speed_m_s)])
+        setup.set_scenes(self.scene, cfg, [scene or (cfg.n_static, cfg.n_dynamic, cfg.dynamic_speed_m_s)])
         numbers = np.arange(n) if numbers is None else np.asarray(numbers)
         mask = np.ones(n) if mask is None else np.asarray(mask)
         rows = (np.broadcast_to(a, n).astype(np.int32) for a in (mask, seed, numbers))
@@ -129,7 +130,7 @@ def within(values, interval, margin=FLOAT_TOL_M):
 
 def test_every_scenario_is_placed_as_asked(any_world):
     of, drawn = any_world
-    scenario.check_scenarios(drawn["faults"])
+    setup.check_scenarios(drawn["faults"])
     assert np.all(drawn["draws"] >= 1)
     first, cfg = of.slots.first_dynamic, of.cfg
     still, moving = drawn["kind"][:, :first] != NONE, drawn["kind"][:, first:] != NONE
@@ -415,7 +416,7 @@ def test_number_of_static_obstacles_keeps_start_goal_and_the_first_obstacles():
 
 _OTHER_PROCESS = """
 import sys, numpy as np
-from uuvtai.runtime import start_taichi
+from uuvtai.compile.runtime import start_taichi
 start_taichi("cpu")
 from tests.test_world import Drawn, PURE, world_config
 drawn = Drawn(world_config("pool", static_capacity=8, dynamic_capacity=6), n_env=7)
@@ -495,19 +496,19 @@ def test_a_world_that_cannot_be_placed_is_told():
         WorldConfig.model_validate({"n_static": 12, "n_dynamic": 0, "static": {"gap_m": 4.0}}), n_env=4
     )
     with pytest.raises(RuntimeError, match=r"4 of 4 scenarios.*static obstacles find no place"):
-        scenario.check_scenarios(of.draw()["faults"])
+        setup.check_scenarios(of.draw()["faults"])
     assert not of.draw(scene=(1, 0, 0.6))["faults"].any()
     crowded = WorldConfig.model_validate(
         {"n_static": 0, "n_dynamic": 1, "dynamic": {"line_length_m": [30, 40], "circle_fraction": 0}}
     )
     with pytest.raises(RuntimeError, match="moving obstacle finds no path"):
-        scenario.check_scenarios(Drawn(crowded, n_env=4).draw()["faults"])
+        setup.check_scenarios(Drawn(crowded, n_env=4).draw()["faults"])
     walled = {"kind": "box", "x_m": 10, "y_m": 3, "half_extents_m": [4.1, 3.0]}
     far = WorldConfig.model_validate(
         {"n_static": 0, "n_dynamic": 0, "start_goal_gap_m": 9, "fixed": [walled]}
     )
     with pytest.raises(RuntimeError, match="no layout joins start and goal"):
-        scenario.check_scenarios(Drawn(far, n_env=4).draw()["faults"])
+        setup.check_scenarios(Drawn(far, n_env=4).draw()["faults"])
 
 
 @pytest.mark.parametrize(
@@ -516,7 +517,7 @@ def test_a_world_that_cannot_be_placed_is_told():
 def test_scenes_that_do_not_fit_are_refused(scene):
     of = drawn_world("gauntlet")[0]
     with pytest.raises(ValueError, match=r"slots|speed"):
-        scenario.set_scenes(of.scene, of.cfg, [scene])
+        setup.set_scenes(of.scene, of.cfg, [scene])
 
 
 @pytest.mark.parametrize(

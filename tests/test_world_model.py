@@ -11,9 +11,9 @@ from scipy import stats
 
 from tests.reference import world_model as reference
 from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
-from uuvtai.learn.distill import Uncertainty
-from uuvtai.learn.normalise import moments_of
-from uuvtai.learn.world_model import (
+from uuvtai.learning.distillation import Uncertainty
+from uuvtai.learning.networks import moments_of
+from uuvtai.learning.world_model import (
     LOG_VAR_BOUNDS,
     N_TARGET,
     WorldModel,

@@ -11,8 +11,8 @@ import sys
 import torch
 
 from tests.small_sim import SmallSim, sim_with_one_beam
-from uuvtai.native.gpu_shape import VARIABLE, asked_shape
-from uuvtai.runtime import start_taichi
+from uuvtai.compile.launch import VARIABLE, asked_shape
+from uuvtai.compile.runtime import start_taichi
 
 STEPS = 6
 """one depth image and one decision of the tree are among them"""

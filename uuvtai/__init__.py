@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 
-from uuvtai.taichi_patches.first_import import watch_for_taichi
-from uuvtai.version import __version__ as __version__
+from uuvtai.common.version import __version__ as __version__
+from uuvtai.compile.first_import import watch_for_taichi
 
 # without typing, which takes longer to import than this file: signals are not heard before it is done
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from uuvtai.env import VectorEnv
+    from uuvtai.envs.vector_env import VectorEnv
 
 # Taichi prints a banner to stdout when it is imported; stdout belongs to results
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -38,12 +38,13 @@ def make(
     ``overrides`` maps dotted config keys to values, ``{"world.n_dynamic": 9}``; ``teacher`` is the behaviour
     tree behind ``info["teacher_action"]``; ``device`` is 'cpu', 'cuda' or 'auto'. Raises ConfigError, a
     ValueError, for presets, keys and values that do not exist or fit, ValueError or MemoryError for
-    impossible sizes, RuntimeError for a missing device. The rest is told at ``uuvtai.env.VectorEnv``.
+    impossible sizes, RuntimeError for a missing device. The rest is told at
+    ``uuvtai.envs.vector_env.VectorEnv``.
     """
-    from uuvtai.env import VectorEnv, checked_seed
-    from uuvtai.loader import load_config
-    from uuvtai.sim import Sim
-    from uuvtai.tree import read_tree
+    from uuvtai.config.loader import load_config
+    from uuvtai.envs.vector_env import VectorEnv, checked_seed
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.sim.sim import Sim
 
     if type(num_envs) is not int:
         raise TypeError(f"num_envs must be an int, got {num_envs!r}")

@@ -14,13 +14,13 @@ from typing import Annotated
 
 import typer
 
-from uuvtai import arguments, signals
-from uuvtai import option_groups as groups
-from uuvtai import options as opt
-from uuvtai.endings import FAILED, GATE, UsageError, guarded, plain, say
-from uuvtai.scene_options import SceneOptions
-from uuvtai.show.progress import Progress, counted
-from uuvtai.version import __version__
+from uuvtai.common import signals
+from uuvtai.common.exits import FAILED, GATE, UsageError, guarded, plain, say
+from uuvtai.common.version import __version__
+from uuvtai.console import groups, parsing
+from uuvtai.console import options as opt
+from uuvtai.console.screen import Progress, counted
+from uuvtai.sim.scene import SceneOptions
 
 app = typer.Typer(
     name="uuv",
@@ -60,16 +60,16 @@ def evaluate(
 ) -> None:
     """Play the same episodes with every controller and trained policy and print the table of methods."""
     if resume is not None:
-        arguments.refuse_beside_resume(ctx, ("allow_code",))
-        from uuvtai.measure.evaluate.compare import resume as go_on
+        parsing.refuse_beside_resume(ctx, ("allow_code",))
+        from uuvtai.evaluation.evaluate import resume as go_on
 
         result, folder = go_on(resume, Progress(), allow_code)
     else:
-        seed_list = arguments.seeds("--seeds", seeds)
-        arguments.refuse_less("--episodes", episodes, 1)
+        seed_list = parsing.seeds("--seeds", seeds)
+        parsing.refuse_less("--episodes", episodes, 1)
         recording = kept.asked()
-        from uuvtai.measure.evaluate.compare import compare
-        from uuvtai.measure.evaluate.eval_request import Request
+        from uuvtai.evaluation.evaluate import compare
+        from uuvtai.evaluation.results import Request
 
         trained, controllers = drivers.named()
         request = Request.typed(
@@ -77,7 +77,7 @@ def evaluate(
             num_envs=num_envs, device=device, run_dir=run_dir, **recording,
         )  # fmt: skip
         result, folder = compare(request, Progress())
-    from uuvtai.show.evaluation import show_evaluation
+    from uuvtai.console.views import show_evaluation
 
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
     _report_if(with_report, folder)
@@ -99,15 +99,15 @@ def train_policy(
     run_dir: opt.RunDir = None,
 ) -> None:
     """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
-    from uuvtai.learn.run import TrainRequest, train
-    from uuvtai.measure.evaluate.while_training import evaluate_now
-    from uuvtai.show.dashboard import TrainingProgress
+    from uuvtai.console.screen import TrainingProgress
+    from uuvtai.evaluation.evaluate import evaluate_now
+    from uuvtai.learning.runner import TrainRequest, train
 
     if resume is None:
         new = {"iterations": iterations, "device": device, "run_dir": run_dir}
         request = TrainRequest.typed(scene, preset, num_envs, seed, **new)
     else:
-        arguments.refuse_beside_resume(ctx, ("iterations", "device", "overrides"))
+        parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides"))
         request = TrainRequest(
             resume=resume, overrides=[*(scene.overrides or [])], iterations=iterations, device=device
         )
@@ -131,14 +131,14 @@ def simulate(
     """Open-loop physics in open water, to validate a vehicle against theory or data; or, with --controller,
     one vehicle that is driven to a goal."""
     config = SceneOptions("open", "clean", vehicle, overrides=overrides).config()
-    from uuvtai.measure.simulate import simulate as run
-    from uuvtai.show.simulation import show_simulation
+    from uuvtai.console.views import show_simulation
+    from uuvtai.evaluation.simulate import simulate as run
 
     trial, driven = motion.trial(), driver.one
     if driven is None:
         result = run(config, trial)
     else:
-        from uuvtai.measure.driven import drive
+        from uuvtai.evaluation.simulate import drive
 
         result = drive(config, trial, driven)
     title = f"{vehicle}: {trial.seconds:g} s, substep {trial.dt:g} s"
@@ -161,11 +161,11 @@ def watch_live(
     device: opt.Device = "auto",
 ) -> None:
     """Run episodes in real time and serve them to Foxglove and Lichtblick."""
-    seed_list = arguments.seeds("--seeds", seeds)
-    arguments.refuse_odd_live(episodes, rate, port)
-    from uuvtai.measure.evaluate.eval_request import Request
-    from uuvtai.measure.watching import LiveOptions, watch_episodes
-    from uuvtai.show.live_episodes import show_watched
+    seed_list = parsing.seeds("--seeds", seeds)
+    parsing.refuse_odd_live(episodes, rate, port)
+    from uuvtai.console.views import show_watched
+    from uuvtai.evaluation.results import Request
+    from uuvtai.evaluation.simulate import LiveOptions, watch_episodes
 
     trained, controllers = drivers.named()
     request = Request.typed(
@@ -193,13 +193,13 @@ def identify_vehicle(
     force: opt.IdentifyForce = False,
 ) -> None:
     """Drag, added mass, buoyancy, thruster gain and rotor lag of a vehicle from logs, with intervals."""
-    from uuvtai.identify.identify_files import identify
+    from uuvtai.vehicle.identify.fit import identify
 
     target = out or file[0].with_suffix(".vehicle.yaml")
     base = SceneOptions("open", "clean", vehicle, overrides=overrides).config().vehicle
     document = identify(file, base, vehicle, known, truth, target, force, system)
 
-    from uuvtai.show.identification import show_identified
+    from uuvtai.console.views import show_identified
 
     output.show(document, lambda screen: show_identified(screen, document, f"{known} of {vehicle}"))
     say(f"wrote {target}")
@@ -227,21 +227,20 @@ def sweep(
     run_dir: opt.RunDir = None,
 ) -> None:
     """Play every cell of a grid with every method; finished cells survive a kill: --resume goes on."""
-    from uuvtai.measure.sweep import play
-    from uuvtai.measure.sweep.cells import grid_of
-    from uuvtai.measure.sweep.plan import SweepRequest
-    from uuvtai.show.sweeping import show_sweep
+    from uuvtai.console.views import show_sweep
+    from uuvtai.evaluation import sweep as play
+    from uuvtai.evaluation.grid import SweepRequest, grid_of
 
-    arguments.refuse_less("--episodes", episodes, 1)
+    parsing.refuse_less("--episodes", episodes, 1)
     engine, progress = place.made(), Progress("cells")
     if resume is not None:
-        arguments.refuse_beside_resume(ctx, arguments.OF_A_SWEEP_RESUMED)
+        parsing.refuse_beside_resume(ctx, parsing.OF_A_SWEEP_RESUMED)
         result, folder = play.resume(resume, engine, progress, allow_code)
     else:
         trained, controllers = drivers.named(["bt"])
         request = SweepRequest.typed(
             scene, trained, grid=grid_of(grid or []), controllers=tuple(controllers), episodes=episodes,
-            seeds=tuple(arguments.seeds("--seeds", seeds)), num_envs=num_envs, device=device,
+            seeds=tuple(parsing.seeds("--seeds", seeds)), num_envs=num_envs, device=device,
         )  # fmt: skip
         result, folder = play.sweep(request, engine, run_dir, progress)
     _report_if(with_report, folder)
@@ -268,10 +267,10 @@ def profile(
 ) -> None:
     """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the
     paper's timing tables."""
-    sizes = arguments.integers("--num-envs", num_envs)
-    arguments.refuse_no_duration("--seconds", seconds)
-    from uuvtai.measure.profile.profiling import profile as run
-    from uuvtai.show.profile import show_profile
+    sizes = parsing.integers("--num-envs", num_envs)
+    parsing.refuse_no_duration("--seconds", seconds)
+    from uuvtai.console.views import show_profile
+    from uuvtai.evaluation.profile import profile as run
 
     result = run(scene.training(preset), sizes, controller, device, seconds, density, say)
     output.show(result, lambda screen: show_profile(screen, result))
@@ -289,11 +288,11 @@ def reproduce(
     run_dir: opt.RunDir = None,
 ) -> None:
     """Train, evaluate, sweep and profile whatever the paper shows, and judge each of its claims."""
-    from uuvtai.measure.reproduce import paper_run
-    from uuvtai.tables.claim_table import claim_table
+    from uuvtai.evaluation import reproduce as paper_run
+    from uuvtai.report.reproduction import claim_table
 
     if resume is not None:
-        arguments.refuse_beside_resume(ctx, ("budget", "allow_code"))
+        parsing.refuse_beside_resume(ctx, ("budget", "allow_code"))
         result, folder = paper_run.resume(resume, Progress(), allow_code)
     else:
         result, folder = paper_run.reproduce(budget, run_dir, Progress(), own.named())
@@ -317,7 +316,7 @@ def report_run(
     if paper is not None:
         if out is not None or force:
             raise UsageError("--paper: writes a folder of its own; leave out --out and --force")
-        from uuvtai.report.paper_kit import paper as write_paper
+        from uuvtai.report.paper import paper as write_paper
 
         kit = write_paper(runs, paper)
         return output.show(kit.document(), lambda _screen: typer.echo(str(kit.folder)))
@@ -348,14 +347,14 @@ def export_policy(
 ) -> None:
     """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3:
     it disagrees. Or, with --stack, the stack itself as native code."""
-    from uuvtai.show.exports import show_export, show_stack
+    from uuvtai.console.views import show_export, show_stack
 
     if (written := stacked.written(run)) is not None:
         return output.show(written, lambda _: show_stack(written))
     if (run is None) == (check is None):
         raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
-    from uuvtai.deploy import export
-    from uuvtai.measure.exporting import export_run
+    from uuvtai.evaluation.agents import export_run
+    from uuvtai.learning.export import folder as export
 
     found = export.check(check, say) if check else export_run(run or "", out, evaluation or [], say, force)
     output.show(found.document(), lambda screen: show_export(screen, found))
@@ -376,8 +375,8 @@ def replay_log(
 ) -> None:
     """Feed a log's sensor messages to the stack again, without the simulator, and compare the commands. Exit
     code 3: they differ, though nothing was disturbed."""
-    from uuvtai.measure.replay.replaying import replay
-    from uuvtai.show.replays import show_replay
+    from uuvtai.console.views import show_replay
+    from uuvtai.vehicle.replay import replay
 
     found = replay(log, faults.made(), controller)
     output.show(found, lambda screen: show_replay(screen, found))
@@ -397,9 +396,9 @@ def pilot_vehicle(
 ) -> None:
     """Drive a real vehicle, or ArduSub's simulated one, by MAVLink: a dry run unless --arm is given
     (docs/safety.md). Exit code 3: it ended by a safe action."""
-    from uuvtai.link.onboard_loop import fly
-    from uuvtai.show.flights import show_flight
-    from uuvtai.tree import read_tree
+    from uuvtai.console.views import show_flight
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.vehicle.control_loop import fly
 
     config = scene.config()
     found, failure = fly(config, read_tree(controller, config.teacher.max_node), flight.plan(config), say)
@@ -416,9 +415,9 @@ def pilot_vehicle(
 @groups.grouped
 def serve_sitl(scene: groups.SitlSceneGroup, served: groups.ServedGroup, output: groups.OutputGroup) -> None:
     """Be the water for ArduSub: our physics, world and sensors behind its JSON interface (docs/sitl.md)."""
-    from uuvtai.show.flights import show_sitl
-    from uuvtai.sitl.serving import serve_water
-    from uuvtai.tree import read_tree
+    from uuvtai.console.views import show_sitl
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.vehicle.sitl import serve_water
 
     plan, config = served.plan(), scene.config()
     found = serve_water(config, read_tree("straight", config.teacher.max_node), plan, say)
@@ -437,14 +436,14 @@ def presets(
     everything: opt.Everything = False,
 ) -> None:
     """List the shipped presets with a sentence each, or show what one of them states."""
-    from uuvtai.show import presets as shown
+    from uuvtai.console import views as shown
 
     if action is None:
         return output.show(shown.sentences(), shown.show_presets)
     kind, name = shown.kind_and_name(action, name)
     if not everything or kind == "tree":  # a tree has no keys
         return shown.show_stated(kind, name, output.as_json)
-    from uuvtai.measure.preset_config import whole_preset
+    from uuvtai.sim.scene import whole_preset
 
     found, text = whole_preset(kind, name)
     output.show(found, lambda _screen: typer.echo(text))
@@ -453,7 +452,7 @@ def presets(
 @app.command(epilog="Example: uuv examples mine")
 def examples(folder: opt.ExamplesFolder = Path("examples")) -> None:
     """Copy the examples of the documentation into a folder: own pieces, trainers, a world, a tree."""
-    from uuvtai.example_files import copy_examples
+    from uuvtai.console.doctor import copy_examples
 
     typer.echo("\n".join(map(str, copy_examples(folder))))
 
@@ -462,9 +461,8 @@ def examples(folder: opt.ExamplesFolder = Path("examples")) -> None:
 @groups.grouped
 def doctor(output: groups.PlainOutputGroup, clean: opt.Clean = False) -> None:
     """Check that everything uuv needs is here and works."""
-    from uuvtai.doctor import checks
-    from uuvtai.doctor import clean as delete_machine_code
-    from uuvtai.show.health import show_checks
+    from uuvtai.console.doctor import checks, show_checks
+    from uuvtai.console.doctor import clean as delete_machine_code
 
     if clean:
         typer.echo(f"deleted {delete_machine_code()} files of machine code", err=True)
@@ -486,15 +484,15 @@ def warm(
     workers: opt.WarmWorkers = 0,
 ) -> None:
     """Compile beforehand what later commands need, so that they start at once (docs/native.md)."""
-    from uuvtai import warming
-    from uuvtai.show.health import show_shapes
+    from uuvtai.console.doctor import show_shapes
+    from uuvtai.envs import warm_up
 
-    sizes = arguments.integers("--num-envs", num_envs)
-    arguments.refuse_less("--workers", workers, 0)
+    sizes = parsing.integers("--num-envs", num_envs)
+    parsing.refuse_less("--workers", workers, 0)
     scenes = [SceneOptions(world, name, overrides=overrides) for name in sensors.split(",")]
-    shapes = warming.shapes_of(scenes, sizes)
+    shapes = warm_up.shapes_of(scenes, sizes)
     say(f"sizes to compile: {len(shapes)}, about a minute each the first time")
-    found = warming.warm(shapes, workers or None)
+    found = warm_up.warm(shapes, workers or None)
     output.show({"shapes": found}, lambda screen: show_shapes(screen, found))
 
 
@@ -507,13 +505,13 @@ def tree(
     dot: opt.Dot = False,
 ) -> None:
     """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
-    from uuvtai.measure.evaluate.tree_report import tree_report
+    from uuvtai.sim.behavior_tree import tree_report
 
     report = tree_report(controller, run)
     if dot or run is None:
         text = plain(report.dot if dot else report.text)
         return output.show(report.document, lambda _screen: typer.echo(text))
-    from uuvtai.show.trees import show_tree
+    from uuvtai.console.views import show_tree
 
     output.show(report.document, lambda screen: show_tree(screen, report.text, report.document["nodes"]))
 
@@ -525,8 +523,8 @@ def tree(
 @groups.grouped
 def log_info(output: groups.OutputGroup, file: opt.LogFile) -> None:
     """Topics, counts, rates, metadata and outcome of a log."""
+    from uuvtai.console.views import show_log
     from uuvtai.logs import reader
-    from uuvtai.show.logs import show_log
 
     found = reader.info(file)
     output.show(found, lambda screen: show_log(screen, found, file))
@@ -537,7 +535,7 @@ def log_export(
     file: opt.LogFile, out: opt.LogExportOut, topic: opt.Topics = None, fmt: opt.LogFormat = "json"
 ) -> None:
     """Write every topic as a file, and the attachments below attachments/."""
-    from uuvtai.logs import log_export
+    from uuvtai.logs import export as log_export
 
     for path in log_export.export(file, out, topic, fmt):
         typer.echo(str(path))
@@ -546,7 +544,7 @@ def log_export(
 @log_app.command("repair", epilog="Example: uuv log repair runs/first/logs/bt_seed0_episode0.mcap")
 def log_repair(file: opt.LogFile, out: opt.RepairOut = None, force: opt.LogForce = False) -> None:
     """Recover the messages of a log whose writing was cut off."""
-    from uuvtai.logs import repair
+    from uuvtai.logs import export as repair
 
     found = repair.repair(file, out, force)
     for damage in found.damages:
@@ -581,7 +579,7 @@ def log_video(
     force: opt.LogForce = False,
 ) -> None:
     """Render a top-down video of a recorded episode as WebM, MP4 or GIF."""
-    from uuvtai.files import output_beside
+    from uuvtai.common.files import output_beside
     from uuvtai.logs.video import video
 
     target = output_beside([file], out, ".webm", force)
@@ -598,7 +596,7 @@ def log_picture(
     force: opt.LogForce = False,
 ) -> None:
     """Draw a recorded episode as PNG: occupancy, trajectories, goal."""
-    from uuvtai.files import output_beside
+    from uuvtai.common.files import output_beside
     from uuvtai.logs.picture import picture
 
     typer.echo(str(picture(file, output_beside(file, out, ".png", force), clearance=clearance)))
@@ -622,7 +620,7 @@ def _root(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command and leave with its exit code. ``uuv`` itself begins in ``uuvtai.entry``."""
+    """Run a command and leave with its exit code. ``uuv`` itself begins in ``uuvtai.__main__``."""
     code = guarded(lambda: app(args=arguments, prog_name="uuv", standalone_mode=False))
     signals.finish(code)
     sys.exit(code)

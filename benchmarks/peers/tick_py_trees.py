@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import py_trees
 from py_trees.common import Status
 
-from uuvtai import tree_codes as codes
-from uuvtai.tree import FlatTree
+from uuvtai.common import tree_codes as codes
+from uuvtai.sim.behavior_tree import FlatTree
 
 _CODE = {
     Status.INVALID: codes.IDLE,

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from uuvtai.allocation import allocation_matrices
 from uuvtai.config import Config
-from uuvtai.kernels.vehicle.actuation import axis_loops
-from uuvtai.kernels.vehicle.rotor import KGF, edge_rpm, thrust_at, thrust_limits
+from uuvtai.kernels.vehicle.control import axis_loops
+from uuvtai.kernels.vehicle.dynamics import KGF, edge_rpm, thrust_at, thrust_limits
+from uuvtai.sim.setup import allocation_matrices
 
 _STATE = ("pos", "vel", "rate", "quat", "rpm", "rpm_command", "integral")
 

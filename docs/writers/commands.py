@@ -9,8 +9,9 @@ import typer
 from typer.cli import get_docs_for_click
 
 from docs.writers.markdown import contents
-from uuvtai import cli, endings
-from uuvtai.tables.table import text_table
+from uuvtai import cli
+from uuvtai.common import exits
+from uuvtai.report.tables import text_table
 
 SEE = {
     "eval": ("quickstart", "own_pieces", "viewers", "determinism"),
@@ -35,24 +36,24 @@ SEE = {
 """prose about a command"""
 
 EXIT_CODES = (
-    (endings.OK, "done"),
+    (exits.OK, "done"),
     (
-        endings.FAILED,
+        exits.FAILED,
         "failed while running: a file that cannot be read or written, a device that is missing, a worker "
         "lost too often",
     ),
     (
-        endings.USAGE,
+        exits.USAGE,
         "usage or configuration: nothing was begun, nothing was written; the message says what to type "
         "instead",
     ),
     (
-        endings.GATE,
+        exits.GATE,
         "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, `uuv "
         "replay` that commands do, `uuv pilot` ended by a safe action",
     ),
     (
-        endings.INTERRUPTED,
+        exits.INTERRUPTED,
         "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on",
     ),
 )

@@ -13,10 +13,10 @@ from typing import Any, get_args
 from pydantic import BaseModel
 
 from docs.writers.markdown import contents
-from uuvtai import loader
+from uuvtai.config import loader
+from uuvtai.config.base import LARGEST, MOST, SMALLEST
 from uuvtai.config.learning import LearningConfig
-from uuvtai.config.section import LARGEST, MOST, SMALLEST
-from uuvtai.tables.table import text_table
+from uuvtai.report.tables import text_table
 
 Schema = dict[str, Any]
 Model = type[BaseModel]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from uuvtai.measure.explain.causes import CAUSES, REMARKS
-from uuvtai.tables.table import text_table
+from uuvtai.evaluation.failure_causes import CAUSES, REMARKS
+from uuvtai.report.tables import text_table
 
 
 def page() -> str:

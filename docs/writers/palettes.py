@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import uuvtai
-from uuvtai.tree_codes import ACTION, LEAVES
+from uuvtai.common.tree_codes import ACTION, LEAVES
 
 TREES = Path(uuvtai.__file__).parent / "presets" / "trees"
 _PALETTE = re.compile(r" *<TreeNodesModel>.*?</TreeNodesModel>\n", re.DOTALL)

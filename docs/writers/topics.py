@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from uuvtai.config import Config
-from uuvtai.logs.moment import EpisodeHeader
+from uuvtai.logs.encode import EpisodeHeader
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topics import TOPICS
-from uuvtai.tables.table import text_table
+from uuvtai.report.tables import text_table
 
 _NO_RUN = EpisodeHeader(controller="", config=Config(), config_yaml="", scenario={})
 """schemas of its topics have no fields that depend on a run"""

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from uuvtai import multibeam
+from uuvtai.config import multibeam
 
 
 def side_lobe_level(heard, sonar_cfg):

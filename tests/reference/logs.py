@@ -11,21 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from uuvtai.closed_form import body_positions
-from uuvtai.config import Config, SensorsConfig, SonarConfig
-from uuvtai.logs.mcap_log import McapEpisodeLog
-from uuvtai.logs.moment import EpisodeHeader
-from uuvtai.logs.scenario_document import scenario_document
-from uuvtai.outcomes import OUTCOMES
-from uuvtai.plan_codes import (
+from uuvtai.common.enums import (
     FAIL_DISCONNECTED,
     FAIL_NONE,
+    OUTCOMES,
     PLANNER_RRT,
     PLANNER_VORONOI,
     TRIGGER_INITIAL,
     TRIGGER_NONE,
     TRIGGER_STUCK,
 )
+from uuvtai.common.obstacle_motion import body_positions
+from uuvtai.config import Config, SensorsConfig, SonarConfig
+from uuvtai.logs.encode import EpisodeHeader
+from uuvtai.logs.scenario import scenario_document
+from uuvtai.logs.writer import McapEpisodeLog
 
 DT = 0.02
 N_RAY = 256

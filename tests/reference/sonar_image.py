@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from uuvtai.closed_form import body_positions
+from uuvtai.common.obstacle_motion import body_positions
 from uuvtai.config import SonarConfig
-from uuvtai.multibeam import ABSORPTION_NP_M, elevation_pattern, elevations, heard_bearings, ray_sr
+from uuvtai.config.multibeam import ABSORPTION_NP_M, elevation_pattern, elevations, heard_bearings, ray_sr
 
 _WALL, _FLOOR, _SURFACE = -1, -2, -3
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pydantic import model_validator
 
+from uuvtai.config.base import Section
 from uuvtai.config.baselines import (
     BaselinesConfig,
     DynamicWindowConfig,
@@ -15,6 +16,7 @@ from uuvtai.config.baselines import (
     PotentialFieldConfig,
     VelocityObstacleConfig,
 )
+from uuvtai.config.behavior import FastConfig, SlowConfig, TeacherConfig
 from uuvtai.config.perception import (
     ElevationConfig,
     ForecastConfig,
@@ -24,7 +26,6 @@ from uuvtai.config.perception import (
     TrackingConfig,
 )
 from uuvtai.config.planning import ClearanceConfig, FeaturesConfig, QuietConfig, RouteConfig, VoronoiConfig
-from uuvtai.config.section import Section
 from uuvtai.config.sensors import (
     DepthConfig,
     DvlConfig,
@@ -34,8 +35,6 @@ from uuvtai.config.sensors import (
     SonarConfig,
 )
 from uuvtai.config.task import EpisodeConfig, RewardConfig
-from uuvtai.config.teacher import TeacherConfig
-from uuvtai.config.tuned import FastConfig, SlowConfig
 from uuvtai.config.vehicle import ActuationConfig, DisturbanceConfig, Thruster, VehicleConfig, instability
 from uuvtai.config.world import (
     DynamicObstacles,

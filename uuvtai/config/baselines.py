@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from uuvtai.config.section import Fraction, NonNegative, Positive, PositiveCount, Section
+from uuvtai.config.base import Fraction, NonNegative, Positive, PositiveCount, Section
 
 
 class DynamicWindowConfig(Section):

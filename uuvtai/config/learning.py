@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from uuvtai.config import Config
-from uuvtai.config.section import Count, Fraction, NonNegative, Positive, PositiveCount, Section, Seed
+from uuvtai.config.base import Count, Fraction, NonNegative, Positive, PositiveCount, Section, Seed
 
 Points = tuple[tuple[NonNegative, NonNegative], ...]
 """(share of the run, value): linear in between, constant outside; two points at the same share are a jump"""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from uuvtai.config.section import Fraction, NonNegative, Packets, Positive, PositiveCount, Section
+from uuvtai.config.base import Fraction, NonNegative, Packets, Positive, PositiveCount, Section
 
 
 class PoseConfig(Section):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from uuvtai.config.section import Count, NonNegative, Positive, PositiveCount, Section
+from uuvtai.config.base import Count, NonNegative, Positive, PositiveCount, Section
 
 
 class ClearanceConfig(Section):

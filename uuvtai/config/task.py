@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from uuvtai.config.section import NonNegative, Positive, PositiveCount, Real, Section
+from uuvtai.config.base import NonNegative, Positive, PositiveCount, Real, Section
 
 TERMS = (
     "alive",

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from uuvtai.config.section import (
+from uuvtai.config.base import (
     Count,
     Fraction,
     NonNegative,

@@ -7,7 +7,8 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from uuvtai.config.section import (
+from uuvtai.common.enums import Truth
+from uuvtai.config.base import (
     Count,
     Fraction,
     Interval,
@@ -18,7 +19,6 @@ from uuvtai.config.section import (
     Real,
     Section,
 )
-from uuvtai.truth import Truth
 
 _LONGEST_M, _MOST_AREA_M2, _DEEPEST_M = 1000.0, 40_000.0, 100.0
 

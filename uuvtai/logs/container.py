@@ -12,11 +12,11 @@ from pathlib import Path
 
 from mcap.writer import Writer
 
-from uuvtai import signals
-from uuvtai.files import flush, open_new, unfinished
-from uuvtai.logs.log_errors import LogError
+from uuvtai.common import signals
+from uuvtai.common.files import flush, open_new, unfinished
+from uuvtai.common.version import __version__
+from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import MAX_RECORD
-from uuvtai.version import __version__
 
 signals.never_within(__file__)
 MAX_MESSAGE = MAX_RECORD - (2 << 20)

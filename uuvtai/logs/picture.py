@@ -10,23 +10,25 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uuvtai.files import whole_file
-from uuvtai.logs.canvas import (
+from uuvtai.common.enums import COLLIDED
+from uuvtai.common.files import whole_file
+from uuvtai.logs.drawing import (
     DYNAMIC,
     FAILED,
     GREY,
     INK,
     MOVER,
     PAPER,
+    PICTURE_TOPICS,
     STATIC,
     WATER,
     Canvas,
     Color,
-    method_inks,
-)
-from uuvtai.logs.log_errors import LogError, checked_suffix
-from uuvtai.logs.painting import (
+    Recording,
+    drawing,
+    load_recording,
     map_canvas,
+    method_inks,
     mixed,
     paint_layers,
     paint_ruler,
@@ -34,8 +36,7 @@ from uuvtai.logs.painting import (
     paint_walls,
     paint_water,
 )
-from uuvtai.logs.recording import PICTURE_TOPICS, Recording, drawing, load_recording
-from uuvtai.outcomes import COLLIDED
+from uuvtai.logs.encode import LogError, checked_suffix
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 44, 96, 62
 _ROW = 30

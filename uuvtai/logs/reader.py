@@ -22,8 +22,8 @@ from mcap.records import Attachment, Channel, Chunk, DataEnd, Message, Metadata,
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from uuvtai.files import open_file
-from uuvtai.logs.log_errors import LogError
+from uuvtai.common.files import open_file
+from uuvtai.logs.encode import LogError
 
 MAX_RECORD = 64 << 20
 """[bytes] of a record, and of what a chunk unpacks to: six times the map of a tank of 200 x 100 m"""

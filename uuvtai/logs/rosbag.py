@@ -14,14 +14,12 @@ from typing import Any
 import yaml
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
-from uuvtai.files import refuse_output, whole_folder
-from uuvtai.loader import ConfigError, parsed_yaml
+from uuvtai.common.files import refuse_output, whole_folder
+from uuvtai.config.loader import ConfigError, parsed_yaml
 from uuvtai.logs.container import MAX_MESSAGE, McapFile
-from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import LogHead, read_head, read_messages, records
-from uuvtai.logs.ros_read import NAMES, READ, Reader
-from uuvtai.logs.ros_types import RosMessages
-from uuvtai.logs.ros_write import SOURCES, WRITTEN, Setup, ros_messages
+from uuvtai.logs.ros2 import NAMES, READ, SOURCES, WRITTEN, Reader, RosMessages, Setup, ros_messages
 
 _ODD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from uuvtai.tables.table import Data, Table
+from uuvtai.report.tables import Data, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -3,28 +3,295 @@ figures, whole or not at all."""
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Iterator, Sequence
+import re
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from uuvtai.errors import UserError
-from uuvtai.files import FileError, refuse_links_in, refuse_output
-from uuvtai.loader import ConfigError
-from uuvtai.report.blocks import Block, Figure, Heading, PageSection
-from uuvtai.report.learning_curves import Training, training
-from uuvtai.report.media import media, shared
-from uuvtai.report.methods_table import evaluation
-from uuvtai.report.page import Page, render
-from uuvtai.report.provenance import checkpoints, command_of, config_text, origins, provenance, status_notice
+from uuvtai.common.errors import UserError
+from uuvtai.common.files import FileError, read_bytes, refuse_links_in, refuse_output
+from uuvtai.config.loader import ConfigError
+from uuvtai.logs.run_folder import RunFolderError, write_atomic
+from uuvtai.report.blocks import (
+    Block,
+    Code,
+    Facts,
+    Figure,
+    Gallery,
+    Heading,
+    Media,
+    Notice,
+    PageSection,
+    Paragraph,
+)
+from uuvtai.report.evaluation import evaluation
+from uuvtai.report.html import Page, read_config, read_json, read_lines, render
 from uuvtai.report.reproduction import reproduction
-from uuvtai.report.run_files import read_config, read_json, read_lines
 from uuvtai.report.sweep import sweep
+from uuvtai.report.tables import Table, heads, megabytes, number
 from uuvtai.report.timing import timing
-from uuvtai.run_folder import RunFolderError, write_atomic
-from uuvtai.tables.table import Table
+from uuvtai.report.training import Training, training
+
+# ------------------------------------------------------------------------------------------------------------
+# Blocks of pictures and videos: trajectories over the occupancy map, the worst episodes first, as many as
+# the page may hold.
+
+
+MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
+"""What all pictures and videos of a page, and the pictures of a run among them, may weigh: in base64 8.8 MB
+of a page's 10 MB"""
+
+_NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
+_SUCCESS = "success"
+_OUTCOMES = {"ttc": "TTC stop", "out_of_tank": "out of the tank"}
+
+Detail = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """A file and the episode in it; pictures show the same episode of every method."""
+
+    path: Path
+    method: str
+    episode: tuple[int, int] | None
+    details: tuple[tuple[str, Detail], ...]
+    """(method, how its episode went)"""
+    remark: str
+
+    @property
+    def severity(self) -> tuple[bool, bool, float]:
+        """Sorts the worst first: failures, then what came closest; what is not known comes last."""
+        failed = any(detail["outcome"] != _SUCCESS for _, detail in self.details)
+        closest = [
+            detail["min_clearance_m"]
+            for _, detail in self.details
+            if detail.get("min_clearance_m") is not None
+        ]
+        return (not self.details, not failed, min(closest, default=float("inf")))
+
+
+def media(folder: Path, result: dict[str, Any] | None, budget: int = MEDIA_BYTES) -> list[Block]:
+    """Pictures, then videos, of a run folder; ``result`` is its ``uuv eval --json`` document, ``budget`` in
+    bytes."""
+    methods = (result or {}).get("methods", [])
+    pictures = _worst_first(sorted([*folder.glob("pictures/*.png"), *folder.glob("explain/*.png")]), methods)
+    videos = _worst_first(sorted([*folder.glob("explain/*.webm"), *folder.glob("videos/*.webm")]), methods)
+    blocks: list[Block] = []
+    for title, shown, mime, most in (
+        ("Trajectories over the occupancy map", pictures, "image/png", PICTURE_BYTES),
+        ("Videos, the worst episodes first", _once(videos), "video/webm", budget),
+    ):
+        if shown:
+            gallery = _gallery(folder, shown, mime, min(budget, most))
+            budget -= sum(len(item.content) for item in gallery.items)
+            blocks += [Heading(title), gallery]
+    return blocks
+
+
+def _gallery(folder: Path, shown: Iterable[_Shown], mime: str, budget: int) -> Gallery:
+    """As many files as the budget holds, in order; what is too big is named."""
+    items, left_out = [], []
+    for one in shown:
+        size = one.path.lstat().st_size
+        if size > budget:
+            left_out.append(f"{one.path.relative_to(folder)} ({megabytes(size)})")
+            continue
+        budget -= size
+        items.append(
+            Media(mime, read_bytes(one.path, size, folder), _caption(one), str(one.path.relative_to(folder)))
+        )
+    return Gallery(items, _note(left_out))
+
+
+def _note(left_out: Sequence[str]) -> str:
+    return (
+        f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}."
+        if left_out
+        else ""
+    )
+
+
+def shared(sections: Sequence[PageSection]) -> list[PageSection]:
+    """The same sections with what the page's budget [bytes] holds: pictures of every run first, then videos,
+    in the page's order."""
+    kept: dict[int, Gallery] = {}
+    budget = MEDIA_BYTES
+    galleries = [block for section in sections for block in section.blocks if isinstance(block, Gallery)]
+    for gallery in sorted(
+        galleries, key=lambda one: any(item.mime.startswith("video/") for item in one.items)
+    ):
+        kept[id(gallery)] = _trimmed(gallery, budget)
+        budget -= sum(len(item.content) for item in kept[id(gallery)].items)
+    return [
+        replace(section, blocks=[kept.get(id(block), block) for block in section.blocks])
+        for section in sections
+    ]
+
+
+def _trimmed(gallery: Gallery, budget: int) -> Gallery:
+    items, left_out = [], []
+    for item in gallery.items:
+        if len(item.content) > budget:
+            left_out.append(f"{item.name} ({megabytes(len(item.content))})")
+            continue
+        budget -= len(item.content)
+        items.append(item)
+    return replace(
+        gallery, items=items, note=" ".join(part for part in (gallery.note, _note(left_out)) if part)
+    )
+
+
+def _worst_first(paths: Iterable[Path], methods: list[dict[str, Any]]) -> list[_Shown]:
+    return sorted((_shown(path, methods) for path in paths), key=lambda one: one.severity)
+
+
+def _once(shown: list[_Shown]) -> list[_Shown]:
+    """A failure that was recorded again to explain it is shown once, with its cause."""
+    explained = {(one.method, one.episode) for one in shown if one.remark}
+    return [one for one in shown if one.remark or (one.method, one.episode) not in explained]
+
+
+def _shown(path: Path, methods: list[dict[str, Any]]) -> _Shown:
+    found = _NAME.fullmatch(path.stem)
+    if found is None:
+        return _Shown(path, "", None, (), path.stem)
+    label, episode = found["label"], (int(found["seed"]), int(found["episode"]))
+    method = _method_of(label, methods)
+    remark = label.removesuffix(method).strip("_") if method else found["rest"].strip("_")
+    own = [m for m in methods if not label or m["name"] == method]
+    details = tuple(
+        (m["name"], d) for m in own for d in m["episodes_detail"] if (d["seed"], d["episode"]) == episode
+    )
+    return _Shown(path, method, episode, details, remark.replace("_", " "))
+
+
+def _method_of(label: str, methods: list[dict[str, Any]]) -> str:
+    """The method that a file's label ends with; before it may stand why the episode failed."""
+    names = [m["name"] for m in methods if label == m["name"] or label.endswith(f"_{m['name']}")]
+    return max(names, key=len, default="")
+
+
+def _caption(one: _Shown) -> str:
+    if one.episode is None:
+        return one.path.stem
+    where = f"seed {one.episode[0]}, episode {one.episode[1]}"
+    went = "; ".join(f"{name}: {_outcome(detail)}" for name, detail in one.details)
+    said = f"{one.remark}, {where}" if one.remark else where
+    return ". ".join(part for part in (said[0].upper() + said[1:], went) if part)
+
+
+def _outcome(detail: Detail) -> str:
+    outcome = _OUTCOMES.get(detail["outcome"], detail["outcome"])
+    return (
+        f"{outcome} after {number(detail['time_s'])} s, closest {number(detail.get('min_clearance_m'), 2)} m"
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Where figures come from: the command, the machine, the versions, the config.
+
+
+MANIFEST_BYTES = 16 << 20
+"""[bytes] more than any manifest of a checkpoint has"""
+
+
+def command_of(record: dict[str, Any]) -> str:
+    """The command line of run.json as a person types it."""
+    argv = [str(word) for word in record.get("argv", [])]
+    return shlex.join(["uuv", *argv[1:]]) if argv else ""
+
+
+def status_notice(record: dict[str, Any]) -> list[Block]:
+    """A warning where the run did not end well."""
+    status = record.get("status", "unknown")
+    if status == "finished":
+        return []
+    return [
+        Notice(f"The run is marked '{status}': what follows is what was there when this page was written.")
+    ]
+
+
+def provenance(record: dict[str, Any]) -> list[Block]:
+    """Facts of run.json."""
+    hardware, versions = record.get("hardware", {}), record.get("versions", {})
+    facts = {
+        "command": command_of(record),
+        "started": record.get("started"),
+        "status": record.get("status"),
+        "wall time": f"{number(record['wall_s'])} s" if "wall_s" in record else None,
+        "seeds": ", ".join(map(str, record.get("seeds", []))),
+        "commit": record.get("git_sha"),
+        "processor": hardware.get("cpu"),
+        "cores": hardware.get("cores"),
+        "system": hardware.get("system"),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+        "resumed": "; ".join(str(resumed.get("started")) for resumed in record.get("resumed", [])),
+    }
+    return [Facts([(name, str(value)) for name, value in facts.items() if value not in (None, "")])]
+
+
+def config_text(folder: Path) -> list[Block]:
+    """config.yaml, folded away."""
+    text = read_config(folder)
+    return [] if text is None else [Code("config.yaml", text)]
+
+
+def checkpoints(folder: Path) -> list[Block]:
+    """Table of the checkpoints that are kept."""
+    rows = []
+    for path in sorted((folder / "checkpoints").glob("*/manifest.json")):
+        manifest = read_json(folder, str(path.relative_to(folder))) or {}
+        files = manifest.get("files", {})
+        digest = (files.get("model.safetensors") or {}).get("sha256", "-")
+        rows.append(
+            [
+                path.parent.name,
+                str(manifest.get("step", "-")),
+                number(manifest.get("score"), 3),
+                str(digest)[:16],
+            ]
+        )
+    if not rows:
+        return []
+    columns = heads("checkpoint", "iteration", "score", "sha256 of the model (first 16 digits)")
+    return [Table(columns, rows, "Checkpoints")]
+
+
+def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]:
+    """For every policy of an evaluation the training that made it, by the sha256 of its checkpoint's
+    manifest; [] without trainings."""
+    kept = {
+        _sha256(path, run): (run.name, path.parent.name)
+        for run in trainings
+        for path in (run / "checkpoints").glob("*/manifest.json")
+    }
+    sentences = []
+    for method in methods if trainings else []:
+        digest = str(method.get("checkpoint", {}).get("sha256", ""))
+        if digest in kept:
+            sentences.append(
+                "{} is checkpoint {} of the training {}.".format(method["name"], *reversed(kept[digest]))
+            )
+        elif digest:
+            sentences.append(
+                f"{method['name']} (checkpoint {digest[:16]}) is none of the checkpoints that these "
+                "trainings keep."
+            )
+    return [Paragraph(" ".join(sentences))] if sentences else []
+
+
+def _sha256(path: Path, run: Path) -> str:
+    return hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest()
+
+
+# ------------------------------------------------------------------------------------------------------------
+
 
 NOTHING = (
     "has nothing to report yet: no eval/result.json, metrics.jsonl, sweep.json, profile.json or "

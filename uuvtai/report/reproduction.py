@@ -1,19 +1,4 @@
-"""Blocks of ``reproduce.json``: sections of prose, tables, verdicts and the runs that they rest on.
-
-``{"schema": 1, "title": "..", "sections": [{"title": "..", "blocks": [BLOCK, ..]}]}`` where a BLOCK is one of
-
-- ``{"kind": "prose" | "heading" | "notice", "text": ".."}``
-- ``{"kind": "table", "columns": [..], "rows": [[..], ..], "caption": "..", "n_left": 1}``
-- ``{"kind": "verdicts", "items": [{"claim": "..", "verdict": "holds" | "does not hold" | "cannot be judged",
-  "numbers": ".."}]}``
-- ``{"kind": "trade_off", "series": [{"name": "..", "points": [{"collision_rate": 0, "success_rate": 0}]}],
-  "marks": [{"name": "paper", "collision_rate": 0.011, "success_rate": 0.828}], "caption": "..", "command":
-  ".."}``
-- ``{"kind": "run", "path": ".."}``: what a run folder inside this one has to show (evaluation, sweep,
-  profile, pictures, videos)
-- ``{"kind": "curves", "paths": ["..", ..]}``: training curves of run folders inside this one, seeds of one
-  method as a band
-"""
+"""Table of the paper's claims (the document of ``uuv reproduce --json``), each with its verdict."""
 
 from __future__ import annotations
 
@@ -21,20 +6,56 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uuvtai.loader import ConfigError
-from uuvtai.report.blocks import (
-    Block,
-    Figure,
-    Heading,
-    Notice,
-    PageSection,
-    Paragraph,
-    Verdict,
-    Verdicts,
-)
+from uuvtai.config.loader import ConfigError
+from uuvtai.report.blocks import Block, Figure, Heading, Notice, PageSection, Paragraph, Verdict, Verdicts
 from uuvtai.report.figures import Line, trade_off
-from uuvtai.tables.table import Data, Table, heads
-from uuvtai.tables.wording import value_name
+from uuvtai.report.tables import PAGE, Cell, Column, Data, Table, heads, probability, value_name
+
+_COLOURS = {"holds": "green", "does not hold": "red"}
+
+
+def _verdict(claim: dict[str, Any]) -> Cell:
+    return Cell(claim["verdict"], style=_COLOURS.get(claim["verdict"], "yellow"))
+
+
+_CLAIMS = (
+    Column("claim", prose=True, of=lambda c: c["text"]),
+    Column("the paper", prose=True, of=lambda c: c["theirs"]),
+    Column("here", prose=True, of=lambda c: c["ours"]),
+    Column(
+        "verdict", prose=True, of=lambda c: Cell(c["verdict"], style=_COLOURS.get(c["verdict"], "yellow"))
+    ),
+    Column("p", only=PAGE, of=lambda c: probability(c["p"], ".4f")),
+    Column("p (Holm)", only=PAGE, of=lambda c: probability(c["p_holm"], ".4f")),
+)
+
+
+def claim_table(document: dict[str, Any]) -> Table:
+    """One row a claim; the terminal draws a rule after each."""
+    claims = document["claims"]
+    title = f"the paper's claims, budget {document['budget']}"
+    return Table(_CLAIMS, claims, title, sections=range(len(claims)))
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Blocks of ``reproduce.json``: sections of prose, tables, verdicts and the runs that they rest on.
+#
+# ``{"schema": 1, "title": "..", "sections": [{"title": "..", "blocks": [BLOCK, ..]}]}`` where a BLOCK is one
+# of
+#
+# - ``{"kind": "prose" | "heading" | "notice", "text": ".."}``
+# - ``{"kind": "table", "columns": [..], "rows": [[..], ..], "caption": "..", "n_left": 1}``
+# - ``{"kind": "verdicts", "items": [{"claim": "..", "verdict": "holds" | "does not hold" | "cannot be
+# judged",
+#   "numbers": ".."}]}``
+# - ``{"kind": "trade_off", "series": [{"name": "..", "points": [{"collision_rate": 0, "success_rate": 0}]}],
+#   "marks": [{"name": "paper", "collision_rate": 0.011, "success_rate": 0.828}], "caption": "..", "command":
+#   ".."}``
+# - ``{"kind": "run", "path": ".."}``: what a run folder inside this one has to show (evaluation, sweep,
+#   profile, pictures, videos)
+# - ``{"kind": "curves", "paths": ["..", ..]}``: training curves of run folders inside this one, seeds of one
+#   method as a band
+
 
 RULINGS = ("holds", "does not hold", "cannot be judged")
 

@@ -1,19 +1,97 @@
-"""Blocks of a sweep (the document of ``uuv sweep --json``): heat maps over two or more axes, curves with
-intervals over one."""
+"""Table of the cells of a sweep (the document of ``uuv sweep --json``)."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-from uuvtai.outcomes import ENDINGS
+from uuvtai.common.colours import method_colours
+from uuvtai.common.enums import ENDINGS
 from uuvtai.report.blocks import Block, Figure, Notice, Paragraph
-from uuvtai.report.colours import method_colours
+from uuvtai.report.evaluation import COLLISION, ENDS, SUCCESS, TIME, TTS
 from uuvtai.report.figures import Line, heat_map, hover_text, intervals
-from uuvtai.tables.cell_table import axes_of_cells, cell_table, method_of
-from uuvtai.tables.heatmap import Cell, pivot, varying
-from uuvtai.tables.one_at_a_time import axes_of, of_axis, place_names, places, varies_alone
-from uuvtai.tables.table import Data, Table
-from uuvtai.tables.wording import axis_name, value_name
+from uuvtai.report.tables import (
+    PAGE,
+    TERMINAL,
+    Column,
+    Data,
+    MapCell,
+    Table,
+    axes_of,
+    axis_name,
+    change_name,
+    number,
+    of_axis,
+    pivot,
+    place_names,
+    place_of,
+    places,
+    value_name,
+    varies_alone,
+    varying,
+)
+
+_SCENE = {"S": "S", "D": "D", "v": "v_m_s"}
+
+
+def cell_table(cells: list[MapCell], document: dict[str, Any], title: str, **page: Any) -> Table:
+    """One row a cell: where it stands, rates with counts and intervals, how the rest ended, times."""
+    method = Column("method", left=True, of=method_of)
+    columns = [
+        replace(method, only=PAGE),
+        *(_axis(name) for name in axes_of_cells(cells)),
+        *_place(document),
+        replace(method, only=TERMINAL),
+        SUCCESS,
+        COLLISION,
+        replace(ENDS, only=PAGE),
+        replace(TIME, priority=1),
+        replace(TTS, only=PAGE),
+    ]
+    return Table(columns, cells, title, **page)
+
+
+def method_of(cell: MapCell) -> str:
+    """The method that played the cell."""
+    return str(cell.get("method", "policy"))
+
+
+def axes_of_cells(cells: list[MapCell]) -> list[str]:
+    """Every axis that a cell names, in the order in which they come."""
+    return list(dict.fromkeys(name for cell in cells for name in place_of(cell)))
+
+
+def _axis(name: str) -> Column:
+    def value(cell: MapCell) -> str:
+        return "-" if cell.get(name) is None else value_name(cell[name])
+
+    return Column(axis_name(name), left=True, only=PAGE, of=value)
+
+
+def _place(document: dict[str, Any]) -> list[Column]:
+    """Where a cell stands, in a terminal: the scene, of which what does not vary is the first to be left out,
+    and what else varies."""
+    axes = document["axes"]
+    fixed = {name for name in _SCENE if len(axes.get(name, ())) < 2}
+    scene = [
+        Column("S", 2 * ("S" in fixed), only=TERMINAL, of=lambda cell: str(cell["S"])),
+        Column("D", 2 * ("D" in fixed), only=TERMINAL, of=lambda cell: str(cell["D"])),
+        Column("v m/s", 2 * ("v" in fixed), only=TERMINAL, of=lambda cell: number(cell["v_m_s"])),
+    ]
+    if varies_alone(document):
+        changed = Column("changed", left=True, only=TERMINAL, of=lambda cell: change_name(cell, document))
+        return [*scene, changed]
+    return [*scene, *(_other(name) for name in axes if name not in _SCENE)]
+
+
+def _other(name: str) -> Column:
+    return Column(name, left=True, only=TERMINAL, of=lambda cell: str(cell.get(name, "")))
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Blocks of a sweep (the document of ``uuv sweep --json``): heat maps over two or more axes, curves with
+# intervals over one.
+
 
 ON_HOVER = "Counts and intervals: on hover and below"
 """said of a figure on a page, where it has both"""
@@ -81,7 +159,9 @@ def _curves(document: dict[str, Any], command: str) -> list[Block]:
     ]
 
 
-def _axis_figure(cells: list[Cell], axis: str, places: list[Any], names: list[str], command: str) -> Figure:
+def _axis_figure(
+    cells: list[MapCell], axis: str, places: list[Any], names: list[str], command: str
+) -> Figure:
     own = by_method(cells)
     colours = method_colours(list(own))
     panels = [
@@ -97,7 +177,7 @@ def _axis_figure(cells: list[Cell], axis: str, places: list[Any], names: list[st
     return Figure(f"sweep_{axis}", panels, caption, cells_data(cells), command)
 
 
-def _line(method: str, own: list[Cell], key: str, axis: str, places: list[Any], colour: str) -> Line:
+def _line(method: str, own: list[MapCell], key: str, axis: str, places: list[Any], colour: str) -> Line:
     known = [cell for cell in own if cell.get(f"{key}_rate") is not None]
     bounds = [cell.get(f"{key}_ci95") or [cell[f"{key}_rate"]] * 2 for cell in known]
     x = [places.index(cell.get(axis)) for cell in known]
@@ -113,21 +193,21 @@ def _line(method: str, own: list[Cell], key: str, axis: str, places: list[Any], 
     )
 
 
-def by_method(cells: list[Cell]) -> dict[str, list[Cell]]:
+def by_method(cells: list[MapCell]) -> dict[str, list[MapCell]]:
     """Cells of each method, in the order in which they come."""
-    found: dict[str, list[Cell]] = {}
+    found: dict[str, list[MapCell]] = {}
     for cell in cells:
         found.setdefault(method_of(cell), []).append(cell)
     return found
 
 
-def _cells(cells: list[Cell], document: dict[str, Any], caption: str) -> Table:
+def _cells(cells: list[MapCell], document: dict[str, Any], caption: str) -> Table:
     colours = method_colours(list(by_method(cells)))
     swatches = [colours[method_of(cell)] for cell in cells]
     return cell_table(cells, document, caption, folded=True, swatches=swatches)
 
 
-def cells_data(cells: list[Cell]) -> Data:
+def cells_data(cells: list[MapCell]) -> Data:
     """Every cell as numbers."""
     axes = axes_of_cells(cells)
     bounds = [f"{key}_ci95_{end}" for key in ("success", "collision") for end in ("low", "high")]
@@ -136,7 +216,7 @@ def cells_data(cells: list[Cell]) -> Data:
     )
 
 
-def _numbers(cell: Cell, axes: list[str]) -> list[Any]:
+def _numbers(cell: MapCell, axes: list[str]) -> list[Any]:
     outcomes = cell.get("outcomes") or {}
     bounds = [
         bound for key in ("success", "collision") for bound in (cell.get(f"{key}_ci95") or (None, None))

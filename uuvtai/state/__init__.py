@@ -11,7 +11,7 @@ structs from here.
 from __future__ import annotations
 
 from uuvtai.state.arrays import PACKET, REAL, WORD, allocate, array, bytes_of
-from uuvtai.state.baselines import BaselineState
+from uuvtai.state.behavior import BaselineState, TeacherState, TreeTable
 from uuvtai.state.perception import (
     ClusterState,
     EchoState,
@@ -43,7 +43,6 @@ from uuvtai.state.sensors import (
     SonarScan,
 )
 from uuvtai.state.task import ClockState, EpisodeState, MissionState, RefereeState, RewardState
-from uuvtai.state.teacher import TeacherState, TreeTable
 from uuvtai.state.vehicle import ActuationState, Allocation, CurrentState, VehicleParams, VehicleState
 from uuvtai.state.world import FixedTable, PathState, ScenarioScratch, SceneState, WorldState
 

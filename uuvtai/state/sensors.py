@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from uuvtai.common.enums import Truth
 from uuvtai.state.arrays import array
-from uuvtai.truth import Truth
 
 
 @dataclass(frozen=True, eq=False)

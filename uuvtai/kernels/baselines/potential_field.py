@@ -10,8 +10,9 @@ known to be above or below pushes down or up too.
 
 import taichi as ti
 
-from uuvtai.kernels.baselines.bundles import PotentialFieldIO
-from uuvtai.kernels.baselines.surroundings import (
+from uuvtai.compile.launch import quick_launch
+from uuvtai.kernels.baselines.io import PotentialFieldIO
+from uuvtai.kernels.baselines.local_planner import (
     apart_m,
     decides,
     edge_stopped,
@@ -20,8 +21,7 @@ from uuvtai.kernels.baselines.surroundings import (
     speed_limited,
     wanted_velocity,
 )
-from uuvtai.kernels.core.signature import Bundle, spread
-from uuvtai.native.launch import quick_launch
+from uuvtai.kernels.core.stage import Bundle, spread
 
 
 @quick_launch

@@ -11,12 +11,17 @@ one that collides last is driven (the paper leaves that to the designer).
 
 import taichi as ti
 
-from uuvtai.kernels.baselines.bundles import VelocityObstacleIO
-from uuvtai.kernels.baselines.reachable import reachable_velocity
-from uuvtai.kernels.baselines.surroundings import decides, free_water_m, mapped_m, wanted_velocity
+from uuvtai.compile.launch import quick_launch
+from uuvtai.kernels.baselines.io import VelocityObstacleIO
+from uuvtai.kernels.baselines.local_planner import (
+    decides,
+    free_water_m,
+    mapped_m,
+    reachable_velocity,
+    wanted_velocity,
+)
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3
-from uuvtai.kernels.core.signature import Bundle, spread
-from uuvtai.native.launch import quick_launch
+from uuvtai.kernels.core.stage import Bundle, spread
 
 _FORBIDDEN = 100.0
 """Cost above that of every velocity outside all cones."""

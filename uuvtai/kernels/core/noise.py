@@ -7,7 +7,7 @@ Wellons, hash-prospector, bias 0.17).
 
 import taichi as ti
 
-from uuvtai.kernels.core.signature import Const
+from uuvtai.kernels.core.stage import Const
 
 # one stream per purpose; a stream's draws never meet another's
 STREAM_SCENARIO = 1

@@ -13,9 +13,9 @@ import taichi as ti
 
 from uuvtai.kernels.core.beams import beam_lanes, beam_there
 from uuvtai.kernels.core.geometry import turned_z
-from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Bundle
-from uuvtai.kernels.perception.bundles import TrackingIO
+from uuvtai.kernels.core.simd import LANES, f16x
+from uuvtai.kernels.core.stage import Bundle
+from uuvtai.kernels.perception.io import TrackingIO
 
 ARC = 0.25 * math.pi
 """Mean over the beams of a far circle's visible arc of sqrt(1 - x^2): how many radii its mean range lies

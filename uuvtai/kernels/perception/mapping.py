@@ -26,13 +26,11 @@ import math
 
 import taichi as ti
 
-from uuvtai.kernels.core.bits import WORD, bit_of, lowest_bit, taken, with_bit, without_lowest
-from uuvtai.kernels.core.lanes import n_item, n_turn
-from uuvtai.kernels.core.signature import Bundle, Const, spread
-from uuvtai.kernels.perception.bundles import MappingIO
-from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
-from uuvtai.kernels.perception.fan import mark_free
-from uuvtai.native.launch import quick_launch, with_cse
+from uuvtai.compile.launch import quick_launch, with_cse
+from uuvtai.kernels.core.simd import WORD, bit_of, lowest_bit, n_item, n_turn, taken, with_bit, without_lowest
+from uuvtai.kernels.core.stage import Bundle, Const, spread
+from uuvtai.kernels.perception.io import MappingIO
+from uuvtai.kernels.perception.sensor_model import mark_depth, mark_free, mark_hits
 
 RATED_HZ = 10.0
 """Scan rate for which the gains of MappingConfig are given."""

@@ -26,20 +26,31 @@ import math
 
 import taichi as ti
 
-from uuvtai.kernels.core.bits import WORD, cell_bit, highest_bit, lowest_bit, put_bit, without_lowest
-from uuvtai.kernels.core.lanes import LANES, i16x, n_item
-from uuvtai.kernels.core.signature import Bundle, Const, In, spread
-from uuvtai.kernels.planning.bundles import ClearanceIO
-from uuvtai.kernels.planning.clearance_cells import find_changes, note_farthest, redo_cells
-from uuvtai.kernels.planning.clearance_keys import (
+from uuvtai.compile.launch import quick_launch, with_cse
+from uuvtai.kernels.core.simd import (
+    LANES,
+    WORD,
+    cell_bit,
+    highest_bit,
+    i16x,
+    lowest_bit,
+    n_item,
+    put_bit,
+    without_lowest,
+)
+from uuvtai.kernels.core.stage import Bundle, Const, In, spread
+from uuvtai.kernels.planning.clearance_gpu import (
+    find_changes,
     is_due,
     no_site,
+    note_farthest,
     offset_bits,
+    redo_cells,
     site_word,
     squared_limit,
     window_reach,
 )
-from uuvtai.native.launch import quick_launch, with_cse
+from uuvtai.kernels.planning.io import ClearanceIO
 
 _FAR_COLS = 1 << 12
 """[cells] stands for "no site in this row"; its square fits an int32."""

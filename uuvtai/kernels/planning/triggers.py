@@ -11,15 +11,7 @@ them is counted per replan.
 
 import taichi as ti
 
-from uuvtai.kernels.core.lanes import LANES, i16x
-from uuvtai.kernels.core.signature import Bundle, spread
-from uuvtai.kernels.perception.range_rate import range_rate
-from uuvtai.kernels.planning.along import advanced_arc, level, look_along
-from uuvtai.kernels.planning.bundles import TriggersIO
-from uuvtai.kernels.planning.path_risk import cell_on_grid, risk_at
-from uuvtai.kernels.planning.traversable import is_traversable
-from uuvtai.native.launch import quick_launch
-from uuvtai.plan_codes import (
+from uuvtai.common.enums import (
     FAIL_NONE,
     N_TRIGGER,
     TRIGGER_INITIAL,
@@ -28,6 +20,13 @@ from uuvtai.plan_codes import (
     TRIGGER_SAFETY,
     TRIGGER_STUCK,
 )
+from uuvtai.compile.launch import quick_launch
+from uuvtai.kernels.core.beams import range_rate
+from uuvtai.kernels.core.simd import LANES, i16x
+from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.planning.io import TriggersIO
+from uuvtai.kernels.planning.medial_axis import is_traversable
+from uuvtai.kernels.planning.route import advanced_arc, cell_on_grid, level, look_along, risk_at
 
 
 @quick_launch

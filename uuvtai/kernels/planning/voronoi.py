@@ -9,22 +9,33 @@ fails with a reason, and the host's RRT takes over.
 
 import taichi as ti
 
-from uuvtai.kernels.core.grid import grid_origin
-from uuvtai.kernels.core.lanes import filled, n_lane
-from uuvtai.kernels.core.signature import Bundle, FloatMatrix, spread
-from uuvtai.kernels.planning.bundles import VoronoiIO
-from uuvtai.kernels.planning.chord import count_of_waypoints, path_cells, straightened_cost
-from uuvtai.kernels.planning.medial import FOUND, NOT_FOUND, join_skeleton, search_cells, widest_m
-from uuvtai.kernels.planning.polyline import MAX_WIDENINGS, WIDENING, install_route
-from uuvtai.kernels.planning.traversable import is_traversable, occupancy
-from uuvtai.native.launch import quick_launch
-from uuvtai.plan_codes import (
+from uuvtai.common.enums import (
     FAIL_BUDGET,
     FAIL_DISCONNECTED,
     FAIL_GOAL_OUTSIDE,
     FAIL_NONE,
     FAIL_START_OUTSIDE,
     PLANNER_VORONOI,
+)
+from uuvtai.compile.launch import quick_launch
+from uuvtai.kernels.core.grid import grid_origin
+from uuvtai.kernels.core.simd import filled, n_lane
+from uuvtai.kernels.core.stage import Bundle, FloatMatrix, spread
+from uuvtai.kernels.planning.io import VoronoiIO
+from uuvtai.kernels.planning.medial_axis import (
+    FOUND,
+    MAX_WIDENINGS,
+    NOT_FOUND,
+    WIDENING,
+    count_of_waypoints,
+    install_route,
+    is_traversable,
+    join_skeleton,
+    occupancy,
+    path_cells,
+    search_cells,
+    straightened_cost,
+    widest_m,
 )
 
 

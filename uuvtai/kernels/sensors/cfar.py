@@ -15,11 +15,11 @@ import math
 import taichi as ti
 
 from uuvtai.config import SonarConfig
+from uuvtai.config.multibeam import ABSORPTION_NP_M, SHOWN_DB, filled_beam
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.core.lanes import filled
-from uuvtai.kernels.core.signature import Bundle, Const
-from uuvtai.kernels.sensors.bundles import SonarIO
-from uuvtai.multibeam import ABSORPTION_NP_M, SHOWN_DB, filled_beam
+from uuvtai.kernels.core.simd import filled
+from uuvtai.kernels.core.stage import Bundle, Const
+from uuvtai.kernels.sensors.io import SonarIO
 
 
 @ti.func

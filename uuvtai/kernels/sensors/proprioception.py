@@ -14,6 +14,7 @@ unknown (``find_velocity``).
 
 import taichi as ti
 
+from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb, wrapped_angle
 from uuvtai.kernels.core.noise import (
     STREAM_DVL,
@@ -24,9 +25,8 @@ from uuvtai.kernels.core.noise import (
     uniform,
     uniform_in,
 )
-from uuvtai.kernels.core.signature import Bundle, spread
-from uuvtai.kernels.sensors.bundles import ExactProprioceptionIO, ProprioceptionIO, VelocityIO
-from uuvtai.native.launch import quick_launch
+from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.sensors.io import ExactProprioceptionIO, ProprioceptionIO, VelocityIO
 
 _EPISODE_DRAW = 1000
 """Index of draws made once per episode, apart from those of step 0."""

@@ -11,9 +11,9 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE
-from uuvtai.kernels.core.lanes import LANES, f16x, filled, lane_bits
-from uuvtai.kernels.core.signature import Bundle, Const
-from uuvtai.kernels.sensors.bundles import SonarIO
+from uuvtai.kernels.core.simd import LANES, f16x, filled, lane_bits
+from uuvtai.kernels.core.stage import Bundle, Const
+from uuvtai.kernels.sensors.io import SonarIO
 
 _TINY = 1.0e-9
 """Below this a direction component counts as parallel."""

@@ -9,20 +9,9 @@ import math
 
 import taichi as ti
 
+from uuvtai.compile.launch import quick_launch, with_cse
 from uuvtai.config import SonarConfig
-from uuvtai.kernels.core.geometry import BOX, FAR_M, SPHERE
-from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.noise import (
-    STREAM_SONAR_HISS,
-    STREAM_SONAR_SPECKLE,
-    normal_pair_lanes,
-    stream_key,
-)
-from uuvtai.kernels.core.signature import Bundle, spread
-from uuvtai.kernels.sensors.bundles import SonarIO
-from uuvtai.kernels.sensors.raycast import ball_span, bodies_in_wedge, disc_span, slab_span, wall_echo
-from uuvtai.kernels.sensors.sonar import place_sonar, sonar_mount
-from uuvtai.multibeam import (
+from uuvtai.config.multibeam import (
     ABSORPTION_NP_M,
     BEAM_DEG,
     HALF_POWER,
@@ -32,7 +21,18 @@ from uuvtai.multibeam import (
     noise_power,
     pad_beams,
 )
-from uuvtai.native.launch import quick_launch, with_cse
+from uuvtai.kernels.core.geometry import BOX, FAR_M, SPHERE
+from uuvtai.kernels.core.noise import (
+    STREAM_SONAR_HISS,
+    STREAM_SONAR_SPECKLE,
+    normal_pair_lanes,
+    stream_key,
+)
+from uuvtai.kernels.core.simd import LANES, f16x
+from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.sensors.io import SonarIO
+from uuvtai.kernels.sensors.raycast import ball_span, bodies_in_wedge, disc_span, slab_span, wall_echo
+from uuvtai.kernels.sensors.sonar import place_sonar, sonar_mount
 
 _WALL, _FLOOR, _SURFACE = -1, -2, -3
 """surfaces that are no body"""

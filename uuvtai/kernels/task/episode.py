@@ -3,13 +3,20 @@ rules."""
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import FAR_M, NONE, rotation_wb
-from uuvtai.kernels.core.hull import hull_to_body, hull_to_floor_or_surface, hull_to_side_wall, is_in_tank
+from uuvtai.common.enums import COLLISION, OUT_OF_TANK, OUTCOMES, RUNNING, SUCCESS, TIMEOUT, TTC
+from uuvtai.compile.launch import quick_launch
+from uuvtai.kernels.core.geometry import (
+    FAR_M,
+    NONE,
+    hull_to_body,
+    hull_to_floor_or_surface,
+    hull_to_side_wall,
+    is_in_tank,
+    rotation_wb,
+)
 from uuvtai.kernels.core.noise import episode_key
-from uuvtai.kernels.core.signature import Bundle, IntVector, spread
-from uuvtai.kernels.task.bundles import EpisodeIO
-from uuvtai.native.launch import quick_launch
-from uuvtai.outcomes import COLLISION, OUT_OF_TANK, OUTCOMES, RUNNING, SUCCESS, TIMEOUT, TTC
+from uuvtai.kernels.core.stage import Bundle, IntVector, spread
+from uuvtai.kernels.task.io import EpisodeIO
 
 __all__ = ["COLLISION", "OUTCOMES", "OUT_OF_TANK", "RUNNING", "SUCCESS", "TIMEOUT", "TTC"]
 

@@ -8,9 +8,11 @@ Safety terms come from the referee (truth), which the reward may use; the policy
 
 import taichi as ti
 
+from uuvtai.common.enums import COLLISION, OUT_OF_TANK, SUCCESS, TIMEOUT
+from uuvtai.compile.launch import quick_launch
 from uuvtai.config.task import TERMS
 from uuvtai.kernels.core.geometry import rotation_wb
-from uuvtai.kernels.core.signature import (
+from uuvtai.kernels.core.stage import (
     AnyVector,
     Bundle,
     ByteVector,
@@ -20,9 +22,7 @@ from uuvtai.kernels.core.signature import (
     IntVector,
     spread,
 )
-from uuvtai.kernels.task.bundles import RewardIO
-from uuvtai.native.launch import quick_launch
-from uuvtai.outcomes import COLLISION, OUT_OF_TANK, SUCCESS, TIMEOUT
+from uuvtai.kernels.task.io import RewardIO
 
 _PENALTIES = ("path_distance", "cross_track", "clearance", "ttc", "overspeed", "failure", "tilt", "effort")
 """Terms that the equation subtracts."""

@@ -3,30 +3,19 @@ what writes, declares, reads back and documents logs follows from it."""
 
 from __future__ import annotations
 
-from uuvtai.logs.topic import Topic
-from uuvtai.logs.topics import (
-    body_topics,
-    camera_topics,
-    driver_topics,
-    event_topics,
-    instrument_topics,
-    map_topics,
-    plan_topics,
-    pose_topics,
-    sonar_topics,
-    state_topics,
-)
+from uuvtai.logs.encode import Topic
+from uuvtai.logs.topics import motion, perception, planning, sensors
 
 TOPICS: tuple[Topic, ...] = (
-    *pose_topics.ROWS,
-    *instrument_topics.ROWS,
-    *sonar_topics.ROWS,
-    *camera_topics.ROWS,
-    *map_topics.ROWS,
-    *plan_topics.ROWS,
-    *body_topics.ROWS,
-    *state_topics.ROWS,
-    *driver_topics.ROWS,
-    *event_topics.ROWS,
+    *motion.POSE_ROWS,
+    *motion.INSTRUMENT_ROWS,
+    *sensors.SONAR_ROWS,
+    *sensors.CAMERA_ROWS,
+    *perception.MAP_ROWS,
+    *planning.PLAN_ROWS,
+    *perception.BODY_ROWS,
+    *motion.STATE_ROWS,
+    *planning.DRIVER_ROWS,
+    *motion.EVENT_ROWS,
 )
 """no two of one name"""

@@ -1,1 +1,0 @@
-"""The stack as a folder that drives without Taichi and torch: for a companion computer."""

@@ -1,0 +1,1 @@
+"""What every room may use: errors and exits, files, signals, processes, statistics, codes."""

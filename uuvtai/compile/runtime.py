@@ -1,0 +1,137 @@
+"""Start Taichi once per process. Only this module calls ``ti.init``."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import taichi as ti
+from taichi.lang import impl
+from taichi.lang.impl import default_cfg
+
+from uuvtai.common.errors import DeviceError, SettingError
+
+# ------------------------------------------------------------------------------------------------------------
+# Taichi's cache of compiled kernels: how large it may grow, and locks that nobody holds any more.
+
+
+_LOCKED_S = 60.0
+"""Taichi locks its cache by a file, for as long as it reads or writes there: one older than this belongs to a
+process that was killed"""
+
+CACHE_BYTES = 1 << 30
+"""Taichi's own limit, 100 MB, is about twelve sizes of simulator (6 to 9 MB each): a sweep and a training
+push each other's kernels out"""
+
+
+def stale_locks() -> list[Path]:
+    """Locks of the kernel cache that nobody holds any more: with one of them every process compiles
+    everything again."""
+    cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or default_cfg().offline_cache_file_path)
+    return [lock for lock in cache.rglob("*.lock") if time.time() - lock.stat().st_mtime > _LOCKED_S]
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """How Taichi was started."""
+
+    device: str
+    """'cpu' or 'cuda'"""
+    precision: str
+    """'f32' or 'f64': dtype of continuous quantities"""
+
+    @property
+    def real(self):
+        """Taichi dtype of continuous quantities."""
+        return ti.f64 if self.precision == "f64" else ti.f32
+
+
+_started: list[Runtime] = []
+
+_MAX_THREADS = 1024
+
+LOOP_PARTS = 16
+"""threads that loops are cut for, however many there are: one code, and one entry in the kernel cache, for
+all"""
+
+
+def start_taichi(device: str = "cpu", precision: str = "f32") -> Runtime:
+    """Start Taichi on ``device`` ('auto', 'cpu' or 'cuda'), or return the runtime that is already up.
+
+    A second ``ti.init`` would destroy every field, so a process has one runtime; asking for another kind is
+    an error. ``UUV_NUM_THREADS`` bounds the CPU threads. Raises DeviceError where the device is missing,
+    SettingError for others.
+    """
+    wanted = Runtime(_resolved(device), precision)
+    if _started:
+        if _started[0] != wanted:
+            raise RuntimeError(f"Taichi already runs as {_started[0]}; start a new process for {wanted}")
+        return wanted
+    with contextlib.suppress(
+        OSError
+    ):  # another process was faster, or may do so in our place: ``uuv doctor`` tells
+        for lock in stale_locks():
+            lock.unlink()
+    options = {}
+    if threads := os.environ.get("UUV_NUM_THREADS"):
+        options["cpu_max_num_threads"] = _thread_count(threads)
+    with contextlib.redirect_stdout(sys.stderr):  # Taichi greets on stdout, which belongs to results
+        ti.init(
+            arch=ti.cuda if wanted.device == "cuda" else ti.cpu,
+            default_fp=wanted.real,
+            fast_math=False,
+            offline_cache=True,
+            offline_cache_max_size_of_files=CACHE_BYTES,
+            cfg_optimization=False,  # LLVM does that work again: half of the time to compile, equal results;
+            # and on CUDA Taichi 1.7.4 falls over what that pass leaves of ``tick_tree``
+            log_level=ti.WARN,
+            **options,
+        )
+    arch = impl.current_cfg().arch
+    if wanted.device == "cuda" and arch != ti.cuda:  # our tensors would lie where its kernels cannot reach
+        ti.reset()
+        raise DeviceError(
+            f"--device {device}: torch sees a CUDA device, but Taichi cannot use it and fell back to "
+            f"{str(arch).rpartition('.')[2]}; use --device cpu, or mend the driver"
+        )
+    if wanted.device == "cpu":  # its pool has its threads by now, and takes no more than it has
+        program: Any = impl.get_runtime().prog
+        program.config().cpu_max_num_threads = LOOP_PARTS
+    _started.append(wanted)
+    return wanted
+
+
+def _thread_count(text: str) -> int:
+    """Number of threads that ``UUV_NUM_THREADS`` asks for. Raises SettingError."""
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if not 1 <= count <= _MAX_THREADS:
+        raise SettingError(
+            f"UUV_NUM_THREADS={text!r}: must be a whole number of CPU threads from 1 to {_MAX_THREADS}; "
+            "unset it to use all"
+        )
+    return count
+
+
+def _resolved(device: str) -> str:
+    if device == "cpu":
+        return "cpu"
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if device == "cuda":
+        if not torch.cuda.is_available():
+            raise DeviceError("--device cuda: torch sees no CUDA device here; use --device cpu")
+        return "cuda"
+    raise SettingError(f"unknown device {device!r}: use auto, cpu or cuda")

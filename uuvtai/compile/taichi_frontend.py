@@ -1,0 +1,119 @@
+"""Taichi's front end with a memory: what it works out again for every call of a ``ti.func`` is worked out
+once.
+
+Taichi inlines: it transforms a func's source anew wherever it is called, thousands of times before the first
+step of a simulator. Each time it looks the source up and wraps its lines, which are pure functions of the
+source; and it words a position that quotes the source for every node of the syntax tree, errors or not: a
+fifth of a warm start. Here the quotation is made when there is an error, a source is parsed once, and a field
+keeps the line that declared it instead of a stack trace. Positions are no part of what Taichi's cache is
+asked for, so it finds kernels that were compiled without this.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import sys
+import textwrap
+import types
+from typing import Any
+
+from taichi.lang import impl, kernel_impl, snode
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+from uuvtai.compile.first_import import inside_class
+
+
+def remember_sources() -> None:
+    """Give this process's Taichi the memory; once is enough. A Taichi without these names is left as it
+    is."""
+    if hasattr(ASTTransformerContext, "get_pos_info") and not hasattr(
+        ASTTransformerContext.get_pos_info, "__wrapped__"
+    ):
+        ASTTransformerContext.get_pos_info = _short_unless_raised(ASTTransformerContext.get_pos_info)
+    for name in ("getsourcefile", "getsourcelines"):
+        if hasattr(kernel_impl, name) and not hasattr(getattr(kernel_impl, name), "__wrapped__"):
+            setattr(kernel_impl, name, functools.cache(getattr(kernel_impl, name)))
+    if hasattr(kernel_impl, "_inside_class"):
+        kernel_impl._inside_class = inside_class  # type: ignore[attr-defined]
+    if getattr(kernel_impl, "textwrap", None) is textwrap:
+        kernel_impl.textwrap = types.SimpleNamespace(
+            fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent)
+        )  # type: ignore[attr-defined]
+    if getattr(kernel_impl, "ast", None) is ast:
+        ours = types.SimpleNamespace(**{**vars(ast), "parse": _parse})
+        kernel_impl.ast = ours  # type: ignore[attr-defined]
+    for module in (impl, snode):
+        if hasattr(module, "get_traceback"):
+            module.get_traceback = _caller
+    if hasattr(kernel_impl.Kernel, "materialize") and not hasattr(
+        kernel_impl.Kernel.materialize, "__wrapped__"
+    ):
+        kernel_impl.Kernel.materialize = _counted(kernel_impl.Kernel.materialize)
+
+
+_made = [0]
+
+
+def kernels_made() -> int:
+    """How many kernels were compiled, or found in the cache, since this process began: time in which this
+    grows is no working time."""
+    return _made[0]
+
+
+def _counted(materialize: Any) -> Any:
+    @functools.wraps(materialize)
+    def counted(kernel: Any, *arguments: Any, **named: Any) -> Any:
+        before, tracer = len(kernel.compiled_kernels), sys.gettrace()
+        if (
+            tracer is not None
+        ):  # nobody debugs Taichi's front end, or measures its coverage: a third of the time under either
+            sys.settrace(None)
+        try:
+            result = materialize(kernel, *arguments, **named)
+        finally:
+            if tracer is not None:
+                sys.settrace(tracer)
+        _made[0] += len(kernel.compiled_kernels) - before
+        return result
+
+    return counted
+
+
+@functools.cache
+def _tree(source: str) -> tuple[ast.Module, list[ast.arg]]:
+    tree = ast.parse(source)
+    return tree, list(tree.body[0].args.args)  # type: ignore[attr-defined]
+
+
+def _parse(source: str) -> ast.Module:
+    """The tree of a function's source, as good as new: Taichi takes a kernel's parameters out, and what it
+    notes at nodes it overwrites."""
+    tree, parameters = _tree(source)
+    tree.body[0].args.args = list(parameters)  # type: ignore[attr-defined]
+    return tree
+
+
+def _caller(stacklevel: int = 1) -> str:
+    """Where a field is declared: the frame that asked Taichi for it; Taichi's ``stacklevel`` has no meaning
+    here."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("taichi."):
+        frame = frame.f_back
+    return f'  File "{frame.f_code.co_filename}", line {frame.f_lineno}, in {frame.f_code.co_name}\n'
+
+
+def _short_unless_raised(get_pos_info: Any) -> Any:
+    """``get_pos_info(context, node)`` that quotes the source only while an exception is being handled, and
+    else names file and line."""
+
+    @functools.wraps(get_pos_info)
+    def position(context: Any, node: Any) -> str:
+        if sys.exc_info()[0] is not None:
+            return get_pos_info(context, node)
+        return (
+            f'File "{context.file}", line {node.lineno + context.lineno_offset}, in '
+            f"{context.func.func.__name__}:\n"
+        )
+
+    return position

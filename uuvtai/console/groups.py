@@ -1,0 +1,396 @@
+"""Options that several commands share, as one parameter: ``grouped`` spreads a group's options out for Typer
+and hands the command the group, filled.
+
+A group is a dataclass whose fields are annotated as options are (``options.py``); a field that is not
+annotated so cannot be typed and keeps its default.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_origin, get_type_hints
+
+import typer
+
+from uuvtai.common.exits import UsageError, say
+from uuvtai.console import options as opt
+from uuvtai.console import parsing
+from uuvtai.console.screen import Screen
+from uuvtai.sim.scene import SceneOptions
+
+if TYPE_CHECKING:
+    from uuvtai.config import Config
+    from uuvtai.evaluation.simulate import Trial
+    from uuvtai.evaluation.sweep import Engine
+    from uuvtai.vehicle.control_loop import FlightPlan
+    from uuvtai.vehicle.replay import Faults
+    from uuvtai.vehicle.sitl import SitlPlan
+
+_F = TypeVar("_F", bound=Callable[..., None])
+
+
+def grouped(command: _F) -> _F:
+    """The command as Typer is to see it: each option of its groups by itself, those of the output last."""
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+    given = list(inspect.signature(command).parameters.values())
+    given.sort(key=lambda each: issubclass(groups.get(each.name, object), OutputGroup))  # last in the help
+    parameters = [own for each in given for own in _spread(each, hints[each.name], groups)]
+
+    @functools.wraps(command)
+    def spread_out(**typed: Any) -> None:
+        filled = {
+            name: kind(**{own: typed.pop(own) for own in _annotated(kind)}) for name, kind in groups.items()
+        }
+        command(**typed, **filled)
+
+    spread_out.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    spread_out.__annotations__ = {each.name: each.annotation for each in parameters}
+    return spread_out  # type: ignore[return-value]
+
+
+def _annotated(group: Any) -> dict[str, Any]:
+    """Annotations of the fields that can be typed."""
+    hints = get_type_hints(group, include_extras=True)
+    return {
+        each.name: hints[each.name] for each in fields(group) if get_origin(hints[each.name]) is Annotated
+    }
+
+
+def _spread(parameter: inspect.Parameter, hint: Any, groups: dict[str, Any]) -> list[inspect.Parameter]:
+    group = groups.get(parameter.name)
+    if group is None:
+        return [parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY)]
+    defaults = {
+        each.name: inspect.Parameter.empty if each.default is MISSING else each.default
+        for each in fields(group)
+    }
+    return [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=kind)
+        for name, kind in _annotated(group).items()
+    ]
+
+
+# ------------------------------------------------------------------------------------------------ the groups
+
+
+@dataclass(frozen=True)
+class SceneGroup(SceneOptions):
+    """Where, and with which vehicle."""
+
+    world: opt.World = "pool"
+    sensors: opt.Sensors = None
+    vehicle: opt.Vehicle = None
+    stack: opt.Stack = None
+    n_static: opt.Static = None
+    n_dynamic: opt.Dynamic = None
+    speed_m_s: opt.Speed = None
+    overrides: opt.Set = None
+
+
+@dataclass(frozen=True)
+class TrainSceneGroup(SceneOptions):
+    """What is not typed is the training preset's."""
+
+    world: opt.TrainWorld = None
+    sensors: opt.TrainSensors = None
+    stack: opt.Stack = None
+    n_static: opt.Static = None
+    n_dynamic: opt.Dynamic = None
+    speed_m_s: opt.Speed = None
+    overrides: opt.Set = None
+
+
+@dataclass(frozen=True)
+class DriversGroup:
+    """Who drives: trained policies, controllers, the user's own pieces."""
+
+    runs: opt.EvalRuns = None
+    controller: opt.EvalControllers = None
+    planner: opt.Planners = None
+    policy: opt.Policies = None
+
+    def named(self, default: list[str] | None = None) -> tuple[list[str], list[str]]:
+        """(trained policies, controllers with the user's own pieces among them); ``default``: the
+        controllers where none is typed. UsageError."""
+        return parsing.drivers(self.runs, self.controller or default, self.planner, self.policy)
+
+
+@dataclass(frozen=True)
+class WatchDriversGroup(DriversGroup):
+    """As ``DriversGroup``; by default one of them alone."""
+
+    controller: opt.WatchControllers = None
+
+    def named(self, default: list[str] | None = None) -> tuple[list[str], list[str]]:
+        """As ``DriversGroup.named``: beside somebody else nobody, else the tree."""
+        others = self.runs or self.planner or self.policy
+        return super().named(default or (["none"] if others else ["bt"]))
+
+
+@dataclass(frozen=True)
+class SweepDriversGroup(DriversGroup):
+    """As ``DriversGroup``."""
+
+    runs: opt.SweepRuns = None
+    controller: opt.SweepControllers = None
+
+
+@dataclass(frozen=True)
+class DriverGroup:
+    """Who drives one vehicle."""
+
+    controller: opt.DrivenBy = None
+    planner: opt.Planners = None
+    policy: opt.Policies = None
+
+    @property
+    def one(self) -> str | None:
+        """Its name; None = nobody. UsageError for several."""
+        return parsing.one_driver(self.controller, self.planner, self.policy)
+
+
+@dataclass(frozen=True)
+class PiecesGroup:
+    """The user's own pieces, and nothing else."""
+
+    controller: opt.OwnControllers = None
+    planner: opt.Planners = None
+    policy: opt.Policies = None
+
+    def named(self) -> list[str]:
+        """UsageError for what is no piece of hers."""
+        return parsing.own_pieces(self.controller, self.planner, self.policy)
+
+
+@dataclass(frozen=True)
+class RecordingGroup:
+    """What an evaluation keeps of its episodes."""
+
+    record: opt.Record = 0
+    video: opt.Video = False
+    depth_images: opt.DepthImages = False
+    explain: opt.Explain = False
+    explain_record: opt.ExplainRecord = None
+
+    def asked(self) -> dict[str, Any]:
+        """Fields of a ``Request``. UsageError for what does not go together."""
+        parsing.refuse_less("--record", self.record, 0)
+        if self.explain_record is not None:
+            parsing.refuse_less("--explain-record", self.explain_record, 0)
+            if not self.explain:
+                raise UsageError("--explain-record: give --explain too, it says which episodes to record")
+        kept = {each.name: getattr(self, each.name) for each in fields(self)}
+        return kept | {"explain_record": 3 if self.explain_record is None else self.explain_record}
+
+
+@dataclass(frozen=True)
+class WorkplaceGroup:
+    """Who works on a sweep."""
+
+    engine: opt.EngineName = "local"
+    workers: opt.Workers = 1
+    address: opt.Address = "auto"
+
+    def made(self) -> Engine:
+        """Who works. UsageError."""
+        from uuvtai.evaluation.sweep import engine_of
+
+        parsing.refuse_less("--workers", self.workers, 1)
+        return engine_of(self.engine, self.workers, self.address)
+
+
+@dataclass(frozen=True)
+class MotionGroup:
+    """How a vehicle begins in open water, and what acts on it."""
+
+    seconds: opt.SimulateSeconds
+    wrench: opt.Wrench = None
+    command: opt.Command = None
+    current: opt.Current = None
+    initial_rpy_deg: opt.InitialRpy = None
+    initial_velocity: opt.InitialVelocity = None
+    neutral: opt.Neutral = False
+    dt: opt.Substep = 0.01
+
+    def trial(self) -> Trial:
+        """UsageError for what is no number."""
+        from uuvtai.evaluation.simulate import Trial
+
+        return Trial(
+            self.seconds,
+            wrench=parsing.numbers("--wrench", self.wrench, 6),
+            command=parsing.numbers("--command", self.command, 4),
+            current=parsing.numbers("--current", self.current, 3),
+            initial_rpy_deg=parsing.numbers("--initial-rpy-deg", self.initial_rpy_deg, 3),
+            initial_velocity=parsing.numbers("--initial-velocity", self.initial_velocity, 6),
+            neutral=self.neutral,
+            dt=self.dt,
+        )
+
+
+@dataclass(frozen=True)
+class FaultsGroup:
+    """What happens to the messages of the sensors."""
+
+    drop: opt.Drop = 0.0
+    jitter: opt.Jitter = 0.0
+    lose: opt.Lose = None
+    fault_seed: opt.FaultSeed = 0
+
+    def made(self) -> Faults:
+        """UsageError."""
+        from uuvtai.vehicle.replay import Faults, outage_of
+
+        parsing.refuse_less("--fault-seed", self.fault_seed, 0)
+        return Faults(self.drop, self.jitter, tuple(map(outage_of, self.lose or [])), self.fault_seed)
+
+
+@dataclass(frozen=True)
+class SeenSceneGroup(SceneOptions):
+    """What a pilot on a vehicle is told of its world, vehicle and sensors."""
+
+    world: opt.World = "pool"
+    sensors: opt.Sensors = "multibeam"
+    vehicle: opt.Vehicle = None
+    overrides: opt.Set = None
+
+
+@dataclass(frozen=True)
+class SitlSceneGroup(SceneOptions):
+    """What ArduSub meets."""
+
+    world: opt.World = "pool"
+    sensors: opt.Sensors = "multibeam"
+    vehicle: opt.Vehicle = "bluerov2_16v"
+    n_static: opt.Static = None
+    n_dynamic: opt.Dynamic = None
+    speed_m_s: opt.Speed = None
+    overrides: opt.Set = None
+
+
+@dataclass(frozen=True)
+class StackGroup:
+    """The whole stack of a log as a folder of native code."""
+
+    stack: opt.ExportStack = None
+    machines: opt.ExportFor = "x86_64,aarch64"
+
+    def written(self, log: str | None) -> dict[str, Any] | None:
+        """What was written, where it was asked for. Raises LogError, StackExportError, CrossError."""
+        if log is None or self.stack is None:
+            return None
+        from uuvtai.evaluation.agents import export_log
+
+        return export_log(Path(log), self.stack, self.machines.split(","))
+
+
+@dataclass(frozen=True)
+class FlightGroup:
+    """Where the vehicle is, where it is to go, and what it must keep to."""
+
+    mavlink: opt.Mavlink
+    start: opt.PilotStart
+    goal: opt.PilotGoal
+    arm: opt.Arm = False
+    heading: opt.Heading = None
+    box: opt.FenceBox = None
+    depth: opt.FenceDepth = None
+    max_speed: opt.MostSpeed = 0.5
+    battery: opt.LeastBattery = 13.2
+    system: opt.VehicleId = 1
+    operator: opt.OperatorId = 255
+    sender: opt.HeardSenders = None
+    seconds: opt.PilotSeconds = None
+    rate: opt.PilotRate = 1.0
+    log: opt.PilotLog = None
+    force: opt.PilotForce = False
+
+    def plan(self, config: Config) -> FlightPlan:
+        """UsageError, LinkError."""
+        from uuvtai.vehicle.control_loop import FlightPlan
+
+        parsing.refuse_odd_rate(self.rate)
+        if self.log is not None and self.log.exists() and not self.force:
+            raise UsageError(f"--log {self.log}: is there already; give another name, or --force")
+        return FlightPlan.typed(
+            config,
+            self.mavlink,
+            parsing.numbers("--start", self.start, 3),
+            parsing.numbers("--goal", self.goal, 3),
+            parsing.numbers("--box", self.box, 4),
+            parsing.numbers("--depth", self.depth, 2),
+            self.max_speed,
+            self.battery,
+            arms=self.arm,
+            heading_deg=self.heading,
+            seconds=self.seconds,
+            rate=self.rate,
+            log=self.log,
+            system=self.system,
+            operator=self.operator,
+            senders=self.sender or (),
+        )
+
+
+@dataclass(frozen=True)
+class ServedGroup:
+    """How water is served to ArduSub."""
+
+    seed: opt.SitlSeed = 0
+    episode: opt.SitlEpisode = 0
+    instances: opt.Instances = 1
+    port: opt.SitlPort = 9002
+    host: opt.SitlHost = "127.0.0.1"
+    mavlink: opt.SensorPlaces = None
+    operator: opt.PlayOperator = False
+    rate: opt.SitlRate = 0.0
+    seconds: opt.SitlSeconds = None
+    once: opt.SitlOnce = False
+
+    def plan(self) -> SitlPlan:
+        """UsageError, LinkError."""
+        from uuvtai.vehicle.sitl import SitlPlan
+
+        parsing.refuse_odd_rate(self.rate)
+        told = SitlPlan.typed(
+            self.host,
+            self.port,
+            self.instances,
+            self.mavlink,
+            self.rate,
+            self.seconds,
+            self.once,
+            self.seed,
+            self.episode,
+        )
+        return replace(told, operator=self.operator)
+
+
+@dataclass(frozen=True)
+class OutputGroup:
+    """How the result is shown."""
+
+    wide: opt.Wide = False
+    as_json: opt.AsJson = False
+
+    def show(self, document: Any, shown: Callable[[Screen], None], folder: Path | None = None) -> None:
+        """The result, for a program or for a person, who also hears of the run's ``folder``."""
+        if self.as_json:
+            typer.echo(json.dumps(document, allow_nan=False))
+            return
+        shown(Screen(self.wide))
+        if folder is not None:
+            say(f"run folder: {folder}")
+
+
+@dataclass(frozen=True)
+class PlainOutputGroup(OutputGroup):
+    """Of what is no table."""
+
+    wide: bool = False

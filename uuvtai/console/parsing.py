@@ -1,0 +1,290 @@
+"""What was typed on the command line as values, or UsageError; which options a resumed run refuses."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from uuvtai.common.exits import UsageError
+from uuvtai.common.presets import KINDS, preset_names
+
+
+def integers(option: str, text: str) -> list[int]:
+    """Whole numbers of 32 bits, as ``--seeds 0,1,2`` has them."""
+    return [_integer(option, item) for item in text.split(",")]
+
+
+def seeds(option: str, text: str) -> list[int]:
+    """Seeds, as ``--seeds 0,1,2`` has them, each as kernels count with it."""
+    from uuvtai.config.base import folded_seed
+
+    given = [_integer(option, item, None) for item in text.split(",")]
+    if low := [seed for seed in given if seed < -(2**31)]:
+        raise UsageError(f"{option} {low[0]}: must be 0 or more")
+    return [folded_seed(seed) for seed in given]
+
+
+def _integer(option: str, text: str, bits: int | None = 32) -> int:
+    """A whole number, of so many bits."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise UsageError(
+            f"{option} {text!r}: whole numbers separated by commas, for example {option} 0,1,2"
+        ) from None
+    if bits and not -(2 ** (bits - 1)) <= value < 2 ** (bits - 1):
+        raise UsageError(f"{option} {text}: must fit {bits} bits")
+    return value
+
+
+def numbers(option: str, text: str | None, count: int) -> list[float] | None:
+    """``count`` finite numbers, or None where none were typed."""
+    if text is None:
+        return None
+    try:
+        values = [float(item) for item in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise UsageError(
+            f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces"
+        )
+    return values
+
+
+def refuse_less(option: str, value: int, least: int) -> None:
+    """UsageError for a value below ``least``."""
+    if value < least:
+        raise UsageError(f"{option} {value}: must be at least {least}")
+
+
+def refuse_no_duration(option: str, seconds: float) -> None:
+    """UsageError for a duration that is none."""
+    if not math.isfinite(seconds) or seconds <= 0:
+        raise UsageError(f"{option} {seconds}: must be a positive number, for example {option} 10")
+
+
+def drivers(
+    runs: list[str] | None, controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
+) -> tuple[list[str], list[str]]:
+    """(trained policies, controllers with the user's own pieces among them) of RUN, --controller, --planner
+    and --policy; a --policy that is no file of hers is a RUN."""
+    from uuvtai.plugins.api import CONTROLLER, PLANNER, POLICY, is_piece, piece_spec
+
+    trained = [*(runs or []), *(name for name in policy or [] if not is_piece(name))]
+    own = [piece_spec(name, PLANNER).text for name in planner or []]
+    own += [piece_spec(name, POLICY).text for name in policy or [] if is_piece(name)]
+    named = controllers(controller, bool(trained or own))
+    found = [piece_spec(name, CONTROLLER).text if is_piece(name) else name for name in named]
+    return trained, [*found, *own]
+
+
+def own_pieces(
+    controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
+) -> list[str]:
+    """The user's own pieces where nothing else may be named."""
+    from uuvtai.plugins.api import is_piece
+
+    given = [*(controller or []), *(policy or [])]
+    strange = [name for name in given if not is_piece(name)]
+    if strange:
+        raise UsageError(f"{strange[0]}: is no piece of yours, for example --controller mine.py:act")
+    _trained, found = drivers(None, controller or ["none"], planner, policy) if given or planner else ([], [])
+    return found
+
+
+def one_driver(controller: str | None, planner: list[str] | None, policy: list[str] | None) -> str | None:
+    """Who drives one vehicle; None = nobody."""
+    if controller is None and not planner and not policy:
+        return None
+    trained, found = drivers(None, [controller or "none"], planner, policy)
+    if trained or len(found) != 1:
+        raise UsageError("--controller, --planner, --policy: give one of them, once: one vehicle is driven")
+    return found[0]
+
+
+def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
+    """Names typed with --controller; without any all three, or the tree alone beside a policy."""
+    default = ["bt"] if has_policies else ["straight", "planner", "bt"]
+    names = [name for item in given or default for name in item.split(",") if name]
+    if has_policies and names == ["none"]:
+        return []
+    if not names:
+        raise UsageError("--controller: name at least one of straight, planner, bt or a tree's XML")
+    return names
+
+
+def refuse_odd_rate(rate: float) -> None:
+    """UsageError for a pace that is none; 0 means as fast as it goes."""
+    if not (math.isfinite(rate) and rate >= 0):
+        raise UsageError(f"--rate {rate:g}: give a number at least 0, for example --rate 2")
+
+
+def refuse_odd_live(episodes: int, rate: float, port: int) -> None:
+    """UsageError for numbers of ``uuv watch`` that make no sense."""
+    refuse_less("--episodes", episodes, 0)
+    refuse_odd_rate(rate)
+    if not 0 <= port < 65536:
+        raise UsageError(f"--port {port}: ports go from 0 (a free one) to 65535, for example --port 8765")
+
+
+OF_A_SWEEP_RESUMED = (
+    "allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device",
+)  # fmt: skip
+"""what is not refused beside ``--resume`` of a sweep"""
+_OF_EVERY_RESUME = ("resume", "with_report", "wide", "as_json")
+
+
+def refuse_beside_resume(ctx: typer.Context, kept: tuple[str, ...] = ()) -> None:
+    """UsageError for what was typed, be it a default's value, that a resumed run keeps as it was; ``kept``:
+    parameters of the command that count for the rest of the run."""
+    for parameter in ctx.command.params:
+        name = parameter.name or ""
+        source = ctx.get_parameter_source(name)
+        if name in (*_OF_EVERY_RESUME, *kept) or source is None or source.name != "COMMANDLINE":
+            continue
+        is_option = parameter.param_type_name == "option"
+        what = parameter.opts[0] if is_option else str(getattr(parameter, "metavar", "")).strip("[].")
+        raise UsageError(
+            f"{what} {ctx.params[name]}: a resumed run keeps its own; leave it out, or begin a new run "
+            "without --resume"
+        )
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What may be typed where: values beside an option, names that the shell completes, refusals that say what
+# was meant.
+
+
+DEVICES = ("auto", "cpu", "cuda")
+_MEANT = {"gpu": "cuda", "nvidia": "cuda"}
+"""what people type for a device, and what they mean by it"""
+
+Complete = Callable[[str], list[str]]
+"""From what is typed so far to what it may become."""
+
+
+def choice(option: str, values: tuple[str, ...], help_text: str, meant: dict[str, str] | None = None) -> Any:
+    """Option whose values are listed in the help, completed by the shell, and checked as soon as the command
+    line is read."""
+
+    def check(value: str | None) -> str | None:
+        if value is not None and value not in values:
+            close = (meant or {}).get(value) or next(
+                iter(difflib.get_close_matches(value, values, n=1, cutoff=0.5)), None
+            )
+            hint = f"; did you mean '{close}'?" if close else ""
+            raise UsageError(f"{option} {value}: use {', '.join(values[:-1])} or {values[-1]}{hint}")
+        return value
+
+    return typer.Option(
+        option, metavar="|".join(values), help=help_text, callback=check, autocompletion=_among(values)
+    )
+
+
+def device() -> Any:
+    """``--device``."""
+    return choice("--device", DEVICES, "Where to compute; auto takes a GPU if there is one.", _MEANT)
+
+
+def names(kind: str) -> str:
+    """'gauntlet, maze, ...': the presets of a kind, for a help text."""
+    return ", ".join(preset_names(kind))
+
+
+def presets(kind: str, *more: str, suffix: str = ".yaml") -> Complete:
+    """Names of the presets of a kind, ``more`` words, and files."""
+
+    def complete(incomplete: str) -> list[str]:
+        return _starting([*preset_names(kind), *more], incomplete) + _paths(
+            incomplete, lambda path: path.suffix == suffix
+        )
+
+    return complete
+
+
+def controller_choices(incomplete: str) -> list[str]:
+    """Trees, stacks, yardsticks that know the truth, and files of trees and stacks; after a comma the
+    next one."""
+    before, comma, last = incomplete.rpartition(",")
+    trees = preset_names("tree")
+    found = _starting(
+        [*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle", "none"], last
+    ) + _paths(last, lambda path: path.suffix in (".xml", ".yaml", ".py"))
+    return [f"{before}{comma}{name}" for name in found]
+
+
+def files(*suffixes: str) -> Complete:
+    """Files with these endings."""
+
+    def complete(incomplete: str) -> list[str]:
+        return _paths(incomplete, lambda path: path.suffix in suffixes)
+
+    return complete
+
+
+def grids(incomplete: str) -> list[str]:
+    """Presets of grids, and the axes that have short names."""
+    return _starting([*preset_names("grid"), "S=", "D=", "v=", "sensors=", "vehicle="], incomplete)
+
+
+def policies(incomplete: str) -> list[str]:
+    """Run folders with checkpoints."""
+    return _runs(incomplete, "checkpoints")
+
+
+def runs(incomplete: str) -> list[str]:
+    """Run folders."""
+    return _runs(incomplete, "run.json")
+
+
+def evaluations(incomplete: str) -> list[str]:
+    """Run folders of evaluations."""
+    return _runs(incomplete, "eval/tree.json")
+
+
+def shown(incomplete: str) -> list[str]:
+    """Every preset, and KIND/NAME of it."""
+    found = {name: None for kind in KINDS for name in preset_names(kind)}
+    kind, slash, _rest = incomplete.partition("/")
+    if slash and kind in KINDS:
+        return _starting([f"{kind}/{name}" for name in preset_names(kind)], incomplete)
+    return _starting([*found, *(f"{kind}/" for kind in KINDS)], incomplete)
+
+
+def _among(values: Iterable[str]) -> Complete:
+    def complete(incomplete: str) -> list[str]:
+        return _starting(values, incomplete)
+
+    return complete
+
+
+def _starting(words: Iterable[str], incomplete: str) -> list[str]:
+    return [word for word in words if word.startswith(incomplete)]
+
+
+def _runs(incomplete: str, holds: str) -> list[str]:
+    """Folders below the one that is typed, or below ``runs``, that hold this file or folder."""
+    typed = _paths(incomplete, lambda path: (path / holds).exists())
+    below = [] if incomplete else _paths("runs/", lambda path: (path / holds).exists())
+    return list(dict.fromkeys([*below, *typed]))
+
+
+def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
+    """Paths that begin like this: those that are ``wanted``, and folders with a slash, to be typed
+    further."""
+    folder, slash, start = incomplete.rpartition("/")
+    try:
+        entries = sorted(Path(folder or slash or ".").iterdir())
+    except OSError:
+        return []
+    found = [path for path in entries if path.name.startswith(start) and (start or path.name[0] != ".")]
+    texts = {path: f"{folder}{slash}{path.name}" for path in found}
+    return [
+        text if wanted(path) else f"{text}/" for path, text in texts.items() if wanted(path) or path.is_dir()
+    ]

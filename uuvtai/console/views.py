@@ -1,0 +1,628 @@
+"""An evaluation in the terminal: the table of methods, pairs of methods, and why episodes failed."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.text import Text
+
+from uuvtai.common.exits import UsageError, plain, say
+from uuvtai.common.files import read_text
+from uuvtai.common.presets import KINDS, preset_names, shipped_file
+from uuvtai.common.tree_codes import ACTION, LEAVES
+from uuvtai.console.screen import Screen, print_heat_maps
+from uuvtai.report.evaluation import DAGGER, causes_table, methods_table, paired_table
+from uuvtai.report.sweep import cell_table
+from uuvtai.report.tables import Column, Table, bodies, number, sensing, varies_alone, varying, vehicle
+from uuvtai.report.timing import density_table, latency_table
+
+
+def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
+    """All of a ``uuv eval --json`` document: methods, pairs, and why episodes failed."""
+    show_methods(screen, result)
+    show_pairs(screen, result["paired"])
+    if any("causes" in method for method in result["methods"]):
+        show_causes(screen, result)
+        say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
+
+
+def show_methods(screen: Screen, result: dict[str, Any]) -> None:
+    """Table of methods of a ``uuv eval --json`` document, and what belongs below it."""
+    speed = f"v = {result['v_m_s']} m/s, " if result["D"] else ""
+    title = (
+        f"{result['world']}: {bodies(result)}, {speed}{vehicle(result)}{sensing(result)}, "
+        f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x "
+        f"{result['episodes_per_seed']} episodes"
+    )
+    screen.table(methods_table(result["methods"], title))
+    for part in result["remainder"]:
+        _show_remainder(screen, part)
+    for m in result["methods"]:
+        if m["privileged"]:
+            screen.line(f"{DAGGER} {m['name']} is privileged: {_privilege(m['name'])}", "dim")
+
+
+def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
+    """Every two methods on the episodes that both played (``measure.evaluate.paired``); nothing where one
+    method played alone."""
+    if not pairs:
+        return
+    screen.line("")
+    screen.table(paired_table(pairs, f"the same {pairs[0]['episodes']} episodes, two methods at a time"))
+
+
+def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
+    screen.line(
+        f"{part['method']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told "
+        f"of the moving bodies it arrives), {part['forecast_decision']} by forecast, decision and inertia (a "
+        f"point had a way), {part['physics']} by physics (the oracle finds none)"
+    )
+
+
+def _privilege(name: str) -> str:
+    if name == "oracle":
+        return (
+            "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
+        )
+    return "it is told where every moving body is and how it moves; what stands still it senses"
+
+
+_REMARKABLE_SHARE = 0.2
+"""Remarks on fewer of a cause's episodes are left to the JSON."""
+
+_LEGEND = (
+    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: "
+    "unseen = since a beam last met the killer, evading = since evasion began, chance = until when some "
+    "velocity still escaped. worst: seed:episode of the hardest hit"
+)
+
+
+def show_causes(screen: Screen, result: dict[str, Any]) -> None:
+    """Causes of every method of a ``uuv eval --explain --json`` document."""
+    for m in result["methods"]:
+        if "explain" in m:
+            _show_method(screen, m)
+    if any(m.get("explain") for m in result["methods"]):
+        screen.line(_LEGEND, "dim")
+
+
+def _show_method(screen: Screen, m: dict[str, Any]) -> None:
+    failed = len(m["explain"])
+    screen.line("")
+    if not failed:
+        screen.line(f"{m['name']}: no episode failed, nothing to explain")
+        return
+    screen.table(causes_table(m, f"{m['name']}: why {failed} of {m['episodes']} episodes failed"))
+    for c in m["causes"]:
+        remarks = ", ".join(
+            f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"]
+        )
+        meaning = Text(plain(c["label"]), style="bold").append(plain(f": {c['meaning']}"), style="not bold")
+        screen.line(meaning.append(plain(f" ({remarks})"), style="not bold dim") if remarks else meaning)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A profile in the terminal: time per stage, rates, one bar per batch size, and the paper's timing tables
+# beside ours.
+
+
+_RATES = {
+    "step": "random actions",
+    "tree": "driven by the tree",
+    "step_inference": "+ policy",
+    "train": "+ training",
+}
+_FLAME_WIDTH = 100
+_FLAME_COLORS = (
+    "blue",
+    "cyan",
+    "green",
+    "yellow",
+    "magenta",
+    "red",
+    "bright_blue",
+    "bright_cyan",
+    "bright_green",
+    "bright_yellow",
+)
+
+
+def show_profile(screen: Screen, result: dict[str, Any]) -> None:
+    """Tables of a ``uuv profile --json`` document."""
+    rows = result["rows"]
+    machine = f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}"
+    stages = list(rows[0]["stages_us_per_env_step"])
+    screen.table(_by_batch_size(rows, stages, machine))
+    screen.line("")
+    for row in rows:
+        _show_flame(screen, row)
+    if result["paper_latency"]:
+        _show_latency(screen, result)
+    if result["paper_density"]:
+        screen.line("")
+        title = "loop time against moving obstacles (one env)"
+        screen.table(density_table(result["paper_density"], title))
+
+
+def _by_batch_size(rows: list[dict[str, Any]], stages: list[str], title: str) -> Table:
+    # the largest batch is what most people come for, the first one what a vehicle would do; sizes between
+    # them go first
+    priorities = [0 if i == len(rows) - 1 else 1 if i == 0 else 2 for i in range(len(rows))]
+    sizes = [
+        Column(f"{row['num_envs']} env", priority) for row, priority in zip(rows, priorities, strict=True)
+    ]
+    lines = [[stage, *(f"{row['stages_us_per_env_step'][stage]:.2f}" for row in rows)] for stage in stages]
+    lines += [
+        [f"env-steps/s: {meaning}", *(number(row["env_steps_per_s"].get(name), 0) for row in rows)]
+        for name, meaning in _RATES.items()
+    ]
+    lines.append(["memory MB", *(f"{row['memory_mb']:,.0f}" for row in rows)])
+    lines.append(["compile s", *(f"{row['compile_s']:.1f}" for row in rows)])
+    return Table([Column("us per env-step", left=True), *sizes], lines, title, sections=[len(stages) - 1])
+
+
+def _show_flame(screen: Screen, row: dict[str, Any]) -> None:
+    """Stages of a step as one bar, each as wide as its share of the time; a name stands where it has room."""
+    stages = {name: us for name, us in row["stages_us_per_env_step"].items() if us > 0}
+    total, bar, edge = sum(stages.values()), Text(), 0.0
+    before, after = f"{row['num_envs']:>6} env ", f" {total:.1f} us"
+    room = min(_FLAME_WIDTH, screen.console.width - len(before) - len(after))
+    for (name, us), color in zip(stages.items(), _FLAME_COLORS * 2, strict=False):
+        first, edge = round(room * edge / total), edge + us
+        width = round(room * edge / total) - first
+        bar.append((name if len(name) <= width else "").ljust(width), style=f"black on {color}")
+    screen.line(Text(before).append(bar).append(after))
+
+
+def _show_latency(screen: Screen, result: dict[str, Any]) -> None:
+    rows = [row for row in result["paper_latency"] if row["component"] != "Replanning rate"]
+    screen.line("")
+    screen.table(
+        latency_table(
+            rows, "beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)"
+        )
+    )
+    for row in result["paper_latency"]:
+        if row["component"] == "Replanning rate":
+            ours = f"{row['replans_per_episode']:.1f} replans an episode, {row['hz']:.2f} Hz"
+            screen.line(f"{ours} (paper: {row['paper_replans_per_episode']}, {row['paper_hz']} Hz)", "dim")
+    loop = result["real_time"]
+    times = ", ".join(f"{name} {loop[f'{name}_ms']:.2f}" for name in ("p50", "p99", "max"))
+    verdict = f"{loop['budget_ms']:.0f} ms a step {'kept' if loop['within'] else 'NOT kept'}"
+    screen.line(f"{verdict}: {times} ms; {loop['late']} of {loop['steps']} steps late")
+
+
+# ------------------------------------------------------------------------------------------------------------
+# The shipped presets in the terminal: a sentence for each, and what one of them states, with its comments,
+# units and sources.
+
+
+_PRESETS = (Column("", left=True), Column("", prose=True))
+_MAX_BYTES = 1 << 20
+_SENTENCE = re.compile(r"(.+?[.])(?:\s+(?=[A-Z0-9])|$)", re.S)
+
+
+def sentence(kind: str, name: str) -> str:
+    """What a shipped preset says of itself first: its first comment's first sentence."""
+    text = read_text(shipped_file(kind, name), _MAX_BYTES)
+    if kind == "tree":
+        said = text.partition("<!--")[2].partition("-->")[0]
+    else:
+        lines = text.splitlines()
+        head = lines[: next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))]
+        said = " ".join(line.lstrip("# ") for line in head)
+    said = " ".join(said.split()).removeprefix(f"{name}: ")
+    first = _SENTENCE.match(said)
+    return first.group(1) if first else said
+
+
+def sentences() -> dict[str, dict[str, str]]:
+    """Kind -> name -> sentence, of everything that is shipped."""
+    return {kind: {name: sentence(kind, name) for name in preset_names(kind)} for kind in KINDS}
+
+
+def show_presets(screen: Screen) -> None:
+    """Every kind with its presets."""
+    for place, (kind, found) in enumerate(sentences().items()):
+        if place:
+            screen.line("")
+        screen.line(Text(kind, style="bold"))
+        screen.table(Table(_PRESETS, [[f"  {name}", said] for name, said in found.items()]))
+    screen.line("")
+    screen.line(
+        "one of them as it is written: uuv presets show NAME; every key that it gives: uuv presets show NAME "
+        "--all",
+        "dim",
+    )
+
+
+def show_stated(kind: str, name: str, as_json: bool) -> None:
+    """A preset as it is written, its comments included. Raises ConfigError, FileError, OSError."""
+    from uuvtai.config import loader
+
+    path = loader.preset_path(kind, name)
+    if as_json and path.suffix not in (".xml", ".md"):
+        typer.echo(json.dumps(loader.stated(path), allow_nan=False))
+        return
+    text = plain(read_text(path, _MAX_BYTES)).rstrip("\n")
+    if as_json:
+        typer.echo(json.dumps({"schema": 1, "text": text}, allow_nan=False))
+        return
+    typer.echo(text)
+    if kind == "world":
+        with contextlib.suppress(loader.ConfigError):  # a file is shown although it cannot be used
+            told = bodies(loader.load_config(name).world.bodies)
+            vehicle, sensors = (loader.preset_of(other, name, None) for other in ("vehicle", "sensors"))
+            say(f"{told}, vehicle {vehicle}, sensors {sensors}")
+    if (base := loader.base_of(path)) is not None:
+        say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
+
+
+def kind_and_name(action: str, name: str | None) -> tuple[str, str]:
+    """(kind, name) of 'NAME' or 'KIND/NAME' after ``show``; a path is taken for a world's. UsageError for
+    another action, and for a name that no kind has."""
+    if action != "show" or not name:
+        raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
+    kind, slash, rest = name.partition("/")
+    if slash and kind in KINDS:
+        return kind, rest
+    kinds = [kind for kind in KINDS if name in preset_names(kind)]
+    for other in kinds[1:]:
+        say(f"there is another one: uuv presets show {other}/{name}")
+    if not kinds and not slash and not Path(name).suffix:
+        known = "; ".join(f"{kind}: {', '.join(names)}" for kind in KINDS if (names := preset_names(kind)))
+        raise UsageError(f"{name!r} is no preset{near(name) or '.'} There are {known}")
+    return (kinds[0] if kinds else "world"), name
+
+
+def near(name: str) -> str:
+    """'; did you mean ...' for a name that no kind of preset has, or nothing."""
+    known = {name: kind for kind in reversed(KINDS) for name in preset_names(kind)}
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"; did you mean '{close[0]}' ({known[close[0]]})?" if close else ""
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A replayed log in the terminal: what agrees, where it first does not, and what became of the messages.
+
+
+_MESSAGES = (
+    Column("sensor", left=True),
+    Column("fed"),
+    Column("used"),
+    Column("lost"),
+    Column("late"),
+    Column("bad", 1),
+    Column("unplaced", 1),
+)
+
+
+def show_replay(screen: Screen, found: dict[str, Any]) -> None:
+    """A ``uuv replay --json`` document."""
+    steps = found["steps"]
+    columns = (
+        Column("per step", left=True),
+        Column("equal"),
+        Column("first difference", left=True, prose=True),
+    )
+    rows = [
+        [row["what"], f"{row['equal_steps']} of {steps}", _place(row["first_difference"])]
+        for row in found["agreement"]
+    ]
+    title = f"{found['log']}: {found['controller']} in {found['world']}, {steps} steps"
+    screen.table(Table(columns, rows, title))
+    if found["faults"]["any"]:
+        screen.table(
+            Table(_MESSAGES, [_counts(name, row) for name, row in found["messages"].items()], "messages")
+        )
+        _show_change(screen, found["change"], steps)
+    screen.line(_verdict(found))
+
+
+def _place(first: dict[str, Any] | None) -> str:
+    if first is None:
+        return "none"
+    said = (_value(first[name]) for name in ("replayed", "logged"))
+    return f"step {first['step']} ({first['time_s']:g} s): {' instead of '.join(said)}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, str):
+        return value or "no node"
+    return "(" + ", ".join(f"{number:.9g}" for number in value) + ")"
+
+
+def _counts(name: str, row: dict[str, int]) -> list[str]:
+    return [name, *(str(row[key]) for key in ("fed", "used", "lost", "late", "bad", "unplaced"))]
+
+
+def _show_change(screen: Screen, change: dict[str, Any], steps: int) -> None:
+    screen.line(
+        f"commands off by {change['mean']:.3f} in the mean, {change['largest']:.2f} at most (of 1); by more "
+        f"than 0.1 in {change['steps_beyond_tenth']} of {steps} steps; own position off by up to "
+        f"{change['position_m']:.2f} m"
+    )
+    reasons = ", ".join(f"{name} {count}" for name, count in change["held_for"].items())
+    screen.line(
+        f"stopped in {change['held_steps']} of {steps} steps{f' (for want of: {reasons})' if reasons else ''}"
+    )
+
+
+def _verdict(found: dict[str, Any]) -> str:
+    tick = found["tick_ms"]
+    time = f"{tick['median']:.2f} ms a step (99 %: {tick['99th percentile']:.2f} ms)"
+    if found["equal"]:
+        return f"all commands equal the logged ones; {time}"
+    why = "under these faults" if found["faults"]["any"] else "though nothing was disturbed"
+    return f"commands differ, {why}; {time}"
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A flight by MAVLink in the terminal: what was done, and why.
+
+
+_ACTIONS = (Column("action", left=True), Column("steps"), Column("share"))
+_ORDERS = (Column("order", left=True), Column("said"), Column("sent"))
+_FATES = ("fed", "used", "late", "bad", "unplaced")
+_SENSORS = (Column("sensor", left=True), *(Column(name) for name in _FATES))
+
+
+def show_flight(screen: Screen, found: dict[str, Any]) -> None:
+    """A ``uuv pilot --json`` document."""
+    steps = max(found["steps"], 1)
+    title = "dry run: nothing was sent that moves the vehicle" if found["dry_run"] else "armed"
+    rows = [[name, str(count), f"{100 * count / steps:.0f} %"] for name, count in found["actions"].items()]
+    screen.table(Table(_ACTIONS, rows, title))
+    counts = [[name, str(row["said"]), str(row["sent"])] for name, row in found["said"].items()]
+    screen.table(Table(_ORDERS, counts, f"driven in {found['driven_in'] or 'no mode'}"))
+    sensors = [[name, *(str(row[key]) for key in _FATES)] for name, row in found["sensors"].items()]
+    screen.table(Table(_SENSORS, sensors, "messages"))
+    for name, count in found["refused"].items():
+        screen.line(f"not used, {count} times: {name}")
+    if found["log_trouble"]:
+        screen.line(found["log_trouble"])
+    screen.line(f"ended: {found['ended']}; log: {found['log']}")
+
+
+_INSTANCES = tuple(Column(name) for name in ("instance", "seconds", "driven s", "outcome"))
+_PACKETS = ("step", "reset", "again", "ignore", "bad")
+
+
+def show_sitl(screen: Screen, found: dict[str, Any]) -> None:
+    """A ``uuv sitl --json`` document."""
+    columns = (*_INSTANCES, *(Column(name, 1) for name in _PACKETS))
+    rows = [
+        [
+            str(row["row"]),
+            f"{row['seconds']:.1f}",
+            f"{row['driven_s']:.1f}",
+            row["outcome"],
+            *(str(row["packets"][name]) for name in _PACKETS),
+        ]
+        for row in found["instances"]
+    ]
+    screen.table(
+        Table(columns, rows, f"{found['seconds']:.0f} s by the clock; packets by what they asked for")
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What was identified, in the terminal: parameters with intervals, errors ahead, warnings.
+
+
+def _number(value: float) -> str:
+    return f"{value:.3f}"
+
+
+def _interval(entry: dict[str, Any]) -> str:
+    return f"[{_number(entry['low'])}, {_number(entry['high'])}]" if entry["fitted"] else ""
+
+
+_PARAMETERS = (
+    Column("parameter", left=True, of=lambda entry: entry["name"]),
+    Column("unit", 1, left=True, of=lambda entry: entry["unit"]),
+    Column("given", 2, of=lambda entry: _number(entry["given"])),
+    Column("found", of=lambda entry: _number(entry["value"]) if entry["fitted"] else "as given"),
+    Column("95 % interval", of=_interval),
+)
+_AHEAD = (
+    Column("steps ahead"),
+    Column("vehicle", left=True),
+    Column("surge m/s"),
+    Column("sway m/s"),
+    Column("heave m/s"),
+    Column("yaw rad/s"),
+)
+
+
+def show_identified(screen: Screen, document: dict[str, Any], known: str) -> None:
+    """Tables of a ``uuv identify --json`` document, then its warnings; ``known``: what was taken from which
+    vehicle."""
+    title = f"{document['seconds']:g} s of drives, known: {known}"
+    screen.table(Table(_PARAMETERS, document["parameters"], title))
+    rows = [
+        [steps, name, *_errors(found[steps])]
+        for steps in document["horizons"]["identified"]
+        for name, found in document["horizons"].items()
+    ]
+    screen.table(Table(_AHEAD, rows, "rms error of predictions, on stretches that the fit had not seen"))
+    for text in document["warnings"]:
+        screen.line(f"warning: {text}", "yellow")
+
+
+def _errors(values: Sequence[float | None]) -> list[str]:
+    return ["-" if value is None else f"{value:.4f}" for value in values]
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Watched episodes in the terminal: how each ended.
+
+
+_COLUMNS = (
+    Column("method"),
+    Column("seed"),
+    Column("episode"),
+    Column("outcome"),
+    Column("time s"),
+    Column("min clearance m", 1),
+    Column("real-time factor", 2),
+)
+
+
+def show_watched(screen: Screen, watched: list[dict[str, Any]]) -> None:
+    """A row per episode of ``uuv watch --json``."""
+    rows = [
+        [
+            entry["method"],
+            str(entry["seed"]),
+            str(entry["episode"]),
+            entry["outcome"],
+            f"{entry['time_s']:.1f}",
+            f"{entry['min_clearance_m']:.2f}",
+            f"{entry['real_time_factor']:.2f}",
+        ]
+        for entry in watched
+    ]
+    screen.table(Table(_COLUMNS, rows))
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What was exported, in the terminal: do a policy's engines agree, and how long does each take.
+
+
+def _largest(agreement: Any) -> str:
+    worst = max(agreement.difference, key=lambda name: agreement.difference[name])
+    return f"{agreement.difference[worst]:.1e} ({worst})"
+
+
+_ENGINES = (
+    Column("engine", left=True, of=lambda one: one.engine),
+    Column("", left=True, of=lambda one: "agrees" if one.agrees else "DIFFERS"),
+    Column("largest difference", 1, of=_largest),
+    Column("p50 ms", 2, of=lambda one: f"{one.p50_ms:.3f}"),
+    Column("p99 ms", 3, of=lambda one: f"{one.p99_ms:.3f}"),
+)
+
+
+def show_stack(document: dict[str, Any]) -> None:
+    """What ``uuv export --stack`` wrote."""
+    size = f"{document['bytes'] / 2**20:.1f} MiB"
+    machines = " and ".join(document["machines"])
+    say(f"wrote {document['folder']} ({size}): {document['kernels']} kernels for {machines}")
+    say(f"there: python3 -m uuv_stack decides {document['checked_steps']} steps of the log anew")
+
+
+def show_export(screen: Screen, found: Any) -> None:
+    """One row per engine of a ``deploy.export`` result, where any could run, and what is damaged."""
+    for damage in found.damages:
+        say(damage)
+    if found.agreements:
+        screen.table(Table(_ENGINES, found.agreements, str(found.folder)))
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A recorded episode in the terminal: its topics, how often they come, how it ended.
+
+
+_TOPICS = (
+    Column("topic", left=True, of=lambda topic: topic["topic"]),
+    Column("messages", of=lambda topic: str(topic["messages"])),
+    Column("Hz", of=lambda topic: number(topic["rate_hz"])),
+    Column("schema", 1, left=True, of=lambda topic: topic["schema"]),
+)
+
+
+def show_log(screen: Screen, found: dict[str, Any], file: Path) -> None:
+    """Topics of a ``uuv log info --json`` document."""
+    screen.table(Table(_TOPICS, found["topics"], str(file)))
+    end = f"outcome {found['outcome'] or 'none: the log was cut off'}"
+    screen.line(
+        f"duration {found['duration_s']:.2f} s, {end if found['is_eval'] else 'not a log of uuv eval'}"
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A behaviour tree in the terminal, with what its nodes did in an evaluation.
+
+
+_NODES = (
+    Column("node", left=True),
+    Column("episodes"),
+    Column("ticks", 3),
+    Column("acted", 2),
+    Column("acted %", 1),
+)
+_TREE_LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
+
+
+def show_tree(screen: Screen, text: str, nodes: list[dict[str, Any]]) -> None:
+    """One row per line of ``text``, for ``nodes`` of a ``uuv tree RUN --json`` document. Actions alone can
+    act."""
+    total = max(1, sum(node["acted"] for node in nodes))
+    rows = []
+    for line, node in zip(text.split("\n"), nodes, strict=True):
+        leaf = LEAVES.get(node["type"])
+        is_action = leaf is not None and leaf.kind == ACTION
+        acted = [str(node["acted"]), f"{100 * node['acted'] / total:.1f} %"] if is_action else ["", ""]
+        rows.append([line, f"{100 * node['share']:.1f} %", str(node["ticks"]), *acted])
+    screen.table(Table(_NODES, rows))
+    screen.line(_TREE_LEGEND, "dim")
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A sweep in the terminal: heat maps where two axes vary, else one row per cell.
+
+
+def show_sweep(screen: Screen, result: dict[str, Any]) -> None:
+    """Cells of a ``uuv sweep --json`` document."""
+    if len(varying(result["axes"])) > 1 and not varies_alone(result):
+        print_heat_maps(result, screen.console, is_whole=screen.wide)
+        return
+    title = f"{result['world']}: {len(result['cells'])} cells x {result['episodes_per_seed']} episodes"
+    screen.table(cell_table(result["cells"], result, title))
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Open-loop physics in the terminal: a dozen moments of ``uuv simulate``.
+
+
+_ROWS = 12
+_STATE = (
+    Column("t s"),
+    Column("x m"),
+    Column("y m"),
+    Column("z m"),
+    Column("roll deg", 3),
+    Column("pitch deg", 3),
+    Column("yaw deg", 1),
+    Column("u m/s", 1),
+    Column("v m/s", 2),
+    Column("w m/s", 2),
+    Column("p rad/s", 4),
+    Column("q rad/s", 4),
+    Column("r rad/s", 4),
+)
+
+
+def show_simulation(screen: Screen, result: dict[str, Any], title: str, driven: str | None = None) -> None:
+    """Position, attitude and body velocities of a ``uuv simulate --json`` document at moments evenly spread;
+    ``driven``: who drove to its goal."""
+    if driven is not None:
+        goal = ", ".join(f"{value:.2f}" for value in result["goal"])
+        title = f"{title}, {driven.removeprefix('controller:')} drives to ({goal})"
+    rows = []
+    for i in _picked(len(result["t"]), _ROWS):
+        values = [result["t"][i], *result["position"][i], *result["rpy_deg"][i], *result["nu"][i]]
+        rows.append([f"{value:.3f}" for value in values])
+    screen.table(Table(_STATE, rows, title))
+
+
+def _picked(n: int, wanted: int) -> list[int]:
+    return sorted({round(i * (n - 1) / max(1, wanted - 1)) for i in range(wanted)}) if n else []

@@ -1,0 +1,1 @@
+"""The batch as an environment: torch tensors, Gymnasium, other trainers."""

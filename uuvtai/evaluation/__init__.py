@@ -1,0 +1,1 @@
+"""Agents on the same episodes: rates, causes of failure, sweeps, the paper."""

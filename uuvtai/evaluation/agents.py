@@ -1,0 +1,282 @@
+"""What drives an evaluation: behaviour trees and stacks by name, trained policies by run folder, checkpoint
+folder, and pieces that the user brings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from uuvtai.common.errors import SettingError
+from uuvtai.common.presets import TRAINING_TREE, preset_names
+from uuvtai.config import Config
+from uuvtai.config.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
+from uuvtai.learning.export.folder import Export, export
+from uuvtai.plugins.api import is_piece, piece_spec
+from uuvtai.sim.behavior_tree import FlatTree, read_tree
+
+if TYPE_CHECKING:
+    from uuvtai.learning.checkpoint import Checkpoint
+    from uuvtai.logs.writer import PolicyNote
+    from uuvtai.plugins.loading import OwnPiece
+    from uuvtai.sim.rrt import RoutePlanner
+    from uuvtai.sim.sim import Sim
+
+
+TRUTH = "truth"
+"""suffix of a tree's name: a privileged yardstick whose tracks of moving bodies are the truth"""
+
+_STACK = (
+    "tracking",
+    "forecast",
+    "elevation",
+    "mapping",
+    "clearance",
+    "voronoi",
+    "quiet",
+    "route",
+    "teacher",
+    "fast",
+    "actuation",
+    "episode",
+)
+"""sections that shape what a policy sees and does; differences from its training are told, not refused"""
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the table of methods."""
+
+    name: str
+    tree: FlatTree
+    checkpoint: Checkpoint | None = None
+    """None = the tree drives"""
+    privileged: bool = False
+    """its tracks of moving bodies are the truth"""
+    stack: str | None = None
+    """stack preset (name or path) that this row alone drives with; None = the request's own"""
+    own: OwnPiece | None = None
+    """what the user brought: it drives, or plans the routes of the tree"""
+
+    def config_of(self, config: Config) -> Config:
+        """What this method's simulator runs on; scenarios, sensors and referee are those of ``config``.
+        Raises ConfigError."""
+        return config if self.stack is None else with_stack(config, self.stack)
+
+    def driver_for(self, sim: Sim) -> PolicyNote | None:
+        """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError or
+        PieceError for one that does not fit."""
+        if self.own is not None:
+            from uuvtai.logs.writer import PolicyNote
+
+            driver = self.own.driver(sim)
+            return None if driver is None else PolicyNote(driver, self.own.sha256, None)
+        if self.checkpoint is None:
+            return None
+        from uuvtai.envs.vector_env import VectorEnv
+        from uuvtai.learning.policy_agent import load_pilot, refuse_forecaster
+        from uuvtai.logs.writer import PolicyNote
+
+        if self.checkpoint.config.tuner.enabled:
+            from uuvtai.learning.agents import load_tuned
+
+            return PolicyNote(load_tuned(self.checkpoint, sim), self.checkpoint.sha256, None)
+        if self.checkpoint.config.twin.enabled:
+            from uuvtai.learning.agents import load_set_pilot
+
+            return PolicyNote(load_set_pilot(self.checkpoint, sim), self.checkpoint.sha256, None)
+        refuse_forecaster(self.checkpoint)
+        self.checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
+        weight = self.checkpoint.manifest.metrics.get("distill/lambda")
+        pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
+        return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
+
+    def planner_for(self, sim: Sim) -> RoutePlanner | None:
+        """Who plans this simulator's routes in place of its own planners; None = they do. PieceError."""
+        return None if self.own is None else self.own.planner(sim)
+
+    def document(self) -> dict[str, Any]:
+        """What ``uuv eval --json`` says of a policy, a stack or a piece of the user's beside its results."""
+        if self.own is not None:
+            return {"own": self.own.document()}
+        if self.checkpoint is None:
+            return (
+                {}
+                if self.stack is None
+                else {"stack": {"preset": self.stack, "tree": tree_of_stack(self.stack)}}
+            )
+        found = self.checkpoint
+        return {
+            "checkpoint": {
+                "path": str(found.path),
+                "sha256": found.sha256,
+                "step": found.step,
+                "version": found.manifest.version,
+            }
+        }
+
+
+def trees_of(names: list[str], max_node: int) -> list[Method]:
+    """Methods that a tree drives, by names of trees or stacks or paths of their XML or YAML, each perhaps
+    with ``+truth``; and those of the user's own pieces. ConfigError, PieceError."""
+    found: dict[str, Method] = {}
+    for name in names:
+        if is_piece(name):
+            method = _own_method(name, max_node)
+            if method.name in found:
+                raise ConfigError(
+                    f"{name}: two rows would be called {method.name}; rename a file or its function"
+                )
+            found[method.name] = method
+            continue
+        driver, privileged = _parted(name)
+        label = f"{_label(driver)}+{TRUTH}" if privileged else _label(driver)
+        stack = driver if _is_stack(driver) else None
+        tree = tree_of_stack(driver) if stack else driver
+        found[label] = Method(label, read_tree(tree, max_node), privileged=privileged, stack=stack)
+    return list(found.values())
+
+
+def _own_method(name: str, max_node: int) -> Method:
+    """A piece of the user's: what it leaves to the stack, the training tree's does."""
+    from uuvtai.plugins.loading import own_piece
+
+    try:
+        found = own_piece(piece_spec(name))
+    except SettingError as error:
+        raise ConfigError(str(error)) from None
+    return Method(found.label, read_tree(TRAINING_TREE, max_node), own=found)
+
+
+def _is_stack(name: str) -> bool:
+    """Whether a controller's name is that of a stack preset, or a path of one; ConfigError for what is
+    neither tree nor stack."""
+    if name.endswith((".yaml", ".yml")):
+        preset_path("stack", name)
+        return True
+    trees, stacks = preset_names("tree"), preset_names("stack")
+    if name in stacks and name not in trees:
+        return True
+    if name not in trees and not name.endswith(".xml") and "/" not in name:
+        raise ConfigError(
+            f"--controller: {name!r} is no preset of a tree or a stack{nearest(name, [*trees, *stacks])}; "
+            f"trees: {', '.join(trees)}; stacks: {', '.join(stacks)}; or give the path of a tree's .xml, a "
+            "stack's .yaml or a function of yours, mine.py:act"
+        )
+    return False
+
+
+def policies_of(names: list[str], max_node: int, note: Callable[[str], None]) -> list[Method]:
+    """Methods that a trained policy drives; ``note`` is told of checkpoints that were left out. Raises
+    ConfigError, CheckpointError."""
+    tree = read_tree(TRAINING_TREE, max_node) if names else None
+    found = [
+        Method(policy_name(name, checkpoint), tree, checkpoint)
+        for name in names
+        if (checkpoint := find_policy(name, note)) and tree
+    ]
+    doubled = {method.name for method in found if [other.name for other in found].count(method.name) > 1}
+    if doubled:
+        raise ConfigError(
+            f"{', '.join(sorted(doubled))}: given twice, or two runs with the same name; evaluate them one "
+            "by one"
+        )
+    return found
+
+
+def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
+    """Checkpoint of a checkpoint folder, or of a run folder (its best one, else its newest).
+
+    Raises ConfigError for what is none of them, CheckpointError for what cannot be used.
+    """
+    from uuvtai.learning import checkpoint
+    from uuvtai.learning import checkpoint as manifest
+
+    path = Path(name)
+    if (path / manifest.MANIFEST).exists():
+        return checkpoint.open_checkpoint(path)
+    if (path / "checkpoints").is_dir():
+        return checkpoint.best(path, note)
+    is_driver = name in (*preset_names("tree"), *preset_names("stack"))
+    instead = f"; it drives by itself: --controller {name}. Else" if is_driver else ":"
+    raise ConfigError(
+        f"{name!r} is no trained policy{instead} give the run folder of 'uuv train', one of its "
+        f"checkpoints/step_N, or one of yours: --policy model.onnx, --policy mine.py:load"
+    )
+
+
+def features_of(names: list[str]) -> list[tuple[str, Any]]:
+    """Overrides that give the observation the columns these policies were trained with. ConfigError where
+    they differ among themselves."""
+    sections = {name: find_policy(name).config.features.model_dump(mode="json") for name in names}
+    for name, section in sections.items():
+        if section != next(iter(sections.values())):
+            raise ConfigError(
+                f"{names[0]} and {name} see other columns ({sections[names[0]]} and {section}); "
+                "evaluate them one by one: with the same seeds they meet the same episodes"
+            )
+    return [("features", section) for section in list(sections.values())[:1]]
+
+
+def differences(method: Method, config: Config) -> str:
+    """Keys of the stack that differ from the policy's training, in words; empty = none."""
+    if method.checkpoint is None:
+        return ""
+    ours, trained = config.model_dump(mode="json"), method.checkpoint.config.model_dump(mode="json")
+    parts = [
+        f"{section}.{key} = {value} (trained with {trained[section].get(key)})"
+        for section in _STACK
+        for key, value in ours[section].items()
+        if value != trained[section].get(key)
+    ]
+    return f"{method.name}: {', '.join(parts)}" if parts else ""
+
+
+def policy_name(name: str, checkpoint: Checkpoint) -> str:
+    """What a policy is called in tables: its run, or its run and step."""
+    path = Path(name).resolve()
+    return path.name if path != checkpoint.path.resolve() else f"{path.parent.parent.name}-{path.name}"
+
+
+def _parted(name: str) -> tuple[str, bool]:
+    """(tree, whether it is told the truth) of a controller's name. Raises ConfigError."""
+    if "+" not in name or name.endswith((".xml", ".yaml", ".yml")):
+        return name, False
+    tree, _, suffix = name.rpartition("+")
+    if suffix != TRUTH:
+        raise ConfigError(
+            f"--controller {name}: '+{suffix}' is unknown; the one suffix is +{TRUTH}, for example "
+            f"{tree}+{TRUTH}"
+        )
+    return tree, True
+
+
+def _label(name: str) -> str:
+    return Path(name).stem if name.endswith((".xml", ".yaml", ".yml")) else name
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A run or a checkpoint, found and exported; the stack of a log.
+
+
+def export_run(
+    run: str, out: Path | None, evaluations: list[Path], note: Callable[[str], None], force: bool
+) -> Export:
+    """Export to ``out`` or runs/NAME_export. Raises as ``find_policy`` and ``deploy.export.export``."""
+    checkpoint = find_policy(run, note)
+    name = policy_name(run, checkpoint)
+    return export(checkpoint, name, out or Path("runs") / f"{name}_export", evaluations, note, force)
+
+
+def export_log(log: Path, out: Path, machines: Sequence[str]) -> dict[str, Any]:
+    """Export the stack of a log of ``uuv eval --record``, with its messages as a check. Raises as
+    ``read_feed`` and ``aboard.stack_folder.export_stack``."""
+    from uuvtai.vehicle.embedded.export import export_stack
+    from uuvtai.vehicle.replay import read_feed
+
+    feed = read_feed(log)
+    dt_s = feed.config.episode.control_dt_s
+    arrivals = [(max(0, math.ceil(each.time_s / dt_s - 0.5)), each.message) for each in feed.arrivals]
+    return export_stack(feed.config, feed.tree, feed.mission, arrivals, out, machines)

@@ -1,0 +1,565 @@
+"""Compare controllers and trained policies on paired scenarios in one run folder: results, logs, pictures,
+videos."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+
+from uuvtai.common.enums import PLANNERS, REASONS, TRIGGERS
+from uuvtai.common.errors import SettingError
+from uuvtai.common.obstacle_motion import describe_scenario
+from uuvtai.config import Config
+from uuvtai.config.learning import LearningConfig
+from uuvtai.config.loader import ConfigError
+from uuvtai.evaluation import failure_causes
+from uuvtai.evaluation.agents import TRUTH, Method
+from uuvtai.evaluation.episodes import EpisodeResult, Job, Progress, Recorders, StepClock, run_episodes
+from uuvtai.evaluation.oracle import earliest_arrival
+from uuvtai.evaluation.results import (
+    ORACLE,
+    Ledger,
+    LedgerWriter,
+    Request,
+    document_of,
+    drivers_of,
+    read_request,
+    refuse_others,
+    summary,
+    tree_use,
+)
+from uuvtai.evaluation.results import REQUEST_FILE as REQUEST
+from uuvtai.logs.run_folder import RunFolder, default_run_dir, refuse_place
+from uuvtai.logs.writer import EpisodeRecorder, PolicyNote
+from uuvtai.plugins.api import refuse_code
+from uuvtai.sim.rrt import RoutePlanner
+from uuvtai.sim.sim import Sim
+
+if TYPE_CHECKING:
+    from uuvtai.learning.runner import AnyTrainer, Metrics
+    from uuvtai.sim.behavior_tree import FlatTree
+
+
+_BATCH = 256
+"""Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost
+little."""
+
+
+def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
+    """Play every method's episodes; the ``uuv eval --json`` document and the run folder.
+
+    Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError,
+    MemoryError, RunFolderError, CheckpointError.
+    """
+    if request.num_envs is not None and request.num_envs < 1:
+        raise SettingError(
+            f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64"
+        )
+    if len(set(request.seeds)) != len(request.seeds):
+        raise ConfigError(
+            f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the "
+            "same"
+        )
+    refuse_place(request.run_dir)
+    methods = methods_of(request, watch)
+    num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
+    comparison = comparison_of(request, num_envs, methods, watch)
+    folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
+    with _going_on(folder, watch):
+        device = comparison.any_simulator().device.type
+        folder.write_json(REQUEST, document_of(request, num_envs, device, drivers_of(methods)))
+        return _compared(comparison, folder), folder.path
+
+
+def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tuple[dict[str, Any], Path]:
+    """Go on with an evaluation that was interrupted or killed: episodes that are over stay as they are.
+    ``allow_code``: Python files that the folder names may be run.
+
+    The document is that of an undisturbed evaluation, times of the machine excepted. Raises RunFolderError,
+    FileError, ConfigError, CheckpointError.
+    """
+    folder = RunFolder.held(place, "uuv eval")
+    try:
+        request, drivers = read_request(place)
+        refuse_code(place, request.controllers, allow_code)
+        methods = methods_of(request, watch)
+        refuse_others(place, drivers, drivers_of(methods))
+        folder.go_on({"what": "eval"})
+    except BaseException:
+        folder.release()
+        raise
+    with _going_on(folder, watch):
+        assert request.num_envs is not None  # the file states it
+        return _compared(comparison_of(request, request.num_envs, methods, watch), folder), place
+
+
+@contextmanager
+def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
+    """Record how the work inside ends, and say how to go on where it was interrupted."""
+    try:
+        with folder.recorded():
+            yield
+    except KeyboardInterrupt:
+        watch.stop()
+        watch.note(f"finished episodes are kept; go on with: uuv eval --resume {folder.path}")
+        if any((folder.path / "logs").glob("*.part")):
+            watch.note(
+                f"{folder.path / 'logs'}: .part files end where it was interrupted; --resume records them "
+                "anew, or: uuv log repair"
+            )
+        raise
+    finally:
+        watch.stop()
+
+
+def methods_of(request: Request, watch: EvaluationWatch) -> list[Method]:
+    """Who plays. Raises ConfigError, CheckpointError, PieceError."""
+    from uuvtai.evaluation.agents import differences, policies_of, trees_of
+
+    max_node = request.config.teacher.max_node
+    trees = [name for name in request.controllers if name != ORACLE]
+    methods = [*trees_of(trees, max_node), *policies_of(list(request.policies), max_node, watch.note)]
+    names = [method.name for method in methods] + [ORACLE] * (ORACLE in request.controllers)
+    if len(set(names)) != len(names):
+        raise ConfigError(
+            f"{', '.join(names)}: a policy and a controller have the same name; rename the run's folder"
+        )
+    if not methods and (request.record or request.explain):
+        raise ConfigError(
+            "--record, --explain: the oracle drives no vehicle; add who does, for example --controller "
+            "bt,oracle"
+        )
+    for method in methods:
+        if changes := differences(method, request.config):
+            watch.note(f"note: {changes}")
+    return methods
+
+
+def comparison_of(
+    request: Request, num_envs: int, methods: list[Method], watch: EvaluationWatch
+) -> Comparison:
+    """A simulator for the request's own config and one for every stack that drives a row: the episodes are
+    the same in all. And the policies, ready for them."""
+    from uuvtai.sim.sim import Sim
+
+    watch.note(
+        f"starting {num_envs} envs (sizes not used before compile their kernels first, about half a minute)"
+    )
+    configs = {method.stack: method.config_of(request.config) for method in methods} or {None: request.config}
+    tree = methods[0].tree if methods else _any_tree()
+    sims = {stack: Sim(config, num_envs, tree, request.device) for stack, config in configs.items()}
+    for method in methods:
+        if method.own:
+            method.own.note = watch.note
+    policies = {method.name: method.driver_for(sims[method.stack]) for method in methods}
+    planners = {method.name: method.planner_for(sims[method.stack]) for method in methods}
+    return Comparison(request, methods, sims, policies, planners, watch)
+
+
+def _any_tree() -> FlatTree:
+    """The oracle drives no vehicle, but a simulator wants a tree."""
+    from uuvtai.common.presets import TRAINING_TREE
+    from uuvtai.sim.behavior_tree import read_tree
+
+    return read_tree(TRAINING_TREE)
+
+
+def _compared(comparison: Comparison, folder: RunFolder) -> dict[str, Any]:
+    """Play what is not over yet; the whole document, and all that is written and drawn of it."""
+    from uuvtai.evaluation.episodes import jobs_of
+    from uuvtai.evaluation.results import Ledger, document
+
+    request = comparison.request
+    jobs = jobs_of(request.seeds, request.episodes)
+    ledger = Ledger(folder.path)
+    try:
+        runs = [play(comparison, method, jobs, ledger, folder.path) for method in comparison.methods]
+    finally:
+        ledger.close()
+    entries = [method_run.entry for method_run in runs]
+    scenarios = scenarios_of(comparison.any_simulator(), jobs)
+    if ORACLE in request.controllers:
+        entries.append(_ask_oracle(comparison, jobs, scenarios))
+    named = request.world, request.sensors, request.vehicle
+    result = document(request.config, *named, request.seeds, request.episodes, entries)
+    result |= {"remainder": remainder_of(entries), "scenarios_sha256": scenarios_sha256(scenarios)}
+    _write_results(folder, result, runs)
+    if request.explain:
+        explain(comparison, runs, result, folder)
+    _draw(comparison, folder.path, [method_run.logs for method_run in runs if method_run.logs])
+    return result
+
+
+def _ask_oracle(comparison: Comparison, jobs: list[Job], scenarios: list[dict[str, Any]]) -> dict[str, Any]:
+
+    comparison.watch.start(ORACLE, len(jobs))
+    try:
+        return oracle_entry(comparison.request.config, jobs, scenarios, comparison.watch.update)
+    finally:
+        comparison.watch.stop()
+
+
+def _write_results(folder: RunFolder, result: dict[str, Any], runs: list[MethodRun]) -> None:
+    """The document, and the trees that drove with the use of their nodes."""
+    folder.write_json("eval/result.json", result)
+    driving = [method_run for method_run in runs if method_run.policy is None]
+    for method_run in driving:
+        method = method_run.method
+        folder.write_bytes(f"eval/trees/{method.name}.xml", method.tree.xml)
+    use = {method_run.method.name: method_run.use for method_run in driving}
+    folder.write_json("eval/tree.json", {"schema": 1, "use": use})
+
+
+def _draw(comparison: Comparison, folder: Path, logs: list[dict[Job, Path]]) -> None:
+    """One picture per recorded episode with every method's trajectory, and the videos."""
+    if not logs:
+        return
+    from uuvtai.logs.picture import picture
+    from uuvtai.logs.video import SMALL, video
+
+    for job in logs[0]:
+        end = f"seed{job.seed}_episode{job.episode}"
+        files = [paths[job] for paths in reversed(logs)]  # the map drawn is that of the last method
+        names = [file.stem.removesuffix(f"_{end}") for file in reversed(files)]
+        picture(files, folder / "pictures" / f"{end}.png", methods=names)
+        picture(files, folder / "pictures" / f"{end}_clearance.png", clearance=True, methods=names)
+        for file in files if comparison.request.video else []:
+            target = folder / "videos" / f"{file.stem}.webm"
+            if not target.exists():  # an evaluation that goes on may have drawn it before
+                comparison.watch.note(f"drawing {target.name}")
+                video(file, target, methods=names, **SMALL)
+
+
+_DIGITS = 3
+"""of a number: millimetres"""
+
+
+def scenarios_sha256(scenarios: list[dict[str, Any]]) -> str:
+    """Of ``closed_form.describe_scenario``'s documents, to the millimetre. On another processor a number may
+    round to the other side: equal digests prove equal scenarios, unequal ones do not prove the contrary."""
+    text = json.dumps(_rounded(scenarios), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _rounded(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(inner) for inner in value]
+    return round(float(value), _DIGITS) + 0.0 if isinstance(value, float) else value
+
+
+# ------------------------------------------------------------------------------------------------------------
+# One method of an evaluation plays its episodes on its simulator, as far as they are not over.
+
+
+class EvaluationWatch(Protocol):
+    """Shows how far a comparison is."""
+
+    def start(self, name: str, total: int) -> None: ...
+    def note(self, text: str) -> None: ...
+    def update(self, done: int, total: int, env_steps: int, left: int | None = None) -> None: ...
+    def stop(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is compared, and on what."""
+
+    request: Request
+    methods: list[Method]
+    sims: dict[str | None, Sim]
+    """by the stack that drives; None = the request's own"""
+    policies: dict[str, PolicyNote | None]
+    """by method, ready for its simulator; None where a tree drives"""
+    planners: dict[str, RoutePlanner | None]
+    """by method: who plans routes in place of the simulator's planners; None = they do"""
+    watch: EvaluationWatch
+
+    def any_simulator(self) -> Sim:
+        """For what is the same in all of them."""
+        return next(iter(self.sims.values()))
+
+    def simulator_for(self, method: Method) -> Sim:
+        """The method's simulator, with its tree, its planner and, where it is a yardstick, with the truth."""
+        sim = self.sims[method.stack]
+        sim.use_tree(method.tree)
+        sim.privileged = method.privileged
+        sim.planner = self.planners[method.name]
+        return sim
+
+
+@dataclass(frozen=True)
+class MethodRun:
+    """What a method has done."""
+
+    method: Method
+    policy: PolicyNote | None
+    results: list[EpisodeResult]
+    entry: dict[str, Any]
+    """of ``uuv eval --json``"""
+    use: list[dict[str, Any]]
+    """of its tree's nodes"""
+    logs: dict[Job, Path]
+
+
+def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger, folder: Path) -> MethodRun:
+    """Play one method's episodes, as far as they are not over; ``folder`` is the run's."""
+    policy, watch = comparison.policies[method.name], comparison.watch
+    dt = comparison.request.config.episode.control_dt_s
+    sim = comparison.simulator_for(method)
+    recorder = _recorder(comparison.request, folder, method.name, jobs, policy)
+    logs = recorder.paths if recorder else {}
+    over = ledger.finished(method.name)
+    left = [job for job in jobs if job not in over or (job in logs and not logs[job].exists())]
+    before = len(jobs) - len(left)
+    watch.start(method.name, len(jobs))
+    writer, clock = LedgerWriter(ledger, method.name), StepClock()
+    try:
+        run_episodes(
+            sim,
+            left,
+            Recorders([recorder, writer]),
+            lambda done, _total, env_steps, to_come: watch.update(
+                before + done, len(jobs), env_steps, to_come
+            ),
+            policy.pilot if policy else None,
+            clock,
+        )
+    finally:
+        watch.stop()
+        if method.own:
+            method.own.close()
+        if recorder:
+            recorder.abort()
+    if method.own and (slow := method.own.told()):
+        watch.note(slow)
+    results = [over[job].result for job in jobs]
+    env_steps, wall_s = sum(round(r.time_s / dt) for r in results), writer.wall_s if left else writer.before_s
+    entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)
+    entry |= {"privileged": method.privileged} | method.document()
+    return MethodRun(method, policy, results, entry, tree_use(sim, results), logs)
+
+
+def _recorder(
+    request: Request, folder: Path, method: str, jobs: list[Job], policy: PolicyNote | None
+) -> EpisodeRecorder | None:
+    if not request.record:
+        return None
+    world, chosen = Path(request.world).stem, jobs[: request.record]
+    return EpisodeRecorder(folder / "logs", world, method, chosen, request.depth_images, policy)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Evaluations in the course of a training: the policy as it is, on the simulator that it is trained with.
+
+
+def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
+    """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
+    nothing had been."""
+    from uuvtai.evaluation.episodes import jobs_of, run_episodes
+    from uuvtai.evaluation.results import summary
+    from uuvtai.learning.forecast import ForecastTrainer
+    from uuvtai.learning.parameter_search import TunerTrainer
+    from uuvtai.learning.policy_agent import Pilot
+    from uuvtai.learning.surrogate_trainer import TwinTrainer
+
+    if isinstance(trainer, TwinTrainer | TunerTrainer | ForecastTrainer):  # they play by themselves
+        return trainer.evaluate()
+    env = trainer.env
+    model = trainer.world_model if config.world_model.as_features else None
+    pilot = Pilot(trainer.policy, model, env.num_envs, env.device)
+    held = env.capture()
+    try:
+        env.sim.sleep()
+        env.sim.set_scenes()
+        jobs = jobs_of([config.train.evaluate_seed], config.train.evaluate_episodes)
+        results, env_steps = run_episodes(env.sim, jobs, driver=pilot)
+    finally:
+        env.sim.set_scenes(config.train.scenes)
+        env.restore(held)
+    results_document = summary("policy", results, env_steps, 0.0)
+    names = ("success_rate", "collision_rate", "return_mean", "time_to_success_mean_s")
+    return {f"eval/{name}": results_document[name] for name in names if results_document[name] is not None}
+
+
+# ------------------------------------------------------------------------------------------------------------
+# ``uuv eval --explain``: the causes of failures in the document, and logs of the worst.
+
+
+def explain(comparison: Comparison, runs: list[MethodRun], result: dict[str, Any], folder: RunFolder) -> None:
+    """Replay what failed, add the causes to the document, record the worst. What is known is written before
+    the next long step begins."""
+    rows = {method_run.method.name: _explained(comparison, method_run) for method_run in runs}
+    _write_causes(folder, result)
+    for method_run in runs:
+        method, entry = method_run.method, method_run.entry
+        found = rows[method.name]
+        chosen = failure_causes.chosen_for_recording(found, comparison.request.explain_record)
+        paths = failure_causes.record_worst(
+            comparison.simulator_for(method),
+            chosen,
+            folder.path / "explain",
+            comparison.request.world,
+            method.name,
+            comparison.watch.note,
+            method_run.policy,
+            list(rows),
+        )
+        for row, path in zip(chosen, paths, strict=True):
+            entry["explain"][found.index(row)]["log"] = str(path.relative_to(folder.path))
+    _write_causes(folder, result)
+
+
+def _explained(comparison: Comparison, method_run: MethodRun) -> list[failure_causes.Row]:
+    """A method's failures with their explanations, which its entry then holds too."""
+    policy, watch, name = method_run.policy, comparison.watch, method_run.method.name
+    watch.start(f"{name}: replaying failures", len(failure_causes.failures(method_run.results)))
+    rows = failure_causes.explain_failures(
+        comparison.simulator_for(method_run.method),
+        method_run.results,
+        watch.update,
+        policy.pilot if policy else None,
+        method_run.method.own is not None,
+    )
+    watch.stop()
+    if lost := len(failure_causes.failures(method_run.results)) - len(rows):
+        watch.note(
+            f"{name}: {lost} failures ended otherwise when they were played again and are not explained: "
+            "your code depends on more than it is shown (random numbers, the clock, older episodes)"
+        )
+    method_run.entry["causes"] = failure_causes.table_of(rows)
+    method_run.entry["explain"] = [row.document() for row in rows]
+    return rows
+
+
+def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
+    folder.write_json("eval/result.json", result)
+    methods = [
+        {"name": entry["name"], "causes": entry["causes"], "explain": entry["explain"]}
+        for entry in result["methods"]
+        if "explain" in entry
+    ]
+    folder.write_json("eval/explain.json", {"schema": 1, "methods": methods})
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Privileged yardsticks beside the methods: the oracle's row of the table, and what a method lacks of it.
+
+
+_UNKNOWN = (
+    "return_mean",
+    "min_clearance_mean_m",
+    "path_length_mean_m",
+    "replans_per_episode",
+    "env_steps_per_s",
+)
+"""What the oracle does not tell: it drives no vehicle."""
+
+_UNKNOWN_OF_EPISODE = ("return", "min_clearance_m", "path_length_m", "replans")
+
+
+def scenarios_of(sim: Sim, jobs: list[Job]) -> list[dict[str, Any]]:
+    """``describe_scenario``'s document of every job. No row of the simulator runs afterwards."""
+    found = [
+        scenario
+        for first in range(0, len(jobs), sim.num_envs)
+        for scenario in _drawn(sim, jobs[first : first + sim.num_envs])
+    ]
+    sim.sleep()
+    return found
+
+
+def _drawn(sim: Sim, jobs: list[Job]) -> Iterator[dict[str, Any]]:
+    mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
+    for row, job in enumerate(jobs):
+        mask[row], seed[row], number[row] = 1, job.seed, job.episode
+    sim.draw(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
+    rows, read = list(range(len(jobs))), {}
+    for row in rows:
+
+        def values(name: str, row: int = row) -> np.ndarray:
+            if name not in read:
+                read[name] = sim.rows(attrgetter(name)(sim.s), rows)
+            return read[name][row]
+
+        yield describe_scenario(values)
+
+
+def oracle_entry(
+    config: Config, jobs: list[Job], scenarios: list[dict[str, Any]], progress: Progress | None = None
+) -> dict[str, Any]:
+    """The oracle's entry of ``uuv eval --json``: success with the earliest arrival, or timeout, which here
+    means "not reachable"."""
+    begun, results = time.perf_counter(), []
+    for job, scenario in zip(jobs, scenarios, strict=True):
+        results.append(_result(job, earliest_arrival(scenario, config).time_s, config))
+        if progress:
+            progress(len(results), len(jobs), 0, None)
+    entry = summary(ORACLE, results, 0, time.perf_counter() - begun)
+    details = [detail | dict.fromkeys(_UNKNOWN_OF_EPISODE) for detail in entry["episodes_detail"]]
+    return entry | dict.fromkeys(_UNKNOWN) | {"episodes_detail": details, "privileged": True}
+
+
+def _result(job: Job, time_s: float | None, config: Config) -> EpisodeResult:
+    horizon = config.episode.horizon_steps * config.episode.control_dt_s
+    return EpisodeResult(
+        seed=job.seed,
+        episode=job.episode,
+        outcome="timeout" if time_s is None else "success",
+        time_s=round(horizon if time_s is None else time_s, 6),
+        episode_return=0.0,
+        min_clearance_m=0.0,
+        path_length_m=0.0,
+        replans=dict.fromkeys(TRIGGERS, 0),
+        planned_by=dict.fromkeys(PLANNERS, 0),
+        fallbacks=dict.fromkeys(REASONS, 0),
+        ticks=np.zeros(0),
+        acted=np.zeros(0),
+    )
+
+
+def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What each method lacks of 100 %, split: ``remainder`` of ``uuv eval --json``, for methods whose
+    ``+truth`` and the oracle are there.
+
+    Episodes, as differences of successes that add up to ``missed``: sensing = with the true tracks less
+    without, forecast_decision = the oracle's less that (with the vehicle's inertia, which the oracle has
+    not), physics = what the oracle cannot reach either. A part may be negative where knowing more did not
+    help; ``lost_with_truth`` counts the episodes that the method won and its ``+truth`` did not.
+    """
+    won = {entry["name"]: _won(entry) for entry in entries}
+    if ORACLE not in won:
+        return []
+    ceiling = won[ORACLE]
+    return [
+        {
+            "method": name,
+            "episodes": entries[0]["episodes"],
+            "missed": entries[0]["episodes"] - len(own),
+            "sensing": len(with_truth) - len(own),
+            "forecast_decision": len(ceiling) - len(with_truth),
+            "physics": entries[0]["episodes"] - len(ceiling),
+            "lost_with_truth": len(own - with_truth),
+        }
+        for name, own in won.items()
+        if (with_truth := won.get(f"{name}+{TRUTH}")) is not None
+    ]
+
+
+def _won(entry: dict[str, Any]) -> set[tuple[int, int]]:
+    return {
+        (detail["seed"], detail["episode"])
+        for detail in entry["episodes_detail"]
+        if detail["outcome"] == "success"
+    }

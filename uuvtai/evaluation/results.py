@@ -1,0 +1,493 @@
+"""Finished episodes of an evaluation, on disk as soon as each is over: what an interrupted ``uuv eval`` need
+not play again."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from uuvtai.common.enums import COLLIDED, ENDINGS, PLANNERS, REASONS, TRIGGERS
+from uuvtai.common.files import (
+    open_to_append,
+    read_bytes,
+    read_text,
+    refuse_links,
+    truncate,
+)
+from uuvtai.common.statistics import (
+    bootstrap_interval,
+    mcnemar_p,
+    mean,
+    rate,
+    time_to_success_s,
+    wilson_interval,
+)
+from uuvtai.config import Config
+from uuvtai.config.loader import ConfigError, preset_of, read_preset, validated
+from uuvtai.evaluation.episodes import EpisodeObserver, EpisodeResult, Job
+from uuvtai.logs.run_folder import RunFolderError
+from uuvtai.plugins.api import is_piece, piece_spec
+from uuvtai.sim.behavior_tree import (
+    node_use,
+)
+from uuvtai.sim.sim import Sim
+
+if TYPE_CHECKING:
+    from uuvtai.evaluation.agents import Method
+    from uuvtai.sim.scene import SceneOptions
+
+
+JOURNAL_FILE = "eval/episodes.jsonl"
+
+_SYNC_S = 1.0
+"""a kill of the process loses nothing that was flushed; against a failing machine the disk is asked this
+often"""
+
+_COUNTS = ("replans", "planned_by", "fallbacks")
+_PLAIN = (
+    "seed",
+    "episode",
+    "outcome",
+    "time_s",
+    "episode_return",
+    "min_clearance_m",
+    "path_length_m",
+    *_COUNTS,
+)
+
+
+class Finished(NamedTuple):
+    """An episode that is over."""
+
+    result: EpisodeResult
+    wall_s: float
+    """time that its method had taken by then"""
+
+
+class _Line(BaseModel):
+    """A line of the file, checked."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+    method: str
+    seed: int
+    episode: int = Field(ge=0)
+    outcome: Literal["success", "collision", "ttc", "out_of_tank", "timeout"]
+    time_s: float = Field(ge=0)
+    episode_return: float
+    min_clearance_m: float
+    path_length_m: float
+    replans: dict[str, int]
+    planned_by: dict[str, int]
+    fallbacks: dict[str, int]
+    ticks: list[int]
+    acted: list[int]
+    wall_s: float = Field(ge=0)
+
+    def finished(self) -> Finished:
+        plain: dict[str, Any] = {name: getattr(self, name) for name in _PLAIN}
+        counts: dict[str, Any] = {
+            name: np.array(getattr(self, name), dtype=np.int32) for name in ("ticks", "acted")
+        }
+        return Finished(EpisodeResult(**plain, **counts), self.wall_s)
+
+
+class Ledger:
+    """The file ``eval/episodes.jsonl`` of a run folder that this process holds. Raises RunFolderError,
+    FileError."""
+
+    def __init__(self, folder: Path) -> None:
+        """Reads what is there; a last line that a kill cut off is removed."""
+        self._path, self._synced = folder / JOURNAL_FILE, time.monotonic()
+        refuse_links(folder, self._path)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._found: dict[str, dict[Job, Finished]] = {}
+        if self._path.exists():
+            truncate(self._path, self._read(folder), folder)
+        self._file = open_to_append(self._path, folder)
+
+    def finished(self, method: str) -> dict[Job, Finished]:
+        """A method's episodes that are over."""
+        return self._found.setdefault(method, {})
+
+    def add(self, method: str, finished: Finished) -> None:
+        """Write an episode down."""
+        result = finished.result
+        row: dict[str, Any] = {"method": method} | {name: getattr(result, name) for name in _PLAIN}
+        row |= {name: getattr(result, name).tolist() for name in ("ticks", "acted")}
+        row |= {"wall_s": round(finished.wall_s, 3)}
+        self._file.write(json.dumps(row, allow_nan=False, separators=(",", ":")).encode() + b"\n")
+        self._file.flush()
+        if time.monotonic() - self._synced >= _SYNC_S:
+            os.fsync(self._file.fileno())
+            self._synced = time.monotonic()
+        self.finished(method)[Job(result.seed, result.episode)] = finished
+
+    def close(self) -> None:
+        """See all of it on the disk."""
+        if not self._file.closed:
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+
+    def _read(self, folder: Path) -> int:
+        """Length of the whole lines [bytes], which are taken in."""
+        kept = 0
+        for number, line in enumerate(read_bytes(self._path, folder=folder).splitlines(keepends=True), 1):
+            if not line.endswith(b"\n"):
+                break
+            try:
+                found = _Line.model_validate_json(line)
+            except ValidationError as error:
+                reason = error.errors()[0]["msg"]
+                raise RunFolderError(
+                    f"{self._path}, line {number}: is no finished episode ({reason}); take that line out"
+                ) from None
+            self.finished(found.method)[Job(found.seed, found.episode)] = found.finished()
+            kept += len(line)
+        return kept
+
+
+class LedgerWriter(EpisodeObserver):
+    """Recorder that writes a method's episodes into the ledger as they end; behind those whose work an
+    episode needs to be whole."""
+
+    def __init__(self, ledger: Ledger, method: str) -> None:
+        self._ledger, self._method = ledger, method
+        self.before_s = max((found.wall_s for found in ledger.finished(method).values()), default=0.0)
+        self._begun = time.perf_counter()
+
+    @property
+    def wall_s(self) -> float:
+        """Time that the method has taken, that of earlier processes included."""
+        return self.before_s + time.perf_counter() - self._begun
+
+    def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
+        """Keep the episode."""
+        self._ledger.add(self._method, Finished(result, self.wall_s))
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Methods compared on the same episodes: who alone arrives, how sure that is, and the difference in time
+# where both do.
+
+
+Episode = dict[str, Any]
+"""an entry of ``episodes_detail``: seed, episode, outcome, time_s at least"""
+
+
+def paired(methods: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Every pair of methods (entries of ``uuv eval --json``): only_a and only_b arrive, McNemar's exact p,
+    times where both arrive.
+
+    ``time_difference_mean_s`` is a's time minus b's, with a bootstrap interval over episodes.
+    """
+    return [_compared(a, b) for a, b in itertools.combinations(methods, 2)]
+
+
+def _compared(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    pairs = _pairs(a["episodes_detail"], b["episodes_detail"])
+    arrived = [tuple(e["outcome"] == "success" for e in pair) for pair in pairs]
+    times = [
+        (one["time_s"], other["time_s"])
+        for (one, other), both in zip(pairs, arrived, strict=True)
+        if all(both)
+    ]
+    only_a, only_b = arrived.count((True, False)), arrived.count((False, True))
+    differences = [one - other for one, other in times]
+    interval = bootstrap_interval(differences)
+    return {
+        "a": a["name"],
+        "b": b["name"],
+        "episodes": len(pairs),
+        "both": len(times),
+        "only_a": only_a,
+        "only_b": only_b,
+        "mcnemar_p": mcnemar_p(only_a, only_b),
+        "time_a_mean_s": mean([one for one, _other in times]),
+        "time_b_mean_s": mean([other for _one, other in times]),
+        "time_difference_mean_s": mean(differences),
+        "time_difference_ci95": None if interval is None else list(interval),
+    }
+
+
+def _pairs(a: list[Episode], b: list[Episode]) -> list[tuple[Episode, Episode]]:
+    """Entries of the same (seed, episode), in the order of ``a``."""
+    of_b = {(e["seed"], e["episode"]): e for e in b}
+    return [(e, of_b[key]) for e in a if (key := (e["seed"], e["episode"])) in of_b]
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What ``uuv eval --json`` says of played episodes: one entry per method, and the whole document.
+
+
+def summary(
+    name: str,
+    results: list[EpisodeResult],
+    env_steps: int,
+    wall_s: float,
+    env_steps_per_s: float | None = None,
+) -> dict[str, Any]:
+    """One method's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never
+    NaN.
+
+    ``env_steps_per_s`` is a ``StepClock``'s: of simulating alone, where ``wall_s`` is all the time that the
+    method took.
+    """
+    n = len(results)
+    outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in ENDINGS}
+    collided = sum(outcomes[o] for o in COLLIDED)
+    time_mean, to_goal = (
+        mean([r.time_s for r in results]),
+        [r.time_s for r in results if r.outcome == "success"],
+    )
+    return {
+        "name": name,
+        "episodes": n,
+        "outcomes": outcomes,
+        "success_rate": rate(outcomes["success"], n),
+        "success_ci95": _as_list(wilson_interval(outcomes["success"], n)),
+        "collision_rate": rate(collided, n),
+        "collision_ci95": _as_list(wilson_interval(collided, n)),
+        "return_mean": mean([r.episode_return for r in results]),
+        "return_ci95": _as_list(bootstrap_interval([r.episode_return for r in results])),
+        "time_mean_s": time_mean,
+        "tts_s": time_to_success_s(time_mean, rate(outcomes["success"], n)),
+        "time_to_success_mean_s": mean(to_goal),
+        "time_to_success_ci95": _as_list(bootstrap_interval(to_goal)),
+        "min_clearance_mean_m": mean([r.min_clearance_m for r in results]),
+        "path_length_mean_m": mean([r.path_length_m for r in results]),
+        "replans_per_episode": mean([float(sum(r.replans.values())) for r in results]),
+        "replans_by_trigger": _summed(TRIGGERS, [r.replans for r in results]),
+        "planned_by": _summed(PLANNERS, [r.planned_by for r in results]),
+        "fallbacks_by_reason": _summed(REASONS, [r.fallbacks for r in results]),
+        "env_steps": env_steps,
+        "wall_s": round(wall_s, 3),
+        "env_steps_per_s": None if env_steps_per_s is None else round(env_steps_per_s, 1),
+        "episodes_detail": [
+            {
+                "seed": r.seed,
+                "episode": r.episode,
+                "outcome": r.outcome,
+                "time_s": r.time_s,
+                "return": r.episode_return,
+                "min_clearance_m": r.min_clearance_m,
+                "path_length_m": r.path_length_m,
+                "replans": sum(r.replans.values()),
+            }
+            for r in results
+        ],
+    }
+
+
+def tree_use(sim: Sim, results: list[EpisodeResult]) -> list[dict[str, Any]]:
+    """Per node of the tree: the share of episodes that ticked it, its ticks, and the control steps in which
+    it set the action."""
+    ticks, acted = (
+        np.stack([getattr(r, which) for r in results]).astype(np.int64) for which in ("ticks", "acted")
+    )
+    return [vars(use) for use in node_use(ticks, acted, len(sim.tree.names))]
+
+
+def document(
+    config: Config,
+    world: str,
+    sensors: str,
+    vehicle: str,
+    seeds: list[int],
+    episodes: int,
+    methods: list[dict[str, Any]],
+) -> dict[str, Any]:
+    """The whole ``uuv eval --json`` document."""
+    return {
+        "schema": 1,
+        "world": world,
+        **config.world.bodies,
+        "v_m_s": config.world.dynamic_speed_m_s,
+        "sensors": sensors,
+        "vehicle": vehicle,
+        "localization": config.sensors.localization,
+        "seeds": seeds,
+        "episodes_per_seed": episodes,
+        "methods": methods,
+        "paired": paired(methods),
+    }
+
+
+def _as_list(interval: tuple[float, float] | None) -> list[float] | None:
+    return None if interval is None else list(interval)
+
+
+def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, int]:
+    return {name: sum(c.get(name, 0) for c in counts) for name in names}
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What ``uuv eval`` was asked for, as an object and as the file from which an interrupted evaluation goes
+# on.
+
+
+REQUEST_FILE = "eval/request.json"
+ORACLE = "oracle"
+"""controller that is asked, not driven: the privileged upper bound"""
+
+_MAX_BYTES = 1 << 22
+_GIVE = "give the folder that an interrupted 'uuv eval' printed"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What ``uuv eval`` was asked for."""
+
+    config: Config
+    world: str
+    sensors: str
+    controllers: list[str]
+    """names of trees or stacks, paths of XML or YAML files, each perhaps with ``+truth``; ``oracle``; pieces
+    of the user's (``own.piece_spec``)"""
+    seeds: list[int]
+    episodes: int
+    vehicle: str = ""
+    """name of its preset; of old requests ''"""
+    policies: tuple[str, ...] = ()
+    """run folders or checkpoint folders"""
+    num_envs: int | None = None
+    record: int = 0
+    video: bool = False
+    depth_images: bool = False
+    explain: bool = False
+    explain_record: int = 3
+    device: str = "auto"
+    run_dir: Path | None = None
+
+    @classmethod
+    def typed(cls, scene: SceneOptions, policies: list[str], **rest: Any) -> Request:
+        """What a command line asks for: the scene as it was typed, observed as the policies were trained.
+        Raises ConfigError, CheckpointError."""
+        from uuvtai.evaluation.agents import features_of
+
+        config = scene.config(features_of(policies) if policies else [])
+        world = scene.world_name
+        named = {kind: preset_of(kind, world, getattr(scene, kind)) for kind in ("sensors", "vehicle")}
+        return cls(config=config, world=world, **named, policies=tuple(policies), **rest)
+
+
+class _Document(BaseModel):
+    """The file, checked."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    schema_: int = Field(alias="schema", ge=1, le=1)
+    config: dict[str, Any]
+    world: str
+    sensors: str
+    vehicle: str = ""
+    controllers: list[str]
+    seeds: list[int] = Field(min_length=1)
+    episodes: int = Field(ge=1)
+    policies: list[str]
+    num_envs: int = Field(ge=1)
+    record: int = Field(ge=0)
+    video: bool
+    depth_images: bool
+    explain: bool
+    explain_record: int = Field(ge=0)
+    device: str
+    cwd: str
+    drivers: dict[str, str]
+
+
+def document_of(request: Request, num_envs: int, device: str, drivers: dict[str, str]) -> dict[str, Any]:
+    """The request with what was chosen for it, as JSON; ``drivers``: sha256 of what drives, by method."""
+    document = {
+        field.name: getattr(request, field.name)
+        for field in dataclasses.fields(request)
+        if field.name not in ("config", "run_dir")
+    }
+    document |= {"policies": list(request.policies), "num_envs": num_envs, "device": device}
+    return {
+        "schema": 1,
+        **document,
+        "config": request.config.model_dump(mode="json"),
+        "cwd": os.getcwd(),
+        "drivers": drivers,
+    }
+
+
+def read_request(place: Path) -> tuple[Request, dict[str, str]]:
+    """The request of a run folder, and the sha256 of what drove by method. Raises RunFolderError,
+    FileError."""
+    file = place / REQUEST_FILE
+    try:
+        found = _Document.model_validate_json(read_text(file, _MAX_BYTES, place))
+        config = validated(found.config)
+    except OSError as error:
+        raise RunFolderError(f"{file}: cannot be read ({error.strerror}); {_GIVE}") from None
+    except (ValidationError, ConfigError) as error:
+        reason = (
+            error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error).splitlines()[0]
+        )
+        raise RunFolderError(
+            f"{file}: is no request of this version of 'uuv eval' ({reason}); {_GIVE}"
+        ) from None
+    given = found.model_dump(exclude={"schema_", "config", "cwd", "drivers"})
+    request = Request(config=config, **given)
+    return _found_again(replace(request, policies=tuple(found.policies)), Path(found.cwd)), found.drivers
+
+
+def _found_again(request: Request, cwd: Path) -> Request:
+    """Paths that were typed in another folder, seen from this one; names of what is shipped stay names."""
+
+    def seen(name: str) -> str:
+        file = name.removesuffix("+truth")
+        return name if Path(file).exists() else str(cwd / name)
+
+    def seen_driver(name: str) -> str:
+        if is_piece(name):
+            return piece_spec(name).located(cwd).text
+        return seen(name) if name.removesuffix("+truth").endswith((".xml", ".yaml", ".yml")) else name
+
+    controllers = [seen_driver(name) for name in request.controllers]
+    return replace(request, controllers=controllers, policies=tuple(map(seen, request.policies)))
+
+
+def drivers_of(methods: list[Method]) -> dict[str, str]:
+    """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played, with its stack,
+    of the file of a piece of the user's."""
+    return {
+        method.name: method.own.sha256
+        if method.own
+        else method.checkpoint.sha256
+        if method.checkpoint
+        else _tree_sha256(method)
+        for method in methods
+    }
+
+
+def refuse_others(place: Path, before: dict[str, str], now: dict[str, str]) -> None:
+    """RunFolderError where another tree or policy has a method's name by now: episodes of both under one name
+    would prove nothing."""
+    changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    if changed:
+        what = ", ".join(changed)
+        raise RunFolderError(
+            f"{place}: {what} has changed since this evaluation began; begin a new one with another --run-dir"
+        )
+
+
+def _tree_sha256(method: Method) -> str:
+    tree = dataclasses.asdict(method.tree)
+    del tree["source"], tree["xml"]
+    stack = [] if method.stack is None else [read_preset("stack", method.stack)]
+    return hashlib.sha256(json.dumps([tree, method.privileged, *stack]).encode()).hexdigest()

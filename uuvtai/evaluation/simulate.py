@@ -1,0 +1,347 @@
+"""Open-loop physics in endless water: what ``uuv simulate`` runs, to hold a vehicle against theory or one's
+own data."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from uuvtai.common.enums import RUNNING
+from uuvtai.common.errors import DivergenceError, SettingError
+from uuvtai.common.presets import PRESET_DIR
+from uuvtai.compile.runtime import Runtime, start_taichi
+from uuvtai.config import Config
+from uuvtai.config.loader import ConfigError
+from uuvtai.evaluation.agents import Method, trees_of
+from uuvtai.evaluation.episodes import Job, Recorders, Stepper, run_episodes
+from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, comparison_of, methods_of
+from uuvtai.evaluation.results import ORACLE, Request
+from uuvtai.live.server import Broadcast, RealTime, ViewerServer
+from uuvtai.sim.plant import Plant
+from uuvtai.sim.sim import Sim
+
+CONTROL_DT_S = 0.02
+"""Samples are this far apart, or one substep where that is longer."""
+
+_MAX_STEPS = 10_000_000
+_MAX_COMPONENT = 1e6
+_WHAT = {
+    "wrench": ("fx,fy,fz,mx,my,mz in N and N m", 6),
+    "command": ("surge,sway,heave,yaw rate in m/s and rad/s", 4),
+    "current": ("x,y,z in m/s", 3),
+    "initial_rpy_deg": ("roll,pitch,yaw in degrees", 3),
+    "initial_velocity": ("u,v,w,p,q,r in m/s and rad/s", 6),
+}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What one vehicle that starts at the origin is exposed to; None = nothing, rest, level."""
+
+    seconds: float
+    wrench: Sequence[float] | None = None
+    """constant force and moment [N, N m], body frame, on top of the thrusters, which are off without
+    ``command``"""
+    command: Sequence[float] | None = None
+    """velocity and yaw rate [m/s, rad/s], body frame, for the inner loop"""
+    current: Sequence[float] | None = None
+    """[m/s], world frame"""
+    initial_rpy_deg: Sequence[float] | None = None
+    initial_velocity: Sequence[float] | None = None
+    """u,v,w,p,q,r [m/s, rad/s], body frame"""
+    neutral: bool = False
+    """buoyancy equal to weight"""
+    dt: float = 0.01
+    """substep [s]"""
+
+
+def simulate(config: Config, trial: Trial, runtime: Runtime | None = None) -> dict[str, list]:
+    """Trajectory sampled at every control step, the initial state first: {"t" [s], "position" [m], "rpy_deg",
+    "nu" [m/s, rad/s], "rpm"}.
+
+    Starts Taichi in double precision unless ``runtime`` says what is running. Raises SettingError for input
+    that makes no sense, DivergenceError where the integration diverges.
+    """
+    given = {name: getattr(trial, name) for name in _WHAT}
+    vectors = {name: checked_vector(name, value) for name, value in given.items() if value is not None}
+    substeps, control_dt = control_step(trial.dt)
+    n_step = checked_steps(trial.seconds, control_dt, substeps)
+    config = experiment(config, trial)
+    action = None if trial.command is None else _action(config, vectors["command"])
+    plant = Plant(config, runtime or start_taichi(precision="f64"))
+    plant.reset()
+    _set_start(plant, vectors)
+    samples = [_sample(plant, 0.0)]
+    for k in range(1, n_step + 1):
+        plant.step(action)
+        samples.append(_sample(plant, k * control_dt))
+        if not math.isfinite(sum(samples[-1]["nu"])):
+            raise DivergenceError(
+                f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt "
+                f"{trial.dt / 4:g}"
+            )
+    return {key: [s[key] for s in samples] for key in samples[0]}
+
+
+# ------------------------------------------------------------------------------------------------------ input
+
+
+def checked_vector(name: str, value: Sequence[float]) -> np.ndarray:
+    """``value`` as float64; SettingError unless it has the right number of finite, sane components."""
+    what, length = _WHAT[name]
+    flag = "--" + name.replace("_", "-")
+    try:
+        vector = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SettingError(f"{flag} must be {length} numbers ({what}), got {value!r}") from None
+    example = ",".join(["0.1"] + ["0"] * (length - 1))
+    if vector.shape != (length,):
+        raise SettingError(
+            f"{flag} must be {length} numbers ({what}), got {vector.size}: for example {flag} {example}"
+        )
+    if not np.isfinite(vector).all() or np.abs(vector).max() > _MAX_COMPONENT:
+        raise SettingError(
+            f"{flag} must be finite numbers below {_MAX_COMPONENT:g} ({what}), got {value!r}: for example "
+            f"{flag} {example}"
+        )
+    return vector
+
+
+def control_step(dt: float) -> tuple[int, float]:
+    """(substeps, control step [s]) for a substep of ``dt``: 0.02 s where dt divides it, else the next
+    multiple of dt."""
+    if not (isinstance(dt, (int, float)) and math.isfinite(dt) and dt > 0):
+        raise SettingError(f"--dt must be a positive number of seconds, got {dt!r}: for example --dt 0.01")
+    ratio = CONTROL_DT_S / dt
+    substeps = max(1, math.ceil(ratio - 1e-9))
+    if abs(ratio - substeps) < 1e-6:
+        return substeps, CONTROL_DT_S
+    return substeps, substeps * dt
+
+
+def checked_steps(seconds: float, control_dt: float, substeps: int) -> int:
+    """Control steps that cover ``seconds``; SettingError where that is nothing or far too many."""
+    if not (isinstance(seconds, (int, float)) and math.isfinite(seconds) and seconds > 0):
+        raise SettingError(f"--seconds must be a positive number, got {seconds!r}: for example --seconds 10")
+    if seconds / control_dt * substeps > _MAX_STEPS:
+        raise SettingError(
+            f"--seconds {seconds:g} at --dt {control_dt / substeps:g} is more than {_MAX_STEPS} substeps: "
+            "use fewer seconds or larger --dt"
+        )
+    return max(1, math.ceil(seconds / control_dt - 1e-6))
+
+
+def _action(config: Config, command: np.ndarray) -> np.ndarray:
+    vehicle = config.vehicle
+    names = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
+    limits = np.array([getattr(vehicle, name) for name in names])
+    for name, value, limit in zip(names, command, limits, strict=True):
+        if abs(value) > limit * (1 + 1e-9):
+            raise SettingError(
+                f"--command asks for {value:g}, above vehicle.{name} = {limit:g}: ask for less, or --set "
+                f"vehicle.{name}={abs(value):g}"
+            )
+    return (command / limits).astype(np.float32)[None, :]
+
+
+def experiment(config: Config, trial: Trial) -> Config:
+    """The config with the trial's current, buoyancy and steps in it. Raises SettingError."""
+    substeps, control_dt = control_step(trial.dt)
+    vehicle, disturbance = config.vehicle, config.disturbance
+    if trial.neutral:
+        vehicle = vehicle.model_copy(update={"volume_m3": vehicle.mass_kg / vehicle.water_density_kg_m3})
+    if trial.current is not None:
+        current = checked_vector("current", trial.current)
+        disturbance = disturbance.model_copy(update={"current_m_s": tuple(float(x) for x in current)})
+    episode = config.episode.model_copy(update={"control_dt_s": control_dt, "substeps": substeps})
+    return config.model_copy(update={"vehicle": vehicle, "disturbance": disturbance, "episode": episode})
+
+
+# ------------------------------------------------------------------------------------------------- trajectory
+
+
+def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
+    if "initial_rpy_deg" in vectors:
+        plant.write(plant.vehicle.quat_wb, quaternion(*np.radians(vectors["initial_rpy_deg"])))
+    if "initial_velocity" in vectors:
+        plant.write(plant.vehicle.vel_b, vectors["initial_velocity"][:3])
+        plant.write(plant.vehicle.rate_b, vectors["initial_velocity"][3:])
+    if "wrench" in vectors:
+        plant.write(plant.actuation.external_wrench_b, vectors["wrench"])
+
+
+def _sample(plant: Plant, time_s: float) -> dict[str, Any]:
+    v = plant.vehicle
+    position, q, vel, rate = (
+        plant.read(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b)
+    )
+    return {
+        "t": time_s,
+        "position": position.tolist(),
+        "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
+        "nu": [*vel.tolist(), *rate.tolist()],
+        "rpm": plant.read(v.rpm)[0].astype(float).tolist(),
+    }
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """(w, x, y, z) of yaw-pitch-roll angles [rad]."""
+    cr, sr, cp, sp, cy, sy = (f(0.5 * a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+def roll_pitch_yaw(q: np.ndarray) -> np.ndarray:
+    """Angles [rad] of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q
+    return np.array(
+        [
+            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
+            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ]
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------
+# One vehicle that somebody drives through open water, from a start to a goal: ``uuv simulate
+# --controller``.
+
+
+_NOT_BESIDE = ("wrench", "command", "initial_rpy_deg", "initial_velocity")
+
+
+def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
+    """As ``simulate.simulate``, positions [m] from the start, with "goal" [m] from there. It ends early where
+    the goal is reached or the tank is left. ``name``: a tree or a piece of the user's. Raises SettingError,
+    ConfigError, PieceError."""
+    for given in _NOT_BESIDE:
+        if getattr(trial, given) is not None:
+            option = "--" + given.replace("_", "-")
+            raise SettingError(
+                f"{option}: not beside --controller, which drives from rest; leave one of them out"
+            )
+    substeps, control_dt = control_step(trial.dt)
+    n_step = checked_steps(trial.seconds, control_dt, substeps)
+    (method,) = trees_of([name], config.teacher.max_node)
+    config = method.config_of(experiment(config, trial))
+    config = config.model_copy(
+        update={"episode": config.episode.model_copy(update={"horizon_steps": n_step + 1})}
+    )
+    sim = Sim(config, 1, method.tree, "cpu")
+    sim.planner, sim.privileged = method.planner_for(sim), method.privileged
+    note = method.driver_for(sim)
+    stepper = Stepper(sim, note.pilot if note else None)
+    one, zero = torch.ones(1, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
+    stepper.reset(one, zero, zero)
+    start, goal = (sim.rows(field)[0].astype(float) for field in (sim.s.vehicle.pos_w, sim.s.mission.goal_w))
+    samples = [_drive_sample(sim, start, 0.0)]
+    for k in range(1, n_step + 1):
+        stepper.step()
+        samples.append(_drive_sample(sim, start, k * control_dt))
+        if sim.rows(sim.s.referee.outcome)[0] != RUNNING:
+            break
+    if method.own:
+        method.own.close()
+    return {key: [s[key] for s in samples] for key in samples[0]} | {"goal": (goal - start).tolist()}
+
+
+def _drive_sample(sim: Sim, start: np.ndarray, time_s: float) -> dict[str, Any]:
+    v = sim.s.vehicle
+    position, q, vel, rate, rpm = (
+        sim.rows(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b, v.rpm)
+    )
+    return {
+        "t": time_s,
+        "position": (position - start).tolist(),
+        "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
+        "nu": [*vel.tolist(), *rate.tolist()],
+        "rpm": rpm.tolist(),
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------
+# ``uuv watch``: episodes at the clock's pace, one after another, for viewers that come and go.
+
+
+LAYOUT = PRESET_DIR / "layout" / "navigation.json"
+"""for Foxglove and Lichtblick"""
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """How episodes are shown."""
+
+    host: str = "127.0.0.1"
+    port: int = 8765
+    rate: float = 1.0
+    """seconds of the episode in one of the clock's; 0 = as fast as it goes"""
+    origins: Sequence[str] = ()
+    """of web pages that may connect beside those of this host"""
+
+
+def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) -> list[dict[str, Any]]:
+    """Play the request's episodes, each by every method in turn, and serve them; ``episodes`` 0 = on and on,
+    until it is interrupted. How each ended. Raises LiveError, ConfigError, CheckpointError, PieceError."""
+    if ORACLE in request.controllers:
+        raise ConfigError("--controller oracle: it drives no vehicle; name who does, for example bt")
+    methods = methods_of(request, watch)
+    with ViewerServer(live.host, live.port, live.origins) as server:
+        shown = "localhost" if live.host in ("127.0.0.1", "0.0.0.0", "::") else live.host
+        watch.note(f"serving ws://{shown}:{server.port}; in Foxglove or Lichtblick: open a connection,")
+        watch.note(f"Foxglove WebSocket, to that address, and import the layout {LAYOUT}")
+        comparison = comparison_of(request, 1, methods, watch)
+        try:
+            return [
+                _watched(comparison, method, job, server, live.rate)
+                for job in _jobs(request)
+                for method in methods
+            ]
+        finally:
+            for method in methods:
+                if method.own:
+                    method.own.close()
+
+
+def _jobs(request: Request) -> Iterable[Job]:
+    numbers = range(request.episodes) if request.episodes else itertools.count()
+    return (Job(seed, number) for number in numbers for seed in request.seeds)
+
+
+def _watched(
+    comparison: Comparison, method: Method, job: Job, server: ViewerServer, rate: float
+) -> dict[str, Any]:
+    """Play one episode for all to see; how it ended."""
+    request, policy = comparison.request, comparison.policies[method.name]
+    sim = comparison.simulator_for(method)
+    clock = RealTime(request.config.episode.control_dt_s, rate)
+    shown = Broadcast(server, Path(request.world).stem, method.name, request.depth_images, policy)
+    driver = policy.pilot if policy else None
+    (result,), _ = run_episodes(sim, [job], Recorders([shown, clock]), driver=driver)
+    entry = {
+        "method": method.name,
+        "seed": job.seed,
+        "episode": job.episode,
+        "outcome": result.outcome,
+        "time_s": result.time_s,
+        "min_clearance_m": round(result.min_clearance_m, 4),
+        "real_time_factor": round(clock.real_time_factor, 2),
+    }
+    comparison.watch.note(
+        f"{method.name}, seed {job.seed}, episode {job.episode}: {result.outcome} after "
+        f"{result.time_s:.1f} s ({entry['real_time_factor']:.2f} of real time)"
+    )
+    return entry

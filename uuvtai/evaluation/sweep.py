@@ -1,0 +1,342 @@
+"""A sweep's run folder: every finished row is on disk at once, so that a sweep killed at any moment goes on
+where it was."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from uuvtai.common import signals
+from uuvtai.common.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
+from uuvtai.common.processes import ATTEMPTS, EngineError, Item, LocalEngine, Work
+from uuvtai.evaluation.grid import (
+    Grid,
+    Row,
+    SweepRequest,
+    base_config,
+    check_rows,
+    ordered,
+    play,
+    request_of,
+    row_key,
+    tasks_of,
+    unchanged,
+)
+from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
+from uuvtai.plugins.api import is_piece, piece_spec, refuse_code
+
+if TYPE_CHECKING:
+    from uuvtai.config import Config
+    from uuvtai.evaluation.agents import Method
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Who does the work of a sweep: processes on this machine, or a Ray cluster. A worker that is lost costs its
+# task once more.
+
+
+class Engine(Protocol):
+    """Runs tasks somewhere."""
+
+    def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
+        """(number of the item, result) as they come. Errors of the work itself are raised; EngineError where
+        workers keep dying."""
+        ...
+
+
+class RayEngine:
+    """Tasks on a Ray cluster that runs already, or on one inside this process; Ray itself runs lost tasks
+    again."""
+
+    def __init__(self, address: str = "auto", cpus_per_task: float = 2.0) -> None:
+        """``address``: of the cluster, ``auto`` = the one that this machine belongs to, ``local`` = one
+        inside this process."""
+        try:
+            import ray  # type: ignore[import-not-found]  # an extra
+        except ImportError:
+            raise EngineError(
+                "--engine ray: the package ray is missing; install it: pip install 'uuvtai[cluster]'"
+            ) from None
+        self._ray = ray
+        try:
+            ray.init(
+                address=None if address == "local" else address,
+                ignore_reinit_error=True,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+            )
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise EngineError(
+                f"--engine ray: no cluster at {address!r} ({error}); start one: ray start --head"
+            ) from None
+        signals.reinstall()  # Ray has put its own handler of SIGTERM in their place
+        self._cpus = min(cpus_per_task, ray.cluster_resources().get("CPU", 1.0))
+
+    def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
+        """As ``Engine.run``."""
+        remote = self._ray.remote(num_cpus=self._cpus, max_retries=ATTEMPTS - 1)(work)
+        running = {remote.remote(item): number for number, item in enumerate(items)}
+        try:
+            yield from self._results(running, len(items))
+        finally:
+            for left in running:  # of a cluster that outlives us
+                self._ray.cancel(left, force=True)
+
+    def _results(self, running: dict[Any, int], total: int) -> Iterator[tuple[int, Any]]:
+        while running:
+            (done, *_), _rest = self._ray.wait(list(running))
+            number = running.pop(done)
+            try:
+                yield number, self._ray.get(done)
+            except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.NodeDiedError) as error:
+                raise EngineError(
+                    f"task {number + 1} of {total} lost its worker {ATTEMPTS} times: {error}"
+                ) from None
+            except self._ray.exceptions.RayTaskError as error:
+                raise error.as_instanceof_cause() from None
+
+
+def engine_of(name: str, workers: int, address: str) -> Engine:
+    """The engine of ``uuv sweep --engine``: 'local' with so many ``workers``, or 'ray' at ``address``."""
+    return LocalEngine(workers) if name == "local" else RayEngine(address)
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
+ROWS, REQUEST, RESULT = "cells.jsonl", "sweep_request.json", "sweep.json"
+
+MethodKey = tuple[str, str | None, str | None]
+"""(name in the table, controller, policy): exactly one of the last two"""
+
+
+class SweepWatch(Protocol):
+    """Shows how far a sweep is."""
+
+    def start(self, name: str, total: int, done: int = 0) -> None: ...
+    def note(self, text: str) -> None: ...
+    def update(self, done: int, total: int, env_steps: int) -> None: ...
+    def stop(self) -> None: ...
+
+
+def sweep(
+    request: SweepRequest, engine: Engine, run_dir: Path | None, watch: SweepWatch
+) -> tuple[dict[str, Any], Path]:
+    """Begin a sweep: the ``uuv sweep --json`` document and the run folder. Whatever can be refused is refused
+    before anything is written.
+
+    Raises ConfigError, CheckpointError, RunFolderError, EngineError.
+    """
+    refuse_place(run_dir)
+    request, methods, checkpoints = resolved(request, watch)
+    keys = check_rows(request, [name for name, _controller, _policy in methods])
+    place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
+    folder = RunFolder(place, base_config(request), list(request.seeds))
+    folder.write_json(
+        REQUEST, {"schema": 1, **request.document(), "methods": methods, "checkpoints": checkpoints}
+    )
+    return _play(request, methods, keys, engine, folder, watch), folder.path
+
+
+def resume(
+    place: Path, engine: Engine, watch: SweepWatch, allow_code: bool = False
+) -> tuple[dict[str, Any], Path]:
+    """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are.
+    ``allow_code``: Python files that the folder names may be run. Raises RunFolderError."""
+    folder = RunFolder.held(place, "uuv sweep")
+    try:
+        try:
+            document = read_json(place / REQUEST, folder=place)
+            request, methods = request_of(document), [_method_key(method) for method in document["methods"]]
+            checkpoints = dict(document["checkpoints"])
+        except (FileError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise RunFolderError(
+                f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed"
+            ) from None
+        controllers = [controller for _name, controller, _policy in methods]
+        refuse_code(place, [*request.controllers, *filter(None, controllers)], allow_code)
+        _refuse_other_policies(place, request, controllers, checkpoints, watch)
+        keys = check_rows(request, [name for name, _controller, _policy in methods])
+        folder.go_on({"rows": len(read_rows(place))})
+        return _play(request, methods, keys, engine, folder, watch), place
+    finally:
+        folder.release()
+
+
+def _method_key(given: Any) -> MethodKey:
+    """Of a request on disk. Raises TypeError, ValueError."""
+    name, controller, policy = given
+    if not isinstance(name, str) or not all(isinstance(one, str | None) for one in (controller, policy)):
+        raise TypeError(f"{given!r:.80} is no method")
+    return name, controller, policy
+
+
+def _refuse_other_policies(
+    place: Path,
+    request: SweepRequest,
+    controllers: Sequence[str | None],
+    checkpoints: dict[str, str],
+    watch: SweepWatch,
+) -> None:
+    """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
+    nothing."""
+    from uuvtai.evaluation.agents import policies_of
+
+    trained = policies_of(list(request.policies), base_config(request).teacher.max_node, watch.note)
+    now = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
+    own = _own_of(controllers, base_config(request))
+    now |= {method.name: method.own.sha256 for method in own if method.own}
+    changed = [name for name, sha256 in checkpoints.items() if now.get(name) != sha256]
+    if changed:
+        raise RunFolderError(
+            f"{place}: {', '.join(changed)} has changed since this sweep began; begin a new sweep with "
+            "another --run-dir"
+        )
+
+
+def resolved(
+    request: SweepRequest, watch: SweepWatch
+) -> tuple[SweepRequest, list[MethodKey], dict[str, str]]:
+    """The request with the columns that its policies see, its methods by their names in the table, and the
+    sha256 of every policy.
+
+    Paths are made absolute. Raises ConfigError, CheckpointError.
+    """
+    from uuvtai.evaluation.agents import features_of, policies_of, trees_of
+
+    limit = base_config(request).teacher.max_node
+    trees = trees_of(list(request.controllers), limit)
+    policies = tuple(str(Path(name).resolve()) if Path(name).exists() else name for name in request.policies)
+    trained = policies_of(list(policies), limit, watch.note)
+    controllers = [_located(name) for name in request.controllers]
+    methods: list[MethodKey] = [
+        (tree.name, name, None) for tree, name in zip(trees, controllers, strict=True)
+    ]
+    methods += [(method.name, None, name) for method, name in zip(trained, policies, strict=True)]
+    features = features_of(list(policies)) if policies else []
+    checkpoints = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
+    checkpoints |= {method.name: method.own.sha256 for method in trees if method.own}
+    return (
+        replace(request, overrides=(*features, *request.overrides), policies=policies),
+        methods,
+        checkpoints,
+    )
+
+
+def _located(name: str) -> str:
+    """A controller's name as a worker in any folder finds it."""
+    if is_piece(name):
+        return piece_spec(name).absolute().text
+    return str(Path(name).resolve()) if name.endswith((".xml", ".yaml", ".yml")) else name
+
+
+def _own_of(controllers: Sequence[str | None], config: Config) -> list[Method]:
+    """The user's own pieces among them."""
+    from uuvtai.evaluation.agents import trees_of
+
+    return trees_of([name for name in controllers if name and is_piece(name)], config.teacher.max_node)
+
+
+def _play(
+    request: SweepRequest,
+    methods: Sequence[MethodKey],
+    keys: list[str],
+    engine: Engine,
+    folder: RunFolder,
+    watch: SweepWatch,
+) -> dict[str, Any]:
+    rows = _by_key(folder.path, request.grid)
+    tasks = tasks_of(request, methods, set(rows))
+    watch.start(f"{len(keys)} cells", len(keys), len(rows))
+    try:
+        with folder.recorded():
+            for number, played in engine.run(play, tasks):
+                for row in played:
+                    append_row(folder.path, row)
+                    rows[row_key(_label(row, request.grid), row["method"])] = row
+                watch.note(f"{_words(tasks[number].labels[0])} .. {_words(tasks[number].labels[-1])}: done")
+                watch.update(len(rows), len(keys), 0)
+            document = _document(request, ordered(rows, keys))
+            folder.write_json(RESULT, document)
+            return document
+    except KeyboardInterrupt:
+        watch.note(f"finished rows are kept; go on with: uuv sweep --resume {folder.path}")
+        raise
+    finally:
+        watch.stop()
+
+
+def _by_key(place: Path, grid: Grid) -> dict[str, Row]:
+    """Rows that are finished. Raises RunFolderError for rows of another grid."""
+    try:
+        return {row_key(_label(row, grid), row["method"]): row for row in read_rows(place)}
+    except (KeyError, TypeError) as error:
+        raise RunFolderError(
+            f"{place / ROWS}: holds a row that is not of this sweep ({error!r}); take it out to go on"
+        ) from None
+
+
+def _label(row: Row, grid: Grid) -> dict[str, Any]:
+    """Of a row that was written: what ``label_of`` gave for its cell."""
+    names = ("S", "D", "v_m_s", *(name for name in grid.axes if name in row and name not in ("S", "D", "v")))
+    return {name: row[name] for name in names}
+
+
+def _words(label: dict[str, Any]) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in label.items() if value is not None)
+
+
+def _document(request: SweepRequest, rows: list[Row]) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "world": request.world,
+        "sensors": request.sensors,
+        "axes": request.grid.document(),
+        **({"one_at_a_time": True, "unchanged": unchanged(request)} if request.grid.one_at_a_time else {}),
+        "seeds": list(request.seeds),
+        "episodes_per_seed": request.episodes,
+        "cells": rows,
+    }
+
+
+# ------------------------------------------------------------------------------------------------------- file
+
+
+def append_row(place: Path, row: Row) -> None:
+    """Add a row to a run folder that is held, and see it on the disk."""
+    with open_to_append(place / ROWS, place) as stream:
+        stream.write(json.dumps(row, allow_nan=False).encode() + b"\n")
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def read_rows(place: Path) -> list[Row]:
+    """Rows written so far in a run folder that is held.
+
+    A last line that a kill cut off is removed from the file, so that the next row begins a line of its own.
+    """
+    path = place / ROWS
+    if not path.exists():
+        return []
+    rows: list[Row] = []
+    whole, last, row = 0, 0, None
+    for line in read_lines(path, folder=place):
+        row = _row(line)
+        rows += [] if row is None else [row]
+        whole, last = whole + len(line), len(line)
+    if row is None and whole:
+        truncate(path, whole - last, place)
+    return rows
+
+
+def _row(line: bytes) -> Row | None:
+    try:
+        row = parsed_json(line, ROWS)
+    except FileError:
+        return None
+    return row if line.endswith(b"\n") and isinstance(row, dict) else None

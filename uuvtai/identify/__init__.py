@@ -1,1 +1,0 @@
-"""From a log of a drive to the numbers of the vehicle: damping, added mass, buoyancy, thrust."""

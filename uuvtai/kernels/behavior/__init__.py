@@ -1,0 +1,1 @@
+"""The behavior tree: threats, rollouts, leaves."""

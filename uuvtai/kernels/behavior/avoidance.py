@@ -1,0 +1,183 @@
+"""Search for an evasive velocity: headings times speeds, stop, the last command and the follow velocity,
+rolled out in packets."""
+
+import taichi as ti
+
+from uuvtai.compile.launch import quick_launch
+from uuvtai.config.behavior import BURST, CHANGE, CONTACT, DEVIATION, HEAVE, MEAN, PEAK, SOFTNESS, STATIC
+from uuvtai.kernels.behavior.io import EvasionIO
+from uuvtai.kernels.behavior.rollout import (
+    body_depths,
+    depth_band,
+    drive_of,
+    edge_gap,
+    place_doubt,
+    static_depths,
+    tuned,
+)
+from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
+from uuvtai.kernels.core.simd import filled, n_lane, put_column, row_lanes
+from uuvtai.kernels.core.stage import Bundle, Const, spread
+
+
+@quick_launch
+@ti.kernel
+def plan_evasion(io: Bundle[EvasionIO]):
+    """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is
+    as good as the best one."""
+    n, lanes = ti.static(io.clock.awake.shape[0], n_lane())
+    n_packet = ti.static(io.teacher.candidate_cost.shape[1] // lanes)
+    for env, packet in ti.ndrange(n, n_packet):
+        if io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
+            cx, cy, cz = candidate_lanes(env, packet * lanes, lanes, io)
+            burst_s = ti.select(
+                packet * lanes >= io.teacher_cfg.first_burst,
+                io.teacher_cfg.burst_s * tuned(env, BURST, io.teacher),
+                FAR_M,
+            )
+            cost = cost_lanes(env, cx, cy, cz, burst_s, io)
+            for i in ti.static(range(lanes)):
+                io.teacher.candidate_cost[env, packet * lanes + i] = cost[i]
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
+            index, best_cost, mean = _chosen(env, io)
+            cx, cy, cz = filled(mean[0], lanes), filled(mean[1], lanes), filled(mean[2], lanes)
+            cost = cost_lanes(env, cx, cy, cz, FAR_M, io)
+            good = cost[0] <= best_cost + io.teacher_cfg.softness * tuned(env, SOFTNESS, io.teacher)
+            io.teacher.evade_vel_w[env] = ti.select(good, mean, candidate(env, index, io))
+            io.teacher.evade_candidate[env] = ti.select(good, -1, index)
+            io.teacher.evade_cost[env] = ti.select(good, cost[0], best_cost)
+
+
+@ti.func
+def candidate_lanes(env, first, lanes: Const[int], io: Bundle[EvasionIO]):
+    """World velocities (lanes x, y, z [m/s]) of as many candidates from ``first`` on."""
+    velocities = ti.Matrix.zero(ti.f32, 3, lanes)
+    for lane in range(lanes):
+        put_column(velocities, lane, candidate(env, first + lane, io))
+    return row_lanes(velocities, 0), row_lanes(velocities, 1), row_lanes(velocities, 2)
+
+
+@ti.func
+def candidate(env, index, io: Bundle[EvasionIO]):
+    """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route
+    is among them.
+
+    First the level ones (they keep the heave of following), then stop, last command and follow, then those
+    that climb and those that dive, and from ``first_burst`` on the level dashes, which last ``burst_s`` only.
+    Padding repeats standing still.
+    """
+    n_level, n_heave = ti.static(
+        io.teacher_cfg.n_heading * io.teacher_cfg.n_speed, io.teacher_cfg.n_heave_heading
+    )
+    follow = io.teacher.follow_vel_w[env]
+    out = ti.Vector([0.0, 0.0, 0.0])
+    if index >= ti.static(io.teacher_cfg.first_burst):
+        turn = ti.static(TWO_PI / 32) * (index - ti.static(io.teacher_cfg.first_burst))
+        out = _towards(env, turn, 1.0, follow[2], io)
+    elif index < n_level:
+        speed = 1.0 / ti.static(io.teacher_cfg.n_speed) * (index // ti.static(io.teacher_cfg.n_heading) + 1)
+        turn = ti.static(TWO_PI / io.teacher_cfg.n_heading) * (index % ti.static(io.teacher_cfg.n_heading))
+        out = _towards(env, turn, speed, follow[2], io)
+    elif index == n_level + 1:
+        out = io.teacher.last_vel_w[env]
+        out[2] = edge_limited(env, out[2], io)
+    elif index == n_level + 2:
+        out = follow
+    elif index > n_level + 2 and index < ti.static(io.teacher_cfg.n_held):
+        nth = index - n_level - 3
+        heave = ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s * tuned(env, HEAVE, io.teacher)
+        heave = edge_limited(env, heave, io)
+        turn = ti.static(TWO_PI / io.teacher_cfg.n_heave_heading) * (nth // 2)
+        out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, io)
+    return out
+
+
+@ti.func
+def _towards(env, turn, share, heave, io: Bundle[EvasionIO]):
+    """World velocity at an angle from the follow direction, at a share of the speed possible there."""
+    follow = io.teacher.follow_vel_w[env]
+    heading = ti.atan2(follow[1], follow[0]) + turn
+    speed = share * ti.min(ti.static(io.teacher_cfg.evade_m_s), speed_limit(heading - io.ego.rpy[env][2], io))
+    return ti.Vector([ti.cos(heading) * speed, ti.sin(heading) * speed, heave])
+
+
+@ti.func
+def edge_limited(env, heave, io: Bundle[EvasionIO]):
+    """Heave [m/s] that stops at the band's edges instead of running into floor or surface."""
+    low, high = depth_band(edge_gap(env, io.ego, io.teacher_cfg), io.tank_cfg)
+    own_z = io.ego.pos_w[env][2]
+    return ti.math.clamp(heave, ti.min(low - own_z, 0.0), ti.max(high - own_z, 0.0))
+
+
+@ti.func
+def speed_limit(angle, io: Bundle[EvasionIO]):
+    """Fastest level speed in a direction of the body frame: surge and sway are limited one by one, so
+    diagonals are faster."""
+    along = ti.abs(ti.cos(angle)) / ti.static(io.vehicle_cfg.max_surge_m_s)
+    across = ti.abs(ti.sin(angle)) / ti.static(io.vehicle_cfg.max_sway_m_s)
+    return 1.0 / ti.max(along, across)
+
+
+@ti.func
+def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
+    """Cost of a packet of commanded velocities. Violations count by depth: a flat penalty drives straight on
+    when every candidate is bad."""
+    drive = drive_of(env, cx, cy, cz, burst_s, io.ego, io.teacher, io.teacher_cfg)
+    peak, mean, contact, _ = body_depths(
+        env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
+    )
+    doubt = place_doubt(io.ego.pose_cov[env], io.teacher_cfg)
+    static_mean, static_contact = static_depths(
+        env,
+        drive,
+        doubt,
+        io.clearance,
+        io.teacher_cfg,
+        io.tank_cfg,
+        io.mapping_cfg,
+    )
+    off = _distance_lanes(cx, cy, cz, io.teacher.follow_vel_w[env]) * (
+        ti.static(io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s)
+        * tuned(env, DEVIATION, io.teacher)
+    )
+    change = _distance_lanes(cx, cy, cz, io.teacher.last_vel_w[env]) * (
+        ti.static(io.teacher_cfg.weight_change / io.teacher_cfg.cruise_m_s) * tuned(env, CHANGE, io.teacher)
+    )
+    of_peak = io.teacher_cfg.weight_peak * tuned(env, PEAK, io.teacher)
+    of_mean = io.teacher_cfg.weight_mean * tuned(env, MEAN, io.teacher)
+    of_contact = io.teacher_cfg.weight_contact * tuned(env, CONTACT, io.teacher)
+    of_static = io.teacher_cfg.weight_static * tuned(env, STATIC, io.teacher)
+    moving = peak * of_peak + mean * of_mean
+    touching = contact * of_contact + static_contact * ti.static(io.teacher_cfg.weight_static_contact)
+    return moving + touching + static_mean * of_static + off + change
+
+
+@ti.func
+def _distance_lanes(cx, cy, cz, velocity):
+    dx = cx - velocity[0]
+    dy = cy - velocity[1]
+    dz = cz - velocity[2]
+    return ti.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@ti.func
+def _chosen(env, io: Bundle[EvasionIO]):
+    """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost /
+    softness)."""
+    n_used = ti.static(io.teacher_cfg.n_candidate)
+    best_cost, best = FAR_M, 0
+    for index in range(n_used):
+        if io.teacher.candidate_cost[env, index] < best_cost:
+            best_cost = io.teacher.candidate_cost[env, index]
+            best = index
+    total, mean = 0.0, ti.Vector([0.0, 0.0, 0.0])
+    sharpness = ti.static(1.0 / io.teacher_cfg.softness) / tuned(env, SOFTNESS, io.teacher)
+    for index in range(n_used):
+        excess = (io.teacher.candidate_cost[env, index] - best_cost) * sharpness
+        if excess < 12.0:
+            weight = ti.exp(-excess)
+            total += weight
+            mean += weight * candidate(env, index, io)
+    average = ti.Vector([mean[i] / total for i in range(3)])
+    return best, best_cost, average

@@ -1,0 +1,111 @@
+"""Markers for kernel parameters, and the loop helper every per-env kernel uses.
+
+A bundle says what a stage reads and what it writes: ``In[Struct]``, ``Out[Struct]``, ``Const[Section]`` (a
+frozen config section whose numbers become constants of the compiled kernel); its kernels take ``io:
+Bundle[..]`` and what changes from call to call, functions that serve one stage end in ``io``, and those that
+several stages share take the structs and sections that they need, marked in the same way. For the type
+checker these are the plain classes; for Taichi they are ``ti.template()``. Tensors of the caller are
+``FloatMatrix`` and the like. ``tests/test_architecture.py`` reads all of this to prove who sees what.
+"""
+
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+
+import taichi as ti
+
+from uuvtai.compile.launch import is_gpu_shaped
+
+_T = TypeVar("_T")
+
+if TYPE_CHECKING:
+    In = Annotated[_T, "read only"]
+    Out = Annotated[_T, "read and written"]
+    Const = Annotated[_T, "compile-time constant"]
+    Bundle = Annotated[_T, "what a stage reads and writes"]
+    FloatVector = FloatMatrix = IntVector = ByteVector = AnyVector = AnyTensor = Any
+else:
+    FloatVector, FloatMatrix = ti.types.ndarray(dtype=ti.f32, ndim=1), ti.types.ndarray(dtype=ti.f32, ndim=2)
+    IntVector, AnyVector = ti.types.ndarray(dtype=ti.i32, ndim=1), ti.types.ndarray(ndim=1)
+    ByteVector = ti.types.ndarray(dtype=ti.u8, ndim=1)
+    AnyTensor = ti.types.ndarray()
+
+    class _Marker:
+        def __class_getitem__(cls, _item):
+            return ti.template()
+
+    class In(_Marker):
+        """A struct that the kernel only reads."""
+
+    class Out(_Marker):
+        """A struct that the kernel writes (and may read)."""
+
+    class Const(_Marker):
+        """A frozen config section: its values are constants of the compiled kernel."""
+
+    class Bundle(_Marker):
+        """All that a stage reads and writes, in one frozen dataclass."""
+
+
+_CPU_BLOCK = 512
+"""Taichi's CPU scheduler never splits a loop into blocks of fewer items than this (measured on 1.7.4)."""
+
+_BLOCKS = 16
+"""Blocks wanted per loop, so that two to sixteen cores share unequal work evenly."""
+
+
+def spread(n_env: int, inner: int = 1) -> int:
+    """Loop items per env (and ``inner`` index) that make ``ti.ndrange(n_env, inner, spread(n_env, inner))``
+    fill every core; use only the items with ``pad == 0``. One on a GPU, where an idle item is an idle thread,
+    and for one env, which has one thread: idle items only cost time there."""
+    if is_gpu_shaped() or n_env == 1:
+        return 1
+    return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // (n_env * inner))))
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What a group of columns of the observation is: the environment's table is read off these declarations, and
+# the kernels write by them.
+
+
+class ColumnGroup(NamedTuple):
+    """A group of neighbouring columns of the observation, all of one quantity."""
+
+    name: str
+    width: int
+    """columns of the env, or of each of its sectors or bodies"""
+    unit: str
+    frame: str
+    """"level" is the body frame without roll and pitch: x along the heading, y to its left, z up"""
+    meaning: str
+    source: Any
+    """func that returns the values of one env, or the value of one of its sectors, or the values of all
+    groups of one of its bodies"""
+    per: str = ""
+    """'sector' or 'body': there are so many for each"""
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Copy chosen rows of a field into a host buffer: recording must not copy every env to look at one.
+
+
+@ti.kernel
+def copy_rows(field: In[ti.Field], envs: IntVector, out: AnyTensor):
+    """out[i] = field[envs[i]] for a field of rank 1, 2 or 3 (vectors add a last axis)."""
+    for i in range(envs.shape[0]):
+        env = envs[i]
+        if ti.static(len(field.shape) == 1):
+            _copy_cell(field, out, ti.Vector([env]), ti.Vector([i]))
+        elif ti.static(len(field.shape) == 2):
+            for j in range(ti.static(field.shape[1])):
+                _copy_cell(field, out, ti.Vector([env, j]), ti.Vector([i, j]))
+        else:
+            for j, k in ti.ndrange(ti.static(field.shape[1]), ti.static(field.shape[2])):
+                _copy_cell(field, out, ti.Vector([env, j, k]), ti.Vector([i, j, k]))
+
+
+@ti.func
+def _copy_cell(field: In[ti.Field], out: Out[ti.Field], source, target):
+    if ti.static(hasattr(field, "n")):
+        for c in ti.static(range(field.n)):
+            out[target, c] = field[source][c]
+    else:
+        out[target] = field[source]

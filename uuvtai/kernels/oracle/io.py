@@ -1,0 +1,54 @@
+"""What each yardstick reads and writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uuvtai.config import ElevationConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
+from uuvtai.kernels.core.stage import Const, In, Out
+from uuvtai.state import (
+    ClockState,
+    ClusterState,
+    MapState,
+    PathState,
+    Proprioception,
+    SonarScan,
+    TrackState,
+    WorldState,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TrueMapIO:
+    """A yardstick: the map as it truly is."""
+
+    grid_map: Out[MapState]
+    clock: In[ClockState]
+    world: In[WorldState]
+    mapping_cfg: Const[MappingConfig]
+    tank_cfg: Const[TankConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class TrueTracksIO:
+    """A yardstick: the tracks as they truly are."""
+
+    clusters: Out[ClusterState]
+    tracks: Out[TrackState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    path: In[PathState]
+    scan: In[SonarScan]
+    world: In[WorldState]
+    elevation_cfg: Const[ElevationConfig]
+    episode_cfg: Const[EpisodeConfig]
+    sonar_cfg: Const[SonarConfig]
+    tank_cfg: Const[TankConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class PrivilegedStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    true_tracks: TrueTracksIO
+    true_map: TrueMapIO

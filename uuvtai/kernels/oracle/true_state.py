@@ -1,0 +1,212 @@
+"""Debugging aid: writes moving bodies into the dynamic layer from the truth. Never part of a preset: it
+breaks observation-only sensing.
+
+Launched only where ``mapping.stamp`` > 0 (default 0).
+"""
+
+import taichi as ti
+
+from uuvtai.compile.launch import quick_launch
+from uuvtai.kernels.core.geometry import BOX, NONE, turned_z
+from uuvtai.kernels.core.grid import centre_of
+from uuvtai.kernels.core.simd import LANES, f16x, put_bit
+from uuvtai.kernels.core.stage import Bundle, Const, spread
+from uuvtai.kernels.oracle.io import TrueMapIO, TrueTracksIO
+from uuvtai.kernels.perception.height import COLUMN, half_height
+from uuvtai.kernels.perception.track_filter import CONFIRMED
+from uuvtai.kernels.perception.tracking import clear_track
+from uuvtai.kernels.world.motion import first_moving
+
+
+@ti.func
+def covers(env, body, point, io: Bundle[TrueMapIO]):
+    """True where a moving body lies over or under a horizontal point."""
+    offset = point - ti.Vector([io.world.pos_w[env, body][0], io.world.pos_w[env, body][1]])
+    size = io.world.size[env, body]
+    inside = offset.norm() <= size[0]
+    if io.world.kind[env, body] == BOX:
+        local = turned_z(offset, -io.world.yaw[env, body])
+        inside = ti.abs(local[0]) <= size[0] and ti.abs(local[1]) <= size[1]
+    return inside and io.world.kind[env, body] != NONE and io.world.vel_w[env, body].norm() > 0.0
+
+
+@ti.func
+def is_covered(env, point, io: Bundle[TrueMapIO]):
+    """1 where any moving body does."""
+    covered = 0
+    for body in range(ti.static(io.world.kind.shape[1])):
+        if covers(env, body, point, io):
+            covered = 1
+    return covered
+
+
+@ti.func
+def stamp(env, row, col, io: Bundle[TrueMapIO]):
+    """Add to one cell's occupancy, and keep the bits that follow from it."""
+    stamped_occ = ti.min(1.0, io.grid_map.dynamic_occ[env, row, col] + io.mapping_cfg.stamp)
+    io.grid_map.dynamic_occ[env, row, col] = stamped_occ
+    put_bit(io.grid_map.alive, env, row, col)
+    if stamped_occ >= io.mapping_cfg.occupied:
+        put_bit(io.grid_map.dynamic_occupied, env, row, col)
+
+
+@ti.kernel
+def stamp_truth(io: Bundle[TrueMapIO]):
+    """Add ``stamp`` to the dynamic occupancy of every cell whose centre a moving body covers, clipped at
+    1."""
+    n_env, n_row, n_col = ti.static(io.grid_map.dynamic_occ.shape)
+    for env, row in ti.ndrange(n_env, n_row):
+        if io.clock.awake[env] == 1:
+            for col in range(n_col):
+                if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), io) == 1:
+                    stamp(env, row, col, io)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Privileged reference: the tracks of moving bodies, taken from the truth instead of from tracking. It breaks
+# observation-only sensing.
+#
+# Launched only while ``Sim.privileged`` is on, which no config key and no preset can do. What reads tracks
+# (forecast, heights, threats, planning) works on as it does; what stands still is sensed and mapped as ever.
+
+
+_VARIANCE = 1.0e-6
+"""[m^2, m^2/s^2, rad^2/s^2] of what is known exactly: small, but a filter's variance is never 0."""
+
+_NAMED_M = 0.15
+"""A return so close to a body's outline is its own (EC: 3 sigma of the harsh sonar's range)."""
+
+_COLUMN_SHARE = 0.9
+"""A body that takes up so much of the water's depth goes through all of it."""
+
+
+def take_true_tracks(io: TrueTracksIO) -> None:
+    """Tracks of the awake rows as they truly are in this very step, and which of them every beam of a fresh
+    scan hit."""
+    know_bodies(io)
+    name_beams_truly(io)
+
+
+@quick_launch
+@ti.kernel
+def know_bodies(io: Bundle[TrueTracksIO]):
+    """One track for every moving body, in the order of the bodies; the nearest bodies where the tracks are
+    too few."""
+    n, n_track = ti.static(io.tracks.alive.shape)
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
+        if pad == 0 and io.clock.awake[env] == 1:
+            io.clusters.fresh[env] = 1  # tracks have changed: habits and forecasts are to be worked out anew
+            io.tracks.scan_step[env] = io.clock.step[env]
+            clear_track(env, track, io.tracks)
+            lane = lane_of(env, track, ti.static(n_track), io)
+            if lane >= 0:
+                know_motion(env, track, lane, io)
+                know_height(env, track, first_moving(io.world, io.path) + lane, io)
+
+
+@ti.func
+def lane_of(env, track, n_track: Const[int], io: Bundle[TrueTracksIO]):
+    """Which moving body a track holds, -1 = none."""
+    n_lane = ti.static(io.path.n_way.shape[1])
+    found = -1
+    if ti.static(n_lane <= n_track):
+        if track < n_lane:
+            if io.world.kind[env, first_moving(io.world, io.path) + track] != NONE:
+                found = track
+    else:
+        for lane in range(n_lane):
+            if (
+                io.world.kind[env, first_moving(io.world, io.path) + lane] != NONE
+                and rank_of(env, lane, io) == track
+            ):
+                found = lane
+    return found
+
+
+@ti.func
+def rank_of(env, lane, io: Bundle[TrueTracksIO]):
+    """How many moving bodies are nearer to the vehicle."""
+    first, nearer = first_moving(io.world, io.path), 0
+    own = (io.world.pos_w[env, first + lane] - io.ego.pos_w[env]).norm_sqr()
+    for other in range(ti.static(io.path.n_way.shape[1])):
+        away = (io.world.pos_w[env, first + other] - io.ego.pos_w[env]).norm_sqr()
+        nearer += ti.cast(
+            io.world.kind[env, first + other] != NONE and (away < own or (away == own and other < lane)),
+            ti.i32,
+        )
+    return nearer
+
+
+@ti.func
+def know_motion(env, track, lane, io: Bundle[TrueTracksIO]):
+    """Position, velocity, turn rate and radius; of a box the radius that holds it."""
+    body = first_moving(io.world, io.path) + lane
+    pos, vel, size = io.world.pos_w[env, body], io.world.vel_w[env, body], io.world.size[env, body]
+    io.tracks.alive[env, track] = 1
+    io.tracks.moving[env, track] = ti.cast(vel.norm() > 0.0, ti.i32)
+    io.tracks.state[env, track] = ti.Vector([pos[0], pos[1], vel[0], vel[1]])
+    for diagonal in ti.static((0, 4, 7, 9)):
+        io.tracks.cov[env, track][diagonal] = _VARIANCE
+    io.tracks.z_m[env, track] = pos[2]
+    io.tracks.radius_m[env, track] = ti.select(
+        io.world.kind[env, body] == BOX, ti.sqrt(size[0] ** 2 + size[1] ** 2), size[0]
+    )
+    io.tracks.radius_var[env, track] = _VARIANCE
+    io.tracks.turn_cov[env, track][4] = _VARIANCE
+    if io.path.n_way[env, lane] == 0:
+        io.tracks.turn_rate[env, track] = io.path.speed_m_s[env, lane] / io.path.radius_m[env, lane]
+    io.tracks.age[env, track] = CONFIRMED
+    io.tracks.seen_step[env, track] = io.clock.step[env]
+    io.tracks.present[env, track] = 1.0
+
+
+@ti.func
+def know_height(env, track, body, io: Bundle[TrueTracksIO]):
+    """Equal shares for the fewest neighbouring heights whose bodies, as high as the stack takes them to be,
+    cover this one."""
+    step = ti.static((io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0]) / COLUMN)
+    half = io.world.size[env, body][2]
+    beyond = ti.max(half - half_height(env, track, io.tracks, io.elevation_cfg), 0.0)
+    at = io.world.pos_w[env, body][2] - ti.static(io.tank_cfg.z_m[0])
+    low = ti.math.clamp(ti.floor((at - beyond) / step - 0.5), 0.0, COLUMN - 1.0)
+    high = ti.math.clamp(ti.ceil((at + beyond) / step - 0.5), 0.0, COLUMN - 1.0)
+    if 2.0 * half > ti.static(_COLUMN_SHARE * (io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0])):
+        low, high = ti.cast(COLUMN, ti.f32), ti.cast(COLUMN, ti.f32)
+    share = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        share[i] = ti.select(low <= i <= high, 1.0 / (high - low + 1.0), 0.0)
+    io.tracks.height[env, track, 0] = share
+
+
+@quick_launch
+@ti.kernel
+def name_beams_truly(io: Bundle[TrueTracksIO]):
+    """Every return of a fresh scan within ``_NAMED_M`` of a body's outline, where it was at the ping, belongs
+    to the nearest such body."""
+    n, n_ray = ti.static(io.tracks.beam_track.shape)
+    for env, ray, pad in ti.ndrange(n, n_ray, ti.static(spread(n, n_ray))):
+        if pad == 0 and io.clock.awake[env] == 1 and io.scan.fresh[env] == 1:
+            ago = (io.clock.step[env] - io.scan.ping_step[env]) * io.episode_cfg.control_dt_s
+            bearing = (io.scan.ping_yaw[env] + ti.static(io.sonar_cfg.first_beam_rad)) + ray * ti.static(
+                io.sonar_cfg.beam_step_rad
+            )
+            hit_x = io.scan.ping_pos_w[env][0] + io.scan.range_m[env, ray] * ti.cos(bearing)
+            hit_y = io.scan.ping_pos_w[env][1] + io.scan.range_m[env, ray] * ti.sin(bearing)
+            named = -1
+            if io.scan.hit[env, ray] == 1:
+                named = nearest_track(env, hit_x, hit_y, ago, io)
+            io.tracks.beam_track[env, ray] = named
+
+
+@ti.func
+def nearest_track(env, hit_x, hit_y, ago, io: Bundle[TrueTracksIO]):
+    """The track whose outline lay nearest to a return ``ago`` [s], within ``_NAMED_M``; -1 = none."""
+    named, nearest = -1, _NAMED_M
+    for track in range(ti.static(io.tracks.alive.shape[1])):
+        if io.tracks.alive[env, track] == 1:
+            body = io.tracks.state[env, track]
+            off = ti.Vector([hit_x - body[0] + ago * body[2], hit_y - body[1] + ago * body[3]])
+            gap = off.norm() - io.tracks.radius_m[env, track]
+            if gap < nearest:
+                named, nearest = track, gap
+    return named

@@ -1,0 +1,145 @@
+"""What each stage of this room reads and writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uuvtai.config import (
+    ClearanceConfig,
+    EpisodeConfig,
+    FeaturesConfig,
+    ForecastConfig,
+    MappingConfig,
+    QuietConfig,
+    RouteConfig,
+    SonarConfig,
+    TankConfig,
+    TrackingConfig,
+    VoronoiConfig,
+)
+from uuvtai.kernels.core.stage import Const, In, Out
+from uuvtai.state import (
+    ClearanceMemory,
+    ClearanceState,
+    ClockState,
+    FeatureState,
+    ForecastState,
+    GridMask,
+    MapState,
+    MissionState,
+    Proprioception,
+    RouteState,
+    SonarScan,
+    TeacherState,
+    TrackState,
+    TreeTable,
+    VoronoiState,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ClearanceIO:
+    """Distance to the nearest occupied cell, and which one it is."""
+
+    clearance: Out[ClearanceState]
+    clearance_memory: Out[ClearanceMemory]
+    clock: In[ClockState]
+    grid_map: In[MapState]
+    mask: In[GridMask]
+    clearance_cfg: Const[ClearanceConfig]
+    mapping_cfg: Const[MappingConfig]
+    voronoi_cfg: Const[VoronoiConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class FeaturesIO:
+    """The observation: what the policy reads."""
+
+    features: Out[FeatureState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    forecast: In[ForecastState]
+    mission: In[MissionState]
+    route: In[RouteState]
+    scan: In[SonarScan]
+    table: In[TreeTable]
+    teacher: In[TeacherState]
+    tracks: In[TrackState]
+    episode_cfg: Const[EpisodeConfig]
+    features_cfg: Const[FeaturesConfig]
+    forecast_cfg: Const[ForecastConfig]
+    sonar_cfg: Const[SonarConfig]
+    tank_cfg: Const[TankConfig]
+    tracking_cfg: Const[TrackingConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class RouteIO:
+    """The route ahead: where to aim, what is left, what it risks."""
+
+    route: Out[RouteState]
+    clearance: In[ClearanceState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    grid_map: In[MapState]
+    mission: In[MissionState]
+    clearance_cfg: Const[ClearanceConfig]
+    mapping_cfg: Const[MappingConfig]
+    route_cfg: Const[RouteConfig]
+    tank_cfg: Const[TankConfig]
+    voronoi_cfg: Const[VoronoiConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class TriggersIO:
+    """When to plan again."""
+
+    route: Out[RouteState]
+    clearance: In[ClearanceState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    forecast: In[ForecastState]
+    grid_map: In[MapState]
+    mask: In[GridMask]
+    mission: In[MissionState]
+    scan: In[SonarScan]
+    tracks: In[TrackState]
+    clearance_cfg: Const[ClearanceConfig]
+    episode_cfg: Const[EpisodeConfig]
+    mapping_cfg: Const[MappingConfig]
+    route_cfg: Const[RouteConfig]
+    sonar_cfg: Const[SonarConfig]
+    tank_cfg: Const[TankConfig]
+    tracking_cfg: Const[TrackingConfig]
+    voronoi_cfg: Const[VoronoiConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class VoronoiIO:
+    """The route planner."""
+
+    route: Out[RouteState]
+    voronoi: Out[VoronoiState]
+    clearance: In[ClearanceState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    grid_map: In[MapState]
+    mask: In[GridMask]
+    mission: In[MissionState]
+    clearance_cfg: Const[ClearanceConfig]
+    mapping_cfg: Const[MappingConfig]
+    quiet_cfg: Const[QuietConfig]
+    route_cfg: Const[RouteConfig]
+    tank_cfg: Const[TankConfig]
+    voronoi_cfg: Const[VoronoiConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    clearance: ClearanceIO
+    features: FeaturesIO
+    triggers: TriggersIO
+    voronoi: VoronoiIO
+    route: RouteIO

@@ -1,1 +1,0 @@
-"""The behaviour tree and the trajectories it weighs."""

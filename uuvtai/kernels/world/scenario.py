@@ -1,0 +1,358 @@
+"""Scenarios and moving obstacles: all that is true of the world as a pure function of (world preset, seed,
+episode, time).
+
+Draws of different purposes have keys of their own, so that the number of moving obstacles or their speed
+changes neither the static obstacles nor start and goal, and obstacle i of S is drawn alike for every S. Every
+search is bounded; where its draws run out, ``WorldState.faults`` says so: a scenario is never silently made
+easier.
+"""
+
+import taichi as ti
+
+from uuvtai.compile.launch import quick_launch
+from uuvtai.kernels.core.geometry import (
+    BOX,
+    CYLINDER,
+    NONE,
+    TWO_PI,
+    disc,
+    footprint_of,
+    is_apart,
+    is_inside,
+    nearest_squared,
+)
+from uuvtai.kernels.core.noise import STREAM_SCENARIO, stream_key, uniform, uniform_in
+from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.world.io import WorldIO
+from uuvtai.kernels.world.motion import (
+    draw_moving_bodies,
+    first_moving,
+    is_chosen,
+    path_point,
+    polyline_length,
+    put_body,
+)
+
+# ------------------------------------------------------------------------------------------------------------
+# Layout of a scenario: start, goal and static obstacles, drawn again until free space joins start and goal.
+# Floor of ``world.py``.
+#
+# Every search is bounded; where its draws run out, ``WorldState.faults`` says so and the scenario counts as
+# not
+# placed.
+
+
+COARSE_M = 0.2
+"""Cell of the grid on which free space is flooded from the start [m]."""
+
+FAULT_ENDPOINTS = 1
+FAULT_STATIC = 2
+FAULT_JOINED = 4
+
+_LAYOUTS = 16
+"""Static layouts drawn for one pair of start and goal."""
+_PAIRS = 32
+"""Pairs of start and goal that are tried: where a wall parts the water, half of them cannot be joined."""
+_PAIR_DRAWS = 64
+_PLACE_DRAWS = 64
+_SWEEPS = 64
+"""Pairs of raster sweeps of the flood; what needs more counts as not joined."""
+_PAIR_STEP = 1 << 20
+"""Keeps the keys of start and goal apart from those of layouts."""
+
+
+@ti.func
+def draw_layout(env, io: Bundle[WorldIO]):
+    """Start, goal and static obstacles, drawn again until free space joins start and goal."""
+    joined = 0
+    draws = 0
+    fault = 0
+    while joined == 0 and draws < _LAYOUTS * _PAIRS:
+        if draws % _LAYOUTS == 0:
+            pair = draws // _LAYOUTS
+            fault = draw_endpoints(env, pair, io)
+        layout_fault = fault
+        if ti.static(io.world_cfg.static_slots > 0):
+            if draw_static_bodies(env, draws, io) == 0:
+                layout_fault |= FAULT_STATIC
+        if ti.static(io.world_cfg.n_fixed_static + io.world_cfg.static_slots > 0):
+            if layout_fault == 0 and is_joined(env, io) == 0:
+                layout_fault |= FAULT_JOINED
+        joined = ti.cast(layout_fault == 0, ti.i32)
+        io.world.faults[env] = layout_fault
+        draws += 1
+    io.world.draws[env] = draws
+
+
+@ti.func
+def draw_endpoints(env, pair, io: Bundle[WorldIO]):
+    """Start, goal and heading; a fault where no draw keeps the gaps."""
+    key = stream_key(io.episode.key[env], _PAIR_STEP + pair, STREAM_SCENARIO)
+    io.mission.start_yaw[env] = uniform_in(key, 0, -0.5 * TWO_PI, 0.5 * TWO_PI)
+    found = 0
+    draw = 0
+    while found == 0 and draw < _PAIR_DRAWS:
+        start = ti.Vector([0.0, 0.0, 0.0])
+        goal = ti.Vector([0.0, 0.0, 0.0])
+        for end in range(2):
+            first = 8 + 8 * draw + 4 * end
+            point = ti.Vector(
+                [
+                    uniform_in(key, first, io.world_cfg.spawn_x_m[0], io.world_cfg.spawn_x_m[1]),
+                    uniform_in(key, first + 1, io.world_cfg.spawn_y_m[0], io.world_cfg.spawn_y_m[1]),
+                    uniform_in(key, first + 2, io.world_cfg.spawn_z_m[0], io.world_cfg.spawn_z_m[1]),
+                ]
+            )
+            if end == 0:
+                start = point
+            else:
+                goal = point
+        across = ti.Vector([goal[0] - start[0], goal[1] - start[1]])
+        found = ti.cast(across.dot(across) >= io.world_cfg.start_goal_gap_m**2, ti.i32)
+        io.mission.start_w[env] = start
+        io.mission.goal_w[env] = goal
+        for slot in range(ti.static(io.world_cfg.n_fixed_static)):
+            found &= keeps_endpoints(env, io.scratch.footprint[env, slot], io)
+        draw += 1
+    return ti.cast(found == 0, ti.i32) * FAULT_ENDPOINTS
+
+
+@ti.func
+def keeps_endpoints(env, shape, io: Bundle[WorldIO]):
+    """1 where a footprint's surface keeps its gap from start and goal."""
+    reach = io.world_cfg.static.endpoint_gap_m + shape[6]
+    nearest = ti.min(
+        nearest_squared(shape, io.mission.start_w[env]), nearest_squared(shape, io.mission.goal_w[env])
+    )
+    return ti.cast(nearest > 0.0 and nearest >= reach * reach, ti.i32)
+
+
+@ti.func
+def draw_static_bodies(env, layout, io: Bundle[WorldIO]):
+    """Draw S static obstacles one after the other; 0 where one finds no place."""
+    key = stream_key(io.episode.key[env], layout, STREAM_SCENARIO)
+    n_static = ti.min(io.scene.n_static[env], ti.static(io.world_cfg.static_slots))
+    first = ti.static(io.world_cfg.n_fixed_static)
+    for i in range(ti.static(io.world_cfg.static_slots)):
+        io.world.kind[env, first + i] = NONE
+    placed = 1
+    i = 0
+    while placed == 1 and i < n_static:
+        placed = draw_static_body(env, first + i, i, key, io)
+        i += 1
+    return placed
+
+
+@ti.func
+def draw_static_body(env, slot, i, key, io: Bundle[WorldIO]):
+    """Draw size and heading once, then places until the gaps are kept; 0 where none keeps them."""
+    first = i * (8 + 2 * _PLACE_DRAWS)
+    half_height = 0.5 * (io.world_cfg.tank.z_m[1] - io.world_cfg.tank.z_m[0])
+    radius = uniform_in(key, first, io.world_cfg.static.radius_m[0], io.world_cfg.static.radius_m[1])
+    kind = CYLINDER
+    size = ti.Vector([radius, radius, half_height])
+    yaw = 0.0
+    if is_chosen(i, io.world_cfg.static.box_fraction) == 1:
+        kind = BOX
+        size[0] = uniform_in(
+            key, first + 1, io.world_cfg.static.half_extent_m[0], io.world_cfg.static.half_extent_m[1]
+        )
+        size[1] = uniform_in(
+            key, first + 2, io.world_cfg.static.half_extent_m[0], io.world_cfg.static.half_extent_m[1]
+        )
+        yaw = TWO_PI * uniform(key, first + 3)
+    found = 0
+    draw = 0
+    while found == 0 and draw < _PLACE_DRAWS:
+        x = uniform_in(key, first + 8 + 2 * draw, io.world_cfg.tank.x_m[0], io.world_cfg.tank.x_m[1])
+        y = uniform_in(key, first + 9 + 2 * draw, io.world_cfg.tank.y_m[0], io.world_cfg.tank.y_m[1])
+        pos_w = ti.Vector([x, y, io.world_cfg.tank.z_m[0] + half_height])
+        shape = footprint_of(kind, pos_w, size, yaw)
+        if is_inside(shape, 0.0, io.world_cfg.tank) == 1 and keeps_endpoints(env, shape, io) == 1:
+            found = keeps_gaps(env, shape, slot, io.world_cfg.static.gap_m, io)
+        if found == 1:
+            put_body(env, slot, kind, pos_w, size, yaw, io)
+            io.scratch.footprint[env, slot] = shape
+        draw += 1
+    return found
+
+
+@ti.func
+def keeps_gaps(env, shape, n_body, gap_m, io: Bundle[WorldIO]):
+    """1 where a footprint keeps its gap from the first bodies of the list."""
+    kept = 1
+    for slot in range(n_body):
+        if kept == 1:
+            kept = is_apart(shape, io.scratch.footprint[env, slot], gap_m)
+    return kept
+
+
+# ---------------------------------------------------------------------------- is the goal joined to the start
+
+
+@ti.func
+def is_joined(env, io: Bundle[WorldIO]):
+    """1 where free space with the wanted clearance joins start and goal.
+
+    Conservative: cells are neighbours over their edges, and a cell is free where its centre has half a cell
+    more clearance than wanted, so that the straight way between neighbours has what is wanted (distance is
+    1-Lipschitz).
+    """
+    block_cells(env, io.world_cfg.static.joined_clearance_m + 0.5 * COARSE_M, io)
+    start = coarse_cell(io.mission.start_w[env], io)
+    goal = coarse_cell(io.mission.goal_w[env], io)
+    changed = ti.cast(io.scratch.reach[env, start[0], start[1]] == 0, ti.i32)
+    if changed == 1:
+        io.scratch.reach[env, start[0], start[1]] = ti.u8(2)
+    sweep = 0
+    while changed == 1 and sweep < 2 * _SWEEPS and io.scratch.reach[env, goal[0], goal[1]] != 2:
+        changed = flood_sweep(env, sweep & 1, io)
+        if changed == 0 and sweep == 0:
+            changed = 1  # the first sweep runs one way only
+        sweep += 1
+    return ti.cast(io.scratch.reach[env, goal[0], goal[1]] == 2, ti.i32)
+
+
+@ti.func
+def coarse_cell(pos_w, io: Bundle[WorldIO]):
+    """(row, col) of the coarse cell that holds a position."""
+    row = ti.cast((pos_w[1] - io.world_cfg.tank.y_m[0]) * (1.0 / COARSE_M), ti.i32)
+    col = ti.cast((pos_w[0] - io.world_cfg.tank.x_m[0]) * (1.0 / COARSE_M), ti.i32)
+    return ti.Vector(
+        [
+            ti.math.clamp(row, 0, io.scratch.reach.shape[1] - 1),
+            ti.math.clamp(col, 0, io.scratch.reach.shape[2] - 1),
+        ]
+    )
+
+
+@ti.func
+def coarse_centre(row, col, io: Bundle[WorldIO]):
+    """World (x, y) [m] of a coarse cell's centre."""
+    x = io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M
+    y = io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M
+    return ti.Vector([x, y])
+
+
+@ti.func
+def block_cells(env, clearance_m, io: Bundle[WorldIO]):
+    """Mark the cells whose centre is nearer than ``clearance_m`` to a wall or static obstacle."""
+    for row, col in ti.ndrange(io.scratch.reach.shape[1], io.scratch.reach.shape[2]):
+        center = coarse_centre(row, col, io)
+        io.scratch.reach[env, row, col] = ti.cast(
+            1 - is_inside(disc(center, 0.0), clearance_m, io.world_cfg.tank), ti.u8
+        )
+    for slot in range(ti.static(io.world_cfg.n_fixed_static + io.world_cfg.static_slots)):
+        if io.world.kind[env, slot] != NONE:
+            shape = io.scratch.footprint[env, slot]
+            block_around(env, shape, clearance_m + shape[6], io)
+
+
+@ti.func
+def block_around(env, shape, reach, io: Bundle[WorldIO]):
+    """Mark the cells whose centre is nearer than ``reach`` [m] to a footprint's core."""
+    span = ti.Vector([1.0, 1.0]) * (reach + shape[4] + shape[5])  # bounds the turned rectangle
+    low = coarse_cell(ti.Vector([shape[0], shape[1]]) - span, io)
+    high = coarse_cell(ti.Vector([shape[0], shape[1]]) + span, io)
+    for row in range(low[0], high[0] + 1):
+        for col in range(low[1], high[1] + 1):
+            if nearest_squared(shape, coarse_centre(row, col, io)) < reach * reach:
+                io.scratch.reach[env, row, col] = ti.u8(1)
+
+
+@ti.func
+def flood_sweep(env, backward, io: Bundle[WorldIO]):
+    """Carry "reached" to free neighbours in raster order, forward or backward; 1 where anything changed."""
+    n_row = ti.static(io.scratch.reach.shape[1])
+    n_col = ti.static(io.scratch.reach.shape[2])
+    changed = 0
+    for i in range(n_row * n_col):
+        cell = i
+        if backward == 1:
+            cell = n_row * n_col - 1 - i
+        row = cell // n_col
+        col = cell - row * n_col
+        if io.scratch.reach[env, row, col] == 0:
+            near = 0
+            if row > 0 and io.scratch.reach[env, row - 1, col] == 2:
+                near = 1
+            if row < n_row - 1 and io.scratch.reach[env, row + 1, col] == 2:
+                near = 1
+            if col > 0 and io.scratch.reach[env, row, col - 1] == 2:
+                near = 1
+            if col < n_col - 1 and io.scratch.reach[env, row, col + 1] == 2:
+                near = 1
+            if near == 1:
+                io.scratch.reach[env, row, col] = ti.u8(2)
+                changed = 1
+    return changed
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
+@quick_launch
+@ti.kernel
+def generate_scenarios(io: Bundle[WorldIO]):
+    """Draw start, goal, static and moving obstacles of every awake row; ``move_obstacles`` then puts the
+    moving ones in place."""
+    n = ti.static(io.clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and io.clock.awake[env] == 1:
+            clear_bodies(env, io)
+            place_fixed(env, io)
+            draw_layout(env, io)
+    if ti.static(io.world_cfg.dynamic_slots > 0):
+        for env, pad in ti.ndrange(n, ti.static(spread(n))):  # a loop of its own compiles in half the time
+            if pad == 0 and io.clock.awake[env] == 1:
+                draw_moving_bodies(env, io)
+
+
+@ti.func
+def clear_bodies(env, io: Bundle[WorldIO]):
+    """Empty every slot, so that nothing of the last episode stays."""
+    for slot in range(io.world.kind.shape[1]):
+        put_body(env, slot, NONE, ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0]), 0.0, io)
+    io.world.draws[env] = 0
+    io.world.unclear_paths[env] = 0
+    io.world.faults[env] = 0
+
+
+@ti.func
+def place_fixed(env, io: Bundle[WorldIO]):
+    """Explicit obstacles: those at rest in the first slots, those with a path in the first moving ones."""
+    n_still = ti.static(io.world_cfg.n_fixed_static)
+    for i in range(ti.static(len(io.world_cfg.fixed))):
+        slot = i
+        lane = i - n_still
+        if lane >= 0:
+            slot = first_moving(io.world, io.path) + lane
+            io.path.n_way[env, lane] = io.fixed.n_way[i]
+            io.path.radius_m[env, lane] = 0.0
+            io.path.phase_m[env, lane] = 0.0
+            io.path.speed_m_s[env, lane] = (
+                io.fixed.speed_m_s[i] if io.fixed.speed_m_s[i] >= 0.0 else io.scene.speed_m_s[env]
+            )
+            for j in range(io.path.way_w.shape[2]):
+                io.path.way_w[env, lane, j] = io.fixed.way_w[i, j]
+            io.path.length_m[env, lane] = polyline_length(env, lane, io)
+        put_body(env, slot, io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i], io)
+        io.scratch.footprint[env, slot] = footprint_of(
+            io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i]
+        )
+
+
+@quick_launch
+@ti.kernel
+def move_obstacles(io: Bundle[WorldIO]):
+    """Put every moving body of the awake rows where it is at time step * dt, with its velocity; depth
+    stays."""
+    n = ti.static(io.clock.awake.shape[0])
+    for env, lane in ti.ndrange(n, ti.static(io.path.n_way.shape[1])):
+        slot = first_moving(io.world, io.path) + lane
+        if io.clock.awake[env] == 1 and io.world.kind[env, slot] != NONE:
+            speed = io.path.speed_m_s[env, lane]
+            time_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
+            at = path_point(env, lane, io.path.phase_m[env, lane] + speed * time_s, io)
+            io.world.pos_w[env, slot] = ti.Vector([at[0], at[1], io.world.pos_w[env, slot][2]])
+            io.world.vel_w[env, slot] = ti.Vector([speed * at[2], speed * at[3], 0.0])

@@ -1,0 +1,1 @@
+"""PPO, distillation, world model, parameter search, forecast."""

@@ -1,0 +1,364 @@
+"""The model card, README.md of an exported policy: what it was trained on, how it did, what it is for and
+what it is not for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from uuvtai.common.enums import COLLIDED
+from uuvtai.common.errors import UserError
+from uuvtai.common.files import read_json
+from uuvtai.common.statistics import wilson_interval
+from uuvtai.config.learning import LearningConfig
+from uuvtai.config.loader import ConfigError
+from uuvtai.learning.checkpoint import Checkpoint
+from uuvtai.report.tables import sensing
+
+# ------------------------------------------------------------------------------------------------------------
+# How often a policy arrived and collided, from the evaluations that are at hand: the counts behind every
+# rate of the model card.
+
+
+RESULT = Path("eval/result.json")
+"""what ``uuv eval`` leaves in its run folder"""
+_MAX_BYTES = 256 << 20
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One row of the card's table."""
+
+    where: str
+    """world, obstacles, sensing, seeds"""
+    episodes: int
+    successes: int
+    collisions: int
+    """contacts, TTC stops and leaving the tank"""
+    repeated: bool = False
+    """worlds or scenes had episodes of the same numbers, which go together; single ends were not kept"""
+
+    def rates(self) -> tuple[str, str]:
+        """Success and collision as k/n with their 95 % Wilson intervals; without where episodes are
+        ``repeated``."""
+        n, bare = self.episodes, self.repeated
+        return _rate(self.successes, n, bare), _rate(self.collisions, n, bare)
+
+
+def during_training(checkpoint: Checkpoint) -> Evaluation | None:
+    """The evaluation by which training chose this checkpoint; None where there was none at this step."""
+    metrics, config = checkpoint.manifest.metrics, checkpoint.config
+    success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
+    if not isinstance(success, float | int) or not isinstance(collision, float | int):
+        return None
+    where, n = _held_out_in_worlds(config) if config.twin.enabled else _held_out(config)
+    where += f", seed {config.train.evaluate_seed}"
+    repeated = config.twin.enabled and len(config.twin.worlds) * max(1, len(config.train.scenes)) > 1
+    return Evaluation(where, n, round(success * n), round(collision * n), repeated)
+
+
+def _held_out(config: LearningConfig) -> tuple[str, int]:
+    """(conditions, number of episodes) of a training in its own world."""
+    world = config.world
+    return (
+        f"the training's own world and sensing, S = {world.n_static}, D = {world.n_dynamic}, v = "
+        f"{world.dynamic_speed_m_s:g} m/s"
+    ), config.train.evaluate_episodes
+
+
+def _held_out_in_worlds(config: LearningConfig) -> tuple[str, int]:
+    """As ``_held_out``, of a policy over a set of bodies: as many of every world and scene."""
+    worlds = config.twin.worlds
+    groups = len(worlds) * max(1, len(config.train.scenes))
+    each = -(-config.train.evaluate_episodes // groups)
+    return f"the kinematic twin, {' and '.join(map(_word, worlds))}, {scenes_of(config)}", groups * each
+
+
+def scenes_of(config: LearningConfig) -> str:
+    """Numbers and speeds of the obstacles that were learnt among."""
+    scenes = config.train.scenes or (config.world.own_scene,)
+    return "; ".join(f"S = {s}, D = {d}, v = {v:g} m/s" for s, d, v in scenes)
+
+
+def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[Evaluation]:
+    """This checkpoint's rows in the results of ``uuv eval`` below the run folder and in ``folders``.
+
+    Raises ConfigError for one of ``folders`` that does not hold any.
+    """
+    run = checkpoint.path.parent.parent
+    found = [row for file in _own_results(checkpoint) for row in _rows(file, run, checkpoint.sha256)]
+    for folder in folders:
+        rows = _rows(folder / RESULT, folder, checkpoint.sha256)
+        if not rows:
+            raise ConfigError(
+                f"--evaluation {folder}: does not evaluate this checkpoint; give the run folder that 'uuv "
+                "eval RUN' printed"
+            )
+        found += rows
+    return found
+
+
+def _own_results(checkpoint: Checkpoint) -> list[Path]:
+    run = checkpoint.path.parent.parent
+    if checkpoint.path.parent.name != "checkpoints":
+        return []
+    return sorted(file for file in (run / RESULT, *run.glob(f"*/{RESULT}")) if file.is_file())
+
+
+def _rows(file: Path, folder: Path, sha256: str) -> list[Evaluation]:
+    """Rows of the methods that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is
+    no result."""
+    try:
+        result = read_json(file, _MAX_BYTES, folder)
+        return [_row(result, m) for m in result["methods"] if m.get("checkpoint", {}).get("sha256") == sha256]
+    except (UserError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(
+            f"{file}: is no result of uuv eval ({error!r}); give the run folder that 'uuv eval RUN' printed"
+        ) from None
+
+
+def _row(result: dict[str, Any], method: dict[str, Any]) -> Evaluation:
+    speed = f", v = {float(result['v_m_s']):g} m/s" if result["D"] else ""
+    seeds = ", ".join(str(int(seed)) for seed in result["seeds"])
+    where = (
+        f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, "
+        f"{sensing({**result, 'sensors': _word(result['sensors'])})}, seed {seeds}"
+    )
+    k, n = int(method["outcomes"]["success"]), int(method["episodes"])
+    collisions = sum(int(method["outcomes"][name]) for name in COLLIDED)
+    if min(k, collisions) < 0 or k + collisions > n:
+        raise ValueError(f"{k} successes and {collisions} collisions of {n} episodes")
+    return Evaluation(where, n, k, collisions)
+
+
+def _word(name: Any) -> str:
+    """A preset's name or the last part of a path, without what would break a table."""
+    return "".join(c for c in Path(str(name)).stem if c.isalnum() or c in "-_ ") or "unnamed"
+
+
+def _rate(k: int, n: int, bare: bool) -> str:
+    bounds = wilson_interval(k, n)
+    if bounds is None:
+        return "-"
+    share = f"{k}/{n} = {100 * k / n:.1f} %"
+    return share if bare else f"{share} [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
+_TEXT = """# {name}
+
+A policy that drives an underwater vehicle of the BlueROV2 class from sensor features, trained in the
+simulator of uuvtai {version}.
+
+## What it was trained on
+{training}
+
+## How it did
+{results}
+
+## How to run it
+`python run_policy.py` (NumPy alone) replays the golden pairs and prints the latency. In a program:
+`load(folder)`, `reset()` when a mission begins, `act(observation)` at every control step ({control_hz:g} Hz).
+A decision is made every {hold_steps} control step(s);
+{residual} `policy_spec.json` lists every column of the observation
+with unit, frame and scaling, the limits of the actions, the rate and the sha256 of every file.{graph}
+
+## What it is for
+Research in simulation, and trials on a vehicle in a tank with an operator who can stop it. The observation
+has to come from the same stack (sonar, map, route, tracking{tree}) with the same meaning; a column that
+means something else makes the policy worthless.
+
+## What it is not for
+- It has been judged in this simulator alone. Nothing here says how it does on a real vehicle, in other water,
+  or with other sensors.
+- It does not guarantee clearance and does not say when it is in danger. Keep a separate safety stop.
+- It expects the vehicle's inner velocity loop with the limits of `policy_spec.json`; it never commands
+  thrusters.
+"""
+
+_COUNTED = """
+Rates are counts with 95 % Wilson intervals. Collision counts contacts, time-to-collision stops and leaving
+the tank."""
+_RESIDUAL = (
+    "it adds to the behaviour tree's action, which is part of the observation, so the tree has to "
+    "run beside it."
+)
+_PLAIN = "in between the action is kept."
+_GRAPH = """
+
+`policy.onnx` is one decision without memory: remember the last decision yourself, as `graph`
+in the specification says."""
+
+
+def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
+    """The card as Markdown."""
+    is_residual = spec["network"]["teacher_columns"] is not None
+    return _TEXT.format(
+        name=spec["name"],
+        version=checkpoint.manifest.version,
+        training=training_text(checkpoint),
+        results=results_text(checkpoint, evaluations),
+        control_hz=spec["rate"]["control_hz"],
+        hold_steps=spec["rate"]["hold_steps"],
+        residual=_RESIDUAL if is_residual else _PLAIN,
+        tree=", behaviour tree" if checkpoint.config.features.teacher else "",
+        graph=_GRAPH if spec["graph"] else "",
+    )
+
+
+def training_text(checkpoint: Checkpoint) -> str:
+    """How long, on what, and which checkpoint, as a list."""
+    config, metrics = checkpoint.config, checkpoint.manifest.metrics
+    steps = metrics.get("time/env_steps")
+    trained = f"{checkpoint.step} iterations" + (
+        f", {steps / 1e6:.2f} million env-steps" if isinstance(steps, float) else ""
+    )
+    lines = [
+        f"{trained}, seed {config.train.seed}, {config.train.num_envs} vehicles at once.",
+        f"Checkpoint {checkpoint.sha256} of {checkpoint.manifest.created}.",
+        _tank(config),
+        _obstacles(config),
+    ]
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _tank(config: LearningConfig) -> str:
+    tank, sonar = config.world.tank, config.sensors.sonar
+    extent = " x ".join(f"{high - low:g}" for low, high in (tank.x_m, tank.y_m, tank.z_m))
+    return (
+        f"Tank of {extent} m, sonar with {sonar.n_ray} beams to {sonar.max_range_m:g} m, all numbers in "
+        "the checkpoint's config."
+    )
+
+
+def _obstacles(config: LearningConfig) -> str:
+    return f"Resting obstacles S, moving ones D, their speed v: {scenes_of(config)}."
+
+
+def results_text(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
+    """Counts of all evaluations as a table, and what they count."""
+    own = during_training(checkpoint)
+    rows = [(row, "") for row in evaluations] + (
+        [(own, " (chose the checkpoint: too good by selection)")] if own else []
+    )
+    if not rows:
+        return (
+            "No evaluation was at hand. Evaluate it with `uuv eval RUN` and export again with "
+            "`--evaluation FOLDER`."
+        )
+    lines = ["| where | success | collision |", "|---|---|---|"]
+    lines += ["| " + " | ".join((row.where + remark, *row.rates())) + " |" for row, remark in rows]
+    return "\n".join([*lines, _COUNTED])
+
+
+# ------------------------------------------------------------------------------------------------------------
+# README.md of an exported policy over a set of bodies or of a learned forecast: how a stranger drives by it,
+# what it learnt from, how it did, and what it is not for.
+
+
+_CARD = """# {name}
+
+{what}
+Trained with uuvtai {version}.
+
+## What it was trained on
+{training}
+
+## How it did
+{results}
+
+## How to run it
+`python run_set_policy.py` (NumPy alone) replays the golden pairs and prints the latency.
+{how}
+`policy_spec.json` says what every column is.{graph}
+
+{rule}## What it is not for
+- It has been judged in this simulator alone. Nothing here says how it does on a real vehicle, in other water,
+  or with other sensors.
+{limits}
+"""
+_SET = (
+    "A policy that drives an underwater vehicle by a wish for a velocity, from tracked bodies and free "
+    "distances."
+)
+_FORECAST = "A forecast of tracked moving bodies: a mixture of Gaussians over the places in the next seconds."
+_HOW_SET = """In a program: `from run_set_policy import load`, `policy = load(folder)`, then {rate:g} times a
+second `said = policy.act(bodies, own)`, and at every control step ({control_hz:g} Hz)
+`policy.command(said.wish, flip, yaw_rad, z_m)`. It remembers nothing; the last wish that was carried out is
+among the columns."""
+_HOW_FORECAST = """In a program: `from run_set_policy import load`, `forecast = load(folder)`, then
+`forecast.futures(columns, speed)` for each track: `log_weight` of each future, `place` [m] along and
+across the track's course after {times} s, and `sigma` [m]."""
+_SET_GRAPH = " `policy.onnx` is the same for any number of rows."
+_RULE = """## The hull rule
+A wish (x, y, up) becomes a command at every control step, by the heading and the height of that moment;
+numbers are `hull_rule` of `policy_spec.json`, and `command` in `run_set_policy.py` is this rule.
+
+1. Velocity wanted in the world: (flip.x x, flip.y y) times {fastest_m_s:.3f} m/s, shortened to that
+   length where (x, y) is longer than 1; upward `up`, within +-1, times {heave:g} m/s. A flip is -1
+   where the goal lies at a smaller coordinate than the start, else 1.
+2. In the body frame (turned by the heading) the two become parts of {surge:g} m/s surge and {sway:g}
+   m/s sway. Where one is beyond 1 both are divided by the larger one.
+3. Heave: the upward velocity is at most what leads to {gap_m:g} m below the surface in one second, and
+   at least what leads to {gap_m:g} m above the floor in one second; then in parts of {heave:g} m/s,
+   within +-1. Height 0 is the surface, the floor lies at {floor:g} m.
+4. Yaw rate: the nearest diagonal of the hull (45, 135, 225 or 315 degrees) turns to the motion, for
+   there surge and sway add up: the angle times {turn_gain_1_s:g} 1/s, in parts of
+   {max_yaw_rate_rad_s:g} rad/s, within +-1. Slower than {least_speed_m_s:g} m/s the heading stays.
+
+"""
+_LIMITS = """- It does not guarantee clearance. Keep a separate safety stop.
+- Columns have to come from the same stack (tracks, map, pose) with the same meaning.
+- It expects the vehicle's inner velocity loop with these limits; it never commands thrusters."""
+_LIMITS_FORECAST = """- Its probabilities are those of bodies as they move in this simulator.
+- Columns have to come from the same tracker with the same meaning."""
+
+
+def set_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
+    """The card as Markdown."""
+    kind = spec["kind"]
+    parts = _forecast_parts(spec, checkpoint) if kind == "forecast" else _set_parts(spec)
+    results = {"results": results_text(checkpoint, evaluations)} | parts
+    return _CARD.format(
+        name=spec["name"],
+        version=checkpoint.manifest.version,
+        training=training_text(checkpoint),
+        graph=_SET_GRAPH if spec["graph"] else "",
+        **results,
+    )
+
+
+def _set_parts(spec: dict[str, Any]) -> dict[str, str]:
+    rate = spec["rate"]
+    return {
+        "what": _SET,
+        "how": _HOW_SET.format(rate=rate["decision_hz"], control_hz=rate["control_hz"]),
+        "rule": _rule(spec["hull_rule"]),
+        "limits": _LIMITS,
+    }
+
+
+def _rule(rule: dict[str, Any]) -> str:
+    return _RULE.format(**rule, **rule["limits_m_s"], floor=rule["z_m"][0])
+
+
+def _forecast_parts(spec: dict[str, Any], checkpoint: Checkpoint) -> dict[str, str]:
+    rows = [
+        f"- {name.removeprefix('eval/')}: {value:.3g}"
+        for name, value in sorted(checkpoint.manifest.metrics.items())
+        if name.startswith("eval/") and isinstance(value, float)
+    ]
+    times = ", ".join(f"{time:g}" for time in spec["network"]["times_s"])
+    return {
+        "what": _FORECAST,
+        "how": _HOW_FORECAST.format(times=times),
+        "rule": "",
+        "limits": _LIMITS_FORECAST,
+        "results": "\n".join(["On held-out episodes of the training's worlds:", *rows])
+        if rows
+        else "No evaluation was at hand.",
+    }

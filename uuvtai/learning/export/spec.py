@@ -1,0 +1,369 @@
+"""policy_spec.json: what every column of the observation is, what an action means, how often to decide, and
+what the files hold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from uuvtai.common.enums import (
+    AHEAD_STEPS,
+    COLUMNS,
+    FAR,
+    LEAST_SPEED_M_S,
+    LENGTH_M,
+    N_BEND,
+    N_BODY,
+    N_MODE,
+    N_PAST,
+    N_RAY,
+    PAST_S,
+    TURN_GAIN,
+)
+from uuvtai.common.version import __version__
+from uuvtai.config.learning import LearningConfig
+from uuvtai.learning.checkpoint import Checkpoint
+from uuvtai.learning.export.graph import (
+    INPUTS,
+    OPSET,
+    OUTPUTS,
+    SET_OUTPUTS,
+    TOLERANCE,
+    ExportedModule,
+    OneDecision,
+    OneWish,
+)
+from uuvtai.learning.export.run_policy import GOLDEN, SCHEMA, WEIGHTS
+from uuvtai.learning.networks import TIMES_S, ActorCritic, RunningNorm
+from uuvtai.learning.policy_agent import Pilot
+from uuvtai.learning.world_model import N_FEATURES, WorldModel
+
+ONNX = "policy.onnx"
+
+_OBSERVATION = (
+    "float32, raw SI units, in this order; the scaling is inside the policy. A value that is not finite "
+    "counts as the mean of training. Frames: body is the vehicle's (x ahead, y left, z up); level is the "
+    "same without roll and pitch; route follows the planned path; world has z up and 0 at the surface."
+)
+_HOLD = (
+    "The networks decide at the first control step of a mission and then at every hold_steps-th one. In "
+    "between the decision is held: the action itself, or, for a residual policy, its difference from the "
+    "tree's action, which is added to the newest tree action in the observation. The result is cut off to "
+    "[-1, 1]. last_obs and last_action are those of the last decision."
+)
+
+
+def origin_of(checkpoint: Checkpoint) -> dict[str, Any]:
+    """What the folder came from: part of the document."""
+    return {
+        "uuvtai": __version__,
+        "checkpoint": {
+            "sha256": checkpoint.sha256,
+            "step": checkpoint.step,
+            "created": checkpoint.manifest.created,
+        },
+    }
+
+
+def specification(checkpoint: Checkpoint, pilot: Pilot, name: str, has_onnx: bool) -> dict[str, Any]:
+    """The document without ``files``, which ``export`` adds."""
+    config, policy = checkpoint.config, pilot.policy
+    return {
+        "schema": SCHEMA,
+        "name": name,
+        **origin_of(checkpoint),
+        "observation": {
+            "width": policy.n_in - N_FEATURES,
+            "meaning": _OBSERVATION,
+            "columns": _columns(checkpoint, pilot),
+        },
+        "features": _features(pilot),
+        "action": checkpoint.manifest.action,
+        "action_meaning": "parts of the limits within [-1, 1]; velocities in the body frame, wanted of the "
+        "inner velocity loop",
+        "rate": _rate(config.episode.control_dt_s, policy.config.hold_steps),
+        "network": _network(pilot),
+        "graph": _graph(pilot) if has_onnx else None,
+        "golden": {"file": GOLDEN, "tolerance": TOLERANCE},
+        "weights": WEIGHTS,
+    }
+
+
+def _columns(checkpoint: Checkpoint, pilot: Pilot) -> list[dict[str, Any]]:
+    """Every single column with its place, name, unit, frame and what it is scaled by."""
+    norm = pilot.policy.observation_norm
+    mean, std = norm.mean.tolist(), norm.std().tolist()
+    found = []
+    for row in checkpoint.manifest.observation_table:
+        width = row["stop"] - row["first"]
+        for i in range(width):
+            at = row["first"] + i
+            name = row["name"] if width == 1 else f"{row['name']}[{i}]"
+            found.append(
+                {
+                    "index": at,
+                    "name": name,
+                    "unit": row["unit"],
+                    "frame": row["frame"],
+                    "mean": mean[at],
+                    "std": std[at],
+                }
+            )
+    return found
+
+
+def _features(pilot: Pilot) -> list[dict[str, Any]]:
+    """The two inputs that the policy makes itself."""
+    norm = pilot.policy.observation_norm
+    names = ("residual", "uncertainty")
+    rows = zip(names, norm.mean[-N_FEATURES:].tolist(), norm.std()[-N_FEATURES:].tolist(), strict=True)
+    return [
+        {"name": name, "unit": "1", "mean": mean, "std": std, "used": pilot.world_model is not None}
+        for name, mean, std in rows
+    ]
+
+
+def _rate(control_dt_s: float, hold_steps: int) -> dict[str, Any]:
+    hertz = 1.0 / control_dt_s
+    return {
+        "control_dt_s": control_dt_s,
+        "control_hz": hertz,
+        "hold_steps": hold_steps,
+        "decision_hz": hertz / hold_steps,
+        "meaning": _HOLD,
+    }
+
+
+def _network(pilot: Pilot) -> dict[str, Any]:
+    """What ``run_policy.py`` has to know beside the arrays."""
+    config, teacher = pilot.policy.config, pilot.policy.teacher_slice
+    return {
+        "hidden": list(config.hidden),
+        "activation": config.activation,
+        "residual_limit": config.residual_limit,
+        "teacher_columns": [teacher.start, teacher.stop] if config.residual and teacher else None,
+        "predict_change": pilot.world_model is None or pilot.world_model.config.predict_change,
+        "clip_observation": config.clip_observation,
+    }
+
+
+def _graph(pilot: Pilot) -> dict[str, Any]:
+    names = OneDecision(pilot).outputs
+    return {
+        "file": ONNX,
+        "opset": OPSET,
+        "inputs": INPUTS,
+        "outputs": {name: OUTPUTS[name] for name in names},
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What every column of a policy over a set of bodies is, in words, for policy_spec.json
+# (``twin/set_columns.py`` writes them).
+
+
+MEANING = (
+    "float32. Mirrored world: x is turned round where the goal lies at smaller x than the start, y "
+    "where it lies at smaller y (flip is -1 there, else 1), so that the goal lies ahead and to the left "
+    "at the start; flips do not change during a mission. Each column is the quantity in its unit, "
+    "computed as its meaning says. clip(v, a, b) cuts off to [a, b]. A body is a tracked moving body; "
+    "one row each, at most the nearest ones; a row of zeros is no body. Numbers that are not finite are "
+    "refused."
+)
+MOTION_MEANING = (
+    "float32, in the track's frame: its place now, x along its course, y to the left. Lengths are "
+    f"divided by {LENGTH_M:g} m and cut off to +-{FAR:g}. In this order: speed [m/s], turn rate [rad/s] "
+    "within +-4, its standard deviation, 1 where it is known, standard deviations of place [m] and "
+    "velocity [m/s] at most 2, time unseen [s] at most 3, log(1 + scans) / 5, radius [m], 1 where it "
+    "was tracked from the beginning of this straight way, 1 where it turned into it, way gone straight; "
+    "walls ahead, behind, left, right; way to the next remembered turn of this water, course behind it "
+    "(2; 0 = none), turns back and other turns seen in this water / 8 at most 2; the analytic forecast "
+    f"after {', '.join(map(str, AHEAD_STEPS))} tenths of a second (2 each); the last {N_BEND} turns of "
+    f"this track (2, and 1 where known); its last {N_PAST} places, {PAST_S:g} s apart (2 each), and "
+    "seconds since the newest."
+)
+
+
+def _column(name: str, unit: str, meaning: str) -> dict[str, str]:
+    return {"name": name, "unit": unit, "meaning": meaning}
+
+
+def _pair(name: str, unit: str, meaning: str) -> list[dict[str, str]]:
+    return [_column(f"{name}.{axis}", unit, meaning) for axis in "xy"]
+
+
+BODY_COLUMNS = [
+    _column("there", "1", "1 = a body"),
+    *_pair("way", "4 m", "from the vehicle to the body, in metres, / 4"),
+    *_pair("relative_velocity", "m/s", "the body's less the vehicle's"),
+    *_pair("velocity", "m/s", "of the body"),
+    _column("width", "m", "twice its radius"),
+    _column(
+        "water_above", "m", "from the vehicle's depth up to the body's top, where known: clip(v, 0, 1.6)"
+    ),
+    _column(
+        "water_below", "m", "from the body's bottom up to the vehicle's depth, where known: clip(v, 0, 1.6)"
+    ),
+    _column("unseen", "2 s", "seconds since it was seen, at most 4, / 2"),
+    _column(
+        "turn", "2 rad/s", "rate of its course, mirrored by flip.x flip.y, clip(v, -3, 3) / 2; 0 = a corner"
+    ),
+    *_pair("way_in_1s", "4 m", "from the vehicle now to where the body is forecast in 1 s, / 4"),
+    *_pair("way_in_2s", "4 m", "the same in 2 s"),
+    _column("gap", "4 m", "distance less the body's radius, at most 8 m, / 4"),
+    _column("nearness", "1/m", "1 / (0.3 + max(distance - radius - 0.22, 0))"),
+    _column("closest_in", "s", "time of the closest approach on straight lines, clip(v, 0, 3)"),
+    _column("closest_gap", "m", "distance then, less radius and 0.22, clip(v, -1, 3)"),
+    *_pair("goal_direction", "1", "unit vector from the vehicle to the goal"),
+]
+"""Columns of a body."""
+OWN_COLUMNS = [
+    _column("goal.x", "10 m", "from the vehicle to the goal, / 10"),
+    _column("goal.y", "4 m", "the same, / 4"),
+    _column("goal.z", "m", "height of the goal above the vehicle"),
+    *_pair("goal_direction", "1", "unit vector to the goal"),
+    _column("goal_distance", "4 m", "horizontal, at most 4 m, / 4"),
+    *_pair("speed", "m/s", "of the vehicle"),
+    _column("heave", "0.5 m/s", "upward velocity in the body frame, x 2"),
+    _column("height", "m", "z + 0.8, z = 0 at the surface"),
+    *[
+        _column(f"last_wish.{axis}", "1", "carried out last: x and y shortened to length 1, z within +-1; 0 "
+                "at the start")
+        for axis in "xyz"
+    ],
+    _column("cos_4_yaw", "1", "cosine of four times the heading"),
+    _column("sin_4_yaw", "1", "its sine, times flip.x flip.y"),
+    _column("across", "3 m", "flip.y (y - 3) / 3, y in the tank"),
+    _column("along", "10 m", "flip.x (x - 10) / 10, x in the tank"),
+    *[
+        _column(f"ray[{i}]", "1/m", "1 / (0.3 + clip(free - 0.22, 0, 4)) - 0.5, free metres to the nearest "
+                f"wall or occupied cell (at most 4.3) at {360 * i / N_RAY:g} degrees from x towards y")
+        for i in range(N_RAY)
+    ],
+]  # fmt: skip
+"""Columns of the vehicle's own."""
+
+
+# ------------------------------------------------------------------------------------------------------------
+# policy_spec.json of policies over a set of bodies and of learned forecasts: every column, the hull rule,
+# and what the networks are.
+
+
+_WISH = (
+    "ahead, left, up in the mirrored world: the first two in parts of fastest_m_s, shortened to length 1 "
+    "where they are longer, the third in parts of the heave limit; held until the next decision"
+)
+
+
+def set_specification(
+    checkpoint: Checkpoint, decision: ExportedModule, kind: str, name: str, has_onnx: bool
+) -> dict[str, Any]:
+    """The document without ``files``, which ``export`` adds."""
+    about = _set_parts(checkpoint.config) if isinstance(decision, OneWish) else _forecast_parts()
+    graph = {
+        "file": ONNX,
+        "opset": OPSET,
+        "inputs": decision.inputs,
+        "outputs": {output: SET_OUTPUTS[output] for output in decision.outputs},
+    }
+    return {
+        "schema": SCHEMA,
+        "kind": kind,
+        "name": name,
+        **origin_of(checkpoint),
+        **about,
+        "graph": graph if has_onnx else None,
+        "golden": {"file": GOLDEN, "tolerance": TOLERANCE},
+        "weights": WEIGHTS,
+    }
+
+
+def _set_parts(config: LearningConfig) -> dict[str, Any]:
+    columns = {"bodies": {"most": N_BODY, "columns": BODY_COLUMNS}, "own": {"columns": OWN_COLUMNS}}
+    dt_s, hold = config.episode.control_dt_s, config.policy.hold_steps
+    return {
+        "observation": {"meaning": MEANING, **columns},
+        "action": {"columns": ["ahead", "left", "up"], "meaning": _WISH},
+        "rate": {
+            "control_dt_s": dt_s,
+            "control_hz": 1.0 / dt_s,
+            "hold_steps": hold,
+            "decision_hz": 1.0 / dt_s / hold,
+        },
+        "hull_rule": hull_rule_of(config),
+        "network": {"goal_gain": config.twin.goal_gain},
+    }
+
+
+def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
+    """Numbers of the rule that lays a wish on the hull, as the card's README tells it."""
+    vehicle = config.vehicle
+    limits = {"surge": vehicle.max_surge_m_s, "sway": vehicle.max_sway_m_s, "heave": vehicle.max_heave_m_s}
+    return {
+        "fastest_m_s": math.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s),
+        "limits_m_s": limits,
+        "max_yaw_rate_rad_s": vehicle.max_yaw_rate_rad_s,
+        "turn_gain_1_s": TURN_GAIN,
+        "least_speed_m_s": LEAST_SPEED_M_S,
+        "z_m": list(config.world.tank.z_m),
+        "gap_m": config.twin.vertical_gap_m,
+    }
+
+
+def _forecast_parts() -> dict[str, Any]:
+    return {
+        "observation": {"columns": {"width": COLUMNS}, "meaning": MOTION_MEANING},
+        "network": {"modes": N_MODE, "times_s": [float(time) for time in TIMES_S]},
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------
+# The networks of a pilot as float32 arrays under plain names, with everything that they scale by: what
+# ``run_policy.py`` computes with.
+
+
+NO_LIMIT = float(torch.finfo(torch.float32).max)
+"""of a normaliser that has seen nothing and therefore cuts nothing off"""
+
+
+def weights_of(pilot: Pilot) -> dict[str, Tensor]:
+    """Arrays of policy and world model, on the host, contiguous."""
+    found = dict(_policy(pilot.policy))
+    if pilot.world_model is not None:
+        found |= dict(_world_model(pilot.world_model))
+    return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in found.items()}
+
+
+def _policy(policy: ActorCritic) -> Iterator[tuple[str, Tensor]]:
+    yield from _net("actor", policy.actor)
+    yield from _net("critic", policy.critic)
+    yield from _norm("norm", policy.observation_norm)
+    yield "value.mean", policy.value_norm.mean.float()
+    yield "value.std", policy.value_norm.std().float()
+
+
+def _world_model(world_model: WorldModel) -> Iterator[tuple[str, Tensor]]:
+    for name in ("encoder", "dynamics", "decoder"):
+        yield from _net(name, getattr(world_model, name))
+    yield from _norm("world_norm", world_model.observation_norm)
+    yield "target.scale", world_model.scale()
+    yield (
+        "target.base",
+        world_model.base(torch.zeros(world_model.n_obs, device=world_model.change_norm.mean.device)),
+    )
+    yield "change.unit", world_model.error_unit()
+
+
+def _net(name: str, net: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    for key, tensor in net.state_dict().items():
+        yield f"{name}.{key}", tensor.float()
+
+
+def _norm(name: str, norm: RunningNorm) -> Iterator[tuple[str, Tensor]]:
+    yield f"{name}.mean", norm.mean.float()
+    yield f"{name}.scale", (1.0 / norm.std()).float()
+    yield f"{name}.limit", torch.tensor([norm.clip if float(norm.count) > 0 else NO_LIMIT])

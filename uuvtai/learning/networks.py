@@ -1,0 +1,558 @@
+"""Multilayer perceptron with orthogonal initial weights drawn from a generator of its own."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from uuvtai.common.enums import (
+    ANCHOR_S,
+    ANCHORS,
+    FAR_COLUMNS,
+    N_COLUMN,
+    N_HIDDEN,
+    N_MODE,
+    N_SAID,
+    N_SPREAD,
+    N_TOLD,
+    SIDE_COLUMNS,
+)
+from uuvtai.common.errors import SettingError, UserError
+from uuvtai.config.learning import PolicyConfig
+
+if TYPE_CHECKING:
+    from uuvtai.config.learning import PpoConfig
+
+
+Activation = Literal["elu", "tanh", "relu"]
+
+_ACTIVATIONS = {"elu": lambda: nn.ELU(inplace=True), "tanh": nn.Tanh, "relu": lambda: nn.ReLU(inplace=True)}
+_HIDDEN_GAIN = math.sqrt(2.0)
+
+
+def mlp(
+    sizes: Sequence[int], activation: Activation, generator: torch.Generator, out_gain: float = 1.0
+) -> nn.Sequential:
+    """Layers of these widths (input, hidden ..., output), an activation after every one but the last, biases
+    zero.
+
+    Weights are orthogonal with gain sqrt 2, the last layer's with ``out_gain`` (0 = its output is zero at
+    birth). ``generator`` is a CPU generator. ValueError for fewer than two widths.
+    """
+    if len(sizes) < 2:
+        raise ValueError(f"an mlp needs at least an input and an output width, got {list(sizes)}")
+    layers: list[nn.Module] = []
+    for number, (n_in, n_out) in enumerate(itertools.pairwise(sizes), start=2):
+        last = number == len(sizes)
+        layer = linear(n_in, n_out, out_gain if last else _HIDDEN_GAIN, generator)
+        layers += [layer] if last else [layer, _ACTIVATIONS[activation]()]
+    return nn.Sequential(*layers)
+
+
+def linear(n_in: int, n_out: int, gain: float, generator: torch.Generator) -> nn.Linear:
+    """One layer, weights orthogonal with this gain, bias zero."""
+    with torch.random.fork_rng(devices=()):  # its own initial weights come from the global generator
+        layer = nn.Linear(n_in, n_out)
+    nn.init.orthogonal_(layer.weight, gain, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Running mean and deviation in float64, merged batch by batch exactly (Chan, Golub, LeVeque 1979), and the
+# scaling they give.
+
+
+_ROWS_AT_ONCE = 2048
+"""a float64 copy of a whole rollout would not fit the caches"""
+MIN_STD = 1e-2
+"""a column's deviation counts as at least this much (in its own unit): a constant column must not become
+noise"""
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Moments of samples of ``width`` columns, float64."""
+
+    mean: torch.Tensor
+    """(width,)"""
+    m2: torch.Tensor
+    """(width,), sum of squared differences from the mean"""
+    count: torch.Tensor
+    """(), number of samples"""
+
+
+def moments_of(x: torch.Tensor) -> Moments:
+    """Moments of the rows of x (..., width); a row that is not finite in every column is left out."""
+    rows = x.detach().reshape(-1, x.shape[-1])
+    kept = torch.isfinite(rows.sum(dim=1))
+    if not bool(kept.all()):
+        rows = rows[kept]
+    width = rows.shape[1]
+    zeros = torch.zeros(2 * width + 1, dtype=torch.float64, device=x.device)
+    total = Moments(zeros[:width], zeros[width:-1], zeros[-1])
+    for first in range(0, len(rows), _ROWS_AT_ONCE):
+        total = combined(total, _moments_of_part(rows[first : first + _ROWS_AT_ONCE].double()))
+    return total
+
+
+def _moments_of_part(rows: torch.Tensor) -> Moments:
+    mean = rows.mean(dim=0)
+    return Moments(mean, (rows - mean).square().sum(dim=0), rows.new_tensor(float(len(rows))))
+
+
+def combined(a: Moments, b: Moments) -> Moments:
+    """Moments of the samples of both, as if they had been taken together (Chan et al., equation 1.5)."""
+    count = a.count + b.count
+    share = b.count / count.clamp(min=1.0)
+    difference = b.mean - a.mean
+    return Moments(a.mean + share * difference, a.m2 + b.m2 + difference.square() * (a.count * share), count)
+
+
+class RunningNorm(nn.Module):
+    """Scales columns to mean 0 and deviation 1 by the moments of all samples seen so far; before the first
+    one it changes nothing."""
+
+    mean: torch.Tensor
+    m2: torch.Tensor
+    count: torch.Tensor
+
+    def __init__(self, width: int, clip: float = 10.0) -> None:
+        """``clip``: normalised values are cut off beyond +-clip."""
+        super().__init__()
+        self.clip = clip
+        self.register_buffer("mean", torch.zeros(width, dtype=torch.float64))
+        self.register_buffer("m2", torch.zeros(width, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    @property
+    def moments(self) -> Moments:
+        """Of all samples so far."""
+        return Moments(self.mean, self.m2, self.count)
+
+    def update(self, x: torch.Tensor) -> None:
+        """Add the rows of x (..., width); rows that are not finite are left out."""
+        self.merge(moments_of(x))
+
+    def merge(self, moments: Moments) -> None:
+        """Add samples whose moments are known."""
+        united = combined(self.moments, moments)
+        self.mean.copy_(united.mean)
+        self.m2.copy_(united.m2)
+        self.count.copy_(united.count)
+
+    def std(self) -> torch.Tensor:
+        """(width,) deviation, float64, at least ``MIN_STD``; 1 before the first sample."""
+        variance = torch.where(self.count > 0, self.m2 / self.count.clamp(min=1.0), 1.0)
+        return variance.sqrt().clamp(min=MIN_STD)
+
+    def forward(self, x: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+        """Normalised x (..., width), float32, within +-clip; what is not a number becomes 0, the mean.
+
+        ``out``: written to instead of a new tensor.
+        """
+        y = torch.sub(x, self.mean.float(), out=out)
+        limit = torch.where(self.count > 0, self.clip, math.inf).float()
+        y.mul_((1.0 / self.std()).float()).clamp_(-limit, limit)
+        return y.nan_to_num_(nan=0.0, posinf=self.clip, neginf=-self.clip)
+
+    def inverse(self, y: torch.Tensor) -> torch.Tensor:
+        """The x whose normalised value is y (..., width), float32."""
+        return torch.addcmul(self.mean.float(), y, self.std().float())
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Actor and critic: a diagonal Gaussian over the four commands and the value, with the normalisers of both
+# inside the module.
+
+
+NUM_ACTIONS = 4
+_MEAN_GAIN, _VALUE_GAIN = (
+    0.01,
+    1.0,
+)  # small first actions (Andrychowicz et al. 2021, choice of the last layer's scale)
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class PolicyStep(NamedTuple):
+    """What the policy decided for N envs."""
+
+    action: torch.Tensor
+    """(N, 4) drawn, in parts of the vehicle's limits, unclamped: the environment clamps"""
+    log_prob: torch.Tensor
+    """(N,) [nat]"""
+    value: torch.Tensor
+    """(N,) expected return"""
+    mean: torch.Tensor
+    """(N, 4)"""
+
+
+def log_prob(action: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
+    """Log density [nat] of actions (..., 4) under a diagonal Gaussian of mean (..., 4) and log deviation
+    (4,): (...,)."""
+    scaled = (action - mean) * torch.exp(-log_std)
+    return -0.5 * scaled.square().sum(dim=-1) - (log_std.sum() + log_std.shape[-1] * _HALF_LOG_2PI)
+
+
+def entropy(log_std: torch.Tensor) -> torch.Tensor:
+    """Differential entropy [nat] of a diagonal Gaussian of log deviation (4,), a scalar."""
+    return log_std.sum() + log_std.shape[-1] * (0.5 + _HALF_LOG_2PI)
+
+
+class ActorCritic(nn.Module):
+    """Two separate networks on the normalised input; all it knows, statistics included, is in its
+    ``state_dict``.
+
+    Inputs x are (..., n_in) raw. With ``config.residual`` the mean is the teacher's action, read from x
+    before normalisation, plus ``residual_limit`` tanh(network): the teacher itself at birth.
+    """
+
+    def __init__(
+        self,
+        n_in: int,
+        config: PolicyConfig,
+        teacher_slice: slice | None,
+        generator: torch.Generator,
+    ) -> None:
+        """``teacher_slice``: columns of x with the teacher's action; ValueError where a residual policy has
+        none."""
+        super().__init__()
+        if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != NUM_ACTIONS):
+            raise SettingError(
+                f"policy.residual adds to the teacher's {NUM_ACTIONS} commands, but the observation has no "
+                f"such columns (got {teacher_slice}): set features.teacher=true or policy.residual=false"
+            )
+        if config.initial_std < config.min_std:
+            raise SettingError(
+                f"policy.initial_std {config.initial_std:g} lies below the floor policy.min_std "
+                f"{config.min_std:g}"
+            )
+        self.config, self.n_in, self.teacher_slice = config, n_in, teacher_slice
+        self.actor = mlp(
+            (n_in, *config.hidden, NUM_ACTIONS),
+            config.activation,
+            generator,
+            0.0 if config.residual else _MEAN_GAIN,
+        )
+        self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
+        self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
+        self.observation_norm = RunningNorm(n_in, config.clip_observation)
+        self.value_norm = RunningNorm(1, math.inf)
+
+    def distribution(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(mean (..., 4), log_std (4,)) of the action."""
+        return self.mean(self.observation_norm(x), self.teacher_action(x)), self.log_std
+
+    def value(self, x: torch.Tensor) -> torch.Tensor:
+        """(...,) expected return, in units of the reward."""
+        return self.value_norm.inverse(self.critic(self.observation_norm(x)).squeeze(-1))
+
+    @torch.no_grad()
+    def act(self, x: torch.Tensor, generator: torch.Generator) -> PolicyStep:
+        """Draw actions for x (N, n_in) with noise from a CPU generator."""
+        normalised = self.observation_norm(x)
+        mean = self.mean(normalised, self.teacher_action(x))
+        noise = torch.randn(mean.shape, generator=generator).to(mean.device)
+        action = torch.addcmul(mean, noise, self.log_std.exp())
+        value = self.value_norm.inverse(self.critic(normalised).squeeze(-1))
+        return PolicyStep(action, log_prob(action, mean, self.log_std), value, mean)
+
+    def mean(self, normalised: torch.Tensor, teacher_action: torch.Tensor | None) -> torch.Tensor:
+        """(..., 4) mean action of normalised inputs; ``teacher_action`` is what ``teacher_action(x)``
+        gave."""
+        return self.mean_of(self.actor(normalised), teacher_action)
+
+    def mean_of(self, out: torch.Tensor, teacher_action: torch.Tensor | None) -> torch.Tensor:
+        """(..., 4) mean action from the actor network's output (..., 4)."""
+        if not self.config.residual or teacher_action is None:
+            return out
+        return teacher_action + self.config.residual_limit * torch.tanh(out)
+
+    def teacher_action(self, x: torch.Tensor) -> torch.Tensor | None:
+        """(..., 4) the columns that a residual policy adds to (what is not finite counts as 0); None for
+        others."""
+        if not self.config.residual or self.teacher_slice is None:
+            return None
+        return x[..., self.teacher_slice].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+
+    @torch.no_grad()
+    def floor_std(self) -> None:
+        """Lift deviations that a step took below ``config.min_std`` back onto it: clamping inside would stop
+        their gradient there."""
+        self.log_std.clamp_(min=math.log(self.config.min_std))
+
+    @torch.no_grad()
+    def learn_returns(self, moments: Moments) -> None:
+        """Add the moments of returns (width 1) to the value's statistics and change the critic's last layer
+        so that no value changes.
+
+        Source: van Hasselt et al. 2016, "Learning values across many orders of magnitude" (Pop-Art), equation
+        9.
+        """
+        old_mean, old_std = self.value_norm.mean.clone(), self.value_norm.std()
+        self.value_norm.merge(moments)
+        mean, std = self.value_norm.mean, self.value_norm.std()
+        last = self.critic[-1]
+        assert isinstance(last, nn.Linear)
+        last.weight.copy_(last.weight * (old_std / std))
+        last.bias.copy_((last.bias * old_std + old_mean - mean) / std)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Products in bfloat16 (``ppo.bfloat16``), where that is faster: a CPU without the instructions takes ten
+# times as long for them.
+
+
+INSTRUCTIONS = ("avx512_bf16", "amx_bf16", "bf16")
+"""of CPUs, as torch names them"""
+
+
+def in_bfloat16(config: PpoConfig, device: str) -> bool:
+    """Whether products are made in bfloat16 on this device ("cpu" or "cuda")."""
+    return config.bfloat16 and multiplies_bfloat16(device)
+
+
+@functools.cache
+def multiplies_bfloat16(device: str) -> bool:
+    """Whether this device has the instructions. A torch that cannot tell of a CPU, before 2.13, is taken for
+    no."""
+    if device != "cpu":
+        return True
+    known = getattr(torch.cpu, "get_capabilities", dict)()
+    return any(known.get(name, False) for name in INSTRUCTIONS)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Adam without torch's compiler, which its class imports when one is built and when it steps: that takes
+# most of a second, and nothing here compiles by it. Same numbers, same states.
+
+
+class PlainAdam(torch.optim.Adam):
+    """``torch.optim.Adam``."""
+
+    step = torch.no_grad()(getattr(torch.optim.Adam.step, "__wrapped__", torch.optim.Adam.step))
+    """torch's without what switches its compiler off around it"""
+
+    def __init__(self, *arguments, **named) -> None:
+        _spare_compiler()
+        super().__init__(*arguments, **named)
+
+
+def _spare_compiler() -> None:
+    """Tell the methods of optimisers that they are switched off for the compiler already, unless somebody has
+    imported it. A torch that asks in another way imports it as before."""
+    if "torch._dynamo" in sys.modules:
+        return
+    for method in vars(torch.optim.Optimizer).values():
+        inner = getattr(method, "__wrapped__", None)
+        if inner is not None and not hasattr(inner, "__dynamo_disable"):
+            inner.__dynamo_disable = inner
+
+
+# ------------------------------------------------------------------------------------------------------------
+# The network of a learned forecast, its likelihood, and what it says in metres.
+#
+# A mixture of ``N_MODE`` Gaussians over the places at ``ANCHORS`` times, along and across the track's course
+# (Bishop 1994). Each future is a whole way: its places share one weight.
+
+
+TIMES_S = torch.arange(1, ANCHORS + 1) * ANCHOR_S
+"""[s] ahead, of the places that it tells"""
+_LEAST_M, _MOST = 0.03, 4.0
+"""[m] smallest deviation; largest, as a part of the way that a body can go"""
+_HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
+
+
+class Mixture(NamedTuple):
+    """What may come of n tracks, in their frames."""
+
+    log_weight: torch.Tensor
+    """(n, N_MODE) logarithm of the probability of each future"""
+    place: torch.Tensor
+    """(n, N_MODE, ANCHORS, 2) [m] along and across the course"""
+    sigma: torch.Tensor
+    """(n, N_MODE, ANCHORS, 2) [m] standard deviations"""
+
+
+class MixtureNet(nn.Module):
+    """Columns of a track to its futures: two hidden layers of rectified units."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__()
+        gain = math.sqrt(2.0)
+        self.into = linear(N_COLUMN, N_HIDDEN, gain, generator)
+        self.middle = linear(N_HIDDEN, N_HIDDEN, gain, generator)
+        self.said = linear(N_HIDDEN, N_TOLD, 0.1, generator)
+        self.spread = linear(N_HIDDEN, N_SPREAD, 0.1, generator)
+        with torch.no_grad():  # the futures begin apart: straight on, slower, back, left and right
+            ways = torch.tensor([[1.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [-0.8, 0.0], [0.5, 0.5], [0.5, -0.5]])
+            self.said.bias[N_MODE:] = ways[:N_MODE, None].expand(-1, ANCHORS, -1).reshape(-1)
+            self.spread.bias.fill_(math.log(0.3))
+
+    def forward(self, columns: torch.Tensor, speed: torch.Tensor) -> Mixture:
+        """``columns`` (n, N_COLUMN), ``speed`` (n,) [m/s]."""
+        hidden = torch.relu(self.middle(torch.relu(self.into(columns))))
+        said = self.said(hidden)
+        reach = (speed[:, None] * TIMES_S)[:, None, :, None]
+        place = said[:, N_MODE:].view(-1, N_MODE, ANCHORS, 2) * reach
+        part = self.spread(hidden).view(-1, N_MODE, ANCHORS, 2).clamp(-6.0, math.log(_MOST)).exp()
+        return Mixture(torch.log_softmax(said[:, :N_MODE], -1), place, _LEAST_M + part * reach)
+
+    def weights(self) -> dict[str, np.ndarray]:
+        """Arrays of a forecast's file (``mixture_weights``)."""
+        out, bias = torch.zeros(N_HIDDEN, N_SAID), torch.zeros(N_SAID)
+        out[:, :N_TOLD], bias[:N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
+        found = {"weight_out": out, "bias_out": bias}
+        for name, layer in self._layers().items():
+            found |= {f"weight_{name}": layer.weight.T, f"bias_{name}": layer.bias}
+        return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
+
+    def _layers(self) -> dict[str, nn.Linear]:
+        """Those that are in the file as they are; the last one is padded there."""
+        return {"in": self.into, "mid": self.middle, "spread": self.spread}
+
+
+def negative_log_likelihood(mixture: Mixture, truth: torch.Tensor) -> torch.Tensor:
+    """(n,) of the true places (n, ANCHORS, 2) [m] in the tracks' frames, in nats of all of them together."""
+    off = (truth[:, None] - mixture.place) / mixture.sigma
+    log_density = -(0.5 * off * off + mixture.sigma.log() + _HALF_LOG_TAU).sum((-1, -2))
+    return -torch.logsumexp(mixture.log_weight + log_density, -1)
+
+
+def mirrored(columns: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same tracks seen in a mirror along their course: left is right."""
+    flip = torch.ones(N_COLUMN)
+    flip[list(SIDE_COLUMNS)] = -1.0
+    order = torch.arange(N_COLUMN)
+    for one, other in FAR_COLUMNS:
+        order[one], order[other] = other, one
+    return (columns * flip)[:, order], truth * torch.tensor([1.0, -1.0])
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What is not a finite number neither spreads nor stays silent: it is replaced, counted by name, and
+# iteration after iteration an error.
+
+
+PREFIX = "non_finite/"
+"""of the metrics that count what was replaced; they are there only when something was"""
+
+
+class TrainingError(UserError, RuntimeError):
+    """Training cannot go on: what is wrong, since when, and what to type next."""
+
+
+class Guard:
+    """Replaces values that are not finite and counts them, without a wait for the device."""
+
+    def __init__(
+        self, columns: Sequence[tuple[str, slice]], num_envs: int, patience: int, device: torch.device
+    ) -> None:
+        """``columns``: names of the observation's columns; ``patience``: iterations in a row with something
+        bad before it is an error."""
+        self.columns, self.patience = tuple(columns), patience
+        width = max((place.stop for _, place in self.columns), default=0)
+        self._observation = torch.zeros(width, dtype=torch.int64, device=device)
+        self._rows = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._none = torch.zeros_like(self._rows)
+        self._other: dict[str, torch.Tensor] = {
+            name: torch.zeros((), dtype=torch.int64, device=device) for name in _NAMES
+        }
+        self.bad_in_a_row = 0
+
+    def observation(
+        self, obs: torch.Tensor, fill: torch.Tensor, out: torch.Tensor, counted: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Copy obs (N, n_obs) into ``out``, with ``fill`` (n_obs,) in place of what is not finite; returns
+        which rows were bad, (N,).
+
+        ``counted`` (N,): rows that count (default: all).
+        """
+        if _is_sound(obs):
+            out.copy_(obs)
+            return self._none
+        bad = ~torch.isfinite(obs)
+        torch.where(bad, fill, obs, out=out)
+        counting = bad if counted is None else bad & counted[:, None]
+        self._observation += counting.sum(dim=0)
+        rows = bad.any(dim=1)
+        self._rows |= counting.any(dim=1)
+        return rows
+
+    def values(self, name: str, values: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
+        """Copy ``values`` (N, ...) into ``out`` with 0 in place of what is not finite; returns which rows
+        were bad, (N,)."""
+        if _is_sound(values):
+            out.copy_(values)
+            return self._none
+        bad = ~torch.isfinite(values)
+        out.copy_(values).masked_fill_(bad, 0.0)
+        rows = bad if bad.dim() == 1 else bad.any(dim=1)
+        self._other[name] += bad.sum()
+        self._rows |= rows
+        return rows
+
+    def take(self) -> dict[str, float]:
+        """Counts since the last call by name, those above zero only: ``non_finite/<column>``,
+        ``non_finite/reward`` and so on."""
+        counts = self._observation.tolist()
+        found = {name: sum(counts[place]) for name, place in self.columns} | {
+            n: int(t) for n, t in self._other.items()
+        }
+        self._observation.zero_()
+        for counter in self._other.values():
+            counter.zero_()
+        return {f"{PREFIX}{name}": float(count) for name, count in found.items() if count}
+
+    def judge(
+        self, iteration: int, complaints: Sequence[str], seed: torch.Tensor, episode: torch.Tensor
+    ) -> None:
+        """Count an iteration with or without complaints; TrainingError after ``patience`` in a row with some.
+
+        ``seed`` and ``episode`` (N,): which scenarios the envs are in, for the message.
+        """
+        rows = self._rows.nonzero().flatten().tolist()
+        self._rows.zero_()
+        self.bad_in_a_row = self.bad_in_a_row + 1 if complaints else 0
+        if self.bad_in_a_row < self.patience:
+            return
+        envs = "".join(
+            f"; env {row} (seed {int(seed[row])}, episode {int(episode[row])})" for row in rows[:_ROWS_TOLD]
+        )
+        raise TrainingError(
+            f"iterations {iteration - self.bad_in_a_row + 1} to {iteration} were all bad: "
+            f"{'; '.join(complaints)}{envs}. What was bad did not change the networks. If updates were left "
+            "out, go on with smaller steps: uuv train --resume RUN --set ppo.learning_rate=1e-4. If an "
+            "observation or a reward is not finite, the simulator is at fault: please report seed and episode"
+        )
+
+
+def guarded_step(loss: torch.Tensor, module: torch.nn.Module, optimiser: torch.optim.Optimizer) -> bool:
+    """One gradient step on ``loss`` (a scalar); False where the gradient is zero or not finite, and nothing
+    was changed."""
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    gradients = [p.grad for p in module.parameters() if p.grad is not None]
+    sound = 0.0 < float(torch.nn.utils.get_total_norm(gradients)) < math.inf
+    if sound:
+        optimiser.step()
+    return sound
+
+
+def _is_sound(values: torch.Tensor) -> bool:
+    """Whether everything is finite, asked where that is no wait for a device: whatever is not makes the sum
+    so, and so may large numbers, which are then looked at one by one."""
+    return values.device.type == "cpu" and math.isfinite(values.sum())
+
+
+_ROWS_TOLD = 4
+_NAMES = ("reward", "teacher_action", "world_model_features")

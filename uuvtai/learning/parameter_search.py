@@ -1,0 +1,379 @@
+"""Learn the behaviour tree's numbers: what ``learn/run.py`` drives where ``tuner.enabled``.
+
+Every iteration plays episodes of one scene in the simulator, each with numbers of its own, and moves the best
+numbers so far: those for slow bodies or those for fast ones (``number_search``).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+
+from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS
+from uuvtai.config.behavior import FAST, SLOW, TUNED, configured_factors, log_bounds
+from uuvtai.config.learning import LearningConfig, TunerScene
+from uuvtai.config.loader import ConfigError
+from uuvtai.learning.agents import TunedPilot, tree_row
+from uuvtai.learning.rollout import Recent, RolloutSums
+
+if TYPE_CHECKING:
+    from uuvtai.learning.policy_agent import PilotDecision
+    from uuvtai.sim.setup import Scene
+    from uuvtai.sim.sim import Sim
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A search among many numbers at once: trials drawn around the best ones so far, and steps along the response
+# surface of all trials.
+#
+# A quadratic without mixed terms is fitted to the trials by ridge regression: a response surface (Box &
+# Wilson
+# 1951, Journal of the Royal Statistical Society B 13). Noise of one trial hardly matters, for every trial
+# says
+# something about every number.
+
+
+class NumberSearch:
+    """Best numbers so far, every trial, and where the next ones lie. It draws from a generator of its own:
+    what two searches find does not depend on whether they run in turns or one after the other."""
+
+    def __init__(
+        self, centre: torch.Tensor, bounds: torch.Tensor, spread: float, size: int, seed: int
+    ) -> None:
+        """``centre`` (n,) to begin at, within ``bounds`` (2, n); trials lie within ``spread`` of the way
+        between these around the best ones; ``size`` is the most trials there will be."""
+        self.centre = centre.clone()
+        self.low, self.high = bounds
+        self.spread = spread * (self.high - self.low)
+        self.trials = 0
+        self._generator = torch.Generator().manual_seed(seed)
+        self._place, self._score = torch.zeros(size, len(centre)), torch.zeros(size)
+        self._group = torch.zeros(size, dtype=torch.int64)
+
+    @property
+    def size(self) -> int:
+        """The most trials there will be."""
+        return len(self._score)
+
+    def drawn(self, count: int) -> torch.Tensor:
+        """(count, n) numbers to try, by pairs for one episode each: anywhere within ``spread``, the second of
+        a pair as far the other way (mirrored sampling)."""
+        draw = torch.rand(count // 2, len(self.centre), generator=self._generator)
+        way = (2.0 * draw - 1.0) * self.spread
+        tried = self.centre + torch.stack([way, -way], 1).reshape(count, len(self.centre))
+        return tried.clamp(self.low, self.high)
+
+    def take(self, place: torch.Tensor, score: torch.Tensor, group: int) -> None:
+        """Remember trials at ``place`` (count, n) with scores (count,), all of one ``group``: the levels of
+        groups say nothing about the numbers."""
+        rows = slice(self.trials, self.trials + len(place))
+        self._place[rows], self._score[rows], self._group[rows] = place, score, group
+        self.trials += len(place)
+
+    def move(self) -> None:
+        """One step along the surface of all trials."""
+        n = slice(self.trials)
+        place, spread = self._place[n].double().numpy(), self.spread.double().numpy()
+        slope, bend = fitted(place, self._score[n].double().numpy(), self._group[n].numpy(), spread)
+        centre, low, high = (part.double().numpy() for part in (self.centre, self.low, self.high))
+        self.centre = torch.from_numpy(best_near(centre, slope, bend, spread, low, high)).float()
+
+    def state(self) -> dict[str, Any]:
+        """All that the next steps depend on, but for ``memory``."""
+        return {"centre": self.centre, "generator": self._generator.get_state(), "trials": self.trials}
+
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Every trial."""
+        return {"place": self._place, "score": self._score, "group": self._group}
+
+    def load_state(self, state: Mapping[str, Any], memory: Mapping[str, torch.Tensor]) -> None:
+        """Go on from what ``state`` and ``memory`` gave."""
+        self.centre = state["centre"].clone()
+        self._generator.set_state(state["generator"])
+        self.trials = int(state["trials"])
+        for name, own in self.memory().items():
+            own.copy_(memory[name])
+
+
+PAIR_CORRELATION = 0.4
+"""of the scores of two trials of one episode: as measured in the fast gauntlet"""
+SLOPE_SD, BEND_MEAN, BEND_SD = 0.02, -0.01, 0.01
+"""what is expected of the terms per ``spread`` and per its square: the narrower, the more trials it takes to
+believe in an effect; numbers that are in use have their best place somewhere near"""
+
+
+def fitted(
+    place: np.ndarray, score: np.ndarray, group: np.ndarray, spread: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(slopes, bends), both (n,) per unit of ``spread`` (n,), of the scores (m,) of trials at ``place`` (m,
+    n): score = level of its group + slopes x + bends x^2. ``group`` (m,) are numbers from 0 on. Trials 0
+    and 1, 2 and 3, .. are of one episode: what makes it easy or hard counts for both alike."""
+    x = place / spread
+    level = np.eye(int(group.max()) + 1)[group]
+    columns = np.concatenate([level, x, x * x], axis=1)
+    centred = score - (level @ (level.T @ score / np.maximum(level.sum(0), 1)))
+    noise = max(float(np.mean(centred**2)), 1e-9)
+    columns, score = _uncorrelated(columns), _uncorrelated(score)
+    n, n_level = x.shape[1], level.shape[1]
+    prior = np.concatenate(
+        [np.full(n_level, 1e-6), np.full(n, noise / SLOPE_SD**2), np.full(n, noise / BEND_SD**2)]
+    )
+    mean = np.concatenate([np.zeros(n_level + n), np.full(n, BEND_MEAN)])
+    found = np.linalg.solve(columns.T @ columns + np.diag(prior), columns.T @ score + prior * mean)
+    return found[n_level : n_level + n], found[n_level + n :]
+
+
+def _uncorrelated(rows: np.ndarray) -> np.ndarray:
+    """Sums and differences of the pairs, both with errors of the same size that are not correlated."""
+    first, second = rows[0::2], rows[1::2]
+    total = (first + second) / np.sqrt(2.0 * (1.0 + PAIR_CORRELATION))
+    return np.concatenate([total, (first - second) / np.sqrt(2.0 * (1.0 - PAIR_CORRELATION))])
+
+
+def best_near(
+    centre: np.ndarray,
+    slope: np.ndarray,
+    bend: np.ndarray,
+    spread: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
+    """(n,) highest place of the surface within half a ``spread`` of ``centre`` and within the bounds."""
+    first, last = np.maximum(centre - 0.5 * spread, low), np.minimum(centre + 0.5 * spread, high)
+    top = np.where(bend < 0, -0.5 * slope / np.where(bend < 0, bend, -1.0) * spread, first)
+    tries = np.stack([first, last, np.clip(top, first, last)])
+    x = tries / spread
+    return np.take_along_axis(tries, np.argmax(slope * x + bend * x * x, axis=0)[None], axis=0)[0]
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Simulators of the worlds that a trainer plays in.
+
+
+def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
+    """A simulator of a world with room for every scene, on the run's sensors and stack. Raises
+    ConfigError."""
+    from uuvtai.common.presets import TRAINING_TREE
+    from uuvtai.config.loader import load_config
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.sim.sim import Sim
+
+    most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
+    config = config.model_copy(update={"world": load_config(world, overrides=[*most]).world})
+    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node))
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Episodes of one scene in a trainer's simulator, so many at once as there are rows.
+
+
+class WavePilot(Protocol):
+    """Who drives."""
+
+    @property
+    def simulator(self) -> Sim: ...
+
+    running: torch.Tensor
+    """(num_envs,) rows whose episode has not ended"""
+    number: torch.Tensor
+    """(num_envs,) episode of every row"""
+
+    def reset(self, rows: torch.Tensor) -> None: ...
+    def decide(self, obs: torch.Tensor, /) -> PilotDecision: ...
+    def advance(self) -> None: ...
+
+
+def play_episodes(
+    pilot: WavePilot, scene: Scene, seed: int, first: int, count: int, times: int = 1
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(outcome code, control steps), both (count,), of episodes from ``first`` on of a seed, each played
+    ``times`` times in a row."""
+    sim = pilot.simulator
+    outcome, steps = (torch.zeros(count, dtype=torch.int64) for _ in range(2))
+    sim.set_scenes([scene])
+    for begin in range(0, count, sim.num_envs):
+        rows = torch.arange(sim.num_envs)
+        mask = (rows < count - begin).int()
+        pilot.running, pilot.number = mask == 1, begin + rows
+        sim.sleep()
+        sim.reset(mask, torch.full_like(mask, seed), (first + (begin + rows) // times).int())
+        pilot.reset(mask)
+        action = pilot.decide(sim.action).action
+        while bool(pilot.running.any()):
+            steps[pilot.number[pilot.running]] += 1
+            sim.step(action)
+            pilot.advance()
+            now = torch.from_numpy(sim.rows(sim.s.referee.outcome).astype("int64"))
+            ended = pilot.running & (now != RUNNING)
+            if bool(ended.any()):
+                outcome[pilot.number[ended]] = now[ended]
+                pilot.running &= ~ended
+                sim.sleep_ended()
+            action = pilot.decide(sim.action).action
+    return outcome, steps
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
+class TunerTrainer:
+    """Everything that the search carries from one iteration to the next. Episodes begin and end within an
+    iteration: the simulators carry nothing."""
+
+    def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None = None) -> None:
+        """``sims``: simulators of worlds that are there already. Raises ConfigError."""
+        self.config = config
+        self.observation_table = (tree_row(),)
+        self._scenes = config.tuner.scenes
+        self._part = [self._part_of(scene) for scene in self._scenes]
+        self.searches = tuple(self._search(part) for part in (SLOW, FAST))
+        self.recent = Recent(OUTCOMES, ())
+        self.iteration = self.env_steps = 0
+        self._sims = dict(sims or {})
+
+    def _part_of(self, scene: TunerScene) -> int:
+        """``SLOW`` or ``FAST``."""
+        fast = self.config.fast
+        if fast.from_m_s < scene[3] < fast.full_m_s:
+            raise ConfigError(
+                f"tuner.scenes: bodies at {scene[3]:g} m/s, in {scene[0]}, are neither slow (fast.from_m_s, "
+                f"{fast.from_m_s:g} m/s or less) nor fast (fast.full_m_s, {fast.full_m_s:g} m/s or more); "
+                "choose another speed"
+            )
+        return SLOW if scene[3] <= fast.from_m_s else FAST
+
+    def _search(self, part: int) -> NumberSearch:
+        config, n = self.config, len(self._part)
+        rounds = sum(self._part[i % n] == part for i in range(config.train.iterations))
+        return NumberSearch(
+            torch.from_numpy(configured_factors(config.slow, config.fast)[:, part]),
+            torch.tensor(log_bounds()),
+            config.tuner.spread,
+            rounds * config.train.num_envs,
+            config.train.seed,
+        )
+
+    @property
+    def centre(self) -> torch.Tensor:
+        """(n_tuned, 2) natural logarithms of the best factors so far."""
+        return torch.stack([search.centre for search in self.searches], 1)
+
+    def iterate(self) -> dict[str, float]:
+        """Play episodes, move towards the better ones; metrics by their names in metrics.jsonl."""
+        began = time.perf_counter()
+        nth = self.iteration % len(self._scenes)
+        scene, part = self._scenes[nth], self._part[nth]
+        search = self.searches[part]
+        place = self.centre.repeat(self.config.train.num_envs, 1, 1)
+        place[:, :, part] = search.drawn(len(place))
+        outcome, steps = self._played(scene, place, self.config.train.seed, search.trials // 2, 2)
+        between = time.perf_counter()
+        search.take(place[:, :, part], self._scored(outcome, steps, part), nth)
+        if search.trials >= self.config.tuner.warm_up * search.size:
+            search.move()
+        learn_s = time.perf_counter() - between
+        self.iteration += 1
+        env_steps = int(steps.sum())
+        self.env_steps += env_steps
+        return (
+            self._counted(outcome, env_steps)
+            | self.factors()
+            | {
+                "time/simulate_s": between - began,
+                "time/infer_s": 0.0,
+                "time/learn_s": learn_s,
+                "time/env_steps_per_s": env_steps / (between - began + learn_s),
+                "time/env_steps": float(self.env_steps),
+            }
+        )
+
+    def factors(self) -> dict[str, float]:
+        """The factors that trials are drawn around, by their names in metrics.jsonl."""
+        return {
+            f"{section}/{number.name}": factor
+            for section, search in zip(("slow", "fast"), self.searches, strict=True)
+            for number, factor in zip(TUNED, search.centre.exp().tolist(), strict=True)
+        }
+
+    def _played(
+        self, scene: TunerScene, place: torch.Tensor, seed: int, first: int, times: int = 1
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        world, s, d, v = scene
+        if world not in self._sims:
+            here = tuple(other[1:] for other in self._scenes if other[0] == world)
+            self._sims[world] = simulator_of(self.config, world, here)
+        pilot = _TrialPilot(place, self._sims[world])
+        return play_episodes(pilot, (s, d, v), seed, first, len(place), times)
+
+    def _scored(self, outcome: torch.Tensor, steps: torch.Tensor, part: int) -> torch.Tensor:
+        """1 for an arrival at once, less for a late one, 0 for none."""
+        tuner = self.config.tuner
+        cost = tuner.slow_time_cost if part == SLOW else tuner.time_cost
+        late = steps * self.config.episode.control_dt_s * cost
+        return (outcome == SUCCESS).float() * (1.0 - late)
+
+    def _counted(self, outcome: torch.Tensor, steps: int) -> dict[str, float]:
+        sums = RolloutSums.zeros(len(OUTCOMES), 0, torch.device("cpu"))
+        sums.outcomes += torch.bincount(outcome, minlength=len(OUTCOMES)).double()
+        sums.episode_steps += steps
+        sums.samples += steps
+        return self.recent.add(sums)
+
+    # --------------------------------------------------------------------------------------------- evaluation
+
+    def evaluate(self) -> dict[str, float]:
+        """``eval/*`` of what was found so far, on episodes that no trial met, as many of each scene."""
+        train, scenes = self.config.train, list(dict.fromkeys(self._scenes))
+        each, won, metrics = -(-train.evaluate_episodes // len(scenes)), [], {}
+        for scene in scenes:
+            outcome, steps = self._played(scene, self.centre.repeat(each, 1, 1), train.evaluate_seed, 0)
+            arrived = outcome == SUCCESS
+            won.append(arrived.float())
+            name = f"{Path(scene[0]).stem}_{scene[2]}_{scene[3]:g}"
+            metrics[f"eval/success_{name}"] = float(won[-1].mean())
+            if bool(arrived.any()):
+                mean_s = float(steps[arrived].float().mean()) * self.config.episode.control_dt_s
+                metrics[f"eval/time_to_success_{name}_s"] = mean_s
+        return metrics | {"eval/success_rate": float(torch.cat(won).mean())}
+
+    # ------------------------------------------------------------------------------------------------- resume
+
+    def state(self) -> dict[str, Any]:
+        """All that the next iterations depend on. What drives is the part ``tree``."""
+        return {
+            "tree": {"log_factor": self.centre},
+            "recent": list(self.recent.rows),
+            "counters": {name: getattr(self, name) for name in ("iteration", "env_steps")},
+            "searches": [search.state() for search in self.searches],
+            "env": [search.memory() for search in self.searches],
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what ``state`` gave."""
+        self.recent.rows = [list(row) for row in state["recent"]]
+        for name, value in state["counters"].items():
+            setattr(self, name, int(value))
+        for search, own, memory in zip(self.searches, state["searches"], state["env"], strict=True):
+            search.load_state(own, memory)
+
+
+class _TrialPilot(TunedPilot):
+    """Drives every episode with numbers of its own."""
+
+    def __init__(self, place: torch.Tensor, sim: Sim) -> None:
+        """``place`` (count, n_tuned, 2) of the episodes, in their order."""
+        super().__init__(torch.zeros(len(TUNED), 2), sim)
+        self._place = place.numpy()
+        self.running = torch.ones(sim.num_envs, dtype=torch.bool)
+        self.number = torch.zeros(sim.num_envs, dtype=torch.int64)
+
+    def reset(self, rows: torch.Tensor) -> None:
+        """As ``TunedPilot.reset``."""
+        of_row = np.minimum(self.number.numpy(), len(self._place) - 1)
+        self.log_factor[: len(of_row)] = self._place[of_row]
+        super().reset(rows)

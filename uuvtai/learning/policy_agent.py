@@ -1,0 +1,229 @@
+"""A trained policy at the wheel: the mean action without exploration noise, with the world model's memory of
+every row.
+
+What a row does must not depend on its neighbours, the batch's size or the number of threads. The networks
+therefore always see ``CHUNK`` rows at once, the last chunk filled up: equal shapes take equal paths through
+the matrix products.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+
+from uuvtai.config.learning import LearningConfig
+from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
+from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic
+from uuvtai.learning.world_model import N_FEATURES, WorldModel
+
+CHUNK = 64
+"""rows that go through the networks together"""
+TEACHER_COLUMN = "teacher_action"
+"""column of the observation that a residual policy adds to"""
+
+
+class PilotDecision(NamedTuple):
+    """What the policy chooses for N rows, and what it thinks of their state."""
+
+    action: torch.Tensor
+    """(N, 4) mean action in parts of the vehicle's limits, within [-1, 1]"""
+    value: torch.Tensor
+    """(N,) expected return"""
+    std: torch.Tensor
+    """(4,) of the exploration it was trained with"""
+    residual: torch.Tensor
+    """(N,) of the world model's last prediction; 0 = none yet, or no world model"""
+    uncertainty: torch.Tensor
+    """(N,) of that prediction"""
+
+
+class Pilot:
+    """Drives ``num_envs`` rows. ``decide`` looks, ``advance`` goes on to the next step; ``reset`` when a row
+    begins another episode."""
+
+    def __init__(
+        self,
+        policy: ActorCritic,
+        world_model: WorldModel | None,
+        num_envs: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """``world_model``: None where the policy was trained without its features. The networks are used, not
+        copied."""
+        self.policy, self.world_model, self.device = policy, world_model, torch.device(device)
+        self._n_obs = policy.n_in - N_FEATURES
+        rows = num_envs
+        self._x, self._last_obs = (
+            torch.zeros(rows, width, device=device) for width in (policy.n_in, self._n_obs)
+        )
+        self._action, self._last_action = (torch.zeros(rows, NUM_ACTIONS, device=device) for _ in range(2))
+        self._has_last = torch.zeros(rows, dtype=torch.bool, device=device)
+        self._hold, self._age = policy.config.hold_steps, torch.zeros(rows, dtype=torch.int64, device=device)
+        self._offset, self._said = (torch.zeros(rows, width, device=device) for width in (NUM_ACTIONS, 3))
+        self.decision = PilotDecision(*(torch.zeros(0) for _ in PilotDecision._fields))
+        """the last one; where an older one is held, what the networks said then"""
+
+    @property
+    def mean_action(self) -> torch.Tensor:
+        """(num_envs, 4) action of the last decision before it was cut off to [-1, 1]: what the difference
+        that is held was taken from."""
+        return self._action
+
+    def reset(self, rows: torch.Tensor) -> None:
+        """Forget the last step of the rows (num_envs,) where this is not 0."""
+        kept = rows.to(self.device) == 0
+        self._has_last &= kept
+        self._age *= kept
+
+    @torch.no_grad()
+    def decide(self, obs: torch.Tensor) -> PilotDecision:
+        """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on."""
+        x = self._x
+        fill = self.policy.observation_norm.mean[: self._n_obs].float()
+        x[:, : self._n_obs] = torch.where(torch.isfinite(obs), obs, fill)
+        due = self._due()
+        if len(due):
+            self._think(due)
+        teacher = self.policy.teacher_action(x)
+        self._action = self._offset if teacher is None else teacher + self._offset
+        value, residual, uncertainty = self._said.clone().T
+        self.decision = PilotDecision(
+            self._action.clamp(-1.0, 1.0),
+            value,
+            self.policy.log_std.exp(),
+            residual,
+            uncertainty,
+        )
+        return self.decision
+
+    def advance(self) -> None:
+        """The last decision has been carried out."""
+        due = self._due()
+        self._last_obs[due], self._last_action[due] = self._x[due, : self._n_obs], self._action[due]
+        self._has_last[due] = True
+        self._age += 1
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        """Decide and carry it out: actions (num_envs, 4)."""
+        action = self.decide(obs).action
+        self.advance()
+        return action
+
+    def _due(self) -> torch.Tensor:
+        """Rows whose decision is not held any more."""
+        return (self._age % self._hold == 0).nonzero().flatten()
+
+    def _think(self, rows: torch.Tensor) -> None:
+        """Ask the networks about these rows."""
+        x = self._x[rows]
+        x[:, self._n_obs :] = self._features(rows, x)
+        self._x[rows] = x
+        teacher = self.policy.teacher_action(x)
+        mean = by_chunk(lambda part: self.policy.distribution(part)[0], x)
+        self._offset[rows] = mean if teacher is None else mean - teacher
+        self._said[rows] = torch.stack([by_chunk(self.policy.value, x), x[:, -2], x[:, -1]], dim=1)
+
+    def _features(self, rows: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        if self.world_model is None:
+            return x.new_zeros(len(x), N_FEATURES)
+        found = by_chunk(
+            self.world_model.features, self._last_obs[rows], self._last_action[rows], x[:, : self._n_obs]
+        )
+        return torch.where(self._has_last[rows, None], found, 0.0)
+
+
+def by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> torch.Tensor:
+    """Function of inputs (n, ...), ``CHUNK`` rows at a time, the last chunk filled up with its first row."""
+    parts = []
+    for i in range(0, len(inputs[0]), CHUNK):
+        chunk = [tensor[i : i + CHUNK] for tensor in inputs]
+        missing = CHUNK - len(chunk[0])
+        parts.append(
+            function(
+                *(
+                    torch.cat([t, t[:1].expand(missing, *t.shape[1:])]) if missing else t.contiguous()
+                    for t in chunk
+                )
+            )
+        )
+    return torch.cat(parts)[: len(inputs[0])]
+
+
+def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> None:
+    """Raise ValueError where the networks of a config are not as wide as the tensors that came with it,
+    before anything is made so wide."""
+    n_in, latent = n_obs + N_FEATURES, config.world_model.latent
+    nets = [
+        ("policy", "actor", (n_in, *config.policy.hidden)),
+        ("policy", "critic", (n_in, *config.policy.hidden)),
+    ]
+    if config.world_model.enabled and config.world_model.as_features:
+        hidden = config.world_model.hidden
+        nets += [
+            ("world_model", "encoder", (n_obs, *hidden, latent)),
+            ("world_model", "dynamics", (latent + NUM_ACTIONS, *hidden, latent)),
+        ]
+        nets += [("world_model", "decoder", (latent, *hidden))]
+    for part, net, widths in nets:
+        for number, (first, last) in enumerate(itertools.pairwise(widths)):
+            name = f"{net}.{2 * number}.weight"
+            if parts[part][name].shape != (last, first):
+                raise ValueError(
+                    f"{part}.{name} is {tuple(parts[part][name].shape)} instead of {(last, first)}"
+                )
+
+
+def refuse_forecaster(checkpoint: Checkpoint) -> None:
+    """CheckpointError for a network that does not drive."""
+    if checkpoint.config.forecaster.enabled:
+        raise CheckpointError(
+            f"{checkpoint.path}: forecasts and does not drive; give it to a pilot that does: --set "
+            "forecast.learned=RUN"
+        )
+
+
+def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> Pilot:
+    """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config
+    says."""
+    config, rows = checkpoint.config, checkpoint.manifest.observation_table
+    refuse_forecaster(checkpoint)
+    if config.tuner.enabled:
+        raise CheckpointError(
+            f"{checkpoint.path}: numbers for the behaviour tree, no network that could be "
+            "exported; any stack takes them: --stack best, or stack.yaml of the run"
+        )
+    if config.twin.enabled:
+        raise CheckpointError(
+            f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "
+            "drives in 'uuv eval' and 'uuv sweep', and is exported by 'uuv export'"
+        )
+    parts, generator = checkpoint.model(), torch.Generator()
+    try:
+        n_obs = max(row["stop"] for row in rows)
+        teacher = next(
+            (slice(row["first"], row["stop"]) for row in rows if row["name"] == TEACHER_COLUMN), None
+        )
+        _check_sizes(parts, config, n_obs)
+        policy = ActorCritic(n_obs + N_FEATURES, config.policy, teacher, generator)
+        policy.load_state_dict(parts["policy"])
+        world_model = None
+        if config.world_model.enabled and config.world_model.as_features:
+            world_model = WorldModel(n_obs, config.world_model, generator)
+            world_model.load_state_dict(parts["world_model"])
+    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
+        ) from None
+    modules = [module for module in (policy, world_model) if module is not None]
+    for module in modules:
+        for name, tensor in module.state_dict().items():
+            if not bool(torch.isfinite(tensor).all()):
+                raise CheckpointError(
+                    f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
+                    "checkpoint"
+                )
+        module.to(device).eval()
+    return Pilot(policy, world_model, num_envs, device)

@@ -1,0 +1,180 @@
+"""The networks of a checkpoint that learnt in the twin or to forecast: made, filled, checked."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import torch
+from torch import nn
+
+from uuvtai.common.enums import BODY_WIDTH, EGO_COLUMNS
+from uuvtai.config.learning import LearningConfig
+from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
+from uuvtai.learning.networks import MixtureNet, mlp
+
+# ------------------------------------------------------------------------------------------------------------
+# Policy over a set of bodies: every body goes through one encoder, and what comes out is pooled by maximum
+# and sum, so that neither their order nor their number matters. The critic has an encoder of its own, which
+# also sees the bodies' true future: it serves training alone, and no file that drives holds it.
+
+
+NUM_WISHES = 3
+"""ahead, left, up: parts of the fastest velocity, in the mirrored world"""
+MOST_WISH = 2.0
+"""wishes beyond it are cut off before they are carried out"""
+AT_DIRECTION = slice(3, 5)
+"""columns of ``own`` with the unit vector to the goal"""
+_SUM_SCALE = 0.3
+"""sums over the bodies are a few times as large as a maximum"""
+
+
+class SetEncoder(nn.Module):
+    """Bodies (..., n, n_body) of which ``mask`` (..., n, 1) are there, and the vehicle's own columns (...,
+    n_own), to ``n_out`` numbers."""
+
+    def __init__(
+        self,
+        n_body: int,
+        n_own: int,
+        n_out: int,
+        config: LearningConfig,
+        gain: float,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        wide, head = config.twin.body_hidden, config.twin.head_hidden
+        self.body = mlp((n_body, wide, wide), "relu", generator, math.sqrt(2.0))
+        self.own = nn.Sequential(*mlp((n_own, wide), "relu", generator, math.sqrt(2.0)), nn.ReLU())
+        self.head = mlp((3 * wide, head, head, n_out), "relu", generator, gain)
+
+    def forward(self, bodies: torch.Tensor, own: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        """(..., n_out)."""
+        n, rows = bodies.shape[-2], bodies.shape[:-2]
+        each = bodies.reshape(-1, n, bodies.shape[-1]).transpose(0, 1)  # bodies first, as pooling wants them
+        said = self.body(each.flatten(0, 1)).unflatten(0, each.shape[:2])  # rows: ReLU in place costs none
+        highest, total = MaxAndSum.apply(said, mask.reshape(-1, n).t())
+        pooled = torch.cat((highest, _SUM_SCALE * total), dim=-1)
+        return self.head(torch.cat((pooled.reshape(*rows, -1), self.own(own)), dim=-1))
+
+
+class SetActor(nn.Module):
+    """What drives: a diagonal Gaussian over the wish for a velocity. Its input is what the vehicle knows."""
+
+    def __init__(self, n_body: int, n_own: int, config: LearningConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        self.n_body, self.n_own = n_body, n_own
+        self.goal_gain = config.twin.goal_gain
+        self.net = SetEncoder(n_body, n_own, NUM_WISHES, config, 0.01, generator)
+        self.log_std = nn.Parameter(torch.full((NUM_WISHES,), math.log(config.policy.initial_std)))
+
+    def forward(self, bodies: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
+        """(..., 3) mean wish; straight to the goal at birth."""
+        ahead = self.goal_gain * own[..., AT_DIRECTION]
+        said = self.net(bodies, own, bodies[..., :1])
+        return torch.cat([ahead + said[..., :2], said[..., 2:]], dim=-1)
+
+
+class SetCritic(nn.Module):
+    """Expected return, from what the vehicle knows and from the bodies' true places, now and later."""
+
+    def __init__(
+        self, n_body: int, n_own: int, n_truth: int, config: LearningConfig, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.net = SetEncoder(n_body + n_truth, n_own, 1, config, 1.0, generator)
+
+    def forward(self, bodies: torch.Tensor, own: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        """(...,)."""
+        there = torch.maximum(bodies[..., :1], truth[..., 2:3])
+        return self.net(torch.cat([bodies, truth], dim=-1), own, there).squeeze(-1)
+
+
+class MaxAndSum(torch.autograd.Function):
+    """(highest, sum), both (rows, wide), over the bodies of relu(said) where ``mask`` is 1; 0 where no body
+    is there. Its gradient is its own: torch's, by the pieces, takes as long as all products of the policy.
+
+    ``said`` (bodies, rows, wide) is what an encoder says of each body, ``mask`` (bodies, rows) is 1 or 0 and
+    has no gradient. Bodies come first: what is next to each other in memory is then reduced together. Bodies
+    that are equally high share the gradient of the highest, as in ``torch.amax``.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, said: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """As the class says."""
+        each = torch.relu(said).mul_(mask.to(said.dtype).unsqueeze(-1))
+        highest = each.amax(dim=0)
+        ctx.save_for_backward(each, highest)
+        return highest, _sum(each)
+
+    @staticmethod
+    def backward(ctx: Any, *to_outputs: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """(gradient of ``said``, None)."""
+        to_highest, to_sum = to_outputs
+        each, highest = ctx.saved_tensors
+        is_highest = each.clone().eq_(highest)
+        to_each = is_highest.mul_(to_highest / _sum(is_highest)).add_(to_sum)
+        torch.ops.aten.threshold_backward.grad_input(to_each, each, 0, grad_input=to_each)
+        return to_each, None
+
+
+def _sum(each: torch.Tensor) -> torch.Tensor:
+    """Over the bodies. Torch adds up in float32 in any case, and twice as fast where it is told."""
+    return each.sum(dim=0, dtype=torch.float32).to(each.dtype)
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
+Net = TypeVar("Net", bound=nn.Module)
+
+
+def actor_of(checkpoint: Checkpoint) -> SetActor:
+    """The policy over a set of bodies. Raises CheckpointError where its networks are not those of its
+    config."""
+    config = checkpoint.config
+    wide, head = config.twin.body_hidden, config.twin.head_hidden
+    with _refused(checkpoint):
+        part = checkpoint.model()["policy"]
+        for name, shape in (
+            ("net.body.0.weight", (wide, BODY_WIDTH)),
+            ("net.head.0.weight", (head, 3 * wide)),
+        ):
+            if tuple(part[name].shape) != shape:
+                raise ValueError(f"{name} is {tuple(part[name].shape)} instead of {shape}")
+        actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator())
+        actor.load_state_dict(part)
+    return _finite(actor, checkpoint)
+
+
+def mixture_net_of(checkpoint: Checkpoint) -> MixtureNet:
+    """A learned forecast. Raises as ``actor_of``."""
+    with _refused(checkpoint):
+        net = MixtureNet(torch.Generator())
+        net.load_state_dict(checkpoint.model()["forecast"])
+    return _finite(net, checkpoint)
+
+
+@contextlib.contextmanager
+def _refused(checkpoint: Checkpoint) -> Iterator[None]:
+    """Turn what networks of another shape raise into a CheckpointError."""
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
+        ) from None
+
+
+def _finite(net: Net, checkpoint: Checkpoint) -> Net:
+    for name, tensor in net.state_dict().items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(
+                f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
+                "checkpoint"
+            )
+    return net.eval()

@@ -1,0 +1,316 @@
+"""Latent world model: predicts the next observation's first 24 columns and how sure it is (paper, Sec.
+"Latent World Model").
+
+z = f(o), z' = g(z, a), o' = h(z') with a mean and a log-variance per target. Loss: reconstruction of the true
+next observation plus beta
+|f(o') - z'|^2, both summed over their dimensions. What goes beyond the paper is a switch of
+``WorldModelConfig`` each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as fn
+from torch import Tensor, nn
+
+from uuvtai.common.errors import SettingError
+from uuvtai.config.learning import WorldModelConfig
+from uuvtai.learning.networks import Moments, PlainAdam, RunningNorm, guarded_step, mlp, moments_of
+
+N_TARGET = 24
+"""first columns of the observation: goal, heading error, velocity, yaw rate, depth, tilt, 12 sector ranges"""
+N_ACTION = 4
+N_FEATURES = 2
+"""residual, uncertainty"""
+
+LOG_VAR_BOUNDS = (-12.0, 6.0)
+"""of a target in the decoder's unit; approached smoothly, so that no gradient dies"""
+MIN_DEVIATION = 1e-5
+"""smallest running deviation of a target, in its own unit: below any sensor's resolution"""
+MAX_DEVIATIONS = 100.0
+"""a jump counts as at most this many running deviations; replanned routes reach about 50"""
+_OUT_GAIN = 0.01
+"""of the decoder: at birth it says "as ever" with variance one"""
+
+
+class Prediction(NamedTuple):
+    """Next observation's targets, raw SI units."""
+
+    latent: Tensor
+    """(..., latent) z'"""
+    mean: Tensor
+    """(..., 24)"""
+    log_var: Tensor
+    """(..., 24), natural logarithm of the variance in squared SI units"""
+
+
+class Losses(NamedTuple):
+    """Means over the valid samples, scalars."""
+
+    total: Tensor
+    reconstruction: Tensor
+    """[nat] if ``likelihood``, else squared decoder units; summed over the targets"""
+    dynamics: Tensor
+    """squared distance in the latent space"""
+
+
+class WorldModel(nn.Module):
+    """Encoder, latent dynamics and decoder with the statistics they scale by; inputs are raw observations in
+    SI units.
+
+    The decoder's unit is the running deviation of what it decodes, the one-step change (``predict_change``)
+    or the target itself, so that metres, radians and m/s weigh the same; 1 without ``normalise_targets``.
+    Actions are clamped to [-1, 1], as the environment does.
+    """
+
+    def __init__(self, n_obs: int, config: WorldModelConfig, generator: torch.Generator) -> None:
+        """``n_obs`` columns of the observation, at least 24 (ValueError); initial weights come from the CPU
+        ``generator``."""
+        super().__init__()
+        if n_obs < N_TARGET:
+            raise SettingError(
+                f"the world model predicts the first {N_TARGET} columns of the observation, but it has only "
+                f"{n_obs}"
+            )
+        self.n_obs, self.config = n_obs, config
+        self.encoder = mlp((n_obs, *config.hidden, config.latent), "elu", generator)
+        self.dynamics = mlp((config.latent + N_ACTION, *config.hidden, config.latent), "elu", generator)
+        self.decoder = mlp((config.latent, *config.hidden, 2 * N_TARGET), "elu", generator, _OUT_GAIN)
+        self.observation_norm, self.change_norm = RunningNorm(n_obs), RunningNorm(N_TARGET)
+
+    def encode(self, obs: Tensor) -> Tensor:
+        """z (..., latent) of raw observations (..., n_obs)."""
+        return self.encoder(self.observation_norm(obs))
+
+    def advance(self, latent: Tensor, action: Tensor) -> Tensor:
+        """z' (..., latent) after an action (..., 4)."""
+        return self.dynamics(torch.cat([latent, action.clamp(-1.0, 1.0)], dim=-1))
+
+    def decode(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """(mean, log-variance), each (..., 24), in the decoder's unit."""
+        mean, raw = self.decoder(latent).split(N_TARGET, dim=-1)
+        low, high = LOG_VAR_BOUNDS
+        return mean, high - fn.softplus(high - low - fn.softplus(raw - low))
+
+    def predict(self, obs: Tensor, action: Tensor) -> Prediction:
+        """What follows observations (..., n_obs) and actions (..., 4)."""
+        latent = self.advance(self.encode(obs), action)
+        mean, log_var = self.decode(latent)
+        scale = self.scale()
+        return Prediction(latent, self.base(obs) + scale * mean, log_var + 2.0 * scale.log())
+
+    @torch.no_grad()
+    def features(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+        """Columns of the policy's input at ``next_obs``, (N, 2): one-step residual and uncertainty of the
+        prediction made before it.
+
+        Errors are counted in ``error_unit``: the residual is the root mean square of the errors, the
+        uncertainty sigma_t = mean(exp(log_var)) the mean predicted variance. In deviations of the one-step
+        change 1 = no better than saying "as before". What is not finite becomes 0.
+        """
+        predicted = self.predict(obs, action)
+        error = ((next_obs[..., :N_TARGET] - predicted.mean) / self.error_unit()).clamp(
+            -MAX_DEVIATIONS, MAX_DEVIATIONS
+        )
+        residual = error.square().mean(dim=-1).sqrt()
+        return torch.stack([residual, self.uncertainty(predicted)], dim=-1).nan_to_num_(0.0, 0.0, 0.0)
+
+    def uncertainty(self, predicted: Prediction) -> Tensor:
+        """sigma_t (...,): mean over the targets of predicted variance in squares of ``error_unit``."""
+        return torch.exp(predicted.log_var - 2.0 * self.error_unit().log()).mean(dim=-1)
+
+    def loss(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor) -> Losses:
+        """Losses of a batch: obs, next_obs (B, n_obs), action (B, 4), valid (B,) bool. ``next_obs`` is the
+        true one, also at an end."""
+        config, weight = self.config, valid / valid.sum().clamp(min=1)
+        ahead = self.advance(self.encode(obs), action)
+        mean, log_var = self.decode(ahead)
+        target = ((next_obs[:, :N_TARGET] - self.base(obs)) / self.scale()).clamp(
+            -MAX_DEVIATIONS, MAX_DEVIATIONS
+        )
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not config.stop_target_gradient):
+            following = self.encode(next_obs)
+        reconstruction = self._reconstruction(mean, log_var, target).sum(dim=-1) @ weight
+        dynamics = (following - ahead).square().sum(dim=-1) @ weight
+        total = config.reconstruction_weight * reconstruction + config.dynamics_weight * dynamics
+        return Losses(total, reconstruction, dynamics)
+
+    def observe(self, obs: Moments, change: Moments) -> None:
+        """Take in the moments of observations (n_obs columns) and of one-step changes of the targets (24
+        columns)."""
+        self.observation_norm.merge(obs)
+        self.change_norm.merge(change)
+
+    def _reconstruction(self, mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
+        error = (target - mean).square()
+        if not self.config.likelihood:
+            return error
+        nll = 0.5 * (error * torch.exp(-log_var) + log_var)
+        return nll * torch.exp(self.config.beta_nll * log_var).detach() if self.config.beta_nll else nll
+
+    def base(self, obs: Tensor) -> Tensor:
+        """What the decoder's mean is added to."""
+        if self.config.predict_change:
+            return obs[..., :N_TARGET]
+        return (
+            self.observation_norm.mean[:N_TARGET].float()
+            if self.config.normalise_targets
+            else obs.new_zeros(N_TARGET)
+        )
+
+    def scale(self) -> Tensor:
+        """(24,) decoder's unit in SI units."""
+        if not self.config.normalise_targets:
+            return torch.ones_like(self.change_norm.mean, dtype=torch.float32)
+        if self.config.predict_change:
+            return deviation(self.change_norm.moments)
+        return deviation(self.observation_norm.moments)[:N_TARGET]
+
+    def error_unit(self) -> Tensor:
+        """(24,) SI units that the features count errors in (``config.error_unit``)."""
+        return deviation(self.change_norm.moments) if self.config.error_unit == "change" else self.scale()
+
+
+def deviation(moments: Moments) -> Tensor:
+    """(width,) float32 running deviation, at least ``MIN_DEVIATION``; 1 before the first sample."""
+    variance = torch.where(moments.count > 0, moments.m2 / moments.count.clamp(min=1.0), 1.0)
+    return variance.sqrt().clamp(min=MIN_DEVIATION).float()
+
+
+def mean_of(values: Iterable[Tensor]) -> float:
+    """Mean of scalars that carry a gradient."""
+    return float(torch.stack([value.detach() for value in values]).mean())
+
+
+class WorldModelLearner:
+    """Adam on batches drawn from rollouts, with a guard against NaN."""
+
+    def __init__(self, world_model: WorldModel, config: WorldModelConfig) -> None:
+        self.model, self.config = world_model, config
+        self.optimiser = PlainAdam(world_model.parameters(), lr=config.learning_rate, fused=True)
+        self.skipped = 0
+        """steps left out because the gradient was not finite, or zero for want of valid samples"""
+
+    def update(
+        self,
+        obs: Tensor,
+        action: Tensor,
+        next_obs: Tensor,
+        generator: torch.Generator,
+        valid: Tensor | None = None,
+    ) -> dict[str, float]:
+        """``config.steps`` gradient steps on a rollout: obs, next_obs (T, N, n_obs), action (T, N, 4), valid
+        (T, N) (default: all).
+
+        ``next_obs`` is the observation each step led to, ``info["final_obs"]``. Rows that are not finite are
+        left out. ``generator`` (CPU) draws the batches. Returns metrics by their names in metrics.jsonl;
+        calibration is that of the first batch before its step: the model has not learned from this rollout
+        yet.
+        """
+        skipped, batches = (
+            self.skipped,
+            [self._drawn(obs, action, next_obs, valid, generator) for _ in range(self.config.steps)],
+        )
+        self._observe(batches)
+        metrics = self._calibration(batches[0])
+        learned = [self._learn(batch) for batch in batches]
+        return metrics | {
+            "world_model/reconstruction_loss": mean_of(losses.reconstruction for losses in learned),
+            "world_model/dynamics_loss": mean_of(losses.dynamics for losses in learned),
+            "world_model/skipped_updates": float(self.skipped - skipped),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Adam's moments and the counter; the model keeps its own."""
+        return {"optimiser": self.optimiser.state_dict(), "skipped": self.skipped}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """What ``state_dict`` gave."""
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.skipped = int(state["skipped"])
+
+    def _drawn(
+        self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor | None, generator: torch.Generator
+    ) -> ModelBatch:
+        """Random samples; rows with anything that is not finite are zero and not valid."""
+        steps, num_envs = action.shape[:2]
+        drawn = torch.randint(steps * num_envs, (self.config.batch,), generator=generator).to(obs.device)
+        t, env = drawn // num_envs, drawn % num_envs
+        rows = obs[t, env], action[t, env], next_obs[t, env]
+        good = torch.isfinite(torch.cat(rows, dim=1)).all(dim=1)
+        if valid is not None:
+            good &= valid[t, env]
+        kept = [torch.where(good[:, None], row, 0.0) for row in rows]
+        return ModelBatch(kept[0], kept[1], kept[2], good)
+
+    def _observe(self, batches: list[ModelBatch]) -> None:
+        """Statistics of what was drawn: a rollout's neighbouring steps are alike, so that all of it would say
+        little more."""
+        obs = torch.cat([batch.obs[batch.valid] for batch in batches])
+        following = torch.cat([batch.next_obs[batch.valid, :N_TARGET] for batch in batches])
+        self.model.observe(moments_of(obs), moments_of(following - obs[:, :N_TARGET]))
+
+    @torch.no_grad()
+    def _calibration(self, batch: ModelBatch) -> dict[str, float]:
+        kept = batch.valid
+        if not bool(kept.any()):
+            return {}
+        obs = batch.obs[kept]
+        predicted = self.model.predict(obs, batch.action[kept])
+        target = batch.next_obs[kept, :N_TARGET]
+        inside = coverage(
+            predicted.mean, predicted.log_var, target, torch.tensor([0.9], device=target.device)
+        )
+        return {
+            "world_model/standardised_residual": mean_squared_standardised_residual(
+                predicted.mean, predicted.log_var, target
+            ),
+            "world_model/coverage_90": float(inside),
+            "world_model/uncertainty": float(self.model.uncertainty(predicted).mean()),
+            "world_model/latent_std": float(self.model.encode(obs).std(dim=0, correction=0).mean()),
+        }
+
+    def _learn(self, batch: ModelBatch) -> Losses:
+        losses = self.model.loss(*batch)
+        self.skipped += not guarded_step(losses.total, self.model, self.optimiser)
+        return losses
+
+
+class ModelBatch(NamedTuple):
+    """Samples of a gradient step."""
+
+    obs: Tensor
+    """(B, n_obs)"""
+    action: Tensor
+    """(B, 4)"""
+    next_obs: Tensor
+    """(B, n_obs)"""
+    valid: Tensor
+    """(B,) bool"""
+
+
+# ------------------------------------------------------------------------------------------------ calibration
+
+
+def standardised_residual(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
+    """(target - mean) in predicted standard deviations, float64, same shape."""
+    return (target.double() - mean.double()) * torch.exp(-0.5 * log_var.double())
+
+
+def mean_squared_standardised_residual(mean: Tensor, log_var: Tensor, target: Tensor) -> float:
+    """1 where predicted variances are right on average; above 1: too sure of itself."""
+    return float(standardised_residual(mean, log_var, target).square().mean())
+
+
+def coverage(mean: Tensor, log_var: Tensor, target: Tensor, levels: Tensor) -> Tensor:
+    """Share of targets inside the central Gaussian interval of each nominal level, (n_level,): equals
+    ``levels`` if calibrated."""
+    if bool(((levels <= 0) | (levels >= 1)).any()):
+        raise ValueError(f"coverage levels must lie between 0 and 1, got {levels.tolist()}")
+    size = standardised_residual(mean, log_var, target).abs().flatten()
+    half_width = math.sqrt(2.0) * torch.erfinv(levels.double())
+    return torch.stack([(size <= width).double().mean() for width in half_width])

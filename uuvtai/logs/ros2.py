@@ -1,0 +1,584 @@
+"""ROS 2 without ROS: its standard messages by the package ``rosbags``, and our names for its frames.
+
+Only the messages named here are ever decoded, by definitions that come with ``rosbags``; a bag's own
+definitions are never parsed. Frames and units follow REP 103 and REP 105, scans without a return REP 117.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import zstandard
+
+from uuvtai.common.clocks import JUMP_S
+from uuvtai.common.files import parsed_json
+from uuvtai.config import Config
+from uuvtai.logs.encode import LogError, dumped, time_text
+from uuvtai.logs.reader import MAX_RECORD, ZSTD
+from uuvtai.logs.schemas import (
+    BASE64,
+    BOOLEAN,
+    FRAME_TRANSFORMS,
+    GRID,
+    LASER_SCAN,
+    NUMBER,
+    PACKED_FIELD,
+    POSE,
+    STRING,
+    THREE,
+    TIME,
+    UINT,
+    Schema,
+    array_of,
+    record,
+)
+from uuvtai.logs.topics.perception import dynamic_colors, grid_text, grid_values, static_colors
+
+EXTRA = "uuvtai[ros]"
+"""extra that brings ``rosbags``"""
+_PACKAGE = "rosbags"
+
+FRAMES = {"world": "map", "base": "base_link", "sonar": "sonar_link", "camera": "camera_optical_frame"}
+"""frame of a log: the same one in ROS"""
+FRAMES_BACK = {ros: ours for ours, ros in FRAMES.items()}
+
+SURFACE_PA = 101_325.0
+"""standard atmosphere, which FluidPressure has on top of the water's"""
+
+
+class RosMessages:
+    """Makes, packs (CDR) and unpacks standard messages: ``ros("geometry_msgs/msg/Vector3", x=0.0, ...)``."""
+
+    def __init__(self) -> None:
+        """Raises LogError where ``rosbags`` is not installed."""
+        if importlib.util.find_spec(_PACKAGE) is None:
+            raise LogError(f"uuv log convert with rosbag2 needs {_PACKAGE}: pip install '{EXTRA}'")
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def __call__(self, kind: str, **fields: Any) -> Any:
+        return self._store.types[kind](**fields)
+
+    def packed(self, message: Any) -> bytes:
+        """CDR of a message."""
+        return bytes(self._store.serialize_cdr(message, message.__msgtype__))
+
+    def unpacked(self, data: bytes, kind: str) -> Any:
+        """Message of CDR, compressed by itself or not. Raises ValueError for bytes that are none of this
+        kind."""
+        try:
+            if data.startswith(ZSTD) and 0 <= zstandard.frame_content_size(data) <= MAX_RECORD:
+                data = zstandard.ZstdDecompressor().decompress(data)
+            return self._store.deserialize_cdr(data, kind)
+        except MemoryError:
+            raise
+        except Exception as error:  # struct.error, AssertionError, rosbags' own and more
+            raise ValueError(f"not a {kind}: {error!r}") from None
+
+    def definition(self, kind: str) -> bytes:
+        """Text of a message's definition, as MCAP's encoding 'ros2msg' has it."""
+        return self._store.generate_msgdef(kind, ros_version=2)[0].encode()
+
+    # ------------------------------------------------------------------------------------------------- parts
+
+    def header(self, time_ns: int, frame: str) -> Any:
+        """std_msgs/Header; ``frame`` by our name or ROS's."""
+        sec, nanosec = divmod(time_ns, 1_000_000_000)
+        stamp = self("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self("std_msgs/msg/Header", stamp=stamp, frame_id=FRAMES.get(frame, frame))
+
+    def vector(self, x: float, y: float, z: float, kind: str = "Vector3") -> Any:
+        """geometry_msgs/Vector3 or Point."""
+        return self(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
+
+    def quaternion(self, w: float, x: float, y: float, z: float) -> Any:
+        """geometry_msgs/Quaternion."""
+        return self("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
+
+    def twist(self, linear: Any, angular: Any) -> Any:
+        """geometry_msgs/Twist."""
+        return self("geometry_msgs/msg/Twist", linear=self.vector(*linear), angular=self.vector(*angular))
+
+
+def zeros(count: int) -> np.ndarray:
+    """A covariance that is unknown."""
+    return np.zeros(count)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A log's control steps as ROS 2's standard messages; the table of docs/viewers.md.
+
+
+Step = dict[str, dict[str, Any]]
+"""messages of one control step by topic"""
+
+WRITTEN = {
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/ground_truth/odom": "nav_msgs/msg/Odometry",
+    "/odometry/filtered": "nav_msgs/msg/Odometry",
+    "/imu/data": "sensor_msgs/msg/Imu",
+    "/pressure": "sensor_msgs/msg/FluidPressure",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/sonar/points": "sensor_msgs/msg/PointCloud2",
+    "/sonar/own_velocity": "geometry_msgs/msg/TwistStamped",
+    "/map": "nav_msgs/msg/OccupancyGrid",
+    "/map/dynamic": "nav_msgs/msg/OccupancyGrid",
+    "/cmd_vel": "geometry_msgs/msg/Twist",
+}
+"""ROS topic: its message"""
+SOURCES = frozenset(
+    (
+        *("/tf", "/state", "/pose_estimate", "/pose_covariance", "/sonar/scan", "/sonar/doppler"),
+        *("/map/static", "/map/dynamic", "/action"),
+    )
+)
+"""topics of a log that anything is made of"""
+INVALID_VAR = 1e6
+"""[m^2/s^2] variance of a velocity that the instrument calls invalid"""
+_FLOAT32 = 7
+_CLOUD_FIELDS = ("x", "y", "z", "intensity", "velocity")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a run's config says about its messages."""
+
+    max_range_m: float
+    pa_per_m: float
+    """pressure of a metre of water"""
+    limits: tuple[float, ...]
+    """[m/s, m/s, m/s, rad/s] that an action of 1 asks for"""
+
+    @classmethod
+    def of(cls, given: dict[str, Any]) -> Setup:
+        """From a config as read from YAML; what it lacks is the default. Raises ValueError, TypeError,
+        AttributeError."""
+        vehicle, default = given.get("vehicle") or {}, Config()
+        names = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
+        sonar = (given.get("sensors") or {}).get("sonar") or {}
+
+        def value(name: str) -> float:
+            return float(vehicle.get(name, getattr(default.vehicle, name)))
+
+        return cls(
+            float(sonar.get("max_range_m", default.sensors.sonar.max_range_m)),
+            value("water_density_kg_m3") * value("gravity_m_s2"),
+            tuple(value(name) for name in names),
+        )
+
+
+def ros_messages(ros: RosMessages, setup: Setup, time_ns: int, step: Step) -> Iterator[tuple[str, Any]]:
+    """(topic, message) of one control step."""
+    if "/tf" in step:
+        yield "/tf", _transforms(ros, step["/tf"])
+    if "/state" in step:
+        yield from _motion(ros, setup, time_ns, step)
+    if "/sonar/scan" in step:
+        yield "/scan", _scan(ros, setup, step["/sonar/scan"])
+        if "/sonar/doppler" in step:
+            yield "/sonar/points", _cloud(ros, step["/sonar/scan"], step["/sonar/doppler"]["velocity"])
+    if "/sonar/doppler" in step:
+        own = step["/sonar/doppler"]
+        head, twist = ros.header(_ns(own), "base"), ros.twist(own["own_velocity"], (0, 0, 0))
+        yield "/sonar/own_velocity", ros("geometry_msgs/msg/TwistStamped", header=head, twist=twist)
+    for topic, name in (("/map/static", "/map"), ("/map/dynamic", "/map/dynamic")):
+        if topic in step:
+            yield name, _grid(ros, step[topic])
+    if "/action" in step:
+        surge, sway, heave, yaw = np.multiply(step["/action"]["applied"], setup.limits)
+        yield "/cmd_vel", ros.twist((surge, sway, heave), (0, 0, yaw))
+
+
+def _ns(message: dict[str, Any]) -> int:
+    stamp = message["timestamp"]
+    return int(stamp["sec"]) * 1_000_000_000 + int(stamp["nsec"])
+
+
+def _wxyz(value: dict[str, float]) -> tuple[float, ...]:
+    return value["w"], value["x"], value["y"], value["z"]
+
+
+def _xyz(value: dict[str, float]) -> tuple[float, float, float]:
+    return value["x"], value["y"], value["z"]
+
+
+def _transforms(ros: RosMessages, data: dict[str, Any]) -> Any:
+    transforms = []
+    for one in data["transforms"]:
+        head = ros.header(_ns(one), one["parent_frame_id"])
+        child = ros.header(0, one["child_frame_id"]).frame_id
+        moved = ros(
+            "geometry_msgs/msg/Transform",
+            translation=ros.vector(*_xyz(one["translation"])),
+            rotation=ros.quaternion(*_wxyz(one["rotation"])),
+        )
+        transforms.append(
+            ros("geometry_msgs/msg/TransformStamped", header=head, child_frame_id=child, transform=moved)
+        )
+    return ros("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+
+def _motion(ros: RosMessages, setup: Setup, time_ns: int, step: Step) -> Iterator[tuple[str, Any]]:
+    state, measured = step["/state"], step["/state"]["measured"]
+    place, turn = state["position"], state["orientation"]
+    motion = state["velocity"], state["rates"]
+    yield "/ground_truth/odom", _odometry(ros, time_ns, (place, turn), motion, zeros(36), zeros(36))
+    if "/pose_estimate" in step:
+        pose = step["/pose_estimate"]["pose"]
+        place, turn = _xyz(pose["position"]), _wxyz(pose["orientation"])
+        pose_cov = np.array(step.get("/pose_covariance", {}).get("covariance", zeros(36)), float)
+        twist_cov = zeros(36)
+        if not measured["velocity_valid"]:
+            twist_cov[[0, 7, 14]] = INVALID_VAR
+        motion = measured["velocity"], measured["rates"]
+        yield "/odometry/filtered", _odometry(ros, time_ns, (place, turn), motion, pose_cov, twist_cov)
+        yield "/imu/data", _imu(ros, time_ns, turn, measured["rates"])
+    pressure = SURFACE_PA + measured["depth_m"] * setup.pa_per_m
+    head = ros.header(time_ns, "base")
+    yield (
+        "/pressure",
+        ros("sensor_msgs/msg/FluidPressure", header=head, fluid_pressure=pressure, variance=0.0),
+    )
+
+
+def _odometry(
+    ros: RosMessages, time_ns: int, pose: Any, motion: Any, pose_cov: np.ndarray, twist_cov: np.ndarray
+) -> Any:
+    place, turn = pose
+    at = ros(
+        "geometry_msgs/msg/Pose",
+        position=ros.vector(*place, kind="Point"),
+        orientation=ros.quaternion(*turn),
+    )
+    return ros(
+        "nav_msgs/msg/Odometry",
+        header=ros.header(time_ns, "world"),
+        child_frame_id=ros.header(0, "base").frame_id,
+        pose=ros("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=pose_cov),
+        twist=ros("geometry_msgs/msg/TwistWithCovariance", twist=ros.twist(*motion), covariance=twist_cov),
+    )
+
+
+def _imu(ros: RosMessages, time_ns: int, turn: Any, rates: Any) -> Any:
+    """Attitude as estimated and the gyro; logs hold no acceleration, which covariance[0] = -1 says."""
+    return ros(
+        "sensor_msgs/msg/Imu",
+        header=ros.header(time_ns, "base"),
+        orientation=ros.quaternion(*turn),
+        orientation_covariance=zeros(9),
+        angular_velocity=ros.vector(*rates),
+        angular_velocity_covariance=zeros(9),
+        linear_acceleration=ros.vector(0, 0, 0),
+        linear_acceleration_covariance=np.array([-1.0] + [0.0] * 8),
+    )
+
+
+def _bearings(scan: dict[str, Any]) -> np.ndarray:
+    return np.linspace(scan["start_angle"], scan["end_angle"], len(scan["ranges"]))
+
+
+def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
+    """REP 117: -inf where noise puts a return behind the sonar, NaN where nothing is known, +inf where
+    nothing is."""
+    ranges, intensities = np.array(scan["ranges"], np.float32), np.array(scan["intensities"], np.float32)
+    first, last = float(scan["start_angle"]), float(scan["end_angle"])
+    return ros(
+        "sensor_msgs/msg/LaserScan",
+        header=ros.header(_ns(scan), scan["frame_id"]),
+        angle_min=first,
+        angle_max=last,
+        angle_increment=(last - first) / max(len(ranges) - 1, 1),
+        time_increment=0.0,
+        scan_time=0.0,
+        range_min=0.0,
+        range_max=setup.max_range_m,
+        ranges=np.select(
+            [(intensities > 0) & (ranges >= 0), intensities > 0, ranges > 0],
+            [ranges, np.float32(-math.inf), np.float32(math.inf)],
+            np.float32(math.nan),
+        ),
+        intensities=intensities,
+    )
+
+
+def _cloud(ros: RosMessages, scan: dict[str, Any], velocity: Any) -> Any:
+    """Returns only; their velocity is NaN where the sonar measures none."""
+    ranges, bearing, shine = np.array(scan["ranges"]), _bearings(scan), np.array(scan["intensities"])
+    hit = shine > 0
+    speed = np.array(velocity) if len(velocity) else np.full(len(ranges), math.nan)
+    columns = (ranges * np.cos(bearing), ranges * np.sin(bearing), 0 * ranges, shine, speed)
+    points = np.column_stack(columns)[hit].astype("<f4")
+    fields = [
+        ros("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=_FLOAT32, count=1)
+        for i, name in enumerate(_CLOUD_FIELDS)
+    ]
+    step = 4 * len(fields)
+    return ros(
+        "sensor_msgs/msg/PointCloud2",
+        header=ros.header(_ns(scan), scan["frame_id"]),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=step,
+        row_step=step * len(points),
+        data=np.frombuffer(points.tobytes(), np.uint8),
+        is_dense=len(velocity) > 0,
+    )
+
+
+def _grid(ros: RosMessages, grid: dict[str, Any]) -> Any:
+    """Probabilities in per cent."""
+    if len(base64.b64decode(grid["data"])) % grid["row_stride"]:
+        raise ValueError("a grid that is cut off")
+    values, pose, head = grid_values(grid), grid["pose"], ros.header(_ns(grid), grid["frame_id"])
+    origin = ros(
+        "geometry_msgs/msg/Pose",
+        position=ros.vector(*_xyz(pose["position"]), kind="Point"),
+        orientation=ros.quaternion(*_wxyz(pose["orientation"])),
+    )
+    info = ros(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=head.stamp,
+        resolution=float(grid["cell_size"]["x"]),
+        width=values.shape[1],
+        height=values.shape[0],
+        origin=origin,
+    )
+    data = np.rint(100 * np.clip(values, 0, 1)).astype(np.int8).ravel()
+    return ros("nav_msgs/msg/OccupancyGrid", header=head, info=info, data=data)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# ROS 2's standard messages as a log's JSON messages; the table of docs/viewers.md. Nothing in a message is
+# trusted: what does not fit together is a ValueError.
+
+
+_CLOUD = record(
+    "foxglove.PointCloud",
+    timestamp=TIME,
+    frame_id=STRING,
+    pose=POSE,
+    point_stride=UINT,
+    fields=array_of(PACKED_FIELD),
+    data=BASE64,
+)
+_ODOMETRY = record(
+    "uuv.Odometry",
+    timestamp=TIME,
+    frame_id=STRING,
+    pose=POSE,
+    pose_covariance=array_of(NUMBER),
+    velocity=THREE,
+    rates=THREE,
+    velocity_valid=BOOLEAN,
+)
+_IMU = record(
+    "uuv.Imu",
+    "",
+    {"acceleration": THREE, "orientation": POSE["properties"]["orientation"]},
+    timestamp=TIME,
+    frame_id=STRING,
+    rates=THREE,
+)
+_PRESSURE = record("uuv.Pressure", timestamp=TIME, frame_id=STRING, pressure_pa=NUMBER, depth_m=NUMBER)
+_TWIST = record("uuv.Twist", linear=THREE, angular=THREE)
+_TWIST_STAMPED = record("uuv.TwistStamped", timestamp=TIME, frame_id=STRING, linear=THREE, angular=THREE)
+
+_LATE_NS = round(1e9 * JUMP_S)
+NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}
+"""ROS topic: the log's, where it is another"""
+_UNIT = 0.1
+"""by which the square of a quaternion's length may be off 1"""
+_TYPES = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
+"""PointField's codes: Foxglove's"""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How messages of one kind become ours."""
+
+    schema: Schema
+    read: Callable[[Reader, Any], bytes]
+
+
+class Reader:
+    """Of one message, logged at ``log_ns``; times count from the start of the bag's ``span_ns``."""
+
+    def __init__(self, topic: str, setup: Setup, span_ns: tuple[int, int], log_ns: int) -> None:
+        self.topic, self.setup, self._span_ns, self._log_ns = topic, setup, span_ns, log_ns
+        self.is_foreign = False
+        """whether a stamp was of another clock than the bag's, not just late"""
+
+    def head(self, header: Any) -> dict[str, Any]:
+        """timestamp and frame_id."""
+        return {
+            "timestamp": parsed_json(self.stamp(header), self.topic),
+            "frame_id": FRAMES_BACK.get(header.frame_id, header.frame_id),
+        }
+
+    def stamp(self, header: Any) -> str:
+        """Time as a foxglove time; of a stamp outside of the bag's span that of the log."""
+        time_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+        start_ns, end_ns = self._span_ns
+        if not start_ns <= time_ns <= end_ns:
+            self.is_foreign |= max(start_ns - time_ns, time_ns - end_ns) > _LATE_NS
+            time_ns = self._log_ns
+        return time_text(time_ns - start_ns)
+
+
+def _read_xyz(value: Any) -> dict[str, float]:
+    return {"x": value.x, "y": value.y, "z": value.z}
+
+
+def _list(value: Any) -> list[float]:
+    return [value.x, value.y, value.z]
+
+
+def _turn(value: Any) -> dict[str, float]:
+    if abs(value.x**2 + value.y**2 + value.z**2 + value.w**2 - 1) > _UNIT:
+        raise ValueError(f"an orientation that is none ({value.x:g}, {value.y:g}, {value.z:g}, {value.w:g})")
+    return {"x": value.x, "y": value.y, "z": value.z, "w": value.w}
+
+
+def _pose(value: Any) -> dict[str, Any]:
+    return {"position": _read_xyz(value.position), "orientation": _turn(value.orientation)}
+
+
+_HERE = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+
+
+def _read_transforms(reader: Reader, message: Any) -> bytes:
+    return dumped({"transforms": [_transform(reader, one) for one in message.transforms]})
+
+
+def _transform(reader: Reader, one: Any) -> dict[str, Any]:
+    head = reader.head(one.header)
+    return {
+        "timestamp": head["timestamp"],
+        "parent_frame_id": head["frame_id"],
+        "child_frame_id": FRAMES_BACK.get(one.child_frame_id, one.child_frame_id),
+        "translation": _read_xyz(one.transform.translation),
+        "rotation": _turn(one.transform.rotation),
+    }
+
+
+def _read_scan(reader: Reader, message: Any) -> bytes:
+    """REP 117: +inf is no return, as in our logs: maximum range with intensity 0. -inf is too near to
+    measure: a return at the least range. What else is no range (NaN, below the least, beyond the greatest)
+    says nothing: range 0 with intensity 0, so that no water counts as free."""
+    ranges = np.asarray(message.ranges, np.float64)
+    shine = np.asarray(message.intensities, np.float64)
+    if len(shine) not in (0, len(ranges)):
+        raise ValueError(f"{len(ranges)} ranges with {len(shine)} intensities")
+    near, none = np.isneginf(ranges), np.isposinf(ranges)
+    hit = near | ((ranges >= message.range_min) & (ranges <= message.range_max) & ~none)
+    shine = np.where(hit, np.fmax(shine, 1e-3) if len(shine) else 1.0, 0.0)
+    ranges = np.select([near, hit, none], [message.range_min, ranges, message.range_max], 0.0)
+    last = message.angle_min + message.angle_increment * max(len(ranges) - 1, 0)
+    return dumped(
+        {
+            **reader.head(message.header),
+            "pose": _HERE,
+            "start_angle": message.angle_min,
+            "end_angle": last,
+            "ranges": ranges.tolist(),
+            "intensities": shine.tolist(),
+        }
+    )
+
+
+def _read_cloud(reader: Reader, message: Any) -> bytes:
+    fields = [
+        {"name": one.name, "offset": one.offset, "type": _TYPES[one.datatype]} for one in message.fields
+    ]
+    points, row = np.asarray(message.data, np.uint8), message.point_step * message.width
+    if row < message.row_step and len(points) == message.row_step * message.height:
+        points = points.reshape(message.height, -1)[:, :row]  # without what fills up the rows
+    if message.is_bigendian or points.size != row * message.height:
+        raise ValueError("a point cloud that is big-endian or cut off")
+    data = base64.b64encode(points.tobytes()).decode()
+    head = reader.head(message.header)
+    return dumped({**head, "pose": _HERE, "point_stride": message.point_step, "fields": fields, "data": data})
+
+
+def _read_grid(reader: Reader, message: Any) -> bytes:
+    """Per cent as a share; unknown (-1) as a half."""
+    info, data = message.info, np.asarray(message.data, np.int8)
+    if len(data) != info.width * info.height or not len(data) or data.max() > 100:
+        raise ValueError(f"a map of {info.width} x {info.height} with {len(data)} cells")
+    values = np.where(data < 0, np.float32(0.5), data / np.float32(100)).reshape(info.height, info.width)
+    head = reader.head(message.header)
+    paint = dynamic_colors if reader.topic == "/map/dynamic" else static_colors
+    place = _pose(info.origin)
+    dumped(place)  # finite
+    return grid_text(
+        reader.stamp(message.header), head["frame_id"], place, info.resolution, values.astype("<f4"), paint
+    )
+
+
+def _read_odometry(reader: Reader, message: Any) -> bytes:
+    twist = message.twist.twist
+    return dumped(
+        {
+            **reader.head(message.header),
+            "pose": _pose(message.pose.pose),
+            "pose_covariance": np.asarray(message.pose.covariance, float).tolist(),
+            "velocity": _list(twist.linear),
+            "rates": _list(twist.angular),
+            "velocity_valid": bool(message.twist.covariance[0] < INVALID_VAR),
+        }
+    )
+
+
+def _read_imu(reader: Reader, message: Any) -> bytes:
+    """What a covariance of -1, or an orientation of zeros, says is not measured is null."""
+    q, attitude, acceleration = (
+        message.orientation,
+        message.orientation_covariance[0],
+        message.linear_acceleration_covariance[0],
+    )
+    return dumped(
+        {
+            **reader.head(message.header),
+            "orientation": None if attitude == -1 or not any((q.x, q.y, q.z, q.w)) else _turn(q),
+            "rates": _list(message.angular_velocity),
+            "acceleration": None if acceleration == -1 else _list(message.linear_acceleration),
+        }
+    )
+
+
+def _pressure(reader: Reader, message: Any) -> bytes:
+    depth = (message.fluid_pressure - SURFACE_PA) / reader.setup.pa_per_m
+    return dumped({**reader.head(message.header), "pressure_pa": message.fluid_pressure, "depth_m": depth})
+
+
+def _twist(reader: Reader, message: Any) -> bytes:
+    return dumped({"linear": _list(message.linear), "angular": _list(message.angular)})
+
+
+def _twist_stamped(reader: Reader, message: Any) -> bytes:
+    twist = message.twist
+    head = reader.head(message.header)
+    return dumped({**head, "linear": _list(twist.linear), "angular": _list(twist.angular)})
+
+
+READ = {
+    "tf2_msgs/msg/TFMessage": Reading(FRAME_TRANSFORMS, _read_transforms),
+    "nav_msgs/msg/Odometry": Reading(_ODOMETRY, _read_odometry),
+    "sensor_msgs/msg/Imu": Reading(_IMU, _read_imu),
+    "sensor_msgs/msg/FluidPressure": Reading(_PRESSURE, _pressure),
+    "sensor_msgs/msg/LaserScan": Reading(LASER_SCAN, _read_scan),
+    "sensor_msgs/msg/PointCloud2": Reading(_CLOUD, _read_cloud),
+    "nav_msgs/msg/OccupancyGrid": Reading(GRID, _read_grid),
+    "geometry_msgs/msg/TwistStamped": Reading(_TWIST_STAMPED, _twist_stamped),
+    "geometry_msgs/msg/Twist": Reading(_TWIST, _twist),
+}
+"""message: how it is read; all others are left out"""

@@ -1,1 +1,0 @@
-"""``uuv eval --explain``: failed episodes played again, and why each failed."""

@@ -1,1 +1,0 @@
-"""``uuv profile``: time per stage, throughput, memory, and the real-time loop of one vehicle."""

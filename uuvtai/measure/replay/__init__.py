@@ -1,1 +1,0 @@
-"""Recorded episodes fed to the pilot again: does it decide the same?"""

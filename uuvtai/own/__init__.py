@@ -1,6 +1,0 @@
-"""Pieces that the user brings: a planner, a controller or a policy in a file of her own, beside the shipped
-ones."""
-
-from uuvtai.own.protocol import About, Forecast, View, piece
-
-__all__ = ["About", "Forecast", "View", "piece"]

@@ -1,0 +1,461 @@
+"""The one place where Python of the user's is imported: from the file that she named, never from one that a
+file names."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import ModuleType
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from uuvtai.common.files import read_bytes
+from uuvtai.envs.vector_env import NUM_ACTIONS
+from uuvtai.kernels.planning.observation import placed_columns
+from uuvtai.learning.export import graph as graph_check
+from uuvtai.learning.export import graph as onnx_session
+from uuvtai.learning.policy_agent import CHUNK
+from uuvtai.plugins import adapters
+from uuvtai.plugins.adapters import CallMeter, Marks, OwnCode, OwnDriver, asking_controller, asking_policy
+from uuvtai.plugins.api import (
+    CONTROLLER,
+    PLANNER,
+    POLICY,
+    About,
+    Forecast,
+    PieceError,
+    PieceSpec,
+    failed,
+    piece,
+)
+from uuvtai.sim.rrt import PlanRequest
+from uuvtai.sim.sim import Sim
+
+MAX_BYTES = 1 << 20
+"""of a Python file"""
+FACTORY = "load"
+"""a function of this name is called once; what it returns drives"""
+
+_loaded: dict[tuple[str, str], ModuleType] = {}
+
+
+class _OwnSource(SourceFileLoader):
+    """Reads as everything is read, and leaves no bytecode beside the user's file."""
+
+    def get_data(self, path: str) -> bytes:
+        return read_bytes(Path(path), MAX_BYTES)
+
+    def path_stats(self, path: str) -> Any:
+        raise OSError
+
+    def set_data(self, *_given: Any, **_others: Any) -> None:
+        pass
+
+
+def content_of(spec: PieceSpec, limit: int) -> bytes:
+    """The piece's file. Raises PieceError where there is none, FileError for what is no plain file."""
+    try:
+        return read_bytes(spec.path, limit)
+    except OSError as error:
+        raise PieceError(f"{spec.option}: {spec.path} cannot be read ({error.strerror})") from None
+
+
+def object_of(spec: PieceSpec) -> Any:
+    """The object that the piece names, its file imported once per content. Raises PieceError, FileError."""
+    module = _module(spec)
+    if not hasattr(module, spec.name):
+        there = [name for name, value in vars(module).items() if _is_own(value, module)]
+        raise PieceError(
+            f"{spec.option}: {spec.path} has no {spec.name!r}; it has {', '.join(there) or 'no function'}"
+        )
+    return getattr(module, spec.name)
+
+
+def _module(spec: PieceSpec) -> ModuleType:
+    digest = hashlib.sha256(content_of(spec, MAX_BYTES)).hexdigest()
+    key = str(spec.path.resolve()), digest
+    if key not in _loaded:
+        name = f"uuv_own_{spec.path.stem}_{digest[:8]}"
+        found = importlib.util.spec_from_loader(name, _OwnSource(name, str(spec.path)))
+        assert found is not None  # a loader was given
+        module = importlib.util.module_from_spec(found)
+        folder = str(spec.path.resolve().parent)
+        if folder not in sys.path:  # what lies beside it can be imported, as for 'python mine.py'
+            sys.path.insert(0, folder)
+        sys.modules[name] = module  # dataclasses and pickles look for it
+        try:
+            _OwnSource(name, str(spec.path)).exec_module(module)
+        except (Exception, SystemExit) as error:
+            del sys.modules[name]
+            raise failed(error, spec.path, f"while {spec.option} was imported") from error
+        _loaded[key] = module
+    return _loaded[key]
+
+
+def _is_own(value: Any, module: ModuleType) -> bool:
+    return callable(value) and getattr(value, "__module__", "") == module.__name__
+
+
+def made(found: Any, spec: PieceSpec, about: About) -> Any:
+    """What drives: the object itself, an instance of a class, or what a function named ``load`` returns.
+    Raises PieceError."""
+    is_class, make = inspect.isclass(found), cast("Callable[..., Any]", found)
+    if not is_class and not (spec.name == FACTORY and inspect.isroutine(found)):
+        return found
+    takes = _parameters(found)
+    if takes > 1:
+        raise PieceError(
+            f"{place_of(found, spec)}: {spec.name} needs {takes} arguments; it gets one (about) or none"
+        )
+    try:
+        made_one = make(about) if takes or _may_take(found) else make()
+    except (Exception, SystemExit) as error:
+        raise failed(error, spec.path, f"while {spec.option} was made") from error
+    for name in ("rows", "arrays", "hold_steps"):  # a decorated ``load`` says it for what it returns
+        if not is_class and hasattr(found, name) and not hasattr(made_one, name):
+            return _Marked(made_one, {n: getattr(found, n) for n in ("rows", "arrays", "hold_steps")})
+    return made_one
+
+
+class _Marked:
+    """An object of somebody else's library with the marks of ``piece``."""
+
+    def __init__(self, inner: Any, marks: dict[str, Any]) -> None:
+        self.inner, self.rows, self.arrays, self.hold_steps = (
+            inner,
+            marks["rows"],
+            marks["arrays"],
+            marks["hold_steps"],
+        )
+
+
+def inner_of(found: Any) -> Any:
+    """The object below the marks."""
+    return found.inner if isinstance(found, _Marked) else found
+
+
+def _parameters(found: Any) -> int:
+    """How many arguments it needs at least."""
+    try:
+        given = inspect.signature(found).parameters.values()
+    except (TypeError, ValueError):  # of compiled code
+        return 0
+    return sum(p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in given)
+
+
+def _may_take(found: Any) -> bool:
+    """Whether its first argument is called ``about``, though it may be left out."""
+    try:
+        return next(iter(inspect.signature(found).parameters), "") == "about"
+    except (TypeError, ValueError):
+        return False
+
+
+def method_of(
+    found: Any, names: tuple[str, ...], spec: PieceSpec, usage: str, count: int
+) -> Callable[..., Any]:
+    """The function to call: the first method of ``names`` that the object has, or the object itself. Raises
+    PieceError where there is none, or where it takes other than ``count`` arguments."""
+    inner = inner_of(found)
+    method = next((getattr(inner, name) for name in names if callable(getattr(inner, name, None))), inner)
+    if not callable(method):
+        raise PieceError(
+            f"{spec.option}: {spec.name} is {type(inner).__name__}, which cannot be called and has no "
+            f"{' or '.join(names)}; {usage}"
+        )
+    try:
+        taken = inspect.signature(method)
+        taken.bind(*range(count), **({"row": 0} if "row" in taken.parameters else {}))
+    except TypeError as error:
+        raise PieceError(f"{place_of(method, spec)}: {error}; {usage}") from None
+    except ValueError:  # of compiled code
+        pass
+    return method
+
+
+def place_of(found: Any, spec: PieceSpec) -> str:
+    """FILE:LINE where a function or a class begins, as far as it is known."""
+    code = getattr(inspect.unwrap(found) if inspect.isroutine(found) else found, "__code__", None)
+    if code is not None and code.co_filename == str(spec.path):
+        return f"{spec.path}:{code.co_firstlineno}"
+    return str(spec.path)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A policy as an ONNX graph of whoever's: it holds our operators alone, and its size, memory and work are
+# reckoned before ONNX Runtime sees it (``deploy.graph_check``).
+
+
+HOLD = "hold_steps"
+"""key of the graph's metadata: control steps that a decision is held for"""
+_OUTPUTS = ("action", "actions", "mean_action", "mean_actions", "mean")
+"""names that an action has where a graph gives more than it"""
+MAX_GRAPH_BYTES = graph_check.MAX_BYTES
+
+
+def graph_of(spec: PieceSpec) -> bytes:
+    """The file, with its weights if they lie beside it, no larger than a graph may be. Raises PieceError,
+    FileError."""
+    if not onnx_session.is_installed():
+        raise PieceError(f"{spec.option}: needs onnx and onnxruntime: pip install 'uuvtai[export]'")
+    graph = content_of(spec, MAX_GRAPH_BYTES)
+
+    def beside(name: str) -> bytes:
+        try:
+            return read_bytes(spec.path.parent / name, MAX_GRAPH_BYTES, spec.path.parent)
+        except OSError as error:
+            raise PieceError(
+                f"{spec.path}: its weights are in {name}, which cannot be read ({error.strerror}); copy that "
+                "file too, beside it"
+            ) from None
+
+    try:
+        return graph_check.with_weights(graph, beside)
+    except graph_check.GraphError as error:
+        raise PieceError(f"{spec.path}: {error.reason}") from None
+
+
+def onnx_policy(spec: PieceSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
+    """(function from observations (n, n_obs) to actions (n, 4), control steps per decision). Raises
+    PieceError for a graph that is strange, or made for another observation."""
+    try:
+        head = graph_check.head_of(graph)
+        output = next((known for known in _OUTPUTS if known in head.outputs), head.outputs[0])
+        if len(head.outputs) > 1:
+            graph = graph_check.only(graph, output)
+        if len(head.inputs) != 1:
+            raise PieceError(
+                f"{spec.path}: takes {', '.join(head.inputs) or 'nothing'}; a policy takes one input, "
+                f"observations (n, {n_obs}), and keeps no state; of 'uuv export' evaluate its run"
+            )
+        name, (width, rows, dtype) = next(iter(head.inputs.items()))
+        if dtype is None or rows == 0 or (rows or 0) > CHUNK:
+            raise PieceError(
+                f"{spec.path}: {name} takes no observations: a float input (n, {n_obs}) does, n "
+                f"open, 1, or up to {CHUNK}"
+            )
+        if width not in (None, n_obs):
+            raise PieceError(
+                f"{spec.path}: takes observations of {width} columns, here they have {n_obs} "
+                "(docs/gym.md lists them); --set features.n_track=.. and features.teacher=true add columns"
+            )
+        calls = -(-CHUNK // (rows or CHUNK))
+        graph_check.refuse_strange(graph, {name: (rows or CHUNK, n_obs)}, calls, rows or 1)
+        session = onnx_session.session(graph)
+    except graph_check.GraphError as error:
+        raise PieceError(f"{spec.path}: {error.reason}") from None
+    except PieceError:
+        raise
+    except Exception as error:  # ONNX Runtime's own, which share no base class beyond this
+        raise PieceError(
+            f"{spec.path}: ONNX Runtime cannot use it ({' '.join(str(error).split())[:200]})"
+        ) from None
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        given = obs.astype(dtype, copy=False)
+        if rows is None:
+            return session.run([output], {name: given})[0]
+        padded = np.zeros((-(-len(obs) // rows) * rows, n_obs), dtype)
+        padded[: len(obs)] = given
+        parts = [session.run([output], {name: part})[0] for part in np.split(padded, len(padded) // rows)]
+        return np.concatenate(parts)[: len(obs)]
+
+    return act, _hold(spec, head.metadata)
+
+
+def _hold(spec: PieceSpec, metadata: dict[str, str]) -> int:
+    text = metadata.get(HOLD, "1")
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text[:9]) <= 10_000:
+        raise PieceError(
+            f"{spec.path}: metadata {HOLD} = {text[:40]!r}; a whole number of control steps from 1"
+        )
+    return int(text)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# A piece of the user's from its name to what drives or plans in a simulator.
+
+
+_USAGE = {
+    PLANNER: "a planner is called plan(clearance, cell_m, start, goal, forecast)",
+    CONTROLLER: "a controller is called act(view)",
+    POLICY: "a policy is called act(obs)",
+}
+_METHODS = {PLANNER: ("plan",), CONTROLLER: ("act",), POLICY: ("act", "predict")}
+_ARGUMENTS = {PLANNER: 5, CONTROLLER: 1, POLICY: 1}
+_LIMITS = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+@dataclass
+class OwnPiece:
+    """A piece that was found: its file can be read and has what it names."""
+
+    spec: PieceSpec
+    sha256: str
+    """of its file; what that imports is not in it"""
+    found: Any
+    """the object; an ONNX graph's bytes"""
+    note: Callable[[str], None] = _say
+    """told of calls that take too long"""
+    meter: CallMeter | None = field(default=None, init=False)
+
+    @property
+    def label(self) -> str:
+        """What it is called in tables."""
+        return self.spec.label
+
+    def driver(self, sim: Sim) -> OwnDriver | None:
+        """Who drives this simulator; None for a planner, where the tree does. Raises PieceError."""
+        if self.spec.kind == PLANNER:
+            return None
+        columns = columns_of(sim)
+        about = about_of(sim, self.spec.argument)
+        code = self._code(sim, about)
+        if self.spec.kind == CONTROLLER:
+            return OwnDriver(sim, code, asking_controller(sim, code, columns, about.limits))
+        return OwnDriver(sim, code, asking_policy(code, sim.device))
+
+    def planner(self, sim: Sim) -> RouteSource | None:
+        """Who plans routes in this simulator; None where its own planner does. Raises PieceError."""
+        if self.spec.kind != PLANNER:
+            return None
+        code = self._code(sim, about_of(sim, self.spec.argument))
+        return RouteSource(code, sim.config.mapping.cell_m, sim.config.tracking.forecast_dt_s)
+
+    def told(self) -> str:
+        """What has to be said of its time; empty = nothing."""
+        return self.meter.told() if self.meter else ""
+
+    def close(self) -> None:
+        """Nobody waits for a call any more."""
+        if self.meter:
+            self.meter.close()
+
+    def document(self) -> dict[str, Any]:
+        """What ``uuv eval --json`` says of it: where it comes from, and the time of its calls so far."""
+        spec = self.spec
+        where = {
+            "kind": spec.kind,
+            "file": str(spec.path),
+            "object": spec.name or None,
+            "sha256": self.sha256,
+        }
+        return where | (self.meter.document() if self.meter else {})
+
+    def _code(self, sim: Sim, about: About) -> OwnCode:
+        spec, kind = self.spec, self.spec.kind
+        # a route is planned while the vehicle drives on: its time is held against a control step all the same
+        self.meter = CallMeter(spec.option, spec.path, about.dt_s, self.note)
+        if not spec.is_code:
+            act, hold_steps = onnx_policy(spec, self.found, about.n_obs)
+            return OwnCode(spec, act, None, str(spec.path), Marks(hold_steps=hold_steps), self.meter)
+        drives = made(self.found, spec, about)
+        inner = inner_of(drives)
+        act = method_of(drives, _METHODS[kind], spec, _USAGE[kind], _ARGUMENTS[kind])
+        place = f"{place_of(act, spec)}: {spec.name if act is inner else getattr(act, '__name__', spec.name)}"
+        marks = _marks(drives, place)
+        if kind == POLICY and getattr(act, "__name__", "") == "predict":
+            act = _predicting(act)
+        return OwnCode(spec, act, _reset_of(inner, self.found), place, marks, self.meter)
+
+
+def own_piece(spec: PieceSpec) -> OwnPiece:
+    """The piece of a name, refused at once where its file or object is missing. Raises PieceError,
+    FileError."""
+    if not spec.is_code:
+        graph = graph_of(spec)
+        return OwnPiece(spec, hashlib.sha256(graph).hexdigest(), graph)
+    content = content_of(spec, MAX_BYTES)
+    return OwnPiece(spec, hashlib.sha256(content).hexdigest(), object_of(spec))
+
+
+def columns_of(sim: Sim) -> dict[str, slice]:
+    """Columns of the observation by name."""
+    return {c.name: slice(first, first + width) for c, first, width in placed_columns(sim.config.features)}
+
+
+def about_of(sim: Sim, argument: str = "") -> About:
+    """What a piece is told before it begins."""
+    config, columns = sim.config, columns_of(sim)
+    limits = np.array([getattr(config.vehicle, name) for name in _LIMITS], np.float32)
+    assert len(limits) == NUM_ACTIONS
+    return About(
+        num_envs=sim.num_envs, dt_s=config.episode.control_dt_s, limits=limits, columns=columns,
+        n_obs=max(place.stop for place in columns.values()), cell_m=config.mapping.cell_m,
+        min_clearance_m=config.voronoi.min_clearance_m, device=sim.device.type, argument=argument,
+    )  # fmt: skip
+
+
+def _marks(drives: Any, place: str) -> Marks:
+    """How it wants to be called; torch for a torch module that says nothing."""
+    arrays = "torch" if isinstance(inner_of(drives), torch.nn.Module) else "numpy"
+    found = Marks(
+        *(getattr(drives, name, default) for name, default in Marks(arrays=arrays)._asdict().items())
+    )
+    given: Any = found
+    try:
+        piece(*given)
+    except ValueError as error:
+        raise PieceError(f"{place}: {error}") from None
+    return found
+
+
+def _predicting(predict: Callable[..., Any]) -> Callable[[Any], Any]:
+    """Stable-Baselines3's way: (actions, state), without exploration where it can be asked for."""
+    plain = "deterministic" not in inspect.signature(predict).parameters
+
+    def act(obs: Any) -> Any:
+        found = predict(obs) if plain else predict(obs, deterministic=True)
+        return found[0] if isinstance(found, tuple) else found
+
+    return act
+
+
+def _reset_of(inner: Any, found: Any) -> Callable[..., Any] | None:
+    """Its own method; of a plain function the function ``reset`` beside it in the file."""
+    own = getattr(inner, "reset", None)
+    if inspect.isroutine(inner) and getattr(inner, "__name__", "") != FACTORY:
+        own = getattr(sys.modules.get(inner.__module__), "reset", None) if inner is found else None
+    return own if callable(own) else None
+
+
+class RouteSource:
+    """Calls ``plan(clearance, cell_m, start, goal, forecast)`` for one env after the other; ``row=`` too
+    where it has that parameter."""
+
+    def __init__(self, code: OwnCode, cell_m: float, forecast_dt_s: float) -> None:
+        self.code, self._cell_m, self._dt_s = code, cell_m, forecast_dt_s
+        self._wants_row = "row" in inspect.signature(code.act).parameters
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """New episodes begin in the rows (n_env,) where this is not 0."""
+        self.code.forget(mask)
+
+    def plan(self, asked: PlanRequest) -> np.ndarray | None:
+        """Corners (n >= 2, 2) [m] from start to goal; None = no way. PieceError for any other answer."""
+        forecast = Forecast(asked.body, asked.radius_m, self._dt_s)
+        more = {"row": asked.env} if self._wants_row else {}
+
+        def called(_given: None) -> object:
+            return self.code.act(
+                asked.clearance_m, self._cell_m, asked.start.copy(), asked.goal.copy(), forecast, **more
+            )
+
+        found = self.code.called(called, None, 1)
+        if found is None:
+            return None
+        n_row, n_col = asked.clearance_m.shape
+        size_m = n_col * self._cell_m, n_row * self._cell_m
+        return adapters.waypoints(found, (asked.start, asked.goal), size_m, self.code.place)

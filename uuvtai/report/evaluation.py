@@ -1,0 +1,322 @@
+"""Tables of an evaluation (the document of ``uuv eval --json``): methods, pairs of them, why they failed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from uuvtai.common.colours import method_colours
+from uuvtai.common.enums import ENDINGS
+from uuvtai.report.blocks import Block, Figure, Paragraph
+from uuvtai.report.figures import Line, intervals, rates_text
+from uuvtai.report.tables import (
+    PAGE,
+    TERMINAL,
+    Cell,
+    Column,
+    Data,
+    Table,
+    accidents,
+    bodies,
+    number,
+    percent,
+    probability,
+    rate,
+    seconds,
+    sensing,
+    vehicle,
+    with_interval,
+)
+
+DAGGER = "\u2020"
+"""marks privileged methods in the terminal"""
+
+_ENDS = ("collision", "ttc", "out_of_tank", "timeout")
+
+
+def _name(m: dict[str, Any]) -> Cell:
+    return Cell(m["name"], f"{m['name']} {DAGGER}" if m.get("privileged") else "")
+
+
+def _rate(record: dict[str, Any], key: str) -> Cell:
+    """Of success or collision: as counted, else as the share says."""
+    n, outcomes, share = record["episodes"], record.get("outcomes"), record.get(f"{key}_rate")
+    if outcomes:
+        k = outcomes["success"] if key == "success" else accidents(outcomes)
+    else:
+        k = None if share is None else round(share * n)
+    return rate(k, n, record.get(f"{key}_ci95"))
+
+
+def _ends(record: dict[str, Any]) -> Cell:
+    counts = [str((record.get("outcomes") or {}).get(name, "-")) for name in _ENDS]
+    return Cell(" / ".join(counts), "/".join(counts))
+
+
+SUCCESS = Column("success", short="success [95 %]", of=lambda r: _rate(r, "success"))
+COLLISION = Column("collision", short="collision [95 %]", of=lambda r: _rate(r, "collision"))
+ENDS = Column("contact / TTC / out / timeout", 1, short="contact/ttc/\nout/timeout", of=_ends)
+TIME = Column(
+    "time to goal s", 2, short="time to\ngoal s", of=lambda r: number(r.get("time_to_success_mean_s"))
+)
+TTS = Column("TTS s", 4, of=lambda r: number(r.get("tts_s")))
+
+_METHODS = (
+    Column("method", left=True, of=_name),
+    SUCCESS,
+    COLLISION,
+    ENDS,
+    TIME,
+    TTS,
+    Column("replans", 3, only=TERMINAL, of=lambda m: number(m["replans_per_episode"])),
+    Column("steps/s", 5, only=TERMINAL, of=lambda m: number(m["env_steps_per_s"], 0)),
+    Column("return", only=PAGE, of=lambda m: number(m.get("return_mean"))),
+    Column("closest m", only=PAGE, of=lambda m: number(m.get("min_clearance_mean_m"), 2)),
+)
+
+
+def milliseconds(value: float) -> str:
+    """'0.018', '4.6', '450'."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def _own_ms(m: dict[str, Any]) -> Cell:
+    """Mean time of a decision, and the slowest; nothing where no code of the user's was called."""
+    own = m.get("own") or {}
+    mean_ms, slowest_ms = own.get("decision_ms"), own.get("slowest_ms")
+    if mean_ms is None or slowest_ms is None:
+        return Cell("-")
+    mean_text, slowest_text = milliseconds(mean_ms), milliseconds(slowest_ms)
+    return Cell(f"{mean_text} (slowest {slowest_text})", f"{mean_text} ({slowest_text})")
+
+
+_OWN = Column("own code: ms a decision", 1, short="own code ms\n(slowest)", of=_own_ms)
+
+
+def methods_table(methods: list[dict[str, Any]], title: str, **page: Any) -> Table:
+    """One row a method: rates with counts and 95 % Wilson intervals, how the rest ended, both times; the time
+    of the user's own code where there is any."""
+    columns = (*_METHODS, _OWN) if any(m.get("own") for m in methods) else _METHODS
+    return Table(columns, methods, title, **page)
+
+
+def _difference(pair: dict[str, Any]) -> str:
+    return with_interval(pair.get("time_difference_mean_s"), pair.get("time_difference_ci95"))
+
+
+_BOTH = Column("both arrive", of=lambda p: str(p["both"]))
+_PAIRS = (
+    Column("a : b", left=True, only=TERMINAL, of=lambda p: f"{p['a']} : {p['b']}"),
+    Column("a", left=True, only=PAGE, of=lambda p: p["a"]),
+    Column("b", left=True, only=PAGE, of=lambda p: p["b"]),
+    Column("episodes", only=PAGE, of=lambda p: str(p["episodes"])),
+    replace(_BOTH, only=PAGE),
+    Column("only a", short="only a\narrives", of=lambda p: str(p["only_a"])),
+    Column("only b", short="only b\narrives", of=lambda p: str(p["only_b"])),
+    Column("McNemar's p", short="p\n(McNemar)", of=lambda p: probability(p["mcnemar_p"])),
+    Column("time of a s", only=PAGE, of=lambda p: number(p.get("time_a_mean_s"), 2)),
+    Column("time of b s", only=PAGE, of=lambda p: number(p.get("time_b_mean_s"), 2)),
+    Column("a - b s", 1, short="time a - b, where both\narrive: s [95 %]", of=_difference),
+    replace(_BOTH, only=TERMINAL, priority=2, short="both\narrive"),
+)
+
+
+def paired_table(pairs: list[dict[str, Any]], title: str, **page: Any) -> Table:
+    """Every two methods on the episodes that both played (``measure.paired``): who alone arrives, how sure
+    that is, and the difference in time where both do."""
+    return Table(_PAIRS, pairs, title, **page)
+
+
+def _median(cause: dict[str, Any], key: str) -> Cell:
+    return Cell(number(cause[key]), seconds(cause[key]))
+
+
+_CAUSES = (
+    Column("cause", left=True, of=lambda c: Cell(c["label"].replace("_", " "), c["label"])),
+    Column("n", of=lambda c: str(c["count"])),
+    Column("share", of=lambda c: percent(c["share"], 0)),
+    Column("knew", 2, of=lambda c: percent(c["knew_share"], 0)),
+    Column("unseen s", 3, short="unseen", of=lambda c: _median(c, "unseen_median_s")),
+    Column("evading s", 4, short="evading", of=lambda c: _median(c, "evading_median_s")),
+    Column("last chance s", 5, short="chance", of=lambda c: _median(c, "last_chance_median_s")),
+    Column("worst", 1, left=True, only=TERMINAL, of=lambda c: ":".join(map(str, c["examples"][0]))),
+    Column("meaning", prose=True, only=PAGE, of=lambda c: c["meaning"]),
+)
+
+
+def causes_table(method: dict[str, Any], title: str) -> Table:
+    """Why episodes of a method failed, the most frequent cause first."""
+    return Table(_CAUSES, method["causes"], title)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Blocks of an evaluation (the document of ``uuv eval --json``): methods, and why they failed.
+
+
+Method = dict[str, Any]
+
+
+def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
+    """Everything that an evaluation has to show but its pictures."""
+    methods = result["methods"]
+    table = methods_table(methods, _SHOWN, data=evaluation_data(methods), swatches=_swatches(methods))
+    blocks: list[Block] = [Paragraph(conditions(result)), table]
+    if methods:
+        blocks.append(_rates_figure(methods, command))
+    blocks += _paired(result.get("paired", []))
+    blocks.append(Table(_PLANNING, methods, "Planning", swatches=_swatches(methods)))
+    for method in methods:
+        blocks += _causes(method)
+    return blocks
+
+
+_SHOWN = (
+    "Methods. Collision counts contacts, TTC stops and episodes out of the tank; intervals are 95 % Wilson. "
+    "Time to goal: mean over successes; TTS: mean time over success rate."
+)
+
+
+def conditions(result: dict[str, Any]) -> str:
+    """The scene in a sentence."""
+    speed = f", v = {result['v_m_s']} m/s" if result["D"] else ""
+    seeds = ", ".join(map(str, result["seeds"]))
+    return (
+        f"World {result['world']}, {bodies(result, ' resting', ' moving obstacles')}{speed}, "
+        f"{vehicle(result)}{sensing(result)}; seeds {seeds}, {result['episodes_per_seed']} episodes each, "
+        "the same ones for every method."
+    )
+
+
+def _swatches(methods: list[Method]) -> list[str]:
+    names = [m["name"] for m in methods]
+    colours = method_colours(names)
+    return [colours[name] for name in names]
+
+
+_PLAIN = (
+    "success_rate",
+    "collision_rate",
+    "time_to_success_mean_s",
+    "time_mean_s",
+    "tts_s",
+    "return_mean",
+    "min_clearance_mean_m",
+)
+
+
+def evaluation_data(methods: list[Method]) -> Data:
+    """Counts, rates, bounds and times of every method as numbers."""
+    bounds = ("success_ci95_low", "success_ci95_high", "collision_ci95_low", "collision_ci95_high")
+    rows = [
+        [
+            m["name"],
+            m["episodes"],
+            *(m["outcomes"][name] for name in ENDINGS),
+            *_bounds(m),
+            *(m.get(name) for name in _PLAIN),
+        ]
+        for m in methods
+    ]
+    return Data(["method", "episodes", *ENDINGS, *bounds, *_PLAIN], rows)
+
+
+def _bounds(m: dict[str, Any]) -> list[float | None]:
+    return [*(m["success_ci95"] or (None, None)), *(m["collision_ci95"] or (None, None))]
+
+
+def _rates_figure(methods: list[Method], command: str) -> Figure:
+    names = [m["name"] for m in methods]
+    colours = _swatches(methods)
+    panels = [
+        intervals(
+            [_rates_line(i, m, key, colours[i]) for i, m in enumerate(methods)], names, key, "", joined=False
+        )
+        for key in ("success", "collision")
+    ]
+    return Figure(
+        "methods",
+        panels,
+        "Success and collision of every method with 95 % Wilson intervals",
+        evaluation_data(methods),
+        command,
+    )
+
+
+def _rates_line(place: int, method: Method, key: str, colour: str) -> Line:
+    """The one point of a method; none where it played nothing."""
+    if method[f"{key}_rate"] is None:
+        return Line(method["name"], [], [], [], [], colour=colour)
+    low, high = method[f"{key}_ci95"]
+    return Line(
+        method["name"],
+        [place],
+        [method[f"{key}_rate"]],
+        [low],
+        [high],
+        [f"{method['name']}\n{rates_text(method)}"],
+        colour,
+    )
+
+
+_PAIRED = (
+    "both",
+    "only_a",
+    "only_b",
+    "mcnemar_p",
+    "time_a_mean_s",
+    "time_b_mean_s",
+    "time_difference_mean_s",
+)
+
+
+_BOUNDS = "time_difference_ci95"
+
+
+def _paired(pairs: list[dict[str, Any]]) -> list[Block]:
+    """[] without two methods."""
+    if not pairs:
+        return []
+    caption = (
+        "Pairs of methods on the same episodes: who alone arrives, with McNemar's exact p, and the mean "
+        "times where both arrive, their difference with its 95 % bootstrap interval. The values of p are not "
+        "adjusted for the number of pairs"
+    )
+    return [paired_table(pairs, caption, data=paired_data(pairs))]
+
+
+def paired_data(pairs: list[dict[str, Any]]) -> Data:
+    """Pairs of methods as numbers."""
+    keys = ("a", "b", "episodes", *_PAIRED)
+    rows = [[*map(pair.get, keys), *(pair.get(_BOUNDS) or (None, None))] for pair in pairs]
+    return Data([*keys, f"{_BOUNDS}_low", f"{_BOUNDS}_high"], rows)
+
+
+def _counts(method: Method, key: str, *names: str) -> str:
+    return " / ".join(str(method.get(key, {}).get(name, "-")) for name in names)
+
+
+_PLANNING = (
+    Column("method", left=True, of=lambda m: m["name"]),
+    Column("replans an episode", of=lambda m: number(m.get("replans_per_episode"))),
+    Column(
+        "initial / stuck / safety / intersection",
+        of=lambda m: _counts(m, "replans_by_trigger", "initial", "stuck", "safety", "intersection"),
+    ),
+    Column("Voronoi / RRT / own", of=lambda m: _counts(m, "planned_by", "voronoi", "rrt", "own")),
+    Column("path m", of=lambda m: number(m.get("path_length_mean_m"))),
+    Column("env-steps/s", of=lambda m: number(m.get("env_steps_per_s"), 0)),
+)
+
+
+# -------------------------------------------------------------------------------------------- causes
+
+
+def _causes(method: Method) -> list[Block]:
+    if not method.get("causes"):
+        return []
+    caption = (
+        f"Why {len(method['explain'])} of {method['episodes']} episodes of {method['name']} failed. "
+        "Knew: share whose forecast of the killer 1 s before the end was right; the times are medians before "
+        "the end"
+    )
+    return [causes_table(method, caption)]

@@ -1,0 +1,1 @@
+"""The simulator of one step: which stage comes after which."""

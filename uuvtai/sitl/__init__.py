@@ -1,1 +1,0 @@
-"""Our water for ArduSub: the simulator behind its JSON interface, in lockstep (docs/sitl.md)."""

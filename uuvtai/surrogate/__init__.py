@@ -1,0 +1,1 @@
+"""A kinematic simulator in which policies train faster."""

@@ -1,0 +1,73 @@
+"""Where things lie in the twin's arrays, and the config sections its kernels are compiled for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uuvtai.config import (
+    ActuationConfig,
+    EpisodeConfig,
+    MappingConfig,
+    TankConfig,
+    TrackingConfig,
+    VehicleConfig,
+)
+from uuvtai.config.learning import TwinConfig
+from uuvtai.kernels.core.stage import Const, In
+from uuvtai.state import (
+    ClearanceState,
+    ClockState,
+    ForecastState,
+    MissionState,
+    Proprioception,
+    TrackState,
+)
+
+AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL = (
+    0,
+    3,
+    6,
+    7,
+    8,
+    9,
+    12,
+    14,
+    17,
+)
+"""columns of an env's row: position in the world, velocity in the body frame, heading, yaw rate, time, goal,
+signs of the way to the goal, last action, integrals of the velocity loops"""
+EGO_WIDTH = 21
+TRACK_WIDTH = 9
+"""of what the twin's tracker remembers of a body (``sensing_model.sense_twin``)"""
+RAW_WIDTH = 14
+"""of a body as a tracker delivers it: x, y, vx, vy, turn rate, radius, free water above, below, time unseen,
+displacement in 1 s (2), in 2 s (2), 1 = there"""
+TRUTH_WIDTH = 10
+"""of a body as only the critic sees it, in training"""
+
+
+@dataclass(frozen=True, eq=False)
+class TwinRules:
+    """What the twin's kernels are compiled for."""
+
+    vehicle_cfg: Const[VehicleConfig]
+    actuation_cfg: Const[ActuationConfig]
+    tank_cfg: Const[TankConfig]
+    episode_cfg: Const[EpisodeConfig]
+    twin_cfg: Const[TwinConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverIO:
+    """What a policy over a set of bodies is told by the simulator: nothing that only the simulator knows."""
+
+    clock: In[ClockState]
+    mission: In[MissionState]
+    ego: In[Proprioception]
+    tracks: In[TrackState]
+    forecast: In[ForecastState]
+    clearance: In[ClearanceState]
+    vehicle_cfg: Const[VehicleConfig]
+    tank_cfg: Const[TankConfig]
+    mapping_cfg: Const[MappingConfig]
+    tracking_cfg: Const[TrackingConfig]

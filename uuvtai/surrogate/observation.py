@@ -1,0 +1,294 @@
+"""The simulator seen as the twin sees its world: the same rows, of what the vehicle senses and remembers."""
+
+import taichi as ti
+
+from uuvtai.common.enums import BODY_WIDTH, EGO_COLUMNS, N_BODY, N_RAY, OWN_WIDTH
+from uuvtai.envs.vector_env import ObservationColumn
+from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
+from uuvtai.kernels.core.grid import cell_of
+from uuvtai.kernels.core.stage import AnyTensor, Bundle, FloatMatrix, IntVector
+from uuvtai.surrogate.arrays import (
+    AT_FLIP,
+    AT_GOAL,
+    AT_LAST,
+    AT_POS,
+    AT_RATE,
+    AT_VEL,
+    AT_YAW,
+    RAW_WIDTH,
+    ObserverIO,
+)
+from uuvtai.surrogate.motion import hull_command, wished_velocity
+
+CONTROL_S = 0.02
+SIGHT_M = 4.3
+"""rays end here"""
+MARCHES = 14
+LARGEST_TURN = 3.5
+"""[rad/s] a forecast that bends more has a corner in it"""
+
+
+@ti.func
+def free_ray(env, x, y, ux, uy, io: Bundle[ObserverIO]):
+    """[m] along a ray to the nearest occupied cell or wall of the map, in steps of the clearance."""
+    far, hit = 0.0, 0
+    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
+    for _ in range(MARCHES):
+        if hit == 0 and far <= SIGHT_M:
+            cell = cell_of(ti.Vector([x + far * ux, y + far * uy]), io.tank_cfg, io.mapping_cfg.cell_m)
+            row, col = ti.math.clamp(cell[0], 0, n_row - 1), ti.math.clamp(cell[1], 0, n_col - 1)
+            clear = io.clearance.clearance_m[env, row, col]
+            if clear < 0.08:
+                hit = 1
+            else:
+                far += ti.max(clear - 0.03, 0.05)
+    return far
+
+
+@ti.func
+def put_track(env, lane, track, raw: AnyTensor, io: Bundle[ObserverIO]):
+    """One track as a row of the policy's bodies."""
+    pos_w = io.forecast.pos_w[env, track, 0]
+    state = io.tracks.state[env, track]
+    first = io.forecast.pos_w[env, track, 1] - pos_w
+    second = io.forecast.pos_w[env, track, 2] - io.forecast.pos_w[env, track, 1]
+    bend = ti.atan2(first[0] * second[1] - first[1] * second[0], first.dot(second))
+    turn = bend / io.tracking_cfg.forecast_dt_s
+    z = io.ego.pos_w[env][2]
+    per_s = ti.static(round(1.0 / io.tracking_cfg.forecast_dt_s))
+    one = io.forecast.pos_w[env, track, per_s] - pos_w
+    two = io.forecast.pos_w[env, track, 2 * per_s] - pos_w
+    raw[env, lane, 0], raw[env, lane, 1] = pos_w[0], pos_w[1]
+    raw[env, lane, 2], raw[env, lane, 3] = state[2], state[3]
+    raw[env, lane, 4] = turn if ti.abs(turn) <= LARGEST_TURN else 0.0
+    raw[env, lane, 5] = io.tracks.radius_m[env, track]
+    raw[env, lane, 6] = io.forecast.above_w[env, track] - z
+    raw[env, lane, 7] = z - io.forecast.below_w[env, track]
+    raw[env, lane, 8] = (io.clock.step[env] - io.tracks.seen_step[env, track]) * CONTROL_S
+    raw[env, lane, 9], raw[env, lane, 10] = one[0], one[1]
+    raw[env, lane, 11], raw[env, lane, 12] = two[0], two[1]
+    raw[env, lane, 13] = 1.0
+
+
+@ti.func
+def next_track(env, after, slot, io: Bundle[ObserverIO]):
+    """Gap [m] and slot of the nearest track behind the one in ``slot``, whose gap is ``after``; slot -1 =
+    there is none."""
+    best, chosen = FAR_M + 0.0, -1
+    own = io.ego.pos_w[env]
+    for track in range(ti.static(io.tracks.alive.shape[1])):
+        if io.forecast.radius_m[env, track, 0] >= 0.0:
+            away = io.forecast.pos_w[env, track, 0] - ti.Vector([own[0], own[1]])
+            gap = away.norm() - io.tracks.radius_m[env, track]
+            is_next = gap > after or (gap == after and track > slot)
+            if is_next and gap < best:
+                best, chosen = gap, track
+    return best, chosen
+
+
+@ti.kernel
+def observe_bodies(
+    io: Bundle[ObserverIO], due: IntVector, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix
+):
+    """Rows of the vehicle, of its nearest tracks and of the free distances, where ``due`` is 1; the last
+    action in ``ego`` stays."""
+    for env in range(due.shape[0]):
+        if due[env] == 1:
+            pos_w, vel_b, rpy = io.ego.pos_w[env], io.ego.vel_b[env], io.ego.rpy[env]
+            for i in ti.static(range(3)):
+                ego[env, AT_POS + i], ego[env, AT_VEL + i] = pos_w[i], vel_b[i]
+                ego[env, AT_GOAL + i] = io.mission.goal_w[env][i]
+            ego[env, AT_YAW], ego[env, AT_RATE] = rpy[2], io.ego.rate_b[env][2]
+            for i in ti.static(range(2)):
+                ahead = io.mission.goal_w[env][i] >= io.mission.start_w[env][i]
+                ego[env, AT_FLIP + i] = 1.0 if ahead else -1.0
+            after, slot = -FAR_M, -1
+            for lane in range(raw.shape[1]):
+                best, chosen = next_track(env, after, slot, io)
+                for i in range(ti.static(RAW_WIDTH)):
+                    raw[env, lane, i] = 0.0
+                if chosen >= 0:
+                    put_track(env, lane, chosen, raw, io)
+                after, slot = best, chosen
+            for i in range(ray.shape[1]):
+                angle = i * (TWO_PI / ray.shape[1])
+                ray[env, i] = free_ray(env, pos_w[0], pos_w[1], ti.cos(angle), ti.sin(angle), io)
+
+
+@ti.kernel
+def command_hull(io: Bundle[ObserverIO], gap_m: float, action: FloatMatrix, command: FloatMatrix):
+    """Commands (n, 4) of the policy's actions (n, 3), where each vehicle is now."""
+    for env in range(action.shape[0]):
+        flip = ti.Vector([1.0, 1.0])
+        for i in ti.static(range(2)):
+            if io.mission.goal_w[env][i] < io.mission.start_w[env][i]:
+                flip[i] = -1.0
+        wish = wished_velocity(
+            action[env, 0], action[env, 1], action[env, 2], flip[0], flip[1], io.vehicle_cfg
+        )
+        out = hull_command(wish, io.ego.rpy[env][2], io.ego.pos_w[env][2], gap_m, io.vehicle_cfg, io.tank_cfg)
+        for i in ti.static(range(4)):
+            command[env, i] = out[i]
+
+
+def _table():
+    """Columns of the policy's input: the vehicle's own, then one body's after the other."""
+    own = ObservationColumn(
+        "set_own", slice(0, OWN_WIDTH), "mixed", "mirrored world", "vehicle, goal, last action"
+    )
+    rays = ObservationColumn(
+        "set_rays", slice(OWN_WIDTH, EGO_COLUMNS), "1/m", "mirrored world", "nearness of walls"
+    )
+    stop = EGO_COLUMNS + N_BODY * BODY_WIDTH
+    bodies = ObservationColumn(
+        "set_bodies", slice(EGO_COLUMNS, stop), "mixed", "mirrored world", "nearest tracks"
+    )
+    return own, rays, bodies
+
+
+SET_TABLE = _table()
+"""The observation of a policy over a set of bodies, for a checkpoint's manifest."""
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Columns of the policy over a set of bodies, the same for the twin and the simulator.
+#
+# Everything is seen in the world mirrored so that the goal lies ahead and to the left at the start: four
+# situations that mirror each other are one to the policy.
+
+
+HULL_M = 0.22
+"""hull radius and half of its half length"""
+
+
+@ti.func
+def mirrored(env, ego: FloatMatrix):
+    """Flips of x and y (1 or -1), then velocity [m/s] and way to the goal [m] in the mirrored frame."""
+    flip = ti.Vector([ego[env, AT_FLIP], ego[env, AT_FLIP + 1]])
+    c, s = ti.cos(ego[env, AT_YAW]), ti.sin(ego[env, AT_YAW])
+    speed = ti.Vector(
+        [
+            flip[0] * (c * ego[env, AT_VEL] - s * ego[env, AT_VEL + 1]),
+            flip[1] * (s * ego[env, AT_VEL] + c * ego[env, AT_VEL + 1]),
+        ]
+    )
+    way = ti.Vector(
+        [
+            flip[0] * (ego[env, AT_GOAL] - ego[env, AT_POS]),
+            flip[1] * (ego[env, AT_GOAL + 1] - ego[env, AT_POS + 1]),
+        ]
+    )
+    return flip, speed, way
+
+
+@ti.func
+def length_of(way):
+    """[m] never 0."""
+    return ti.max(ti.sqrt(way[0] * way[0] + way[1] * way[1]), 1e-3)
+
+
+@ti.func
+def body_columns(env, lane, flip, speed, way, ego: FloatMatrix, raw: AnyTensor):
+    """What the policy is told of a track; ``flip``, ``speed`` and ``way`` as ``mirrored`` gives them."""
+    fx, fy, to_goal = flip[0], flip[1], length_of(way)
+    dx = fx * (raw[env, lane, 0] - ego[env, AT_POS])
+    dy = fy * (raw[env, lane, 1] - ego[env, AT_POS + 1])
+    bx, by = fx * raw[env, lane, 2], fy * raw[env, lane, 3]
+    rx, ry, radius = bx - speed[0], by - speed[1], raw[env, lane, 5]
+    far = length_of(ti.Vector([dx, dy]))
+    when = ti.math.clamp(-(dx * rx + dy * ry) / ti.max(rx * rx + ry * ry, 1e-3), 0.0, 3.0)
+    miss = ti.sqrt((dx + when * rx) ** 2 + (dy + when * ry) ** 2) - radius - HULL_M
+    return ti.Vector(
+        [
+            1.0,
+            dx / 4,
+            dy / 4,
+            rx,
+            ry,
+            bx,
+            by,
+            2 * radius,
+            ti.math.clamp(raw[env, lane, 6], 0.0, 1.6),
+            ti.math.clamp(raw[env, lane, 7], 0.0, 1.6),
+            ti.min(raw[env, lane, 8], 4.0) / 2,
+            ti.math.clamp(fx * fy * raw[env, lane, 4], -3.0, 3.0) / 2,
+            (dx + fx * raw[env, lane, 9]) / 4,
+            (dy + fy * raw[env, lane, 10]) / 4,
+            (dx + fx * raw[env, lane, 11]) / 4,
+            (dy + fy * raw[env, lane, 12]) / 4,
+            ti.min(far - radius, 8.0) / 4,
+            1.0 / (0.3 + ti.max(far - radius - HULL_M, 0.0)),
+            when,
+            ti.math.clamp(miss, -1.0, 3.0),
+            way[0] / to_goal,
+            way[1] / to_goal,
+        ]
+    )
+
+
+@ti.func
+def own_columns(env, flip, speed, way, ego: FloatMatrix):
+    """What the policy is told of the vehicle and its goal; as ``body_columns``."""
+    to_goal, yaw, z = length_of(way), ego[env, AT_YAW], ego[env, AT_POS + 2]
+    return ti.Vector(
+        [
+            way[0] / 10,
+            way[1] / 4,
+            ego[env, AT_GOAL + 2] - z,
+            way[0] / to_goal,
+            way[1] / to_goal,
+            ti.min(to_goal, 4.0) / 4,
+            speed[0],
+            speed[1],
+            2 * ego[env, AT_VEL + 2],
+            z + 0.8,
+            ego[env, AT_LAST],
+            ego[env, AT_LAST + 1],
+            ego[env, AT_LAST + 2],
+            ti.cos(4 * yaw),
+            flip[0] * flip[1] * ti.sin(4 * yaw),
+            flip[1] * (ego[env, AT_POS + 1] - 3) / 3,
+            flip[0] * (ego[env, AT_POS] - 10) / 10,
+        ]
+    )
+
+
+@ti.func
+def mirrored_ray(i, env, ego: FloatMatrix):
+    """Number of the ray that is number ``i`` in the mirrored frame."""
+    at = i
+    if ego[env, AT_FLIP] < 0.0:
+        at = (N_RAY // 2 - at + N_RAY) % N_RAY
+    if ego[env, AT_FLIP + 1] < 0.0:
+        at = (N_RAY - at) % N_RAY
+    return at
+
+
+@ti.func
+def write_columns_of(
+    env, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, bodies: AnyTensor, own: FloatMatrix
+):
+    """Columns of one row, as ``write_set_columns``."""
+    flip, speed, way = mirrored(env, ego)
+    for lane in range(raw.shape[1]):
+        columns = ti.Vector.zero(ti.f32, BODY_WIDTH)
+        if raw[env, lane, 13] > 0.5:
+            columns = body_columns(env, lane, flip, speed, way, ego, raw)
+        for i in ti.static(range(BODY_WIDTH)):
+            bodies[env, lane, i] = columns[i]
+    values = own_columns(env, flip, speed, way, ego)
+    for i in ti.static(range(OWN_WIDTH)):
+        own[env, i] = values[i]
+    for i in range(N_RAY):
+        free = ray[env, mirrored_ray(i, env, ego)]
+        own[env, OWN_WIDTH + i] = 1.0 / (0.3 + ti.math.clamp(free - HULL_M, 0.0, 4.0)) - 0.5
+
+
+@ti.kernel
+def write_set_columns(
+    ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, bodies: AnyTensor, own: FloatMatrix
+):
+    """``bodies`` (n, lanes, BODY_WIDTH) and ``own`` (n, EGO_COLUMNS) from rows of the vehicle
+    (``twin_arrays``), tracks (n, lanes, RAW_WIDTH) and free distances (n, N_RAY) [m]."""
+    for env in range(ego.shape[0]):
+        write_columns_of(env, ego, raw, ray, bodies, own)

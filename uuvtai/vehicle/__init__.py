@@ -1,0 +1,1 @@
+"""The stack on a vehicle: sensor messages, MAVLink, safety rules, ArduSub, identification."""

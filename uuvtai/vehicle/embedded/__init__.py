@@ -1,0 +1,1 @@
+"""The stack as a folder of machine code and NumPy."""

@@ -1,0 +1,140 @@
+"""What was heard, decided and said, as MCAP: a message on /mavlink/said for every order, sent or not."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from uuvtai.logs.container import McapFile
+from uuvtai.logs.encode import LogError
+from uuvtai.logs.schemas import BOOLEAN, FOUR, INT, NUMBER, STRING, THREE, array_of, record
+from uuvtai.vehicle.mavlink import MavMessage, Order
+from uuvtai.vehicle.onboard import PilotCommand
+from uuvtai.vehicle.safety import SafeDecision
+from uuvtai.vehicle.telemetry import Heard
+
+_FIELDS = {"type": "object"}
+_SCHEMAS = {
+    "/mavlink/seen": record(
+        "uuv.MavlinkSeen", "A message of MAVLink that came.",
+        name=STRING, system=INT, component=INT, fields=_FIELDS,
+    ),
+    "/mavlink/said": record(
+        "uuv.MavlinkSaid", "A message of MAVLink that was sent, or (sent = false) would have been.",
+        name=STRING, kind=STRING, sent=BOOLEAN, fields=_FIELDS,
+    ),
+    "/pilot/command": record(
+        "uuv.PilotCommand", "What the stack wanted: surge, sway, heave [m/s], yaw rate [rad/s].",
+        velocity=FOUR, position=THREE, leaf=STRING, held=array_of(STRING),
+    ),
+    "/pilot/safety": record(
+        "uuv.SafetyDecision", "What was done with it; asked: the velocity after all limits.",
+        action=STRING, asked=FOUR, reasons=array_of(STRING), mode=INT, armed=BOOLEAN, speed=NUMBER,
+    ),
+}  # fmt: skip
+MOST_SEEN = 10
+"""messages heard in one step that are written; more are counted only, lest a stranger fill the disk"""
+
+
+class LinkLog:
+    """One run's log. Once it cannot be written it is given up, and driving goes on: see ``trouble``."""
+
+    def __init__(self, path: Path, about: dict[str, str]) -> None:
+        """Raises LogError."""
+        self.path, self.trouble = path, ""
+        self._left, self.unwritten, self._closed = 0, 0, False
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = McapFile(path)
+            self._file.add_metadata("uuv.pilot", about)
+            self._channels = {
+                topic: self._file.add_channel(
+                    topic, self._file.add_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
+                )
+                for topic, schema in _SCHEMAS.items()
+            }
+        except OSError as error:
+            raise LogError(
+                f"{path}: cannot write there ({error.strerror or error}); try --log FILE"
+            ) from error
+
+    def begin_step(self) -> None:
+        """Another step."""
+        self._left = MOST_SEEN
+
+    def saw(self, time_s: float, heard: MavMessage) -> None:
+        """A message came."""
+        if self._left <= 0:
+            self.unwritten += 1
+            return
+        self._left -= 1
+        whose = {"name": heard.name, "system": heard.system, "component": heard.component}
+        self._write("/mavlink/seen", time_s, {**whose, "fields": plain_fields(heard.fields)})
+
+    def said(self, time_s: float, order: Order, was_sent: bool) -> None:
+        """An order was given, or would have been."""
+        whose = {"name": order.message, "kind": order.kind, "sent": was_sent}
+        self._write("/mavlink/said", time_s, {**whose, "fields": plain_fields(order.fields)})
+
+    def decided(
+        self,
+        time_s: float,
+        command: PilotCommand | None,
+        decision: SafeDecision,
+        heard: Heard,
+        speed: float | None,
+    ) -> None:
+        """What this step came to; without a command while the vehicle is given back."""
+        if command is not None:
+            wanted = {"velocity": _finite(command.velocity), "position": _finite(command.pos_w)}
+            self._write(
+                "/pilot/command", time_s, {**wanted, "leaf": command.leaf, "held": list(command.held)}
+            )
+        done = {
+            "action": decision.action.name,
+            "asked": list(decision.velocity),
+            "reasons": list(decision.reasons),
+        }
+        state = {"mode": heard.mode, "armed": heard.is_armed, "speed": _finite([speed or 0.0])[0]}
+        self._write("/pilot/safety", time_s, done | state)
+
+    def _write(self, topic: str, time_s: float, content: dict[str, Any]) -> None:
+        if self.trouble:
+            return
+        try:
+            data = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+            self._file.add_message(self._channels[topic], max(0, round(1e9 * time_s)), data)
+            self._file.settle()
+        except OSError as error:
+            self._give_up(error)
+
+    def close(self) -> None:
+        """Finish the file under its name."""
+        if not (self.trouble or self._closed):
+            self._closed = True
+            try:
+                self._file.finish()
+            except OSError as error:
+                self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        self.trouble = f"{self.path}: the log ends early ({error.strerror or error})"
+
+
+def plain_fields(fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields as JSON has them; a number that is not finite is null."""
+    return {name: _plain_value(value) for name, value in fields.items()}
+
+
+def _plain_value(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, list | tuple):
+        return [_plain_value(item) for item in value]
+    return value if isinstance(value, int | str) else str(value)
+
+
+def _finite(values: Any) -> list[float]:
+    return [float(value) if math.isfinite(value) else 0.0 for value in values]
