@@ -39,6 +39,8 @@ _TANK_M, _START, _GOAL = (20.0, 6.0), (2.0, 3.0, -0.8), (18.0, 3.0, -0.8)
 
 def measure(job: Job) -> list[Row]:
     """Violations; each is shown as it is found."""
+    for number in _NUMBERS:  # a job in the background ignores some, and so would its children
+        signal.signal(number, signal.SIG_DFL)
     return [*signalled(job), flown(job)]
 
 
@@ -151,10 +153,8 @@ def _ended(folder: Path, number: signal.Signals, after_s: float) -> tuple[list[s
         sub.close()
         child.kill()
     after = [message for message in sub.told[before:] if orders(message)]
-    found = _wrong(after, asked, sub) + _not_whole(
-        log, out.read_text(), err.read_text(), child.returncode, number
-    )
-    return found, wait_s, drove
+    found = _wrong(after, asked, sub)
+    return found + _not_whole(log, out.read_text(), err.read_text(), child.returncode, number), wait_s, drove
 
 
 def _wait(child: subprocess.Popen[str]) -> None:
@@ -179,7 +179,7 @@ def _wrong(after: list[Any], asked: bool, sub: FakeSub) -> list[str]:
     first = next((i for i, message in enumerate(after) if not moves(message)), len(after))
     rest, found = after[first:], []
     if first > 1 or any(map(moves, rest)):
-        found.append(f"moved after the signal by {[m for m in after if moves(m)]}")
+        found.append(f"moved after the signal {sum(map(moves, after))} times")
     kinds = [message.get_type() for message in rest]
     if asked and sub.mode != 2:
         found.append(f"left in mode {sub.mode}, told {kinds}")
@@ -187,7 +187,7 @@ def _wrong(after: list[Any], asked: bool, sub: FakeSub) -> list[str]:
         found.append(f"told {kinds[:4]} and not to stop and hand back")
     commands = [m for m in rest if m.get_type() == "COMMAND_LONG"]
     if any((m.command, m.param2) != (mav.MAV_CMD_DO_SET_MODE, 2.0) for m in commands):
-        found.append(f"commanded {commands}")
+        found.append(f"commanded {[(m.command, m.param2) for m in commands]}")
     return found
 
 

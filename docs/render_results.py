@@ -30,7 +30,7 @@ Document = dict[str, Any]
 Cells = list[Document]
 
 ROOT = Path(__file__).resolve().parents[1]
-EVALUATIONS, REPRODUCTION = "docs/data/evaluations_90007.json", "docs/data/reproduce.json"
+EVALUATIONS, REPRODUCTION = "docs/data/evaluations.json", "docs/data/reproduce.json"
 SWEEPS, BENCHMARKS = "docs/data/sweeps.json", "benchmarks/results"
 README, RESULTS = "README.md", "docs/results.md"
 ROBUSTNESS, BASELINES, SPEEDS = "docs/robustness.md", "docs/baselines.md", "benchmarks/README.md"
@@ -58,9 +58,7 @@ def measured(root: Path) -> str:
         f"Measured here: {document['episodes']:,} episodes of seed {seed} in each row, paper sensing, "
         "S = 8.\n"
         f"{seen} Success, collision and endings are those of\n"
-        "`bt`, in the last row of `paper`. `-` = not evaluated or not kept. Since then `bt` steers without a "
-        "DVL and grows less cautious\n"
-        f"while it waits: its rows on seed 90009 are in `research/LOG.md`. Counts: `{EVALUATIONS}`."
+        f"`bt`, in the last row of `paper`. `-` = not evaluated. Counts: `{EVALUATIONS}`."
     )
 
 

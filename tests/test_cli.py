@@ -285,13 +285,13 @@ def test_every_refusal_of_the_package_is_of_one_type():
     }
     found = {}
     for path in [
-        *root.glob("measure/**/*.py"),
-        *root.glob("tree/*.py"),
+        *root.glob("evaluation/*.py"),
         *root.glob("report/*.py"),
-        root / "sizes.py",
-        root / "runtime.py",
-        root / "statistics.py",
-        root / "learn" / "run.py",
+        root / "sim/behavior_tree.py",
+        root / "sim/setup.py",
+        root / "compile/runtime.py",
+        root / "common/statistics.py",
+        root / "learning/runner.py",
     ]:
         raised = [
             node.exc.func.id
@@ -307,9 +307,9 @@ def test_every_refusal_of_the_package_is_of_one_type():
 
 PLAIN = {
     "evaluation/failure_causes.py": ["RuntimeError"],  # a replay that ends otherwise: a bug of ours
-    "statistics.py": ["ValueError"],  # counts that cannot be: a bug of ours
-    "evaluation/results.py": ["ValueError"],  # told by its caller, with the file that it comes from
-    "runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
+    "common/statistics.py": ["ValueError"],  # counts that cannot be: a bug of ours
+    "sim/behavior_tree.py": ["ValueError"],  # told by its caller, with the file that it comes from
+    "compile/runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
 }
 
 

@@ -10,26 +10,18 @@ import uuvtai
 KERNELS = Path(uuvtai.__file__).parent / "kernels"
 
 FILES = {
-    "dynamics": ("lost_thruster", "actuation", "dynamics"),
-    "world": ("scenarios", "episode"),
+    "dynamics": ("thruster_fault", "control", "dynamics"),
+    "world": ("scenario", "episode"),
     "proprioception": ("proprioception",),
-    "sonar": ("sonar", "sonar_error", "raycast"),
-    "pose": ("pose", "wall_fix"),
-    "depth": ("depth",),
-    "tracking": ("tracking", "habits", "elevation", "look", "forecast", "spotting"),
+    "sonar": ("sonar", "raycast"),
+    "pose": ("localization",),
+    "depth": ("depth_camera",),
+    "tracking": ("tracking", "track_filter", "height", "prediction", "camera_tracking"),
     "mapping": ("mapping",),
     "clearance": ("clearance",),
-    "planning": ("triggers", "voronoi", "medial", "route"),
-    "features": ("features",),
-    "teacher": (
-        "threats",
-        "evasion",
-        "dynamic_window",
-        "potential_field",
-        "velocity_obstacle",
-        "path_integral",
-        "leaves",
-    ),
+    "planning": ("triggers", "voronoi", "medial_axis", "route"),
+    "features": ("observation",),
+    "teacher": ("threats", "avoidance", "dwa", "potential_field", "velocity_obstacle", "mppi", "tree"),
     "reward": ("reward",),
 }
 """kernel files of each stage, by the names of ``uuvtai.sim.stages.STAGES``"""

@@ -17,7 +17,6 @@ from uuvtai.common.exits import UsageError, plain, say
 from uuvtai.common.files import read_text
 from uuvtai.common.presets import KINDS, preset_names, shipped_file
 from uuvtai.common.tree_codes import ACTION, LEAVES
-from uuvtai.config import loader
 from uuvtai.console.screen import Screen, print_heat_maps
 from uuvtai.report.evaluation import DAGGER, causes_table, methods_table, paired_table
 from uuvtai.report.sweep import cell_table
@@ -249,6 +248,7 @@ def show_presets(screen: Screen) -> None:
 
 def show_stated(kind: str, name: str, as_json: bool) -> None:
     """A preset as it is written, its comments included. Raises ConfigError, FileError, OSError."""
+    from uuvtai.config import loader
 
     path = loader.preset_path(kind, name)
     if as_json and path.suffix not in (".xml", ".md"):
