@@ -25,6 +25,7 @@ from uuvtai.common.files import (
     refuse_links,
     truncate,
 )
+from uuvtai.common.presets import preset_names
 from uuvtai.common.statistics import (
     bootstrap_interval,
     mcnemar_p,
