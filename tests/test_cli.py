@@ -141,7 +141,10 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
         (["eval", "--world", "a/" + 5000 * "b" + ".yaml"], "too long"),
         (["eval", "--resume", "nowhere"], "nowhere: is no run folder"),
         (["eval", "--resume", "nowhere", "--episodes", "64"], "--episodes 64: a resumed run keeps its own"),
-        (["eval", "runs/a", "--resume", "nowhere"], "RUN ['runs/a']: a resumed run keeps its own"),
+        (
+            ["eval", "--agent", "runs/a", "--resume", "nowhere"],
+            "--agent ['runs/a']: a resumed run keeps its own",
+        ),
         (["train", "smoke", "--set", "train.scenes=[[9, 9999, 1.0]]"], "do not fit"),
         (["train", "smoke", "--set", "policy.initial_std=0.01"], "lies below the floor"),
     ],

@@ -15,7 +15,7 @@ from uuvtai.console import parsing
 
 _WORLDS, _SENSORS, _VEHICLES = (parsing.names(kind) for kind in ("world", "sensors", "vehicle"))
 _NAME = "NAME|FILE"
-_PANEL = {"rich_help_panel": "More"}
+_PANEL: dict[str, Any] = {"rich_help_panel": "More"}
 _more = functools.partial(Option, rich_help_panel="More")
 
 

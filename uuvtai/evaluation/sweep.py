@@ -152,7 +152,7 @@ def resume(
         try:
             document = read_json(place / REQUEST, folder=place)
             if "agents" not in document:
-                raise KeyError("an older version of uuv wrote it; begin the sweep again")
+                raise TypeError("an older version of uuv wrote it; begin the sweep again")
             request, methods = request_of(document), [_method_key(method) for method in document["methods"]]
             checkpoints = dict(document["checkpoints"])
         except (FileError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
