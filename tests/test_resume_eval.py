@@ -147,6 +147,7 @@ def test_another_tree_under_the_same_name_is_refused(ask, tmp_path):
     [
         (REQUEST, b"{", "is no request"),
         (REQUEST, b"[1]", "is no request"),
+        (REQUEST, b'{"schema": 1, "controllers": ["bt"]}', "is no request of this version of 'uuv eval'"),
         (REQUEST, None, "cannot be read"),
         (results.JOURNAL_FILE, b'{"method": "straight"}\n', "line 1: is no finished episode"),
         (results.JOURNAL_FILE, b"\xff\xfe\n", "line 1: is no finished episode"),
