@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.common import Job, Row, seconds_per_call
 from tests import planning_maps as maps
-from tests.reference.voronoi import clearance_of
+from tests.oracles.voronoi import clearance_of
 from uuvtai import state
 from uuvtai.common.enums import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.compile.runtime import start_taichi

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 
 from benchmarks.common import Job, Row, seconds_per_call
-from tests.reference import scenes
-from tests.reference.sonar import beam_headings
+from tests.oracles import scenes
+from tests.oracles.sonar import beam_headings
 from uuvtai import state
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig

@@ -354,7 +354,8 @@ _KEPT = ("name", "episodes", "outcomes", "ends", "time_mean_s", "time_to_success
 
 
 def _kept(entry: Document) -> Document:
-    return {name: entry[name] for name in _KEPT if name in entry}
+    causes = [{name: cause[name] for name in ("label", "count")} for cause in entry.get("causes", [])]
+    return {name: entry[name] for name in _KEPT if name in entry} | {"causes": causes}
 
 
 def _small_sweep(sweep: Document) -> Document:

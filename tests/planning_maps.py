@@ -77,7 +77,7 @@ def gaps(rng):
 def random_map(seed):
     """(occupied, start_w, goal_w): start and goal anywhere in the traversable set of the kind of map that
     ``seed`` draws."""
-    from tests.reference.voronoi import clearance_of, traversable
+    from tests.oracles.voronoi import clearance_of, traversable
 
     rng = np.random.default_rng(seed)
     while True:

@@ -7,7 +7,7 @@ import numpy as np
 
 from tests import planning_maps as maps
 from tests.bundles import io_for
-from tests.reference.voronoi import clearance_of
+from tests.oracles.voronoi import clearance_of
 from uuvtai import state
 from uuvtai.config import Config
 from uuvtai.kernels.planning.io import RouteIO, VoronoiIO

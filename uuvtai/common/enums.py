@@ -85,7 +85,7 @@ N_WEIGHT = LAST + (1 + N_HIDDEN) * N_SAID
 
 class Truth:
     """Base of structs and sections that no stage of the stack may name, nor be handed:
-    ``tests/test_architecture.py`` reads it."""
+    ``tests/repository/test_architecture.py`` reads it."""
 
 
 # ------------------------------------------------------------------------------------------------------------

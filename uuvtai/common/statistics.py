@@ -1,5 +1,5 @@
 """Intervals for rates and means, paired comparison of methods, and the two time figures. Hand-checked in
-tests/test_statistics.py."""
+tests/common/test_statistics.py."""
 
 from __future__ import annotations
 

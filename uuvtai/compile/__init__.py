@@ -1,7 +1,7 @@
 """What works around Taichi 1.7.4: all that replaces its parts or stands on names that it does not publish.
 
 A Taichi without one of the names in ``front_end`` is left as it is there; the other files fail loudly. Try a
-new version of Taichi with ``tests/test_front_end.py``, ``test_launch.py``, ``test_native.py`` and
+new version of Taichi with ``tests/compile/test_front_end.py``, ``test_launch.py``, ``test_native.py`` and
 ``test_capture.py`` first. No committed results file measures the gain of a part alone, so no figure stands
 here.
 

@@ -266,8 +266,8 @@ def _unpacked(content: bytes, key: str) -> MachineCode | None:
 _SEEN_BY_KERNELS = (
     "kernels", "config", "state", "compile", "common/enums.py", "common/tree_codes.py",
 )  # fmt: skip
-"""files and folders of the package that a kernel's code can depend on (``tests/test_native.py`` compares them
-with what the kernels import)"""
+"""files and folders of the package that a kernel's code can depend on (a test compares them with what the
+kernels import)"""
 
 
 class KeyNameError(Exception):

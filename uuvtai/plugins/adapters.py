@@ -33,7 +33,7 @@ from uuvtai.sim.sim import Sim
 
 # ------------------------------------------------------------------------------------------------------------
 # What a controller of the user's is shown: rows of what the vehicle senses, remembers and decides, read when
-# it is asked for. ``FIELDS`` is the whole of it; no truth is among them (``tests/test_own_pieces.py``).
+# it is asked for. ``FIELDS`` is the whole of it; no truth is among them (a test asks).
 
 
 FIELDS = {

@@ -140,7 +140,7 @@ class SafetyRule:
 
     @property
     def case(self) -> str:
-        """What its cases in tests/test_safety.py are called."""
+        """What its cases in tests/vehicle/test_safety.py are called."""
         return self.name.replace(" ", "_")
 
 

@@ -9,8 +9,8 @@ What each stage reads (``kernels/*/bundles.py``), and where it comes from here:
   pose *of the ping and of the shot*: what ``ego`` held then, which is kept here for a second or so.
 - all others: ``ego`` as it is now, ``clock``, ``mission``, and what those before them wrote.
 
-Nobody behind the sensors reads the truth (``tests/test_observation_only.py``). Between two messages the last
-one is held, and one that comes late is carried forward to this step (``carrying.py``); a DVL without a
+Nobody behind the sensors reads the truth (``tests/sim/test_observation_only.py``). Between two messages the
+last one is held, and one that comes late is carried forward to this step (``carrying.py``); a DVL without a
 message in its turn has lost the bottom. Until its next message how the given position changes stands for it,
 as that was told and not as it was carried (``find_velocity`` takes it). Nothing late is compared with, or
 carried by, corrections that came after it (``own_motion.py``). Sonar intensity is read by nobody.

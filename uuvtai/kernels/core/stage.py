@@ -5,7 +5,7 @@ frozen config section whose numbers become constants of the compiled kernel); it
 Bundle[..]`` and what changes from call to call, functions that serve one stage end in ``io``, and those that
 several stages share take the structs and sections that they need, marked in the same way. For the type
 checker these are the plain classes; for Taichi they are ``ti.template()``. Tensors of the caller are
-``FloatMatrix`` and the like. ``tests/test_architecture.py`` reads all of this to prove who sees what.
+``FloatMatrix`` and the like. A test reads all of this to prove who sees what.
 """
 
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar

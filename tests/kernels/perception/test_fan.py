@@ -1,0 +1,246 @@
+"""A sonar that is a fan ahead: where its beams look, what they meet, and that nothing is made of what lies
+behind them."""
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from tests.bundles import io_for
+from tests.map_bits import get_map
+from tests.oracles import scenes
+from tests.oracles.sonar import body_hits, doppler_by_differences, wall_hits
+from uuvtai.common.errors import UserError
+from uuvtai.config import (
+    DepthConfig,
+    EpisodeConfig,
+    FeaturesConfig,
+    MappingConfig,
+    SonarConfig,
+    TankConfig,
+)
+from uuvtai.config.loader import load_config
+from uuvtai.kernels.core.beams import beam_bearing, beam_there, beam_towards
+from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
+from uuvtai.kernels.core.stage import AnyTensor, Const
+from uuvtai.kernels.perception import mapping
+from uuvtai.kernels.perception.io import MappingIO
+from uuvtai.kernels.planning.io import FeaturesIO
+from uuvtai.kernels.planning.observation import sense_sectors
+from uuvtai.kernels.sensors import sonar
+from uuvtai.kernels.sensors.io import SonarIO
+from uuvtai.sim.setup import load_bounds
+from uuvtai.state import (
+    ClockState,
+    ClusterState,
+    DepthImage,
+    EpisodeState,
+    FeatureState,
+    GridMask,
+    MapScratch,
+    MapState,
+    Proprioception,
+    SonarMemory,
+    SonarScan,
+    TrackState,
+    VehicleState,
+    WorldState,
+    allocate,
+)
+
+N_ENV, N_BODY = 24, 14
+TANK, RULES = TankConfig(), EpisodeConfig()
+SIZES = {"n_env": N_ENV, "n_body": N_BODY, "n_ray": 512, "n_latency": 2, "n_cloud": 1, "n_thruster": 6}
+TOLERANCE_M = 2e-3
+GRAZING_SHARE = 2e-4
+"""Beams that pass an edge closer than float32 can tell, of those of all scenes here."""
+SONAR = load_config("pool", "multibeam").sensors.sonar
+CLEAN = {"range_sigma_m": 0.0, "doppler_sigma_m_s": 0.0}
+FLAT = SONAR.model_copy(update={"vertical_half_aperture_deg": 0.0, **CLEAN})
+"""aperture 0: a beam is a line in space, which MuJoCo casts at the bodies themselves"""
+FINE = SonarConfig(n_ray=512, horizontal_aperture_deg=120.0)
+
+
+def bearings(config):
+    """[rad] of all beams from ahead: the middles of n equal parts of the aperture, from right to left."""
+    share = (np.arange(config.n_ray) + 0.5) / config.n_ray - 0.5
+    return np.radians(config.horizontal_aperture_deg) * share
+
+
+def aim(scene, env, config):
+    """(n, 2) horizontal unit vectors of the beams of one env."""
+    R = scenes.rotation(scene["quat"][env])
+    world = np.arctan2(R[1, 0], R[0, 0]) + bearings(config)
+    return np.stack([np.cos(world), np.sin(world)], 1)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return scenes.random_scenes(np.random.default_rng(7), N_ENV, N_BODY, TANK)
+
+
+def cast(scene, config):
+    """What a sonar reports of a scene: ranges, returns and Doppler (N_ENV, n_ray)."""
+    parts = [
+        allocate(struct, SIZES)
+        for struct in (SonarScan, SonarMemory, Proprioception, VehicleState, WorldState, EpisodeState)
+    ]
+    clock = allocate(ClockState, SIZES)
+    scenes.load(scene, parts[3], parts[4])
+    clock.awake.fill(1)
+    sonar.reset_sonar(io_for(SonarIO, parts[0], parts[1], clock))
+    sonar.cast_sonar(io_for(SonarIO, *parts, clock, config, TANK, RULES))
+    names = ("range_m", "hit", "doppler_m_s")
+    return [getattr(parts[0], name).to_numpy()[:, : config.n_ray] for name in names]
+
+
+def test_a_fan_lies_ahead_and_a_ring_begins_there():
+    ring = SonarConfig()
+    assert ring.is_ring and ring.first_beam_rad == 0.0 and ring.circle_beams == 256
+    assert ring.beam_step_rad == pytest.approx(2 * np.pi / 256, abs=1e-15)
+    assert not SONAR.is_ring and not SONAR.doppler
+    assert SONAR.n_ray == 256 and SONAR.horizontal_aperture_deg == 130.0
+    for fan in (SONAR, FINE):
+        told = fan.first_beam_rad + fan.beam_step_rad * np.arange(fan.n_ray)
+        np.testing.assert_allclose(told, bearings(fan), atol=1e-12)
+        assert fan.circle_beams * fan.beam_step_rad == pytest.approx(2 * np.pi, abs=fan.beam_step_rad)
+
+
+@pytest.mark.parametrize("degrees", ["0", "9", "361", "nan", "wide"])
+def test_an_aperture_that_cannot_be_is_refused(degrees):
+    with pytest.raises(UserError, match=r"sonar\.horizontal_aperture_deg"):
+        load_config("pool", "multibeam", overrides={"sensors.sonar.horizontal_aperture_deg": degrees})
+
+
+@ti.kernel
+def ask(bearing: AnyTensor, beam: AnyTensor, back: AnyTensor, sonar_cfg: Const[SonarConfig]):
+    for i in range(bearing.shape[0]):
+        beam[i] = beam_there(beam_towards(bearing[i], sonar_cfg), sonar_cfg)
+        back[i] = beam_bearing(ti.max(beam[i], 0), sonar_cfg)
+
+
+@pytest.mark.parametrize("config", [SONAR, SonarConfig(n_ray=96)], ids=["fan", "ring"])
+def test_beams_are_found_by_their_bearing(config):
+    asked = np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, 4000).astype(np.float32)
+    beam, back = np.zeros(4000, np.int32), np.zeros(4000, np.float32)
+    ask(asked, beam, back, config)
+    off = np.angle(np.exp(1j * (asked - back)))
+    step = config.beam_step_rad
+    assert np.abs(off[beam >= 0]).max() < 0.5 * step + 1e-5
+    wrapped = np.abs(np.angle(np.exp(1j * asked.astype(float))))
+    edge = np.pi if config.is_ring else np.radians(65.0)
+    np.testing.assert_array_equal(
+        (beam < 0)[np.abs(wrapped - edge) > 1e-4], (wrapped > edge)[np.abs(wrapped - edge) > 1e-4]
+    )
+
+
+def test_a_fans_ranges_are_mujocos(scene):
+    range_m, hit, doppler = cast(scene, FLAT)
+    truth = []
+    for env in range(N_ENV):
+        beams = np.column_stack([aim(scene, env, FLAT), np.zeros(FLAT.n_ray)])
+        truth.append(scenes.Caster(scene, env, TANK).distances(scene["pos"][env], beams))
+    truth = np.array(truth)
+    wrong = np.abs(range_m - np.minimum(truth, 12.0)) > TOLERANCE_M
+    assert wrong.mean() < GRAZING_SHARE
+    assert ((hit == 1) == (truth <= 12.0)).mean() > 1 - GRAZING_SHARE
+    assert not doppler.any(), "this sonar measures none"
+
+
+def test_a_fine_fans_ranges_and_doppler_are_the_oracles(scene):
+    """The vertical aperture too: what a beam meets above or below its plane."""
+    range_m, hit, doppler = cast(scene, FINE)
+    slope, wrong, bodies = np.tan(np.radians(10.0)), 0, 0
+    for env in range(N_ENV):
+        u = aim(scene, env, FINE)
+        best, who = wall_hits(scene["pos"][env][:2], u, TANK)[0], np.full(FINE.n_ray, -1)
+        for body in np.flatnonzero(scene["kind"][env]):
+            r, _ = body_hits(scene, env, body, scene["pos"][env], u, slope)
+            best, who = np.where(r < best, r, best), np.where(r < best, body, who)
+        right = np.abs(range_m[env] - np.minimum(best, 12.0)) < TOLERANCE_M
+        wrong, bodies = wrong + (~right).sum(), bodies + (who >= 0).sum()
+        rate = doppler_by_differences(scene, env, u, best, who)
+        assert np.abs(doppler[env] - rate)[right & (hit[env] == 1)].max() < 1e-4
+    assert wrong < GRAZING_SHARE * N_ENV * FINE.n_ray and bodies > 1000
+
+
+# ------------------------------------------------------------------------------------- what is made of a scan
+
+POND = TankConfig(x_m=(0.0, 6.0), y_m=(0.0, 4.0))
+MAP, CAMERA = MappingConfig(period_steps=1), DepthConfig(rows=6, cols=16)
+SMALL = SonarConfig(n_ray=64, horizontal_aperture_deg=100.0, doppler=False)
+
+
+def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
+    """At (2, 2), nose to +y: free water within 50 degrees of it up to the wall, a body at (2, 3) at rest; the
+    Doppler that is not measured is not a number."""
+    shape = grid_shape(POND, MAP.cell_m)
+    sizes = {"n_env": 1, "n_row": shape[0], "n_col": shape[1], "n_ray": 64, "n_track": 4, "n_cluster": 4}
+    sizes |= {"n_height": 16, "n_slot": 1, "n_pixel_row": 6, "n_pixel_col": 16}
+    made = {
+        struct: allocate(struct, sizes)
+        for struct in (
+            MapState,
+            MapScratch,
+            SonarScan,
+            DepthImage,
+            TrackState,
+            ClusterState,
+            GridMask,
+            ClockState,
+        )
+    }
+    scan, grid = made[SonarScan], made[MapState]
+    load_bounds(made[GridMask], np.array(outside_cells(POND, MAP.cell_m)))
+    world = np.pi / 2 + bearings(SMALL)
+    to_wall = np.minimum(2.0 / np.sin(world), 2.0 / np.maximum(np.abs(np.cos(world)), 1e-9))
+    hits_body = np.abs(bearings(SMALL)) < np.radians(10.0)
+    scan.range_m.from_numpy(np.where(hits_body, 1.0, to_wall)[None].astype(np.float32))
+    scan.hit.fill(1)
+    scan.doppler_m_s.fill(np.nan)
+    scan.ping_yaw.fill(np.pi / 2)
+    scan.ping_pos_w.from_numpy(np.array([[2.0, 2.0, -0.8]], np.float32))
+    scan.ping_vel_b.from_numpy(np.array([[0.6, 0.0, 0.0]], np.float32))
+    scan.ping_vel_valid.fill(1)
+    scan.fresh.fill(1)
+    made[TrackState].beam_track.fill(-1)
+    made[ClockState].awake.fill(1)
+    mapping.reset_map(io_for(MappingIO, grid, made[ClockState]))
+    io = io_for(MappingIO, *made.values(), MAP, SMALL, CAMERA, POND, RULES)
+    for step in range(20):
+        made[ClockState].step.fill(step)
+        mapping.update_map(io)
+    found = get_map(grid)
+    x0, y0 = grid_origin(POND, MAP.cell_m)
+    x = x0 + (np.arange(shape[1]) + 0.5) * MAP.cell_m - 2.0
+    y = y0 + (np.arange(shape[0]) + 0.5) * MAP.cell_m - 2.0
+    off = np.degrees(np.abs(np.arctan2(x[None, :], y[:, None])))
+    seen = found["seen"][0].astype(bool)
+    assert not seen[off > 52.0].any(), "nothing beside or behind the fan"
+    inside = (np.hypot(x[None, :], y[:, None]) < 0.8) & (off < 46.0)
+    assert seen[inside].all() and inside.sum() > 30
+    assert found["static"][0].max() > 0.5 and not found["dynamic"][0].any()
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.3, np.pi])
+def test_sectors_beside_the_fan_have_no_return(turned):
+    """Every beam returns from 3 m; the vehicle has turned since."""
+    n_sector, features, config = 12, FeaturesConfig(), SONAR.model_copy(update={"doppler": True})
+    sizes = {"n_env": 1, "n_ray": 256, "n_sector": n_sector, "n_track": 4}
+    made = [allocate(struct, sizes) for struct in (FeatureState, SonarScan, Proprioception, ClockState)]
+    state, scan, ego, clock = made
+    scan.range_m.fill(3.0)
+    scan.hit.fill(1)
+    scan.doppler_m_s.fill(-0.5)
+    ego.rpy.from_numpy(np.array([[0.0, 0.0, turned]], np.float32))
+    clock.awake.fill(1)
+    sense_sectors(io_for(FeaturesIO, *made, features, config))
+    middle = np.arange(n_sector) * 2 * np.pi / n_sector + turned
+    away = np.degrees(np.abs(np.angle(np.exp(1j * middle)))) - 15.0
+    sees = away < 64.0
+    assert np.all(np.abs(away - 65.0) > 1.0), "no sector ends at the fan's edge"
+    np.testing.assert_array_equal(state.sector_valid.to_numpy()[0] == 1, sees)
+    np.testing.assert_allclose(state.sector_range_m.to_numpy()[0], np.where(sees, 3.0, 12.0))
+    np.testing.assert_allclose(state.sector_closing_m_s.to_numpy()[0], np.where(sees, 0.5, 0.0))
+    np.testing.assert_allclose(
+        state.sector_ttc_s.to_numpy()[0], np.where(sees, min(6.0, features.ttc_cap_s), features.ttc_cap_s)
+    )

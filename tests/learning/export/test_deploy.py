@@ -1,0 +1,470 @@
+"""Exported policies: NumPy, ONNX Runtime and torch agree with the pilot; folders are whole, checked, and
+never believed."""
+
+import ast
+import json
+import runpy
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.command import run_cli
+from uuvtai.config import FeaturesConfig
+from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.kernels.planning.observation import observation_width, placed_columns
+from uuvtai.learning import checkpoint
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.export import folder as deploy
+from uuvtai.learning.export import run_policy
+from uuvtai.learning.export.card import evaluations_of
+from uuvtai.learning.export.folder import of_torch
+from uuvtai.learning.export.graph import TOLERANCE, OneDecision, golden_of, missing_packages
+from uuvtai.learning.export.spec import weights_of
+from uuvtai.learning.networks import ActorCritic
+from uuvtai.learning.policy_agent import TEACHER_COLUMN, Pilot, load_pilot
+from uuvtai.learning.world_model import N_TARGET, WorldModel
+from uuvtai.plugins.api import piece_spec
+from uuvtai.plugins.loading import graph_of, onnx_policy
+
+N_OBS = 40
+TEACHER = slice(30, 34)
+TABLE = [
+    ("goal", 0, 3, "m", "body"),
+    ("rest", 3, 30, "1", "level"),
+    (TEACHER_COLUMN, 30, 34, "1", "body"),
+    ("more", 34, 40, "s", "body"),
+]
+SMALL = {"policy.hidden": [16, 16], "world_model.hidden": [16], "world_model.latent": 8}
+
+
+class Column:
+    """A row of an observation table."""
+
+    def __init__(self, name, first, stop, unit, frame):
+        self.name, self.slice, self.unit, self.frame = name, slice(first, stop), unit, frame
+
+
+def config_of(**changes):
+    return load_training(
+        "smoke", list((SMALL | {key.replace("__", "."): value for key, value in changes.items()}).items())
+    )
+
+
+def networks(config, seed=0):
+    """Networks that have seen a batch and act decidedly, as a trainer's state."""
+    rng = torch.Generator().manual_seed(seed)
+    policy = ActorCritic(N_OBS + 2, config.policy, TEACHER, rng)
+    policy.observation_norm.update(3.0 * torch.randn(500, N_OBS + 2, generator=rng) + 1.0)
+    policy.value_norm.update(20.0 * torch.randn(500, 1, generator=rng) + 5.0)
+    with torch.no_grad():
+        policy.actor[-1].weight.copy_(torch.randn(policy.actor[-1].weight.shape, generator=rng))
+    state = {"policy": policy.state_dict(), "env": {}}
+    if config.world_model.enabled:
+        model = WorldModel(N_OBS, config.world_model, rng)
+        model.observation_norm.update(3.0 * torch.randn(500, N_OBS, generator=rng))
+        model.change_norm.update(0.2 * torch.randn(500, N_TARGET, generator=rng))
+        state["world_model"] = model.state_dict()
+    return state
+
+
+def saved(folder, config=None, metrics=None, **changes):
+    """A run folder with one checkpoint."""
+    config = config or config_of(**changes)
+    table = [Column(*row) for row in TABLE]
+    checkpoint.save(folder / "checkpoints", 3, networks(config), config, table, metrics=metrics)
+    return checkpoint.newest(folder)
+
+
+def exported(found, out, note=lambda _text: None, evaluations=()):
+    return deploy.export(found, "mine", out, evaluations, note)
+
+
+# -------------------------------------------------------------------------------------------------- agreement
+
+CASES = {
+    "residual held for ten steps": {"policy.residual": True, "policy.hold_steps": 10},
+    "residual at every step": {"policy.residual": True},
+    "plain, held for ten": {"policy.hold_steps": 10},
+    "plain at every step": {},
+    "no features, tanh": {
+        "world_model.as_features": False,
+        "policy.activation": "tanh",
+        "policy.hold_steps": 3,
+    },
+    "relu": {"policy.activation": "relu"},
+    "world model as in the paper": {
+        "world_model.predict_change": False,
+        "world_model.normalise_targets": True,
+    },
+    "targets as they are": {"world_model.predict_change": False, "world_model.normalise_targets": False},
+}
+
+
+@pytest.mark.parametrize("changes", CASES.values(), ids=CASES)
+def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, changes):
+    found = saved(tmp_path, load_training("smoke", list((SMALL | changes).items())))
+    pilot = load_pilot(found, 1)
+    golden = golden_of(pilot)
+    spec = {
+        "observation": {"width": N_OBS},
+        "action": found.manifest.action,
+        "rate": {"hold_steps": found.config.policy.hold_steps, "control_dt_s": 0.02},
+        "network": deploy.specification(found, pilot, "mine", False)["network"],
+    }
+    policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
+    answer = run_policy.replayed(policy, golden)
+    for name, values in answer.items():
+        assert run_policy.difference(values, golden[name]) <= TOLERANCE, name
+    assert of_torch(OneDecision(pilot), golden).agrees
+    has_model = pilot.world_model is not None
+    assert golden["action"].std() > 0.1 and np.abs(golden["action"]).max() <= 1.0
+    assert (golden["residual"] > 0).any() == has_model
+    first, hold = len(golden["obs"]) // 2 + 1, found.config.policy.hold_steps
+    assert len(golden["pair_obs"]) == -(-first // hold) + -(-(len(golden["obs"]) - first) // hold)
+    assert not np.isfinite(golden["obs"]).all(), "sensors that fail are among the golden pairs"
+
+
+def test_networks_that_have_seen_nothing_agree_too():
+    config, rng = config_of(), torch.Generator().manual_seed(0)
+    pilot = Pilot(
+        ActorCritic(N_OBS + 2, config.policy, None, rng), WorldModel(N_OBS, config.world_model, rng), 1
+    )
+    golden = golden_of(pilot)
+    spec = {
+        "observation": {"width": N_OBS},
+        "action": [{"limit": 1.0}] * 4,
+        "rate": {"hold_steps": 1, "control_dt_s": 0.02},
+    }
+    spec["network"] = {
+        "teacher_columns": None,
+        "activation": "elu",
+        "predict_change": True,
+        "residual_limit": 0.5,
+    }
+    policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
+    answer = run_policy.replayed(policy, golden)
+    assert max(run_policy.difference(values, golden[name]) for name, values in answer.items()) <= TOLERANCE
+
+
+def test_a_held_residual_follows_the_newest_tree_action(tmp_path, no_onnx):
+    exported(saved(tmp_path / "run", policy__residual=True, policy__hold_steps=10), tmp_path / "out")
+    policy = run_policy.load(tmp_path / "out")
+    obs = np.zeros(N_OBS, np.float32)
+    first = policy.act(obs)
+    obs[TEACHER] = 0.1
+    second = policy.act(obs)
+    np.testing.assert_allclose(second.action, np.clip(first.action + 0.1, -1, 1), atol=1e-6)
+    np.testing.assert_allclose(second.command_si, second.action * [0.6, 0.6, 0.4, 1.0], rtol=1e-6)
+    assert second.value == first.value, "what it thinks is held too"
+    policy.reset()
+    assert policy.act(obs).value != first.value
+
+
+def test_an_observation_of_another_width_is_refused(folder):
+    with pytest.raises(ValueError, match=r"must have shape \(40,\), got \(39,\)"):
+        run_policy.load(folder).act(np.zeros(39))
+
+
+# ----------------------------------------------------------------------------------------------------- folder
+
+
+@pytest.mark.skipif(bool(missing_packages()), reason="needs the extra uuvtai[export]")
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"policy__residual": True, "policy__hold_steps": 10},
+        {"world_model__as_features": False},
+    ],
+)
+def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, capfd):
+    pytest.importorskip("onnxruntime")
+    found = exported(saved(tmp_path / "run", **changes), tmp_path / "out")
+    assert [one.engine for one in found.agreements] == ["torch", "NumPy", "ONNX Runtime"]
+    assert found.agrees and all(0 < one.p50_ms <= one.p99_ms for one in found.agreements)
+    again = deploy.check(tmp_path / "out", print)
+    assert again.agrees and [one.engine for one in again.agreements] == ["NumPy", "ONNX Runtime"]
+    assert capfd.readouterr().out == "", "results only on stdout"
+    spec = run_policy.read_spec(tmp_path / "out")
+    assert set(spec["graph"]["inputs"]) == {"obs", "last_obs", "last_action", "has_last"}
+    assert set(spec["graph"]["outputs"]) == {"mean_action", "value", "features"}
+
+
+def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
+    found = saved(tmp_path / "run", policy__hold_steps=10)
+    exported(found, tmp_path / "out")
+    spec = run_policy.read_spec(tmp_path / "out")
+    columns = spec["observation"]["columns"]
+    assert [column["index"] for column in columns] == list(range(N_OBS))
+    norm = load_pilot(found, 1).policy.observation_norm
+    mean, std = float(norm.mean[2]), float(norm.std()[2])
+    assert columns[2] == {
+        "index": 2,
+        "name": "goal[2]",
+        "unit": "m",
+        "frame": "body",
+        "mean": mean,
+        "std": std,
+    }
+    assert [row["name"] for row in spec["features"]] == ["residual", "uncertainty"]
+    assert [(row["name"], row["limit"], row["unit"]) for row in spec["action"]] == [
+        ("surge", 0.6, "m/s"), ("sway", 0.6, "m/s"), ("heave", 0.4, "m/s"), ("yaw_rate", 1.0, "rad/s"),
+    ]  # fmt: skip
+    assert (spec["rate"]["control_hz"], spec["rate"]["decision_hz"], spec["rate"]["hold_steps"]) == (
+        50.0,
+        5.0,
+        10,
+    )
+    assert spec["checkpoint"]["sha256"] == found.sha256
+    listed = {path.name for path in (tmp_path / "out").iterdir()} - {"policy_spec.json"}
+    assert set(spec["files"]) == listed == {"policy.safetensors", "golden.npz", "README.md", "run_policy.py"}
+
+
+def test_the_folder_drives_where_there_is_numpy_alone(folder):
+    """In a process that can import neither torch nor uuvtai; and the file itself imports NumPy and the
+    standard library alone."""
+    code = (
+        "import sys, runpy\n"
+        "class Guard:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('torch', 'uuvtai', 'taichi', 'safetensors', 'onnxruntime', "
+        "'onnx'): raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Guard()); sys.argv = ['run_policy.py']; runpy.run_path('run_policy.py', "
+        "run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "uncertainty: largest difference" in done.stdout and "p50" in done.stdout
+    roots = {
+        (node.module or "").split(".")[0]
+        if isinstance(node, ast.ImportFrom)
+        else node.names[0].name.split(".")[0]
+        for node in ast.walk(ast.parse((folder / "run_policy.py").read_text()))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    }
+    assert roots - set(sys.stdlib_module_names) == {"numpy"}
+
+
+def test_constants_that_the_driver_repeats_are_those_of_the_package():
+    from uuvtai.learning import world_model
+
+    assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, world_model.N_ACTION)
+    assert (run_policy._LOG_VAR, run_policy._MAX_DEVIATIONS) == (
+        world_model.LOG_VAR_BOUNDS,
+        world_model.MAX_DEVIATIONS,
+    )
+
+
+def test_without_the_extra_the_graph_is_left_out_and_told(tmp_path, no_onnx):
+    notes = []
+    found = exported(saved(tmp_path / "run"), tmp_path / "out", notes.append)
+    assert found.agrees and not (tmp_path / "out" / "policy.onnx").exists()
+    assert "pip install 'uuvtai[export]'" in notes[0]
+    assert run_policy.read_spec(tmp_path / "out")["graph"] is None
+
+
+def test_a_place_that_is_taken_is_refused_and_a_full_disk_leaves_nothing(tmp_path, no_onnx, monkeypatch):
+    found = saved(tmp_path / "run")
+    (tmp_path / "out").mkdir()
+    with pytest.raises(ConfigError, match="already there; give another folder with --out"):
+        exported(found, tmp_path / "out")
+
+    def full(path, content):
+        if path.name == "golden.npz":
+            raise OSError(28, "No space left on device")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+    monkeypatch.setattr(deploy, "write_atomic", full)
+    with pytest.raises(RuntimeError, match="No space left"):
+        exported(found, tmp_path / "other")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "run"]
+
+
+def test_networks_that_cannot_drive_are_not_exported(tmp_path, no_onnx):
+    config = config_of()
+    state = networks(config)
+    state["policy"]["log_std"] = torch.full((4,), float("nan"))
+    checkpoint.save(tmp_path / "run" / "checkpoints", 1, state, config, [Column(*row) for row in TABLE])
+    with pytest.raises(CheckpointError, match="log_std is not finite"):
+        exported(checkpoint.newest(tmp_path / "run"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+# ------------------------------------------------------------------------------------------------------- card
+
+
+def result_of(found, k=90, n=100):
+    """A result of ``uuv eval`` with this checkpoint and a tree."""
+    outcomes = {"success": k, "collision": n - k - 2, "ttc": 1, "out_of_tank": 0, "timeout": 1}
+    methods = [{"name": "bt", "episodes": n, "outcomes": outcomes}]
+    methods.append(
+        {"name": "mine", "episodes": n, "outcomes": outcomes, "checkpoint": {"sha256": found.sha256}}
+    )
+    return {
+        "world": "pool",
+        "S": 8,
+        "D": 6,
+        "v_m_s": 0.6,
+        "sensors": "paper",
+        "seeds": [1, 2],
+        "methods": methods,
+    }
+
+
+def written(folder, result):
+    (folder / "eval").mkdir(parents=True)
+    (folder / "eval" / "result.json").write_text(json.dumps(result))
+    return folder
+
+
+def test_the_card_has_counts_and_intervals(tmp_path, no_onnx):
+    found = saved(
+        tmp_path / "run",
+        metrics={"eval/success_rate": 0.5, "eval/collision_rate": 0.25, "time/env_steps": 2e6},
+    )
+    written(tmp_path / "run" / "eval_pool", result_of(found))
+    elsewhere = written(tmp_path / "elsewhere", result_of(found, 40, 50))
+    exported(found, tmp_path / "out", evaluations=[elsewhere])
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert (
+        "pool, S = 8, D = 6, v = 0.6 m/s, paper sensing, seed 1, 2 | 90/100 = 90.0 % [82.6, 94.5] | 9/100 = "
+        "9.0 %" in card
+    )
+    assert (
+        "40/50 = 80.0 %" in card
+        and "2/4 = 50.0 % [15.0, 85.0] | 1/4" in card
+        and "too good by selection" in card
+    )
+    assert "2.00 million env-steps" in card
+
+
+def test_without_evaluations_the_card_says_so(folder):
+    assert "No evaluation was at hand" in (folder / "README.md").read_text()
+
+
+def test_evaluations_of_something_else_are_refused(tmp_path):
+    found = saved(tmp_path / "run")
+    other = result_of(found)
+    other["methods"][1]["checkpoint"]["sha256"] = "0" * 64
+    with pytest.raises(ConfigError, match="does not evaluate this checkpoint"):
+        evaluations_of(found, [written(tmp_path / "other", other)])
+    for number, broken in enumerate(
+        (
+            result_of(found, k=-3),
+            {"methods": [3]},
+            [],
+            {"methods": [{"checkpoint": {"sha256": found.sha256}}]},
+        )
+    ):
+        with pytest.raises(ConfigError, match="is no result of uuv eval"):
+            evaluations_of(found, [written(tmp_path / str(number), broken)])
+    with pytest.raises(ConfigError, match="is no result of uuv eval"):
+        evaluations_of(found, [tmp_path / "nowhere"])
+
+
+# ---------------------------------------------------------------------------------------------------- command
+
+
+def without_graph(root):
+    """An exported folder; ONNX takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(deploy, "missing_packages", lambda: ["onnx"])
+        exported(saved(root / "run"), root / "out")
+    return root / "out"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An exported policy."""
+    return without_graph(tmp_path_factory.mktemp("export"))
+
+
+@pytest.fixture
+def folder(whole, tmp_path):
+    """A copy of it to be spoiled."""
+    return Path(shutil.copytree(whole, tmp_path / "out"))
+
+
+def test_the_command_exports_prints_and_checks(tmp_path, no_onnx, capfd):
+    saved(tmp_path / "run")
+    assert run_cli("export", tmp_path / "run", "--out", tmp_path / "out", "--json") == 0
+    answer = capfd.readouterr()
+    document = json.loads(answer.out)
+    assert document["agrees"] and [engine["engine"] for engine in document["engines"]] == ["torch", "NumPy"]
+    assert "left out policy.onnx" in answer.err
+    assert run_cli("export", "--check", tmp_path / "out") == 0
+    assert "agrees" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "golden.npz", "README.md", "run_policy.py"])
+def test_a_changed_file_is_exit_3(folder, name, capfd):
+    content = bytearray((folder / name).read_bytes())
+    content[-1] ^= 1
+    (folder / name).write_bytes(content)
+    assert run_cli("export", "--check", folder) == 3
+    assert f"{name}: has changed" in capfd.readouterr().err
+
+
+def resigned(folder, name, content):
+    """Put other content in a file, with its right sha256 in the specification."""
+    (folder / name).write_bytes(content)
+    spec = json.loads((folder / "policy_spec.json").read_text())
+    spec["files"][name] = run_policy.hashlib.sha256(content).hexdigest()
+    (folder / "policy_spec.json").write_text(json.dumps(spec))
+
+
+def test_other_weights_with_the_right_sha256_are_exit_3(folder, tmp_path, capfd):
+    other = saved(tmp_path / "other", config_of(), metrics={"a": 1.0})
+    weights = weights_of(load_pilot(other, 1))
+    weights["actor.4.bias"] += 0.01
+    from safetensors.torch import save
+
+    resigned(folder, "policy.safetensors", save(weights))
+    assert run_cli("export", "--check", folder) == 3
+    assert "DIFFERS" in capfd.readouterr().out
+    done = subprocess.run(
+        [sys.executable, "run_policy.py"], cwd=folder, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says", "code"),
+    [
+        (["export"], "give the RUN to export", 2),
+        (["export", "x", "--check", "y"], "give the RUN to export", 2),
+        (["export", "nothing"], "is no trained policy", 2),
+        (["export", "--check", "nothing"], "policy_spec.json: is missing", 2),
+    ],
+)
+def test_bad_usage(arguments, says, code, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run_cli(*arguments) == code
+    assert says in capfd.readouterr().err
+
+
+# ---------------------------------------------------------------------------------- a policy of the user's
+
+
+def test_the_example_writes_a_graph_that_is_taken_as_a_policy(tmp_path, monkeypatch):
+    """``python examples/own_onnx.py``, then ``uuv eval --agent model.onnx``."""
+    pytest.importorskip("onnxscript", reason="needs the extra uuvtai[export]")
+    columns = {c.name: slice(first, first + width) for c, first, width in placed_columns(FeaturesConfig())}
+    n_obs = observation_width(FeaturesConfig())
+    env = SimpleNamespace(num_obs=n_obs, columns=columns)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("uuvtai.make", lambda *_given, **_others: env)
+    module = runpy.run_path(str(Path(__file__).parents[3] / "examples/own_onnx.py"), run_name="__main__")
+    spec = piece_spec("model.onnx", "policy")
+    act, hold_steps = onnx_policy(spec, graph_of(spec), n_obs)
+    obs = torch.randn(64, n_obs)
+    np.testing.assert_allclose(act(obs.numpy()), module["Policy"](columns)(obs), rtol=1e-5, atol=1e-6)
+    assert hold_steps == 10

@@ -1,0 +1,421 @@
+"""Exported policies over a set of bodies and forecasts: NumPy, ONNX Runtime and torch agree with
+what drives in the simulator, the hull rule is the kernel's, and folders are checked and never believed."""
+
+import copy
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from tests.command import run_cli
+from tests.learning.export.test_deploy import resigned
+from tests.oracles import hull_rule as reference
+from uuvtai.common.enums import BODY_WIDTH, COLUMNS, EGO_COLUMNS, N_BODY, N_COLUMN
+from uuvtai.config import TankConfig, VehicleConfig
+from uuvtai.config.loader import load_training
+from uuvtai.learning import checkpoint, networks, set_networks
+from uuvtai.learning.agents import load_set_pilot
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.export import folder as deploy
+from uuvtai.learning.export import run_policy, run_set_policy
+from uuvtai.learning.export import spec as set_columns_text
+from uuvtai.learning.export.graph import (
+    TOLERANCE,
+    golden_rows,
+    kind_of,
+    missing_packages,
+    module_of,
+    set_weights,
+)
+from uuvtai.learning.export.spec import hull_rule_of
+from uuvtai.learning.forecast import column_row
+from uuvtai.learning.networks import MixtureNet
+from uuvtai.learning.set_networks import SetActor, SetCritic
+from uuvtai.surrogate.arrays import TRUTH_WIDTH
+from uuvtai.surrogate.observation import SET_TABLE
+
+NET = {"twin.body_hidden": 8, "twin.head_hidden": 8}
+
+
+def filled(module, seed, spread=0.3):
+    """With weights that say something."""
+    rng = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for tensor in module.parameters():
+            tensor.add_(spread * torch.randn(tensor.shape, generator=rng))
+    return module
+
+
+def actor_and_critic(config):
+    rng = torch.Generator().manual_seed(1)
+    actor = filled(SetActor(BODY_WIDTH, EGO_COLUMNS, config, rng), 2)
+    critic = SetCritic(BODY_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, rng)
+    return {"policy": actor.state_dict(), "critic": critic.state_dict(), "counters": {}, "env": {}}
+
+
+def saved(kind, folder, change=None):
+    """A run folder with one checkpoint of a kind, after ``change`` of its state."""
+    preset, table = ("twin", SET_TABLE) if kind == "set" else ("forecast", (column_row(),))
+    config = load_training(preset, overrides=NET)
+    state = actor_and_critic(config)
+    if kind == "forecast":
+        net = filled(MixtureNet(torch.Generator().manual_seed(6)), 7, 0.05)
+        state = {"forecast": net.state_dict(), "counters": {}, "env": {}}
+    state = copy.deepcopy(state)
+    if change:
+        change(state)
+    metrics = {"eval/nll_pool": -3.25, "eval/success_rate": 0.5, "eval/collision_rate": 0.25}
+    checkpoint.save(folder / "checkpoints", 3, state, config, table, metrics=metrics)
+    return checkpoint.newest(folder)
+
+
+def exported(kind, folder):
+    """(checkpoint, what was exported, into which folder)."""
+    found, out = saved(kind, folder / "run"), folder / "out"
+    return found, deploy.export(found, "mine", out, (), lambda _text: None), out
+
+
+@pytest.fixture(scope="module", params=run_policy.KINDS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def whole(kind, tmp_path_factory):
+    """(checkpoint, exported folder without a graph)."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(deploy, "missing_packages", lambda: ["onnx"])
+        found, done, out = exported(kind, tmp_path_factory.mktemp(kind))
+    assert [each.engine for each in done.agreements] == ["torch", "NumPy"] and done.agrees
+    return found, out
+
+
+def test_a_folder_has_its_driver_and_checks_itself(kind, whole, capfd):
+    _, folder = whole
+    spec = run_policy.read_spec(folder)
+    listed = {path.name for path in folder.iterdir()} - {"policy_spec.json", "__pycache__"}
+    drivers = {"run_policy.py", "run_set_policy.py"}
+    assert set(spec["files"]) == listed == {"policy.safetensors", "golden.npz", "README.md"} | drivers
+    assert spec["kind"] == kind and spec["graph"] is None
+    assert run_cli("export", "--check", folder) == 0
+    assert "agrees" in capfd.readouterr().out
+
+
+def test_the_card_says_where_it_was_judged(whole, kind):
+    """Not in the config's own world: in all worlds and scenes that it learnt in."""
+    card = (whole[1] / "README.md").read_text()
+    if kind == "set":
+        assert (
+            "the kinematic twin, pool and gauntlet, S = 8, D = 9, v = 1.5 m/s; S = 8, D = 9, v = 1 m/s; "
+            in card
+        )
+        assert "| 768/1536 = 50.0 % | 384/1536 = 25.0 % |" in card, (
+            "no interval: scenes share their episodes' numbers"
+        )
+    assert "the simulator of uuvtai" not in card
+
+
+def test_it_drives_where_there_is_numpy_alone(whole):
+    _, folder = whole
+    code = (
+        "import sys, runpy\n"
+        "class Guard:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('torch', 'uuvtai', 'taichi', 'safetensors', 'onnxruntime'): raise "
+        "ImportError(name)\n"
+        "sys.meta_path.insert(0, Guard()); sys.path.insert(0, '.'); sys.argv = ['run_set_policy.py']\n"
+        "runpy.run_path('run_set_policy.py', run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", code],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "largest difference" in done.stdout and "p50" in done.stdout
+
+
+def test_the_golden_pairs_say_something(kind, whole):
+    golden = run_policy.read_golden(whole[1] / "golden.npz")
+    if kind == "forecast":
+        assert golden["pair_columns"].shape == (64, COLUMNS) and np.ptp(golden["pair_log_weight"]) > 0.1
+        assert (golden["pair_sigma"] > 0).all() and golden["pair_place"].shape == (64, 6, 5, 2)
+        return
+    there = golden["pair_bodies"][..., 0]
+    assert set(there.sum(1).astype(int)) >= {0, 1, N_BODY} and np.ptp(golden["pair_mean_wish"]) > 0.5
+    assert (golden["pair_bodies"][there == 0] == 0).all()
+
+
+def test_no_critic_and_no_truth_is_exported(kind, whole):
+    """Every array is one of the networks that drive, and every input what the vehicle knows."""
+    found, folder = whole
+    arrays = run_policy.read_safetensors(folder / "policy.safetensors")
+    module = module_of(found, kind)
+    driving = module.actor.net if kind == "set" else module.net
+    assert len(arrays) == len(driving.state_dict())
+    parts = {"set": {"actor"}, "forecast": {"into", "middle", "said", "spread"}}
+    assert {name.split(".")[0] for name in arrays} == parts[kind]
+    assert not any("critic" in name or "log_std" in name for name in arrays)
+    text = (folder / "policy_spec.json").read_text() + (folder / "README.md").read_text()
+    assert "critic" not in text and "truth" not in text
+    if kind != "forecast":
+        assert arrays["actor.body.0.weight"].shape[1] == BODY_WIDTH
+        assert arrays["actor.own.0.weight"].shape[1] == EGO_COLUMNS
+
+
+@pytest.mark.parametrize("kind", run_policy.KINDS)
+def test_the_graph_says_the_same(kind, tmp_path):
+    if missing_packages():
+        pytest.skip("needs the extra uuvtai[export]")
+    _, done, out = exported(kind, tmp_path)
+    assert [each.engine for each in done.agreements] == ["torch", "NumPy", "ONNX Runtime"] and done.agrees
+    spec = run_policy.read_spec(out)
+    policy = run_set_policy.load(out)
+    assert set(spec["graph"]["inputs"]) == set(policy.inputs)
+    assert set(spec["graph"]["outputs"]) == set(policy.said(golden_inputs(out, policy)))
+    if kind == "forecast":
+        return
+    from uuvtai.learning.export.graph import session
+
+    rng = np.random.default_rng(0)
+    few = {name: rng.normal(size=(3, policy.widths[name])).astype(np.float32) for name in policy.inputs[1:]}
+    few["bodies"] = rng.normal(size=(3, 2, BODY_WIDTH)).astype(np.float32)
+    few["bodies"][..., 0] = 1.0
+    graph = session((out / "policy.onnx").read_bytes())
+    (wish, *_) = graph.run(["mean_wish"], few)
+    np.testing.assert_allclose(wish, policy.said(few)["mean_wish"], atol=1e-5)
+
+
+def golden_inputs(folder, policy):
+    golden = run_policy.read_golden(folder / "golden.npz")
+    return {name: golden[f"pair_{name}"] for name in policy.inputs}
+
+
+# ------------------------------------------------------------------------------------------------ what drives
+
+
+def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp_path, no_onnx):
+    """Columns that the pilot wrote, the wish, and the hull rule where each vehicle then is."""
+    found, _, out = exported("set", tmp_path)
+    policy, pilot = run_set_policy.load(out), load_set_pilot(found, small.sim)
+    small.begin(range(small.N), seed=5)
+    pilot.reset(torch.ones(small.N))
+    ways = small.sim.rows(small.sim.s.mission.goal_w) - small.sim.rows(small.sim.s.mission.start_w)
+    for step in range(7):
+        action = pilot.decide(torch.zeros(small.N, 1)).action.numpy()
+        yaw, z = (
+            small.sim.rows(small.sim.s.ego.rpy)[:, 2],
+            small.sim.rows(small.sim.s.ego.pos_w)[:, 2],
+        )
+        if step % 5 == 0:
+            wishes = [
+                policy.act(bodies, own).wish
+                for bodies, own in zip(pilot.bodies.numpy(), pilot.own.numpy(), strict=True)
+            ]
+            np.testing.assert_allclose(wishes, pilot.wish.numpy(), atol=1e-5)
+        flips = np.where(ways[:, :2] >= 0, 1, -1)
+        commands = [policy.command(*row) for row in zip(wishes, flips, yaw, z, strict=True)]
+        np.testing.assert_allclose(commands, action, atol=1e-5)
+        assert np.abs(commands).max() > 0.1
+        small.sim.step(torch.from_numpy(action))
+        pilot.advance()
+
+
+def test_the_hull_rule_is_that_of_the_oracle():
+    config = load_training("twin", overrides=NET)
+    decision = module_policy()
+    rng = np.random.default_rng(0)
+    low, high = [-1.5, -1.5, -1.5, -np.pi, -1.6], [1.5, 1.5, 1.5, np.pi, 0.0]
+    rule = hull_rule_of(config)
+    for x, y, up, yaw, z in rng.uniform(low, high, (300, 5)):
+        flip = rng.choice([-1, 1], 2)
+        long = max(1.0, np.hypot(x, y))
+        wish = np.array([*(rule["fastest_m_s"] * flip * [x, y] / long), np.clip(up, -1, 1) * 0.4])
+        wanted = reference.hull_command(wish, yaw, z, rule["gap_m"], VehicleConfig(), TankConfig())
+        np.testing.assert_allclose(decision.command((x, y, up), flip, yaw, z), wanted, atol=1e-5)
+    assert rule["limits_m_s"]["heave"] == 0.4 and rule["z_m"] == [-1.6, 0.0]
+    slow = decision.command((0.01, 0.0, 0.0), (1, 1), 0.3, -0.8)
+    assert slow[3] == 0.0, "too slow to turn for"
+
+
+def module_policy():
+    """A policy of made-up weights, without a folder."""
+    config = load_training("twin", overrides=NET)
+    actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    spec = {
+        "observation": {
+            "meaning": "",
+            "bodies": {"columns": [0] * BODY_WIDTH},
+            "own": {"columns": [0] * EGO_COLUMNS},
+        },
+        "network": {"goal_gain": 0.7},
+        "hull_rule": hull_rule_of(config),
+    }
+    arrays = {f"actor.{name}": tensor.numpy() for name, tensor in actor.net.state_dict().items()}
+    return run_set_policy.SetPolicy(spec, arrays)
+
+
+def test_order_and_number_of_bodies_do_not_matter():
+    policy, rng = module_policy(), np.random.default_rng(3)
+    bodies, own = rng.normal(size=(5, BODY_WIDTH)), rng.normal(size=EGO_COLUMNS)
+    bodies[:, 0] = 1.0
+    wish = policy.act(bodies, own).wish
+    np.testing.assert_allclose(policy.act(bodies[::-1], own).wish, wish, atol=1e-6)
+    more = np.concatenate([bodies, np.zeros((4, BODY_WIDTH))])
+    np.testing.assert_allclose(policy.act(more, own).wish, wish, atol=1e-6)
+
+
+def test_words_and_constants_are_those_of_the_package():
+    text = set_columns_text
+    assert [len(columns) for columns in (text.BODY_COLUMNS, text.OWN_COLUMNS)] == [BODY_WIDTH, EGO_COLUMNS]
+    names = [row["name"] for columns in (text.BODY_COLUMNS, text.OWN_COLUMNS) for row in columns]
+    assert names[12] == "way_in_1s.x" and names[BODY_WIDTH + 3] == "goal_direction.x"
+    for own, theirs in (
+        (run_set_policy.AT_DIRECTION, set_networks.AT_DIRECTION),
+        (run_set_policy.SUM_SCALE, set_networks._SUM_SCALE),
+        (run_set_policy.MOST_WISH, set_networks.MOST_WISH),
+        (run_set_policy.LEAST_M, networks._LEAST_M),
+        (run_set_policy.LOG_BOUNDS[1], np.log(networks._MOST)),
+    ):
+        assert own == theirs
+
+
+def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
+    found, _, out = exported("forecast", tmp_path)
+    forecast, net = run_set_policy.load(out), module_of(found, "forecast").net
+    columns = torch.zeros(4, N_COLUMN)
+    columns[:, :COLUMNS] = torch.randn(4, COLUMNS, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        wanted = net(columns, torch.full((4,), 0.8))
+    for i in range(4):
+        said = forecast.futures(columns[i, :COLUMNS].numpy(), 0.8)
+        for own, theirs in zip(said, wanted, strict=True):
+            np.testing.assert_allclose(own, theirs[i].numpy(), atol=1e-5)
+    assert "nll_pool: -3.25" in (out / "README.md").read_text()
+
+
+# -------------------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda b, o: (b[:, 1:], o), r"bodies must have shape \(n, 22\)"),
+        (lambda b, o: (b[0], o), r"bodies must have shape \(n, 22\)"),
+        (lambda b, o: (b[:0], o), r"bodies must have shape \(n, 22\)"),
+        (lambda b, o: (b, o[1:]), r"own must have shape \(41,\), got \(40,\)"),
+        (lambda b, o: (b * np.nan, o), "not finite"),
+        (lambda b, o: (b, o * np.inf), "not finite"),
+        (lambda b, o: (b * 0.5, o), "first column"),
+    ],
+)
+def test_bad_columns_are_refused(change, says):
+    with pytest.raises(ValueError, match=says):
+        module_policy().act(*change(np.ones((3, BODY_WIDTH)), np.ones(EGO_COLUMNS)))
+
+
+def test_the_other_driver_is_named(tmp_path, no_onnx):
+    *_, out = exported("set", tmp_path)
+    with pytest.raises(run_policy.PolicyError, match="'set'; drive by run_set_policy"):
+        run_policy.load(out)
+
+
+@pytest.mark.parametrize(
+    ("columns", "speed"), [(np.ones(3), 1.0), (np.full(COLUMNS, np.nan), 1.0), (np.ones(COLUMNS), np.inf)]
+)
+def test_bad_tracks_are_refused(columns, speed):
+    forecast = run_set_policy.TrackForecast(
+        {
+            "network": {"modes": 6, "times_s": [0.5, 1, 1.5, 2, 2.5]},
+            "observation": {"columns": {"width": COLUMNS}},
+        },
+        {name: tensor.numpy() for name, tensor in MixtureNet(torch.Generator()).state_dict().items()}
+        | {"into.weight": np.zeros((64, COLUMNS), np.float32)},
+    )
+    with pytest.raises(ValueError, match=r"must have shape|not finite"):
+        forecast.futures(columns, speed)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("set", lambda s: s["policy"]["net.own.0.bias"].fill_(float("nan"))),
+        ("forecast", lambda s: s["forecast"]["into.bias"].fill_(float("nan"))),
+        ("set", lambda s: s["policy"].pop("net.own.0.bias")),
+        ("forecast", lambda s: s["forecast"].update({"into.bias": torch.zeros(3)})),
+    ],
+)
+def test_networks_that_cannot_drive_are_not_exported(kind, change, tmp_path, no_onnx):
+    found = saved(kind, tmp_path / "run", change)
+    with pytest.raises(CheckpointError, match=r"is not finite|not those of its config"):
+        deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_weights_with_the_right_sha256_are_exit_3(kind, tmp_path, no_onnx, capfd):
+    found, _, out = exported(kind, tmp_path)
+    weights = set_weights(module_of(found, kind_of(found)))
+    changed = next(name for name in weights if name.endswith("bias"))
+    weights[changed] += 1.0
+    from safetensors.torch import save
+
+    resigned(out, "policy.safetensors", save(weights))
+    assert run_cli("export", "--check", out) == 3
+    assert "DIFFERS" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("set", lambda a: a.pop("actor.own.0.bias")),
+        ("set", lambda a: a.update({"actor.body.0.weight": a["actor.body.0.weight"][:, 1:]})),
+        ("set", lambda a: a.clear()),
+        ("forecast", lambda a: a.update({"said.weight": a["said.weight"][1:]})),
+        ("forecast", lambda a: a.pop("spread.bias")),
+    ],
+)
+def test_arrays_that_do_not_fit_the_specification(kind, change, tmp_path, no_onnx):
+    *_, out = exported(kind, tmp_path)
+    arrays = dict(run_policy.read_safetensors(out / "policy.safetensors"))
+    change(arrays)
+    with pytest.raises(run_policy.PolicyError, match="do not fit together"):
+        run_set_policy.made(run_policy.read_spec(out), arrays)
+
+
+@pytest.mark.parametrize("other", ["tree", 3, [], None])
+def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
+    *_, out = exported("set", tmp_path)
+    spec = json.loads((out / "policy_spec.json").read_text()) | {"kind": other}
+    (out / "policy_spec.json").write_text(json.dumps(spec))
+    assert run_cli("export", "--check", out) == 2
+    assert "not one of set, forecast" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda g: g.pop("pair_own"),
+        lambda g: g.update({"pair_own": g["pair_own"][:5]}),
+        lambda g: g.update({"pair_bodies": g["pair_bodies"] * np.float32(0.5)}),
+        lambda g: g.update({"pair_bodies": np.zeros((0, 9, BODY_WIDTH), np.float32)}),
+        lambda g: g.update({"pair_bodies": np.float32(3)}),
+        lambda g: g.update({name: np.repeat(g[name], 2000, 0) for name in ("pair_bodies", "pair_own")}),
+    ],
+)
+def test_golden_pairs_are_read_without_trust(change, tmp_path, no_onnx, capfd):
+    from uuvtai.learning.export.graph import npz_bytes
+
+    found, _, out = exported("set", tmp_path)
+    golden = golden_rows(module_of(found, "set"))
+    assert max(run_set_policy.differences(run_set_policy.load(out), golden).values()) <= TOLERANCE
+    change(golden)
+    resigned(out, "golden.npz", npz_bytes(golden))
+    assert run_cli("export", "--check", out) in (2, 3)
+    assert run_set_policy.main([str(out)]) in (1, 3)
+    capfd.readouterr()

@@ -1,0 +1,208 @@
+"""The trainer: learns, goes on bit for bit from its state, and neither spreads nor hides what is not
+finite."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.point_env import PointEnv
+from uuvtai.config.learning import LearningConfig
+from uuvtai.learning.checkpoint import pack
+from uuvtai.learning.networks import Guard, TrainingError
+from uuvtai.learning.trainer import Trainer
+
+ROOT = Path(__file__).parents[2]
+WALL_TIMES = "time/simulate_s", "time/infer_s", "time/learn_s", "time/env_steps_per_s"
+SUMMED_APART = 1e-4
+"""float32 gradients of one minibatch added up in another order, over two iterations of a few Adam steps
+each"""
+
+
+def config_of(**sections):
+    """A small run: 16 steps, narrow networks, the world model on."""
+    small = {
+        "policy": {"hidden": [16, 16]},
+        "ppo": {"rollout_steps": 16, "epochs": 2, "minibatches": 2, "learning_rate": 1e-3},
+        "distill": {"batch": 64, "schedule": [[0, 1], [1, 0.2]]},
+        "world_model": {"hidden": [16], "latent": 8, "batch": 64},
+        "train": {"iterations": 8},
+    }
+    return LearningConfig.model_validate(
+        {name: small.get(name, {}) | sections.get(name, {}) for name in {**small, **sections}}
+    )
+
+
+def same(a, b):
+    """Equal to the last bit, NaN included."""
+    (plain_a, tensors_a), (plain_b, tensors_b) = pack(a), pack(b)
+    assert plain_a == plain_b
+    for name, tensor in tensors_a.items():
+        assert torch.equal(
+            tensor.view(torch.uint8) if tensor.dim() else tensor,
+            tensors_b[name].view(torch.uint8) if tensor.dim() else tensors_b[name],
+        ), name
+
+
+def comparable(metrics):
+    """All metrics but wall times."""
+    return {name: value for name, value in metrics.items() if name not in WALL_TIMES}
+
+
+def test_it_learns_the_task_from_its_teacher_and_says_so():
+    teaching = {"batch": 64, "steps": 16, "learning_rate": 3e-3, "schedule": [[0, 1], [1, 0.2]]}
+    trainer = Trainer(PointEnv(), config_of(train={"iterations": 12}, distill=teaching))
+    first = trainer.iterate()
+    for _ in range(11):
+        last = trainer.iterate()
+    assert last["distill/loss"] < 0.5 * first["distill/loss"]
+    assert last["rollout/success_rate"] > 0.9
+    assert last["distill/leaf/Far"] > 0 and last["distill/leaf/Near"] > 0
+    assert (first["distill/lambda"], last["distill/lambda"]) == (1.0, pytest.approx(1 - 0.8 * 11 / 12))
+    assert last["distill/lambda_risk"] == pytest.approx(last["distill/lambda"] * last["distill/scale"])
+    assert last["time/env_steps"] == 16 * 16 * 13, "the rollout that the tree drove counts too"
+    assert last["reward/progress"] > first["reward/progress"]
+    assert set(WALL_TIMES) < set(last)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {
+            "ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16},
+        },
+    ],
+)
+def test_four_iterations_equal_two_and_two_more_after_a_resume(more):
+    config = config_of(**more)
+    whole = Trainer(PointEnv(), config)
+    metrics = [comparable(whole.iterate()) for _ in range(4)]
+    first = Trainer(PointEnv(), config)
+    assert [comparable(first.iterate()) for _ in range(2)] == metrics[:2]
+    state = first.state()
+    first.iterate()
+    second = Trainer(PointEnv(seed=9), config)
+    second.iterate()
+    second.load_state(state)
+    assert [comparable(second.iterate()) for _ in range(2)] == metrics[2:]
+    same(second.state(), whole.state())
+
+
+def test_nothing_draws_from_the_global_generator():
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    Trainer(PointEnv(), config_of()).iterate()
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize(
+    ("poison", "metric"),
+    [
+        ("obs", "non_finite/position"),
+        ("final_obs", None),
+        ("reward", "non_finite/reward"),
+        ("teacher_action", "non_finite/teacher_action"),
+    ],
+)
+def test_what_is_not_finite_is_told_and_does_not_spread(poison, metric):
+    env = PointEnv()
+    trainer = Trainer(env, config_of())
+    assert not any(name.startswith("non_finite/") for name in trainer.iterate())
+    env.poison = {poison}
+    metrics = trainer.iterate()
+    if metric:
+        assert metrics[metric] > 0
+    assert metrics["train/invalid_samples"] >= 15
+    assert metrics["train/skipped_updates"] == 0
+    for name in ("policy", "world_model", "uncertainty", "ppo"):
+        assert all(bool(t.isfinite().all()) for t in pack(getattr(trainer, name).state_dict())[1].values()), (
+            name
+        )
+    assert all(math.isfinite(value) for value in metrics.values())
+    env.poison = set()
+    trainer.iterate()  # its first sample is what the last poisoned step told
+    trainer.iterate()
+    assert trainer.guard.bad_in_a_row == 0
+
+
+def test_bad_iterations_in_a_row_are_an_error_that_names_them():
+    env = PointEnv(seed=4)
+    trainer = Trainer(env, config_of(train={"patience": 3, "seed": 4}))
+    trainer.iterate()
+    env.poison = {"reward"}
+    trainer.iterate()
+    trainer.iterate()
+    with pytest.raises(
+        TrainingError, match=r"iterations 2 to 4 .* reward .* env 1 \(seed 4, episode \d+\).*learning_rate"
+    ):
+        trainer.iterate()
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
+    trainer = Trainer(PointEnv(), config_of(distill={"schedule": [[0, 0]]}, world_model={"enabled": False}))
+    trainer.iterate()
+    trainer.policy.actor[0].weight.register_hook(lambda gradient: gradient * math.nan)
+    before = [p.clone() for p in trainer.policy.actor.parameters()]
+    metrics = trainer.iterate()
+    assert metrics["train/skipped_updates"] == 4
+    assert all(torch.equal(a, b) for a, b in zip(before, trainer.policy.actor.parameters(), strict=True))
+    assert trainer.guard.bad_in_a_row == 1
+
+
+def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
+    trainer = Trainer(PointEnv(), config_of(distill={"schedule": [[0, 0]], "critic_warmup_iterations": 1}))
+    actor, critic = trainer.policy.actor[0].weight.clone(), trainer.policy.critic[0].weight.clone()
+    trainer.iterate()
+    assert torch.equal(trainer.policy.actor[0].weight, actor)
+    assert not torch.equal(trainer.policy.critic[0].weight, critic)
+    trainer.iterate()
+    assert not torch.equal(trainer.policy.actor[0].weight, actor)
+
+
+def test_the_uncertainty_weighs_the_distillation():
+    trainer = Trainer(PointEnv(), config_of(distill={"weighting": "uncertainty"}))
+    for _ in range(4):
+        trainer.iterate()
+    weight = trainer.rollout.weight
+    assert float(weight.mean()) == pytest.approx(1.0, abs=1e-4) and float(weight.std()) > 0
+
+
+def test_the_world_models_columns_can_be_left_out():
+    trainer = Trainer(PointEnv(), config_of(world_model={"as_features": False}))
+    trainer.iterate()
+    assert not trainer.rollout.x[..., -2:].any()
+    assert (trainer.collector.uncertainty > 0).all(), "the distillation is scaled all the same"
+    shown = Trainer(PointEnv(), config_of())
+    shown.iterate()
+    assert shown.rollout.x[1:, :, -2:].any()
+
+
+def test_first_inputs_of_an_episode_have_no_prediction_behind_them():
+    trainer = Trainer(PointEnv(), config_of())
+    trainer.iterate()
+    ended, x = trainer.rollout.ended[:-1], trainer.rollout.x[1:]
+    assert ended.any()
+    assert not x[ended][:, -2:].any() and (x[~ended][:, -1] > 0).all()
+
+
+@pytest.mark.parametrize("of_all", [False, True])
+def test_large_numbers_whose_sum_is_infinite_are_sound(of_all):
+    guard = Guard([("range", slice(0, 3))], 2, 3, torch.device("cpu"))
+    large, out = torch.tensor([[3e38, 3e38, 1.0], [0.0, 2.0, -4.0]]), torch.zeros(2, 3)
+    if of_all:
+        bad = guard.observation(large, torch.zeros(3), out)
+    else:
+        bad = guard.values("reward", large, out)
+    assert bad.tolist() == [False, False] and torch.equal(out, large) and guard.take() == {}
+
+
+def test_what_is_sound_clears_what_was_there():
+    """The rows that the guard says are bad are no longer so a step later."""
+    guard = Guard([("range", slice(0, 2))], 2, 3, torch.device("cpu"))
+    out, fill = torch.zeros(2, 2), torch.full((2,), 7.0)
+    bad = guard.observation(torch.tensor([[1.0, math.inf], [2.0, 3.0]]), fill, out).clone()
+    assert bad.tolist() == [True, False] and out.tolist() == [[1.0, 7.0], [2.0, 3.0]]
+    assert guard.observation(torch.ones(2, 2), fill, out).tolist() == [False, False]
+    assert out.tolist() == [[1.0, 1.0], [1.0, 1.0]] and guard.take() == {"non_finite/range": 1.0}

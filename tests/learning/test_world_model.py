@@ -1,0 +1,344 @@
+"""World model: losses against a NumPy oracle, each switch, units, learning, resume, NaN, and memory of the
+online features."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from tests.oracles import world_model as reference
+from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
+from uuvtai.learning.distillation import Uncertainty
+from uuvtai.learning.networks import moments_of
+from uuvtai.learning.world_model import (
+    LOG_VAR_BOUNDS,
+    N_TARGET,
+    WorldModel,
+    WorldModelLearner,
+    coverage,
+    mean_squared_standardised_residual,
+    standardised_residual,
+)
+
+N_OBS, STEPS, N_ENV = 30, 16, 32
+SMALL = WorldModelConfig(hidden=(32, 32), latent=16, batch=256, steps=2, learning_rate=3e-3)
+
+ROUNDING = 2e-5
+"""Relative: float32 sums of a few hundred terms against float64."""
+
+SAMPLING = 0.2
+"""Around a mean square of one: what the issue allows; the variance of 24 x 2000 held-out residuals alone
+gives 0.01."""
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def transitions(seed=0, steps=STEPS, n_env=N_ENV, unit=1.0):
+    """obs, action, next_obs of a system whose targets follow the action, with noise ten times stronger where
+    column 24 is positive."""
+    gen = generator(seed)
+    obs = torch.randn(steps, n_env, N_OBS, generator=gen)
+    action = torch.rand(steps, n_env, 4, generator=gen) * 2 - 1
+    noise = torch.where(obs[..., 24:25] > 0, 0.2, 0.02) * torch.randn(steps, n_env, N_TARGET, generator=gen)
+    next_obs = obs.clone()
+    next_obs[..., :N_TARGET] += 0.2 * action.repeat(1, 1, 6) + 0.1 * obs[..., 25:26] + noise
+    return obs * unit, action, next_obs * unit
+
+
+def trained(updates, config=SMALL, data=None, seed=0):
+    """A model, its learner and the metrics of the last update, after some updates on the same rollout."""
+    draws = generator(seed)
+    model = WorldModel(N_OBS, config, draws)
+    learner, metrics = WorldModelLearner(model, config), {}
+    for _ in range(updates):
+        metrics = learner.update(*(data or transitions()), draws)
+    return model, learner, metrics
+
+
+def parameters(model):
+    return torch.cat([p.detach().flatten() for p in model.parameters()])
+
+
+SWITCHES = [
+    {},
+    {"predict_change": False},
+    {"normalise_targets": False},
+    {"predict_change": False, "normalise_targets": False},
+    {"beta_nll": 0.0},
+    {"likelihood": False},
+]
+
+
+@pytest.mark.parametrize("switches", SWITCHES, ids=str)
+def test_losses_are_those_of_the_oracle(switches):
+    config = SMALL.model_copy(update={"reconstruction_weight": 0.7, "dynamics_weight": 0.3, **switches})
+    model, _, _ = trained(2, config)
+    obs, action, next_obs = (part[0] for part in transitions(1))
+    action = 2.0 * action  # half of them beyond what the environment clamps
+    valid = torch.arange(N_ENV) % 3 > 0
+    losses = model.loss(obs, action, next_obs, valid)
+    reconstruction, dynamics = reference.losses(
+        model, *(part.double().numpy() for part in (obs, action, next_obs))
+    )
+    kept = valid.numpy()
+    expected = reconstruction[kept].mean(), dynamics[kept].mean()
+    np.testing.assert_allclose(
+        [losses.reconstruction.item(), losses.dynamics.item()], expected, rtol=ROUNDING
+    )
+    assert losses.total.item() == pytest.approx(0.7 * expected[0] + 0.3 * expected[1], rel=ROUNDING)
+
+
+def test_prediction_is_the_decoders_in_si_units():
+    """Likelihoods of the same targets in the decoder's unit and in SI units differ by the logarithm of the
+    units."""
+    for config in (SMALL, SMALL.model_copy(update={"predict_change": False})):
+        plain = config.model_copy(update={"beta_nll": 0.0})
+        model, _, _ = trained(2, plain)
+        obs, action, next_obs = (part[0] for part in transitions(1))
+        predicted = model.predict(obs, action)
+        nll = (
+            0.5
+            * ((next_obs[:, :N_TARGET] - predicted.mean) ** 2 / predicted.log_var.exp() + predicted.log_var)
+            .sum(1)
+            .mean()
+        )
+        inside = model.loss(obs, action, next_obs, torch.ones(N_ENV, dtype=torch.bool)).reconstruction
+        assert (nll - inside).item() == pytest.approx(model.scale().log().sum().item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_no_gradient_reaches_the_encoder_through_the_target_when_it_is_stopped(stopped):
+    """With dynamics that ignore their input, the target's encoding is the only way from the latent loss to
+    the encoder."""
+    config = SMALL.model_copy(update={"reconstruction_weight": 0.0, "stop_target_gradient": stopped})
+    model = WorldModel(N_OBS, config, generator())
+    with torch.no_grad():
+        model.dynamics[-1].weight.zero_()
+    obs, action, next_obs = (part[0] for part in transitions())
+    model.loss(obs, action, next_obs, torch.ones(N_ENV, dtype=torch.bool)).total.backward()
+    reached = sum(p.grad.abs().sum().item() for p in model.encoder.parameters())
+    assert (reached == 0.0) == stopped
+
+
+def test_log_variance_stays_in_bounds_with_a_gradient_everywhere():
+    model = WorldModel(N_OBS, SMALL, generator())
+    with torch.no_grad():
+        model.decoder[-1].weight.zero_()
+        model.decoder[-1].bias[N_TARGET:] = torch.linspace(-20, 20, N_TARGET)
+    _, log_var = model.decode(torch.zeros(1, SMALL.latent))
+    assert (log_var >= LOG_VAR_BOUNDS[0]).all() and (log_var <= LOG_VAR_BOUNDS[1]).all()
+    log_var.sum().backward()
+    assert (model.decoder[-1].bias.grad[N_TARGET:] > 0).all()
+
+
+def test_it_learns_the_change_and_where_it_is_uncertain():
+    """Below "as before" in every target on unseen data, calibrated, and surer where the noise is weak."""
+    model, _, metrics = trained(150, data=transitions(steps=256))
+    obs, action, next_obs = (part.flatten(0, 1) for part in transitions(7, steps=64))
+    with torch.no_grad():
+        predicted = model.predict(obs, action)
+    target = next_obs[:, :N_TARGET]
+    error, before = ((target - other).square().mean(dim=0) for other in (predicted.mean, obs[:, :N_TARGET]))
+    assert (error < before).all()
+    assert mean_squared_standardised_residual(predicted.mean, predicted.log_var, target) == pytest.approx(
+        1.0, abs=SAMPLING
+    )
+    assert metrics["world_model/standardised_residual"] == pytest.approx(1.0, abs=SAMPLING)
+    assert metrics["world_model/coverage_90"] == pytest.approx(0.9, abs=SAMPLING)
+    assert metrics["world_model/latent_std"] > 0.1
+    sigma = model.features(obs, action, next_obs)[:, 1]
+    assert 0 < sigma.max() < 3
+    assert stats.spearmanr(sigma, obs[:, 24] > 0).statistic > 0.8, "the noise is ten times stronger there"
+
+
+def test_features_do_not_depend_on_units():
+    """Lengths in eighths of a metre: exact in binary, so that only roundings of roots and logarithms
+    differ."""
+    metres, _, _ = trained(3)
+    eighths, _, _ = trained(3, data=transitions(unit=8.0))
+    obs, action, next_obs = (part[0] for part in transitions(5))
+    found = metres.features(obs, action, next_obs), eighths.features(8.0 * obs, action, 8.0 * next_obs)
+    torch.testing.assert_close(*found, rtol=1e-3, atol=1e-4)
+    assert found[0].std(dim=0).min() > 1e-3, "they vary at all"
+
+
+def test_residual_is_the_error_in_deviations_of_the_change():
+    model, _, _ = trained(3)
+    obs, action, next_obs = (part[0] for part in transitions(5))
+    with torch.no_grad():
+        predicted = model.predict(obs, action)
+    change = (transitions()[2] - transitions()[0])[..., :N_TARGET].reshape(-1, N_TARGET).std(dim=0)
+    expected = ((next_obs[:, :N_TARGET] - predicted.mean) / change).square().mean(dim=1).sqrt()
+    sigma = (predicted.log_var.exp() / change**2).mean(dim=1)
+    drawn_twice = 0.1  # statistics are of drawn samples, not of all of them
+    torch.testing.assert_close(
+        model.features(obs, action, next_obs), torch.stack([expected, sigma], 1), rtol=drawn_twice, atol=0.0
+    )
+
+
+def test_in_the_decoders_unit_the_uncertainty_is_the_papers_to_the_letter():
+    """sigma_t = mean(exp(log variance)) as the decoder says it, whatever the targets' one-step changes
+    are."""
+    for switches in (
+        {},
+        {"normalise_targets": False},
+        {"predict_change": False},
+        {"predict_change": False, "normalise_targets": False},
+    ):
+        model, _, _ = trained(3, SMALL.model_copy(update={"error_unit": "decoder", **switches}))
+        obs, action, next_obs = (part[0] for part in transitions(5))
+        with torch.no_grad():
+            mean, log_var = model.decode(model.advance(model.encode(obs), action))
+            target = (next_obs[:, :N_TARGET] - model.base(obs)) / model.scale()
+        expected = torch.stack([(target - mean).square().mean(1).sqrt(), log_var.exp().mean(1)], 1)
+        torch.testing.assert_close(model.features(obs, action, next_obs), expected, rtol=ROUNDING, atol=1e-5)
+
+
+def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the_cap():
+    """A decoder that says "0.2 m give or take" of targets that change by 0.01 m: sigma_t is 0.04 in its own
+    unit, 400 in changes."""
+    scales = {}
+    for unit in ("decoder", "change"):
+        config = SMALL.model_copy(
+            update={"predict_change": False, "normalise_targets": False, "error_unit": unit}
+        )
+        model = WorldModel(N_OBS, config, generator())
+        rows = 0.01 * torch.randn(4000, N_TARGET, generator=generator(3))
+        model.observe(moments_of(torch.zeros(10, N_OBS)), moments_of(rows))
+        with torch.no_grad():
+            model.decoder[-1].weight.zero_()
+            model.decoder[-1].bias[N_TARGET:] = math.log(0.04)
+        uncertainty = Uncertainty(UncertaintyConfig())
+        uncertainty.update(
+            model.features(torch.zeros(5, N_OBS), torch.zeros(5, 4), torch.zeros(5, N_OBS))[:, 1]
+        )
+        scales[unit] = uncertainty.scale
+    assert (
+        scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02)
+        and scales["change"] == UncertaintyConfig().max_scale
+    )
+
+
+# --------------------------------------------------------------------------------------------- random, resume
+
+
+def test_only_the_handed_generator_is_drawn_from():
+    before = torch.get_rng_state()
+    first, _, _ = trained(2)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.rand(1)
+    assert torch.equal(parameters(first), parameters(trained(2)[0]))
+    assert not torch.equal(parameters(first), parameters(trained(2, seed=1)[0]))
+
+
+def test_resume_is_bit_exact():
+    draws = generator()
+    model = WorldModel(N_OBS, SMALL, draws)
+    learner = WorldModelLearner(model, SMALL)
+    for _ in range(2):
+        learner.update(*transitions(), draws)
+    again = WorldModel(N_OBS, SMALL, generator(9))
+    resumed = WorldModelLearner(again, SMALL)
+    again.load_state_dict(model.state_dict())
+    resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
+    draws_again = generator().set_state(draws.get_state())
+    for one, g in ((learner, draws), (resumed, draws_again)):
+        last = [one.update(*transitions(4), g) for _ in range(2)][-1]
+    assert last["world_model/reconstruction_loss"] != 0.0
+    for mine, theirs in zip(model.state_dict().values(), again.state_dict().values(), strict=True):
+        assert torch.equal(mine, theirs)
+
+
+# -------------------------------------------------------------------------------------------------- bad input
+
+
+def test_rows_that_are_not_finite_count_like_rows_that_are_not_valid():
+    bad = torch.zeros(STEPS, N_ENV, dtype=torch.bool)
+    bad[:, ::5] = True
+    with_nan = [part.clone() for part in transitions()]
+    for part, value in zip(with_nan, (math.nan, math.inf, math.nan), strict=True):
+        part[:, ::5, 0] = value
+    found = []
+    for data, valid in ((with_nan, None), (transitions(), ~bad)):
+        draws = generator()
+        model = WorldModel(N_OBS, SMALL, draws)
+        WorldModelLearner(model, SMALL).update(*data, draws, valid)
+        found.append(parameters(model))
+    assert torch.equal(*found) and torch.isfinite(found[0]).all()
+    assert not torch.equal(found[0], parameters(trained(1)[0])), "leaving rows out makes a difference"
+
+
+def test_nothing_but_nan_changes_nothing():
+    model, learner, _ = trained(1)
+    before, norm = parameters(model).clone(), model.observation_norm.mean.clone()
+    metrics = learner.update(*(part * math.nan for part in transitions()), generator())
+    assert torch.equal(model.observation_norm.mean, norm)
+    assert torch.equal(parameters(model), before)
+    assert metrics["world_model/skipped_updates"] == SMALL.steps
+    assert all(math.isfinite(value) for value in metrics.values())
+
+
+def test_a_loss_that_is_not_finite_is_skipped_and_counted():
+    model, learner, _ = trained(1)
+    with torch.no_grad():
+        model.decoder[-1].bias[0] = math.inf
+    before = parameters(model).clone()
+    metrics = learner.update(*transitions(), generator())
+    assert metrics["world_model/skipped_updates"] == SMALL.steps == learner.skipped
+    assert torch.equal(parameters(model), before)
+
+
+def test_features_of_nan_are_zero():
+    model, _, _ = trained(1)
+    obs, action, next_obs = (part[0, :2].clone() for part in transitions())
+    next_obs[0, 3] = math.nan
+    found = model.features(obs, action, next_obs)
+    assert found[0, 0] == 0.0 and found[1, 0] > 0.0
+
+
+def test_too_narrow_an_observation_is_refused():
+    with pytest.raises(ValueError, match="first 24 columns of the observation, but it has only 20"):
+        WorldModel(20, SMALL, generator())
+
+
+# ------------------------------------------------------------------------------------------------ calibration
+
+SHARE_SAMPLING = 0.01
+"""Four standard errors of a share of 100,000 samples are 0.0063 at most; of their mean square, 0.018 / 2."""
+
+
+def test_residual_of_a_variance_of_four():
+    mean, log_var = torch.tensor([[1.0, 2.0]]), torch.tensor([[math.log(4.0), 0.0]])
+    target = torch.tensor([[3.0, 5.0]])
+    z = standardised_residual(mean, log_var, target)
+    np.testing.assert_allclose(z, [[1.0, 3.0]], rtol=1e-7)  # log(4) is a float32 here
+    assert mean_squared_standardised_residual(mean, log_var, target) == pytest.approx(5.0, rel=1e-7)
+
+
+def test_true_variance_gives_one_and_nominal_coverage():
+    gen = torch.Generator().manual_seed(0)
+    log_var = torch.randn(100_000, generator=gen)
+    target = torch.exp(0.5 * log_var) * torch.randn(100_000, generator=gen) + 3.0
+    mean, levels = torch.full_like(target, 3.0), torch.tensor([0.5, 0.8, 0.9, 0.99])
+    assert mean_squared_standardised_residual(mean, log_var, target) == pytest.approx(
+        1.0, abs=2 * SHARE_SAMPLING
+    )
+    np.testing.assert_allclose(coverage(mean, log_var, target, levels), levels, atol=SHARE_SAMPLING)
+    too_sure = coverage(mean, log_var - math.log(4.0), target, levels)
+    inside = [2 * stats.norm.cdf(0.5 * stats.norm.ppf(0.5 + level / 2)) - 1 for level in levels.tolist()]
+    np.testing.assert_allclose(too_sure, inside, atol=SHARE_SAMPLING)
+
+
+def test_coverage_of_four_residuals():
+    zero = torch.zeros(4)
+    inside = coverage(
+        zero, zero, torch.tensor([0.5, -0.7, 1.5, 3.0]), torch.tensor([0.5, 0.9])
+    )  # |z| < 0.674, 1.645
+    assert inside.tolist() == [0.25, 0.75]
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        coverage(zero, zero, zero, torch.tensor([0.5, 1.0]))

@@ -1,0 +1,215 @@
+"""Pictures and videos are what their names say, judged by readers of others: Pillow, FFmpeg."""
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.oracles import logs as episode
+from uuvtai.cli import main
+from uuvtai.common.colours import PALETTE, contrast, method_colours
+from uuvtai.common.errors import UserError
+from uuvtai.logs import drawing
+from uuvtai.logs import video as film
+from uuvtai.logs.drawing import PICTURE_TOPICS, load_recording
+from uuvtai.logs.picture import paint_picture, picture
+from uuvtai.logs.topics.perception import Layer
+from uuvtai.logs.video import FrameArtist, video
+
+N_STEP = 60
+DURATION_S = N_STEP * episode.DT
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("formats")
+
+
+@pytest.fixture(scope="module")
+def logs(folder):
+    straight = episode.header("straight")
+    return [
+        episode.record(folder / "bt.mcap", N_STEP),
+        episode.record(folder / "straight.mcap", N_STEP, straight, sway=-0.9),
+    ]
+
+
+def code(color):
+    return "#" + "".join(f"{part:02x}" for part in reversed(color))
+
+
+# --------------------------------------------------------------------------------------------------- pictures
+
+
+def test_a_png_is_a_png(folder, logs):
+    with Image.open(picture(logs, folder / "p.PNG")) as image:
+        assert (image.format, image.size[0]) == ("PNG", 1600)
+
+
+# ----------------------------------------------------------------------------------------------------- videos
+
+
+@pytest.mark.parametrize(
+    ("name", "container", "codec"),
+    [
+        ("v.webm", "matroska,webm", "vp9"),
+        ("v.mp4", "mov,mp4,m4a,3gp,3g2,mj2", "h264"),
+        ("v.gif", "gif", "gif"),
+    ],
+)
+def test_a_video_is_what_its_name_says(folder, logs, capfd, name, container, codec):
+    """Container, codec, size, rate and length by FFmpeg; what a frame shows by its pixels; nothing on
+    stderr."""
+    fps, speed = 10.0, 2.0
+    out = video(logs[0], folder / name, fps=fps, speed=speed, width_px=640)
+    assert capfd.readouterr().err == ""
+    expected = len(np.arange(0.0, DURATION_S, speed / fps)) + 11
+    with av.open(str(out)) as found:
+        stream = found.streams.video[0]
+        assert (found.format.name, stream.codec_context.name.removeprefix("libdav1d")) == (container, codec)
+        frames = [frame.to_ndarray(format="bgr24").astype(int) for frame in found.decode(video=0)]
+        assert float(stream.average_rate) == pytest.approx(fps, rel=0.01)
+        if codec == "h264":
+            assert stream.codec_context.pix_fmt == "yuv420p", "the only one that every player knows"
+    assert len(frames) == expected and frames[0].shape[1] == 640 and frames[0].shape[0] % 2 == 0
+    drawn = cv2.resize(
+        FrameArtist(load_recording(logs[0])).frame(0.4),
+        (640, frames[0].shape[0]),
+        interpolation=cv2.INTER_AREA,
+    )
+    errors = [np.abs(frame - drawn).mean() for frame in frames]
+    assert int(np.argmin(errors)) == 2 and errors[2] < 6
+
+
+def test_an_mp4_can_be_played_while_it_loads(folder, logs):
+    content = video(logs[0], folder / "fast.mp4", width_px=320).read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+
+
+def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
+    """Pillow counts: 15 frames a second are no whole hundredths, and the rare colours must not melt into the
+    frequent ones."""
+    with Image.open(video(logs[0], folder / "t.gif", fps=15.0, speed=4.0)) as image:
+        durations, seen = [], set()
+        for i in range(image.n_frames):
+            image.seek(i)
+            durations.append(image.info["duration"])
+            seen |= set(map(tuple, np.array(image.convert("RGB")).reshape(-1, 3)))
+        assert image.info["loop"] == 0 and image.size[0] == 800
+    assert sum(durations) == pytest.approx(1000 * (image.n_frames / 15), abs=40)
+    assert {color[::-1] for color in (drawing.GOAL, drawing.ROUTE, drawing.method_inks(["bt"])["bt"])} <= seen
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path):
+    for draw, name, there in (
+        (picture, "a.pdf", ".png"),
+        (video, "a.avi", ".webm, .mp4, .gif"),
+        (video, "a", ".webm"),
+    ):
+        with pytest.raises(UserError, match="can be") as answer:
+            draw(tmp_path / "nowhere.mcap", tmp_path / name)
+        assert there in str(answer.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"speed": 0.0},
+        {"speed": -1.0},
+        {"speed": float("nan")},
+        {"fps": 1e9},
+        {"fps": 0.5},
+        {"width_px": 100_000},
+    ],
+)
+def test_values_without_sense_are_refused(tmp_path, logs, wrong):
+    with pytest.raises(UserError, match="must be from"):
+        video(logs[0], tmp_path / "a.webm", **wrong)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cut_file_is_seen(tmp_path, logs):
+    frames = [np.full((64, 64, 3), 20 * i, np.uint8) for i in range(10)]
+    for suffix in (".webm", ".mp4", ".gif"):
+        path = tmp_path / f"a{suffix}"
+        assert film.write_film(path, frames, 10.0, frames, []) == 10
+        film.check_whole(path, 10, path)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        with pytest.raises(UserError, match="disk full"):
+            film.check_whole(path, 10, path)
+
+
+def test_videos_of_a_run_folder_are_small(folder, logs):
+    """A second of an episode takes less than 60 kB, so a page holds three minutes of episodes."""
+    from uuvtai.logs.video import SMALL
+
+    assert video(logs[0], folder / "small.webm", **SMALL).stat().st_size < 60_000 * DURATION_S + 60_000
+
+
+def test_the_command_takes_speed_rate_and_width_and_tells_its_progress(tmp_path, logs, capfd, monkeypatch):
+    monkeypatch.setattr("uuvtai.console.screen._PERIOD_S", 0.0)
+    out = tmp_path / "talk.gif"
+    with pytest.raises(SystemExit) as left:
+        main(
+            ["log", "render", str(logs[0]), "--out", str(out), "--speed", "3", "--fps", "5", "--width", "400"]
+        )
+    said = capfd.readouterr()
+    assert left.value.code == 0 and said.out.strip() == str(out) and "frames" in said.err
+    with Image.open(out) as image:
+        assert image.size[0] == 400
+
+
+# ---------------------------------------------------------------------------------------------------- colours
+
+
+METHODS = ["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"]
+METHODS += ["dwa", "potential_field", "velocity_obstacle", "mppi"]
+
+
+def test_a_method_has_one_colour_wherever_it_is_shown():
+    known = method_colours(METHODS)
+    assert len(set(known.values())) == len(known)
+    for name, colour in known.items():
+        assert method_colours([name]) == {name: colour} and method_colours(["mine", name])[name] == colour
+
+
+def test_other_methods_take_what_is_free_in_their_order():
+    names = ["bt", "a", "b", "c"]
+    found = method_colours(names)
+    assert len(set(found.values())) == 4 and method_colours(["bt", "a"]) == {
+        name: found[name] for name in ("bt", "a")
+    }
+    many = method_colours([f"m{i}" for i in range(20)])
+    assert set(many.values()) <= set(PALETTE) and len(set(many.values())) == 7
+
+
+def test_every_method_stands_out_from_what_a_map_shows():
+    for colour in method_colours(METHODS).values():
+        assert contrast(colour, "#ffffff") > 1.9
+        for meaning in (drawing.DYNAMIC, drawing.MOVER):
+            assert np.abs(np.array(drawing.bgr(colour)) - meaning).max() > 60
+
+
+def test_a_video_draws_its_method_in_its_colour(folder, logs):
+    recording = load_recording(logs[1])
+    own, other = drawing.method_inks(["straight"])["straight"], drawing.method_inks(["bt"])["bt"]
+    pixels = set(map(tuple, FrameArtist(recording).frame(1.0).reshape(-1, 3)))
+    assert tuple(own) in pixels and tuple(other) not in pixels
+
+
+def test_methods_of_a_user_keep_the_colour_that_they_have_beside_each_other(tmp_path):
+    path = episode.record(tmp_path / "b.mcap", N_STEP, episode.header("second"))
+    names = ["bt", "first", "second"]
+    pixels = set(map(tuple, FrameArtist(load_recording(path), methods=names).frame(1.0).reshape(-1, 3)))
+    assert tuple(drawing.method_inks(names)["second"]) in pixels
+    image = paint_picture([load_recording(path, PICTURE_TOPICS)], methods=names).image
+    assert tuple(drawing.method_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))
+
+
+def test_maps_of_a_harbour_are_kept_packed():
+    values = np.zeros((1000, 2000), np.float32)
+    values[3, 4] = 0.75
+    layer = Layer.of(values, (0.0, 0.0), 0.1)
+    assert layer.nbytes < values.nbytes / 100 and np.array_equal(layer.values, values)

@@ -1,0 +1,269 @@
+"""The examples: every script runs, on the session's simulator and with short episodes, and gives the result
+that it promises."""
+
+import importlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.conftest import configure
+from tests.kernels.world.test_world import Drawn
+from uuvtai.compile.runtime import start_taichi
+from uuvtai.config.loader import load_config
+from uuvtai.envs.gymnasium import UuvVectorEnv
+from uuvtai.envs.vector_env import VectorEnv
+from uuvtai.evaluation.agents import load_agents
+from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.logs.run_folder import RunFolderError
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+N = 8
+MOST_LINES = {"train": 100, "custom": 60, "own": 30}
+"""a newcomer reads an example in one go"""
+SHORT = 60
+"""[control steps] of an episode here"""
+TRAINERS = {
+    "train_sb3": "stable_baselines3",
+    "train_skrl": "skrl",
+    "train_torchrl": "torchrl",
+    "train_rsl_rl": "rsl_rl",
+}
+
+
+@pytest.fixture
+def example(monkeypatch):
+    """Module of an example, as ``python examples/NAME.py`` would find what it imports."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    return importlib.import_module
+
+
+@pytest.fixture
+def short(small, monkeypatch):
+    """The session's simulator with every episode begun shortly before its horizon."""
+    small.sim.use_tree(small.trees["bt"])
+    begin = small.sim.reset
+
+    def reset(mask, seed, number):
+        begin(mask, seed, number)
+        for row in mask.nonzero().flatten().tolist():
+            small.sim.s.clock.step[row] = small.config.episode.horizon_steps - SHORT
+
+    monkeypatch.setattr(small.sim, "reset", reset)
+    yield small.sim
+    small.sim.use_tree(small.trees["bt"])
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_a_trainer_learns_for_two_updates(short, example, monkeypatch, name):
+    pytest.importorskip(TRAINERS[name], reason=f"{TRAINERS[name]} is not installed")
+    module = example(name)
+    if name == "train_rsl_rl":
+        monkeypatch.setitem(module.CONFIG, "num_steps_per_env", 8)
+    else:
+        monkeypatch.setattr(module, "ROLLOUT_STEPS", 8)
+    obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
+    before, again, after = (module.train(short, iterations)(obs) for iterations in (0, 0, 2))
+    assert after.shape == (N, 4) and np.isfinite(after).all()
+    np.testing.assert_array_equal(before, again)
+    assert not np.allclose(before, after)
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_what_a_trainer_learnt_is_saved_and_played_again(short, example, monkeypatch, tmp_path, capsys, name):
+    """The policy that is read back acts as the one that was saved; and the command line does both."""
+    pytest.importorskip(TRAINERS[name], reason=f"{TRAINERS[name]} is not installed")
+    module, judge = example(name), example("judge")
+    if name == "train_rsl_rl":
+        monkeypatch.setitem(module.CONFIG, "num_steps_per_env", 8)
+    else:
+        monkeypatch.setattr(module, "ROLLOUT_STEPS", 8)
+    obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
+    (tmp_path / "saved").mkdir()
+    trained = module.train(short, 2, tmp_path / "saved")(obs)
+    np.testing.assert_allclose(module.play(short, tmp_path / "saved")(obs), trained, rtol=1e-5, atol=1e-6)
+    assert not np.allclose(module.train(short, 0)(obs), trained)
+    out = tmp_path / "new" / "run"
+    judge.main(
+        module.train, module.play, 1, ["--out", str(out), "--curve", str(tmp_path / "curve.csv")], short
+    )
+    before, saved, played = capsys.readouterr().out.splitlines()
+    assert before.startswith("before return") and saved.endswith(f"saved in {out}")
+    assert played.startswith("played return") and f"/{N} (" in played
+    assert any(out.iterdir()) and (tmp_path / "curve.csv").read_text().startswith("decisions,return")
+    judge.main(module.train, module.play, 1, ["--play", str(out)], short)
+    assert capsys.readouterr().out.splitlines() == [played]
+    with pytest.raises(RunFolderError, match="already there and not empty"):
+        judge.main(module.train, module.play, 1, ["--out", str(out)], short)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_a_watched_batch_keeps_every_return_once(short, example, mode):
+    """They are what the simulator itself summed up over the episode."""
+    envs = example("judge").Watched(sim=short, hold_steps=5, autoreset_mode=mode)
+    envs.reset(seed=1)
+    answer = []
+    for decision in range(1, 2 + SHORT // 5):
+        *_, terminated, truncated, info = envs.step(np.zeros((N, 4), np.float32))
+        ended = info["final_info"] if mode == "SameStep" and "final_info" in info else info
+        answer += [
+            (decision * N, float(ended["episode_return"][env]))
+            for env in np.flatnonzero(terminated | truncated)
+        ]
+    assert len(answer) >= N
+    np.testing.assert_allclose(envs.curve, answer, rtol=1e-4, atol=1e-4)
+
+
+def test_curves_are_drawn_from_what_was_kept(example, tmp_path):
+    (tmp_path / "a.csv").write_text("decisions,return\n" + "".join(f"{64 * i},{i}\n" for i in range(1, 300)))
+    example("judge").draw([tmp_path / "a.csv"], tmp_path / "out.png")
+    assert cv2.imread(str(tmp_path / "out.png")).std() > 5
+
+
+def test_judge_plays_each_env_once(short, example):
+    """The return is that of the first episode, though other envs go on for longer."""
+    judge = example("judge")
+    seen = []
+
+    def act(obs):
+        seen.append(len(obs))
+        return np.zeros((N, 4), np.float32)
+
+    returns, won = judge.judge(short, act, seed=5)
+    assert won == 0 and seen == [N] * (SHORT // judge.HOLD_STEPS)
+    native = VectorEnv(short, seed=5)
+    native.reset()
+    for _ in range(SHORT):
+        *_rest, info = native.step(torch.zeros(N, 4))
+    np.testing.assert_allclose(returns, info["episode_return"], atol=1e-3)
+
+
+def test_custom_controller_prints_a_table(short, example):
+    head, *rows = example("custom_controller").main(short).splitlines()
+    assert head.split() == ["controller", "success", "return"]
+    assert [row.split()[0] for row in rows] == ["careful", "blind"] and all(f"/{N}" in row for row in rows)
+
+
+def test_custom_controller_turns_and_stops(small, example):
+    module = example("custom_controller")
+    columns, obs = VectorEnv(small.sim).columns, np.zeros((3, VectorEnv(small.sim).num_obs), np.float32)
+    obs[:, columns["sector_range"]] = 12.0
+    obs[:, columns["heading_error"]] = [[0, 1], [1, 0], [0, 1]]
+    obs[2, columns["sector_range"].start] = 0.4
+    action = module.careful(obs, columns)
+    assert action[0, 0] == 1 and action[0, 3] == 0, "free and straight ahead: full speed"
+    assert action[1, 0] == pytest.approx(0, abs=1e-6) and action[1, 3] == 1, (
+        "to the left: turn left on the spot"
+    )
+    assert action[2, 0] < 0, "too near: back"
+
+
+def test_custom_world_is_played_and_drawn(short, example, tmp_path):
+    answer = example("custom_world").main(tmp_path / "new" / "harbour.png", short)
+    assert answer.startswith("harbour.yaml: timeout") and answer.endswith("harbour.png")
+    assert cv2.imread(str(tmp_path / "new" / "harbour.png")).std() > 1
+
+
+def test_custom_world_can_be_placed(taichi_runtime):
+    world = load_config(str(EXAMPLES / "harbour.yaml")).world
+    drawn = Drawn(world, n_env=64).draw()
+    assert not drawn["faults"].any()
+    assert (drawn["kind"] != 0).sum(axis=1).tolist() == [
+        world.n_static + world.n_dynamic + len(world.fixed)
+    ] * 64
+
+
+def test_custom_vehicle_follows_its_command(taichi_runtime, example):
+    module = example("custom_vehicle")
+    head, *rows = module.main(start_taichi("cpu")).splitlines()
+    assert head.split()[-2:] == ["4.0", "s"] and [row.split()[0] for row in rows] == [
+        "bluerov2",
+        "heavy_pack",
+    ]
+    speeds = np.array([[float(value) for value in row.split()[1:]] for row in rows])
+    assert (np.abs(speeds[:, -1] - 0.6) < 0.02).all() and not np.array_equal(*speeds)
+    ours, theirs = (load_config("open", vehicle=name).vehicle for name in reversed(module.VEHICLES))
+    assert ours.mass_kg > theirs.mass_kg and len(ours.thrusters) == len(theirs.thrusters)
+
+
+def test_custom_reward_changes_the_terms_it_names(small, example, monkeypatch):
+    module = example("custom_reward")
+    names = VectorEnv(small.sim).reward_terms
+    default = module.terms(VectorEnv(small.sim), 30)
+    weights = {key.removeprefix("reward."): value for key, value in module.CAREFUL.items()}
+    changed = small.config.reward.model_copy(update=weights)
+    configure(monkeypatch, small.sim, small.config.model_copy(update={"reward": changed}))
+    careful = module.terms(VectorEnv(small.sim), 30)
+    for i, name in enumerate(names):
+        factor = getattr(changed, name) / getattr(small.config.reward, name)
+        assert float(careful[i]) == pytest.approx(factor * float(default[i]), rel=1e-4, abs=1e-6)
+        assert (factor != 1) == (name in weights)
+    rows = module.table({"default": default, "careful": careful}, names).splitlines()
+    assert len(rows) == len(names) + 2 and float(rows[-1].split()[1]) == pytest.approx(
+        float(default.sum()), abs=0.01
+    )
+
+
+def test_custom_tree_stands_beside_the_shipped_ones(short, example):
+    head, *rows = example("custom_tree").main(short, episodes=4).splitlines()
+    assert head.split()[0] == "tree" and [row.split()[0] for row in rows] == ["patient", "bt", "planner"]
+    assert all("/4 (" in row for row in rows)
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*_*.py")), ids=lambda path: path.stem)
+def test_an_example_is_short_and_says_what_it_does(path):
+    lines = path.read_text().splitlines()
+    assert len(lines) <= MOST_LINES[path.stem.partition("_")[0]]
+    assert lines[0].startswith('"""') and f"examples/{path.name}" in path.read_text()
+
+
+OWN = {"own_astar.py": "planner", "own_field.py:act": "controller", "own_torch.py:Pilot": "controller"}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_an_own_piece_drives(short, name):
+    """It plays its episodes without an error, and gets nearer to the goal."""
+    method = load_agents([f"{OWN[name]}:{EXAMPLES / name}"], 64)[0]
+    observed, short.planner = short.observation, method.planner_for(short)
+    try:
+        note = method.driver_for(short)
+        results, _steps = run_episodes(short, jobs_of([77], N), driver=note.pilot if note else None)
+    finally:
+        short.planner, short.observation = None, observed
+        method.own.close()
+    assert [r.outcome for r in results] == ["timeout"] * N and max(r.path_length_m for r in results) > 0.1
+    assert (sum(r.planned_by["own"] for r in results) >= N) == (OWN[name] == "planner")
+
+
+def test_own_astar_goes_around_what_is_in_the_way(example):
+    """Through the one opening of a wall, by its middle; and out of cells that are too near to it."""
+    clearance = np.full((40, 60), 2.0, np.float32)
+    rows = np.abs(np.arange(40) - 9.5)[:, None] * 0.1
+    clearance[:, 25:35] = np.where(rows < 0.9, 1.0 - rows, 0.0)
+    clearance[[0, -1]] = clearance[:, [0, -1]] = 0.0
+    plan = example("own_astar").plan
+    start, goal = np.array([1.05, 2.05]), np.array([5.05, 2.05])
+    way = plan(clearance, 0.1, start, goal, None)
+    inside = way[(way[:, 0] > 2.5) & (way[:, 0] < 3.5)]
+    np.testing.assert_allclose([way[0], way[-1]], [start, goal], atol=1e-9)
+    assert len(way) < 15 and len(inside) and np.abs(inside[:, 1] - 1.0).max() < 0.3
+    clearance[:, 25:35] = 0.0
+    assert plan(clearance, 0.1, start, goal, None) is None
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_what_a_trainer_saved_drives_as_an_own_policy(short, example, tmp_path, name):
+    """``uuv eval --agent examples/own_NAME.py:load=FOLDER`` does what the trainer's own policy does."""
+    pytest.importorskip(TRAINERS[name], reason=f"{TRAINERS[name]} is not installed")
+    example(name).train(short, 0, tmp_path)
+    spec = f"policy:{EXAMPLES / name.replace('train', 'own')}.py:load={tmp_path}"
+    obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
+    with torch.no_grad():
+        expected = example(name).play(short, tmp_path)(obs)
+    obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
+    driver = load_agents([spec], 64)[0].driver_for(short).pilot
+    found = driver.decide(torch.from_numpy(obs)).action.numpy()
+    np.testing.assert_allclose(found, np.clip(expected, -1, 1), rtol=1e-4, atol=1e-5)
+    assert driver.code.marks.hold_steps == example("judge").HOLD_STEPS

@@ -1,0 +1,161 @@
+"""Tables of README and the page of results say what the committed results say; whatever differs is caught."""
+
+import json
+import shlex
+import shutil
+
+import pytest
+
+from docs import render_results
+from docs.render_results import (
+    BASELINES,
+    BENCHMARKS,
+    EVALUATIONS,
+    README,
+    REPRODUCTION,
+    RESULTS,
+    ROBUSTNESS,
+    ROOT,
+    SPEEDS,
+    SWEEPS,
+)
+from tests.repository.test_docs import fault
+from uuvtai.evaluation.claims import Share
+
+
+def test_the_pages_are_those_of_the_results(capsys):
+    """Where this fails: ``python -m docs.render_results``."""
+    assert render_results.differences() == []
+    assert render_results.main(["--check"]) == 0
+    for page, wanted in render_results.TABLES.items():
+        tables = render_results.TABLE.findall((ROOT / page).read_text())
+        assert [name for _head, name, _body, _foot in tables] == list(wanted)
+
+
+@pytest.fixture
+def copy(tmp_path, monkeypatch):
+    """Pages and results in a folder of their own."""
+    for name in ("docs/data", BENCHMARKS):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    for name in (*render_results.TABLES, RESULTS):
+        shutil.copy(ROOT / name, tmp_path / name)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("page", "cell", "changed"),
+    [
+        (README, "| `pool` (6, 0.6) | 990/1000 = 99.0 %", "| `pool` (6, 0.6) | 991/1000 = 99.1 %"),
+        (README, "of seed 90009", "of seed 90001"),
+        (RESULTS, "| withdrawn |", "| holds |"),
+        (ROBUSTNESS, "2037/2048 = 99.5 %", "2048/2048 = 100.0 %"),
+        (BASELINES, "| `paper` | 93.0 / 7.0", "| `paper` | 83.0 / 7.0"),
+        (SPEEDS, "| 2026-11-22 | 46e0ba7 |", "| 2026-11-27 | 46e0ba7 |"),
+    ],
+)
+def test_a_cell_that_was_changed_by_hand_is_caught(copy, page, cell, changed):
+    text = (copy / page).read_text()
+    assert cell in text
+    (copy / page).write_text(text.replace(cell, changed, 1))
+    found = "\n".join(render_results.differences(copy))
+    assert changed in found and cell in found
+
+
+def test_results_that_move_on_leave_the_pages_behind(copy):
+    document = json.loads((copy / EVALUATIONS).read_text())
+    document["rows"][0]["methods"]["bt"]["outcomes"] |= {"success": 999, "collision": 1}
+    (copy / EVALUATIONS).write_text(json.dumps(document))
+    assert "+| `pool` (0) | 999/1000 = 99.9 %" in "\n".join(render_results.differences(copy))
+    document = json.loads((copy / REPRODUCTION).read_text())
+    document["profile"]["rows"][0]["env_steps_per_s"]["step"] *= 2
+    (copy / REPRODUCTION).write_text(json.dumps(document))
+    assert any("| 1,018 |" in line for line in render_results.differences(copy))
+
+
+def test_a_seed_that_was_tuned_on_is_called_so(copy):
+    document = json.loads((copy / EVALUATIONS).read_text())
+    assert "No tuning used this seed" in render_results.measured(copy)
+    (copy / EVALUATIONS).write_text(json.dumps(document | {"seed": 90001}))
+    assert "was looked at while tuning" in render_results.measured(copy)
+
+
+def test_the_newest_speed_of_a_kind_is_shown_with_its_date_and_commit(copy):
+    new = json.loads((copy / BENCHMARKS / "2026-11-22_cpu_tick.json").read_text())
+    new |= {"date": "2026-12-01T00:00:00+0000", "commit": "abcdef0123"}
+    (copy / BENCHMARKS / "2026-12-01_cpu_tick.json").write_text(json.dumps(new))
+    (row,) = [line for line in render_results.speeds(copy).splitlines() if line.startswith("| `tick` |")]
+    assert "| 2026-12-01 | abcdef0 | cpu |" in row
+
+
+def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
+    """Then rates over many cells have an interval, by episode number."""
+    assert "`bt` | 2037/2048 = 99.5 % |" in render_results.grid(copy), "without: none"
+    cells = [
+        {"S": 8, "D": d, "v_m_s": v, "method": "bt", "episodes": 40, "time_to_success_mean_s": 9.0,
+         "outcomes": {"success": 39, "collision": 0, "ttc": 1, "out_of_tank": 0, "timeout": 0},
+         "episode_outcomes": ["ttc", *["success"] * 39]}
+        for d, v in ((0, None), (9, 0.6), (9, 1.5))
+    ]  # fmt: skip
+    document = {"axes": {"S": [8], "D": [0, 9], "v": [0.6, 1.5]}, "seeds": [7], "episodes_per_seed": 40}
+    (tmp_path / "sweep.json").write_text(json.dumps(document | {"cells": cells}))
+    record = {"git_sha": "abc", "started": "today", "hardware": {"cpu": "a"}}
+    record["argv"] = ["uuv", "sweep", "--agent", "bt", "--run-dir", "runs/a b", "--json"]
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    render_results.keep_sweep("pool", tmp_path, copy)
+    kept = json.loads((copy / SWEEPS).read_text())["pool"]
+    assert (kept["commit"], kept["command"]) == ("abc", "uuv sweep --agent bt")
+    low, high = Share(39, 40).interval
+    assert f"`bt` | 117/120 = 97.5 % [{100 * low - 1:.0f}" in render_results.grid(copy), (low, high)
+    with pytest.raises(KeyError):
+        render_results.keep_sweep("puddle", tmp_path, copy)
+
+
+def test_every_row_says_how_it_can_be_evaluated_again():
+    for row in json.loads((ROOT / EVALUATIONS).read_text())["rows"]:
+        first, *words = shlex.split(row["command"])
+        assert first == "uuv" and fault(words) is None
+
+
+def evaluation(folder, n=1000):
+    """A run folder as ``uuv eval`` leaves it."""
+    ends = {"success": n - 3, "collision": 1, "ttc": 1, "out_of_tank": 0, "timeout": 1}
+    agent = {"name": "bt", "episodes": n, "outcomes": ends, "time_mean_s": 9.0, "time_to_success_mean_s": 9.0}
+    agent |= {"causes": [{"label": "late", "count": 3, "share": 1.0}], "episodes_detail": [{}] * n}
+    (folder / "eval").mkdir(parents=True)
+    (folder / "eval/result.json").write_text(json.dumps({"methods": [agent], "paired": []}))
+    (folder / "run.json").write_text(json.dumps({"git_sha": "abc", "started": "today", "hardware": {}}))
+    return folder
+
+
+def test_an_evaluation_is_kept_in_its_row_alone(copy, tmp_path):
+    before = json.loads((copy / EVALUATIONS).read_text())
+    render_results.keep_row("pool_0", evaluation(tmp_path / "run"), copy)
+    after = json.loads((copy / EVALUATIONS).read_text())
+    assert after["rows"][1:] == before["rows"][1:]
+    agents = after["rows"][0]["methods"]
+    assert agents["bt"]["commit"] == "abc" and "episodes_detail" not in agents["bt"]
+    assert agents["best"] == before["rows"][0]["methods"]["best"]
+    assert all("bt" not in (pair["a"], pair["b"]) for pair in after["rows"][0]["paired"])
+    assert (
+        "| `pool` (0) | 997/1000 = 99.7 % [99.1, 99.9] | 0.2 % [0.1, 0.7] | 1 / 1 / 0 / 1 |"
+        in (render_results.pages(copy)[README])
+    )
+    with pytest.raises(ValueError, match="there are pool_0"):
+        render_results.keep_row("pol_0", tmp_path / "run", copy)
+    with pytest.raises(ValueError, match="bt: not 1000 episodes"):
+        render_results.keep_row("pool_0", evaluation(tmp_path / "short", 10), copy)
+
+
+def test_a_reproduction_is_kept_as_small_as_it_is(copy, tmp_path):
+    document = json.loads((copy / REPRODUCTION).read_text())
+    for cell in document["sweeps"]["pool"]["cells"]:
+        cell["episode_times_s"] = [9.0] * cell["episodes"]
+    (tmp_path / "reproduce.json").write_text(json.dumps(document | {"figures": []}))
+    render_results.keep_reproduction(tmp_path, copy)
+    assert render_results.differences(copy) == []
+    assert (copy / REPRODUCTION).stat().st_size == (ROOT / REPRODUCTION).stat().st_size
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path, capsys):
+    assert render_results.main(["--keep", str(tmp_path)]) == 1
+    assert "not kept" in capsys.readouterr().err

@@ -1,0 +1,230 @@
+"""What a user installs: the wheel made from the source distribution, in an environment of its own, in any
+folder, without a network."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.small_sim import SmallSim
+
+ROOT = Path(__file__).parents[2]
+KEPT = ("uuvtai", "tests", "benchmarks", "examples", "docs", "runs/README.md", ".ci", ".github")
+"""of the checkout, beside the files at its top"""
+PRESETS = {
+    path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai" / "presets").rglob("*") if path.is_file()
+}
+EXAMPLES = {path.name for path in (ROOT / "examples").iterdir() if path.is_file()}
+MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai").rglob("*.py")}
+
+NO_NETWORK = """
+import pathlib, sys
+
+def refuse(event, arguments):
+    sends = event in ("socket.connect", "socket.sendto", "socket.sendmsg")
+    if sends and isinstance(arguments[1], tuple) or event in ("socket.getaddrinfo", "socket.gethostbyname"):
+        with open(pathlib.Path(__file__).with_suffix(".log"), "a") as log:
+            log.write(f"{event} {arguments}\\n")
+        raise OSError(f"no network in this environment: {event}")
+
+sys.addaudithook(refuse)
+"""
+"""Module of the wheel's environment: whatever reaches for another machine fails, and is written down in case
+nobody tells."""
+
+
+def run(*command, **options):
+    """One command that must succeed; its stdout."""
+    done = subprocess.run(
+        [str(part) for part in command], capture_output=True, text=True, check=False, **options
+    )
+    assert done.returncode == 0, f"{command}: {done.stderr[-3000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """(source distribution, wheel made from it), built from a copy of the checkout."""
+    place = tmp_path_factory.mktemp("built")
+    copy, dist = place / "checkout", place / "dist"
+    for name in [
+        *KEPT,
+        *(path.name for path in ROOT.iterdir() if path.is_file()),
+    ]:
+        source = ROOT / name
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, copy / name, ignore=shutil.ignore_patterns("node_modules", "__pycache__"))
+        elif source.exists():
+            shutil.copy(source, copy / name)
+    dist.mkdir()
+    run(
+        sys.executable,
+        "-c",
+        "import sys, setuptools.build_meta as b; b.build_sdist(sys.argv[1])",
+        dist,
+        cwd=copy,
+    )
+    (sdist,) = dist.glob("*.tar.gz")
+    run(
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "-w",
+        dist,
+        sdist,
+        cwd=place,
+    )
+    (stepper,) = dist.glob("*.whl")
+    return sdist, stepper
+
+
+@pytest.fixture(scope="module")
+def installed(built, tmp_path_factory):
+    """(packages, interpreter) of a fresh environment with the wheel, lent what it needs by the tests' own; no
+    network there."""
+    place = tmp_path_factory.mktemp("installed")
+    run(sys.executable, "-m", "venv", "--without-pip", place)
+    python = next(place.glob("*/python"), None) or place / "Scripts" / "python.exe"
+    own = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
+    (own / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    run(
+        python,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--ignore-installed",
+        built[1],
+        env=clean(),
+        cwd=place,
+    )
+    (own / "no_network.py").write_text(NO_NETWORK)
+    (own / "no_network.pth").write_text("import no_network\n")
+    return own, python
+
+
+def clean(**more):
+    """The environment of a user: nothing of the checkout in it."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | more
+
+
+@pytest.fixture
+def uuv(installed, tmp_path):
+    """Run ``uuv`` of the wheel in an empty folder; its stdout. Fails where anything reached for the
+    network."""
+    own, python = installed
+
+    def call(*arguments, **more):
+        out = run(python.with_name("uuv"), *arguments, cwd=tmp_path, env=clean(**more))
+        asked = own / "no_network.log"
+        assert not asked.exists(), asked.read_text()
+        return out
+
+    return call
+
+
+def test_the_wheel_holds_the_package_and_the_examples_and_nothing_else(built):
+    names = set(zipfile.ZipFile(built[1]).namelist())
+    info = {name for name in names if name.split("/")[0].endswith(".dist-info")}
+    beside = {name for name in names if ".data/" in name}
+    assert {name.partition("/data/")[2] for name in beside} == {
+        f"share/uuvtai/examples/{n}" for n in EXAMPLES
+    }
+    assert names - info - beside == MODULES | PRESETS | {"uuvtai/py.typed"}
+    assert any(name.endswith("licenses/LICENSE") for name in info)
+
+
+def test_presets_of_every_kind_are_among_them():
+    kinds = {name.split("/")[2] for name in PRESETS}
+    assert kinds >= {"worlds", "sensors", "vehicles", "trees", "train", "grids", "layout", "report"}
+
+
+def test_the_source_distribution_can_be_tested_and_carries_no_litter(built):
+    with tarfile.open(built[0]) as packed:
+        names = {name.partition("/")[2] for name in packed.getnames()}
+    wanted = {
+        "LICENSE",
+        "README.md",
+        "CHANGELOG.md",
+        "CONTRIBUTING.md",
+        "pyproject.toml",
+        "bootstrap.py",
+        "tests/conftest.py",
+        ".ci/run",
+    }
+    assert names >= wanted | MODULES | PRESETS | {
+        "tests/oracles/world.py",
+        "examples/judge.py",
+        "benchmarks/run.py",
+    }
+    assert not [
+        name
+        for name in names
+        if "node_modules" in name or "__pycache__" in name or name.startswith(("build/", "runs/2"))
+    ]
+
+
+def test_the_installed_command_is_the_wheels_and_works_in_any_folder(installed, uuv, tmp_path):
+    own, python = installed
+    where = run(python, "-c", "import uuvtai; print(uuvtai.__file__)", cwd=tmp_path, env=clean()).strip()
+    assert Path(where).parent == own / "uuvtai"
+    assert "observation-only navigation" in uuv("--help")
+    listed = json.loads(uuv("presets", "--json"))
+    assert "pool" in listed["world"] and "bt" in listed["tree"]
+    assert "BTCPP_format" in uuv("presets", "show", "tree/bt")
+
+
+def test_the_examples_are_a_users_by_one_command_and_none_of_hers_is_overwritten(installed, uuv, tmp_path):
+    said = uuv("examples").split()
+    assert {Path(name).name for name in said} == EXAMPLES
+    mine = tmp_path / "examples" / "own_astar.py"
+    assert mine.read_bytes() == (ROOT / "examples" / "own_astar.py").read_bytes()
+    mine.write_text("# hers")
+    own = [installed[1].with_name("uuv"), "examples"]
+    again = subprocess.run(own, capture_output=True, text=True, check=False, cwd=tmp_path, env=clean())
+    assert again.returncode == 2 and "uuv examples NEW" in again.stderr and mine.read_text() == "# hers"
+
+
+def test_who_reaches_for_the_network_is_found_out(installed, tmp_path):
+    """What the other tests rely on: name look-ups and connections fail and are written down, though their
+    errors be swallowed."""
+    own, python = installed
+    tries = (
+        "s.create_connection(('192.0.2.1', 9), 1)",
+        "s.getaddrinfo('uuvtai.invalid', 9)",
+        "s.socket(type=s.SOCK_DGRAM).sendto(b'', ('192.0.2.1', 9))",
+    )
+    for attempt in tries:
+        program = f"import socket as s\ntry: {attempt}\nexcept OSError as error: print(error)"
+        assert "no network in this environment" in run(python, "-c", program, cwd=tmp_path, env=clean())
+    log = own / "no_network.log"
+    assert len(log.read_text().splitlines()) >= len(tries)
+    log.unlink()
+
+
+def test_doctor_asks_no_server(uuv, tmp_path):
+    """In a home without Taichi's cache, where Taichi would ask for its newest version at once."""
+    home = {"HOME": str(tmp_path), "USERPROFILE": str(tmp_path), "XDG_CACHE_HOME": ""}
+    assert json.loads(uuv("doctor", "--json", **home))["ok"]
+
+
+def test_an_evaluation_asks_no_server(uuv):
+    result = json.loads(
+        uuv("eval", "--agent", "bt", "--episodes", "2", "--seeds", "3", *SmallSim.OPTIONS, "--json")
+    )
+    assert sum(result["methods"][0]["outcomes"].values()) == 2

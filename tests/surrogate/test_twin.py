@@ -1,0 +1,569 @@
+"""The kinematic twin against the simulator and against oracles, and the policy that learns in it."""
+
+import copy
+
+import numpy as np
+import pytest
+import taichi as ti
+import torch
+
+from tests.oracles import hull_rule as reference
+from tests.repository.test_architecture import TRUTH
+from uuvtai.common.enums import BODY_WIDTH, COLLISION, EGO_COLUMNS, N_RAY, RUNNING, SUCCESS, TIMEOUT
+from uuvtai.common.errors import UserError
+from uuvtai.common.obstacle_motion import describe_scenario, path_positions
+from uuvtai.config import TankConfig, VehicleConfig
+from uuvtai.config.learning import LearningConfig
+from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
+from uuvtai.kernels.core.noise import episode_key
+from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
+from uuvtai.learning import checkpoint, surrogate_trainer
+from uuvtai.learning.agents import load_set_pilot
+from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.runner import TrainRequest, train
+from uuvtai.learning.set_networks import SetActor
+from uuvtai.learning.surrogate_trainer import Student, TwinTrainer, imitate, wish_of_command
+from uuvtai.sim.stages import bind, members_of
+from uuvtai.surrogate import motion, observation, sensing
+from uuvtai.surrogate.arrays import TRACK_WIDTH, ObserverIO, TwinRules
+from uuvtai.surrogate.world import draw_bank
+
+CLEARANCE_TOL_M = 0.01
+"""the simulator's hull leans by a few degrees, the twin's does not"""
+TTC_TOL_S = 0.1
+"""the same, at closing speeds of 0.1 m/s and more"""
+SOON_S = 0.6
+"""bodies that hit within it are near enough for the twin to look at"""
+FLOAT_TOL = 2e-5
+SMALL = {
+    "train.num_envs": 16,
+    "ppo.rollout_steps": 8,
+    "ppo.minibatches": 2,
+    "twin.body_hidden": 8,
+    "twin.head_hidden": 8,
+    "train.evaluate_episodes": 8,
+    "train.scenes": [[8, 6, 0.6]],
+    "twin.worlds": ["pool"],
+    "train.iterations": 4,
+    "twin.warm_start_waves": 0,
+}
+
+
+@ti.kernel
+def lay(wishes: FloatMatrix, vehicle: Const[VehicleConfig], tank: Const[TankConfig], out: FloatMatrix):
+    for i in range(wishes.shape[0]):
+        wish = ti.Vector([wishes[i, 0], wishes[i, 1], wishes[i, 2]])
+        command = motion.hull_command(wish, wishes[i, 3], wishes[i, 4], 0.25, vehicle, tank)
+        for j in ti.static(range(4)):
+            out[i, j] = command[j]
+
+
+@ti.kernel
+def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
+    for row, lane in ti.ndrange(path.shape[0], path.shape[1]):
+        place = motion.path_place(row, lane, times[row], path)
+        for i in ti.static(range(4)):
+            out[row, lane, i] = place[i]
+
+
+@ti.kernel
+def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[TwinRules], ray: FloatMatrix):
+    for i in range(place.shape[0]):
+        sensing.write_rays(i, i, body.shape[1], place[i, 0], place[i, 1], body, ray, io)
+
+
+@ti.kernel
+def threats(
+    near_only: int,
+    pose: FloatMatrix,
+    moved: FloatMatrix,
+    io: Bundle[TwinRules],
+    body: AnyTensor,
+    path: AnyTensor,
+    out: FloatMatrix,
+):
+    """Clearance and time to collision after hulls (x, y, z, t) have moved by (x, y, z, t), of the bodies that
+    were found near before, or of all."""
+    for i in range(pose.shape[0]):
+        before = ti.Vector([pose[i, k] for k in ti.static(range(3))])
+        after = before + ti.Vector([moved[i, k] for k in ti.static(range(3))])
+        near = motion.EVERY_SLOT + 0
+        if near_only == 1:
+            near = motion.near_slots(i, before, pose[i, 3], body, path, io)
+        ahead = ti.Vector([1.0, 0.0, 0.0])
+        t_s = pose[i, 3] + moved[i, 3]
+        threat = motion.nearest_of(near, i, after, ahead, ahead, 0.0, t_s, body, path, io)
+        out[i, 0], out[i, 1] = threat[0], threat[1]
+
+
+@ti.kernel
+def watch(at: FloatMatrix, is_seen: int, steps: int, bend_m: float, track: AnyTensor):
+    """Bodies that stay at (x, y) with a velocity, each a row, for so many decisions, seen from (0, 0)."""
+    for i in range(at.shape[0]):
+        place = ti.Vector([at[i, 0], at[i, 1], at[i, 2], at[i, 3]])
+        for step in range(steps):
+            key = episode_key(step // sensing.SPELL, i)
+            old = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
+            new = sensing.updated_track(
+                old, 0, place, bend_m, 1.0, ti.Vector([0.0, 0.0]), is_seen == 1, 0, 1, key
+            )
+            for k in ti.static(range(TRACK_WIDTH)):
+                track[i, 0, k] = new[k]
+
+
+@ti.kernel
+def tracked(track: AnyTensor, out: AnyTensor):
+    for i in range(track.shape[0]):
+        row = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
+        out[i] = sensing.is_tracked(row)
+
+
+@ti.kernel
+def velocities(wish: FloatMatrix, flip: FloatMatrix, vehicle: Const[VehicleConfig], out: FloatMatrix):
+    for i in range(wish.shape[0]):
+        found = motion.wished_velocity(wish[i, 0], wish[i, 1], wish[i, 2], flip[i, 0], flip[i, 1], vehicle)
+        for j in ti.static(range(3)):
+            out[i, j] = found[j]
+
+
+@ti.kernel
+def earn(
+    nearer: FloatVector, nearest: FloatVector, ended: IntVector, io: Bundle[TwinRules], out: FloatVector
+):
+    for i in range(out.shape[0]):
+        out[i] = motion.earned(nearer[i], nearest[i], ended[i], io)
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_training("twin", overrides=SMALL)
+
+
+@pytest.fixture(scope="module")
+def bank(small):
+    """Scenarios that the small simulator has drawn."""
+    return small.scenario_bank()
+
+
+@pytest.fixture(scope="module")
+def trainer(config, bank):
+    """After two iterations."""
+    made = TwinTrainer(config, bank)
+    made.iterate()
+    made.iterate()
+    return made
+
+
+@pytest.fixture
+def saved(trainer, config, tmp_path):
+    """Function: checkpoint of the trainer after ``change`` (None = none) of its state."""
+
+    def save(change=None):
+        state = copy.deepcopy(trainer.state())
+        if change:
+            change(state["policy"])
+        path = checkpoint.save(tmp_path / "checkpoints", 2, state, config, trainer.observation_table)
+        return checkpoint.open_checkpoint(path)
+
+    return save
+
+
+# ------------------------------------------------------------------------------------------------- the twin
+
+
+def test_the_hull_rule_is_that_of_the_oracle():
+    rng = np.random.default_rng(0)
+    low, high = [-0.85, -0.85, -0.4, -np.pi, -1.6], [0.85, 0.85, 0.4, np.pi, 0.0]
+    wishes = rng.uniform(low, high, (300, 5)).astype(np.float32)
+    wishes[:20, :2] *= 0.05  # too slow to turn for
+    out = torch.zeros(300, 4)
+    lay(torch.from_numpy(wishes), VehicleConfig(), TankConfig(), out)
+    expected = [
+        reference.hull_command(
+            row[:3].astype(float), *map(float, row[3:]), 0.25, VehicleConfig(), TankConfig()
+        )
+        for row in wishes
+    ]
+    np.testing.assert_allclose(out.numpy(), expected, atol=1e-5)
+
+
+def test_bodies_move_as_in_closed_form(small, bank):
+    small.begin(range(small.N), seed=5)
+    times = torch.linspace(0.0, 50.0, small.N)
+    out = torch.zeros(*bank.path.shape[:2], 4)
+    places(bank.path, times, out)
+    checked = 0
+    for row in range(small.N):
+        arrays = {k: v[row] for k, v in small.arrays("world", "path", "mission").items()}
+        first = bank.body.shape[1] - bank.path.shape[1]
+        for body in describe_scenario(lambda name, arrays=arrays: arrays[name])["bodies"]:
+            if body["path"]:
+                near = np.array([times[row] - 1e-3, times[row], times[row] + 1e-3])
+                way = path_positions(body["path"], near)
+                found = out[row, body["slot"] - first].numpy()
+                np.testing.assert_allclose(found[:2], way[1], atol=1e-3)  # float32 after 50 s
+                np.testing.assert_allclose(np.hypot(*found[2:]), body["path"]["speed_m_s"], rtol=1e-4)
+                checked += 1
+    assert checked == 6 * small.N
+
+
+def states_of(sim):
+    """(n, 12) rows for ``judge_states``."""
+    rows, s = sim.rows, sim.s
+    w, x, y, z = rows(s.vehicle.quat_wb).T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    axis, vel_b = np.stack([x, y, z], axis=1), rows(s.vehicle.vel_b)
+    vel = vel_b + 2 * np.cross(axis, np.cross(axis, vel_b) + w[:, None] * vel_b)
+    time_s = rows(s.clock.step) * sim.config.episode.control_dt_s
+    rate, goal = rows(s.vehicle.rate_b)[:, 2], rows(s.mission.goal_w)
+    pose = np.column_stack([rows(s.vehicle.pos_w), yaw, vel, rate, time_s, goal])
+    return torch.from_numpy(np.ascontiguousarray(pose, np.float32))
+
+
+def test_the_referee_is_the_simulators(small, bank, config):
+    """Clearance, time to collision and verdict of the same states, along rides straight to the goal and
+    through whatever is in the way."""
+    small.sim.use_tree(small.trees["straight"])
+    small.begin(range(small.N), seed=5)
+    rules, compared, verdicts = bind(TwinRules, config), 0, set()
+    for step in range(500):
+        small.sim.step()
+        if step % 5:
+            continue
+        rows, referee = small.sim.rows, small.sim.s.referee
+        seen, outcome = torch.zeros(small.N, 2), torch.zeros(small.N, dtype=torch.int32)
+        motion.judge_states(rules, states_of(small.sim), bank.body, bank.path, seen, outcome)
+        clearance, ttc, ended = rows(referee.clearance_m), rows(referee.ttc_s), rows(referee.outcome)
+        near, soon = clearance < motion.NEAR_M, (ttc < SOON_S) & (ttc > 0.0)
+        np.testing.assert_allclose(seen[near, 0], clearance[near], atol=CLEARANCE_TOL_M)
+        np.testing.assert_allclose(seen[soon, 1], ttc[soon], atol=TTC_TOL_S)
+        edge = (abs(clearance - 0.1) < CLEARANCE_TOL_M) | (abs(ttc - 0.18) < TTC_TOL_S)
+        assert (outcome.numpy()[near & ~edge] == ended[near & ~edge]).all()
+        compared, verdicts = compared + int(soon.sum()), verdicts | set(ended[near & ~edge])
+    small.sim.use_tree(small.trees["bt"])
+    assert compared > 5 and len(verdicts) >= 3
+
+
+def test_far_bodies_are_left_out(config):
+    rules, far = bind(TwinRules, config), torch.zeros(1, 1, 8)
+    far[0, 0] = torch.tensor([1.0, 15.0, 3.0, -0.8, 0.2, 0.2, 0.2, 0.0])
+    pose = torch.tensor([[5.0, 3.0, -0.8, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 18.0, 3.0, -0.8]])
+    seen, outcome = torch.zeros(1, 2), torch.zeros(1, dtype=torch.int32)
+    motion.judge_states(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
+    assert seen[0, 1] == FAR_M and outcome[0] == 0
+    assert seen[0, 0] == pytest.approx(3.0 - 0.17, abs=FLOAT_TOL)  # the side walls
+
+
+@pytest.mark.parametrize("slots", [0, 30])
+def test_no_body_that_can_come_near_is_left_out(bank, config, slots):
+    """Nothing changes where those alone are looked at that were near when the decision began, however the
+    hull has moved since; nor where there are more slots than an integer has bits."""
+    rng, count = np.random.default_rng(3), len(bank.body)
+    rules, changed = bind(TwinRules, config), 0
+    body = torch.cat([torch.zeros(count, slots, 8), bank.body], dim=1).contiguous()
+    for _ in range(200):
+        pose, moved = rng.uniform(0, 1, (count, 4)), rng.uniform(-1, 1, (count, 4))
+        pose = pose * [20.0, 6.0, -1.6, 30.0]
+        moved = moved / np.linalg.norm(moved[:, :3], axis=1, keepdims=True) * 0.25
+        moved[:, 3] = rng.uniform(0, 0.1, count)
+        pose, moved = (torch.from_numpy(a.astype(np.float32)) for a in (pose, moved))
+        all_of_them, near = torch.zeros(count, 2), torch.zeros(count, 2)
+        threats(0, pose, moved, rules, body, bank.path, all_of_them)
+        threats(1, pose, moved, rules, body, bank.path, near)
+        assert torch.equal(near, all_of_them)
+        changed += int((near[:, 1] < FAR_M).sum())
+    assert changed > 100, "bodies come closer"
+
+
+def free_m(x, y, bodies, tank):
+    """Along 24 rays, in float64, each ray against each body: what the twin looks up by directions."""
+    angle = np.arange(N_RAY) * 2 * np.pi / N_RAY
+    u = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    with np.errstate(divide="ignore"):
+        ends = [np.where(u[:, a] > 0, (bound[1] - at) / u[:, a], (bound[0] - at) / u[:, a])
+                for a, (at, bound) in enumerate(((x, tank.x_m), (y, tank.y_m)))]  # fmt: skip
+        out = np.minimum(*[np.where(abs(u[:, a]) < 1e-6, 99.0, end) for a, end in enumerate(ends)])
+    for kind, bx, by, _, wide, deep, _, yaw in bodies:
+        d = np.array([bx - x, by - y])
+        if kind == BOX:
+            c, s = np.cos(yaw), np.sin(yaw)
+            turn = np.array([[c, s], [-s, c]])
+            with np.errstate(divide="ignore"):
+                a, b = ((turn @ d + side)[:, None] / (turn @ u.T) for side in ([-wide, -deep], [wide, deep]))
+            enter, leave = np.minimum(a, b).max(0), np.maximum(a, b).min(0)
+            hit = np.where((leave >= enter) & (leave > 0), np.maximum(enter, 0.0), 99.0)
+        elif kind != NONE:
+            along = u @ d
+            inside = along**2 - d @ d + wide**2
+            hit = np.where((inside > 0) & (along > 0), along - np.sqrt(np.maximum(inside, 0)), 99.0)
+        else:
+            continue
+        out = np.minimum(out, hit)
+    return out
+
+
+def test_rays_meet_what_stands_in_their_way(config):
+    rng, count = np.random.default_rng(0), 400
+    tank = config.world.tank
+    place = np.column_stack([rng.uniform(*tank.x_m, count), rng.uniform(*tank.y_m, count)])
+    body = np.zeros((count, 5, 8))
+    body[..., 0] = rng.choice([NONE, CYLINDER, BOX], (count, 5))
+    body[..., 1:3] = place[:, None] + rng.uniform(-4, 4, (count, 5, 2))
+    body[..., 4:6], body[..., 7] = rng.uniform(0.1, 0.8, (count, 5, 2)), rng.uniform(-7, 7, (count, 5))
+    ray = torch.zeros(count, N_RAY)
+    place, body = (torch.from_numpy(a.astype(np.float32)) for a in (place, body))
+    look_along(place, body, bind(TwinRules, config), ray)
+    wanted = [
+        free_m(*at, row, tank) for at, row in zip(place.double().numpy(), body.double().numpy(), strict=True)
+    ]
+    off = abs(ray.numpy() - wanted) > 1e-3
+    assert off.mean() < 1e-3, "but for rays that touch an edge"
+    bare = [free_m(*at, [], tank) for at in place.double().numpy()]
+    assert (np.array(bare) > np.array(wanted) + 0.1).mean() > 0.1, "bodies are in the way"
+
+
+def test_rewards_by_hand(config):
+    nearer, nearest = torch.tensor([0.08, 0.0, -0.02, 0.1]), torch.tensor([9.0, 0.25, 0.05, 2.0])
+    ended = torch.tensor([RUNNING, TIMEOUT, COLLISION, SUCCESS], dtype=torch.int32)
+    reward, twin = torch.zeros(4), config.twin
+    earn(nearer, nearest, ended, bind(TwinRules, config), reward)
+    close = (1.0 - nearest / twin.soft_clearance_m).clamp(0.0, 1.0)
+    expected = twin.progress * nearer - 0.1 * (twin.time_cost + twin.closeness_cost * close)
+    assert torch.allclose(reward, expected + torch.tensor([0.0, 0.0, -1.0, 1.0]), atol=1e-6)
+
+
+def watched(far_m, steps, is_seen=1, count=4000, radius_m=None, track=None):
+    """Tracks (count, 9) of bodies so far ahead that go across at 1 m/s, on a circle where it has a radius."""
+    at = torch.tensor([[far_m, 0.0, 0.0, 1.0]]).repeat(count, 1)
+    track = torch.zeros(count, 1, TRACK_WIDTH) if track is None else track
+    watch(at, is_seen, steps, radius_m or 0.0, track)
+    return track[:, 0]
+
+
+def test_errors_of_tracks_grow_with_distance_and_have_a_long_tail():
+    near, far = watched(1.0, 30), watched(4.0, 30)
+    errors = [(track[:, :2] - torch.tensor([at, 0.0])).norm(dim=1) for track, at in ((near, 1.0), (far, 4.0))]
+    middle, tail = (np.array([np.quantile(error, q) for error in errors]) for q in (0.5, 0.95))
+    assert middle[1] / middle[0] == pytest.approx(4.0, rel=0.15)
+    assert (tail / middle).min() > 5 and (tail / middle).max() < 20, (
+        "of a normal distribution it would be two"
+    )
+    assert 0.015 < middle[1] < 0.025, "centimetres"
+    assert abs(far[:, 3].median() - 1.0) < 0.01, "what goes across is known by then"
+
+
+def test_a_track_out_of_sight_follows_a_circle_and_else_goes_straight():
+    for radius_m, turned in ((1.0, 1.0), (-1.0, -1.0), (None, 0.0)):
+        track = watched(2.0, 30, radius_m=radius_m)[:, None].contiguous()
+        before = torch.atan2(track[:, 0, 3], track[:, 0, 2])
+        hidden = watched(2.0, 1, is_seen=0, radius_m=radius_m, track=track.clone())
+        track = watched(2.0, 11, is_seen=0, radius_m=radius_m, track=track)
+        moved = torch.atan2(track[:, 3], track[:, 2]) - before
+        assert float(torch.remainder(moved + np.pi, 2 * np.pi).median() - np.pi) == pytest.approx(
+            1.1 * turned, abs=0.05
+        )
+        assert float((hidden[:, 2:4] - track[:, 2:4]).norm(dim=1).median()) > 0.5 or turned == 0.0
+        assert float(track[:, 5].min()) == pytest.approx(1.1)
+
+
+def test_what_is_seen_badly_is_born_late_or_missed():
+    told = [born_of(watched(2.0, steps)).mean() for steps in (1, 3, 5, 9)]
+    assert 0.7 < told[0] < told[1] < told[2] < told[3] < 0.99
+
+
+def born_of(track):
+    """1 where the tracker has the body."""
+    out = np.zeros(len(track), np.int32)
+    tracked(track[:, None].contiguous(), out)
+    return out
+
+
+# ----------------------------------------------------------------------------------------------- the policy
+
+
+def test_neither_order_nor_empty_rows_matter(config):
+    actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    for parameter in actor.parameters():  # biases too: an empty row must not count for what it gives
+        torch.nn.init.normal_(parameter, std=0.3, generator=torch.Generator().manual_seed(2))
+    bodies, own = torch.randn(5, 4, BODY_WIDTH), torch.randn(5, EGO_COLUMNS)
+    bodies[..., 0] = 1.0
+    said = actor(bodies, own)
+    assert torch.allclose(actor(bodies[:, [2, 0, 3, 1]], own), said, atol=1e-5)
+    padded = torch.cat([bodies, torch.zeros(5, 5, BODY_WIDTH)], dim=1)
+    assert torch.allclose(actor(padded, own), said, atol=1e-5)
+    assert not torch.allclose(actor(bodies[:, :3], own), said, atol=1e-3)
+
+
+def test_what_drives_knows_nothing_that_only_the_simulator_knows(saved):
+    assert not set(members_of(ObserverIO).values()) & TRUTH
+    found = saved()
+    assert list(found.model()) == ["policy"]
+    own = SetActor(BODY_WIDTH, EGO_COLUMNS, found.config, torch.Generator()).state_dict()
+    assert {n: t.shape for n, t in found.model()["policy"].items()} == {n: t.shape for n, t in own.items()}
+    assert max(row["stop"] for row in found.manifest.observation_table) == EGO_COLUMNS + 9 * BODY_WIDTH
+
+
+def test_the_critic_alone_feels_the_truth(trainer):
+    view = trainer.twin.look()
+    other = view.truth + torch.randn(view.truth.shape) * (view.truth[..., 2:3] > 0)
+    assert not torch.equal(trainer.critic(view.bodies, view.own, other), trainer.critic(*view))
+
+
+def test_learning_goes_on_from_a_state_bit_for_bit(trainer, config, bank):
+    other = TwinTrainer(config, bank)
+    other.load_state(copy.deepcopy(trainer.state()))
+    kept = copy.deepcopy(trainer.state())
+    ours, theirs = trainer.iterate(), other.iterate()
+    trainer.load_state(kept)
+    same = [name for name in ours if not name.startswith("time/")]
+    assert {n: ours[n] for n in same} == {n: theirs[n] for n in same}
+    assert theirs["train/std"] >= config.policy.min_std
+
+
+# ------------------------------------------------------------------------------------- warm start
+
+
+def test_a_command_becomes_the_wish_with_its_velocity():
+    rng, vehicle = np.random.default_rng(0), VehicleConfig()
+    command = torch.from_numpy(rng.uniform(-1, 1, (200, 4)).astype(np.float32))
+    yaw = torch.from_numpy(rng.uniform(-np.pi, np.pi, 200).astype(np.float32))
+    flip = torch.from_numpy(rng.choice([-1.0, 1.0], (200, 2)).astype(np.float32))
+    out = torch.zeros(200, 3)
+    velocities(wish_of_command(command, yaw, flip, vehicle), flip, vehicle, out)
+    surge, sway = vehicle.max_surge_m_s * command[:, 0], vehicle.max_sway_m_s * command[:, 1]
+    expected = [
+        yaw.cos() * surge - yaw.sin() * sway,
+        yaw.sin() * surge + yaw.cos() * sway,
+        vehicle.max_heave_m_s * command[:, 2],
+    ]
+    np.testing.assert_allclose(out, torch.stack(expected, dim=1), atol=1e-5)
+
+
+def test_it_learns_what_the_tree_says(small, monkeypatch):
+    monkeypatch.setattr(surrogate_trainer, "PASSES", 1)
+    losses, decisions = [], []
+    config = load_training("twin", overrides=SMALL | {"train.num_envs": small.N, "twin.warm_start_waves": 2})
+    for passes in (1, 20):
+        monkeypatch.setattr(surrogate_trainer, "LAST_PASSES", passes)
+        actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+        std = actor.log_std.detach().clone()
+        found = imitate(actor, config, ((8, 6, 0.6),), {"pool": small.sim})
+        losses.append(found["warm_start/loss"])
+        decisions.append(found["warm_start/decisions"])
+        assert torch.equal(actor.log_std, std), "its mean alone is fitted"
+    assert losses[1] < 0.9 * losses[0] and decisions[0] > 100 * small.N / 2
+
+
+def test_the_tree_alone_drives_as_without_a_student(small):
+    config = load_training("twin", overrides=SMALL)
+    actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    student = Student(actor, small.sim, config, torch.Generator().manual_seed(0))
+    small.begin(range(small.N), seed=9)
+    student.reset(torch.ones(small.N))
+    for share, driver in ((1.0, small.sim.action), (0.0, None)):
+        student.tree_share = share
+        said = student.decide(small.sim.action).action
+        expected = student.decision.action if driver is None else driver
+        assert torch.equal(said, expected)
+    assert len(student.samples) == 2 and len(student.samples[0].wish) == small.N
+
+
+def test_what_clearly_pays_is_the_presets():
+    twin, quick = load_training("twin").twin, load_training("quick").twin
+    assert twin.warm_start_waves > 0
+    assert quick.warm_start_waves == 0, "it learns from nothing"
+
+
+# ------------------------------------------------------------------------------------------ in the simulator
+
+
+def test_it_drives_whatever_the_order_of_the_episodes(small, saved):
+    pilot = load_set_pilot(saved(), small.sim)
+    jobs = jobs_of([3], 5)
+    forth, _ = run_episodes(small.sim, jobs, driver=pilot)
+    back, _ = run_episodes(small.sim, jobs[::-1], driver=pilot)
+    assert [(r.outcome, r.time_s, r.path_length_m) for r in forth] == [
+        (r.outcome, r.time_s, r.path_length_m) for r in back[::-1]
+    ]
+    assert max(r.path_length_m for r in forth) > 1.0
+
+
+def test_asking_again_changes_nothing(small, saved):
+    pilot = load_set_pilot(saved(), small.sim)
+    small.begin(range(small.N), seed=9)
+    pilot.reset(torch.ones(small.N))
+    first = pilot.decide(torch.zeros(0)).action
+    assert torch.equal(pilot.decide(torch.zeros(0)).action, first) and bool((first.abs() <= 1.0).all())
+
+
+def test_rays_end_at_the_walls(small):
+    small.begin(range(small.N), seed=5)
+    io = bind(ObserverIO, small.sim.s, small.sim.config)
+    ego, raw, ray = torch.zeros(small.N, 21), torch.zeros(small.N, 9, 14), torch.zeros(small.N, 24)
+    observation.observe_bodies(io, torch.ones(small.N, dtype=torch.int32), ego, raw, ray)
+    y = small.sim.rows(small.sim.s.ego.pos_w)[:, 1]
+    assert (ray[:, 6].numpy() <= 6.0 - y + 0.2).all() and (ray[:, 18].numpy() <= y + 0.2).all()
+    assert bool((ray > 0.3).all())
+
+
+# --------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda part: part.pop("log_std"), "not those of its config"),
+        (lambda part: part.update({"net.body.0.weight": torch.zeros(9, BODY_WIDTH)}), "instead of"),
+        (lambda part: part.update(log_std=torch.full((3,), float("nan"))), "log_std is not finite"),
+    ],
+)
+def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
+    with pytest.raises(CheckpointError, match=says):
+        load_set_pilot(saved(change), small.sim)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("policy.residual", True, "the twin has none"),
+        ("world_model.enabled", True, "the twin has none"),
+        ("policy.hold_steps", 4, "decides every 0.1 s"),
+        ("episode.control_dt_s", 0.01, "decides every 0.1 s"),
+        ("ppo.minibatches", 200, "only 128 samples"),
+    ],
+)
+def test_what_the_twin_lacks_is_refused(bank, key, value, says):
+    with pytest.raises(UserError, match=says):
+        TwinTrainer(load_training("twin", overrides=SMALL | {key: value}), bank)
+
+
+def test_the_trainer_knows_how_long_the_twin_holds_a_decision():
+    assert surrogate_trainer.HOLD_STEPS == motion.STEPS
+    assert surrogate_trainer.DECISION_S == sensing.DT_S
+
+
+def test_it_is_no_policy_of_one_observation(saved):
+    with pytest.raises(CheckpointError, match="looks at the simulator itself"):
+        load_pilot(saved(), 1)
+
+
+@pytest.mark.parametrize("world", ["netpen", "transfer"])
+def test_worlds_of_another_tank_are_refused(world):
+    other = load_training("twin", overrides=SMALL | {"twin.worlds": [world]})
+    with pytest.raises(ConfigError, match=f"{world} has another tank"):
+        draw_bank(other, ((8, 6, 0.6),), 0, 1)
+
+
+def test_a_gpu_is_refused_before_anything_is_written(config, tmp_path):
+    request = TrainRequest(config=config, device="cuda", run_dir=tmp_path / "run")
+    watch = type("Watch", (), {"note": lambda self, text: None})()
+    with pytest.raises(UserError, match="on the CPU"):
+        train(request, watch, lambda trainer, config: {})
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_defaults_are_off():
+    assert not LearningConfig().twin.enabled
