@@ -57,18 +57,7 @@ def _exported(case: tuple[str, ...], folder: Path) -> Path:
     world, sensors, bodies, speed = case
     run, out = folder / f"{world}_{sensors}", folder / f"{world}_{sensors}_stack"
     uuv = [sys.executable, "-m", "uuvtai"]
-    scene = [
-        "--world",
-        world,
-        "--sensors",
-        sensors,
-        "--vehicle",
-        "bluerov2_16v",
-        "-D",
-        bodies,
-        "--speed",
-        speed,
-    ]
+    scene = f"--world {world} --sensors {sensors} --vehicle bluerov2_16v -D {bodies} --speed {speed}".split()
     count = ["--episodes", "1", "--record", "1", "--seeds", str(SEED)]
     _done([*uuv, "eval", "--agent", "bt", *scene, *count, "--depth-images", "--run-dir", str(run)])
     (log,) = (run / "logs").glob("*.mcap")

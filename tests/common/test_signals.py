@@ -291,21 +291,9 @@ def test_sigterm_ends_a_training_as_ctrl_c_does(tmp_path):
 
 
 def test_the_workers_of_a_sweep_end_with_it(tmp_path):
-    grid = [
-        "--grid",
-        "D=0,3,6,9",
-        "--grid",
-        "v=0.5,1.5",
-        "--agent",
-        "bt",
-        "--episodes",
-        "64",
-        "--workers",
-        "2",
-    ]
-    process = started(
-        tmp_path, "sweep", *grid, "--run-dir", "run", "--device", "cpu", "--num-envs", SmallSim.OPTIONS[1]
-    )
+    grid = ["--grid", "D=0,3,6,9", "--grid", "v=0.5,1.5", "--agent", "bt", "--episodes", "64"]
+    where = ["--workers", "2", "--run-dir", "run", "--device", "cpu", *SmallSim.OPTIONS[:2]]
+    process = started(tmp_path, "sweep", *grid, *where)
     children = two_children_of(process)  # a worker and a resource tracker
     os.kill(process.pid, signal.SIGTERM)
     code, err = ended(process, signal.SIGTERM)

@@ -66,10 +66,7 @@ from uuvtai.console.views import show_evaluation
         (["sweep", "--controller", "best"], "No such option: --controller; now it is --agent NAME"),
         (["eval", "--policy=model.onnx"], "No such option: --policy; now it is --agent FILE"),
         (["eval", "-v", "1"], "No such option: -v; now it is --speed"),
-        (
-            ["train", "--stack", "paper"],
-            "No such option: --stack; now it is --agent NAME, or --set stack=NAME",
-        ),
+        (["train", "--stack", "paper"], "No such option: --stack; now it is --agent NAME, or --set stack="),
         (["warm"], "No such command 'warm'; now it is uuv doctor --compile"),
         (["tree", "--dot"], "No such command 'tree'; now it is uuv presets show bt"),
         (["log", "video", "a.mcap"], "now it is uuv log render FILE --out NAME.webm"),
@@ -141,10 +138,7 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
         (["eval", "--world", "a/" + 5000 * "b" + ".yaml"], "too long"),
         (["eval", "--resume", "nowhere"], "nowhere: is no run folder"),
         (["eval", "--resume", "nowhere", "--episodes", "64"], "--episodes 64: a resumed run keeps its own"),
-        (
-            ["eval", "--agent", "runs/a", "--resume", "nowhere"],
-            "--agent ['runs/a']: a resumed run keeps its own",
-        ),
+        (["eval", "--agent", "bt", "--resume", "nowhere"], "--agent ['bt']: a resumed run keeps its own"),
         (["train", "smoke", "--set", "train.scenes=[[9, 9999, 1.0]]"], "do not fit"),
         (["train", "smoke", "--set", "policy.initial_std=0.01"], "lies below the floor"),
     ],

@@ -78,17 +78,8 @@ def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, capfd, tmp_path)
 
 def test_failures_of_a_privileged_tree_are_replayed_with_the_truth(borrowed, capfd, tmp_path):
     """A replay that ended otherwise than the episode would be refused."""
-    command = (
-        *COMMAND,
-        "--agent",
-        "straight+truth,oracle",
-        "--explain",
-        "--explain-record",
-        "0",
-        "--run-dir",
-        str(tmp_path / "run"),
-    )
-    code, out, err = uuv(capfd, *command, "--json")
+    options = ["--agent", "straight+truth,oracle", "--explain", "--explain-record", "0", "--json"]
+    code, out, err = uuv(capfd, *COMMAND, *options, "--run-dir", str(tmp_path / "run"))
     assert code == 0, err
     straight, oracle = json.loads(out)["methods"]
     assert len(straight["explain"]) == 3 - straight["outcomes"]["success"] > 0

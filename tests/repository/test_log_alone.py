@@ -67,19 +67,8 @@ def recordings(tmp_path_factory):
     paper, printed = recorded(
         folder / "paper", "--agent", "straight,bt", "--seeds", "7,3", "--episodes", "2", "--record", "3"
     )
-    clean, _ = recorded(
-        folder / "clean",
-        "--agent",
-        "bt",
-        "--sensors",
-        "clean",
-        "--seeds",
-        "3",
-        "--episodes",
-        "1",
-        "--record",
-        "1",
-    )
+    once = ["--agent", "bt", "--sensors", "clean", "--seeds", "3", "--episodes", "1", "--record", "1"]
+    clean, _ = recorded(folder / "clean", *once)
     return {"paper": paper, "clean": clean, "printed": printed}
 
 
