@@ -575,7 +575,7 @@ def replay_log(
 def simulate(
     motion: groups.MotionGroup,
     driver: groups.AgentGroup,
-    output: groups.PlainOutputGroup,
+    output: groups.OutputGroup,
     vehicle: opt.BaseVehicle = "bluerov2",
     overrides: opt.Set = None,
 ) -> None:

@@ -379,22 +379,24 @@ class OutputGroup:
 
     wide: opt.Wide = False
     as_json: opt.AsJson = False
+    more = "--wide"
 
     def show(self, document: Any, shown: Callable[[Screen], None], folder: Path | None = None) -> None:
         """The result, for a program or for a person, who also hears of the run's ``folder``."""
         if self.as_json:
             typer.echo(json.dumps(document, allow_nan=False))
             return
-        shown(Screen(self.wide))
+        shown(Screen(self.wide, more=self.more))
         if folder is not None:
             say(f"run folder: {folder}")
 
 
 @dataclass(frozen=True)
 class PlainOutputGroup(OutputGroup):
-    """Of what is no table."""
+    """Of what fits most terminals: without ``--wide``."""
 
     wide: bool = False
+    more = "a wider terminal"
 
 
 # ------------------------------------------------------------------------------------------------------------

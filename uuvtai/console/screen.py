@@ -45,11 +45,11 @@ class Screen:
     """Where results are shown. ``wide`` shows every column, however narrow the terminal; a file is wide in
     any case."""
 
-    def __init__(self, wide: bool = False, console: Console | None = None) -> None:
-        """``console``: stdout, unless it is given."""
+    def __init__(self, wide: bool = False, console: Console | None = None, more: str = "--wide") -> None:
+        """``console``: stdout, unless it is given; ``more``: what shows the columns that have no room."""
         is_terminal = console is not None or (sys.stdout is not None and sys.stdout.isatty())
         self.console = console or Console(width=None if is_terminal else _PIPE_WIDTH)
-        self.wide = wide or not is_terminal
+        self.wide, self._more = wide or not is_terminal, more
 
     def line(self, text: str | Text, style: str = "") -> None:
         """A line of prose, wrapped between words; no markup."""
@@ -73,7 +73,7 @@ class Screen:
             self.console.print(drawn)
         if left_out:
             names = ", ".join(_head(layout.columns[i]).replace("\n", " ") for i in sorted(left_out))
-            self.line(f"left out, for want of room: {names}; --wide shows all", "dim")
+            self.line(f"left out, for want of room: {names}; {self._more} shows all", "dim")
 
 
 @dataclass(frozen=True)
