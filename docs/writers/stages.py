@@ -10,26 +10,18 @@ import uuvtai
 KERNELS = Path(uuvtai.__file__).parent / "kernels"
 
 FILES = {
-    "dynamics": ("lost_thruster", "actuation", "dynamics"),
-    "world": ("scenarios", "episode"),
+    "dynamics": ("thruster_fault", "control", "dynamics"),
+    "world": ("scenario", "motion", "episode"),
     "proprioception": ("proprioception",),
-    "sonar": ("sonar", "sonar_error", "raycast"),
-    "pose": ("pose", "wall_fix"),
-    "depth": ("depth",),
-    "tracking": ("tracking", "habits", "elevation", "look", "forecast", "spotting"),
-    "mapping": ("mapping",),
+    "sonar": ("sonar", "sonar_image", "raycast"),
+    "pose": ("localization",),
+    "depth": ("depth_camera",),
+    "tracking": ("tracking", "height", "prediction", "camera_tracking"),
+    "mapping": ("sensor_model", "mapping"),
     "clearance": ("clearance",),
-    "planning": ("triggers", "voronoi", "medial", "route"),
-    "features": ("features",),
-    "teacher": (
-        "threats",
-        "evasion",
-        "dynamic_window",
-        "potential_field",
-        "velocity_obstacle",
-        "path_integral",
-        "leaves",
-    ),
+    "planning": ("triggers", "voronoi", "medial_axis", "route"),
+    "features": ("observation",),
+    "teacher": ("threats", "avoidance", "dwa", "potential_field", "velocity_obstacle", "mppi", "tree"),
     "reward": ("reward",),
 }
 """kernel files of each stage, by the names of ``uuvtai.sim.stages.STAGES``"""
@@ -40,8 +32,8 @@ def page() -> str:
     parts = [
         "# Stages of a step",
         "One control step runs these stages in this order; a row of `uuv profile` carries the same name. The "
-        "text is that of the files in `uuvtai/kernels/`. What they stand on, and what is assumed: [how the "
-        "simulator works](../simulator.md).",
+        "text is that of the files in `uuvtai/kernels/`. What they stand on, and what is assumed: "
+        "[simulator](../simulator.md), [navigation](../navigation.md).",
     ]
     for stage, files in FILES.items():
         parts.append(f"## {stage}")
