@@ -86,7 +86,7 @@ def evaluations(root: Path) -> str:
     ]  # fmt: skip
     shown = [row for row in document["rows"] if row["methods"] and LITERATURE.isdisjoint(row["methods"])]
     note = (
-        "Success, collision and endings are those of `bt`, in the last row of `paper`; `-` = not evaluated. "
+        "Success, collision and endings are those of `bt`, in the last row of `paper`; `-` = not evaluated.\n"
         f"Counts: `{EVALUATIONS}`.\n\n"
     )
     return note + text_table(head, [_evaluated(row) for row in shown])
