@@ -14,6 +14,7 @@ from tests.small_sim import SmallSim
 from tests.test_observation_only import compared
 from uuvtai.common.enums import ANCHORS, COLUMNS, N_COLUMN, N_MODE
 from uuvtai.common.errors import UserError
+from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config.loader import ConfigError, load_training
 from uuvtai.learning import checkpoint
 from uuvtai.learning import forecast as forecast_trainer
@@ -22,8 +23,7 @@ from uuvtai.learning.forecast import ForecastTrainer, TrackMoments, column_row, 
 from uuvtai.learning.networks import TIMES_S, Mixture, MixtureNet, negative_log_likelihood
 from uuvtai.learning.policy_agent import load_pilot
 from uuvtai.learning.runner import TrainRequest, train
-from uuvtai.sim.setup import packed_weights, read_weights
-from uuvtai.state.obstacle_motion import describe_scenario, path_positions
+from uuvtai.sim.forecast_weights import packed_weights, read_weights
 from uuvtai.surrogate.world import scenario_rows
 
 SMALL = {

@@ -25,6 +25,7 @@ from tests.command import read_by_viewer
 from tests.reference import logs as episode
 from tests.reference.world import path_position
 from uuvtai.common.files import FileError
+from uuvtai.common.obstacle_motion import KIND_NAMES, body_positions
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.core import geometry, grid
 from uuvtai.logs.container import McapFile
@@ -38,7 +39,6 @@ from uuvtai.logs.topics.perception import grid_values, map_origin
 from uuvtai.logs.topics.sensors import logged_image
 from uuvtai.logs.writer import NO_POLICY, SIGNS, McapEpisodeLog
 from uuvtai.sim.stages import SimState
-from uuvtai.state.obstacle_motion import KIND_NAMES, body_positions
 
 N_STEP = 210
 DEPTH_ROUNDING_MM = 0.5 + 1e-3

@@ -13,7 +13,7 @@ from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import prediction_network
 from uuvtai.kernels.perception.io import MixtureIO, PastIO
 from uuvtai.learning.networks import TIMES_S, MixtureNet, mirrored
-from uuvtai.sim.setup import SHAPES, SPREADS, packed_weights, put_weights, read_weights
+from uuvtai.sim.forecast_weights import SHAPES, SPREADS, packed_weights, put_weights, read_weights
 from uuvtai.state import (
     ClockState,
     ClusterState,

@@ -204,6 +204,6 @@ def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
         height.bound_heights,
         dataclasses.replace(watched.sim.io.heights, ego=watched.sim.s.vehicle),
     )
-    monkeypatch.setattr("uuvtai.sim.stack.elevation.bound_heights", lambda _io: honest(leaking))
+    monkeypatch.setattr("uuvtai.sim.stack.height.bound_heights", lambda _io: honest(leaking))
     _, differing, _ = compared(watched)
     assert {"forecast.above_w", "observation"} & set(differing)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.reference.world import path_position
+from uuvtai.common.obstacle_motion import path_positions
 from uuvtai.config import Config, DisturbanceConfig
 from uuvtai.evaluation import failure_facts
 from uuvtai.evaluation.oracle import (
@@ -21,7 +22,6 @@ from uuvtai.evaluation.oracle import (
     upright_excess,
 )
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
-from uuvtai.state.obstacle_motion import path_positions
 
 CONFIG = Config()
 TOP_SPEED = math.hypot(0.6, 0.6)

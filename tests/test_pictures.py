@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tests.reference import logs as episode
+from uuvtai.common.obstacle_motion import body_positions
 from uuvtai.logs import drawing as ink
 from uuvtai.logs.drawing import (
     PICTURE_TOPICS,
@@ -19,7 +20,6 @@ from uuvtai.logs.encode import LogError
 from uuvtai.logs.picture import paint_picture, picture
 from uuvtai.logs.video import FrameArtist, video
 from uuvtai.logs.writer import McapEpisodeLog
-from uuvtai.state.obstacle_motion import body_positions
 
 INKS = ink.method_inks(["bt", "straight", "planner"])
 N_STEP = 110

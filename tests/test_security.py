@@ -104,10 +104,10 @@ FORBIDDEN = """
 eval exec compile __import__ pickle marshal shelve dill joblib runpy tarfile os.system os.popen torch.load
 torch.jit.load np.load np.lib.format.read_array
 """
-ALONE = {"vehicle/embedded/runtime.py", "vehicle/embedded/runtime.py"}
-"""files of an exported stack: they run without uuvtai, out of a folder whose native code is run as it is"""
+ALONE = {"vehicle/embedded/runtime.py"}
+"""file of an exported stack: it runs without uuvtai, out of a folder whose native code is run as it is"""
 READERS = {
-    "files.py": "it is the one reader",
+    "common/files.py": "it is the one reader",
     "report/html.py": "the page's template lies in the package",
     "learning/export/run_policy.py": "it must run without uuvtai and has a reader of its own",
     **dict.fromkeys(ALONE, "it must run without uuvtai, beside native code that it runs"),
@@ -116,18 +116,16 @@ READERS = {
 OWN_READS = {
     # what they have just written, or what lies in the package
     "logs/video.py": "os.open, av.open",
-    "compile/cache.py": "path.read_bytes",
+    "compile/cache.py": "path.read_bytes, json.loads",
     "learning/export/folder.py": "Path(module.__file__ or '').read_bytes",
-    "vehicle/embedded/export.py": "out.read_bytes",
-    "vehicle/embedded/export.py": "(_ROOT / name).read_text",
-    "example_files.py": "source.read_bytes",
+    "vehicle/embedded/export.py": "out.read_bytes, (_ROOT / name).read_text",
+    "console/doctor.py": "source.read_bytes",
     # one file of the system, by its name
-    "run_folder.py": "cpuinfo.read_text",
-    "sizes.py": "meminfo.read_text",
+    "logs/run_folder.py": "cpuinfo.read_text",
+    "sim/setup.py": "meminfo.read_text",
     # JSON of this process or its siblings
-    "capture.py": "json.loads",
+    "sim/snapshot.py": "json.loads",
     "evaluation/grid.py": "json.loads",
-    "compile/cache.py": "json.loads",
     # messages and attachments of a log, each no longer than its MAX_RECORD
     "logs/reader.py": "json.loads",
 }
@@ -175,7 +173,7 @@ def test_nothing_in_the_package_can_execute_what_it_reads():
     assert loaders == ["_SafeLoader(text)"] and issubclass(_SafeLoader, yaml.SafeLoader)
     assert importers <= {"doctor.py", "__init__.py"}, "modules are never imported by names from files"
     loaders = [path.name for path in PACKAGE.rglob("*.py") if "module_from_spec" in path.read_text()]
-    assert loaders == ["piece_loading.py"], "Python of the user's is run in one place, which she has named"
+    assert loaders == ["loading.py"], "Python of the user's is run in one place, which she has named"
 
 
 def reads_of(tree):

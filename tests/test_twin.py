@@ -11,6 +11,7 @@ from tests.reference import hull_rule as reference
 from tests.test_architecture import TRUTH
 from uuvtai.common.enums import BODY_WIDTH, COLLISION, EGO_COLUMNS, N_RAY, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.common.errors import UserError
+from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError, load_training
@@ -26,7 +27,6 @@ from uuvtai.learning.runner import TrainRequest, train
 from uuvtai.learning.set_networks import SetActor
 from uuvtai.learning.surrogate_trainer import Student, TwinTrainer, imitate, wish_of_command
 from uuvtai.sim.stages import bind, members_of
-from uuvtai.state.obstacle_motion import describe_scenario, path_positions
 from uuvtai.surrogate import motion, observation, sensing
 from uuvtai.surrogate.arrays import TRACK_WIDTH, ObserverIO, TwinRules
 from uuvtai.surrogate.world import draw_bank

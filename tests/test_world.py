@@ -15,6 +15,7 @@ from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import world as reference
 from uuvtai import state
+from uuvtai.common.obstacle_motion import KIND_NAMES, describe_scenario, path_positions
 from uuvtai.config import EpisodeConfig, TrafficConfig, WorldConfig
 from uuvtai.config.loader import PRESET_DIR, load_config, preset_names
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
@@ -23,7 +24,6 @@ from uuvtai.kernels.task.io import EpisodeIO
 from uuvtai.kernels.world import scenario as scenarios
 from uuvtai.kernels.world.io import WorldIO
 from uuvtai.sim import setup
-from uuvtai.state.obstacle_motion import KIND_NAMES, describe_scenario, path_positions
 
 RULES = EpisodeConfig()
 """one object: a kernel is compiled anew for another"""

@@ -21,11 +21,11 @@ from uuvtai.common.enums import (
     TRIGGER_NONE,
     TRIGGER_STUCK,
 )
+from uuvtai.common.obstacle_motion import body_positions
 from uuvtai.config import Config, SensorsConfig, SonarConfig
 from uuvtai.logs.encode import EpisodeHeader
 from uuvtai.logs.scenario import scenario_document
 from uuvtai.logs.writer import McapEpisodeLog
-from uuvtai.state.obstacle_motion import body_positions
 
 DT = 0.02
 N_RAY = 256

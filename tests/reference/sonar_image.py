@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai.common.obstacle_motion import body_positions
 from uuvtai.config import SonarConfig
 from uuvtai.config.multibeam import ABSORPTION_NP_M, elevation_pattern, elevations, heard_bearings, ray_sr
-from uuvtai.state.obstacle_motion import body_positions
 
 _WALL, _FLOOR, _SURFACE = -1, -2, -3
 

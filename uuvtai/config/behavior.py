@@ -10,7 +10,7 @@ import numpy as np
 from uuvtai.config.base import Fraction, NonNegative, Positive, PositiveCount, Section
 
 if TYPE_CHECKING:
-    from uuvtai.config import Config
+    pass
 
 
 class TeacherConfig(Section):
@@ -286,7 +286,7 @@ def log_bounds() -> tuple[list[float], list[float]]:
     return [math.log(number.least) for number in TUNED], [math.log(number.most) for number in TUNED]
 
 
-def configured_factors(config: Config) -> np.ndarray:
-    """(n_tuned, 2) natural logarithms of the factors in ``config.slow`` and ``config.fast``, float32."""
-    factors = [[getattr(part, number.name) for part in (config.slow, config.fast)] for number in TUNED]
+def configured_factors(slow: SlowConfig, fast: FastConfig) -> np.ndarray:
+    """(n_tuned, 2) natural logarithms of their factors, float32."""
+    factors = [[getattr(part, number.name) for part in (slow, fast)] for number in TUNED]
     return np.log(np.array(factors)).astype(np.float32)

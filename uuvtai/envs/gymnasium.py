@@ -21,6 +21,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from uuvtai.common.enums import SUCCESS
+from uuvtai.common.obstacle_motion import describe_scenario
 from uuvtai.config import Config
 from uuvtai.config.loader import load_config
 from uuvtai.envs.vector_env import NUM_ACTIONS, ObservationColumn, VectorEnv, checked_seed
@@ -38,7 +39,6 @@ from uuvtai.logs.scenario import scenario_document
 from uuvtai.logs.topics.perception import Layer
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.sim import Sim
-from uuvtai.state.obstacle_motion import describe_scenario
 
 # ------------------------------------------------------------------------------------------------------------
 # Spaces of actions and observations, with bounds where the simulator keeps them.

@@ -237,13 +237,13 @@ class VectorEnv:
 
     def _setting(self) -> str:
         """JSON of what a captured state fits to."""
-        tree = dataclasses.asdict(self.sim.tree)
+        nodes = dataclasses.asdict(self.sim.tree)
         for origin in ("source", "xml"):  # where it was read from changes nothing
-            tree.pop(origin)
+            nodes.pop(origin)
         return json.dumps(
             {
                 "num_envs": self.num_envs,
-                "tree": tree,
+                "tree": nodes,
                 **self.config.model_dump(mode="json", include=set(Config.model_fields)),
             }
         )

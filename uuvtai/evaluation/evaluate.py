@@ -18,6 +18,7 @@ import torch
 
 from uuvtai.common.enums import PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.errors import SettingError
+from uuvtai.common.obstacle_motion import describe_scenario
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError
@@ -43,7 +44,6 @@ from uuvtai.logs.writer import EpisodeRecorder, PolicyNote
 from uuvtai.plugins.api import refuse_code
 from uuvtai.sim.rrt import RoutePlanner
 from uuvtai.sim.sim import Sim
-from uuvtai.state.obstacle_motion import describe_scenario
 
 if TYPE_CHECKING:
     from uuvtai.learning.runner import AnyTrainer, Metrics

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.config import Config, SonarConfig, TankConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
-from uuvtai.state.obstacle_motion import KIND_NAMES
 
 # ------------------------------------------------------------------------------------------------------------
 # What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach, what

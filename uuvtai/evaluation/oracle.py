@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai.common.obstacle_motion import body_positions, path_positions
 from uuvtai.config import Config
-from uuvtai.state.obstacle_motion import body_positions, path_positions
 
 # ------------------------------------------------------------------------------------------------------------
 # Where the bodies of a scenario are at given times, and how far points are from them.

@@ -27,7 +27,7 @@ from uuvtai.learning.networks import (
 from uuvtai.learning.parameter_search import simulator_of
 from uuvtai.learning.ppo import ADAM_EPS
 from uuvtai.learning.rollout import Recent
-from uuvtai.sim.setup import packed_weights
+from uuvtai.sim.forecast_weights import packed_weights
 
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import ObservationColumn

@@ -250,7 +250,7 @@ class TunerTrainer:
         config, n = self.config, len(self._part)
         rounds = sum(self._part[i % n] == part for i in range(config.train.iterations))
         return NumberSearch(
-            torch.from_numpy(configured_factors(config)[:, part]),
+            torch.from_numpy(configured_factors(config.slow, config.fast)[:, part]),
             torch.tensor(log_bounds()),
             config.tuner.spread,
             rounds * config.train.num_envs,

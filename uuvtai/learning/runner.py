@@ -329,7 +329,7 @@ class _Run:
     def _export(self) -> None:
         """The file that a stack forecasts with."""
         from uuvtai.learning.forecast import ForecastTrainer
-        from uuvtai.sim.setup import WEIGHTS
+        from uuvtai.sim.forecast_weights import WEIGHTS
 
         assert isinstance(self._trainer, ForecastTrainer)
         self._folder.write_bytes(WEIGHTS, self._trainer.exported())

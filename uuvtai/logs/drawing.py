@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 
 from uuvtai.common.colours import method_colours
+from uuvtai.common.obstacle_motion import body_positions
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import LogHead, read_head, read_messages
 from uuvtai.logs.topics import TOPICS
 from uuvtai.logs.topics.perception import Layer
-from uuvtai.state.obstacle_motion import body_positions
 
 Color = tuple[int, int, int]
 """blue, green, red"""

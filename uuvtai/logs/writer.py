@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from uuvtai.common.obstacle_motion import describe_scenario
 from uuvtai.config import Config
 from uuvtai.config.loader import to_yaml
 from uuvtai.config.task import TERMS
@@ -32,7 +33,6 @@ from uuvtai.logs.run_folder import git_sha
 from uuvtai.logs.scenario import FRAMES, scenario_document
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topics import TOPICS
-from uuvtai.state.obstacle_motion import describe_scenario
 
 # ------------------------------------------------------------------------------------------------------------
 # One episode as messages: of every control step the topics that are due, encoded. What becomes of them is

@@ -263,8 +263,8 @@ def _draw_bodies(axes: Axes, scenario: dict[str, Any], time_s: float) -> None:
     import numpy as np
     from matplotlib.patches import Polygon
 
+    from uuvtai.common.obstacle_motion import body_positions
     from uuvtai.logs.drawing import body_outline
-    from uuvtai.state.obstacle_motion import body_positions
 
     for body in scenario["bodies"]:
         outline = body_outline(body, body_positions(body, np.array([time_s]))[0])

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, get_type_hints
 import numpy as np
 import taichi as ti
 import torch
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
 from uuvtai import state
 from uuvtai.common.enums import (
@@ -28,19 +26,16 @@ from uuvtai.common.enums import (
     N_PLANNER,
     N_REASON,
     N_SAID,
-    N_SPREAD,
     N_TRIGGER,
     N_WEIGHT,
-    PACKET,
     RUNNING,
 )
 from uuvtai.common.errors import SettingError, SizeError, UserError
-from uuvtai.common.files import read_bytes
+from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.compile.launch import forget, is_gpu_shaped
 from uuvtai.compile.memory import Memory, Put, address_of, put_by_kernel
 from uuvtai.config import Config, FixedObstacle, ForecastConfig, SonarConfig, VehicleConfig, WorldConfig
 from uuvtai.config.behavior import TUNED, configured_factors
-from uuvtai.config.loader import PRESET_DIR
 from uuvtai.config.multibeam import elevations, heard_bearings
 from uuvtai.config.task import TERMS
 from uuvtai.kernels.core.grid import grid_shape, outside_cells
@@ -53,10 +48,9 @@ from uuvtai.kernels.world.motion import FAULT_MOVING
 from uuvtai.kernels.world.scenario import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
 from uuvtai.sim.stages import SimState, Stages, bind_all
 from uuvtai.state import FixedTable, GridMask, SceneState
-from uuvtai.state.obstacle_motion import KIND_NAMES
 
 if TYPE_CHECKING:
-    from uuvtai.state import MixtureState
+    pass
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -275,8 +269,10 @@ def fill_constants(s: SimState, config: Config, put: Put) -> None:
     """What no step changes: explicit obstacles, the tank's bounds on the map, the thrusters' geometry, a
     learned forecast, factors on the tree's numbers. Raises ForecastError, FileError."""
     if config.forecast.learned:
+        from uuvtai.sim.forecast_weights import put_weights, read_weights
+
         put_weights(s.mixture, read_weights(config.forecast.learned), put)
-    put(s.table.factor, configured_factors(config))
+    put(s.table.factor, configured_factors(config.slow, config.fast))
     load_fixed(s.fixed, config.world)
     load_bounds(s.mask, np.array(outside_cells(config.world.tank, config.mapping.cell_m)), put)
     wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
@@ -507,73 +503,6 @@ def free_memory_bytes(device: str) -> int | None:
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return None
-
-
-# ------------------------------------------------------------------------------------------------------------
-# The weights of a learned forecast: read from a file, checked, put where the kernel reads them.
-
-
-SHIPPED = "shipped"
-"""name of the network that comes with the package"""
-WEIGHTS = "forecast.safetensors"
-"""file of a run folder, and of what is shipped"""
-SHAPES = {
-    "bias_in": (N_HIDDEN,), "weight_in": (N_COLUMN, N_HIDDEN),
-    "bias_mid": (N_HIDDEN,), "weight_mid": (N_HIDDEN, N_HIDDEN),
-    "bias_out": (N_SAID,), "weight_out": (N_HIDDEN, N_SAID),
-}  # fmt: skip
-"""names and shapes, in the kernel's order; rows are inputs"""
-SPREADS = {"bias_spread": (N_SPREAD,), "weight_spread": (N_HIDDEN, N_SPREAD)}
-"""the layer that says spreads, which the kernel does not need"""
-_LARGEST_BYTES = 4 << 20
-Weights = dict[str, np.ndarray]
-
-
-class ForecastError(UserError, ValueError):
-    """A network that cannot forecast: what, where, why, what to type next."""
-
-
-def weights_file(learned: str) -> Path:
-    """The file that ``forecast.learned`` names: the shipped one, that of a run folder, or a file itself."""
-    if learned == SHIPPED:
-        return PRESET_DIR / "forecast" / WEIGHTS
-    path = Path(learned)
-    return path / WEIGHTS if path.is_dir() else path
-
-
-def read_weights(learned: str) -> Weights:
-    """Float32 arrays of ``SHAPES`` and ``SPREADS``. Raises ForecastError or FileError."""
-    path = weights_file(learned)
-    try:
-        found = load(read_bytes(path, _LARGEST_BYTES))
-    except FileNotFoundError:
-        raise ForecastError(
-            f"forecast.learned={learned}: there is no {path}; train a forecast (uuv train forecast --run-dir "
-            "runs/forecast), or take the one that is shipped: forecast.learned=shipped"
-        ) from None
-    except (SafetensorError, ValueError, KeyError) as error:
-        raise ForecastError(f"{path}: is no safetensors file ({error}); take another one") from None
-    for name, shape in (SHAPES | SPREADS).items():
-        own = found.get(name)
-        if own is None or own.shape != shape or own.dtype != np.float32:
-            what = "missing" if own is None else f"{own.dtype} {list(own.shape)}"
-            raise ForecastError(
-                f"{path}: {name} is {what}, not float32 {list(shape)}: it was not made by this version's "
-                "'uuv train forecast'; train anew or take forecast.learned=shipped"
-            )
-        if not np.isfinite(own).all():
-            raise ForecastError(f"{path}: {name} is not finite: the training failed; take an older file")
-    return {name: found[name] for name in SHAPES | SPREADS}
-
-
-def packed_weights(weights: Weights) -> bytes:
-    """Content of a file that ``read_weights`` reads."""
-    return save({name: np.ascontiguousarray(weights[name], np.float32) for name in SHAPES | SPREADS})
-
-
-def put_weights(mixture: MixtureState, weights: Weights, put: Put) -> None:
-    """Into the simulator's array, in the order of ``SHAPES``."""
-    put(mixture.weight, np.concatenate([weights[name].ravel() for name in SHAPES]).reshape(-1, PACKET))
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.config import Config
 from uuvtai.logs.encode import (
     EVADING,
@@ -46,7 +47,6 @@ from uuvtai.logs.schemas import (
     described,
     record,
 )
-from uuvtai.state.obstacle_motion import KIND_NAMES
 
 _GOAL_COLOR, _TANK_COLOR = (0.98, 0.75, 0.14, 1.0), (0.3, 0.38, 0.46, 1.0)
 _RESTING, _MOVING = (0.44, 0.5, 0.58, 0.9), (0.95, 0.45, 0.2, 0.9)
