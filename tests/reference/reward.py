@@ -3,8 +3,8 @@
 import math
 
 TERMS = (
-    "alive", "progress", "path_distance", "cross_track", "clearance", "ttc", "overspeed", "upright", "heading",
-    "success", "failure", "tilt", "effort",
+    "alive", "progress", "path_distance", "cross_track", "clearance", "ttc", "overspeed", "upright",
+    "heading", "success", "failure", "tilt", "effort",
 )  # fmt: skip
 
 
