@@ -70,8 +70,7 @@ def short(root: Path) -> str:
     rows, lines = {row["name"]: row["methods"] for row in _read(root / EVALUATIONS)["rows"]}, []
     for name, title in SHORT.items():
         bt, best = (_both(rows[name][agent]) if agent in rows[name] else "-" for agent in ("bt", "best"))
-        success, _, collision = bt.partition(" / ")
-        lines.append([title, success, collision or "-", best])
+        lines.append([title, *(bt.split(" / ") * 2)[:2], best])
     head = ["world, dynamic obstacles", "`bt`: success", "collision", "`best`: success / collision"]
     return text_table(head, lines)
 
