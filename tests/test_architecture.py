@@ -330,7 +330,7 @@ def test_what_learns_records_and_reports_starts_no_taichi():
         [sys.executable, "-c", WITHOUT_TAICHI], capture_output=True, text=True, check=False, cwd=ROOT
     )
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 100
+    assert int(done.stdout) > 80
 
 
 def module_of(path):

@@ -294,9 +294,9 @@ def test_nothing_of_them_runs_under_another_tree(small, monkeypatch):
     """Kernels are launched, and their arrays written, only where the tree has their leaf."""
     launched = []
     launch_one_by_one(monkeypatch, small.sim)
-    for name, (kernel, noun) in PLANNERS.items():
+    for name, (kernel, _noun) in PLANNERS.items():
         monkeypatch.setattr(
-            f"uuvtai.sim.stack.{noun}.{kernel.__name__}", lambda io, name=name: launched.append(name)
+            f"uuvtai.sim.stack.{name}.{kernel.__name__}", lambda io, name=name: launched.append(name)
         )
     for name in ("bt", "planner", "straight", *PLANNERS):
         small.sim.use_tree(read_tree(name))

@@ -115,6 +115,7 @@ def test_one_vehicle_has_no_idle_items():
 
 def test_sizes_are_known_before_taichi_has_started():
     """``uuv profile`` asks whether all sizes fit before it makes the first simulator."""
-    code = "from uuvtai import loader, sizes; sizes.check_size(loader.load_config(), 8, 'cpu')"
+    code = "from uuvtai.config import loader; from uuvtai.sim import setup; "
+    code += "setup.check_size(loader.load_config(), 8, 'cpu')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

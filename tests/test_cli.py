@@ -21,7 +21,7 @@ from taichi.lang.impl import default_cfg
 import uuvtai
 from tests.command import uuv
 from tests.small_sim import SmallSim
-from uuvtai.common import errors
+from uuvtai.common import exits
 from uuvtai.common.errors import SettingError, SizeError
 from uuvtai.compile.runtime import _thread_count
 from uuvtai.config import loader
@@ -207,13 +207,13 @@ def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluat
 def test_a_bug_is_one_line_exit_1_and_a_file_with_the_traceback(error, capfd, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("UUV_DEBUG", raising=False)
-    assert errors.guarded(lambda: _fail(error)) == 1
+    assert exits.guarded(lambda: _fail(error)) == 1
     _, err = capfd.readouterr()
     [kept] = tmp_path.iterdir()
     assert len(err.splitlines()) == 1 and str(kept) in err and type(error).__name__ in err
     assert "Traceback" in kept.read_text() and "_fail" in kept.read_text()
     monkeypatch.setenv("UUV_DEBUG", "1")
-    assert errors.guarded(lambda: _fail(error)) == 1
+    assert exits.guarded(lambda: _fail(error)) == 1
     assert "Traceback" in capfd.readouterr().err and list(tmp_path.iterdir()) == [kept]
 
 
@@ -235,7 +235,7 @@ def _fail(error):
 )
 def test_what_the_machine_refuses_is_no_bug(error, code, capfd, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    assert errors.guarded(lambda: _fail(error)) == code
+    assert exits.guarded(lambda: _fail(error)) == code
     assert len(capfd.readouterr().err.splitlines()) == 1
     assert not list(tmp_path.iterdir())
 
@@ -272,13 +272,13 @@ def test_every_refusal_of_the_package_is_of_one_type():
     }
     found = {}
     for path in [
-        *root.glob("measure/**/*.py"),
-        *root.glob("tree/*.py"),
+        *root.glob("evaluation/*.py"),
         *root.glob("report/*.py"),
-        root / "sizes.py",
-        root / "runtime.py",
-        root / "statistics.py",
-        root / "learn" / "run.py",
+        root / "sim/behavior_tree.py",
+        root / "sim/setup.py",
+        root / "compile/runtime.py",
+        root / "common/statistics.py",
+        root / "learning/runner.py",
     ]:
         raised = [
             node.exc.func.id
@@ -294,9 +294,9 @@ def test_every_refusal_of_the_package_is_of_one_type():
 
 PLAIN = {
     "evaluation/failure_causes.py": ["RuntimeError"],  # a replay that ends otherwise: a bug of ours
-    "statistics.py": ["ValueError"],  # counts that cannot be: a bug of ours
-    "evaluation/results.py": ["ValueError"],  # told by its caller, with the file that it comes from
-    "runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
+    "common/statistics.py": ["ValueError"],  # counts that cannot be: a bug of ours
+    "sim/behavior_tree.py": ["ValueError"],  # told by its caller, with the file that it comes from
+    "compile/runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
 }
 
 

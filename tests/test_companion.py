@@ -82,7 +82,7 @@ sys.stdin.buffer.read()
 """
 ASKER = """
 import os, pathlib, time
-from uuvtai.compile import companion
+from uuvtai.compile import parallel as companion
 companion.PROGRAM = "sleeper"
 one = companion.Companion()
 one.ask(b"recipe")

@@ -12,7 +12,7 @@ import pytest
 from docs.writers import commands
 from tests.command import uuv
 from tests.test_docs import fault
-from uuvtai.config.loader import KINDS, preset_names
+from uuvtai.common.presets import KINDS, preset_names
 from uuvtai.console import parsing
 
 HEAVY = {"taichi", "torch", "cv2", "ompl", "numpy", "yaml", "matplotlib", "tensorboard", "mcap"}

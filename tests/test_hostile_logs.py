@@ -59,7 +59,7 @@ def bounded(work, tmp_path):
     from pathlib import Path
     import pytest
     from uuvtai.common.errors import UserError
-    from uuvtai.logs import log_export, reader, repair
+    from uuvtai.logs import export, reader
     here = Path({str(tmp_path)!r})
     begun = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
@@ -163,7 +163,7 @@ def test_bombs_take_no_memory(tmp_path):
     (tmp_path / "a.ok").write_bytes(MAGIC + chunk_of(record_of(0x85, bytes(60 << 20))) * 8 + END)
     work = "[reader.info(path)['messages'] for path in here.glob('*.ok')]"
     assert bounded(work, tmp_path) == "accepted [0]"
-    for tool in ("reader.info", "repair.repair"):
+    for tool in ("reader.info", "export.repair"):
         work = f"len([pytest.raises(UserError, {tool}, path) for path in here.glob('*.bad')])"
         assert bounded(work, tmp_path) == f"accepted {len(SPOILT)}"
 

@@ -3,16 +3,9 @@
 import pytest
 import yaml
 
+from uuvtai.common.presets import preset_names
 from uuvtai.config import Config, loader
-from uuvtai.config.loader import (
-    ConfigError,
-    load_config,
-    load_training,
-    preset_names,
-    to_yaml,
-    validated,
-    with_stack,
-)
+from uuvtai.config.loader import ConfigError, load_config, load_training, to_yaml, validated, with_stack
 
 
 def write(folder, text, name="mine.yaml"):

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from tests.command import uuv
-from uuvtai.config.loader import KINDS, preset_names, shipped_file
+from uuvtai.common.presets import KINDS, preset_names, shipped_file
 from uuvtai.console.views import near, sentences
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.command import Quiet
 from tests.report_samples import robustness_sweep
-from uuvtai.config.loader import preset_names
+from uuvtai.common.presets import preset_names
 from uuvtai.evaluation import claims, reproduce_steps
 from uuvtai.evaluation import reproduce as paper_run
 from uuvtai.evaluation.claims import FAILS, HOLDS, OPEN, Share

@@ -59,7 +59,7 @@ def ended(process, number):
 
 _SWALLOWED = """
 import os, signal
-from uuvtai import signals
+from uuvtai.common import signals
 signals.install()
 signals.engage()
 try:
@@ -86,7 +86,7 @@ _WITHIN_A_WRITE = """
 import os, signal, sys
 from pathlib import Path
 from mcap import writer
-from uuvtai import signals
+from uuvtai.common import signals
 from uuvtai.logs import container
 
 signals.install()
@@ -153,7 +153,7 @@ def test_a_command_that_begins_ends_at_once_and_leaves_nothing(tmp_path, argumen
 
 @pytest.mark.parametrize("number", BOTH)
 def test_while_nothing_is_kept_it_ends_in_the_middle_of_an_import(tmp_path, number):
-    program = "from uuvtai import signals; signals.install(); import slow"
+    program = "from uuvtai.common import signals; signals.install(); import slow"
     (tmp_path / "slow.py").write_text(
         "import time\ntry:\n    time.sleep(30)\nexcept BaseException:\n    pass\nprint('went on')\n"
     )
@@ -166,8 +166,8 @@ def test_while_nothing_is_kept_it_ends_in_the_middle_of_an_import(tmp_path, numb
 
 KEEPS = """
 import os, sys, time
-from uuvtai import signals
-from uuvtai.common.errors import guarded
+from uuvtai.common import signals
+from uuvtai.common.exits import guarded
 signals.install(); signals.end_at_second(); signals.engage()
 def work():
     try:
@@ -239,7 +239,8 @@ def test_an_ignored_signal_stays_ignored(tmp_path):
 
 
 def test_a_signal_at_the_very_end_does_not_change_the_exit_code(tmp_path):
-    program = "import time\nfrom uuvtai import signals\nsignals.install(); signals.finish(3); time.sleep(30)"
+    program = "import time\nfrom uuvtai.common import signals\n"
+    program += "signals.install(); signals.finish(3); time.sleep(30)"
     process = started(tmp_path, program=program)
     time.sleep(0.3)
     process.send_signal(signal.SIGTERM)
@@ -251,7 +252,7 @@ def test_a_signal_at_the_very_end_does_not_change_the_exit_code(tmp_path):
 def test_nor_one_while_python_tidies_up_its_modules(tmp_path, number):
     """The interpreter gives the signals back to the system before that."""
     program = (
-        "import sys, time\nfrom uuvtai import signals\nsignals.install(); signals.end_at_second(); "
+        "import sys, time\nfrom uuvtai.common import signals\nsignals.install(); signals.end_at_second(); "
         "signals.finish(0)\n"
     )
     program += (

@@ -91,7 +91,7 @@ def test_the_camera_is_asked_about_heights_only_if_the_config_says_so(small, mon
     small.begin([0])
     monkeypatch.setattr("uuvtai.sim.stack.tracking.track_bodies", lambda *_: None)
     monkeypatch.setattr("uuvtai.sim.stack.height.bound_heights", lambda *_: None)
-    monkeypatch.setattr("uuvtai.sim.stack.look.look_at_bodies", lambda *_: asked.append(1))
+    monkeypatch.setattr("uuvtai.sim.stack.camera_tracking.look_at_bodies", lambda *_: asked.append(1))
     for use, calls in ((True, 3), (False, 0)):
         changed = small.config.elevation.model_copy(update={"use_camera": use})
         monkeypatch.setattr(sim, "config", small.config.model_copy(update={"elevation": changed}))

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from tests.reference import dynamics as oracle
+from uuvtai.common.presets import preset_names
 from uuvtai.compile.runtime import start_taichi
-from uuvtai.config.loader import load_config, preset_names
+from uuvtai.config.loader import load_config
 from uuvtai.evaluation.simulate import Trial, control_step, quaternion, roll_pitch_yaw, simulate
 
 F32_POSITION_M = 2e-3

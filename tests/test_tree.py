@@ -13,9 +13,10 @@ from docs.writers.palettes import with_palette
 from tests.bundles import io_for
 from uuvtai import state
 from uuvtai.common import tree_codes as codes
+from uuvtai.common.presets import preset_names
 from uuvtai.config import TeacherConfig
 from uuvtai.config.behavior import TUNED
-from uuvtai.config.loader import ConfigError, preset_names, preset_path
+from uuvtai.config.loader import ConfigError, preset_path
 from uuvtai.console.screen import Screen
 from uuvtai.console.views import show_tree
 from uuvtai.kernels.behavior.io import TeacherIO

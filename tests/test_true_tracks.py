@@ -141,5 +141,5 @@ def test_only_an_evaluation_that_is_asked_to_switches_it_on(small):
         if isinstance(node, ast.Assign)
         and any(getattr(target, "attr", "") == "privileged" for target in node.targets)
     }
-    assert setters == {"sim.py", "method_run.py"}
+    assert setters == {"sim.py", "evaluate.py"}
     assert "privileged" not in load_config("pool", "paper").model_dump_json()

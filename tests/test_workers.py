@@ -80,7 +80,7 @@ def _gone(pid, patience_s=30.0):
 _SIGNALLED_WHILE_ONE_STARTS = """
 import os, signal, sys
 from multiprocessing import util
-from uuvtai import signals
+from uuvtai.common import signals
 from uuvtai.common.processes import LocalEngine
 
 spawn, sent = util.spawnv_passfds, []

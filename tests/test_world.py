@@ -16,8 +16,9 @@ from tests.conftest import set_step
 from tests.reference import world as reference
 from uuvtai import state
 from uuvtai.common.obstacle_motion import KIND_NAMES, describe_scenario, path_positions
+from uuvtai.common.presets import PRESET_DIR, preset_names
 from uuvtai.config import EpisodeConfig, TrafficConfig, WorldConfig
-from uuvtai.config.loader import PRESET_DIR, load_config, preset_names
+from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.task import episode
 from uuvtai.kernels.task.io import EpisodeIO

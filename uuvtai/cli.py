@@ -15,12 +15,12 @@ from typing import Annotated
 import typer
 
 from uuvtai.common import signals
-from uuvtai.common.errors import FAILED, GATE, UsageError, guarded, plain, say
+from uuvtai.common.exits import FAILED, GATE, UsageError, guarded, plain, say
 from uuvtai.common.version import __version__
-from uuvtai.config.scene import SceneOptions
 from uuvtai.console import groups, parsing
 from uuvtai.console import options as opt
 from uuvtai.console.screen import Progress, counted
+from uuvtai.sim.scene import SceneOptions
 
 app = typer.Typer(
     name="uuv",
@@ -443,7 +443,7 @@ def presets(
     kind, name = shown.kind_and_name(action, name)
     if not everything or kind == "tree":  # a tree has no keys
         return shown.show_stated(kind, name, output.as_json)
-    from uuvtai.console.views import whole_preset
+    from uuvtai.sim.scene import whole_preset
 
     found, text = whole_preset(kind, name)
     output.show(found, lambda _screen: typer.echo(text))
@@ -505,7 +505,7 @@ def tree(
     dot: opt.Dot = False,
 ) -> None:
     """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
-    from uuvtai.evaluation.results import tree_report
+    from uuvtai.sim.behavior_tree import tree_report
 
     report = tree_report(controller, run)
     if dot or run is None:

@@ -10,7 +10,7 @@ from typer.cli import get_docs_for_click
 
 from docs.writers.markdown import contents
 from uuvtai import cli
-from uuvtai.common import errors
+from uuvtai.common import exits
 from uuvtai.report.tables import text_table
 
 SEE = {
@@ -36,24 +36,24 @@ SEE = {
 """prose about a command"""
 
 EXIT_CODES = (
-    (errors.OK, "done"),
+    (exits.OK, "done"),
     (
-        errors.FAILED,
+        exits.FAILED,
         "failed while running: a file that cannot be read or written, a device that is missing, a worker "
         "lost too often",
     ),
     (
-        errors.USAGE,
+        exits.USAGE,
         "usage or configuration: nothing was begun, nothing was written; the message says what to type "
         "instead",
     ),
     (
-        errors.GATE,
+        exits.GATE,
         "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, `uuv "
         "replay` that commands do, `uuv pilot` ended by a safe action",
     ),
     (
-        errors.INTERRUPTED,
+        exits.INTERRUPTED,
         "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on",
     ),
 )

@@ -16,7 +16,7 @@ FILES = {
     "sonar": ("sonar", "sonar_image", "raycast"),
     "pose": ("localization",),
     "depth": ("depth_camera",),
-    "tracking": ("tracking", "height", "prediction", "camera_tracking"),
+    "tracking": ("tracking", "track_filter", "height", "prediction", "camera_tracking"),
     "mapping": ("sensor_model", "mapping"),
     "clearance": ("clearance",),
     "planning": ("triggers", "voronoi", "medial_axis", "route"),

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from uuvtai.config.base import Fraction, NonNegative, Positive, PositiveCount, Section
 
 if TYPE_CHECKING:
-    pass
+    import numpy as np
 
 
 class TeacherConfig(Section):
@@ -288,5 +286,7 @@ def log_bounds() -> tuple[list[float], list[float]]:
 
 def configured_factors(slow: SlowConfig, fast: FastConfig) -> np.ndarray:
     """(n_tuned, 2) natural logarithms of their factors, float32."""
+    import numpy as np
+
     factors = [[getattr(part, number.name) for part in (slow, fast)] for number in TUNED]
     return np.log(np.array(factors)).astype(np.float32)

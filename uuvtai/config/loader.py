@@ -23,41 +23,9 @@ from pydantic import BaseModel, ValidationError
 
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import FileError, read_text
+from uuvtai.common.presets import preset_names, shipped_file
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
-
-# ------------------------------------------------------------------------------------------------------------
-# Names of the presets that are shipped: what the help, the completion and the loader all read, quickly.
-
-
-PRESET_DIR = Path(__file__).parents[1] / "presets"
-KINDS = {
-    "world": "worlds",
-    "sensors": "sensors",
-    "vehicle": "vehicles",
-    "stack": "stacks",
-    "tree": "trees",
-    "train": "train",
-    "grid": "grids",
-}
-"""kind -> folder in ``PRESET_DIR``"""
-TRAINING_TREE = "bt"
-"""tree beside a policy: what it was distilled from, and what its observation's teacher columns come from"""
-
-
-def preset_names(kind: str) -> list[str]:
-    """Names of what is shipped of a kind (``KINDS``)."""
-    folder = PRESET_DIR / KINDS[kind]
-    return sorted(path.stem for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
-
-
-def shipped_file(kind: str, name: str) -> Path:
-    """File of a shipped preset."""
-    return PRESET_DIR / KINDS[kind] / f"{name}{'.xml' if kind == 'tree' else '.yaml'}"
-
-
-# ------------------------------------------------------------------------------------------------------------
-
 
 DEFAULT_WORLD, DEFAULT_SENSORS, DEFAULT_VEHICLE = "pool", "paper", "bluerov2"
 _SCENE_KINDS = ("world", "sensors", "vehicle")

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_origin, get_type_
 
 import typer
 
-from uuvtai.common.errors import UsageError, say
-from uuvtai.config.scene import SceneOptions
+from uuvtai.common.exits import UsageError, say
 from uuvtai.console import options as opt
 from uuvtai.console import parsing
 from uuvtai.console.screen import Screen
+from uuvtai.sim.scene import SceneOptions
 
 if TYPE_CHECKING:
     from uuvtai.config import Config

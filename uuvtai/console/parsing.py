@@ -10,8 +10,8 @@ from typing import Any
 
 import typer
 
-from uuvtai.common.errors import UsageError
-from uuvtai.config.loader import KINDS, preset_names
+from uuvtai.common.exits import UsageError
+from uuvtai.common.presets import KINDS, preset_names
 
 
 def integers(option: str, text: str) -> list[int]:

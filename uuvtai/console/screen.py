@@ -20,7 +20,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from uuvtai.common.colours import ink_on, shade
-from uuvtai.common.errors import plain, say
+from uuvtai.common.exits import plain, say
 from uuvtai.report.tables import (
     TERMINAL,
     Cell,

@@ -13,12 +13,10 @@ from typing import Any
 import typer
 from rich.text import Text
 
-from uuvtai.common.errors import UsageError, plain, say
+from uuvtai.common.exits import UsageError, plain, say
 from uuvtai.common.files import read_text
+from uuvtai.common.presets import KINDS, preset_names, shipped_file
 from uuvtai.common.tree_codes import ACTION, LEAVES
-from uuvtai.config import loader
-from uuvtai.config.loader import KINDS, preset_names, shipped_file
-from uuvtai.config.scene import SceneOptions
 from uuvtai.console.screen import Screen, print_heat_maps
 from uuvtai.report.evaluation import DAGGER, causes_table, methods_table, paired_table
 from uuvtai.report.sweep import cell_table
@@ -628,23 +626,3 @@ def show_simulation(screen: Screen, result: dict[str, Any], title: str, driven: 
 
 def _picked(n: int, wanted: int) -> list[int]:
     return sorted({round(i * (n - 1) / max(1, wanted - 1)) for i in range(wanted)}) if n else []
-
-
-# ------------------------------------------------------------------------------------------------------------
-# Every key that a preset gives, its own, those it builds on and the defaults: ``uuv presets show --all``.
-
-
-def whole_preset(kind: str, name: str) -> tuple[Any, str]:
-    """As a document and as YAML. Raises ConfigError, CheckpointError."""
-    if kind == "grid":
-        found = loader.read_preset(kind, name)
-        return found, loader.dumped(found)
-    config = _config_of(kind, name)
-    return config.model_dump(mode="json"), loader.to_yaml(config)
-
-
-def _config_of(kind: str, name: str) -> Any:
-    if kind == "train":
-        return SceneOptions().training(name)
-    chosen: dict[str, Any] = {kind: name}
-    return SceneOptions(**chosen).config()

@@ -12,13 +12,8 @@ import operator
 from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium import spaces
-from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
 from uuvtai.common.enums import SUCCESS
 from uuvtai.common.obstacle_motion import describe_scenario
@@ -39,6 +34,22 @@ from uuvtai.logs.scenario import scenario_document
 from uuvtai.logs.topics.perception import Layer
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.sim import Sim
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from gymnasium.utils import seeding
+    from gymnasium.vector import AutoresetMode
+    from gymnasium.vector.utils import batch_space
+except ModuleNotFoundError as error:
+    if error.name != "gymnasium":
+        raise
+    raise ModuleNotFoundError(
+        "uuvtai.envs.gymnasium needs Gymnasium; install it with: pip install 'uuvtai[gym]'", name="gymnasium"
+    ) from None
+
+__all__ = ["ENV_ID", "UuvEnv", "UuvVectorEnv"]
+
 
 # ------------------------------------------------------------------------------------------------------------
 # Spaces of actions and observations, with bounds where the simulator keeps them.
@@ -477,20 +488,6 @@ class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """First row in memory of its own."""
         return value[0].cpu().numpy().copy()
 
-
-# ------------------------------------------------------------------------------------------------------------
-
-
-try:
-    import gymnasium
-except ModuleNotFoundError as error:
-    if error.name != "gymnasium":
-        raise
-    raise ModuleNotFoundError(
-        "uuvtai.envs.gymnasium needs Gymnasium; install it with: pip install 'uuvtai[gym]'", name="gymnasium"
-    ) from None
-
-__all__ = ["ENV_ID", "UuvEnv", "UuvVectorEnv"]
 
 ENV_ID = "uuvtai/Nav-v0"
 """for ``gymnasium.make`` and ``gymnasium.make_vec``"""

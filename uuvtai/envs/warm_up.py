@@ -17,8 +17,8 @@ from uuvtai.common.errors import UserError
 from uuvtai.common.processes import LocalEngine
 from uuvtai.compile.launch import compiling, native
 from uuvtai.config import Config
-from uuvtai.config.scene import SceneOptions
 from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.scene import SceneOptions
 from uuvtai.sim.sim import Sim
 
 _STEPS = 6

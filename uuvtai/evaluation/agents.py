@@ -10,16 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.common.errors import SettingError
+from uuvtai.common.presets import TRAINING_TREE, preset_names
 from uuvtai.config import Config
-from uuvtai.config.loader import (
-    TRAINING_TREE,
-    ConfigError,
-    nearest,
-    preset_names,
-    preset_path,
-    tree_of_stack,
-    with_stack,
-)
+from uuvtai.config.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
 from uuvtai.learning.export.folder import Export, export
 from uuvtai.plugins.api import is_piece, piece_spec
 from uuvtai.sim.behavior_tree import FlatTree, read_tree

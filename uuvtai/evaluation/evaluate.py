@@ -168,7 +168,7 @@ def comparison_of(
 
 def _any_tree() -> FlatTree:
     """The oracle drives no vehicle, but a simulator wants a tree."""
-    from uuvtai.config.loader import TRAINING_TREE
+    from uuvtai.common.presets import TRAINING_TREE
     from uuvtai.sim.behavior_tree import read_tree
 
     return read_tree(TRAINING_TREE)

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from uuvtai.common.presets import preset_names
 from uuvtai.config import Config
-from uuvtai.config.loader import ConfigError, load_config, parsed_yaml, preset_names, read_preset
+from uuvtai.config.loader import ConfigError, load_config, parsed_yaml, read_preset
 
 if TYPE_CHECKING:
-    from uuvtai.config.scene import SceneOptions
     from uuvtai.evaluation.episodes import EpisodeResult
+    from uuvtai.sim.scene import SceneOptions
     from uuvtai.sim.setup import Scene
     from uuvtai.sim.sim import Sim
 
@@ -232,7 +233,7 @@ def play(task: Task) -> list[Row]:
 
 
 def _sim_of(task: Task, config: Config) -> Sim:
-    from uuvtai.config.loader import TRAINING_TREE
+    from uuvtai.common.presets import TRAINING_TREE
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim
 

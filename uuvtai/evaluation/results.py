@@ -19,10 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.common.enums import COLLIDED, ENDINGS, PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.files import (
-    FileError,
     open_to_append,
     read_bytes,
-    read_json,
     read_text,
     refuse_links,
     truncate,
@@ -36,24 +34,18 @@ from uuvtai.common.statistics import (
     wilson_interval,
 )
 from uuvtai.config import Config
-from uuvtai.config.loader import ConfigError, preset_names, preset_of, read_preset, validated
+from uuvtai.config.loader import ConfigError, preset_of, read_preset, validated
 from uuvtai.evaluation.episodes import EpisodeObserver, EpisodeResult, Job
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins.api import is_piece, piece_spec
 from uuvtai.sim.behavior_tree import (
-    FlatTree,
-    NodeUse,
     node_use,
-    read_tree,
-    read_tree_file,
-    tree_dot,
-    tree_text,
 )
 from uuvtai.sim.sim import Sim
 
 if TYPE_CHECKING:
-    from uuvtai.config.scene import SceneOptions
     from uuvtai.evaluation.agents import Method
+    from uuvtai.sim.scene import SceneOptions
 
 
 JOURNAL_FILE = "eval/episodes.jsonl"
@@ -339,87 +331,6 @@ def _as_list(interval: tuple[float, float] | None) -> list[float] | None:
 
 def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, int]:
     return {name: sum(c.get(name, 0) for c in counts) for name in names}
-
-
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv tree``: a behaviour tree as text, DOT or JSON, with how it was used in an evaluation.
-
-
-@dataclass(frozen=True)
-class TreeReport:
-    """The same tree three ways."""
-
-    text: str
-    """one line per node"""
-    dot: str
-    document: dict[str, Any]
-    """nodes in the order of the lines, with their use where a run was given"""
-
-
-def tree_report(controller: str, run: Path | None) -> TreeReport:
-    """Report of a controller's tree; with a run folder, the use of its nodes there. Raises ConfigError."""
-    use = None
-    if run is not None:
-        used = _record(run)
-        if controller not in used:
-            raise ConfigError(
-                f"{run}: has no controller {controller!r}; there are: {', '.join(used)} (--controller NAME)"
-            )
-        tree = read_tree_file(run / "eval" / "trees" / f"{controller}.xml", folder=run)
-        use = used[controller]
-        if len(use) != len(tree.names):
-            raise ConfigError(
-                f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv "
-                "eval'"
-            )
-    else:
-        tree = read_tree(controller)
-    return TreeReport(tree_text(tree), tree_dot(tree, use), _document(controller, tree, use))
-
-
-def _record(run: Path) -> dict[str, list[NodeUse]]:
-    """Use of every node by controller."""
-    path = run / "eval" / "tree.json"
-    if not run.is_dir():
-        shipped = (
-            f"; the tree alone: 'uuv tree --controller {run}'" if str(run) in preset_names("tree") else ""
-        )
-        raise ConfigError(
-            f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}"
-        )
-    try:
-        record = read_json(path, folder=run)
-        return {name: [_use(node) for node in nodes] for name, nodes in record["use"].items()}
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' "
-            "prints it)"
-        ) from None
-    except FileError as error:
-        raise ConfigError(f"{error}; run the evaluation again with 'uuv eval'") from None
-    except (ValueError, OverflowError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ConfigError(
-            f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'"
-        ) from None
-
-
-def _use(node: dict[str, Any]) -> NodeUse:
-    share, ticks, acted = node["share"], int(node["ticks"]), int(node["acted"])
-    if not (isinstance(share, int | float) and 0.0 <= share <= 1.0 and 0 <= acted <= ticks):
-        raise ValueError(
-            f"a node ticked in {share!r:.40} of the episodes, {ticks} times, {acted} of which acted"
-        )
-    return NodeUse(float(share), ticks, acted)
-
-
-def _document(controller: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:
-    nodes = []
-    for i, name in enumerate(tree.names):
-        node: dict[str, Any] = {"id": i, "name": name, "type": tree.types[i], "parent": tree.parent[i]}
-        if use is not None:
-            node |= vars(use[i])
-        nodes.append(node)
-    return {"schema": 1, "controller": controller, "source": tree.source, "nodes": nodes}
 
 
 # ------------------------------------------------------------------------------------------------------------

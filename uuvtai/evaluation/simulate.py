@@ -15,9 +15,10 @@ import torch
 
 from uuvtai.common.enums import RUNNING
 from uuvtai.common.errors import DivergenceError, SettingError
+from uuvtai.common.presets import PRESET_DIR
 from uuvtai.compile.runtime import Runtime, start_taichi
 from uuvtai.config import Config
-from uuvtai.config.loader import PRESET_DIR, ConfigError
+from uuvtai.config.loader import ConfigError
 from uuvtai.evaluation.agents import Method, trees_of
 from uuvtai.evaluation.episodes import Job, Recorders, Stepper, run_episodes
 from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, comparison_of, methods_of

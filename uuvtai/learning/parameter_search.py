@@ -158,7 +158,8 @@ def best_near(
 def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
     """A simulator of a world with room for every scene, on the run's sensors and stack. Raises
     ConfigError."""
-    from uuvtai.config.loader import TRAINING_TREE, load_config
+    from uuvtai.common.presets import TRAINING_TREE
+    from uuvtai.config.loader import load_config
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim
 

@@ -14,19 +14,20 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, Union
 
 from uuvtai.common import signals
 from uuvtai.common.files import FileError, open_to_append, parsed_json, read_lines, truncate
+from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
-from uuvtai.config.loader import TRAINING_TREE, ConfigError, Overrides, load_resolved, to_yaml
+from uuvtai.config.loader import ConfigError, Overrides, load_resolved, to_yaml
 from uuvtai.logs.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
-    from uuvtai.config.scene import SceneOptions
     from uuvtai.envs.vector_env import VectorEnv
     from uuvtai.learning.checkpoint import Checkpoint
     from uuvtai.learning.forecast import ForecastTrainer
     from uuvtai.learning.parameter_search import TunerTrainer
     from uuvtai.learning.surrogate_trainer import TwinTrainer
     from uuvtai.learning.trainer import Trainer
+    from uuvtai.sim.scene import SceneOptions
 
 
 Metrics = dict[str, float]

@@ -17,7 +17,8 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
-from uuvtai.common.errors import UserError, say
+from uuvtai.common.errors import UserError
+from uuvtai.common.exits import say
 from uuvtai.logs.encode import EpisodeEnd, EpisodeHeader, Topic, Values
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.writer import EpisodeReader, PolicyNote, Recordable, RecordedJob, TopicMessage, TopicStream

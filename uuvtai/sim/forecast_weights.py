@@ -12,7 +12,7 @@ from safetensors.numpy import load, save
 from uuvtai.common.enums import N_COLUMN, N_HIDDEN, N_SAID, N_SPREAD, PACKET
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import read_bytes
-from uuvtai.config.loader import PRESET_DIR
+from uuvtai.common.presets import PRESET_DIR
 
 if TYPE_CHECKING:  # a forecast is learnt without Taichi
     from uuvtai.compile.memory import Put

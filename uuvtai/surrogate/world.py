@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from uuvtai.common.enums import BODY_WIDTH, EGO_COLUMNS, N_RAY
+from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import TankConfig
 from uuvtai.config.learning import LearningConfig
-from uuvtai.config.loader import TRAINING_TREE, ConfigError, load_config
+from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.setup import Scene
 from uuvtai.sim.sim import Sim

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from uuvtai.common.files import refuse_output, whole_file
+from uuvtai.common.presets import preset_names
 from uuvtai.config import VehicleConfig
-from uuvtai.config.loader import preset_names
 from uuvtai.report.figures import Line, curves, png
 from uuvtai.vehicle.identify.ardusub_log import ENDINGS, read_ardusub
 from uuvtai.vehicle.identify.drive_log import Drive, DriveError, read_drives

@@ -58,3 +58,16 @@ class SceneOptions:
         from uuvtai.config.loader import load_training
 
         return load_training(preset, [*first, *self.settings], self.world, self.sensors, self.vehicle)
+
+
+def whole_preset(kind: str, name: str) -> tuple[Any, str]:
+    """Every key that a preset gives, its own, those it builds on and the defaults, as a document and as YAML.
+    Raises ConfigError, CheckpointError."""
+    from uuvtai.config import loader
+
+    if kind == "grid":
+        found = loader.read_preset(kind, name)
+        return found, loader.dumped(found)
+    chosen: dict[str, Any] = {kind: name}
+    config = SceneOptions().training(name) if kind == "train" else SceneOptions(**chosen).config()
+    return config.model_dump(mode="json"), loader.to_yaml(config)
