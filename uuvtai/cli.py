@@ -414,7 +414,7 @@ def pilot_vehicle(
 @app.command("sitl", epilog="Example: uuv sitl --world pool -S 8 -D 6 -v 0.6 --instances 3")
 @groups.grouped
 def serve_sitl(scene: groups.SitlSceneGroup, served: groups.ServedGroup, output: groups.OutputGroup) -> None:
-    """Be the water for ArduSub: our physics, world and sensors behind its JSON interface (docs/sitl.md)."""
+    """Run our physics, world and sensors as the backend of ArduSub's simulation (docs/on_a_vehicle.md)."""
     from uuvtai.console.views import show_sitl
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.vehicle.sitl import serve_water
@@ -483,7 +483,7 @@ def warm(
     overrides: opt.Set = None,
     workers: opt.WarmWorkers = 0,
 ) -> None:
-    """Compile beforehand what later commands need, so that they start at once (docs/native.md)."""
+    """Compile beforehand what later commands need, so that they start at once (docs/performance.md)."""
     from uuvtai.console.doctor import show_shapes
     from uuvtai.envs import warm_up
 

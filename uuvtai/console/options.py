@@ -77,7 +77,7 @@ Wide = Annotated[
     bool, Option("--wide", help="Show every column of a table, though the terminal be narrower.")
 ]
 Clean = Annotated[
-    bool, Option("--clean", help="First delete the kernels' own machine code (docs/native.md).")
+    bool, Option("--clean", help="First delete the kernels' own machine code (docs/performance.md).")
 ]
 AsJson = Annotated[bool, Option("--json", help="Print one JSON document and nothing else on stdout.")]
 Seeds = Annotated[str, Option("--seeds", "--seed", help="Seeds, separated by commas.")]
@@ -101,7 +101,7 @@ EvalControllers = Annotated[
         "local planners of the literature; paper = bt on the paper's own stack, a row of "
         "its own; none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. Privileged "
         "yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an "
-        "upper bound). A function of yours: mine.py:act (docs/own_pieces.md).",
+        "upper bound). A function of yours: mine.py:act (docs/extend.md).",
     ),
 ]
 Planners = Annotated[
@@ -498,7 +498,7 @@ DriveLogs = Annotated[
     list[Path],
     Argument(
         help="Logs of drives: .mcap of ours, ArduSub's .bin or .tlog, or .csv with t,u,v,w,r,rpm_1,.. "
-        "(docs/vehicle.md)."
+        "(docs/on_a_vehicle.md)."
     ),
 ]
 IdentifyKnown = Annotated[
