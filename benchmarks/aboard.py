@@ -1,4 +1,4 @@
-"""Exported stacks (``uuv export --stack``) decide what was decided at their export: on this machine without
+"""Exported stacks (``uuv export LOG``) decide what was decided at their export: on this machine without
 Taichi and torch, and on aarch64. ``UUV_AARCH64`` names a Python of that machine with NumPy, as the words that
 start it (for example a user-mode emulator and its interpreter); without it that half is not tried.
 ``UUV_STACK_FOLDER`` names a folder that was exported before, to be looked at in place of new ones.
@@ -57,11 +57,11 @@ def _exported(case: tuple[str, ...], folder: Path) -> Path:
     world, sensors, bodies, speed = case
     run, out = folder / f"{world}_{sensors}", folder / f"{world}_{sensors}_stack"
     uuv = [sys.executable, "-m", "uuvtai"]
-    scene = ["--world", world, "--sensors", sensors, "--vehicle", "bluerov2_16v", "-D", bodies, "-v", speed]
+    scene = f"--world {world} --sensors {sensors} --vehicle bluerov2_16v -D {bodies} --speed {speed}".split()
     count = ["--episodes", "1", "--record", "1", "--seeds", str(SEED)]
-    _done([*uuv, "eval", "--controller", "bt", *scene, *count, "--depth-images", "--run-dir", str(run)])
+    _done([*uuv, "eval", "--agent", "bt", *scene, *count, "--depth-images", "--run-dir", str(run)])
     (log,) = (run / "logs").glob("*.mcap")
-    _done([*uuv, "export", str(log), "--stack", str(out)])
+    _done([*uuv, "export", str(log), "--out", str(out)])
     return out
 
 

@@ -29,7 +29,7 @@ from benchmarks.common import Job, Row
 LONGEST_S = 5400
 ROOT = Path(__file__).resolve().parent.parent
 _WORLDS = (("pool", "paper"), ("gauntlet", "harsh"), ("maze", "nominal"))
-_EVAL = ["eval", "--controller", "bt", "--episodes", "2", "--seeds", "77", "--num-envs", "4", "--record", "2"]
+_EVAL = ["eval", "--agent", "bt", "--episodes", "2", "--seeds", "77", "--num-envs", "4", "--record", "2"]
 _TRAIN = ["--device", "cpu", "--iterations", "4"]
 _SMALL = {
     "curriculum": {

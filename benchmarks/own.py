@@ -10,7 +10,7 @@ import torch
 
 from benchmarks.common import Job, Row
 from uuvtai.config.loader import load_config
-from uuvtai.evaluation.agents import Method, trees_of
+from uuvtai.evaluation.agents import Method, load_agents
 from uuvtai.evaluation.profile import WARM_STEPS, SimBatch
 from uuvtai.sim.sim import Sim
 
@@ -30,7 +30,7 @@ def measure(job: Job) -> list[Row]:
 def _row(job: Job, what: str, n_env: int, name: str, floor: float) -> Row:
     job.say(f"{n_env} envs, {name}")
     config = load_config("pool", "paper")
-    (own,) = trees_of([f"controller:{EXAMPLES / name}"], config.teacher.max_node)
+    (own,) = load_agents([f"controller:{EXAMPLES / name}"], config.teacher.max_node)
     sim = Sim(config, n_env, own.tree, job.device)
     cpu = time.process_time()
     speed, steps = _speed(sim, own, 4 * job.seconds)

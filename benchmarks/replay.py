@@ -24,12 +24,12 @@ THREADS = 1
 LONGEST_S = 10800
 SEED = 77001
 CASES = (
-    ("pool", "paper", ("-D", "6", "-v", "0.6"), 4),
-    ("pool", "nominal", ("-D", "6", "-v", "0.6"), 3),
-    ("pool", "harsh", ("-D", "6", "-v", "0.6"), 2),
-    ("gauntlet", "nominal", ("-D", "9", "-v", "1.5"), 3),
-    ("maze", "nominal", ("-D", "6", "-v", "0.6"), 3),
-    ("column", "paper", ("-D", "9", "-v", "1.5"), 2),
+    ("pool", "paper", ("-D", "6", "--speed", "0.6"), 4),
+    ("pool", "nominal", ("-D", "6", "--speed", "0.6"), 3),
+    ("pool", "harsh", ("-D", "6", "--speed", "0.6"), 2),
+    ("gauntlet", "nominal", ("-D", "9", "--speed", "1.5"), 3),
+    ("maze", "nominal", ("-D", "6", "--speed", "0.6"), 3),
+    ("column", "paper", ("-D", "9", "--speed", "1.5"), 2),
     ("netpen", "", (), 2),
     ("transfer", "", (), 1),
 )
@@ -71,7 +71,7 @@ def _recorded(case: tuple[str, str, tuple[str, ...], int], folder: Path) -> list
                 "-m",
                 "uuvtai",
                 "eval",
-                "--controller",
+                "--agent",
                 "bt",
                 "--world",
                 world,

@@ -38,12 +38,12 @@ _TRAIN = [
     *("--set", "train.checkpoint_every=2", "--set", "train.evaluate_every=10"),
 ]
 _EVAL = [
-    *("eval", "--controller", "straight,bt", "--seeds", "77", "--num-envs", "8", "--device", "cpu"),
+    *("eval", "--agent", "straight,bt", "--seeds", "77", "--num-envs", "8", "--device", "cpu"),
     *("--set", "episode.horizon_steps=400", "--set", "world.dynamic_capacity=9"),
 ]
 _SWEEP = [
-    *("sweep", "--grid", "S=4,8", "--grid", "D=3,6", "--grid", "v=0.6", "--controller", "straight"),
-    *("--controller", "bt", "--num-envs", "8"),
+    *("sweep", "--grid", "S=4,8", "--grid", "D=3,6", "--grid", "v=0.6", "--agent", "straight"),
+    *("--agent", "bt", "--num-envs", "8"),
 ]
 _HALF = (".tmp", ".part", ".tmp.webm")
 _TIMES = ("wall_s", "env_steps_per_s")
@@ -262,7 +262,7 @@ class Bench:
             ["export", "train_whole", "--out", "out/policy"],
             ["profile", "--num-envs", "8", "--seconds", "1"], ["reproduce", *run], ["replay", log],
             ["presets"], ["doctor"], ["log", "info", log], ["log", "repair", log, "--out", "out/log.mcap"],
-            ["log", "picture", log, "--out", "out/log.png"], ["log", "video", log, "--out", "out/log.webm"],
+            ["log", "render", log, "--out", "out/log.png"], ["log", "render", log, "--out", "out/log.webm"],
         ]  # fmt: skip
         wrong, interrupted, count = [], 0, len(commands) if self.job.quick else _SIGNALS
         for i in range(count):
@@ -317,11 +317,11 @@ class Bench:
         log = next((self.folder / "eval_whole/logs").glob("*.mcap"))
         kinds: dict[str, tuple[list[Path], list[list[str]]]] = {
             "logs": ([log], [["log", "info", "FILE"], ["log", "export", "FILE", "--out", "out"],
-            ["log", "repair", "FILE", "--out", "whole.mcap"], ["log", "picture", "FILE", "--out", "a.png"]]),
+            ["log", "repair", "FILE", "--out", "whole.mcap"], ["log", "render", "FILE", "--out", "a.png"]]),
             "presets": (sorted(presets.rglob("*.yaml")),
-            [["presets", "show", "FILE"], ["eval", "--world", "FILE", "--controller", "nobody"]]),
+            [["presets", "show", "FILE"], ["eval", "--world", "FILE", "--agent", "nobody"]]),
             "trees": (sorted(presets.rglob("*.xml")),
-            [["eval", "--controller", "FILE", "--controller", "nobody"]]),
+            [["eval", "--agent", "FILE", "--agent", "nobody"]]),
             "evaluations": (_whole(self.folder / "eval_whole"), [["report", "."]]),
             "trainings": (_whole(self.folder / "train_whole"), [["export", ".", "--out", "out"]]),
             "policies": (_whole(self.folder / "exported"), [["export", "--check", "."]]),

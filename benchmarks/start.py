@@ -22,7 +22,7 @@ from benchmarks.common import Job, Row
 LONGEST_S = 3600
 _TURNS = 5
 _SHORT = ["--device", "cpu", "--set", "episode.horizon_steps=4"]
-_EVAL = ["eval", "--controller", "bt", "--seeds", "77", *_SHORT]
+_EVAL = ["eval", "--agent", "bt", "--seeds", "77", *_SHORT]
 _WARM = {
     "uuv eval, 8 episodes of 4 steps": [*_EVAL, "--episodes", "8"],
     "uuv simulate, 1 s": ["simulate", "--seconds", "1"],
@@ -32,7 +32,7 @@ _EIGHT = [*_EVAL, "--episodes", "8"]
 _NEW = {
     "uuv eval with a D never run before": [[*_EIGHT, "-D", text] for text in ("3", "4", "5")],
     "uuv eval with a batch never run before": [[*_EVAL, "--episodes", text] for text in ("5", "7", "11")],
-    "uuv eval with a speed never run before": [[*_EIGHT, "-v", text] for text in ("0.5", "0.7", "0.9")],
+    "uuv eval with a speed never run before": [[*_EIGHT, "--speed", text] for text in ("0.5", "0.7", "0.9")],
     "uuv eval with a threshold never run before": [
         [*_EIGHT, "--set", f"teacher.caution={text}"] for text in ("0.8", "1.2", "1.4")
     ],

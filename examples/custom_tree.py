@@ -1,6 +1,6 @@
 """Your own behaviour tree: ``patient.xml`` beside the shipped ones on the same episodes: a table.
 
-``python examples/custom_tree.py``, which is ``uuv eval --controller examples/patient.xml`` from Python
+``python examples/custom_tree.py``, which is ``uuv eval --agent examples/patient.xml`` from Python
 """
 
 from __future__ import annotations

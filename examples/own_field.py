@@ -1,5 +1,5 @@
 """A potential field: pulled along the route, pushed off by what the sonar hears and by bodies that will come
-near: ``uuv eval --controller bt,examples/own_field.py``."""
+near: ``uuv eval --agent bt,examples/own_field.py``."""
 
 import numpy as np
 

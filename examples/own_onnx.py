@@ -1,4 +1,4 @@
-"""Writes a policy as ONNX: ``python examples/own_onnx.py``, then ``uuv eval --policy model.onnx``."""
+"""Writes a policy as ONNX: ``python examples/own_onnx.py``, then ``uuv eval --agent model.onnx``."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 """rsl_rl: ``python examples/train_rsl_rl.py --out runs/rsl_rl``, then
-``uuv eval --policy examples/own_rsl_rl.py:load=runs/rsl_rl``."""
+``uuv eval --agent examples/own_rsl_rl.py:load=runs/rsl_rl``."""
 
 from pathlib import Path
 

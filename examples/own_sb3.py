@@ -1,5 +1,5 @@
 """Stable-Baselines3: ``python examples/train_sb3.py --out runs/sb3``, then
-``uuv eval --policy examples/own_sb3.py:load=runs/sb3``. SB3 unpickles both files: load your own only."""
+``uuv eval --agent examples/own_sb3.py:load=runs/sb3``. SB3 unpickles both files: load your own only."""
 
 import pickle
 from pathlib import Path

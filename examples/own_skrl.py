@@ -1,5 +1,5 @@
 """skrl: ``python examples/train_skrl.py --out runs/skrl``, then
-``uuv eval --policy examples/own_skrl.py:load=runs/skrl``."""
+``uuv eval --agent examples/own_skrl.py:load=runs/skrl``."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""All vehicles at once, named columns in torch: ``uuv eval --controller bt,examples/own_torch.py:Pilot``."""
+"""All vehicles at once, named columns in torch: ``uuv eval --agent bt,examples/own_torch.py:Pilot``."""
 
 import torch
 

@@ -1,5 +1,5 @@
 """TorchRL: ``python examples/train_torchrl.py --out runs/torchrl``, then
-``uuv eval --policy examples/own_torchrl.py:load=runs/torchrl``."""
+``uuv eval --agent examples/own_torchrl.py:load=runs/torchrl``."""
 
 from pathlib import Path
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 import gc
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from uuvtai.common import signals
-from uuvtai.common.exits import FAILED, GATE, UsageError, guarded, plain, say
+from uuvtai.common.exits import FAILED, GATE, UsageError, guarded, say
 from uuvtai.common.version import __version__
 from uuvtai.console import groups, parsing
 from uuvtai.console import options as opt
@@ -24,6 +24,7 @@ from uuvtai.sim.scene import SceneOptions
 
 app = typer.Typer(
     name="uuv",
+    cls=groups.Commands,
     help="Train, measure and inspect observation-only navigation for underwater vehicles.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -31,26 +32,29 @@ app = typer.Typer(
     epilog="Example: uuv eval --world gauntlet --episodes 16 --record 1",
 )
 log_app = typer.Typer(
-    help="Look into recorded episodes (MCAP).",
+    help="Read, convert, repair and draw recorded episodes (MCAP).",
     no_args_is_help=True,
     epilog="Example: uuv log info runs/first/logs/bt_seed0_episode0.mcap",
 )
-app.add_typer(log_app, name="log")
 
 
-# ----------------------------------------------------------------------------------------------- eval, train
+# ------------------------------------------------------------------------------------------------------- Run
 
 
-@app.command("eval", epilog="Example: uuv eval --controller best --world gauntlet -D 9 -v 1.5 --seeds 7")
+@app.command(
+    "eval",
+    epilog="Example: uuv eval --agent best --world gauntlet -D 9 --speed 1.5 --seeds 7",
+)
 @groups.grouped
 def evaluate(
     ctx: typer.Context,
-    drivers: groups.DriversGroup,
+    agents: groups.AgentsGroup,
     scene: groups.SceneGroup,
-    kept: groups.RecordingGroup,
-    output: groups.OutputGroup,
+    *,
     episodes: opt.EvalEpisodes = 64,
     seeds: opt.Seeds = "0",
+    kept: groups.RecordingGroup,
+    output: groups.OutputGroup,
     num_envs: opt.Batch = None,
     resume: opt.EvalResume = None,
     allow_code: opt.AllowCode = False,
@@ -58,7 +62,7 @@ def evaluate(
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
 ) -> None:
-    """Play the same episodes with every controller and trained policy and print the table of methods."""
+    """Run agents on the same episodes and compare them."""
     if resume is not None:
         parsing.refuse_beside_resume(ctx, ("allow_code",))
         from uuvtai.evaluation.evaluate import resume as go_on
@@ -71,16 +75,90 @@ def evaluate(
         from uuvtai.evaluation.evaluate import compare
         from uuvtai.evaluation.results import Request
 
-        trained, controllers = drivers.named()
         request = Request.typed(
-            scene, trained, controllers=controllers, seeds=seed_list, episodes=episodes,
-            num_envs=num_envs, device=device, run_dir=run_dir, **recording,
+            scene, agents.named(), seeds=seed_list, episodes=episodes, num_envs=num_envs, device=device,
+            run_dir=run_dir, **recording,
         )  # fmt: skip
         result, folder = compare(request, Progress())
     from uuvtai.console.views import show_evaluation
 
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
     _report_if(with_report, folder)
+
+
+@app.command(epilog="Example: uuv sweep --agent best --grid D=0,6 --grid v=0.4,1.5 --workers 2")
+@groups.grouped
+def sweep(
+    ctx: typer.Context,
+    agents: groups.AgentsOrTreeGroup,
+    scene: groups.SceneGroup,
+    place: groups.WorkplaceGroup,
+    output: groups.OutputGroup,
+    grid: opt.GridAxes = None,
+    episodes: opt.SweepEpisodes = 64,
+    seeds: opt.Seeds = "0",
+    num_envs: opt.Batch = None,
+    resume: opt.SweepResume = None,
+    allow_code: opt.AllowCode = False,
+    device: opt.Device = "auto",
+    with_report: opt.WithReport = False,
+    run_dir: opt.RunDir = None,
+) -> None:
+    """Run agents in every cell of a grid of conditions.
+
+    Finished cells are kept when it is interrupted; --resume continues."""
+    from uuvtai.console.views import show_sweep
+    from uuvtai.evaluation import sweep as play
+    from uuvtai.evaluation.grid import SweepRequest, grid_of
+
+    parsing.refuse_less("--episodes", episodes, 1)
+    engine, progress = place.made(), Progress("cells")
+    if resume is not None:
+        parsing.refuse_beside_resume(ctx, parsing.OF_A_SWEEP_RESUMED)
+        result, folder = play.resume(resume, engine, progress, allow_code)
+    else:
+        request = SweepRequest.typed(
+            scene, agents.named(), grid=grid_of(grid or []), episodes=episodes,
+            seeds=tuple(parsing.seeds("--seeds", seeds)), num_envs=num_envs, device=device,
+        )  # fmt: skip
+        result, folder = play.sweep(request, engine, run_dir, progress)
+    _report_if(with_report, folder)
+    output.show(result, lambda screen: show_sweep(screen, result), folder)
+
+
+@app.command(
+    "watch",
+    epilog="Example: uuv watch --world gauntlet --agent bt,dwa --episodes 4",
+)
+@groups.grouped
+def watch_live(
+    agents: groups.AgentsOrTreeGroup,
+    scene: groups.SceneGroup,
+    output: groups.PlainOutputGroup,
+    episodes: opt.WatchEpisodes = 0,
+    seeds: opt.Seeds = "0",
+    rate: opt.Rate = 1.0,
+    host: opt.Host = "127.0.0.1",
+    port: opt.Port = 8765,
+    origin: opt.Origins = None,
+    depth_images: opt.DepthImages = False,
+    device: opt.Device = "auto",
+) -> None:
+    """Show episodes live in Foxglove or Lichtblick."""
+    seed_list = parsing.seeds("--seeds", seeds)
+    parsing.refuse_odd_live(episodes, rate, port)
+    from uuvtai.console.views import show_watched
+    from uuvtai.evaluation.results import Request
+    from uuvtai.evaluation.simulate import LiveOptions, watch_episodes
+
+    request = Request.typed(
+        scene, agents.named(), seeds=seed_list, episodes=episodes, depth_images=depth_images, device=device
+    )
+    result = watch_episodes(request, LiveOptions(host, port, rate, origin or ()), Progress())
+    output.show(result, lambda screen: show_watched(screen, result))
+
+
+# ----------------------------------------------------------------------------------------------------- Learn
 
 
 @app.command("train", epilog="Example: uuv train curriculum --iterations 20 --run-dir runs/first")
@@ -98,7 +176,9 @@ def train_policy(
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
 ) -> None:
-    """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
+    """Train a policy into a run folder.
+
+    Ctrl-C saves a checkpoint; --resume continues."""
     from uuvtai.console.screen import TrainingProgress
     from uuvtai.evaluation.evaluate import evaluate_now
     from uuvtai.learning.runner import TrainRequest, train
@@ -116,190 +196,38 @@ def train_policy(
     output.show(result, lambda _screen: None)
 
 
-# --------------------------------------------------------------------------------------------------- simulate
-
-
-@app.command(epilog="Example: uuv simulate --seconds 5 --wrench 10,0,0,0,0,0 --vehicle bluerov2_heavy")
+@app.command("export", epilog="Example: uuv export runs/mine --out runs/mine_export")
 @groups.grouped
-def simulate(
-    motion: groups.MotionGroup,
-    driver: groups.DriverGroup,
-    output: groups.OutputGroup,
-    vehicle: opt.SimulateVehicle = "bluerov2",
-    overrides: opt.Set = None,
+def export_policy(
+    output: groups.PlainOutputGroup,
+    run: opt.ExportRun = None,
+    out: opt.ExportOut = None,
+    evaluation: opt.ExportEvaluation = None,
+    check: opt.ExportCheck = None,
+    machines: opt.ExportFor = "x86_64,aarch64",
+    force: opt.ExportForce = False,
 ) -> None:
-    """Open-loop physics in open water, to validate a vehicle against theory or data; or, with --controller,
-    one vehicle that is driven to a goal."""
-    config = SceneOptions("open", "clean", vehicle, overrides=overrides).config()
-    from uuvtai.console.views import show_simulation
-    from uuvtai.evaluation.simulate import simulate as run
+    """Export a policy or a whole stack to run without uuvtai.
 
-    trial, driven = motion.trial(), driver.one
-    if driven is None:
-        result = run(config, trial)
-    else:
-        from uuvtai.evaluation.simulate import drive
+    A policy needs NumPy alone, or ONNX; the stack of a log becomes native code. Exit code 3: --check found
+    that an exported policy disagrees."""
+    from uuvtai.console.views import show_export, show_stack
 
-        result = drive(config, trial, driven)
-    title = f"{vehicle}: {trial.seconds:g} s, substep {trial.dt:g} s"
-    output.show(result, lambda screen: show_simulation(screen, result, title, driven))
+    if (run is None) == (check is None):
+        raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
+    from uuvtai.evaluation.agents import export_log, export_run
+    from uuvtai.learning.export import folder as export
 
-
-@app.command("watch", epilog="Example: uuv watch --world gauntlet --controller bt,dwa --episodes 4")
-@groups.grouped
-def watch_live(
-    drivers: groups.WatchDriversGroup,
-    scene: groups.SceneGroup,
-    output: groups.OutputGroup,
-    episodes: opt.WatchEpisodes = 0,
-    seeds: opt.Seeds = "0",
-    rate: opt.Rate = 1.0,
-    host: opt.Host = "127.0.0.1",
-    port: opt.Port = 8765,
-    origin: opt.Origins = None,
-    depth_images: opt.DepthImages = False,
-    device: opt.Device = "auto",
-) -> None:
-    """Run episodes in real time and serve them to Foxglove and Lichtblick."""
-    seed_list = parsing.seeds("--seeds", seeds)
-    parsing.refuse_odd_live(episodes, rate, port)
-    from uuvtai.console.views import show_watched
-    from uuvtai.evaluation.results import Request
-    from uuvtai.evaluation.simulate import LiveOptions, watch_episodes
-
-    trained, controllers = drivers.named()
-    request = Request.typed(
-        scene, trained, controllers=controllers, seeds=seed_list, episodes=episodes,
-        depth_images=depth_images, device=device,
-    )  # fmt: skip
-    result = watch_episodes(request, LiveOptions(host, port, rate, origin or ()), Progress())
-    output.show(result, lambda screen: show_watched(screen, result))
+    if run is not None and run.endswith(".mcap"):
+        written = export_log(Path(run), out, machines.split(","))
+        return output.show(written, lambda _: show_stack(written))
+    found = export.check(check, say) if check else export_run(run or "", out, evaluation or [], say, force)
+    output.show(found.document(), lambda screen: show_export(screen, found))
+    if not found.agrees:
+        raise typer.Exit(GATE)
 
 
-# --------------------------------------------------------------------------------------------------- identify
-
-
-@app.command("identify", epilog="Example: uuv identify drive.csv --vehicle bluerov2_16v --out mine.yaml")
-@groups.grouped
-def identify_vehicle(
-    file: opt.DriveLogs,
-    output: groups.OutputGroup,
-    vehicle: opt.SimulateVehicle = "bluerov2_16v",
-    known: opt.IdentifyKnown = "gain",
-    truth: opt.IdentifyTruth = False,
-    out: opt.IdentifyOut = None,
-    overrides: opt.Set = None,
-    system: opt.IdentifySystem = None,
-    force: opt.IdentifyForce = False,
-) -> None:
-    """Drag, added mass, buoyancy, thruster gain and rotor lag of a vehicle from logs, with intervals."""
-    from uuvtai.vehicle.identify.fit import identify
-
-    target = out or file[0].with_suffix(".vehicle.yaml")
-    base = SceneOptions("open", "clean", vehicle, overrides=overrides).config().vehicle
-    document = identify(file, base, vehicle, known, truth, target, force, system)
-
-    from uuvtai.console.views import show_identified
-
-    output.show(document, lambda screen: show_identified(screen, document, f"{known} of {vehicle}"))
-    say(f"wrote {target}")
-
-
-# ------------------------------------------------------------------------------------------------------ sweep
-
-
-@app.command(epilog="Example: uuv sweep --controller best --grid D=0,6 --grid v=0.4,1.5 --workers 2")
-@groups.grouped
-def sweep(
-    ctx: typer.Context,
-    drivers: groups.SweepDriversGroup,
-    scene: groups.SceneGroup,
-    place: groups.WorkplaceGroup,
-    output: groups.OutputGroup,
-    grid: opt.GridAxes = None,
-    episodes: opt.SweepEpisodes = 64,
-    seeds: opt.Seeds = "0",
-    num_envs: opt.Batch = None,
-    resume: opt.SweepResume = None,
-    allow_code: opt.AllowCode = False,
-    device: opt.Device = "auto",
-    with_report: opt.WithReport = False,
-    run_dir: opt.RunDir = None,
-) -> None:
-    """Play every cell of a grid with every method; finished cells survive a kill: --resume goes on."""
-    from uuvtai.console.views import show_sweep
-    from uuvtai.evaluation import sweep as play
-    from uuvtai.evaluation.grid import SweepRequest, grid_of
-
-    parsing.refuse_less("--episodes", episodes, 1)
-    engine, progress = place.made(), Progress("cells")
-    if resume is not None:
-        parsing.refuse_beside_resume(ctx, parsing.OF_A_SWEEP_RESUMED)
-        result, folder = play.resume(resume, engine, progress, allow_code)
-    else:
-        trained, controllers = drivers.named(["bt"])
-        request = SweepRequest.typed(
-            scene, trained, grid=grid_of(grid or []), controllers=tuple(controllers), episodes=episodes,
-            seeds=tuple(parsing.seeds("--seeds", seeds)), num_envs=num_envs, device=device,
-        )  # fmt: skip
-        result, folder = play.sweep(request, engine, run_dir, progress)
-    _report_if(with_report, folder)
-    output.show(result, lambda screen: show_sweep(screen, result), folder)
-
-
-# -------------------------------------------------------------------------------------------------- benchmark
-
-
-# ----------------------------------------------------------------------------------------- profile, reproduce
-
-
-@app.command(epilog="Example: uuv profile --num-envs 1,64 --seconds 5")
-@groups.grouped
-def profile(
-    scene: groups.SceneGroup,
-    output: groups.OutputGroup,
-    num_envs: opt.BatchSizes = "1,64,1024",
-    controller: opt.TickedTree = "bt",
-    preset: opt.ProfilePreset = "curriculum",
-    seconds: opt.ProfileSeconds = 10.0,
-    density: opt.Density = False,
-    device: opt.Device = "auto",
-) -> None:
-    """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the
-    paper's timing tables."""
-    sizes = parsing.integers("--num-envs", num_envs)
-    parsing.refuse_no_duration("--seconds", seconds)
-    from uuvtai.console.views import show_profile
-    from uuvtai.evaluation.profile import profile as run
-
-    result = run(scene.training(preset), sizes, controller, device, seconds, density, say)
-    output.show(result, lambda screen: show_profile(screen, result))
-
-
-@app.command(epilog="Example: uuv reproduce --budget quick --run-dir runs/reproduction")
-@groups.grouped
-def reproduce(
-    ctx: typer.Context,
-    own: groups.PiecesGroup,
-    output: groups.OutputGroup,
-    budget: opt.BudgetName = "quick",
-    allow_code: opt.AllowCode = False,
-    resume: opt.ReproduceResume = None,
-    run_dir: opt.RunDir = None,
-) -> None:
-    """Train, evaluate, sweep and profile whatever the paper shows, and judge each of its claims."""
-    from uuvtai.evaluation import reproduce as paper_run
-    from uuvtai.report.reproduction import claim_table
-
-    if resume is not None:
-        parsing.refuse_beside_resume(ctx, ("budget", "allow_code"))
-        result, folder = paper_run.resume(resume, Progress(), allow_code)
-    else:
-        result, folder = paper_run.reproduce(budget, run_dir, Progress(), own.named())
-    output.show(result, lambda screen: screen.table(claim_table(result)), folder)
-
-
-# --------------------------------------------------------------------------------------------- report, export
+# ------------------------------------------------------------------------------------------------------ Look
 
 
 @app.command("report", epilog="Example: uuv report runs/first")
@@ -309,10 +237,11 @@ def report_run(
     output: groups.PlainOutputGroup,
     out: opt.ReportOut = None,
     paper: opt.ReportPaper = None,
-    force: opt.ReportForce = False,
+    force: opt.Force = False,
 ) -> None:
-    """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come
-    from; or, with --paper, figures and tables for a paper."""
+    """Write the HTML page of a run, or figures for a paper.
+
+    The page is one file with tables, figures, pictures and videos."""
     if paper is not None:
         if out is not None or force:
             raise UsageError("--paper: writes a folder of its own; leave out --out and --force")
@@ -334,97 +263,7 @@ def _report_if(with_report: bool, folder: Path) -> None:
         say(f"report: {report([folder]).page}")
 
 
-@app.command("export", epilog="Example: uuv export runs/mine --out runs/mine_export")
-@groups.grouped
-def export_policy(
-    output: groups.OutputGroup,
-    stacked: groups.StackGroup,
-    run: opt.ExportRun = None,
-    out: opt.ExportOut = None,
-    evaluation: opt.ExportEvaluation = None,
-    check: opt.ExportCheck = None,
-    force: opt.ExportForce = False,
-) -> None:
-    """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3:
-    it disagrees. Or, with --stack, the stack itself as native code."""
-    from uuvtai.console.views import show_export, show_stack
-
-    if (written := stacked.written(run)) is not None:
-        return output.show(written, lambda _: show_stack(written))
-    if (run is None) == (check is None):
-        raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
-    from uuvtai.evaluation.agents import export_run
-    from uuvtai.learning.export import folder as export
-
-    found = export.check(check, say) if check else export_run(run or "", out, evaluation or [], say, force)
-    output.show(found.document(), lambda screen: show_export(screen, found))
-    if not found.agrees:
-        raise typer.Exit(GATE)
-
-
-# --------------------------------------------------------------------------------------------------- replay
-
-
-@app.command("replay", epilog="Example: uuv replay runs/first/logs/bt_seed0_episode0.mcap --lose dvl:10:15")
-@groups.grouped
-def replay_log(
-    faults: groups.FaultsGroup,
-    log: opt.ReplayLog,
-    output: groups.OutputGroup,
-    controller: opt.ReplayTree = None,
-) -> None:
-    """Feed a log's sensor messages to the stack again, without the simulator, and compare the commands. Exit
-    code 3: they differ, though nothing was disturbed."""
-    from uuvtai.console.views import show_replay
-    from uuvtai.vehicle.replay import replay
-
-    found = replay(log, faults.made(), controller)
-    output.show(found, lambda screen: show_replay(screen, found))
-    if not (found["equal"] or found["faults"]["any"]):
-        raise typer.Exit(GATE)
-
-
-@app.command(
-    "pilot", epilog="Example: uuv pilot --mavlink udp:127.0.0.1:14550 --start 2,3,-0.8 --goal 18,3,-0.8"
-)
-@groups.grouped
-def pilot_vehicle(
-    flight: groups.FlightGroup,
-    scene: groups.SeenSceneGroup,
-    output: groups.OutputGroup,
-    controller: opt.PilotTree = "bt",
-) -> None:
-    """Drive a real vehicle, or ArduSub's simulated one, by MAVLink: a dry run unless --arm is given
-    (docs/safety.md). Exit code 3: it ended by a safe action."""
-    from uuvtai.console.views import show_flight
-    from uuvtai.sim.behavior_tree import read_tree
-    from uuvtai.vehicle.control_loop import fly
-
-    config = scene.config()
-    found, failure = fly(config, read_tree(controller, config.teacher.max_node), flight.plan(config), say)
-    output.show(found, lambda screen: show_flight(screen, found))
-    if failure is not None:
-        raise failure
-    if found["interrupted"]:
-        raise typer.Exit(signals.exit_code())
-    if not found["safe"]:
-        raise typer.Exit(GATE)
-
-
-@app.command("sitl", epilog="Example: uuv sitl --world pool -S 8 -D 6 -v 0.6 --instances 3")
-@groups.grouped
-def serve_sitl(scene: groups.SitlSceneGroup, served: groups.ServedGroup, output: groups.OutputGroup) -> None:
-    """Run our physics, world and sensors as the backend of ArduSub's simulation (docs/on_a_vehicle.md)."""
-    from uuvtai.console.views import show_sitl
-    from uuvtai.sim.behavior_tree import read_tree
-    from uuvtai.vehicle.sitl import serve_water
-
-    plan, config = served.plan(), scene.config()
-    found = serve_water(config, read_tree("straight", config.teacher.max_node), plan, say)
-    output.show(found, lambda screen: show_sitl(screen, found))
-
-
-# -------------------------------------------------------------------------------------- presets, doctor, tree
+app.add_typer(log_app, name="log")
 
 
 @app.command(epilog="Example: uuv presets show gauntlet")
@@ -434,13 +273,22 @@ def presets(
     action: opt.PresetsAction = None,
     name: opt.PresetName = None,
     everything: opt.Everything = False,
+    run: opt.TreeUse = None,
+    dot: opt.Dot = False,
 ) -> None:
-    """List the shipped presets with a sentence each, or show what one of them states."""
+    """List the presets, or show one of them."""
     from uuvtai.console import views as shown
 
     if action is None:
         return output.show(shown.sentences(), shown.show_presets)
-    kind, name = shown.kind_and_name(action, name)
+    kind, name = shown.kind_and_name(action, name, run)
+    if (run is not None or dot) and kind != "tree":
+        raise UsageError(f"--run, --dot: are of a tree, and {name} is a preset of kind {kind}")
+    if kind == "tree" and not everything:
+        from uuvtai.sim.behavior_tree import tree_report
+
+        report = tree_report(name, run)
+        return output.show(report.document, lambda screen: shown.show_tree_report(screen, report, dot))
     if not everything or kind == "tree":  # a tree has no keys
         return shown.show_stated(kind, name, output.as_json)
     from uuvtai.sim.scene import whole_preset
@@ -449,79 +297,44 @@ def presets(
     output.show(found, lambda _screen: typer.echo(text))
 
 
+@app.command(epilog="Example: uuv doctor --compile --num-envs 64,256")
+@groups.grouped
+def doctor(
+    output: groups.PlainOutputGroup,
+    warmed: groups.CompileGroup,
+    clean: opt.Clean = False,
+) -> None:
+    """Check the installation, or compile kernels in advance."""
+    if not warmed.compile:
+        signals.engage()
+    from uuvtai.console import doctor as work
+
+    if clean:
+        typer.echo(f"deleted {work.clean()} files of machine code", err=True)
+    if warmed.compile:
+        shapes = warmed.made()
+        return output.show({"shapes": shapes}, lambda screen: work.show_shapes(screen, shapes))
+    found = work.checks()
+    is_ok = all(check["ok"] for check in found)
+    output.show({"ok": is_ok, "checks": found}, lambda screen: work.show_checks(screen, found))
+    if not is_ok:
+        raise typer.Exit(FAILED)
+
+
 @app.command(epilog="Example: uuv examples mine")
 def examples(folder: opt.ExamplesFolder = Path("examples")) -> None:
-    """Copy the examples of the documentation into a folder: own pieces, trainers, a world, a tree."""
+    """Copy the example files into a folder."""
     from uuvtai.console.doctor import copy_examples
 
     typer.echo("\n".join(map(str, copy_examples(folder))))
 
 
-@app.command(epilog="Example: uuv doctor --json")
-@groups.grouped
-def doctor(output: groups.PlainOutputGroup, clean: opt.Clean = False) -> None:
-    """Check that everything uuv needs is here and works."""
-    from uuvtai.console.doctor import checks, show_checks
-    from uuvtai.console.doctor import clean as delete_machine_code
-
-    if clean:
-        typer.echo(f"deleted {delete_machine_code()} files of machine code", err=True)
-    found = checks()
-    is_ok = all(check["ok"] for check in found)
-    output.show({"ok": is_ok, "checks": found}, lambda screen: show_checks(screen, found))
-    if not is_ok:
-        raise typer.Exit(FAILED)
-
-
-@app.command(epilog="Example: uuv warm --sensors nominal,paper --num-envs 64,256")
-@groups.grouped
-def warm(
-    output: groups.OutputGroup,
-    num_envs: opt.BatchSizes = "1,8,64,256",
-    world: opt.World = "pool",
-    sensors: opt.WarmSensors = "nominal,paper",
-    overrides: opt.Set = None,
-    workers: opt.WarmWorkers = 0,
-) -> None:
-    """Compile beforehand what later commands need, so that they start at once (docs/performance.md)."""
-    from uuvtai.console.doctor import show_shapes
-    from uuvtai.envs import warm_up
-
-    sizes = parsing.integers("--num-envs", num_envs)
-    parsing.refuse_less("--workers", workers, 0)
-    scenes = [SceneOptions(world, name, overrides=overrides) for name in sensors.split(",")]
-    shapes = warm_up.shapes_of(scenes, sizes)
-    say(f"sizes to compile: {len(shapes)}, about a minute each the first time")
-    found = warm_up.warm(shapes, workers or None)
-    output.show({"shapes": found}, lambda screen: show_shapes(screen, found))
-
-
-@app.command(epilog="Example: uuv tree --controller planner --dot")
-@groups.grouped
-def tree(
-    output: groups.OutputGroup,
-    run: opt.EvaluatedRun = None,
-    controller: opt.ShownTree = "bt",
-    dot: opt.Dot = False,
-) -> None:
-    """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
-    from uuvtai.sim.behavior_tree import tree_report
-
-    report = tree_report(controller, run)
-    if dot or run is None:
-        text = plain(report.dot if dot else report.text)
-        return output.show(report.document, lambda _screen: typer.echo(text))
-    from uuvtai.console.views import show_tree
-
-    output.show(report.document, lambda screen: show_tree(screen, report.text, report.document["nodes"]))
-
-
-# -------------------------------------------------------------------------------------------------------- log
+# ------------------------------------------------------------------------------------------------- Look: log
 
 
 @log_app.command("info", epilog="Example: uuv log info runs/first/logs/bt_seed0_episode0.mcap")
 @groups.grouped
-def log_info(output: groups.OutputGroup, file: opt.LogFile) -> None:
+def log_info(output: groups.PlainOutputGroup, file: opt.LogFile) -> None:
     """Topics, counts, rates, metadata and outcome of a log."""
     from uuvtai.console.views import show_log
     from uuvtai.logs import reader
@@ -541,6 +354,55 @@ def log_export(
         typer.echo(str(path))
 
 
+@log_app.command("convert", epilog="Example: uuv log convert runs/first/logs/bt_seed0_episode0.mcap")
+def log_convert(
+    file: opt.LogFile,
+    out: opt.ConvertOut = None,
+    source: opt.ConvertFrom = "mcap",
+    force: opt.LogForce = False,
+) -> None:
+    """Write a log as a ROS 2 bag, or a bag as a log."""
+    from uuvtai.logs.rosbag import converted
+
+    target, messages, left_out = converted(file, out, source, force)
+    for note in left_out:
+        say(f"{file}: {note}")
+    typer.echo(f"{target}: {messages} messages")
+
+
+@log_app.command(
+    "render", epilog="Example: uuv log render runs/first/logs/bt_seed0_episode0.mcap --out a.webm"
+)
+def log_render(
+    file: opt.RenderLogs,
+    out: opt.RenderOut = None,
+    clearance: opt.WithClearance = False,
+    speed: opt.VideoSpeed = None,
+    fps: opt.VideoFps = None,
+    width: opt.RenderWidth = None,
+    force: opt.LogForce = False,
+) -> None:
+    """Draw a picture (PNG) or a video (WebM, MP4, GIF) of an episode."""
+    from uuvtai.common.files import output_beside
+
+    target = output_beside(file, out, ".png", force)
+    if target.suffix.lower() == ".png":
+        if speed is not None or fps is not None:
+            raise UsageError("--speed, --fps: are of a video; add --out NAME.webm")
+        from uuvtai.logs.picture import picture
+
+        more: dict[str, Any] = {} if width is None else {"width_px": width}
+        picture(file, target, clearance=clearance, **more)
+    else:
+        if clearance or len(file) > 1:
+            raise UsageError("--clearance and several logs: are of a picture; give --out NAME.png")
+        from uuvtai.logs.video import video
+
+        with counted(target.name, "frames") as drawn:
+            video(file[0], target, width, fps, 1.0 if speed is None else speed, drawn)
+    typer.echo(str(target))
+
+
 @log_app.command("repair", epilog="Example: uuv log repair runs/first/logs/bt_seed0_episode0.mcap")
 def log_repair(file: opt.LogFile, out: opt.RepairOut = None, force: opt.LogForce = False) -> None:
     """Recover the messages of a log whose writing was cut off."""
@@ -552,57 +414,190 @@ def log_repair(file: opt.LogFile, out: opt.RepairOut = None, force: opt.LogForce
     typer.echo(f"{found.path}: {found.messages} messages recovered, the last at {found.last_time_s:.2f} s")
 
 
-@log_app.command("convert", epilog="Example: uuv log convert runs/first/logs/bt_seed0_episode0.mcap")
-def log_convert(
-    file: opt.LogFile,
-    out: opt.ConvertOut = None,
-    to: opt.ConvertTo = None,
-    source: opt.ConvertFrom = "mcap",
-    force: opt.LogForce = False,
+# ----------------------------------------------------------------------------------------------------- Paper
+
+
+@app.command(epilog="Example: uuv reproduce --budget quick --run-dir runs/reproduction")
+@groups.grouped
+def reproduce(
+    ctx: typer.Context,
+    own: groups.PiecesGroup,
+    output: groups.PlainOutputGroup,
+    budget: opt.BudgetName = "quick",
+    allow_code: opt.AllowCode = False,
+    resume: opt.ReproduceResume = None,
+    run_dir: opt.RunDir = None,
 ) -> None:
-    """Write a log as a ROS 2 bag, or a bag as a log."""
-    from uuvtai.logs.rosbag import converted
+    """Repeat the paper's experiments and judge each claim."""
+    from uuvtai.evaluation import reproduce as paper_run
+    from uuvtai.report.reproduction import claim_table
 
-    target, messages, left_out = converted(file, out, to, source, force)
-    for note in left_out:
-        say(f"{file}: {note}")
-    typer.echo(f"{target}: {messages} messages")
+    if resume is not None:
+        parsing.refuse_beside_resume(ctx, ("budget", "allow_code"))
+        result, folder = paper_run.resume(resume, Progress(), allow_code)
+    else:
+        result, folder = paper_run.reproduce(budget, run_dir, Progress(), own.named())
+    output.show(result, lambda screen: screen.table(claim_table(result)), folder)
 
 
-@log_app.command("video", epilog="Example: uuv log video runs/first/logs/bt_seed0_episode0.mcap")
-def log_video(
-    file: opt.LogFile,
-    out: opt.VideoOut = None,
-    speed: opt.VideoSpeed = 1.0,
-    fps: opt.VideoFps = None,
-    width: opt.VideoWidth = None,
-    force: opt.LogForce = False,
+@app.command(epilog="Example: uuv profile --num-envs 1,64 --seconds 5")
+@groups.grouped
+def profile(
+    scene: groups.ProfileSceneGroup,
+    output: groups.OutputGroup,
+    num_envs: opt.BatchSizes = "1,64,1024",
+    agent: opt.TickedTree = "bt",
+    preset: opt.ProfilePreset = "curriculum",
+    seconds: opt.ProfileSeconds = 10.0,
+    density: opt.Density = False,
+    device: opt.Device = "auto",
 ) -> None:
-    """Render a top-down video of a recorded episode as WebM, MP4 or GIF."""
-    from uuvtai.common.files import output_beside
-    from uuvtai.logs.video import video
+    """Measure speed and memory, and the paper's timing tables."""
+    sizes = parsing.integers("--num-envs", num_envs)
+    parsing.refuse_no_duration("--seconds", seconds)
+    from uuvtai.console.views import show_profile
+    from uuvtai.evaluation.profile import profile as run
 
-    target = output_beside([file], out, ".webm", force)
-    with counted(target.name, "frames") as drawn:
-        video(file, target, width, fps, speed, drawn)
-    typer.echo(str(target))
+    result = run(scene.training(preset), sizes, agent, device, seconds, density, say)
+    output.show(result, lambda screen: show_profile(screen, result))
 
 
-@log_app.command("picture", epilog="Example: uuv log picture runs/first/logs/bt_seed0_episode0.mcap")
-def log_picture(
-    file: opt.LogFiles,
-    out: opt.PictureOut = None,
-    clearance: opt.WithClearance = False,
-    force: opt.LogForce = False,
+# --------------------------------------------------------------------------------------------------- Vehicle
+
+
+@app.command(
+    "pilot",
+    epilog="Example: uuv pilot --mavlink udp:127.0.0.1:14550 --start 2,3,-0.8 --goal 18,3,-0.8",
+)
+@groups.grouped
+def pilot_vehicle(
+    flight: groups.FlightGroup,
+    scene: groups.SeenSceneGroup,
+    output: groups.PlainOutputGroup,
+    agent: opt.PilotTree = "bt",
 ) -> None:
-    """Draw a recorded episode as PNG: occupancy, trajectories, goal."""
-    from uuvtai.common.files import output_beside
-    from uuvtai.logs.picture import picture
+    """Drive a vehicle over MAVLink; a dry run without --arm.
 
-    typer.echo(str(picture(file, output_beside(file, out, ".png", force), clearance=clearance)))
+    Read docs/safety.md first. Exit code 3: it ended by a safe action."""
+    from uuvtai.console.views import show_flight
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.vehicle.control_loop import fly
+
+    config = scene.config()
+    found, failure = fly(config, read_tree(agent, config.teacher.max_node), flight.plan(config), say)
+    output.show(found, lambda screen: show_flight(screen, found))
+    if failure is not None:
+        raise failure
+    if found["interrupted"]:
+        raise typer.Exit(signals.exit_code())
+    if not found["safe"]:
+        raise typer.Exit(GATE)
 
 
-# ----------------------------------------------------------------------------------------------- the program
+@app.command(
+    "sitl",
+    epilog="Example: uuv sitl --world pool -S 8 -D 6 --speed 0.6 --instances 3",
+)
+@groups.grouped
+def serve_sitl(
+    scene: groups.SitlSceneGroup, served: groups.ServedGroup, output: groups.PlainOutputGroup
+) -> None:
+    """Run our physics as the ArduSub SITL backend.
+
+    ArduSub connects by its JSON interface (docs/on_a_vehicle.md)."""
+    from uuvtai.console.views import show_sitl
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.vehicle.sitl import serve_water
+
+    plan, config = served.plan(), scene.config()
+    found = serve_water(config, read_tree("straight", config.teacher.max_node), plan, say)
+    output.show(found, lambda screen: show_sitl(screen, found))
+
+
+@app.command(
+    "identify",
+    epilog="Example: uuv identify drive.csv --vehicle bluerov2_16v --out mine.yaml",
+)
+@groups.grouped
+def identify_vehicle(
+    file: opt.DriveLogs,
+    output: groups.PlainOutputGroup,
+    vehicle: opt.BaseVehicle = "bluerov2_16v",
+    known: opt.IdentifyKnown = "gain",
+    truth: opt.IdentifyTruth = False,
+    out: opt.IdentifyOut = None,
+    overrides: opt.Set = None,
+    system: opt.IdentifySystem = None,
+    force: opt.Force = False,
+) -> None:
+    """Estimate a vehicle's parameters from logs of drives.
+
+    Drag, added mass, buoyancy, thruster gain and rotor lag, with confidence intervals."""
+    from uuvtai.vehicle.identify.fit import identify
+
+    target = out or file[0].with_suffix(".vehicle.yaml")
+    base = SceneOptions("open", "clean", vehicle, overrides=overrides).config().vehicle
+    document = identify(file, base, vehicle, known, truth, target, force, system)
+
+    from uuvtai.console.views import show_identified
+
+    output.show(document, lambda screen: show_identified(screen, document, f"{known} of {vehicle}"))
+    say(f"wrote {target}")
+
+
+@app.command(
+    "replay",
+    epilog="Example: uuv replay runs/first/logs/bt_seed0_episode0.mcap --lose dvl:10:15",
+)
+@groups.grouped
+def replay_log(
+    faults: groups.FaultsGroup,
+    log: opt.ReplayLog,
+    output: groups.PlainOutputGroup,
+    agent: opt.ReplayTree = None,
+) -> None:
+    """Run the stack on a log's sensor data; compare commands.
+
+    Exit code 3: the commands differ although no fault was added."""
+    from uuvtai.console.views import show_replay
+    from uuvtai.vehicle.replay import replay
+
+    found = replay(log, faults.made(), agent)
+    output.show(found, lambda screen: show_replay(screen, found))
+    if not (found["equal"] or found["faults"]["any"]):
+        raise typer.Exit(GATE)
+
+
+@app.command(
+    epilog="Example: uuv simulate --seconds 5 --wrench 10,0,0,0,0,0 --vehicle bluerov2_heavy",
+)
+@groups.grouped
+def simulate(
+    motion: groups.MotionGroup,
+    driver: groups.AgentGroup,
+    output: groups.PlainOutputGroup,
+    vehicle: opt.BaseVehicle = "bluerov2",
+    overrides: opt.Set = None,
+) -> None:
+    """Simulate one vehicle in open water, open loop.
+
+    With --agent it is driven to a goal instead."""
+    config = SceneOptions("open", "clean", vehicle, overrides=overrides).config()
+    from uuvtai.console.views import show_simulation
+    from uuvtai.evaluation.simulate import simulate as run
+
+    trial, driven = motion.trial(), driver.one
+    if driven is None:
+        result = run(config, trial)
+    else:
+        from uuvtai.evaluation.simulate import drive
+
+        result = drive(config, trial, driven)
+    title = f"{vehicle}: {trial.seconds:g} s, substep {trial.dt:g} s"
+    output.show(result, lambda screen: show_simulation(screen, result, title, driven))
+
+
+# --------------------------------------------------------------------------------------------- the program
 
 
 @app.callback(invoke_without_command=True)
@@ -613,7 +608,7 @@ def _root(
     if version:
         typer.echo(__version__)
         raise typer.Exit
-    if ctx.invoked_subcommand in ("report", "export", "log", "doctor"):
+    if ctx.invoked_subcommand in ("report", "export", "log"):
         signals.engage()  # the others have nothing to tidy up before they have a run folder
     # building kernels makes millions of objects, few of them garbage: half a second of a start
     gc.set_threshold(50_000, 50, 1000)
@@ -621,7 +616,7 @@ def _root(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a command and leave with its exit code. ``uuv`` itself begins in ``uuvtai.__main__``."""
-    code = guarded(lambda: app(args=arguments, prog_name="uuv", standalone_mode=False))
+    code = guarded(lambda: parsing.telling_new_names(app, arguments))
     signals.finish(code)
     sys.exit(code)
 

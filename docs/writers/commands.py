@@ -29,8 +29,6 @@ SEE = {
     "presets": ("reference/configuration",),
     "examples": ("extend",),
     "doctor": ("quickstart", "performance"),
-    "warm": ("performance",),
-    "tree": ("navigation",),
     "log": ("logs", "reference/topics", "security"),
 }
 """prose about a command"""

@@ -132,7 +132,7 @@ def test_a_signal_within_a_write_loses_no_message(tmp_path, call):
         ("simulate", "--seconds", "1"),
         ("sweep", "--grid", "D=0,3", "--run-dir", "run"), ("profile",), ("report", "nowhere"),
         ("export", "nowhere", "--out", "out"),
-        ("presets",), ("doctor",), ("tree",), ("log", "info", "nowhere.mcap"),
+        ("presets",), ("doctor",), ("presets", "show", "bt"), ("log", "info", "nowhere.mcap"),
         ("reproduce", "--run-dir", "run"),
     ],
 )  # fmt: skip
@@ -291,21 +291,9 @@ def test_sigterm_ends_a_training_as_ctrl_c_does(tmp_path):
 
 
 def test_the_workers_of_a_sweep_end_with_it(tmp_path):
-    grid = [
-        "--grid",
-        "D=0,3,6,9",
-        "--grid",
-        "v=0.5,1.5",
-        "--controller",
-        "bt",
-        "--episodes",
-        "64",
-        "--workers",
-        "2",
-    ]
-    process = started(
-        tmp_path, "sweep", *grid, "--run-dir", "run", "--device", "cpu", "--num-envs", SmallSim.OPTIONS[1]
-    )
+    grid = ["--grid", "D=0,3,6,9", "--grid", "v=0.5,1.5", "--agent", "bt", "--episodes", "64"]
+    where = ["--workers", "2", "--run-dir", "run", "--device", "cpu", *SmallSim.OPTIONS[:2]]
+    process = started(tmp_path, "sweep", *grid, *where)
     children = two_children_of(process)  # a worker and a resource tracker
     os.kill(process.pid, signal.SIGTERM)
     code, err = ended(process, signal.SIGTERM)
@@ -317,7 +305,7 @@ def test_the_workers_of_a_sweep_end_with_it(tmp_path):
 
 def test_ctrl_c_ends_what_compiles_side_by_side(tmp_path):
     """A terminal sends it to every process of the command."""
-    command = [sys.executable, "-m", "uuvtai", "warm", "--workers", "2", *SmallSim.OPTIONS[:4]]
+    command = [sys.executable, "-m", "uuvtai", "doctor", "--compile", "--workers", "2", *SmallSim.OPTIONS[:4]]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True
     )

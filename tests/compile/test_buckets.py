@@ -96,7 +96,7 @@ def test_other_batches_bodies_and_speeds_compile_nothing_and_change_nothing():
 def test_warm_makes_what_another_process_finds(capfd):
     """The session's small simulator is compiled already: every kernel is found."""
     options = ("--num-envs", "8", "--sensors", "paper", "--set", "world.dynamic_capacity=9", "--json")
-    code, out, _ = uuv(capfd, "warm", *options)
+    code, out, _ = uuv(capfd, "doctor", "--compile", *options)
     (shape,) = json.loads(out)["shapes"]
     assert code == 0 and (shape["sensors"], shape["num_envs"]) == ("paper", 8)
     assert shape["compiled"] + shape["found"] > 30

@@ -46,24 +46,34 @@ from uuvtai.console.views import show_evaluation
         (["eval", "--num-envs", "900000"], "GiB"),
         (["eval", "--world", "pol"], "did you mean 'pool'"),
         (["eval", "--sensors", "nominl"], "did you mean 'nominal'"),
-        (["eval", "--controller", "btt"], "did you mean 'bt'"),
-        (["eval", "--controller", "nowhere.xml"], "no such file"),
+        (["eval", "--agent", "btt"], "did you mean 'bt'"),
+        (["eval", "--agent", "nowhere.xml"], "no such file"),
         (
-            ["eval", "--controller", "bt+trut"],
+            ["eval", "--agent", "bt+trut"],
             "'+trut' is unknown; the one suffix is +truth, for example bt+truth",
         ),
-        (["eval", "--controller", "btt+truth"], "did you mean 'bt'"),
-        (["eval", "--controller", "orakel"], "'orakel' is no preset"),
-        (["eval", "--controller", "oracle", "--record", "1"], "the oracle drives no vehicle"),
+        (["eval", "--agent", "btt+truth"], "did you mean 'bt'"),
+        (["eval", "--agent", "orakel"], "--agent orakel: is no preset"),
+        (["eval", "--agent", "oracle", "--record", "1"], "the oracle drives no vehicle"),
         (["eval", "--set", "world.n_dynmic=1"], "did you mean 'n_dynamic'"),
         (["eval", "--set", "mapping.static_hit=.nan"], "finite"),
         (["eval", "-S", "-1"], "greater than or equal to 0"),
-        (["eval", "-v", "nan"], "finite"),
+        (["eval", "--speed", "nan"], "finite"),
         (["eval", "--device", "tpu"], "use auto, cpu or cuda"),
-        (["eval", "no/such/run"], "is no trained policy"),
-        (["eval", "bestt"], "is no trained policy"),
-        (["sweep", "best", "--grid", "D=0"], "it drives by itself: --controller best"),
-        (["eval", "--controller", "none"], "'none' is no preset"),
+        (["eval", "--agent", "no/such/run"], "is no preset, file or run folder"),
+        (["eval", "--agent", "."], "is no trained policy"),
+        (["eval", "runs/mine"], "Got unexpected extra argument(s) (runs/mine); now it is --agent NAME|FILE"),
+        (["sweep", "--controller", "best"], "No such option: --controller; now it is --agent NAME"),
+        (["eval", "--policy=model.onnx"], "No such option: --policy; now it is --agent FILE"),
+        (["eval", "-v", "1"], "No such option: -v; now it is --speed"),
+        (["train", "--stack", "paper"], "No such option: --stack; now it is --agent NAME, or --set stack="),
+        (["warm"], "No such command 'warm'; now it is uuv doctor --compile"),
+        (["tree", "--dot"], "No such command 'tree'; now it is uuv presets show bt"),
+        (["log", "video", "a.mcap"], "now it is uuv log render FILE --out NAME.webm"),
+        (["presets", "show", "pool", "--dot"], "--run, --dot: are of a tree"),
+        (["log", "render", "a.mcap", "--fps", "5"], "--speed, --fps: are of a video"),
+        (["log", "render", "a.mcap", "--out", "a.gif", "--clearance"], "are of a picture"),
+        (["eval", "--agent", "none"], "--agent none: is no preset"),
         (["train", "curiculum"], "did you mean 'curriculum'"),
         (["train", "nowhere.yaml"], "no such file"),
         (["train", "smoke", "--set", "ppo.gama=1"], "did you mean 'gamma'"),
@@ -72,7 +82,7 @@ from uuvtai.console.views import show_evaluation
         (["train", "smoke", "--num-envs", "900000"], "GiB"),
         (["train", "smoke", "--seed", "-1"], "train.seed"),
         (["train", "smoke", "--seed", "500000"], "must differ from train.seed"),
-        (["train", "smoke", "-v", "nan"], "finite"),
+        (["train", "smoke", "--speed", "nan"], "finite"),
         (["train", "smoke", "--world", "pol"], "did you mean 'pool'"),
         (["train", "smoke", "--device", "tpu"], "use auto, cpu or cuda"),
         (["train", "--resume", "no/such/run"], "is no run folder"),
@@ -89,7 +99,7 @@ from uuvtai.console.views import show_evaluation
         (["profile", "--seconds", "0"], "positive"),
         (["presets", "show"], "uuv presets show NAME"),
         (["presets", "show", "nothing"], "is no preset"),
-        (["tree", "no/such/run"], "is no run folder"),
+        (["presets", "show", "bt", "--run", "no/such/run"], "is no run folder"),
         (["report", "no/such/run"], "is no run folder"),
         (["report", "."], "has nothing to report yet"),
         (["report", ".", "."], "--out FILE"),
@@ -106,7 +116,7 @@ def test_bad_usage_is_one_message_and_exit_2(capfd, tmp_path, monkeypatch, argum
     assert not list(tmp_path.iterdir()), "nothing may be left behind"
 
 
-@pytest.mark.parametrize("command", ["info", "repair", "video", "picture"])
+@pytest.mark.parametrize("command", ["info", "repair", "render"])
 @pytest.mark.parametrize("content", [None, b"", b"not a log", b"\x89MCAP0\r\n" + b"\x00" * 40])
 def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content):
     log = tmp_path / "broken.mcap"
@@ -128,7 +138,7 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
         (["eval", "--world", "a/" + 5000 * "b" + ".yaml"], "too long"),
         (["eval", "--resume", "nowhere"], "nowhere: is no run folder"),
         (["eval", "--resume", "nowhere", "--episodes", "64"], "--episodes 64: a resumed run keeps its own"),
-        (["eval", "runs/a", "--resume", "nowhere"], "RUN ['runs/a']: a resumed run keeps its own"),
+        (["eval", "--agent", "bt", "--resume", "nowhere"], "--agent ['bt']: a resumed run keeps its own"),
         (["train", "smoke", "--set", "train.scenes=[[9, 9999, 1.0]]"], "do not fit"),
         (["train", "smoke", "--set", "policy.initial_std=0.01"], "lies below the floor"),
     ],
@@ -372,10 +382,10 @@ def test_a_start_removes_the_lock_of_a_killed_process_and_no_other(tmp_path):
 
 
 def test_tree_is_printed_and_drawn(capfd):
-    code, out, _ = uuv(capfd, "tree")
+    code, out, _ = uuv(capfd, "presets", "show", "bt")
     assert code == 0
     assert "FollowRoute" in out
-    code, out, _ = uuv(capfd, "tree", "--dot", "--controller", "straight")
+    code, out, _ = uuv(capfd, "presets", "show", "straight", "--dot")
     assert code == 0
     assert out.startswith("digraph")
 
@@ -399,7 +409,7 @@ def evaluation(tmp_path_factory):
     """One real evaluation in a process of its own: two controllers, recorded, as JSON."""
     folder = tmp_path_factory.mktemp("eval") / "run"
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "straight,bt", "--episodes", "4", "--seeds",
+        sys.executable, "-m", "uuvtai", "eval", "--agent", "straight,bt", "--episodes", "4", "--seeds",
         "3", *SmallSim.OPTIONS,
         "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder),
         "--report", "--json",
@@ -445,7 +455,7 @@ def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, tmp_pa
     """Outcomes of four episodes, and all that one of them wrote down on its way."""
     folder, document, _ = evaluation
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3",
+        sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "4", "--seeds", "3",
         *SmallSim.OPTIONS,
         "--record", "1", "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json",
     ]  # fmt: skip
@@ -477,7 +487,7 @@ def test_eval_leaves_a_complete_run_folder(evaluation):
 
 def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     folder, document, _ = evaluation
-    code, out, _ = uuv(capfd, "tree", str(folder), "--json")
+    code, out, _ = uuv(capfd, "presets", "show", "bt", "--run", str(folder), "--json")
     assert code == 0
     nodes = json.loads(out)["nodes"]
     assert nodes[0]["share"] == 1.0
@@ -485,13 +495,13 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     # the tree is ticked once when the episode begins and after every step
     assert nodes[0]["ticks"] == bt["env_steps"] + bt["episodes"]
     assert sum(n["acted"] for n in nodes) <= nodes[0]["ticks"]
-    code, _, err = uuv(capfd, "tree", str(folder), "--controller", "planner")
+    code, _, err = uuv(capfd, "presets", "show", "planner", "--run", str(folder))
     assert code == 2
-    assert "has no controller 'planner'" in err
-    code, out, _ = uuv(capfd, "tree", str(folder))
+    assert "has no tree 'planner'" in err
+    code, out, _ = uuv(capfd, "presets", "show", "bt", "--run", str(folder))
     assert code == 0 and "acted: control steps whose action the leaf set" in out
-    code, _, err = uuv(capfd, "tree", "bt")
-    assert code == 2 and "bt: is no run folder" in err and "uuv tree --controller bt" in err
+    code, _, err = uuv(capfd, "presets", "show", "bt", "--run", "bt")
+    assert code == 2 and "bt: is no run folder" in err
 
 
 def test_without_a_preset_the_papers_learner_trains(capfd, monkeypatch):
@@ -562,7 +572,7 @@ def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path,
     not listen."""
     folder = tmp_path / "run"
     process = subprocess.Popen(
-        [sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "400", "--seeds", "3",
+        [sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "400", "--seeds", "3",
         *SmallSim.OPTIONS,
          "--set", "episode.horizon_steps=400", "--record", "400", "--run-dir", str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

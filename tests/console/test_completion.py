@@ -45,10 +45,10 @@ def modules_after(*arguments, **environment):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["tree"], ["tree", "--dot", "--controller", "planner"], ["tree", "--json"]]
+    "arguments", [["show", "bt"], ["show", "planner", "--dot"], ["show", "bt", "--json"]]
 )
 def test_a_tree_is_printed_without_torch_and_taichi(arguments):
-    code, modules = modules_after(*arguments)
+    code, modules = modules_after("presets", *arguments)
     assert code == 0
     assert not {"torch", "taichi", "cv2"} & modules
 
@@ -151,13 +151,13 @@ def runs(tmp_path):
         (["eval", "--world", "mi"], ["mixed", "mine.yaml"]),
         (["eval", "--sensors", "n"], ["nominal"]),
         (["train", "curr"], ["curriculum"]),
-        (["tree", "--controller", "pl"], ["planner"]),
-        (["tree", "--controller", "mi"], ["mine.xml"]),
+        (["profile", "--agent", "pl"], ["planner"]),
+        (["profile", "--agent", "mi"], ["mine.xml"]),
         (["sweep", "--grid", "cau"], ["caution"]),
-        (["eval", "--controller", "bt,str"], ["bt,straight", "bt,straight+truth"]),
-        (["eval", "runs/f"], ["runs/first", "runs/first_eval/"]),
+        (["eval", "--agent", "bt,str"], ["bt,straight", "bt,straight+truth"]),
+        (["eval", "--agent", "runs/f"], ["runs/first", "runs/first_eval/"]),
         (["train", "--resume", "runs/"], ["runs/first", "runs/first_eval"]),
-        (["tree", "runs/"], ["runs/first/", "runs/first_eval"]),
+        (["presets", "show", "bt", "--run", "runs/"], ["runs/first/", "runs/first_eval"]),
         (["eval", "--device", ""], ["auto", "cpu", "cuda"]),
         (["presets", "show", "gau"], ["gauntlet"]),
         (["presets", "show", "train/p"], ["train/paper", "train/ppo"]),

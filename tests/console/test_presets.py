@@ -25,7 +25,9 @@ def test_the_list_has_every_preset_with_its_sentence(capfd):
 @pytest.mark.parametrize("kind", KINDS)
 def test_show_prints_what_a_preset_states_with_units_and_sources(kind, capfd):
     for name in preset_names(kind):
-        code, out, err = uuv(capfd, "presets", "show", f"{kind}/{name}")
+        code, out, err = uuv(
+            capfd, "presets", "show", f"{kind}/{name}", *(["--all"] if kind == "tree" else [])
+        )
         assert code == 0, err
         assert out == shipped_file(kind, name).read_text().rstrip("\n") + "\n"
         extends = "extends:" in out and kind != "tree"

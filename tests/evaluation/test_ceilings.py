@@ -7,7 +7,7 @@ import pytest
 
 from tests.command import uuv
 from tests.small_sim import SmallSim
-from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.episodes import Job
 from uuvtai.evaluation.evaluate import remainder_of, scenarios_of
 
@@ -28,7 +28,7 @@ COMMAND = ("eval", "--episodes", "3", "--seeds", str(SEED), *SmallSim.OPTIONS)
 
 def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
     code, out, err = uuv(
-        capfd, *COMMAND, "--controller", "bt,bt+truth,oracle", "--run-dir", str(tmp_path / "run"), "--json"
+        capfd, *COMMAND, "--agent", "bt,bt+truth,oracle", "--run-dir", str(tmp_path / "run"), "--json"
     )
     assert code == 0, err
     document = json.loads(out)
@@ -55,7 +55,7 @@ def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
 
 
 def test_the_oracle_alone_is_printed_with_a_dagger(borrowed, capfd, tmp_path):
-    code, out, err = uuv(capfd, *COMMAND, "--controller", "oracle", "--run-dir", str(tmp_path / "run"))
+    code, out, err = uuv(capfd, *COMMAND, "--agent", "oracle", "--run-dir", str(tmp_path / "run"))
     assert code == 0, err
     assert "oracle †" in out and "† oracle is privileged" in out
 
@@ -63,10 +63,10 @@ def test_the_oracle_alone_is_printed_with_a_dagger(borrowed, capfd, tmp_path):
 def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, capfd, tmp_path):
     """The rows of one evaluation do not leak into each other, whatever their order."""
     code, out, err = uuv(
-        capfd, *COMMAND, "--controller", "bt+truth,bt", "--run-dir", str(tmp_path / "a"), "--json"
+        capfd, *COMMAND, "--agent", "bt+truth,bt", "--run-dir", str(tmp_path / "a"), "--json"
     )
     assert code == 0, err
-    code, alone, err = uuv(capfd, *COMMAND, "--controller", "bt", "--run-dir", str(tmp_path / "b"), "--json")
+    code, alone, err = uuv(capfd, *COMMAND, "--agent", "bt", "--run-dir", str(tmp_path / "b"), "--json")
     assert code == 0, err
     truth, bt = json.loads(out)["methods"]
     assert (
@@ -78,17 +78,8 @@ def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, capfd, tmp_path)
 
 def test_failures_of_a_privileged_tree_are_replayed_with_the_truth(borrowed, capfd, tmp_path):
     """A replay that ended otherwise than the episode would be refused."""
-    command = (
-        *COMMAND,
-        "--controller",
-        "straight+truth,oracle",
-        "--explain",
-        "--explain-record",
-        "0",
-        "--run-dir",
-        str(tmp_path / "run"),
-    )
-    code, out, err = uuv(capfd, *command, "--json")
+    options = ["--agent", "straight+truth,oracle", "--explain", "--explain-record", "0", "--json"]
+    code, out, err = uuv(capfd, *COMMAND, *options, "--run-dir", str(tmp_path / "run"))
     assert code == 0, err
     straight, oracle = json.loads(out)["methods"]
     assert len(straight["explain"]) == 3 - straight["outcomes"]["success"] > 0
@@ -131,7 +122,7 @@ def test_scenarios_are_those_that_are_played_in_any_batch(small):
 def test_a_tree_of_the_users_own_may_have_a_plus_in_its_name(tmp_path):
     file = tmp_path / "mine+yours.xml"
     file.write_text('<root BTCPP_format="4"><BehaviorTree ID="t"><DriveStraight/></BehaviorTree></root>')
-    plain, answer = trees_of([str(file), f"{file}+truth"], 64)
+    plain, answer = load_agents([str(file), f"{file}+truth"], 64)
     assert (plain.name, plain.privileged, answer.name, answer.privileged) == (
         "mine+yours",
         False,

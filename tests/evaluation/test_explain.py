@@ -700,7 +700,7 @@ def request_of(small, tmp_path, monkeypatch):
 
     def build(**options):
         asked = {
-            "controllers": ["straight"],
+            "agents": ["straight"],
             "seeds": [3],
             "episodes": 6,
             "num_envs": small.N,

@@ -318,16 +318,14 @@ class Uuv:
 
 
 def printed(arguments):
-    options = next((i for i, part in enumerate(arguments) if part.startswith("--")), len(arguments))
-    policies = [part.rpartition("/")[2] for part in arguments[1:options]]
+    names = [arguments[i + 1].rpartition("/")[2] for i, part in enumerate(arguments) if part == "--agent"]
     if arguments[0] == "eval":
-        names = policies + [arguments[i + 1] for i, part in enumerate(arguments) if part == "--controller"]
         details = [
             {"seed": 1, "episode": i, "outcome": "success" if i < 50 else "timeout"} for i in range(100)
         ]
         return {"methods": [entry(50) | {"name": name, "episodes_detail": details} for name in names]}
     if arguments[0] == "sweep":
-        cells = [cell(8, 6, 0.6, method=name, success=90) for name in (*policies, "bt")]
+        cells = [cell(8, 6, 0.6, method=name, success=90) for name in names]
         return {"axes": {"S": [8], "D": [6], "v": [0.6]}, "cells": cells}
     if arguments[0] == "profile":
         row = {"num_envs": 1, "env_steps_per_s": {"step": 1.0, "step_inference": 1.0, "train": 1.0}}

@@ -50,7 +50,7 @@ def ask(small, tmp_path_factory):
 
     def request(folder, **others):
         given = {
-            "controllers": ["straight", str(second)],
+            "agents": ["straight", str(second)],
             "episodes": EPISODES,
             "seeds": [77],
             "num_envs": 2,
@@ -127,14 +127,14 @@ def test_a_line_that_a_kill_cut_off_and_a_lost_log_are_played_again(ask, whole, 
 
 def interrupted(ask, run, **others):
     with pytest.raises(KeyboardInterrupt):
-        compare(ask(run, **others), Watch("straight" if "controllers" not in others else "mine", 1))
+        compare(ask(run, **others), Watch("straight" if "agents" not in others else "mine", 1))
 
 
 def test_another_tree_under_the_same_name_is_refused(ask, tmp_path):
     tree = tmp_path / "mine.xml"
     tree.write_text(preset_path("tree", "straight").read_text())
     run = tmp_path / "run"
-    interrupted(ask, run, controllers=[str(tree)], record=0)
+    interrupted(ask, run, agents=[str(tree)], record=0)
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     tree.write_text(preset_path("tree", "planner").read_text())
     with pytest.raises(UserError, match="mine has changed since this evaluation began"):
@@ -147,6 +147,7 @@ def test_another_tree_under_the_same_name_is_refused(ask, tmp_path):
     [
         (REQUEST, b"{", "is no request"),
         (REQUEST, b"[1]", "is no request"),
+        (REQUEST, b'{"schema": 1, "controllers": ["bt"]}', "is no request of this version of 'uuv eval'"),
         (REQUEST, None, "cannot be read"),
         (results.JOURNAL_FILE, b'{"method": "straight"}\n', "line 1: is no finished episode"),
         (results.JOURNAL_FILE, b"\xff\xfe\n", "line 1: is no finished episode"),
@@ -176,7 +177,7 @@ def test_a_ledger_that_is_a_link_is_not_written_through(ask, tmp_path):
 def test_paths_of_the_request_are_found_from_another_folder(ask, tmp_path, monkeypatch):
     (tmp_path / "mine.xml").write_text(preset_path("tree", "straight").read_text())
     monkeypatch.chdir(tmp_path)
-    interrupted(ask, Path("run"), controllers=["mine.xml"], record=0)
+    interrupted(ask, Path("run"), agents=["mine.xml"], record=0)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     result, _ = resume(tmp_path / "run", Watch())

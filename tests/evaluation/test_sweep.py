@@ -99,7 +99,7 @@ def test_a_grid_file_says_what_is_wrong(tmp_path):
 @pytest.mark.parametrize("name", ["paper", "benchmark", "caution", "robustness", "dead_reckoning"])
 def test_shipped_grids_load_and_every_cell_has_a_config(name):
     request = asked(grid_of([name]))
-    tasks = tasks_of(request, [("bt", "bt", None)], set())
+    tasks = tasks_of(request, [("bt", "bt")], set())
     assert sum(len(task.labels) for task in tasks) == len(request.grid.cells())
 
 
@@ -109,16 +109,14 @@ def test_shipped_grids_load_and_every_cell_has_a_config(name):
 def asked(grid, **changes):
     given = {
         "grid": grid, "world": "pool", "sensors": None, "vehicle": None, "overrides": (),
-        "controllers": ("bt",), "policies": (),
+        "agents": ("bt",),
         "seeds": (3,), "episodes": 4,
     }  # fmt: skip
     return SweepRequest(**(given | changes))
 
 
 def test_one_simulator_serves_every_scene():
-    tasks = tasks_of(
-        asked(grid_of(["paper"]), episodes=64), [("bt", "bt", None), ("straight", "straight", None)], set()
-    )
+    tasks = tasks_of(asked(grid_of(["paper"]), episodes=64), [("bt", "bt"), ("straight", "straight")], set())
     assert len({task.config.model_dump_json() for task in tasks}) == 1
     assert (tasks[0].config.world.static_slots, tasks[0].config.world.dynamic_slots) == (16, 16)
     assert all(64 * len(task.scenes) <= 1024 for task in tasks)
@@ -129,7 +127,7 @@ def test_one_simulator_serves_every_scene():
 
 def test_other_axes_make_configs_of_their_own():
     request = asked(grid_of(["teacher.caution=0.5,2", "D=0,6"]))
-    tasks = tasks_of(request, [("bt", "bt", None)], set())
+    tasks = tasks_of(request, [("bt", "bt")], set())
     assert [task.config.teacher.caution for task in tasks] == [0.5, 2.0]
     assert tasks[1].labels == (
         {"S": 8, "D": 0, "v_m_s": None, "teacher.caution": 2},
@@ -193,7 +191,7 @@ class Canned:
             if self.stop_after is not None and len(self.ran) >= self.stop_after:
                 raise self.error
             self.ran.append(task)
-            yield number, [row(label, task.controller) for label in task.labels]
+            yield number, [row(label, task.agent) for label in task.labels]
 
 
 GRID = grid_of(["S=4,8,12", "D=0,6", "v=0.4,0.6"])
@@ -240,6 +238,13 @@ def test_a_policy_that_was_trained_on_is_refused(tmp_path):
 def test_only_a_sweeps_folder_is_resumed(tmp_path):
     with pytest.raises(RunFolderError, match="give the folder that 'uuv sweep' printed"):
         resume(tmp_path, Canned(), Quiet())
+    sweep(asked(GRID), Canned(), tmp_path / "old", Quiet())
+    file = tmp_path / "old/sweep_request.json"
+    old = json.loads(file.read_text())
+    del old["agents"]
+    file.write_text(json.dumps(old | {"controllers": ["bt"], "policies": []}))
+    with pytest.raises(RunFolderError, match="an older version of uuv wrote it; begin the sweep again"):
+        resume(tmp_path / "old", Canned(), Quiet())
 
 
 def test_two_processes_do_not_share_a_sweep(tmp_path, monkeypatch):
@@ -293,7 +298,7 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
     """To the last digit, also after SIGKILL."""
     place, command = (
         tmp_path / "sweep",
-        ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--controller", "bt", *OPTIONS],
+        ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--agent", "bt", *OPTIONS],
     )
     child = subprocess.Popen(
         [sys.executable, "-m", "uuvtai", *command, "--run-dir", str(place)],
@@ -326,8 +331,8 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
         (["--workers", "0"], "at least 1"),
         (["--resume", "/nosuch"], "give the folder that 'uuv sweep' printed"),
         (["--resume", "x", "--grid", "S=4"], "a resumed run keeps its own"),
-        (["nosuch"], "no trained policy"),
-        (["--controller", "nosuch"], "nosuch"),
+        (["nosuch"], "extra argument(s) (nosuch); now it is --agent NAME|FILE"),
+        (["--agent", "nosuch"], "nosuch"),
     ],
 )
 def test_bad_input_is_one_message_and_no_folder(arguments, said, tmp_path, capfd):

@@ -146,7 +146,7 @@ def test_a_resumed_training_goes_on_bit_for_bit(config, made):
     other = ForecastTrainer(config)
     other.load_state(held)
     other.iterate()
-    assert other.exported() == one.exported()
+    assert other.files() == one.files()
     for name, value in one.state()["env"].items():
         assert torch.equal(value, other.state()["env"][name])
 

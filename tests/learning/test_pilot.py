@@ -9,7 +9,7 @@ import torch
 
 from uuvtai.config.loader import load_training
 from uuvtai.envs.vector_env import VectorEnv
-from uuvtai.evaluation.agents import Method, features_of, find_policy, policies_of
+from uuvtai.evaluation.agents import Method, features_of, find_policy, load_agents
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
 from uuvtai.learning import checkpoint
 from uuvtai.learning.checkpoint import CheckpointError
@@ -145,7 +145,7 @@ def trained(small, tmp_path_factory):
 
 
 def pilot_of(folder, small):
-    (method,) = policies_of([str(folder)], 64, print)
+    (method,) = load_agents([str(folder)], 64, print)
     note = method.driver_for(small.sim)
     small.sim.use_tree(method.tree)
     return method, note
@@ -237,15 +237,15 @@ def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
         == by_step.sha256
         == checkpoint.sha256_of(folder / "checkpoints" / "step_000005" / "manifest.json")
     )
-    assert policies_of([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
+    assert load_agents([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
     assert features_of([str(folder)]) == [("features", config.features.model_dump(mode="json"))]
 
 
 def test_names_that_are_no_policy(trained, tmp_path):
     with pytest.raises(ValueError, match="is no trained policy"):
         find_policy(str(tmp_path))
-    with pytest.raises(ValueError, match="given twice"):
-        policies_of([str(trained[0])] * 2, 64, print)
+    with pytest.raises(ValueError, match="two rows would be called mine"):
+        load_agents([str(trained[0]), f"{trained[0]}/"], 64, print)
 
 
 def test_policies_with_other_columns_are_not_evaluated_together(trained, tmp_path):

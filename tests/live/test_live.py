@@ -344,8 +344,8 @@ def test_as_fast_as_it_goes():
         (("--rate", "nan"), "--rate nan"),
         (("--port", "70000"), "--port 70000"),
         (("--episodes", "-1"), "--episodes -1"),
-        (("--controller", "oracle"), "drives no vehicle"),
-        (("--controller", "nobody"), "'nobody' is no preset"),
+        (("--agent", "oracle"), "drives no vehicle"),
+        (("--agent", "nobody"), "--agent nobody: is no preset"),
     ],
 )
 def test_what_makes_no_sense_is_refused(typed, told, capfd):

@@ -153,7 +153,7 @@ def test_the_command_takes_speed_rate_and_width_and_tells_its_progress(tmp_path,
     out = tmp_path / "talk.gif"
     with pytest.raises(SystemExit) as left:
         main(
-            ["log", "video", str(logs[0]), "--out", str(out), "--speed", "3", "--fps", "5", "--width", "400"]
+            ["log", "render", str(logs[0]), "--out", str(out), "--speed", "3", "--fps", "5", "--width", "400"]
         )
     said = capfd.readouterr()
     assert left.value.code == 0 and said.out.strip() == str(out) and "frames" in said.err

@@ -436,14 +436,13 @@ def test_bags_of_other_kinds_are_named(names, why, tmp_path):
 
 def test_the_command(recorded, tmp_path, capfd):
     bag, out = tmp_path / "bag", tmp_path / "b.mcap"
-    assert run_cli("log", "convert", recorded, "--to", "rosbag2", "--out", bag) == 0
+    assert run_cli("log", "convert", recorded, "--out", bag) == 0
     assert run_cli("log", "convert", bag, "--from", "rosbag2", "--out", out) == 0
     assert f"{out}: {info(out)['messages']} messages\n" in capfd.readouterr().out
     for words, reason in (
-        (("--to", "ros"), "choose one of mcap, rosbag2"),
-        (("--from", "bag"), "choose one of mcap, rosbag2"),
-        (("--to", "rosbag2", "--from", "rosbag2"), "leave out --to"),
-        (("--to", "rosbag2", "--out", bag), "is a new folder"),
+        (("--to", "rosbag2"), "No such option: --to; now it is --from"),
+        (("--from", "bag"), "--from bag: use mcap or rosbag2"),
+        (("--out", bag), "is a new folder"),
         (("--from", "rosbag2", "--out", tmp_path / "c.mcap"), "none of the messages that can be read"),
     ):
         assert run_cli("log", "convert", recorded, *words) == 2

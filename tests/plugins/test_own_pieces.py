@@ -16,7 +16,7 @@ from uuvtai.common.errors import SettingError, UserError
 from uuvtai.config import Config, FeaturesConfig
 from uuvtai.config.loader import ConfigError
 from uuvtai.console import parsing
-from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.episodes import Job, Stepper, jobs_of, run_episodes
 from uuvtai.evaluation.evaluate import Request, compare, resume
 from uuvtai.evaluation.failure_causes import FailureRecorder
@@ -100,8 +100,8 @@ def test_what_is_no_piece_stays_what_it_was(text):
     [
         ("mine", "planner", "--planner 'mine': names no piece; for example --planner mine.py:plan"),
         ("mine.py:1x", "controller", "'1x' is no name of Python"),
-        ("model.onnx", "controller", "names no piece; for example --controller mine.py:act"),
-        ("policy:model.pt", "controller", "--policy 'model.pt': names no piece"),
+        ("model.onnx", "controller", "names no piece; for example --agent mine.py:act"),
+        ("policy:model.pt", "controller", "--agent 'model.pt': names no piece"),
     ],
 )
 def test_a_name_that_names_nothing_is_refused(text, kind, says):
@@ -109,21 +109,25 @@ def test_a_name_that_names_nothing_is_refused(text, kind, says):
         piece_spec(text, kind)
 
 
-def test_options_become_controllers_and_runs():
-    trained, names = parsing.drivers(["best"], ["bt,mine.py:act"], ["p.py"], ["m.onnx", "runs/first", "q.py"])
-    assert trained == ["best", "runs/first"]
-    assert names == ["bt", "controller:mine.py:act", "planner:p.py:plan", "policy:m.onnx", "policy:q.py:load"]
-    assert parsing.drivers(None, None, ["p.py"], None) == ([], ["bt", "planner:p.py:plan"])
-    assert parsing.drivers(None, ["none"], None, ["m.onnx"]) == ([], ["policy:m.onnx"])
-    assert parsing.drivers(None, None, None, None)[1] == ["straight", "planner", "bt"]
-    assert parsing.own_pieces(None, ["p.py"], None) == ["planner:p.py:plan"]
-    assert parsing.own_pieces(None, None, None) == [] and parsing.one_driver(None, None, None) is None
-    assert parsing.one_driver("mine.py", None, None) == "controller:mine.py:act"
-    for given in (("bt", ["p.py"], None), (None, ["p.py", "q.py"], None), (None, None, ["best"])):
+def test_options_become_names_of_agents():
+    typed = ["bt,mine.py:act", "best,bt", "m.onnx", "q.py:load=a,b", "q.py", "runs/first"]
+    assert parsing.agents(typed, ["p.py"], ["bt"]) == [
+        "bt", "controller:mine.py:act", "best", "policy:m.onnx", "policy:q.py:load=a,b",
+        "controller:q.py:act", "runs/first", "planner:p.py:plan",
+    ]  # fmt: skip
+    assert parsing.agents(["policy:q.py:net"], None, []) == ["policy:q.py:net"]
+    assert parsing.agents(None, ["p.py"], ["bt"]) == ["planner:p.py:plan"]
+    assert parsing.agents(None, None, ["straight", "bt"]) == ["straight", "bt"]
+    assert parsing.own_pieces(None, ["p.py"]) == ["planner:p.py:plan"]
+    assert parsing.own_pieces(None, None) == [] and parsing.one_agent(None, None) is None
+    assert parsing.one_agent("mine.py", None) == "controller:mine.py:act"
+    for given in (("bt", ["p.py"]), (None, ["p.py", "q.py"]), ("bt,best", None)):
         with pytest.raises(parsing.UsageError, match="give one of them"):
-            parsing.one_driver(*given)
+            parsing.one_agent(*given)
     with pytest.raises(parsing.UsageError, match="bt: is no piece of yours"):
-        parsing.own_pieces(["bt"], None, None)
+        parsing.own_pieces(["bt"], None)
+    with pytest.raises(parsing.UsageError, match="name who drives"):
+        parsing.agents([","], None, ["bt"])
 
 
 def test_two_rows_never_share_a_name(write):
@@ -131,7 +135,7 @@ def test_two_rows_never_share_a_name(write):
     Path("other").mkdir()
     write(AWAY, "other/mine.py")
     with pytest.raises(ConfigError, match="two rows would be called mine-act"):
-        trees_of(["controller:mine.py:act", "controller:other/mine.py:act"], 64)
+        load_agents(["controller:mine.py:act", "controller:other/mine.py:act"], 64)
 
 
 # ---------------------------------------------------------------------------------------------------- loading
@@ -145,7 +149,7 @@ def test_two_rows_never_share_a_name(write):
         (
             "x = 1\nprint(y)\n",
             "mine.py:act",
-            "mine.py:2: NameError: name 'y' is not defined (while --controller",
+            "mine.py:2: NameError: name 'y' is not defined (while --agent",
         ),
         ("raise SystemExit(3)\n", "mine.py:act", "mine.py:1: SystemExit: 3"),
         ("def drive(view): ...\n", "mine.py:act", "mine.py has no 'act'; it has drive"),
@@ -345,11 +349,9 @@ def test_an_exception_names_the_line_where_her_code_was(sim, write):
     assert (
         told.startswith("mine.py:4: KeyError: ") and "no column 'gaol'; there are goal, heading_error" in told
     )
-    assert told.endswith("(--controller mine.py:act)") and isinstance(refused.value.__cause__, KeyError)
+    assert told.endswith("(--agent mine.py:act)") and isinstance(refused.value.__cause__, KeyError)
     write("def act(view): ...\ndef reset(rows):\n    raise ValueError('no')\n", "other.py")
-    with pytest.raises(
-        PieceError, match=r"other.py:3: ValueError: no \(in reset of --controller other.py:act\)"
-    ):
+    with pytest.raises(PieceError, match=r"other.py:3: ValueError: no \(in reset of --agent other.py:act\)"):
         stepped(sim, "other.py:act")
 
 
@@ -509,7 +511,7 @@ def test_a_call_that_does_not_come_back_is_told_by_its_line(sim, write):
     driver.code.meter._stall_s = 0.01
     Stepper(sim, driver).reset(*(torch.ones(8, dtype=torch.int32) for _ in range(3)))
     own.close()
-    assert notes[0].startswith("mine.py:2: a call of --controller mine.py:act has not come back for")
+    assert notes[0].startswith("mine.py:2: a call of --agent mine.py:act has not come back for")
 
 
 def test_the_table_has_a_column_for_the_time_of_own_code():
@@ -541,8 +543,8 @@ def ask(small, monkeypatch, write):
 
     monkeypatch.setattr(small.sim, "reset", begin_late)
 
-    def request(folder, *controllers, **others):
-        given = {"controllers": [*controllers], "episodes": 2, "seeds": [77], "num_envs": 2, "device": "cpu"}
+    def request(folder, *agents, **others):
+        given = {"agents": [*agents], "episodes": 2, "seeds": [77], "num_envs": 2, "device": "cpu"}
         return Request(config=small.config, world="pool", sensors="paper", run_dir=folder, **given | others)
 
     yield request
@@ -562,7 +564,7 @@ def test_pieces_are_rows_beside_the_tree_with_logs_and_pictures(ask, write, tmp_
     assert {path.name for path in (folder / "logs").iterdir()} >= {"mine-act_seed77_episode0.mcap"}
     assert (folder / "pictures/seed77_episode0.png").stat().st_size > 1000
     kept = json.loads((folder / "eval/request.json").read_text())
-    assert kept["controllers"] == ["straight", *pieces] and len(kept["drivers"]["mine-act"]) == 64
+    assert kept["agents"] == ["straight", *pieces] and len(kept["drivers"]["mine-act"]) == 64
 
 
 def test_going_on_runs_code_of_a_folder_only_where_the_user_says_so(ask, write, tmp_path):
@@ -598,12 +600,10 @@ def test_failures_that_are_played_otherwise_are_told_and_left_out():
 
 def test_the_command_line_tells_in_one_line_and_keeps_the_traceback(write, capfd, tmp_path):
     write("def act(view):\n    return nothing\n\nprint(1 / 0)\n")
-    code, out, err = uuv(capfd, "eval", "--controller", "mine.py:act", "--episodes", "1", "--run-dir", "run")
+    code, out, err = uuv(capfd, "eval", "--agent", "mine.py:act", "--episodes", "1", "--run-dir", "run")
     assert code == 2 and out == "" and not Path("run").exists()
     line = err.strip().splitlines()[-1]
-    assert line.startswith(
-        "uuv: mine.py:4: ZeroDivisionError: division by zero (while --controller mine.py:act"
-    )
+    assert line.startswith("uuv: mine.py:4: ZeroDivisionError: division by zero (while --agent mine.py:act")
     kept = Path(line.rpartition("its traceback: ")[2])
     assert "print(1 / 0)" in kept.read_text()
     kept.unlink()
@@ -614,12 +614,12 @@ def test_the_command_line_tells_in_one_line_and_keeps_the_traceback(write, capfd
     [
         (["eval", "--planner", "none.py"], "none.py cannot be read"),
         (["eval", "--planner", "bt"], "--planner 'bt': names no piece; for example --planner mine.py:plan"),
-        (["sweep", "--policy", "none.onnx", "--grid", "D=0"], "none.onnx cannot be read"),
-        (["reproduce", "--controller", "bt"], "bt: is no piece of yours"),
+        (["sweep", "--agent", "none.onnx", "--grid", "D=0"], "none.onnx cannot be read"),
+        (["reproduce", "--agent", "bt"], "bt: is no piece of yours"),
         (["reproduce", "--planner", "none.py"], "none.py cannot be read"),
-        (["simulate", "--seconds", "1", "--controller", "none.py"], "none.py cannot be read"),
+        (["simulate", "--seconds", "1", "--agent", "none.py"], "none.py cannot be read"),
         (
-            ["simulate", "--seconds", "1", "--controller", "bt", "--wrench", "1,0,0,0,0,0"],
+            ["simulate", "--seconds", "1", "--agent", "bt", "--wrench", "1,0,0,0,0,0"],
             "--wrench: not beside",
         ),
     ],
@@ -792,4 +792,11 @@ def test_a_graph_with_too_few_outputs_is_told(sim, tmp_path, monkeypatch):
 
 
 def test_the_spec_of_a_command_is_what_a_request_keeps():
-    assert PieceSpec("policy", Path("m.onnx")).option == "--policy m.onnx" and "m/s" in COMMAND
+    for kind, file, name, option in (
+        ("policy", "m.onnx", "", "--agent m.onnx"),
+        ("policy", "m.py", "load", "--agent m.py:load"),
+        ("policy", "m.py", "net", "--agent policy:m.py:net"),
+        ("planner", "m.py", "plan", "--planner m.py:plan"),
+    ):
+        assert PieceSpec(kind, Path(file), name).option == option
+    assert "m/s" in COMMAND

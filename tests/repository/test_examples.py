@@ -15,7 +15,7 @@ from uuvtai.compile.runtime import start_taichi
 from uuvtai.config.loader import load_config
 from uuvtai.envs.gymnasium import UuvVectorEnv
 from uuvtai.envs.vector_env import VectorEnv
-from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
 from uuvtai.logs.run_folder import RunFolderError
 
@@ -225,7 +225,7 @@ OWN = {"own_astar.py": "planner", "own_field.py:act": "controller", "own_torch.p
 @pytest.mark.parametrize("name", OWN)
 def test_an_own_piece_drives(short, name):
     """It plays its episodes without an error, and gets nearer to the goal."""
-    method = trees_of([f"{OWN[name]}:{EXAMPLES / name}"], 64)[0]
+    method = load_agents([f"{OWN[name]}:{EXAMPLES / name}"], 64)[0]
     observed, short.planner = short.observation, method.planner_for(short)
     try:
         note = method.driver_for(short)
@@ -255,7 +255,7 @@ def test_own_astar_goes_around_what_is_in_the_way(example):
 
 @pytest.mark.parametrize("name", TRAINERS)
 def test_what_a_trainer_saved_drives_as_an_own_policy(short, example, tmp_path, name):
-    """``uuv eval --policy examples/own_NAME.py:load=FOLDER`` does what the trainer's own policy does."""
+    """``uuv eval --agent examples/own_NAME.py:load=FOLDER`` does what the trainer's own policy does."""
     pytest.importorskip(TRAINERS[name], reason=f"{TRAINERS[name]} is not installed")
     example(name).train(short, 0, tmp_path)
     spec = f"policy:{EXAMPLES / name.replace('train', 'own')}.py:load={tmp_path}"
@@ -263,7 +263,7 @@ def test_what_a_trainer_saved_drives_as_an_own_policy(short, example, tmp_path, 
     with torch.no_grad():
         expected = example(name).play(short, tmp_path)(obs)
     obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
-    driver = trees_of([spec], 64)[0].driver_for(short).pilot
+    driver = load_agents([spec], 64)[0].driver_for(short).pilot
     found = driver.decide(torch.from_numpy(obs)).action.numpy()
     np.testing.assert_allclose(found, np.clip(expected, -1, 1), rtol=1e-4, atol=1e-5)
     assert driver.code.marks.hold_steps == example("judge").HOLD_STEPS

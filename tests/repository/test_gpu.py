@@ -42,7 +42,7 @@ def state_after_200_steps(device, folder):
 
 def outcomes(device, folder):
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "64", "--num-envs", "64",
+        sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "64", "--num-envs", "64",
         "--device", device,
         "--run-dir", str(folder / f"run_{device}"), "--json",
     ]  # fmt: skip

@@ -65,21 +65,10 @@ def recordings(tmp_path_factory):
     """Logs of real evaluations by their preset of sensors, and what the evaluation printed for 'paper'."""
     folder = tmp_path_factory.mktemp("recorded")
     paper, printed = recorded(
-        folder / "paper", "--controller", "straight,bt", "--seeds", "7,3", "--episodes", "2", "--record", "3"
+        folder / "paper", "--agent", "straight,bt", "--seeds", "7,3", "--episodes", "2", "--record", "3"
     )
-    clean, _ = recorded(
-        folder / "clean",
-        "--controller",
-        "bt",
-        "--sensors",
-        "clean",
-        "--seeds",
-        "3",
-        "--episodes",
-        "1",
-        "--record",
-        "1",
-    )
+    once = ["--agent", "bt", "--sensors", "clean", "--seeds", "3", "--episodes", "1", "--record", "1"]
+    clean, _ = recorded(folder / "clean", *once)
     return {"paper": paper, "clean": clean, "printed": printed}
 
 

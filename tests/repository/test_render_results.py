@@ -99,11 +99,11 @@ def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
     document = {"axes": {"S": [8], "D": [0, 9], "v": [0.6, 1.5]}, "seeds": [7], "episodes_per_seed": 40}
     (tmp_path / "sweep.json").write_text(json.dumps(document | {"cells": cells}))
     record = {"git_sha": "abc", "started": "today", "hardware": {"cpu": "a"}}
-    record["argv"] = ["uuv", "sweep", "--controller", "bt", "--run-dir", "runs/a b", "--json"]
+    record["argv"] = ["uuv", "sweep", "--agent", "bt", "--run-dir", "runs/a b", "--json"]
     (tmp_path / "run.json").write_text(json.dumps(record))
     render_results.keep_sweep("pool", tmp_path, copy)
     kept = json.loads((copy / SWEEPS).read_text())["pool"]
-    assert (kept["commit"], kept["command"]) == ("abc", "uuv sweep --controller bt")
+    assert (kept["commit"], kept["command"]) == ("abc", "uuv sweep --agent bt")
     low, high = Share(39, 40).interval
     assert f"`bt` | 117/120 = 97.5 % [{100 * low - 1:.0f}" in render_results.grid(copy), (low, high)
     with pytest.raises(KeyError):

@@ -305,7 +305,7 @@ def test_xml(here, text, says, told):
     with pytest.raises(TreeError, match=says):
         parse_tree(text)
     (here / "evil.xml").write_text(text)
-    answer = told("tree", "--controller", here / "evil.xml")
+    answer = told("presets", "show", here / "evil.xml")
     assert re.search(says, answer) and "evil.xml:" in answer and "root:" not in answer
 
 
@@ -605,7 +605,7 @@ def test_the_trees_of_an_evaluation(here, name, told):
     (here / "secret.xml").write_text((PACKAGE / "presets/trees/straight.xml").read_text())
     (here / "run/eval/trees/link.xml").symlink_to(here / "secret.xml")
     (here / "run/eval/tree.json").write_bytes(content)
-    assert says in told("tree", here / "run", "--controller", name if use_of(name) == content else "bt")
+    assert says in told("presets", "show", name if use_of(name) == content else "bt", "--run", here / "run")
 
 
 # ------------------------------------------------------------------------------------------ exported policies
@@ -779,8 +779,8 @@ COMMANDS = (
     ("log", "info"),
     ("log", "export", "--out", "out"),
     ("log", "repair"),
-    ("log", "picture"),
-    ("log", "video"),
+    ("log", "render", "--out", "a.png"),
+    ("log", "render", "--out", "a.webm"),
     ("log", "convert"),
 )
 

@@ -225,6 +225,6 @@ def test_doctor_asks_no_server(uuv, tmp_path):
 
 def test_an_evaluation_asks_no_server(uuv):
     result = json.loads(
-        uuv("eval", "--controller", "bt", "--episodes", "2", "--seeds", "3", *SmallSim.OPTIONS, "--json")
+        uuv("eval", "--agent", "bt", "--episodes", "2", "--seeds", "3", *SmallSim.OPTIONS, "--json")
     )
     assert sum(result["methods"][0]["outcomes"].values()) == 2

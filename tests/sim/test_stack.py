@@ -7,14 +7,14 @@ import pytest
 
 from tests.command import Quiet
 from uuvtai.config.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
-from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.evaluate import Request, compare
 
 
-def test_a_stacks_name_is_a_controller_with_its_own_config_and_tree(tmp_path):
+def test_a_stacks_name_is_an_agent_with_its_own_config_and_tree(tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text("extends: paper\ntree: planner\n")
-    bt, paper, with_truth, own = trees_of(["bt", "paper", "paper+truth", str(mine)], 64)
+    bt, paper, with_truth, own = load_agents(["bt", "paper", "paper+truth", str(mine)], 64)
     config = load_config("pool")
     assert (bt.name, bt.stack, bt.document()) == ("bt", None, {}) and bt.config_of(config) is config
     assert (paper.name, paper.privileged, paper.tree.types) == ("paper", False, bt.tree.types)
@@ -27,11 +27,13 @@ def test_a_stacks_name_is_a_controller_with_its_own_config_and_tree(tmp_path):
     ) and own.tree.types != bt.tree.types
 
 
-def test_a_controller_that_is_neither_tree_nor_stack_is_refused():
-    with pytest.raises(ConfigError, match="'papr' is no preset of a tree or a stack; did you mean 'paper'"):
-        trees_of(["papr"], 64)
+def test_an_agent_that_is_neither_preset_nor_file_is_refused():
+    with pytest.raises(
+        ConfigError, match="--agent papr: is no preset, file or run folder; did you mean 'paper'"
+    ):
+        load_agents(["papr"], 64)
     with pytest.raises(ConfigError, match=r"nowhere.yaml.*no such file"):
-        trees_of(["nowhere.yaml"], 64)
+        load_agents(["nowhere.yaml"], 64)
 
 
 def test_a_stack_touches_nothing_that_makes_an_episode():
@@ -61,7 +63,7 @@ def compared(small, tmp_path_factory):
     is kept."""
     asked = []
     request = Request(
-        config=small.config, world="pool", sensors="paper", controllers=["bt", "paper"], seeds=[5],
+        config=small.config, world="pool", sensors="paper", agents=["bt", "paper"], seeds=[5],
         episodes=3, num_envs=small.N,
         record=1, device="cpu", run_dir=tmp_path_factory.mktemp("runs") / "run",
     )  # fmt: skip

@@ -373,7 +373,7 @@ def without(*names):
         (without("/action"), "has no /action"),
         (without("config.yaml"), "no attachment config.yaml"),
         (without("scenario.json"), "no attachment scenario.json"),
-        (without("tree.xml"), "--controller bt"),
+        (without("tree.xml"), "--agent bt"),
         (lambda kind, name, data: b"{a: [" if name == "config.yaml" else data, "config.yaml cannot be used"),
         (lambda kind, name, data: b"{}" if name == "/sensors/imu" else data, "not as its schema says"),
         (
@@ -458,7 +458,7 @@ def test_the_command_fails_where_commands_differ(log, build, monkeypatch, capfd)
         (["LOG", "--jitter", "-1"], "--jitter -1"),
         (["LOG", "--lose", "gps:1:2"], "--lose gps:1:2"),
         (["LOG", "--fault-seed", "-1"], "--fault-seed"),
-        (["LOG", "--controller", "nobody"], "nobody"),
+        (["LOG", "--agent", "nobody"], "nobody"),
     ],
 )
 def test_wrong_arguments_are_refused_in_one_line(log, capfd, arguments, said):

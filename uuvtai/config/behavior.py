@@ -286,7 +286,7 @@ def log_bounds() -> tuple[list[float], list[float]]:
 
 def configured_factors(slow: SlowConfig, fast: FastConfig) -> np.ndarray:
     """(n_tuned, 2) natural logarithms of their factors, float32."""
-    import numpy as np
+    import numpy as np  # not for the commands that read presets
 
     factors = [[getattr(part, number.name) for part in (slow, fast)] for number in TUNED]
     return np.log(np.array(factors)).astype(np.float32)

@@ -254,3 +254,9 @@ class LearningConfig(Config):
     tuner: TunerConfig = TunerConfig()
     forecaster: ForecasterConfig = ForecasterConfig()
     train: TrainConfig = TrainConfig()
+
+    @property
+    def learner(self) -> str:
+        """Section that says what is learned: forecaster, tuner or twin; else policy, in the simulator."""
+        sections = {"forecaster": self.forecaster, "tuner": self.tuner, "twin": self.twin}
+        return next((name for name, section in sections.items() if section.enabled), "policy")

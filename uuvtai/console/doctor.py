@@ -216,7 +216,7 @@ def copy_examples(folder: Path) -> list[Path]:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What ``uuv doctor`` found and ``uuv warm`` compiled, line by line.
+# What ``uuv doctor`` found and ``--compile`` compiled, line by line.
 
 
 _OK, _BAD = Cell("ok", style="green"), Cell("BAD", style="red")

@@ -86,10 +86,19 @@ class SceneGroup(SceneOptions):
     world: opt.World = "pool"
     sensors: opt.Sensors = None
     vehicle: opt.Vehicle = None
-    stack: opt.Stack = None
     n_static: opt.Static = None
     n_dynamic: opt.Dynamic = None
     speed_m_s: opt.Speed = None
+    overrides: opt.Set = None
+
+
+@dataclass(frozen=True)
+class ProfileSceneGroup(SceneOptions):
+    """Where, and with which vehicle, an agent is timed."""
+
+    world: opt.World = "pool"
+    sensors: opt.Sensors = None
+    vehicle: opt.Vehicle = None
     overrides: opt.Set = None
 
 
@@ -99,7 +108,6 @@ class TrainSceneGroup(SceneOptions):
 
     world: opt.TrainWorld = None
     sensors: opt.TrainSensors = None
-    stack: opt.Stack = None
     n_static: opt.Static = None
     n_dynamic: opt.Dynamic = None
     speed_m_s: opt.Speed = None
@@ -107,65 +115,49 @@ class TrainSceneGroup(SceneOptions):
 
 
 @dataclass(frozen=True)
-class DriversGroup:
-    """Who drives: trained policies, controllers, the user's own pieces."""
+class AgentsGroup:
+    """Who drives, in every table of an evaluation."""
 
-    runs: opt.EvalRuns = None
-    controller: opt.EvalControllers = None
+    agent: opt.Agents = None
     planner: opt.Planners = None
-    policy: opt.Policies = None
+    default = ("straight", "planner", "bt")
 
-    def named(self, default: list[str] | None = None) -> tuple[list[str], list[str]]:
-        """(trained policies, controllers with the user's own pieces among them); ``default``: the
-        controllers where none is typed. UsageError."""
-        return parsing.drivers(self.runs, self.controller or default, self.planner, self.policy)
-
-
-@dataclass(frozen=True)
-class WatchDriversGroup(DriversGroup):
-    """As ``DriversGroup``; by default one of them alone."""
-
-    controller: opt.WatchControllers = None
-
-    def named(self, default: list[str] | None = None) -> tuple[list[str], list[str]]:
-        """As ``DriversGroup.named``: beside somebody else nobody, else the tree."""
-        others = self.runs or self.planner or self.policy
-        return super().named(default or (["none"] if others else ["bt"]))
+    def named(self) -> list[str]:
+        """All of them; the default where nobody is typed. UsageError."""
+        return parsing.agents(self.agent, self.planner, self.default)
 
 
 @dataclass(frozen=True)
-class SweepDriversGroup(DriversGroup):
-    """As ``DriversGroup``."""
+class AgentsOrTreeGroup(AgentsGroup):
+    """As ``AgentsGroup``; by default the tree alone."""
 
-    runs: opt.SweepRuns = None
-    controller: opt.SweepControllers = None
+    agent: opt.AgentsOrTree = None
+    default = ("bt",)
 
 
 @dataclass(frozen=True)
-class DriverGroup:
+class AgentGroup:
     """Who drives one vehicle."""
 
-    controller: opt.DrivenBy = None
+    agent: opt.SimulateAgent = None
     planner: opt.Planners = None
-    policy: opt.Policies = None
 
     @property
     def one(self) -> str | None:
         """Its name; None = nobody. UsageError for several."""
-        return parsing.one_driver(self.controller, self.planner, self.policy)
+        return parsing.one_agent(self.agent, self.planner)
 
 
 @dataclass(frozen=True)
 class PiecesGroup:
     """The user's own pieces, and nothing else."""
 
-    controller: opt.OwnControllers = None
+    agent: opt.OwnAgents = None
     planner: opt.Planners = None
-    policy: opt.Policies = None
 
     def named(self) -> list[str]:
         """UsageError for what is no piece of hers."""
-        return parsing.own_pieces(self.controller, self.planner, self.policy)
+        return parsing.own_pieces(self.agent, self.planner)
 
 
 @dataclass(frozen=True)
@@ -235,6 +227,31 @@ class MotionGroup:
 
 
 @dataclass(frozen=True)
+class CompileGroup:
+    """What is compiled in advance."""
+
+    compile: opt.Compile = False
+    num_envs: opt.BatchSizes = "1,8,64,256"
+    world: opt.World = "pool"
+    sensors: opt.WarmSensors = "nominal,paper"
+    overrides: opt.Set = None
+    workers: opt.WarmWorkers = 0
+
+    def made(self) -> list[dict[str, Any]]:
+        """Compile; an entry per size and sensors. UsageError, ConfigError."""
+        from uuvtai.envs import warm_up
+
+        sizes = parsing.integers("--num-envs", self.num_envs)
+        parsing.refuse_less("--workers", self.workers, 0)
+        scenes = [
+            SceneOptions(self.world, name, overrides=self.overrides) for name in self.sensors.split(",")
+        ]
+        shapes = warm_up.shapes_of(scenes, sizes)
+        say(f"sizes to compile: {len(shapes)}, about a minute each the first time")
+        return warm_up.warm(shapes, self.workers or None)
+
+
+@dataclass(frozen=True)
 class FaultsGroup:
     """What happens to the messages of the sensors."""
 
@@ -256,7 +273,7 @@ class SeenSceneGroup(SceneOptions):
     """What a pilot on a vehicle is told of its world, vehicle and sensors."""
 
     world: opt.World = "pool"
-    sensors: opt.Sensors = "multibeam"
+    sensors: opt.SeenSensors = "multibeam"
     vehicle: opt.Vehicle = None
     overrides: opt.Set = None
 
@@ -266,28 +283,12 @@ class SitlSceneGroup(SceneOptions):
     """What ArduSub meets."""
 
     world: opt.World = "pool"
-    sensors: opt.Sensors = "multibeam"
-    vehicle: opt.Vehicle = "bluerov2_16v"
+    sensors: opt.SeenSensors = "multibeam"
+    vehicle: opt.BaseVehicle = "bluerov2_16v"
     n_static: opt.Static = None
     n_dynamic: opt.Dynamic = None
     speed_m_s: opt.Speed = None
     overrides: opt.Set = None
-
-
-@dataclass(frozen=True)
-class StackGroup:
-    """The whole stack of a log as a folder of native code."""
-
-    stack: opt.ExportStack = None
-    machines: opt.ExportFor = "x86_64,aarch64"
-
-    def written(self, log: str | None) -> dict[str, Any] | None:
-        """What was written, where it was asked for. Raises LogError, StackExportError, CrossError."""
-        if log is None or self.stack is None:
-            return None
-        from uuvtai.evaluation.agents import export_log
-
-        return export_log(Path(log), self.stack, self.machines.split(","))
 
 
 @dataclass(frozen=True)
@@ -394,3 +395,30 @@ class PlainOutputGroup(OutputGroup):
     """Of what is no table."""
 
     wide: bool = False
+
+
+# ------------------------------------------------------------------------------------------------------------
+# The help of ``uuv`` itself: one line a command.
+
+
+_GROUPS = {
+    "Run": ("eval", "sweep", "watch"),
+    "Learn": ("train", "export"),
+    "Look": ("report", "log", "presets", "doctor", "examples"),
+    "Paper": ("reproduce", "profile"),
+    "Vehicle": ("pilot", "sitl", "identify", "replay", "simulate"),
+}
+
+
+class Commands(typer.core.TyperGroup):
+    """All commands, in groups."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """As ``uuv -h`` prints it."""
+        lines = ["Usage: uuv COMMAND [OPTIONS]    (uuv COMMAND -h: its options)", "", self.help or "", ""]
+        for title, names in _GROUPS.items():
+            for name in names:
+                head = typer.style(f"{title if name == names[0] else '':9}", bold=True)
+                lines.append(f"{head}{name:11}{self.commands[name].get_short_help_str(60)}")
+        lines += ["", "Options: -h, --version, --install-completion, --show-completion", self.epilog or ""]
+        formatter.write("\n".join(lines) + "\n")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,54 +70,45 @@ def refuse_no_duration(option: str, seconds: float) -> None:
         raise UsageError(f"{option} {seconds}: must be a positive number, for example {option} 10")
 
 
-def drivers(
-    runs: list[str] | None, controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
-) -> tuple[list[str], list[str]]:
-    """(trained policies, controllers with the user's own pieces among them) of RUN, --controller, --planner
-    and --policy; a --policy that is no file of hers is a RUN."""
-    from uuvtai.plugins.api import CONTROLLER, PLANNER, POLICY, is_piece, piece_spec
+def agents(given: list[str] | None, planner: list[str] | None, default: Sequence[str]) -> list[str]:
+    """Names of --agent, each alone or several with commas between; of --planner a row each. ``default``:
+    where neither is typed."""
+    from uuvtai.plugins.api import PLANNER, is_piece, piece_spec
 
-    trained = [*(runs or []), *(name for name in policy or [] if not is_piece(name))]
-    own = [piece_spec(name, PLANNER).text for name in planner or []]
-    own += [piece_spec(name, POLICY).text for name in policy or [] if is_piece(name)]
-    named = controllers(controller, bool(trained or own))
-    found = [piece_spec(name, CONTROLLER).text if is_piece(name) else name for name in named]
-    return trained, [*found, *own]
+    whole = (part for item in given or (default if not planner else []) for part in _parted(item))
+    names = [piece_spec(name).text if is_piece(name) else name for name in whole]
+    names += [piece_spec(name, PLANNER).text for name in planner or []]
+    if not names:
+        raise UsageError("--agent: name who drives, for example --agent bt")
+    return list(dict.fromkeys(names))
 
 
-def own_pieces(
-    controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
-) -> list[str]:
+def _parted(item: str) -> list[str]:
+    """Names with commas between; a text after = and a path that is there may hold commas of their own."""
+    is_one = "=" in item or Path(item).exists()
+    return [item] if is_one else [name for name in item.split(",") if name]
+
+
+def own_pieces(given: list[str] | None, planner: list[str] | None) -> list[str]:
     """The user's own pieces where nothing else may be named."""
     from uuvtai.plugins.api import is_piece
 
-    given = [*(controller or []), *(policy or [])]
-    strange = [name for name in given if not is_piece(name)]
-    if strange:
-        raise UsageError(f"{strange[0]}: is no piece of yours, for example --controller mine.py:act")
-    _trained, found = drivers(None, controller or ["none"], planner, policy) if given or planner else ([], [])
+    if not (given or planner):
+        return []
+    found = agents(given, planner, [])
+    if strange := [name for name in found if not is_piece(name)]:
+        raise UsageError(f"{strange[0]}: is no piece of yours, for example --agent mine.py:act")
     return found
 
 
-def one_driver(controller: str | None, planner: list[str] | None, policy: list[str] | None) -> str | None:
+def one_agent(given: str | None, planner: list[str] | None) -> str | None:
     """Who drives one vehicle; None = nobody."""
-    if controller is None and not planner and not policy:
+    if given is None and not planner:
         return None
-    trained, found = drivers(None, [controller or "none"], planner, policy)
-    if trained or len(found) != 1:
-        raise UsageError("--controller, --planner, --policy: give one of them, once: one vehicle is driven")
+    found = agents([given] if given else None, planner, [])
+    if len(found) != 1:
+        raise UsageError("--agent, --planner: give one of them, once: one vehicle is driven")
     return found[0]
-
-
-def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
-    """Names typed with --controller; without any all three, or the tree alone beside a policy."""
-    default = ["bt"] if has_policies else ["straight", "planner", "bt"]
-    names = [name for item in given or default for name in item.split(",") if name]
-    if has_policies and names == ["none"]:
-        return []
-    if not names:
-        raise UsageError("--controller: name at least one of straight, planner, bt or a tree's XML")
-    return names
 
 
 def refuse_odd_rate(rate: float) -> None:
@@ -137,6 +129,33 @@ OF_A_SWEEP_RESUMED = (
     "allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device",
 )  # fmt: skip
 """what is not refused beside ``--resume`` of a sweep"""
+
+_TODAY = {
+    "--controller": "--agent NAME",
+    "--policy": "--agent FILE",
+    "--stack": "--agent NAME, or --set stack=NAME for all agents; of 'uuv export': --out",
+    "-v": "--speed",
+    "--to": "--from",
+    "warm": "uuv doctor --compile",
+    "tree": "uuv presets show bt",
+    "picture": "uuv log render FILE",
+    "video": "uuv log render FILE --out NAME.webm",
+}
+"""what older versions took, and what says it now"""
+
+
+def telling_new_names(app: Callable[..., Any], arguments: list[str] | None) -> Any:
+    """Run the program; the refusal of an old name tells the new one."""
+    try:
+        return app(args=arguments, prog_name="uuv", standalone_mode=False)
+    except UsageError as error:
+        found = re.match(r"No such (?:option: |command ')(-*\w+)|Got unexpected extra", error.message)
+        drives = error.ctx is not None and any(p.name == "agent" for p in error.ctx.command.params)
+        if found and (now := _TODAY.get(found[1]) if found[1] else "--agent NAME|FILE" if drives else None):
+            error.message = f"{error.message.rstrip('.')}; now it is {now}"
+        raise
+
+
 _OF_EVERY_RESUME = ("resume", "with_report", "wide", "as_json")
 
 
@@ -169,7 +188,9 @@ Complete = Callable[[str], list[str]]
 """From what is typed so far to what it may become."""
 
 
-def choice(option: str, values: tuple[str, ...], help_text: str, meant: dict[str, str] | None = None) -> Any:
+def choice(
+    option: str, values: tuple[str, ...], help_text: str, meant: dict[str, str] | None = None, **shown: Any
+) -> Any:
     """Option whose values are listed in the help, completed by the shell, and checked as soon as the command
     line is read."""
 
@@ -182,14 +203,15 @@ def choice(option: str, values: tuple[str, ...], help_text: str, meant: dict[str
             raise UsageError(f"{option} {value}: use {', '.join(values[:-1])} or {values[-1]}{hint}")
         return value
 
+    words = "|".join(values)
     return typer.Option(
-        option, metavar="|".join(values), help=help_text, callback=check, autocompletion=_among(values)
+        option, metavar=words, help=help_text, callback=check, autocompletion=_among(values), **shown
     )
 
 
-def device() -> Any:
+def device(**shown: Any) -> Any:
     """``--device``."""
-    return choice("--device", DEVICES, "Where to compute; auto takes a GPU if there is one.", _MEANT)
+    return choice("--device", DEVICES, "Where to compute; auto takes a GPU if there is one.", _MEANT, **shown)
 
 
 def names(kind: str) -> str:
@@ -208,15 +230,18 @@ def presets(kind: str, *more: str, suffix: str = ".yaml") -> Complete:
     return complete
 
 
-def controller_choices(incomplete: str) -> list[str]:
-    """Trees, stacks, yardsticks that know the truth, and files of trees and stacks; after a comma the
-    next one."""
+def agent_names(incomplete: str) -> list[str]:
+    """Trees, stacks, the oracle, files and run folders; after a comma the next one."""
     before, comma, last = incomplete.rpartition(",")
     trees = preset_names("tree")
     found = _starting(
-        [*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle", "none"], last
-    ) + _paths(last, lambda path: path.suffix in (".xml", ".yaml", ".py"))
+        [*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle"], last
+    ) + _paths(last, lambda path: path.suffix in (".xml", ".yaml", ".py", ".onnx") or _is_trained(path))
     return [f"{before}{comma}{name}" for name in found]
+
+
+def _is_trained(path: Path) -> bool:
+    return (path / "checkpoints").is_dir()
 
 
 def files(*suffixes: str) -> Complete:

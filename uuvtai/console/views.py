@@ -8,7 +8,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.text import Text
@@ -22,6 +22,9 @@ from uuvtai.report.evaluation import DAGGER, causes_table, methods_table, paired
 from uuvtai.report.sweep import cell_table
 from uuvtai.report.tables import Column, Table, bodies, number, sensing, varies_alone, varying, vehicle
 from uuvtai.report.timing import density_table, latency_table
+
+if TYPE_CHECKING:
+    from uuvtai.sim.behavior_tree import TreeReport
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
@@ -265,14 +268,16 @@ def show_stated(kind: str, name: str, as_json: bool) -> None:
         say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
 
 
-def kind_and_name(action: str, name: str | None) -> tuple[str, str]:
-    """(kind, name) of 'NAME' or 'KIND/NAME' after ``show``; a path is taken for a world's. UsageError for
-    another action, and for a name that no kind has."""
+def kind_and_name(action: str, name: str | None, run: Path | None = None) -> tuple[str, str]:
+    """(kind, name) of 'NAME' or 'KIND/NAME' after ``show``; a path is taken for a tree's or a world's, any
+    name for a tree of an evaluation's ``run``. UsageError for another action, or a name that no kind has."""
     if action != "show" or not name:
         raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
     kind, slash, rest = name.partition("/")
     if slash and kind in KINDS:
         return kind, rest
+    if run is not None or name.endswith(".xml"):
+        return "tree", name
     kinds = [kind for kind in KINDS if name in preset_names(kind)]
     for other in kinds[1:]:
         say(f"there is another one: uuv presets show {other}/{name}")
@@ -512,7 +517,7 @@ _ENGINES = (
 
 
 def show_stack(document: dict[str, Any]) -> None:
-    """What ``uuv export --stack`` wrote."""
+    """What ``uuv export LOG`` wrote."""
     size = f"{document['bytes'] / 2**20:.1f} MiB"
     machines = " and ".join(document["machines"])
     say(f"wrote {document['folder']} ({size}): {document['kernels']} kernels for {machines}")
@@ -562,9 +567,16 @@ _NODES = (
 _TREE_LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
 
 
+def show_tree_report(screen: Screen, report: TreeReport, dot: bool) -> None:
+    """As DOT, as text, or with the use of its nodes where that is known."""
+    if dot or not report.is_used:
+        typer.echo(plain(report.dot if dot else report.text))
+    else:
+        show_tree(screen, report.text, report.document["nodes"])
+
+
 def show_tree(screen: Screen, text: str, nodes: list[dict[str, Any]]) -> None:
-    """One row per line of ``text``, for ``nodes`` of a ``uuv tree RUN --json`` document. Actions alone can
-    act."""
+    """One row per line of ``text``, for ``nodes`` with their use in an evaluation. Actions alone can act."""
     total = max(1, sum(node["acted"] for node in nodes))
     rows = []
     for line, node in zip(text.split("\n"), nodes, strict=True):

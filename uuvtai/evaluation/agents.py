@@ -75,22 +75,11 @@ class Method:
             return None if driver is None else PolicyNote(driver, self.own.sha256, None)
         if self.checkpoint is None:
             return None
-        from uuvtai.envs.vector_env import VectorEnv
-        from uuvtai.learning.policy_agent import load_pilot, refuse_forecaster
+        from uuvtai.learning.agents import load_driver
         from uuvtai.logs.writer import PolicyNote
 
-        if self.checkpoint.config.tuner.enabled:
-            from uuvtai.learning.agents import load_tuned
-
-            return PolicyNote(load_tuned(self.checkpoint, sim), self.checkpoint.sha256, None)
-        if self.checkpoint.config.twin.enabled:
-            from uuvtai.learning.agents import load_set_pilot
-
-            return PolicyNote(load_set_pilot(self.checkpoint, sim), self.checkpoint.sha256, None)
-        refuse_forecaster(self.checkpoint)
-        self.checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
+        pilot = load_driver(self.checkpoint, sim)
         weight = self.checkpoint.manifest.metrics.get("distill/lambda")
-        pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
         return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
 
     def planner_for(self, sim: Sim) -> RoutePlanner | None:
@@ -118,25 +107,35 @@ class Method:
         }
 
 
-def trees_of(names: list[str], max_node: int) -> list[Method]:
-    """Methods that a tree drives, by names of trees or stacks or paths of their XML or YAML, each perhaps
-    with ``+truth``; and those of the user's own pieces. ConfigError, PieceError."""
+def load_agents(
+    names: Sequence[str], max_node: int, note: Callable[[str], None] = lambda _text: None
+) -> list[Method]:
+    """Every kind of agent by the name that ``--agent`` takes: trees and stacks, each perhaps with ``+truth``,
+    the user's own pieces, trained policies. ``note`` is told of checkpoints that were left out. Raises
+    ConfigError, CheckpointError, PieceError."""
     found: dict[str, Method] = {}
-    for name in names:
-        if is_piece(name):
-            method = _own_method(name, max_node)
-            if method.name in found:
-                raise ConfigError(
-                    f"{name}: two rows would be called {method.name}; rename a file or its function"
-                )
-            found[method.name] = method
-            continue
-        driver, privileged = _parted(name)
-        label = f"{_label(driver)}+{TRUTH}" if privileged else _label(driver)
-        stack = driver if _is_stack(driver) else None
-        tree = tree_of_stack(driver) if stack else driver
-        found[label] = Method(label, read_tree(tree, max_node), privileged=privileged, stack=stack)
+    for name in dict.fromkeys(names):
+        agent = _load(name, max_node, note)
+        if agent.name in found:
+            raise ConfigError(
+                f"--agent {name}: two rows would be called {agent.name}; rename a file, a function or a run "
+                "folder, or evaluate them one by one"
+            )
+        found[agent.name] = agent
     return list(found.values())
+
+
+def _load(name: str, max_node: int, note: Callable[[str], None]) -> Method:
+    if is_piece(name):
+        return _own_method(name, max_node)
+    if is_trained(name):
+        checkpoint = find_policy(name, note)
+        return Method(policy_name(name, checkpoint), read_tree(TRAINING_TREE, max_node), checkpoint)
+    driver, privileged = _parted(name)
+    label = f"{_label(driver)}+{TRUTH}" if privileged else _label(driver)
+    stack = driver if _is_stack(driver) else None
+    tree = tree_of_stack(driver) if stack else driver
+    return Method(label, read_tree(tree, max_node), privileged=privileged, stack=stack)
 
 
 def _own_method(name: str, max_node: int) -> Method:
@@ -150,40 +149,27 @@ def _own_method(name: str, max_node: int) -> Method:
     return Method(found.label, read_tree(TRAINING_TREE, max_node), own=found)
 
 
+def is_trained(name: str) -> bool:
+    """Whether an agent's name is that of a run folder or a checkpoint folder; names of presets come first."""
+    return name not in (*preset_names("tree"), *preset_names("stack")) and Path(name).is_dir()
+
+
 def _is_stack(name: str) -> bool:
-    """Whether a controller's name is that of a stack preset, or a path of one; ConfigError for what is
-    neither tree nor stack."""
+    """Whether an agent's name is that of a stack preset, or a path of one; ConfigError for what is neither
+    tree nor stack."""
     if name.endswith((".yaml", ".yml")):
         preset_path("stack", name)
         return True
     trees, stacks = preset_names("tree"), preset_names("stack")
     if name in stacks and name not in trees:
         return True
-    if name not in trees and not name.endswith(".xml") and "/" not in name:
+    if name not in trees and not name.endswith(".xml"):
         raise ConfigError(
-            f"--controller: {name!r} is no preset of a tree or a stack{nearest(name, [*trees, *stacks])}; "
-            f"trees: {', '.join(trees)}; stacks: {', '.join(stacks)}; or give the path of a tree's .xml, a "
-            "stack's .yaml or a function of yours, mine.py:act"
+            f"--agent {name}: is no preset, file or run folder{nearest(name, [*trees, *stacks])}; presets: "
+            f"{', '.join([*trees, *stacks])}; or give a tree's .xml, a stack's .yaml, mine.py:act, "
+            "mine.py:load, model.onnx, or the run folder of 'uuv train'"
         )
     return False
-
-
-def policies_of(names: list[str], max_node: int, note: Callable[[str], None]) -> list[Method]:
-    """Methods that a trained policy drives; ``note`` is told of checkpoints that were left out. Raises
-    ConfigError, CheckpointError."""
-    tree = read_tree(TRAINING_TREE, max_node) if names else None
-    found = [
-        Method(policy_name(name, checkpoint), tree, checkpoint)
-        for name in names
-        if (checkpoint := find_policy(name, note)) and tree
-    ]
-    doubled = {method.name for method in found if [other.name for other in found].count(method.name) > 1}
-    if doubled:
-        raise ConfigError(
-            f"{', '.join(sorted(doubled))}: given twice, or two runs with the same name; evaluate them one "
-            "by one"
-        )
-    return found
 
 
 def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
@@ -199,22 +185,20 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
         return checkpoint.open_checkpoint(path)
     if (path / "checkpoints").is_dir():
         return checkpoint.best(path, note)
-    is_driver = name in (*preset_names("tree"), *preset_names("stack"))
-    instead = f"; it drives by itself: --controller {name}. Else" if is_driver else ":"
     raise ConfigError(
-        f"{name!r} is no trained policy{instead} give the run folder of 'uuv train', one of its "
-        f"checkpoints/step_N, or one of yours: --policy model.onnx, --policy mine.py:load"
+        f"{name!r} is no trained policy: give the run folder of 'uuv train', or one of its checkpoints/step_N"
     )
 
 
-def features_of(names: list[str]) -> list[tuple[str, Any]]:
-    """Overrides that give the observation the columns these policies were trained with. ConfigError where
-    they differ among themselves."""
-    sections = {name: find_policy(name).config.features.model_dump(mode="json") for name in names}
+def features_of(names: Sequence[str]) -> list[tuple[str, Any]]:
+    """Overrides that give the observation the columns that the trained policies among these agents know.
+    ConfigError where they differ among themselves."""
+    trained = [name for name in names if not is_piece(name) and is_trained(name)]
+    sections = {name: find_policy(name).config.features.model_dump(mode="json") for name in trained}
     for name, section in sections.items():
         if section != next(iter(sections.values())):
             raise ConfigError(
-                f"{names[0]} and {name} see other columns ({sections[names[0]]} and {section}); "
+                f"{trained[0]} and {name} see other columns ({sections[trained[0]]} and {section}); "
                 "evaluate them one by one: with the same seeds they meet the same episodes"
             )
     return [("features", section) for section in list(sections.values())[:1]]
@@ -241,14 +225,13 @@ def policy_name(name: str, checkpoint: Checkpoint) -> str:
 
 
 def _parted(name: str) -> tuple[str, bool]:
-    """(tree, whether it is told the truth) of a controller's name. Raises ConfigError."""
+    """(tree, whether it is told the truth) of an agent's name. Raises ConfigError."""
     if "+" not in name or name.endswith((".xml", ".yaml", ".yml")):
         return name, False
     tree, _, suffix = name.rpartition("+")
     if suffix != TRUTH:
         raise ConfigError(
-            f"--controller {name}: '+{suffix}' is unknown; the one suffix is +{TRUTH}, for example "
-            f"{tree}+{TRUTH}"
+            f"--agent {name}: '+{suffix}' is unknown; the one suffix is +{TRUTH}, for example {tree}+{TRUTH}"
         )
     return tree, True
 
@@ -270,13 +253,14 @@ def export_run(
     return export(checkpoint, name, out or Path("runs") / f"{name}_export", evaluations, note, force)
 
 
-def export_log(log: Path, out: Path, machines: Sequence[str]) -> dict[str, Any]:
-    """Export the stack of a log of ``uuv eval --record``, with its messages as a check. Raises as
-    ``read_feed`` and ``aboard.stack_folder.export_stack``."""
+def export_log(log: Path, out: Path | None, machines: Sequence[str]) -> dict[str, Any]:
+    """Export the stack of a log of ``uuv eval --record`` to ``out`` or runs/NAME_export, with its messages as
+    a check. Raises as ``read_feed`` and ``aboard.stack_folder.export_stack``."""
     from uuvtai.vehicle.embedded.export import export_stack
     from uuvtai.vehicle.replay import read_feed
 
     feed = read_feed(log)
     dt_s = feed.config.episode.control_dt_s
     arrivals = [(max(0, math.ceil(each.time_s / dt_s - 0.5)), each.message) for each in feed.arrivals]
-    return export_stack(feed.config, feed.tree, feed.mission, arrivals, out, machines)
+    target = out or Path("runs") / f"{log.stem}_export"
+    return export_stack(feed.config, feed.tree, feed.mission, arrivals, target, machines)

@@ -23,14 +23,23 @@ from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError
 from uuvtai.evaluation import failure_causes
-from uuvtai.evaluation.agents import TRUTH, Method
-from uuvtai.evaluation.episodes import EpisodeResult, Job, Progress, Recorders, StepClock, run_episodes
+from uuvtai.evaluation.agents import TRUTH, Method, differences, load_agents
+from uuvtai.evaluation.episodes import (
+    EpisodeResult,
+    Job,
+    Progress,
+    Recorders,
+    StepClock,
+    jobs_of,
+    run_episodes,
+)
 from uuvtai.evaluation.oracle import earliest_arrival
 from uuvtai.evaluation.results import (
     ORACLE,
     Ledger,
     LedgerWriter,
     Request,
+    document,
     document_of,
     drivers_of,
     read_request,
@@ -71,14 +80,15 @@ def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], P
             "same"
         )
     refuse_place(request.run_dir)
-    methods = methods_of(request, watch)
+    methods = agents_of(request, watch)
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
     comparison = comparison_of(request, num_envs, methods, watch)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     with _going_on(folder, watch):
         device = comparison.any_simulator().device.type
         folder.write_json(REQUEST, document_of(request, num_envs, device, drivers_of(methods)))
-        return _compared(comparison, folder), folder.path
+        runs = run_agents(comparison, folder)
+        return write_results(comparison, folder, runs), folder.path
 
 
 def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tuple[dict[str, Any], Path]:
@@ -91,8 +101,8 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
     folder = RunFolder.held(place, "uuv eval")
     try:
         request, drivers = read_request(place)
-        refuse_code(place, request.controllers, allow_code)
-        methods = methods_of(request, watch)
+        refuse_code(place, request.agents, allow_code)
+        methods = agents_of(request, watch)
         refuse_others(place, drivers, drivers_of(methods))
         folder.go_on({"what": "eval"})
     except BaseException:
@@ -100,7 +110,8 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
         raise
     with _going_on(folder, watch):
         assert request.num_envs is not None  # the file states it
-        return _compared(comparison_of(request, request.num_envs, methods, watch), folder), place
+        comparison = comparison_of(request, request.num_envs, methods, watch)
+        return write_results(comparison, folder, run_agents(comparison, folder)), place
 
 
 @contextmanager
@@ -122,22 +133,13 @@ def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
         watch.stop()
 
 
-def methods_of(request: Request, watch: EvaluationWatch) -> list[Method]:
-    """Who plays. Raises ConfigError, CheckpointError, PieceError."""
-    from uuvtai.evaluation.agents import differences, policies_of, trees_of
-
-    max_node = request.config.teacher.max_node
-    trees = [name for name in request.controllers if name != ORACLE]
-    methods = [*trees_of(trees, max_node), *policies_of(list(request.policies), max_node, watch.note)]
-    names = [method.name for method in methods] + [ORACLE] * (ORACLE in request.controllers)
-    if len(set(names)) != len(names):
-        raise ConfigError(
-            f"{', '.join(names)}: a policy and a controller have the same name; rename the run's folder"
-        )
+def agents_of(request: Request, watch: EvaluationWatch) -> list[Method]:
+    """The request's agents but the oracle. Raises ConfigError, CheckpointError, PieceError."""
+    names = [name for name in request.agents if name != ORACLE]
+    methods = load_agents(names, request.config.teacher.max_node, watch.note)
     if not methods and (request.record or request.explain):
         raise ConfigError(
-            "--record, --explain: the oracle drives no vehicle; add who does, for example --controller "
-            "bt,oracle"
+            "--record, --explain: the oracle drives no vehicle; add who does, for example --agent bt,oracle"
         )
     for method in methods:
         if changes := differences(method, request.config):
@@ -174,21 +176,23 @@ def _any_tree() -> FlatTree:
     return read_tree(TRAINING_TREE)
 
 
-def _compared(comparison: Comparison, folder: RunFolder) -> dict[str, Any]:
-    """Play what is not over yet; the whole document, and all that is written and drawn of it."""
-    from uuvtai.evaluation.episodes import jobs_of
-    from uuvtai.evaluation.results import Ledger, document
-
-    request = comparison.request
-    jobs = jobs_of(request.seeds, request.episodes)
+def run_agents(comparison: Comparison, folder: RunFolder) -> list[MethodRun]:
+    """Run every agent's episodes that are not over yet."""
+    jobs = jobs_of(comparison.request.seeds, comparison.request.episodes)
     ledger = Ledger(folder.path)
     try:
-        runs = [play(comparison, method, jobs, ledger, folder.path) for method in comparison.methods]
+        return [play(comparison, method, jobs, ledger, folder.path) for method in comparison.methods]
     finally:
         ledger.close()
+
+
+def write_results(comparison: Comparison, folder: RunFolder, runs: list[MethodRun]) -> dict[str, Any]:
+    """The whole document of what was run, with the oracle's row, and all that is written and drawn of it."""
+    request = comparison.request
+    jobs = jobs_of(request.seeds, request.episodes)
     entries = [method_run.entry for method_run in runs]
     scenarios = scenarios_of(comparison.any_simulator(), jobs)
-    if ORACLE in request.controllers:
+    if ORACLE in request.agents:
         entries.append(_ask_oracle(comparison, jobs, scenarios))
     named = request.world, request.sensors, request.vehicle
     result = document(request.config, *named, request.seeds, request.episodes, entries)
@@ -367,14 +371,10 @@ def _recorder(
 def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been."""
-    from uuvtai.evaluation.episodes import jobs_of, run_episodes
-    from uuvtai.evaluation.results import summary
-    from uuvtai.learning.forecast import ForecastTrainer
-    from uuvtai.learning.parameter_search import TunerTrainer
     from uuvtai.learning.policy_agent import Pilot
-    from uuvtai.learning.surrogate_trainer import TwinTrainer
+    from uuvtai.learning.trainer import Trainer
 
-    if isinstance(trainer, TwinTrainer | TunerTrainer | ForecastTrainer):  # they play by themselves
+    if not isinstance(trainer, Trainer):  # the others run episodes by themselves
         return trainer.evaluate()
     env = trainer.env
     model = trainer.world_model if config.world_model.as_features else None

@@ -176,9 +176,8 @@ class Task:
 
     config: Config
     """with room for the largest scene"""
-    controller: str | None
-    policy: str | None
-    """exactly one of the two"""
+    agent: str
+    """as ``agents.load_agents`` takes it"""
     scenes: tuple[Scene, ...]
     """of the cells, in order"""
     labels: tuple[dict[str, Any], ...]
@@ -203,16 +202,10 @@ _kept = _Kept()
 
 def play(task: Task) -> list[Row]:
     """Play all episodes of the task's cells; one row per cell, in their order."""
-    from uuvtai.evaluation.agents import policies_of, trees_of
+    from uuvtai.evaluation.agents import load_agents
     from uuvtai.evaluation.episodes import Job, run_episodes
 
-    limit = task.config.teacher.max_node
-    found = (
-        trees_of([task.controller], limit)
-        if task.controller
-        else policies_of([task.policy or ""], limit, lambda _text: None)
-    )
-    method = found[0]
+    (method,) = load_agents([task.agent], task.config.teacher.max_node)
     sim = _sim_of(task, method.config_of(task.config))
     sim.use_tree(method.tree)
     sim.planner = method.planner_for(sim)
@@ -293,8 +286,7 @@ class SweepRequest:
     vehicle: str | None
     overrides: tuple[Any, ...]
     """of the config, for every cell: ``key=value`` texts and (key, value) pairs"""
-    controllers: tuple[str, ...]
-    policies: tuple[str, ...]
+    agents: tuple[str, ...]
     seeds: tuple[int, ...]
     episodes: int
     """per seed, cell and method"""
@@ -302,14 +294,14 @@ class SweepRequest:
     device: str = "auto"
 
     @classmethod
-    def typed(cls, scene: SceneOptions, policies: list[str], **rest: Any) -> SweepRequest:
+    def typed(cls, scene: SceneOptions, agents: list[str], **rest: Any) -> SweepRequest:
         """What a command line asks for, with the scene as it was typed."""
         return cls(
             world=scene.world_name,
             sensors=scene.sensors,
             vehicle=scene.vehicle,
             overrides=tuple(scene.settings),
-            policies=tuple(policies),
+            agents=tuple(agents),
             **rest,
         )
 
@@ -323,7 +315,7 @@ def request_of(document: dict[str, Any]) -> SweepRequest:
     for another grid."""
     one_at_a_time, axes = document["grid"]["one_at_a_time"], document["grid"]["axes"]
     grid = checked(Grid({name: tuple(values) for name, values in axes.items()}, _typed(one_at_a_time, bool)))
-    lists = {name: tuple(document[name]) for name in ("controllers", "policies", "seeds")}
+    lists = {name: tuple(document[name]) for name in ("agents", "seeds")}
     overrides = tuple(item if isinstance(item, str) else tuple(item) for item in document["overrides"])
     rest = {name: _typed(document[name], of) for name, of in _TYPES.items()}
     for name, values in lists.items():
@@ -397,16 +389,13 @@ def row_key(label: dict[str, Any], method: str) -> str:
     return hashlib.sha256(json.dumps([sorted(label.items(), key=str), method]).encode()).hexdigest()
 
 
-def tasks_of(
-    request: SweepRequest, methods: Sequence[tuple[str, str | None, str | None]], done: set[str]
-) -> list[Task]:
-    """Tasks for the rows that are not ``done`` (keys). ``methods``: (name, controller, policy), exactly one
-    of the two. ConfigError."""
+def tasks_of(request: SweepRequest, methods: Sequence[tuple[str, str]], done: set[str]) -> list[Task]:
+    """Tasks for the rows that are not ``done`` (keys). ``methods``: (name, agent). ConfigError."""
     each = len(request.seeds) * request.episodes
     per_task = max(1, TASK_EPISODES // each)
     found = []
     for config, cells in _by_config(request):
-        for name, controller, policy in methods:
+        for name, agent in methods:
             labels = [label for cell in cells if row_key(label := label_of(cell, config), name) not in done]
             for first in range(0, len(labels), per_task):
                 part = labels[first : first + per_task]
@@ -415,8 +404,7 @@ def tasks_of(
                 found.append(
                     Task(
                         config,
-                        controller,
-                        policy,
+                        agent,
                         scenes,
                         tuple(part),
                         request.seeds,

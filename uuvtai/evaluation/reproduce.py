@@ -14,7 +14,7 @@ from uuvtai.common.files import FileError, read_json
 from uuvtai.common.statistics import mean
 from uuvtai.config.loader import load_config
 from uuvtai.evaluation import claims
-from uuvtai.evaluation.agents import trees_of
+from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.claims import LEVEL, pooled, tts_s
 from uuvtai.evaluation.reproduce_steps import (
     BUDGETS,
@@ -329,7 +329,7 @@ def reproduce(
         raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
     refuse_place(run_dir)
     config, pieces = load_config("pool"), [piece_spec(name).absolute().text for name in own]
-    trees_of(pieces, config.teacher.max_node)  # refuses what cannot be loaded before hours have passed
+    load_agents(pieces, config.teacher.max_node)  # refuses what cannot be loaded before hours have passed
     root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
     folder = RunFolder(root, config, [EVALUATION_SEED])
     request: dict[str, Any] = {"schema": 1, "budget": budget, "own": pieces}

@@ -88,7 +88,7 @@ def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
     at = ("--seeds", str(EVALUATION_SEED), "--episodes")
     places = [str(root / place) for of_preset in runs.values() for place in of_preset]
     pilot = str(root / runs["curriculum"][0])
-    judged = ("eval", *places, *_controllers("straight", "planner", "bt", *own), *at, str(budget.episodes))
+    judged = ("eval", *_agents("straight", "planner", "bt", *own, *places), *at, str(budget.episodes))
     recorded = ("--record", "1", *at, "1")
     methods = [str(root / runs[name][0]) for name in ("ppo", "distill_20", "curriculum")]
     steps = [
@@ -96,22 +96,22 @@ def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
         Step("Table main and ablations", judged, "eval/main"),
         Step(
             "ceilings",
-            ("eval", *_controllers("bt", "bt+truth", "oracle"), *at, str(budget.ceiling_episodes)),
+            ("eval", *_agents("bt", "bt+truth", "oracle"), *at, str(budget.ceiling_episodes)),
             "eval/ceilings",
         ),
         Step(
             "transfer",
-            ("eval", pilot, *_controllers("bt", *own), "--world", "transfer", *at, str(budget.episodes)),
+            ("eval", *_agents("bt", *own, pilot), "--world", "transfer", *at, str(budget.episodes)),
             "eval/transfer",
         ),
         Step(
             "scenario A",
-            ("eval", *methods, *_controllers("bt", *own), *recorded, "--video"),
+            ("eval", *_agents("bt", *own, *methods), *recorded, "--video"),
             "eval/scenario_a",
         ),
         Step(
             "scenario B",
-            ("eval", *methods, *_controllers("bt", *own), "-S", "12", "-D", "9", *recorded, "--video"),
+            ("eval", *_agents("bt", *own, *methods), "-S", "12", "-D", "9", *recorded, "--video"),
             "eval/scenario_b",
         ),
         Step("sweep", _sweep(pilot, "paper", budget.sweep_episodes, own=own), "sweep/pool", resumes=True),
@@ -133,8 +133,7 @@ def _sweep(pilot: str, grid: str, episodes: int, *more: str, own: Sequence[str] 
     seed = ("--seeds", str(EVALUATION_SEED))
     return (
         "sweep",
-        pilot,
-        *_controllers("bt", *own),
+        *_agents("bt", *own, pilot),
         "--grid",
         grid,
         "--episodes",
@@ -155,7 +154,7 @@ def _beyond(pilot: str, budget: Budget, own: Sequence[str]) -> list[Step]:
         ),
         Step(
             "trade-off",
-            ("sweep", *_controllers("bt"), "--grid", "caution", "--episodes", str(few)),
+            ("sweep", *_agents("bt"), "--grid", "caution", "--episodes", str(few)),
             "sweep/caution",
             resumes=True,
         ),
@@ -174,8 +173,8 @@ def _beyond(pilot: str, budget: Budget, own: Sequence[str]) -> list[Step]:
     ]
 
 
-def _controllers(*names: str) -> tuple[str, ...]:
-    return tuple(part for name in names for part in ("--controller", name))
+def _agents(*names: str) -> tuple[str, ...]:
+    return tuple(part for name in names for part in ("--agent", name))
 
 
 # ---------------------------------------------------------------------------------------------------- running

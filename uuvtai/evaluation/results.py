@@ -25,6 +25,7 @@ from uuvtai.common.files import (
     refuse_links,
     truncate,
 )
+from uuvtai.common.presets import preset_names
 from uuvtai.common.statistics import (
     bootstrap_interval,
     mcnemar_p,
@@ -38,9 +39,7 @@ from uuvtai.config.loader import ConfigError, preset_of, read_preset, validated
 from uuvtai.evaluation.episodes import EpisodeObserver, EpisodeResult, Job
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins.api import is_piece, piece_spec
-from uuvtai.sim.behavior_tree import (
-    node_use,
-)
+from uuvtai.sim.behavior_tree import node_use
 from uuvtai.sim.sim import Sim
 
 if TYPE_CHECKING:
@@ -340,7 +339,7 @@ def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, i
 
 REQUEST_FILE = "eval/request.json"
 ORACLE = "oracle"
-"""controller that is asked, not driven: the privileged upper bound"""
+"""agent that is asked, and does not drive: the privileged upper bound"""
 
 _MAX_BYTES = 1 << 22
 _GIVE = "give the folder that an interrupted 'uuv eval' printed"
@@ -353,15 +352,12 @@ class Request:
     config: Config
     world: str
     sensors: str
-    controllers: list[str]
-    """names of trees or stacks, paths of XML or YAML files, each perhaps with ``+truth``; ``oracle``; pieces
-    of the user's (``own.piece_spec``)"""
+    agents: list[str]
+    """as ``agents.load_agents`` takes them, and ``oracle``"""
     seeds: list[int]
     episodes: int
     vehicle: str = ""
     """name of its preset; of old requests ''"""
-    policies: tuple[str, ...] = ()
-    """run folders or checkpoint folders"""
     num_envs: int | None = None
     record: int = 0
     video: bool = False
@@ -372,15 +368,14 @@ class Request:
     run_dir: Path | None = None
 
     @classmethod
-    def typed(cls, scene: SceneOptions, policies: list[str], **rest: Any) -> Request:
+    def typed(cls, scene: SceneOptions, agents: list[str], **rest: Any) -> Request:
         """What a command line asks for: the scene as it was typed, observed as the policies were trained.
         Raises ConfigError, CheckpointError."""
         from uuvtai.evaluation.agents import features_of
 
-        config = scene.config(features_of(policies) if policies else [])
-        world = scene.world_name
+        config, world = scene.config(features_of(agents)), scene.world_name
         named = {kind: preset_of(kind, world, getattr(scene, kind)) for kind in ("sensors", "vehicle")}
-        return cls(config=config, world=world, **named, policies=tuple(policies), **rest)
+        return cls(config=config, world=world, **named, agents=agents, **rest)
 
 
 class _Document(BaseModel):
@@ -393,10 +388,9 @@ class _Document(BaseModel):
     world: str
     sensors: str
     vehicle: str = ""
-    controllers: list[str]
+    agents: list[str]
     seeds: list[int] = Field(min_length=1)
     episodes: int = Field(ge=1)
-    policies: list[str]
     num_envs: int = Field(ge=1)
     record: int = Field(ge=0)
     video: bool
@@ -415,7 +409,7 @@ def document_of(request: Request, num_envs: int, device: str, drivers: dict[str,
         for field in dataclasses.fields(request)
         if field.name not in ("config", "run_dir")
     }
-    document |= {"policies": list(request.policies), "num_envs": num_envs, "device": device}
+    document |= {"num_envs": num_envs, "device": device}
     return {
         "schema": 1,
         **document,
@@ -435,31 +429,28 @@ def read_request(place: Path) -> tuple[Request, dict[str, str]]:
     except OSError as error:
         raise RunFolderError(f"{file}: cannot be read ({error.strerror}); {_GIVE}") from None
     except (ValidationError, ConfigError) as error:
-        reason = (
-            error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error).splitlines()[0]
-        )
+        reason = str(error).splitlines()[0]
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise RunFolderError(
             f"{file}: is no request of this version of 'uuv eval' ({reason}); {_GIVE}"
         ) from None
     given = found.model_dump(exclude={"schema_", "config", "cwd", "drivers"})
-    request = Request(config=config, **given)
-    return _found_again(replace(request, policies=tuple(found.policies)), Path(found.cwd)), found.drivers
+    return _found_again(Request(config=config, **given), Path(found.cwd)), found.drivers
 
 
 def _found_again(request: Request, cwd: Path) -> Request:
     """Paths that were typed in another folder, seen from this one; names of what is shipped stay names."""
 
     def seen(name: str) -> str:
-        file = name.removesuffix("+truth")
-        return name if Path(file).exists() else str(cwd / name)
-
-    def seen_driver(name: str) -> str:
         if is_piece(name):
             return piece_spec(name).located(cwd).text
-        return seen(name) if name.removesuffix("+truth").endswith((".xml", ".yaml", ".yml")) else name
+        file = name.removesuffix("+truth")
+        is_shipped = file in (ORACLE, *preset_names("tree"), *preset_names("stack"))
+        return name if is_shipped or Path(file).exists() else str(cwd / name)
 
-    controllers = [seen_driver(name) for name in request.controllers]
-    return replace(request, controllers=controllers, policies=tuple(map(seen, request.policies)))
+    return replace(request, agents=list(map(seen, request.agents)))
 
 
 def drivers_of(methods: list[Method]) -> dict[str, str]:

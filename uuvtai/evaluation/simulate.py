@@ -19,9 +19,9 @@ from uuvtai.common.presets import PRESET_DIR
 from uuvtai.compile.runtime import Runtime, start_taichi
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError
-from uuvtai.evaluation.agents import Method, trees_of
+from uuvtai.evaluation.agents import Method, load_agents
 from uuvtai.evaluation.episodes import Job, Recorders, Stepper, run_episodes
-from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, comparison_of, methods_of
+from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, agents_of, comparison_of
 from uuvtai.evaluation.results import ORACLE, Request
 from uuvtai.live.server import Broadcast, RealTime, ViewerServer
 from uuvtai.sim.plant import Plant
@@ -217,8 +217,7 @@ def roll_pitch_yaw(q: np.ndarray) -> np.ndarray:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# One vehicle that somebody drives through open water, from a start to a goal: ``uuv simulate
-# --controller``.
+# One vehicle that an agent drives through open water, from a start to a goal: ``uuv simulate --agent``.
 
 
 _NOT_BESIDE = ("wrench", "command", "initial_rpy_deg", "initial_velocity")
@@ -226,17 +225,15 @@ _NOT_BESIDE = ("wrench", "command", "initial_rpy_deg", "initial_velocity")
 
 def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     """As ``simulate.simulate``, positions [m] from the start, with "goal" [m] from there. It ends early where
-    the goal is reached or the tank is left. ``name``: a tree or a piece of the user's. Raises SettingError,
+    the goal is reached or the tank is left. ``name``: any agent. Raises SettingError,
     ConfigError, PieceError."""
     for given in _NOT_BESIDE:
         if getattr(trial, given) is not None:
             option = "--" + given.replace("_", "-")
-            raise SettingError(
-                f"{option}: not beside --controller, which drives from rest; leave one of them out"
-            )
+            raise SettingError(f"{option}: not beside --agent, which drives from rest; leave one of them out")
     substeps, control_dt = control_step(trial.dt)
     n_step = checked_steps(trial.seconds, control_dt, substeps)
-    (method,) = trees_of([name], config.teacher.max_node)
+    (method,) = load_agents([name], config.teacher.max_node)
     config = method.config_of(experiment(config, trial))
     config = config.model_copy(
         update={"episode": config.episode.model_copy(update={"horizon_steps": n_step + 1})}
@@ -296,9 +293,9 @@ class LiveOptions:
 def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) -> list[dict[str, Any]]:
     """Play the request's episodes, each by every method in turn, and serve them; ``episodes`` 0 = on and on,
     until it is interrupted. How each ended. Raises LiveError, ConfigError, CheckpointError, PieceError."""
-    if ORACLE in request.controllers:
-        raise ConfigError("--controller oracle: it drives no vehicle; name who does, for example bt")
-    methods = methods_of(request, watch)
+    if ORACLE in request.agents:
+        raise ConfigError("--agent oracle: it drives no vehicle; name who does, for example bt")
+    methods = agents_of(request, watch)
     with ViewerServer(live.host, live.port, live.origins) as server:
         shown = "localhost" if live.host in ("127.0.0.1", "0.0.0.0", "::") else live.host
         watch.note(f"serving ws://{shown}:{server.port}; in Foxglove or Lichtblick: open a connection,")

@@ -31,7 +31,6 @@ from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, r
 from uuvtai.plugins.api import is_piece, piece_spec, refuse_code
 
 if TYPE_CHECKING:
-    from uuvtai.config import Config
     from uuvtai.evaluation.agents import Method
 
 
@@ -111,8 +110,8 @@ def engine_of(name: str, workers: int, address: str) -> Engine:
 
 ROWS, REQUEST, RESULT = "cells.jsonl", "sweep_request.json", "sweep.json"
 
-MethodKey = tuple[str, str | None, str | None]
-"""(name in the table, controller, policy): exactly one of the last two"""
+MethodKey = tuple[str, str]
+"""(name in the table, agent)"""
 
 
 class SweepWatch(Protocol):
@@ -134,7 +133,7 @@ def sweep(
     """
     refuse_place(run_dir)
     request, methods, checkpoints = resolved(request, watch)
-    keys = check_rows(request, [name for name, _controller, _policy in methods])
+    keys = check_rows(request, [name for name, _agent in methods])
     place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
     folder = RunFolder(place, base_config(request), list(request.seeds))
     folder.write_json(
@@ -152,16 +151,18 @@ def resume(
     try:
         try:
             document = read_json(place / REQUEST, folder=place)
+            if "agents" not in document:
+                raise TypeError("an older version of uuv wrote it; begin the sweep again")
             request, methods = request_of(document), [_method_key(method) for method in document["methods"]]
             checkpoints = dict(document["checkpoints"])
         except (FileError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise RunFolderError(
                 f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed"
             ) from None
-        controllers = [controller for _name, controller, _policy in methods]
-        refuse_code(place, [*request.controllers, *filter(None, controllers)], allow_code)
-        _refuse_other_policies(place, request, controllers, checkpoints, watch)
-        keys = check_rows(request, [name for name, _controller, _policy in methods])
+        agents = [agent for _name, agent in methods]
+        refuse_code(place, [*request.agents, *agents], allow_code)
+        _refuse_other_policies(place, request, agents, checkpoints, watch)
+        keys = check_rows(request, [name for name, _agent in methods])
         folder.go_on({"rows": len(read_rows(place))})
         return _play(request, methods, keys, engine, folder, watch), place
     finally:
@@ -170,27 +171,24 @@ def resume(
 
 def _method_key(given: Any) -> MethodKey:
     """Of a request on disk. Raises TypeError, ValueError."""
-    name, controller, policy = given
-    if not isinstance(name, str) or not all(isinstance(one, str | None) for one in (controller, policy)):
+    name, agent = given
+    if not (isinstance(name, str) and isinstance(agent, str)):
         raise TypeError(f"{given!r:.80} is no method")
-    return name, controller, policy
+    return name, agent
 
 
 def _refuse_other_policies(
     place: Path,
     request: SweepRequest,
-    controllers: Sequence[str | None],
+    agents: Sequence[str],
     checkpoints: dict[str, str],
     watch: SweepWatch,
 ) -> None:
     """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
     nothing."""
-    from uuvtai.evaluation.agents import policies_of
+    from uuvtai.evaluation.agents import load_agents
 
-    trained = policies_of(list(request.policies), base_config(request).teacher.max_node, watch.note)
-    now = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
-    own = _own_of(controllers, base_config(request))
-    now |= {method.name: method.own.sha256 for method in own if method.own}
+    now = _sha256_of(load_agents(agents, base_config(request).teacher.max_node, watch.note))
     changed = [name for name, sha256 in checkpoints.items() if now.get(name) != sha256]
     if changed:
         raise RunFolderError(
@@ -207,39 +205,29 @@ def resolved(
 
     Paths are made absolute. Raises ConfigError, CheckpointError.
     """
-    from uuvtai.evaluation.agents import features_of, policies_of, trees_of
+    from uuvtai.evaluation.agents import features_of, load_agents
 
-    limit = base_config(request).teacher.max_node
-    trees = trees_of(list(request.controllers), limit)
-    policies = tuple(str(Path(name).resolve()) if Path(name).exists() else name for name in request.policies)
-    trained = policies_of(list(policies), limit, watch.note)
-    controllers = [_located(name) for name in request.controllers]
-    methods: list[MethodKey] = [
-        (tree.name, name, None) for tree, name in zip(trees, controllers, strict=True)
-    ]
-    methods += [(method.name, None, name) for method, name in zip(trained, policies, strict=True)]
-    features = features_of(list(policies)) if policies else []
-    checkpoints = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
-    checkpoints |= {method.name: method.own.sha256 for method in trees if method.own}
-    return (
-        replace(request, overrides=(*features, *request.overrides), policies=policies),
-        methods,
-        checkpoints,
-    )
+    agents = tuple(map(_located, request.agents))
+    loaded = load_agents(agents, base_config(request).teacher.max_node, watch.note)
+    methods = [(method.name, name) for method, name in zip(loaded, agents, strict=True)]
+    overrides = (*features_of(agents), *request.overrides)
+    return replace(request, overrides=overrides, agents=agents), methods, _sha256_of(loaded)
 
 
 def _located(name: str) -> str:
-    """A controller's name as a worker in any folder finds it."""
+    """An agent's name as a worker in any folder finds it."""
+    from uuvtai.evaluation.agents import is_trained
+
     if is_piece(name):
         return piece_spec(name).absolute().text
-    return str(Path(name).resolve()) if name.endswith((".xml", ".yaml", ".yml")) else name
+    is_file = name.endswith((".xml", ".yaml", ".yml")) or is_trained(name)
+    return str(Path(name).resolve()) if is_file else name
 
 
-def _own_of(controllers: Sequence[str | None], config: Config) -> list[Method]:
-    """The user's own pieces among them."""
-    from uuvtai.evaluation.agents import trees_of
-
-    return trees_of([name for name in controllers if name and is_piece(name)], config.teacher.max_node)
+def _sha256_of(methods: Sequence[Method]) -> dict[str, str]:
+    """Of the checkpoints and of the user's own pieces, by the method's name."""
+    found = {method.name: method.own or method.checkpoint for method in methods}
+    return {name: driver.sha256 for name, driver in found.items() if driver}
 
 
 def _play(

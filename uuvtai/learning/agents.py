@@ -9,7 +9,7 @@ import torch
 
 from uuvtai.config.behavior import FAST, SLOW, TUNED
 from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
-from uuvtai.learning.policy_agent import PilotDecision, by_chunk
+from uuvtai.learning.policy_agent import Pilot, PilotDecision, by_chunk, load_pilot
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetActor, actor_of
 
 if TYPE_CHECKING:
@@ -181,3 +181,20 @@ def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
     checkpoint.check_table(SET_TABLE, sim.config)
     config, actor = checkpoint.config, actor_of(checkpoint)
     return SetPilot(actor.to(sim.device), sim, config.policy.hold_steps, config.twin.vertical_gap_m)
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
+def load_driver(checkpoint: Checkpoint, sim: Sim) -> Pilot | TunedPilot | SetPilot:
+    """Who drives by a checkpoint, whatever learnt it. Raises CheckpointError for one that does not fit."""
+    from uuvtai.envs.vector_env import VectorEnv
+
+    learner = checkpoint.config.learner
+    if learner == "tuner":
+        return load_tuned(checkpoint, sim)
+    if learner == "twin":
+        return load_set_pilot(checkpoint, sim)
+    if learner == "policy":
+        checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
+    return load_pilot(checkpoint, sim.num_envs, sim.device)

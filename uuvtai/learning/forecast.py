@@ -27,7 +27,7 @@ from uuvtai.learning.networks import (
 from uuvtai.learning.parameter_search import simulator_of
 from uuvtai.learning.ppo import ADAM_EPS
 from uuvtai.learning.rollout import Recent
-from uuvtai.sim.forecast_weights import packed_weights
+from uuvtai.sim.forecast_weights import WEIGHTS, packed_weights
 
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import ObservationColumn
@@ -239,9 +239,9 @@ class ForecastTrainer:
             metrics |= {f"eval/{name}_{world}": value for name, value in scores.items()}
         return metrics
 
-    def exported(self) -> bytes:
+    def files(self) -> dict[str, bytes]:
         """The file that ``forecast.learned`` takes."""
-        return packed_weights(self.net.weights())
+        return {WEIGHTS: packed_weights(self.net.weights())}
 
     def _watched(self, world: str, seed: int, first: int) -> tuple[TrackMoments, int]:
         if world not in self._sims:

@@ -15,10 +15,11 @@ import numpy as np
 import torch
 
 from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS
+from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.config.behavior import FAST, SLOW, TUNED, configured_factors, log_bounds
 from uuvtai.config.learning import LearningConfig, TunerScene
 from uuvtai.config.loader import ConfigError
-from uuvtai.learning.agents import TunedPilot, tree_row
+from uuvtai.learning.agents import TunedPilot, tree_row, tuned_sections
 from uuvtai.learning.rollout import Recent, RolloutSums
 
 if TYPE_CHECKING:
@@ -257,6 +258,13 @@ class TunerTrainer:
             rounds * config.train.num_envs,
             config.train.seed,
         )
+
+    def files(self) -> dict[str, bytes]:
+        """The stack that drives with the tree's numbers as they are now, for ``--agent``."""
+        lines = [f"tree: {TRAINING_TREE}"]
+        for section, factors in tuned_sections(self.centre).items():
+            lines += [f"{section}:", *(f"  {name}: {value}" for name, value in factors.items())]
+        return {"stack.yaml": ("\n".join(lines) + "\n").encode()}
 
     @property
     def centre(self) -> torch.Tensor:

@@ -176,30 +176,22 @@ def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> N
                 )
 
 
-def refuse_forecaster(checkpoint: Checkpoint) -> None:
-    """CheckpointError for a network that does not drive."""
-    if checkpoint.config.forecaster.enabled:
-        raise CheckpointError(
-            f"{checkpoint.path}: forecasts and does not drive; give it to a pilot that does: --set "
-            "forecast.learned=RUN"
-        )
+_NO_NETWORK = {
+    "forecaster": "forecasts and does not drive; give it to a pilot that does: --set forecast.learned=RUN",
+    "tuner": "numbers for the behaviour tree, no network that could be exported; they drive as --agent best, "
+    "or as stack.yaml of the run",
+    "twin": "a policy over a set of bodies, which looks at the simulator itself; it drives in 'uuv eval' and "
+    "'uuv sweep', and is exported by 'uuv export'",
+}
+"""what cannot be a ``Pilot``, by ``LearningConfig.learner``"""
 
 
 def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> Pilot:
     """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config
     says."""
     config, rows = checkpoint.config, checkpoint.manifest.observation_table
-    refuse_forecaster(checkpoint)
-    if config.tuner.enabled:
-        raise CheckpointError(
-            f"{checkpoint.path}: numbers for the behaviour tree, no network that could be "
-            "exported; any stack takes them: --stack best, or stack.yaml of the run"
-        )
-    if config.twin.enabled:
-        raise CheckpointError(
-            f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "
-            "drives in 'uuv eval' and 'uuv sweep', and is exported by 'uuv export'"
-        )
+    if config.learner in _NO_NETWORK:
+        raise CheckpointError(f"{checkpoint.path}: {_NO_NETWORK[config.learner]}")
     parts, generator = checkpoint.model(), torch.Generator()
     try:
         n_obs = max(row["stop"] for row in rows)

@@ -3,6 +3,7 @@ how it all ends."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import threading
@@ -10,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, Union
+from typing import TYPE_CHECKING, Any, Protocol, Union
 
 from uuvtai.common import signals
 from uuvtai.common.files import FileError, open_to_append, parsed_json, read_lines, truncate
@@ -34,8 +35,6 @@ Metrics = dict[str, float]
 
 CONFIG = "config.yaml"
 """of a run folder"""
-STACK = "stack.yaml"
-"""of a run that learns the tree's numbers: the pilot with the newest ones"""
 SCORE = "eval/success_rate"
 """metric by which a checkpoint is the best"""
 
@@ -76,7 +75,6 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-_Trainer = TypeVar("_Trainer", "Trainer", "TwinTrainer", "TunerTrainer", "ForecastTrainer")
 AnyTrainer = Union["Trainer", "TwinTrainer", "TunerTrainer", "ForecastTrainer"]
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
@@ -125,20 +123,12 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    if config.twin.enabled and config.twin.warm_start_waves and not found:
+    if config.learner == "twin" and config.twin.warm_start_waves and not found:
         watch.note(
             f"first {config.twin.warm_start_waves} waves of episodes in the simulator, in which the policy "
             "imitates the tree: about a minute each"
         )
-    trainer: AnyTrainer
-    if config.forecaster.enabled:
-        trainer = _forecast_trainer(config, found, request.device)
-    elif config.tuner.enabled:
-        trainer = _tuner_trainer(config, found, request.device)
-    elif config.twin.enabled:
-        trainer = _twin_trainer(config, found, request.device)
-    else:
-        trainer = _trainer(config, found, request.device)
+    trainer = _continued(_TRAINERS[config.learner](config, request.device), config, found)
     env = getattr(trainer, "env", None)  # of those that learn in the simulator
     device = env.device.type if env else "cpu"
     if config.ppo.bfloat16 and not in_bfloat16(config.ppo, device):
@@ -191,48 +181,38 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
     return VectorEnv(sim, config.train.seed)
 
 
-def _trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> Trainer:
-    """A trainer in the simulator that stands where the checkpoint does, or at the beginning."""
+def _policy(config: LearningConfig, device: str) -> AnyTrainer:
     from uuvtai.learning.trainer import Trainer
 
-    return _continued(Trainer(_env(config, device), config), config, checkpoint)
+    return Trainer(_env(config, device), config)
 
 
-def _continued(trainer: _Trainer, config: LearningConfig, checkpoint: Checkpoint | None) -> _Trainer:
-    """A trainer that goes on from a checkpoint; as it is where there is none."""
+def _on_the_cpu(module: str, name: str) -> Callable[[LearningConfig, str], AnyTrainer]:
+    """A trainer that brings its own environment. ConfigError for a GPU."""
+
+    def made(config: LearningConfig, device: str) -> AnyTrainer:
+        if device == "cuda":
+            raise ConfigError(f"{config.learner}.enabled: it learns on the CPU; leave out --device cuda")
+        return getattr(importlib.import_module(f"uuvtai.learning.{module}"), name)(config)
+
+    return made
+
+
+_TRAINERS: dict[str, Callable[[LearningConfig, str], AnyTrainer]] = {
+    "policy": _policy,
+    "twin": _on_the_cpu("surrogate_trainer", "TwinTrainer"),
+    "tuner": _on_the_cpu("parameter_search", "TunerTrainer"),
+    "forecaster": _on_the_cpu("forecast", "ForecastTrainer"),
+}
+"""by ``LearningConfig.learner``"""
+
+
+def _continued(trainer: AnyTrainer, config: LearningConfig, checkpoint: Checkpoint | None) -> AnyTrainer:
+    """A trainer that stands where the checkpoint does, or at the beginning where there is none."""
     if checkpoint:
         checkpoint.check_table(trainer.observation_table, config)
         trainer.load_state(checkpoint.state(like=trainer.state()))
     return trainer
-
-
-def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TwinTrainer:
-    """As ``_trainer``, in the kinematic twin."""
-    from uuvtai.learning.surrogate_trainer import TwinTrainer
-
-    _refuse_cuda("twin.enabled: the twin trains", device)
-    return _continued(TwinTrainer(config), config, checkpoint)
-
-
-def _tuner_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TunerTrainer:
-    """As ``_trainer``, of the tree's numbers."""
-    from uuvtai.learning.parameter_search import TunerTrainer
-
-    _refuse_cuda("tuner.enabled: it searches", device)
-    return _continued(TunerTrainer(config), config, checkpoint)
-
-
-def _forecast_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ForecastTrainer:
-    """As ``_trainer``, of what moving bodies will do."""
-    from uuvtai.learning.forecast import ForecastTrainer
-
-    _refuse_cuda("forecaster.enabled: it learns", device)
-    return _continued(ForecastTrainer(config), config, checkpoint)
-
-
-def _refuse_cuda(what: str, device: str) -> None:
-    if device == "cuda":
-        raise ConfigError(f"{what} on the CPU; leave out --device cuda")
 
 
 def _folder(
@@ -321,30 +301,9 @@ class _Run:
             self._metrics,
             score,
         )
-        if self._config.forecaster.enabled:
-            self._export()
-        if self._config.tuner.enabled:
-            self._write_stack()
+        for name, content in getattr(trainer, "files", dict)().items():  # of some trainers
+            self._folder.write_bytes(name, content)
         self._saved = trainer.iteration
-
-    def _export(self) -> None:
-        """The file that a stack forecasts with."""
-        from uuvtai.learning.forecast import ForecastTrainer
-        from uuvtai.sim.forecast_weights import WEIGHTS
-
-        assert isinstance(self._trainer, ForecastTrainer)
-        self._folder.write_bytes(WEIGHTS, self._trainer.exported())
-
-    def _write_stack(self) -> None:
-        """The stack that drives with the tree's numbers as they are now, where ``--stack`` is taken."""
-        from uuvtai.learning.agents import tuned_sections
-        from uuvtai.learning.parameter_search import TunerTrainer
-
-        assert isinstance(self._trainer, TunerTrainer)
-        lines = [f"tree: {TRAINING_TREE}"]
-        for section, factors in tuned_sections(self._trainer.centre).items():
-            lines += [f"{section}:", *(f"  {name}: {value}" for name, value in factors.items())]
-        self._folder.write(STACK, "\n".join(lines) + "\n")
 
     def _success_interval(self) -> tuple[float, float] | None:
         """95 % interval of ``rollout/success_rate`` over the episodes that it is the mean of."""

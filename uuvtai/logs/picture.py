@@ -62,7 +62,7 @@ def picture(
     checked_suffix(out, (".png",), "picture")
     found = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not found:
-        raise LogError("uuv log picture: give at least one log")
+        raise LogError("uuv log render: give at least one log")
     recordings = [load_recording(path, PICTURE_TOPICS) for path in found]
     check_same_episode(recordings)
     with drawing(found[0]):

@@ -24,19 +24,9 @@ from uuvtai.logs.ros2 import NAMES, READ, SOURCES, WRITTEN, Reader, RosMessages,
 _ODD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
 
 
-FORMATS = ("mcap", "rosbag2")
-
-
-def converted(
-    file: Path, out: Path | None, to: str | None, source: str, force: bool
-) -> tuple[Path, int, list[str]]:
+def converted(file: Path, out: Path | None, source: str, force: bool) -> tuple[Path, int, list[str]]:
     """A log as a bag or a bag as a log: (what was written, how many messages, what was left out). Raises
     LogError, FileError."""
-    for option, given in (("--to", to), ("--from", source)):
-        if given not in (*FORMATS, None):
-            raise LogError(f"{option} {given}: choose one of {', '.join(FORMATS)}")
-    if source == to:
-        raise LogError(f"--from {source} --to {to}: a log becomes a bag, and a bag a log; leave out --to")
     if source == "rosbag2":
         target = out or file.with_name(f"{file.stem}.log.mcap")
         return target, *from_rosbag2(file, target, force)

@@ -287,8 +287,8 @@ _DEFAULT = {PLANNER: "plan", CONTROLLER: "act", POLICY: "load"}
 _PYTHON = re.compile(r"(?P<file>.+?\.py)(?::(?P<name>[^=:/\\]*))?(?:=(?P<argument>.*))?")
 _EXAMPLE = {
     PLANNER: "--planner mine.py:plan",
-    CONTROLLER: "--controller mine.py:act",
-    POLICY: "--policy model.onnx or --policy mine.py:load",
+    CONTROLLER: "--agent mine.py:act",
+    POLICY: "--agent model.onnx or --agent mine.py:load",
 }
 
 
@@ -318,7 +318,10 @@ class PieceSpec:
     @property
     def option(self) -> str:
         """As it is typed, with its option."""
-        return f"--{self.kind} {self.typed}"
+        if self.kind == PLANNER:
+            return f"--planner {self.typed}"
+        is_plain = piece_spec(self.typed).kind == self.kind
+        return f"--agent {self.typed if is_plain else self.text}"
 
     @property
     def label(self) -> str:
@@ -351,24 +354,28 @@ class PieceSpec:
 
 
 def is_piece(text: str) -> bool:
-    """Whether a controller's name is that of a piece of the user's."""
+    """Whether an agent's name is that of a piece of the user's."""
     kind, colon, _rest = text.partition(":")
     return (kind in _DEFAULT and bool(colon)) or bool(_PYTHON.fullmatch(text)) or text.endswith(".onnx")
 
 
-def piece_spec(text: str, kind: str = CONTROLLER) -> PieceSpec:
-    """The piece of a text; ``kind`` where it does not begin with one. SettingError."""
+def piece_spec(text: str, kind: str = "") -> PieceSpec:
+    """The piece of a text. ``kind`` where the text does not begin with one; without either, a graph and an
+    object named ``load`` are policies, every other one is a controller. SettingError."""
     first, colon, rest = text.partition(":")
     if first in _DEFAULT and colon:
         kind, text = first, rest
-    if kind == POLICY and text.endswith(".onnx"):
-        return PieceSpec(kind, Path(text))
+    if kind in ("", POLICY) and text.endswith(".onnx"):
+        return PieceSpec(POLICY, Path(text))
     found = _PYTHON.fullmatch(text)
+    if not kind:
+        kind = POLICY if found and found["name"] == _DEFAULT[POLICY] else CONTROLLER
+    option = "--planner" if kind == PLANNER else "--agent"
     if found is None:
-        raise SettingError(f"--{kind} {text!r}: names no piece; for example {_EXAMPLE[kind]}")
+        raise SettingError(f"{option} {text!r}: names no piece; for example {_EXAMPLE[kind]}")
     name = found["name"] or _DEFAULT[kind]
     if not name.isidentifier():
-        raise SettingError(f"--{kind} {text!r}: {name!r} is no name of Python; for example {_EXAMPLE[kind]}")
+        raise SettingError(f"{option} {text!r}: {name!r} is no name of Python; for example {_EXAMPLE[kind]}")
     return PieceSpec(kind, Path(found["file"]), name, found["argument"] or "")
 
 

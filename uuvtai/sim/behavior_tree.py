@@ -18,7 +18,6 @@ import numpy as np
 
 from uuvtai.common import tree_codes as codes
 from uuvtai.common.files import FileError, read_bytes, read_json
-from uuvtai.common.presets import preset_names
 from uuvtai.common.tree_codes import CONTROLS, DECORATORS, LEAVES, MAX_PORTS, Leaf
 from uuvtai.config.loader import ConfigError, preset_path
 
@@ -439,28 +438,7 @@ def tree_dot(tree: FlatTree, use: Sequence[NodeUse] | None = None) -> str:
 
 
 # ------------------------------------------------------------------------------------------------------------
-
-
-__all__ = [
-    "CONTROLS",
-    "DECORATORS",
-    "LEAVES",
-    "FlatTree",
-    "Leaf",
-    "NodeUse",
-    "TreeError",
-    "load_tree",
-    "node_use",
-    "parse_tree",
-    "read_tree",
-    "read_tree_file",
-    "tree_dot",
-    "tree_text",
-]
-
-
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv tree``: a behaviour tree as text, DOT or JSON, with how it was used in an evaluation.
+# ``uuv presets show TREE``: a tree as text, DOT or JSON, with how an evaluation used it.
 
 
 @dataclass(frozen=True)
@@ -472,39 +450,33 @@ class TreeReport:
     dot: str
     document: dict[str, Any]
     """nodes in the order of the lines, with their use where a run was given"""
+    is_used: bool
 
 
-def tree_report(controller: str, run: Path | None) -> TreeReport:
-    """Report of a controller's tree; with a run folder, the use of its nodes there. Raises ConfigError."""
+def tree_report(name: str, run: Path | None) -> TreeReport:
+    """Report of a tree, given by name or path; with a run folder, of the tree of that name there and the use
+    of its nodes. Raises ConfigError."""
     use = None
     if run is not None:
         used = _record(run)
-        if controller not in used:
-            raise ConfigError(
-                f"{run}: has no controller {controller!r}; there are: {', '.join(used)} (--controller NAME)"
-            )
-        tree = read_tree_file(run / "eval" / "trees" / f"{controller}.xml", folder=run)
-        use = used[controller]
+        if name not in used:
+            raise ConfigError(f"{run}: has no tree {name!r}; there are: {', '.join(used)}")
+        tree = read_tree_file(run / "eval" / "trees" / f"{name}.xml", folder=run)
+        use = used[name]
         if len(use) != len(tree.names):
             raise ConfigError(
-                f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv "
-                "eval'"
+                f"{run}: the tree {name!r} has changed since that evaluation; run it again with 'uuv eval'"
             )
     else:
-        tree = read_tree(controller)
-    return TreeReport(tree_text(tree), tree_dot(tree, use), _document(controller, tree, use))
+        tree = read_tree(name)
+    return TreeReport(tree_text(tree), tree_dot(tree, use), _document(name, tree, use), use is not None)
 
 
 def _record(run: Path) -> dict[str, list[NodeUse]]:
-    """Use of every node by controller."""
+    """Use of every node by tree."""
     path = run / "eval" / "tree.json"
     if not run.is_dir():
-        shipped = (
-            f"; the tree alone: 'uuv tree --controller {run}'" if str(run) in preset_names("tree") else ""
-        )
-        raise ConfigError(
-            f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}"
-        )
+        raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it)")
     try:
         record = read_json(path, folder=run)
         return {name: [_use(node) for node in nodes] for name, nodes in record["use"].items()}
@@ -530,11 +502,34 @@ def _use(node: dict[str, Any]) -> NodeUse:
     return NodeUse(float(share), ticks, acted)
 
 
-def _document(controller: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:
+def _document(name: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:
     nodes = []
-    for i, name in enumerate(tree.names):
-        node: dict[str, Any] = {"id": i, "name": name, "type": tree.types[i], "parent": tree.parent[i]}
+    for i, label in enumerate(tree.names):
+        node: dict[str, Any] = {"id": i, "name": label, "type": tree.types[i], "parent": tree.parent[i]}
         if use is not None:
             node |= vars(use[i])
         nodes.append(node)
-    return {"schema": 1, "controller": controller, "source": tree.source, "nodes": nodes}
+    return {"schema": 1, "tree": name, "source": tree.source, "nodes": nodes}
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
+__all__ = [
+    "CONTROLS",
+    "DECORATORS",
+    "LEAVES",
+    "FlatTree",
+    "Leaf",
+    "NodeUse",
+    "TreeError",
+    "TreeReport",
+    "load_tree",
+    "node_use",
+    "parse_tree",
+    "read_tree",
+    "read_tree_file",
+    "tree_dot",
+    "tree_report",
+    "tree_text",
+]

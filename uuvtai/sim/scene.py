@@ -30,7 +30,7 @@ class SceneOptions:
 
     @property
     def settings(self) -> list[Setting]:
-        """Changes of the config, each outweighing those before it: the stack, -S -D -v, --set."""
+        """Changes of the config, each outweighing those before it: the stack, -S -D --speed, --set."""
         typed = {
             "stack": self.stack,
             "world.n_static": self.n_static,

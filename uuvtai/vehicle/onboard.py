@@ -97,7 +97,7 @@ class OnboardPilot(FedPilot):
         cls, config: Config, tree: FlatTree, mission: Mission, limits: StaleLimits | None = None
     ) -> OnboardPilot:
         """A pilot with a simulator of its own; its kernels are compiled, or found compiled, at the first
-        steps (``uuv warm --num-envs 1``)."""
+        steps (``uuv doctor --compile --num-envs 1``)."""
         return cls(Sim(config, 1, tree), mission, limits)
 
 

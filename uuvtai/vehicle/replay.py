@@ -129,7 +129,7 @@ def _tree(path: Path, head: LogHead, controller: str | None, config: Config) -> 
         return read_tree(controller, config.teacher.max_node)
     if "tree.xml" not in head.attachments:
         raise LogError(
-            f"{path}: the log does not hold the tree that drove; name it: uuv replay {path} --controller bt"
+            f"{path}: the log does not hold the tree that drove; name it: uuv replay {path} --agent bt"
         )
     return parse_tree(head.attachments["tree.xml"], f"{path}: tree.xml", config.teacher.max_node)
 
@@ -221,7 +221,7 @@ class _FeedReader:
         if m.data["planner"] == "own":
             raise LogError(
                 f"{self._feed.path}: its routes come from a planner of the user's, which no log holds; "
-                "replay a log of --controller"
+                "replay a log without --planner"
             )
 
     def _action(self, m: LogMessage) -> None:

@@ -280,7 +280,7 @@ def borrowed(small, monkeypatch):
 
 def test_all_of_them_are_rows_of_an_evaluation(borrowed, capfd, tmp_path):
     names = list(PLANNERS)
-    command = ("eval", "--episodes", "2", "--seeds", "77", *SmallSim.OPTIONS, "--controller", ",".join(names))
+    command = ("eval", "--episodes", "2", "--seeds", "77", *SmallSim.OPTIONS, "--agent", ",".join(names))
     code, out, err = uuv(capfd, *command, "--run-dir", str(tmp_path / "run"), "--json")
     assert code == 0, err
     methods = json.loads(out)["methods"]

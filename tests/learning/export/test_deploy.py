@@ -455,7 +455,7 @@ def test_bad_usage(arguments, says, code, capfd, tmp_path, monkeypatch):
 
 
 def test_the_example_writes_a_graph_that_is_taken_as_a_policy(tmp_path, monkeypatch):
-    """``python examples/own_onnx.py``, then ``uuv eval --policy model.onnx``."""
+    """``python examples/own_onnx.py``, then ``uuv eval --agent model.onnx``."""
     pytest.importorskip("onnxscript", reason="needs the extra uuvtai[export]")
     columns = {c.name: slice(first, first + width) for c, first, width in placed_columns(FeaturesConfig())}
     n_obs = observation_width(FeaturesConfig())

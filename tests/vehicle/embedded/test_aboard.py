@@ -1,4 +1,4 @@
-"""``uuv export --stack``: a folder that decides the same where neither Taichi nor torch can be imported."""
+"""``uuv export LOG``: a folder that decides the same where neither Taichi nor torch can be imported."""
 
 import json
 import platform
@@ -44,7 +44,7 @@ def folder(log):
     """In a process of its own: Taichi gives the text of a kernel only where it compiles it for the first
     time."""
     out = log.parent / "stack"
-    words = [sys.executable, "-m", "uuvtai", "export", str(log), "--stack", str(out), "--json"]
+    words = [sys.executable, "-m", "uuvtai", "export", str(log), "--out", str(out), "--json"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
@@ -159,17 +159,17 @@ def test_messages_are_packed_whole():
 
 
 def test_what_cannot_be_written_is_refused_before_the_work(log, tmp_path, capfd, monkeypatch):
-    code, _, err = uuv(capfd, "export", log, "--stack", tmp_path / "new", "--for", "riscv64")
+    code, _, err = uuv(capfd, "export", log, "--out", tmp_path / "new", "--for", "riscv64")
     assert code == 2 and "must be of x86_64, aarch64" in err
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a").touch()
-    code, _, err = uuv(capfd, "export", log, "--stack", tmp_path / "full")
+    code, _, err = uuv(capfd, "export", log, "--out", tmp_path / "full")
     assert code == 2 and "is there already" in err
-    code, _, err = uuv(capfd, "export", tmp_path / "none.mcap", "--stack", tmp_path / "new")
+    code, _, err = uuv(capfd, "export", tmp_path / "none.mcap", "--out", tmp_path / "new")
     assert code == 2 and "none.mcap" in err
-    code, _, err = uuv(capfd, "export", "--stack", tmp_path / "new")
+    code, _, err = uuv(capfd, "export", "--out", tmp_path / "new")
     assert code == 2 and "RUN" in err
     monkeypatch.setattr(export.importlib.util, "find_spec", lambda name: None)
-    code, _, err = uuv(capfd, "export", log, "--stack", tmp_path / "new")
+    code, _, err = uuv(capfd, "export", log, "--out", tmp_path / "new")
     assert code == 2 and "uuvtai[aboard]" in err
     assert not (tmp_path / "new").exists()

@@ -53,9 +53,10 @@ def during_training(checkpoint: Checkpoint) -> Evaluation | None:
     success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
     if not isinstance(success, float | int) or not isinstance(collision, float | int):
         return None
-    where, n = _held_out_in_worlds(config) if config.twin.enabled else _held_out(config)
+    is_twin = config.learner == "twin"
+    where, n = _held_out_in_worlds(config) if is_twin else _held_out(config)
     where += f", seed {config.train.evaluate_seed}"
-    repeated = config.twin.enabled and len(config.twin.worlds) * max(1, len(config.train.scenes)) > 1
+    repeated = is_twin and len(config.twin.worlds) * max(1, len(config.train.scenes)) > 1
     return Evaluation(where, n, round(success * n), round(collision * n), repeated)
 
 

@@ -653,10 +653,7 @@ def _set_rows(rng: torch.Generator) -> tuple[Tensor, ...]:
 
 def kind_of(checkpoint: Checkpoint) -> str | None:
     """One of ``run_policy.KINDS``; None = a policy of one observation vector."""
-    config = checkpoint.config
-    if config.forecaster.enabled:
-        return "forecast"
-    return "set" if config.twin.enabled else None
+    return {"forecaster": "forecast", "twin": "set"}.get(checkpoint.config.learner)
 
 
 def module_of(checkpoint: Checkpoint, kind: str) -> ExportedModule:

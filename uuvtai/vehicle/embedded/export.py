@@ -1,4 +1,4 @@
-"""``uuv export --stack``: the stack of a log as a folder that drives without Taichi and torch, written whole
+"""``uuv export LOG``: the stack of a log as a folder that drives without Taichi and torch, written whole
 or not at all."""
 
 from __future__ import annotations
@@ -389,7 +389,7 @@ def export_stack(
     out: Path,
     machines: Sequence[str],
 ) -> dict[str, Any]:
-    """Write the folder; the document of ``uuv export --stack --json``. ``arrivals``: messages of a log, each
+    """Write the folder; the document of ``uuv export LOG --json``. ``arrivals``: messages of a log, each
     with the step before which it arrives; what is decided on them goes into the folder as its check. Raises
     StackExportError, CrossError, OSError."""
     unknown = [name for name in machines if name not in KINDS]
