@@ -30,23 +30,31 @@ Document = dict[str, Any]
 Cells = list[Document]
 
 ROOT = Path(__file__).resolve().parents[1]
-EVALUATIONS, REPRODUCTION = "docs/data/evaluations.json", "docs/data/reproduce.json"
+REPRODUCTION = "docs/data/reproduce.json"
+EVALUATIONS = "docs/data/evaluations.json"
 SWEEPS, BENCHMARKS = "docs/data/sweeps.json", "benchmarks/results"
 README, RESULTS = "README.md", "docs/results.md"
-ROBUSTNESS, BASELINES, SPEEDS = "docs/robustness.md", "docs/baselines.md", "benchmarks/README.md"
-SAFETY = "docs/safety.md"
+ROBUSTNESS, SAFETY, SPEEDS = "docs/robustness.md", "docs/safety.md", "benchmarks/README.md"
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(?P<foot>^<!-- end -->)", re.M | re.S
 )
 LITERATURE = {"mppi", "dwa", "potential_field", "velocity_obstacle"}
-"""agents whose rows docs/baselines.md shows"""
+"""agents whose rows have a table of their own"""
+SHORT = {
+    "pool_6": "`pool`, 6 at 0.6 m/s",
+    "gauntlet_9_fast": "`gauntlet`, 9 at 1.5 m/s",
+    "maze_6": "`maze`, 6 at 0.6 m/s",
+    "column_9_fast": "`column`, 9 at 1.5 m/s",
+    "pool_6_harsh_estimated": "`pool`, 6 at 0.6 m/s, harsh sensors, position estimated",
+}
+"""rows of README's table"""
 
 
-# ----------------------------------------------------------------------------------------------------- README
+# ------------------------------------------------------------------------------------------------ evaluations
 
 
 def measured(root: Path) -> str:
-    """The lines above README's table."""
+    """The lines above a table of evaluations."""
     document = _read(root / EVALUATIONS)
     seed = document["seed"]
     seen = (
@@ -54,48 +62,42 @@ def measured(root: Path) -> str:
         if seed in RETIRED_SEEDS
         else "No tuning used this seed, and each agent was evaluated on it once."
     )
-    return (
-        f"Measured here: {document['episodes']:,} episodes of seed {seed} in each row, paper sensing, "
-        "S = 8.\n"
-        f"{seen} Success, collision and endings are those of\n"
-        f"`bt`, in the last row of `paper`. `-` = not evaluated. Counts: `{EVALUATIONS}`."
-    )
+    return f"{document['episodes']:,} episodes of seed {seed} in each row, eight static obstacles.\n{seen}"
+
+
+def short(root: Path) -> str:
+    """README's table: success and collision of the tree and of the best agent in five worlds."""
+    rows, lines = {row["name"]: row["methods"] for row in _read(root / EVALUATIONS)["rows"]}, []
+    for name, title in SHORT.items():
+        bt, best = (_both(rows[name][agent]) if agent in rows[name] else "-" for agent in ("bt", "best"))
+        lines.append([title, *(bt.split(" / ") * 2)[:2], best])
+    head = ["world, dynamic obstacles", "`bt`: success", "collision", "`best`: success / collision"]
+    return text_table(head, lines)
 
 
 def evaluations(root: Path) -> str:
-    """README's table: the tree in every world, other agents beside it, and why the rest failed."""
+    """The tree in every world, other agents beside it, and why the rest failed."""
     document = _read(root / EVALUATIONS)
     head = [
-        "world (D, v in m/s)",
-        "success",
-        "collision",
-        "contact / TTC stop / out / timeout",
-        "`best`: success / collision",
-        "`capped`",
-        "`planner`",
-        "`straight`",
-        "most frequent causes of failure",
-    ]
+        "world (D, v in m/s)", "success", "collision", "contact / TTC stop / out / timeout",
+        "`best`: success / collision", "`planner`", "most frequent causes of failure",
+    ]  # fmt: skip
     shown = [row for row in document["rows"] if row["methods"] and LITERATURE.isdisjoint(row["methods"])]
-    return text_table(head, [_evaluated(row) for row in shown])
+    note = (
+        "Success, collision and endings are those of `bt`, in the last row of `paper`; `-` = not evaluated.\n"
+        f"Counts: `{EVALUATIONS}`.\n\n"
+    )
+    return note + text_table(head, [_evaluated(row) for row in shown])
 
 
 def _evaluated(row: Document) -> list[str]:
     methods, own = row["methods"], row["methods"][row["shows"]]
     ends = " / ".join(str(own["outcomes"][end]) for end in ("collision", "ttc", "out_of_tank", "timeout"))
-    best, capped = (
-        f"{_percent(methods[name], 'success')} / {_percent(methods[name], *COLLIDED)}"
-        if name in methods
-        else "-"
-        for name in ("best", "capped")
-    )
-    others = [
-        f"{_percent(methods[name], 'success')} %" if name in methods else "-"
-        for name in ("planner", "straight")
-    ]
+    best = _both(methods["best"]) if "best" in methods else "-"
+    planner = f"{_percent(methods['planner'], 'success')} %" if "planner" in methods else "-"
     causes = ", ".join(f"{cause['label']} {cause['count']}" for cause in own["causes"][:2])
     collision = str(pooled([own], *COLLIDED)).partition(" = ")[2]
-    return [row["title"], str(pooled([own], "success")), collision, ends, best, capped, *others, causes]
+    return [row["title"], str(pooled([own], "success")), collision, ends, best, planner, causes]
 
 
 def _percent(method: Document, *outcomes: str) -> str:
@@ -109,11 +111,12 @@ def local_planners(root: Path) -> str:
     """Planners of the literature and the paper's stack beside the tree."""
     rows = {row["name"]: row for row in _read(root / EVALUATIONS)["rows"]}
     worlds = [rows[name] for name in ("pool_6_local", "pool_9_fast_local", "gauntlet_9_fast_local")]
+    paper = rows["pool_6_paper"]
     worlds[0] = worlds[0] | {
-        "methods": worlds[0]["methods"] | {"paper": rows["pool_6_paper"]["methods"]["paper"]},
-        "paired": [*worlds[0]["paired"], *rows["pool_6_paper"]["paired"]],
+        "methods": paper["methods"] | worlds[0]["methods"],
+        "paired": [*worlds[0]["paired"], *paper["paired"]],
     }
-    names = ("bt", "capped", "paper", "mppi", "dwa", "potential_field", "velocity_obstacle")
+    names = ("bt", "paper", "mppi", "dwa", "potential_field", "velocity_obstacle")
     lines = [[f"`{name}`", *(_beside_bt(row, name) for row in worlds)] for name in names]
     return text_table(["", *(row["title"] for row in worlds)], lines)
 
@@ -267,14 +270,16 @@ def safety_rules(root: Path) -> str:
 
 
 TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
-    README: {"measured": measured, "evaluations": evaluations},
+    README: {"measured": measured, "short": short},
     ROBUSTNESS: {
+        "measured": measured,
+        "evaluations": evaluations,
+        "local_planners": local_planners,
         "sweep_commands": sweep_commands,
         "grid": grid,
         "caution": caution,
         "one_at_a_time": one_at_a_time,
     },
-    BASELINES: {"local_planners": local_planners},
     SPEEDS: {"speeds": speeds},
     SAFETY: {"safety_rules": safety_rules},
 }
@@ -436,7 +441,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--check", action="store_true", help="change nothing, list what differs")
     parser.add_argument("--keep", type=Path, metavar="RUN", help="run folder whose results to keep")
-    parser.add_argument("--row", help="row of README's table that the kept run evaluated")
+    parser.add_argument("--row", help="row of the evaluations that the kept run is")
     parser.add_argument("--sweep", help="sweep of docs/data/sweeps.json that the kept run is")
     chosen = parser.parse_args(arguments)
     if chosen.keep:

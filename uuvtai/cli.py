@@ -504,7 +504,7 @@ def serve_sitl(
 ) -> None:
     """Run our physics as the ArduSub SITL backend.
 
-    ArduSub connects by its JSON interface (docs/sitl.md)."""
+    ArduSub connects by its JSON interface (docs/on_a_vehicle.md)."""
     from uuvtai.console.views import show_sitl
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.vehicle.sitl import serve_water

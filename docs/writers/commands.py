@@ -14,22 +14,22 @@ from uuvtai.common import exits
 from uuvtai.report.tables import text_table
 
 SEE = {
-    "eval": ("quickstart", "own_pieces", "viewers", "determinism"),
+    "eval": ("evaluate", "extend"),
     "train": ("quickstart", "learning"),
-    "simulate": ("simulator", "own_pieces"),
-    "watch": ("viewers", "own_pieces"),
-    "identify": ("vehicle",),
-    "sweep": ("scale", "own_pieces"),
-    "reproduce": ("learning", "own_pieces"),
-    "report": ("quickstart", "viewers"),
-    "export": ("deployment",),
-    "replay": ("replay", "viewers"),
-    "pilot": ("safety", "sitl"),
-    "sitl": ("sitl",),
-    "presets": ("reference/configuration", "simulator"),
-    "examples": ("own_pieces", "gym", "python"),
-    "doctor": ("quickstart", "native"),
-    "log": ("viewers", "reference/topics", "security"),
+    "simulate": ("simulator", "extend"),
+    "watch": ("logs",),
+    "identify": ("on_a_vehicle",),
+    "sweep": ("evaluate",),
+    "reproduce": ("evaluate", "results"),
+    "report": ("evaluate",),
+    "export": ("on_a_vehicle",),
+    "replay": ("logs", "on_a_vehicle"),
+    "pilot": ("safety", "on_a_vehicle"),
+    "sitl": ("on_a_vehicle",),
+    "presets": ("reference/configuration",),
+    "examples": ("extend",),
+    "doctor": ("quickstart", "performance"),
+    "log": ("logs", "reference/topics", "security"),
 }
 """prose about a command"""
 

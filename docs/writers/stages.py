@@ -11,13 +11,13 @@ KERNELS = Path(uuvtai.__file__).parent / "kernels"
 
 FILES = {
     "dynamics": ("thruster_fault", "control", "dynamics"),
-    "world": ("scenario", "episode"),
+    "world": ("scenario", "motion", "episode"),
     "proprioception": ("proprioception",),
-    "sonar": ("sonar", "raycast"),
+    "sonar": ("sonar", "sonar_image", "raycast"),
     "pose": ("localization",),
     "depth": ("depth_camera",),
     "tracking": ("tracking", "track_filter", "height", "prediction", "camera_tracking"),
-    "mapping": ("mapping",),
+    "mapping": ("sensor_model", "mapping"),
     "clearance": ("clearance",),
     "planning": ("triggers", "voronoi", "medial_axis", "route"),
     "features": ("observation",),
@@ -32,8 +32,8 @@ def page() -> str:
     parts = [
         "# Stages of a step",
         "One control step runs these stages in this order; a row of `uuv profile` carries the same name. The "
-        "text is that of the files in `uuvtai/kernels/`. What they stand on, and what is assumed: [how the "
-        "simulator works](../simulator.md).",
+        "text is that of the files in `uuvtai/kernels/`. What they stand on, and what is assumed: "
+        "[simulator](../simulator.md), [navigation](../navigation.md).",
     ]
     for stage, files in FILES.items():
         parts.append(f"## {stage}")

@@ -23,7 +23,7 @@ def page() -> str:
         "`uuv eval --record K` writes one MCAP file per episode: JSON messages, zstd chunks, simulation time "
         "from 0, SI units, world frame z-up, body frame forward-left-up. `foxglove.*` schemas are those of "
         "<https://docs.foxglove.dev/docs/sdk/schemas>; our own follow below. Attachments: `config.yaml`, "
-        "`scenario.json`. Metadata: `uuv.run`, `uuv.result`. What opens a log: [viewers](../viewers.md).",
+        "`scenario.json`. Metadata: `uuv.run`, `uuv.result`. What opens a log: [logs](../logs.md).",
         text_table(["topic", "schema", "written"], rows),
     ]
     for topic in TOPICS:

@@ -2,6 +2,11 @@
 
 import math
 
+TERMS = (
+    "alive", "progress", "path_distance", "cross_track", "clearance", "ttc", "overspeed", "upright",
+    "heading", "success", "failure", "tilt", "effort",
+)  # fmt: skip
+
 
 def terms(cfg, vehicle, s):
     """Weighted terms by name of one step; ``s`` holds the step's numbers (see test_reward)."""

@@ -197,9 +197,9 @@ def test_custom_reward_changes_the_terms_it_names(small, example, monkeypatch):
     configure(monkeypatch, small.sim, small.config.model_copy(update={"reward": changed}))
     careful = module.terms(VectorEnv(small.sim), 30)
     for i, name in enumerate(names):
-        factor = getattr(changed, name) / getattr(small.config.reward, name)
-        assert float(careful[i]) == pytest.approx(factor * float(default[i]), rel=1e-4, abs=1e-6)
-        assert (factor != 1) == (name in weights)
+        was, now = getattr(small.config.reward, name), getattr(changed, name)
+        assert was * float(careful[i]) == pytest.approx(now * float(default[i]), rel=1e-4, abs=1e-6 * was)
+        assert (was != now) == (name in weights)
     rows = module.table({"default": default, "careful": careful}, names).splitlines()
     assert len(rows) == len(names) + 2 and float(rows[-1].split()[1]) == pytest.approx(
         float(default.sum()), abs=0.01

@@ -27,7 +27,7 @@ here.
     ``stale_locks``: a process that is killed leaves its lock, and from then on nobody uses the cache. Can go
     when Taichi's lock dies with its process. ``CACHE_BYTES`` lifts a limit by an option of ``ti.init``.
 
-``uuvtai.compile.launch`` (a room of its own: ``docs/native.md``)
+``uuvtai.compile.launch`` (a room of its own: ``docs/performance.md``)
     ``quick_launch`` goes round ``Kernel.__call__``, which looks at every argument and hashes every section at
     every launch: the same objects again go straight to the compiled kernel. Stands on ``compiled_kernels``,
     ``ensure_compiled``, ``compile_kernel`` and ``launch_kernel``. Can go when launching with arguments seen

@@ -308,7 +308,7 @@ class _Row:
 
 # ------------------------------------------------------------------------------------------------------------
 # Which of two shapes kernels are made in: for a CPU's few cores and wide vectors, or for a GPU's many narrow
-# threads. No result depends on it (``docs/cuda.md``).
+# threads. No result depends on it (``docs/performance.md``).
 
 
 VARIABLE = "UUV_KERNELS"

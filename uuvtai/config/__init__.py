@@ -51,7 +51,7 @@ class RuntimeConfig(Section):
     """How kernels are launched."""
 
     native: bool = True
-    """by machine code of their own, kept on disk, instead of by Taichi (CPU, Linux): ``docs/native.md``"""
+    """by machine code of their own, kept on disk, not by Taichi (CPU, Linux): ``docs/performance.md``"""
 
 
 MOST_CELLS = 4_000_000

@@ -113,7 +113,7 @@ def zeros(count: int) -> np.ndarray:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# A log's control steps as ROS 2's standard messages; the table of docs/viewers.md.
+# A log's control steps as ROS 2's standard messages; the table of docs/logs.md.
 
 
 Step = dict[str, dict[str, Any]]
@@ -357,7 +357,7 @@ def _grid(ros: RosMessages, grid: dict[str, Any]) -> Any:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# ROS 2's standard messages as a log's JSON messages; the table of docs/viewers.md. Nothing in a message is
+# ROS 2's standard messages as a log's JSON messages; the table of docs/logs.md. Nothing in a message is
 # trusted: what does not fit together is a ValueError.
 
 

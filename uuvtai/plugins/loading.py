@@ -245,7 +245,7 @@ def onnx_policy(spec: PieceSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np
         if width not in (None, n_obs):
             raise PieceError(
                 f"{spec.path}: takes observations of {width} columns, here they have {n_obs} "
-                "(docs/gym.md lists them); --set features.n_track=.. and features.teacher=true add columns"
+                "(docs/extend.md lists them); --set features.n_track=.. and features.teacher=true add columns"
             )
         calls = -(-CHUNK // (rows or CHUNK))
         graph_check.refuse_strange(graph, {name: (rows or CHUNK, n_obs)}, calls, rows or 1)

@@ -1,4 +1,4 @@
-"""The stack on a vehicle: sensor messages in, commands out (docs/replay.md)."""
+"""The stack on a vehicle: sensor messages in, commands out (docs/on_a_vehicle.md)."""
 
 from __future__ import annotations
 
