@@ -359,8 +359,10 @@ _KEPT = ("name", "episodes", "outcomes", "ends", "time_mean_s", "time_to_success
 
 
 def _kept(entry: Document) -> Document:
-    causes = [{name: cause[name] for name in ("label", "count")} for cause in entry.get("causes", [])]
-    return {name: entry[name] for name in _KEPT if name in entry} | {"causes": causes}
+    kept = {name: entry[name] for name in _KEPT if name in entry}
+    if "causes" in kept:
+        kept["causes"] = [{name: cause[name] for name in ("label", "count")} for cause in kept["causes"]]
+    return kept
 
 
 def _small_sweep(sweep: Document) -> Document:

@@ -371,7 +371,10 @@ SitlEpisode = Annotated[int, _more("--episode", min=0, help="Episode of the firs
 
 DriveLogs = Annotated[
     list[Path],
-    Argument(help="Logs: our .mcap, ArduSub's .bin or .tlog, or .csv (docs/on_a_vehicle.md says how)."),
+    Argument(
+        help="Logs: our .mcap, ArduSub's .bin or .tlog, or .csv with t,u,v,w,r,rpm_1,.."
+        " (docs/on_a_vehicle.md)."
+    ),
 ]
 BaseVehicle = Annotated[str, _preset("--vehicle", "vehicle", f"Vehicle: {_VEHICLES}, or a YAML file.")]
 IdentifyKnown = Annotated[
