@@ -575,7 +575,7 @@ def replay_log(
 def simulate(
     motion: groups.MotionGroup,
     driver: groups.AgentGroup,
-    output: groups.OutputGroup,
+    output: groups.PlainOutputGroup,
     vehicle: opt.BaseVehicle = "bluerov2",
     overrides: opt.Set = None,
 ) -> None:
