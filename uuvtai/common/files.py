@@ -20,16 +20,12 @@ from typing import Any, BinaryIO
 from uuvtai.common import signals
 from uuvtai.common.errors import UserError
 
-MAX_BYTES = 1 << 30
-"""[bytes] most that any file may bring into memory"""
-MAX_JSON_BYTES = 64 << 20
-"""[bytes] most that a JSON document may have"""
+MAX_BYTES = 1 << 30  # [bytes] most that any file may bring into memory
+MAX_JSON_BYTES = 64 << 20  # [bytes] most that a JSON document may have
 _MAX_JSON_CONTAINERS, _MAX_JSON_VALUES = 1_000_000, 8_000_000
 """of one document: in memory an empty list takes thirty times the two bytes that it is written with"""
-_MAX_INTEGER = 1 << 128
-"""what the state of a random generator takes; a float holds it too"""
-_MAX_ENTRIES = 1_000_000
-"""files and folders of one run folder: more are not counted"""
+_MAX_INTEGER = 1 << 128  # what the state of a random generator takes; a float holds it too
+_MAX_ENTRIES = 1_000_000  # files and folders of one run folder: more are not counted
 
 _NO_FOLLOW = getattr(
     os, "O_NOFOLLOW", 0

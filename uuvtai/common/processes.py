@@ -18,11 +18,9 @@ from uuvtai.common import signals
 from uuvtai.common.errors import SettingError, UserError
 
 Item = TypeVar("Item")
-Work = Callable[[Item], Any]
-"""a module's function of one picklable argument"""
+Work = Callable[[Item], Any]  # a module's function of one picklable argument
 
-ATTEMPTS = 3
-"""how often a task is tried that loses its worker"""
+ATTEMPTS = 3  # how often a task is tried that loses its worker
 
 signals.never_within(popen_spawn_posix.__file__)
 """A process that has been started and is then not told what to do would print a traceback."""

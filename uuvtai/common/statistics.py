@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-Z95 = 1.959963984540054
-"""Two-sided 95 % quantile of the standard normal."""
+Z95 = 1.959963984540054  # Two-sided 95 % quantile of the standard normal.
 
 
 def wilson_interval(k: float, n: float) -> tuple[float, float] | None:
@@ -76,10 +75,8 @@ def time_to_success_s(mean_time_s: float | None, success_rate: float | None) -> 
     return mean_time_s / success_rate
 
 
-_RESAMPLES = 2000
-"""of a bootstrap: the ends of a 95 % interval then vary by about a twentieth of its width"""
-_BOOTSTRAP_SEED = 20_240_229
-"""the same samples give the same interval"""
+_RESAMPLES = 2000  # of a bootstrap: the ends of a 95 % interval then vary by about a twentieth of its width
+_BOOTSTRAP_SEED = 20_240_229  # the same samples give the same interval
 
 
 def bootstrap_interval(values: Sequence[float], resamples: int = _RESAMPLES) -> tuple[float, float] | None:

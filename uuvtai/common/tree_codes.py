@@ -36,15 +36,13 @@ HOLD = 18
 UNSTICK = 19
 FOLLOW_ROUTE = 20
 DRIVE_STRAIGHT = 21
-FIRST_BASELINE = 32
-"""Codes from here on are local planners of the literature."""
+FIRST_BASELINE = 32  # Codes from here on are local planners of the literature.
 DYNAMIC_WINDOW = FIRST_BASELINE
 POTENTIAL_FIELD = 33
 VELOCITY_OBSTACLE = 34
 PATH_INTEGRAL = 35
 
-MAX_PORTS = 4
-"""Numbers that a leaf can be given."""
+MAX_PORTS = 4  # Numbers that a leaf can be given.
 
 
 @dataclass(frozen=True)

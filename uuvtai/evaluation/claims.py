@@ -47,8 +47,7 @@ TABLE_MAIN = {
 }
 """by the names of our presets; 25 episodes a method"""
 
-MODERATE = {"S": 8, "D": 9, "v_m_s": 1.5}
-"""largest values of the conditions over which the paper gives means"""
+MODERATE = {"S": 8, "D": 9, "v_m_s": 1.5}  # largest values of the conditions over which the paper gives means
 MODERATE_SUCCESS, MODERATE_COLLISION = 0.828, 0.011
 MODERATE_CONDITIONS, WITHOUT_COLLISION = 40, 38
 FEW_MOVERS, FEW_MOVERS_COLLISION = 3, 0.004
@@ -75,8 +74,7 @@ INCONSISTENCIES = (
 
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be judged"
-LEVEL = 0.05
-"""of all tests of a reproduction together"""
+LEVEL = 0.05  # of all tests of a reproduction together
 
 
 @dataclass(frozen=True)
@@ -96,10 +94,8 @@ class Claim:
     theirs: str
     ours: str
     verdict: str
-    p: float | None = None
-    """of the claim's own test"""
-    p_holm: float | None = None
-    """adjusted for all tests of the reproduction"""
+    p: float | None = None  # of the claim's own test
+    p_holm: float | None = None  # adjusted for all tests of the reproduction
 
 
 def claim(text: str, theirs: str, ours: str, finding: Finding) -> Claim:
@@ -218,8 +214,7 @@ def _by_binomial(a: Share, value: float, holds: bool) -> Finding:
     )
 
 
-_MARGIN = 0.1
-"""how far a rate may fall behind another one that it is said to come near"""
+_MARGIN = 0.1  # how far a rate may fall behind another one that it is said to come near
 
 
 def near(a: Share, b: Share) -> Finding:

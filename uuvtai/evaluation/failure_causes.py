@@ -56,15 +56,13 @@ was off by more than MISS_M at the end, or there was none."""
 CLEAR_M = 0.1
 """A body that is remembered farther above or below than this counts as clear of the own depth (what the
 referee calls contact)."""
-LATELY_S = 2.5
-"""Remarks look back this far."""
+LATELY_S = 2.5  # Remarks look back this far.
 MISS_M = 0.35
 """A forecast missed when it was farther off than the pilot's margin at one second (0.25 m + 0.1 m/s)."""
 REACH_M = 0.4
 """Squeezed: something static is nearer to the hull at the end: no room to give way (hull 0.17 m + contact 0.1
 m + margin)."""
-CROWD_M = 0.6
-"""Crowded: a second moving body came nearer to the hull in the last CROWD_S."""
+CROWD_M = 0.6  # Crowded: a second moving body came nearer to the hull in the last CROWD_S.
 NEAR_M = 1.0
 """Contact with something static is no accident of its own when a moving body came this near to the hull in
 the last NEAR_S."""
@@ -74,12 +72,9 @@ PLACE_M = 0.1
 DEPTH_M = 0.05
 """Took floor or surface for farther than it was: the own depth was off by more, towards it; the pilot keeps
 the hull 0.03 m off and three standard deviations of the depth."""
-CLIMB_M = 0.15
-"""Changed its depth: moved by more, upwards or downwards, in the last second."""
-PROGRESS_M = 1.0
-"""A timeout that came this much nearer to the goal in that time was only slow."""
-STUCK_M = 0.5
-"""A vehicle that drove less in that time did not move."""
+CLIMB_M = 0.15  # Changed its depth: moved by more, upwards or downwards, in the last second.
+PROGRESS_M = 1.0  # A timeout that came this much nearer to the goal in that time was only slow.
+STUCK_M = 0.5  # A vehicle that drove less in that time did not move.
 
 CAUSES: dict[str, str] = {
     "out_of_tank": "left the tank",
@@ -295,8 +290,7 @@ _WINDOW_FIELDS = {
 _COARSE_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
 _BODY_FIELDS = {"world": ("kind", "size", "yaw"), "path": ("n_way", "radius_m", "length_m", "speed_m_s")}
 
-_FORESEEN_S = 1.0e3
-"""A predicted conflict; beyond = none (geometry.FAR_M)."""
+_FORESEEN_S = 1.0e3  # A predicted conflict; beyond = none (geometry.FAR_M).
 
 
 @dataclass
@@ -447,8 +441,7 @@ def _bodies(config: Config, read: dict[str, np.ndarray]) -> Bodies:
 # Explain failed episodes: play them again, label each (``causes.py``), and record the worst.
 
 
-EXAMPLES = 3
-"""Episodes named per label in the table."""
+EXAMPLES = 3  # Episodes named per label in the table.
 
 
 @dataclass(frozen=True, eq=False)

@@ -171,12 +171,9 @@ class Bodies:
     kind: Array
     size: Array
     yaw: Array
-    speed_m_s: Array
-    """nominal; 0 = at rest"""
-    circle_m: Array
-    """radius of the circle it drives on; 0 = a polyline or at rest"""
-    lap_s: Array
-    """time once around its closed path; inf = at rest"""
+    speed_m_s: Array  # nominal; 0 = at rest
+    circle_m: Array  # radius of the circle it drives on; 0 = a polyline or at rest
+    lap_s: Array  # time once around its closed path; inf = at rest
 
     @property
     def moving(self) -> Array:
@@ -190,8 +187,7 @@ class CoarseHistory:
 
     t_s: Array
     pos_w: Array
-    goal_m: Array
-    """3-D distance to the goal"""
+    goal_m: Array  # 3-D distance to the goal
     has_route: Array
     leaf: list[str]
 
@@ -201,44 +197,29 @@ class History:
     """The last seconds of an episode, oldest sample first, the end last; ``coarse`` is the account of all of
     it."""
 
-    t_s: Array
-    """(n,) since the start"""
+    t_s: Array  # (n,) since the start
     pos_w: Array
-    believed_pos_w: Array
-    """(n, 3) own position as the vehicle estimates it"""
-    vel_valid: Array
-    """(n,) whether it knows its velocity: 1, 2 = heave alone, 0 = not"""
+    believed_pos_w: Array  # (n, 3) own position as the vehicle estimates it
+    vel_valid: Array  # (n,) whether it knows its velocity: 1, 2 = heave alone, 0 = not
     quat_wb: Array
     vel_b: Array
     rate_b: Array
-    body_w: Array
-    """(n, nb, 3)"""
+    body_w: Array  # (n, nb, 3)
     body_vel_w: Array
-    ping_age_s: Array
-    """(n,) age of the newest delivered scan"""
-    range_m: Array
-    """(n, n_ray) that scan; no return = maximum range"""
-    track_moving: Array
-    """(n, n_track) 1 = confirmed, 0 = taken to be static, -1 = empty slot"""
-    track_w: Array
-    """(n, n_track, 2)"""
-    forecast_w: Array
-    """(n, n_track, n_forecast, 2)"""
-    forecast_m: Array
-    """(n, n_track) present radius, negative = no forecast"""
+    ping_age_s: Array  # (n,) age of the newest delivered scan
+    range_m: Array  # (n, n_ray) that scan; no return = maximum range
+    track_moving: Array  # (n, n_track) 1 = confirmed, 0 = taken to be static, -1 = empty slot
+    track_w: Array  # (n, n_track, 2)
+    forecast_w: Array  # (n, n_track, n_forecast, 2)
+    forecast_m: Array  # (n, n_track) present radius, negative = no forecast
     forecast_above_w: Array
     """(n, n_track) z of the lowest edge of what it may hold above the vehicle; the vehicle's own z where it
     may be level with it"""
-    forecast_below_w: Array
-    """(n, n_track) z of the highest edge of what it may hold below"""
-    conflict: Array
-    """(n,) bool: the pilot foresees a conflict"""
-    leaf: list[str]
-    """type of the leaf in charge, "" = none"""
-    action: Array
-    """(n, 4)"""
-    map_clearance_m: Array
-    """(n,) what the vehicle's own map says"""
+    forecast_below_w: Array  # (n, n_track) z of the highest edge of what it may hold below
+    conflict: Array  # (n,) bool: the pilot foresees a conflict
+    leaf: list[str]  # type of the leaf in charge, "" = none
+    action: Array  # (n, 4)
+    map_clearance_m: Array  # (n,) what the vehicle's own map says
     coarse: CoarseHistory
 
 
@@ -248,12 +229,10 @@ class History:
 
 
 N_HEADING = 16
-SPEEDS = (0.5, 1.0)
-"""Shares of the fastest evasion in that direction."""
+SPEEDS = (0.5, 1.0)  # Shares of the fastest evasion in that direction.
 STEP_S = 0.05
 _DEEP_M = 1e3
-AFTER_S = 0.5
-"""An escape keeps clear up to this after the end."""
+AFTER_S = 0.5  # An escape keeps clear up to this after the end.
 
 
 def escapes(history: History, bodies: Bodies, config: Config, lead_s: float) -> tuple[int, int]:
@@ -352,43 +331,32 @@ def _reach(pos: Array, bodies: Bodies) -> Array:
 # ------------------------------------------------------------------------------------------------------------
 
 
-WINDOW_S = 4.0
-"""How far back the facts look; a time "ago" that is None lies farther back or never was."""
+WINDOW_S = 4.0  # How far back the facts look; a time "ago" that is None lies farther back or never was.
 LEAD_S = 1.0
 """Forecasts are judged by what they said this long before the end: half a second to react, half a second to
 get out of the way."""
 SIGHT_S = (1.5, 0.5)
 """Without a forecast LEAD_S before the end, this interval tells why: mostly out of the fan, mostly hidden, or
 seen but not tracked."""
-TURN_RAD = math.radians(30.0)
-"""A corner: the body's course changes by more between two samples."""
-BACK_RAD = math.radians(120.0)
-"""A turn back: a corner with more than this."""
-BEFORE_TURN_S = 0.1
-"""The forecast that a turn is judged by was made this long before it."""
+TURN_RAD = math.radians(30.0)  # A corner: the body's course changes by more between two samples.
+BACK_RAD = math.radians(120.0)  # A turn back: a corner with more than this.
+BEFORE_TURN_S = 0.1  # The forecast that a turn is judged by was made this long before it.
 BELIEF_M = 0.5
 """A forecast or track belongs to a body when its present position is this close to the truth, in the
 plane."""
-CLIMB_S = 1.0
-"""Changes of the own depth are counted over this time before the end."""
-BEAM_M = 0.1
-"""A beam met the body when its range agrees with the truth within this plus four sigma."""
-CROWD_S = 0.5
-"""A second moving body counts when it came near in this time before the end."""
-NEAR_S = 1.5
-"""Any moving body counts as near when it was so in this time before the end."""
+CLIMB_S = 1.0  # Changes of the own depth are counted over this time before the end.
+BEAM_M = 0.1  # A beam met the body when its range agrees with the truth within this plus four sigma.
+CROWD_S = 0.5  # A second moving body counts when it came near in this time before the end.
+NEAR_S = 1.5  # Any moving body counts as near when it was so in this time before the end.
 CHANCES_S = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 """The last chance is the latest of these times before the end from which some velocity still escaped
 (``escape.py``)."""
 BLIND_S = 1.0
 """The own velocity is lost when it was unknown in most of this time before the end; for floor and surface
 heave is enough."""
-BREAK_S = 0.3
-"""A leaf that lost charge for no longer than this still counts as in charge."""
-LAST_S = 10.0
-"""Timeouts are judged by their last ten seconds."""
-EVADING = ("Evade", "BackOff")
-"""Leaves that give way to something."""
+BREAK_S = 0.3  # A leaf that lost charge for no longer than this still counts as in charge.
+LAST_S = 10.0  # Timeouts are judged by their last ten seconds.
+EVADING = ("Evade", "BackOff")  # Leaves that give way to something.
 WAITING = ("Hold",)
 """Leaves that stay in place on purpose; further ones are recognised by a name that begins with Wait, Yield or
 Shelter."""
@@ -398,8 +366,7 @@ Shelter."""
 class Killer:
     """What ended the episode."""
 
-    name: str
-    """sphere, cylinder, box, wall, floor or surface; "" = nothing (timeout)"""
+    name: str  # sphere, cylinder, box, wall, floor or surface; "" = nothing (timeout)
     slot: int | None = None
     moving: bool = False
     gap_m: float | None = None

@@ -29,16 +29,13 @@ if TYPE_CHECKING:
 
 SCENE_AXES = {"S": "world.n_static", "D": "world.n_dynamic", "v": "world.dynamic_speed_m_s"}
 """axes that vary as data within one simulator, and their config keys"""
-PRESET_AXES = ("sensors", "vehicle", "world")
-"""axes whose values are names of presets"""
+PRESET_AXES = ("sensors", "vehicle", "world")  # axes whose values are names of presets
 MAX_CELLS = 10_000
-DEFAULT = "paper"
-"""grid preset of a sweep that names no axes"""
+DEFAULT = "paper"  # grid preset of a sweep that names no axes
 _KEY = re.compile(r"[a-z_][a-z0-9_]*(\.[a-z_][a-z0-9_]*)+")
 
 Value = Any
-Cell = dict[str, Value]
-"""value of every axis that the cell sets, by the axis's name"""
+Cell = dict[str, Value]  # value of every axis that the cell sets, by the axis's name
 
 
 @dataclass(frozen=True)
@@ -165,26 +162,20 @@ def _check_values(name: str, values: Sequence[Value]) -> None:
 # any machine.
 
 
-Row = dict[str, Any]
-"""one method in one cell, an entry of ``cells`` in ``uuv sweep --json``"""
+Row = dict[str, Any]  # one method in one cell, an entry of ``cells`` in ``uuv sweep --json``
 
 
 @dataclass(frozen=True)
 class Task:
     """Cells of one config, which one simulator serves, and one method that plays them."""
 
-    config: Config
-    """with room for the largest scene"""
+    config: Config  # with room for the largest scene
     controller: str | None
-    policy: str | None
-    """exactly one of the two"""
-    scenes: tuple[Scene, ...]
-    """of the cells, in order"""
-    labels: tuple[dict[str, Any], ...]
-    """of the cells: values of the axes, which go into the rows"""
+    policy: str | None  # exactly one of the two
+    scenes: tuple[Scene, ...]  # of the cells, in order
+    labels: tuple[dict[str, Any], ...]  # of the cells: values of the axes, which go into the rows
     seeds: tuple[int, ...]
-    episodes: int
-    """per seed"""
+    episodes: int  # per seed
     num_envs: int
     device: str = "auto"
 
@@ -273,8 +264,7 @@ def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> 
 # ------------------------------------------------------------------------------------------------------------
 
 
-BATCH = 256
-"""episodes side by side in one simulator"""
+BATCH = 256  # episodes side by side in one simulator
 TASK_EPISODES = 1024
 """episodes of a task, about: what a kill costs at most, and enough that the last stragglers of a batch cost
 little"""
@@ -290,13 +280,11 @@ class SweepRequest:
     world: str
     sensors: str | None
     vehicle: str | None
-    overrides: tuple[Any, ...]
-    """of the config, for every cell: ``key=value`` texts and (key, value) pairs"""
+    overrides: tuple[Any, ...]  # of the config, for every cell: ``key=value`` texts and (key, value) pairs
     controllers: tuple[str, ...]
     policies: tuple[str, ...]
     seeds: tuple[int, ...]
-    episodes: int
-    """per seed, cell and method"""
+    episodes: int  # per seed, cell and method
     num_envs: int | None = None
     device: str = "auto"
 

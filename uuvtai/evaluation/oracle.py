@@ -31,23 +31,18 @@ from uuvtai.config import Config
 # Where the bodies of a scenario are at given times, and how far points are from them.
 
 
-_BEFORE_S = 1e-4
-"""Velocities are differences over this time: exact but for the moment of a sharp turn."""
+_BEFORE_S = 1e-4  # Velocities are differences over this time: exact but for the moment of a sharp turn.
 
 
 @dataclass(frozen=True)
 class Obstacle:
     """One body of a scenario."""
 
-    kind: str
-    """sphere, cylinder or box"""
-    size: Array
-    """(3,) [m] as in ``WorldState``"""
+    kind: str  # sphere, cylinder or box
+    size: Array  # (3,) [m] as in ``WorldState``
     yaw: float
-    pos_w: Array
-    """(n_t, 3) [m]; n_t = 1 for a body at rest"""
-    vel_w: Array
-    """(n_t, 2) [m/s] horizontal"""
+    pos_w: Array  # (n_t, 3) [m]; n_t = 1 for a body at rest
+    vel_w: Array  # (n_t, 2) [m/s] horizontal
 
     @property
     def moves(self) -> bool:
@@ -105,11 +100,9 @@ def rounding_m(body: Obstacle) -> float:
 # The hull is a ball of its own radius: the slimmest that the capsule can look, whatever its heading.
 
 
-CELL_M = 0.1
-"""Level distance of neighbouring nodes."""
+CELL_M = 0.1  # Level distance of neighbouring nodes.
 
-HEAVE_EVERY = 2
-"""Nodes above each other lie as far apart as full heave goes in so many time steps."""
+HEAVE_EVERY = 2  # Nodes above each other lie as far apart as full heave goes in so many time steps.
 
 STAY, AXES, DIAGONALS = slice(0, 1), slice(1, 5), slice(5, 9)
 MOVES = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)])
@@ -123,13 +116,10 @@ class Lattice:
     x_m: Array
     y_m: Array
     z_m: Array
-    dt_s: float
-    """one level step at full speed"""
+    dt_s: float  # one level step at full speed
     speed_m_s: float
-    inside: Array
-    """far enough from side walls, floor and surface"""
-    start: tuple[int, int, int]
-    """node of the start (z, y, x)"""
+    inside: Array  # far enough from side walls, floor and surface
+    start: tuple[int, int, int]  # node of the start (z, y, x)
 
     def near(self, point: Array, reach_m: float) -> Array:
         """Mask of the nodes within ``reach_m`` of a point."""
@@ -255,8 +245,7 @@ be reached is an octagon."""
 class Arrival:
     """What the oracle says of one scenario."""
 
-    time_s: float | None
-    """earliest arrival; None = not reachable within the horizon"""
+    time_s: float | None  # earliest arrival; None = not reachable within the horizon
 
 
 def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:

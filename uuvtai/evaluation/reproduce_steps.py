@@ -33,14 +33,11 @@ class Budget:
     iterations: int
     """of 256 envs x 64 steps; 38 are 622,592 env-steps, the paper's budget, and 380 ten times as many"""
     training_seeds: int
-    episodes: int
-    """per method in Table main"""
+    episodes: int  # per method in Table main
     ceiling_episodes: int
-    sweep_episodes: int
-    """per cell"""
+    sweep_episodes: int  # per cell
     profile_seconds: float
-    beyond: bool
-    """also trade-off, robustness and gauntlet sweeps"""
+    beyond: bool  # also trade-off, robustness and gauntlet sweeps
 
 
 BUDGETS = {
@@ -54,13 +51,10 @@ class Step:
     """One command. ``folder`` is relative to the reproduction's."""
 
     name: str
-    command: tuple[str, ...]
-    """arguments of ``uuv``, without folder"""
+    command: tuple[str, ...]  # arguments of ``uuv``, without folder
     folder: str
-    resumes: bool = False
-    """what was begun is gone on with by ``--resume``; other commands begin anew"""
-    to_file: bool = False
-    """the command has no run folder: what it prints is kept"""
+    resumes: bool = False  # what was begun is gone on with by ``--resume``; other commands begin anew
+    to_file: bool = False  # the command has no run folder: what it prints is kept
 
     def argv(self, root: Path, resume: bool = False) -> list[str]:
         """Arguments of ``uuv`` with the folder, as they are run."""

@@ -85,8 +85,7 @@ class Broadcast(EpisodeReader):
         )
 
 
-_FORGIVEN_S = 0.25
-"""who is later than this does not catch up: a viewer would see a jump"""
+_FORGIVEN_S = 0.25  # who is later than this does not catch up: a viewer would see a jump
 
 
 class RealTime:
@@ -134,16 +133,12 @@ class RealTime:
 # bytes on. The SDK's own server takes any web page's script, and any number of clients.
 
 
-MOST_CLIENTS = 8
-"""at once, whether they have sent a request already or not"""
+MOST_CLIENTS = 8  # at once, whether they have sent a request already or not
 _REQUEST_S, _REQUEST_BYTES = 5.0, 16 << 10
-_SLOW_S = 10.0
-"""a client that takes nothing for as long is dropped [s]"""
-_BUFFER = 256 << 10
-"""[bytes] that the system keeps for each side of a client"""
+_SLOW_S = 10.0  # a client that takes nothing for as long is dropped [s]
+_BUFFER = 256 << 10  # [bytes] that the system keeps for each side of a client
 _OWN_NAMES = ("localhost", "127.0.0.1", "::1")
-_DESKTOP = "file://"
-"""origin of Foxglove's and Lichtblick's programs; no web page can name it"""
+_DESKTOP = "file://"  # origin of Foxglove's and Lichtblick's programs; no web page can name it
 
 
 class Doorkeeper:
@@ -278,11 +273,9 @@ def _ended(place: socket.socket) -> None:
 
 
 EXTRA = "uuvtai[live]"
-BACKLOG = 64
-"""messages that wait for a client; when more do, the oldest are dropped"""
+BACKLOG = 64  # messages that wait for a client; when more do, the oldest are dropped
 _NEEDED = "foxglove.websocket"
-_MOST_TOLD = 300
-"""characters"""
+_MOST_TOLD = 300  # characters
 
 
 class LiveError(UserError, RuntimeError):

@@ -23,11 +23,9 @@ from uuvtai.logs.reader import LogHead, read_head, read_messages
 from uuvtai.logs.topics import TOPICS
 from uuvtai.logs.topics.perception import Layer
 
-Color = tuple[int, int, int]
-"""blue, green, red"""
+Color = tuple[int, int, int]  # blue, green, red
 
-_SHIFT = 4
-"""bits of sub-pixel precision"""
+_SHIFT = 4  # bits of sub-pixel precision
 
 
 def bgr(code: str) -> Color:
@@ -272,10 +270,8 @@ def _fixed(pixels: np.ndarray) -> np.ndarray:
 # coordinates.
 
 
-_MAX_MAP = 1000
-"""[px] greatest height of the map"""
-_HULL_RADIUS_M = 0.17
-"""half the height of the hull that ``Canvas.vehicle`` draws"""
+_MAX_MAP = 1000  # [px] greatest height of the map
+_HULL_RADIUS_M = 0.17  # half the height of the hull that ``Canvas.vehicle`` draws
 
 
 def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int]) -> Canvas:
@@ -453,8 +449,7 @@ class Recording:
 _ENDINGS = {"ttc": "TTC stop"}
 _MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_BODIES = 3600.0, 1000.0, 1e4, 1000
 """what is drawn must fit a picture and a video that somebody waits for"""
-_MAX_NUMBERS = 100_000
-"""of a scenario: corners of paths are drawn in every frame"""
+_MAX_NUMBERS = 100_000  # of a scenario: corners of paths are drawn in every frame
 _MAX_ARRAYS, _OVERHEAD = 384 << 20, 200
 """[bytes] all that is drawn together, and what a message takes beyond its arrays"""
 _READERS = {topic.name: topic.read for topic in TOPICS if topic.read is not None}

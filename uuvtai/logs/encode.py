@@ -180,22 +180,16 @@ None where there is none."""
 class EpisodeHeader:
     """What is known before the first step; it comes first in the log."""
 
-    controller: str
-    """name of the method that drives: 'bt', 'planner', 'straight' or a policy's name"""
+    controller: str  # name of the method that drives: 'bt', 'planner', 'straight' or a policy's name
     config: Config
-    config_yaml: str
-    """the same as text"""
-    scenario: dict[str, Any]
-    """of ``scenario_document``: everything true about the world, in closed form"""
-    reward_terms: tuple[str, ...] = ()
-    """names of ``reward.term``'s entries"""
+    config_yaml: str  # the same as text
+    scenario: dict[str, Any]  # of ``scenario_document``: everything true about the world, in closed form
+    reward_terms: tuple[str, ...] = ()  # names of ``reward.term``'s entries
     tree_nodes: tuple[str, ...] = ()
     """names of ``teacher.status``'s entries; numbered by the log where two are equal"""
-    tree_xml: bytes = b""
-    """the tree as it was read; empty = unknown"""
+    tree_xml: bytes = b""  # the tree as it was read; empty = unknown
     git_sha: str = "unknown"
-    checkpoint_sha256: str = ""
-    """of the policy's checkpoint; empty = no policy"""
+    checkpoint_sha256: str = ""  # of the policy's checkpoint; empty = no policy
     version: str = __version__
 
     @cached_property
@@ -292,12 +286,10 @@ Encode = Callable[[Moment], bytes | list[bytes]]
 class When:
     """The steps in which a topic is written."""
 
-    text: str
-    """for the reference"""
+    text: str  # for the reference
     holds: Callable[[Moment, bool], bool]
     """whether a step is one; the second value: the last message is ``1 / hertz`` old, or there is none"""
-    reads: tuple[str, ...] = ()
-    """what ``holds`` looks at; 'struct.field' of the state"""
+    reads: tuple[str, ...] = ()  # what ``holds`` looks at; 'struct.field' of the state
     hertz: float = 0.0
 
 
@@ -307,21 +299,16 @@ class Topic:
 
     name: str
     when: When
-    schema: Schema | Callable[[EpisodeHeader], Schema]
-    """a function where it depends on the run"""
+    schema: Schema | Callable[[EpisodeHeader], Schema]  # a function where it depends on the run
     encode: Encode
     reads: tuple[str, ...] = ()
     """what ``encode`` looks at; 'struct.field' of the state, or 'driver.' (``moment.Values``)"""
     read: Callable[[dict[str, Any]], Any] | None = None
     """what pictures and videos take of a message: an array, a Layer, or a tuple with some of them"""
-    in_picture: bool = False
-    """pictures show it too, not videos alone"""
-    note: str = ""
-    """follows ``when.text`` in the reference"""
-    varies: str = ""
-    """which of its fields depend on the run, for the reference"""
-    on_request: bool = False
-    """only in logs with depth images"""
+    in_picture: bool = False  # pictures show it too, not videos alone
+    note: str = ""  # follows ``when.text`` in the reference
+    varies: str = ""  # which of its fields depend on the run, for the reference
+    on_request: bool = False  # only in logs with depth images
 
     def schema_for(self, header: EpisodeHeader) -> Schema:
         """Its schema in this run."""

@@ -27,14 +27,11 @@ from uuvtai.logs.topics.perception import grid_values
 from uuvtai.logs.topics.sensors import logged_image
 
 FORMATS = ("json", "csv", "npz")
-ATTACHMENTS = "attachments"
-"""folder within an export"""
+ATTACHMENTS = "attachments"  # folder within an export
 MAX_COLUMNS, MAX_CELLS = 20_000, 50_000_000
 """of a topic as CSV, and of all topics together: what is written grows with the widest message"""
-MAX_ARRAYS = 256 << 20
-"""[bytes] arrays of one export, which wait in memory"""
-_OVERHEAD = 64
-"""[bytes] an array or a number takes beyond its values"""
+MAX_ARRAYS = 256 << 20  # [bytes] arrays of one export, which wait in memory
+_OVERHEAD = 64  # [bytes] an array or a number takes beyond its values
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
 """names that open a device on some systems"""
 _MAX_NAME = 100
@@ -269,16 +266,12 @@ class Repair:
     path: Path
     messages: int
     last_time_s: float
-    complete: bool
-    """nothing was wrong with the file"""
-    damages: tuple[str, ...]
-    """what was wrong, with the byte"""
+    complete: bool  # nothing was wrong with the file
+    damages: tuple[str, ...]  # what was wrong, with the byte
 
 
-_PART = re.compile(r"(\.[0-9a-f]{8})?\.part$")
-"""what an unfinished recording's name ends in, today or before"""
-MAX_DAMAGES = 100
-"""that are told one by one"""
+_PART = re.compile(r"(\.[0-9a-f]{8})?\.part$")  # what an unfinished recording's name ends in, today or before
+MAX_DAMAGES = 100  # that are told one by one
 
 
 def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:

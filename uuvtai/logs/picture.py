@@ -39,8 +39,7 @@ from uuvtai.logs.drawing import (
 from uuvtai.logs.encode import LogError, checked_suffix
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 44, 96, 62
-_ROW = 30
-"""[px] per line of the legend"""
+_ROW = 30  # [px] per line of the legend
 
 
 def picture(

@@ -40,16 +40,14 @@ from uuvtai.logs.schemas import (
 )
 from uuvtai.logs.topics.perception import dynamic_colors, grid_text, grid_values, static_colors
 
-EXTRA = "uuvtai[ros]"
-"""extra that brings ``rosbags``"""
+EXTRA = "uuvtai[ros]"  # extra that brings ``rosbags``
 _PACKAGE = "rosbags"
 
 FRAMES = {"world": "map", "base": "base_link", "sonar": "sonar_link", "camera": "camera_optical_frame"}
 """frame of a log: the same one in ROS"""
 FRAMES_BACK = {ros: ours for ours, ros in FRAMES.items()}
 
-SURFACE_PA = 101_325.0
-"""standard atmosphere, which FluidPressure has on top of the water's"""
+SURFACE_PA = 101_325.0  # standard atmosphere, which FluidPressure has on top of the water's
 
 
 class RosMessages:
@@ -116,8 +114,7 @@ def zeros(count: int) -> np.ndarray:
 # A log's control steps as ROS 2's standard messages; the table of docs/viewers.md.
 
 
-Step = dict[str, dict[str, Any]]
-"""messages of one control step by topic"""
+Step = dict[str, dict[str, Any]]  # messages of one control step by topic
 
 WRITTEN = {
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -140,8 +137,7 @@ SOURCES = frozenset(
     )
 )
 """topics of a log that anything is made of"""
-INVALID_VAR = 1e6
-"""[m^2/s^2] variance of a velocity that the instrument calls invalid"""
+INVALID_VAR = 1e6  # [m^2/s^2] variance of a velocity that the instrument calls invalid
 _FLOAT32 = 7
 _CLOUD_FIELDS = ("x", "y", "z", "intensity", "velocity")
 
@@ -151,10 +147,8 @@ class Setup:
     """What a run's config says about its messages."""
 
     max_range_m: float
-    pa_per_m: float
-    """pressure of a metre of water"""
-    limits: tuple[float, ...]
-    """[m/s, m/s, m/s, rad/s] that an action of 1 asks for"""
+    pa_per_m: float  # pressure of a metre of water
+    limits: tuple[float, ...]  # [m/s, m/s, m/s, rad/s] that an action of 1 asks for
 
     @classmethod
     def of(cls, given: dict[str, Any]) -> Setup:
@@ -393,12 +387,9 @@ _TWIST = record("uuv.Twist", linear=THREE, angular=THREE)
 _TWIST_STAMPED = record("uuv.TwistStamped", timestamp=TIME, frame_id=STRING, linear=THREE, angular=THREE)
 
 _LATE_NS = round(1e9 * JUMP_S)
-NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}
-"""ROS topic: the log's, where it is another"""
-_UNIT = 0.1
-"""by which the square of a quaternion's length may be off 1"""
-_TYPES = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
-"""PointField's codes: Foxglove's"""
+NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}  # ROS topic: the log's, where it is another
+_UNIT = 0.1  # by which the square of a quaternion's length may be off 1
+_TYPES = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # PointField's codes: Foxglove's
 
 
 @dataclass(frozen=True)

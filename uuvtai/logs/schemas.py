@@ -108,8 +108,7 @@ def compressed_image(text: str) -> Schema:
     )
 
 
-UINT8, FLOAT32 = 1, 7
-"""numeric types of packed fields"""
+UINT8, FLOAT32 = 1, 7  # numeric types of packed fields
 PACKED_FIELD = record(
     "foxglove.PackedElementField",
     name=STRING,
@@ -140,8 +139,7 @@ GRID = record(
     data=described(BASE64, "rows along y, cells of a row along x"),
 )
 
-DEBUG, INFO, WARNING, ERROR = 1, 2, 3, 4
-"""levels of foxglove.Log"""
+DEBUG, INFO, WARNING, ERROR = 1, 2, 3, 4  # levels of foxglove.Log
 LOG = record(
     "foxglove.Log",
     timestamp=TIME,
@@ -152,8 +150,7 @@ LOG = record(
     line=UINT,
 )
 
-LINE_STRIP, LINE_LOOP = 0, 1
-"""types of foxglove.LinePrimitive"""
+LINE_STRIP, LINE_LOOP = 0, 1  # types of foxglove.LinePrimitive
 _LINE = record(
     "foxglove.LinePrimitive",
     type=_choice("foxglove.LineType", LINE_STRIP=0, LINE_LOOP=1, LINE_LIST=2),

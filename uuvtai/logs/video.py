@@ -45,13 +45,10 @@ from uuvtai.logs.drawing import (
 from uuvtai.logs.encode import LogError, checked_suffix
 from uuvtai.logs.topics.perception import Layer
 
-_MARGINS = (52, 28, 84, 212)
-"""[px] left, right, top, bottom"""
-_PANEL = 160
-"""[px] height of the panel below the map"""
+_MARGINS = (52, 28, 84, 212)  # [px] left, right, top, bottom
+_PANEL = 160  # [px] height of the panel below the map
 _ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
-_ECHO_BEAMS = 64
-"""A scan of fewer beams is painted together with those before it."""
+_ECHO_BEAMS = 64  # A scan of fewer beams is painted together with those before it.
 _TRIGGER_COLORS = {
     "initial": GREY,
     "stuck": bgr("#ae3ec9"),
@@ -66,14 +63,12 @@ _LEGEND = (
     (MOVER, "true, moving"),
     (GREY, "true, resting"),
 )
-_HOLD_S = 1.0
-"""The last frame stays this long."""
+_HOLD_S = 1.0  # The last frame stays this long.
 _DRAWN_PX = 1280
 """Narrower frames are drawn this wide and made smaller: the panel below the map needs the room."""
 FORMATS = {".webm": (1280, 15.0), ".mp4": (1280, 15.0), ".gif": (800, 10.0)}
 """what a video's name may end in: (width [px], frames per second) unless told"""
-WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)
-"""least and most"""
+WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)  # least and most
 SMALL: dict[str, Any] = {"width_px": 960, "speed": 2.0}
 """what a run folder holds, so that several fit a page: some 40 kB per second of the episode"""
 _MOST_FRAMES = 100_000
@@ -81,8 +76,7 @@ _FEW_FRAMES, _FRAMES_PER_POSE = 1000, 10
 """a small file must not cost minutes: beyond so many frames a log has to hold something new for them (ours
 hold 50 poses a second)"""
 
-Progress = Callable[[int, int], None]
-"""Called with (frames done, frames in all)."""
+Progress = Callable[[int, int], None]  # Called with (frames done, frames in all).
 
 
 def video(
@@ -379,8 +373,7 @@ class FrameArtist:
 # What stands still costs next to nothing so.
 
 
-Frames = Iterable[np.ndarray]
-"""images (height, width, 3), blue green red, all of one size"""
+Frames = Iterable[np.ndarray]  # images (height, width, 3), blue green red, all of one size
 
 _BT601 = 6
 """the matrix by which frames are turned into YUV; named in the file, or a player would guess by the height"""
@@ -391,8 +384,7 @@ _CODECS: dict[str, tuple[str, dict[str, str]]] = {
     # H.264 in 4:2:0 with its index first: what slides, phones and browsers all play
     ".mp4": ("libx264", {"crf": "26", "preset": "veryfast"}),
 }
-_GIF_TICKS = 100
-"""per second: a GIF counts hundredths"""
+_GIF_TICKS = 100  # per second: a GIF counts hundredths
 
 
 def write_film(

@@ -231,10 +231,8 @@ class Recordable(Protocol):
     """What a recorder needs of a simulator."""
 
     config: Config
-    s: Any
-    """the state's structs by name"""
-    tree: Any
-    """the ``FlatTree`` that drives"""
+    s: Any  # the state's structs by name
+    tree: Any  # the ``FlatTree`` that drives
 
     def rows(self, field: Any, envs: list[int] | None = None) -> np.ndarray:
         """Host copy of a field's rows."""
@@ -254,11 +252,9 @@ class RecordedJob(Protocol):
 class PolicyNote:
     """What a log says of the policy that drives."""
 
-    pilot: Any
-    """its ``learn.pilot.Pilot``, or an ``own.own_driver.OwnDriver``, which expects nothing"""
+    pilot: Any  # its ``learn.pilot.Pilot``, or an ``own.own_driver.OwnDriver``, which expects nothing
     checkpoint_sha256: str
-    distill_lambda: float | None
-    """weight of the distillation when the checkpoint was written"""
+    distill_lambda: float | None  # weight of the distillation when the checkpoint was written
 
     def outputs(self, row: int) -> dict[str, Any]:
         """What the policy chooses and expects in this row."""

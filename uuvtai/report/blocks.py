@@ -11,8 +11,7 @@ from uuvtai.report.tables import Data, Table
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Hover = dict[str, str]
-"""id of a drawn thing -> what is shown while the pointer is over it"""
+Hover = dict[str, str]  # id of a drawn thing -> what is shown while the pointer is over it
 
 
 @dataclass(frozen=True)
@@ -94,8 +93,7 @@ class Media:
     mime: str
     content: bytes
     caption: str
-    name: str = ""
-    """where it lies in the run folder"""
+    name: str = ""  # where it lies in the run folder
 
 
 @dataclass(frozen=True)

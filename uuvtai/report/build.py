@@ -60,8 +60,7 @@ class _Shown:
     path: Path
     method: str
     episode: tuple[int, int] | None
-    details: tuple[tuple[str, Detail], ...]
-    """(method, how its episode went)"""
+    details: tuple[tuple[str, Detail], ...]  # (method, how its episode went)
     remark: str
 
     @property
@@ -197,8 +196,7 @@ def _outcome(detail: Detail) -> str:
 # Where figures come from: the command, the machine, the versions, the config.
 
 
-MANIFEST_BYTES = 16 << 20
-"""[bytes] more than any manifest of a checkpoint has"""
+MANIFEST_BYTES = 16 << 20  # [bytes] more than any manifest of a checkpoint has
 
 
 def command_of(record: dict[str, Any]) -> str:

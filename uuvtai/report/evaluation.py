@@ -28,8 +28,7 @@ from uuvtai.report.tables import (
     with_interval,
 )
 
-DAGGER = "\u2020"
-"""marks privileged methods in the terminal"""
+DAGGER = "\u2020"  # marks privileged methods in the terminal
 
 _ENDS = ("collision", "ttc", "out_of_tank", "timeout")
 

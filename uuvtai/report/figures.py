@@ -182,8 +182,7 @@ _CELL_IN = (0.62, 0.36)
 _MARGIN_IN = (1.15, 0.95)
 _LOG_SPAN = 20.0
 """A quantity that is positive throughout and spans more than this factor is drawn on a logarithmic axis."""
-_ROOM = 0.09
-"""A stage is named in its bar where it takes more than this share of the longest one."""
+_ROOM = 0.09  # A stage is named in its bar where it takes more than this share of the longest one.
 _GOLDEN = 0.618034
 """Stages that follow each other get colours this share of the scale apart, so that neighbours differ."""
 
@@ -199,8 +198,7 @@ class Line:
     low: Sequence[float] | None = None
     high: Sequence[float] | None = None
     said: Sequence[str] = ()
-    colour: str = ""
-    """'#rrggbb' of a method; none = by the order of the lines"""
+    colour: str = ""  # '#rrggbb' of a method; none = by the order of the lines
 
 
 # -------------------------------------------------------------------------------------------------- heat maps

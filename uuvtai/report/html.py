@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 
-_MAX_SHOWN_ROWS = 200
-"""A longer table of numbers is for download only."""
+_MAX_SHOWN_ROWS = 200  # A longer table of numbers is for download only.
 
 
 @dataclass(frozen=True)
@@ -122,8 +121,7 @@ _MOST = {
     "sections": 200,
 }
 """entries of a result's lists that a page has room for: each is drawn, and drawing takes time"""
-_MOST_VALUES = 10_000
-"""of an axis of a sweep"""
+_MOST_VALUES = 10_000  # of an axis of a sweep
 
 
 def read_json(run: Path, name: str) -> dict[str, Any] | None:
@@ -217,8 +215,7 @@ def read_config(run: Path) -> str | None:
 # Texts of files without what no figure and no table can show.
 
 
-_LONGEST = 300
-"""characters of a text in a document: names, not novels"""
+_LONGEST = 300  # characters of a text in a document: names, not novels
 
 
 def shown(text: str) -> str:

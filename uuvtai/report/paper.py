@@ -45,11 +45,9 @@ from uuvtai.report.tables import (
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, training
 
-_MOST_EPISODES = 6
-"""whose ways are drawn"""
+_MOST_EPISODES = 6  # whose ways are drawn
 _LOG = re.compile(r"(?P<method>.+)_seed(?P<seed>-?\d+)_episode(?P<episode>\d+)")
-_WORDS = 3
-"""of a table's title that name it"""
+_WORDS = 3  # of a table's title that name it
 _WILSON = "95 % Wilson intervals"
 
 
@@ -59,13 +57,11 @@ class PaperItem:
 
     name: str
     caption: str
-    origin: str
-    """the command and the commit, a line each"""
+    origin: str  # the command and the commit, a line each
     data: Data | None
     panels: Sequence[PaperPanel] = ()
     table: Table | None = None
-    both_widths: bool = True
-    """a figure for one column too"""
+    both_widths: bool = True  # a figure for one column too
 
 
 def origin_of(run: Path) -> str:
@@ -351,13 +347,11 @@ _SPECIAL = {
     "—": r"\textemdash{}",
     "−": "$-$",
 }
-_LETTERS = range(0xC0, 0x100)
-"""letters with accents that every LaTeX knows in UTF-8"""
+_LETTERS = range(0xC0, 0x100)  # letters with accents that every LaTeX knows in UTF-8
 _NO_LETTERS = (0xD7, 0xF7)
 _COLUMN_CHARACTERS, _GAP = 52, 2
 """what fits one column of a page, and what a column of the table takes beside its words"""
-_MINUS = re.compile(r"(?<![\w.-])-(?=\d)")
-"""before a number of a table"""
+_MINUS = re.compile(r"(?<![\w.-])-(?=\d)")  # before a number of a table
 _PROSE = "p{0.3\\linewidth}"
 
 
@@ -449,12 +443,10 @@ DOCUMENT = r"""% All figures and tables, to look at: pdflatex paper.tex
 _WIDTHS = {"1col": ONE_COLUMN_IN, "2col": TWO_COLUMNS_IN}
 _NAME = re.compile(r"[^A-Za-z0-9]+")
 _LONGEST = 60
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""what a spreadsheet takes a text that begins so for"""
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet takes a text that begins so for
 _MARKDOWN = re.compile(r"([\\`*_{}\[\]<>#|&!])")
 _MOST_ITEMS = 400
-_TALL_IN = 6.5
-"""a figure that is higher in one column stands in two"""
+_TALL_IN = 6.5  # a figure that is higher in one column stands in two
 
 
 @dataclass(frozen=True)

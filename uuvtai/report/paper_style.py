@@ -28,15 +28,11 @@ if TYPE_CHECKING:
 # Figures as journals want them: PDF and SVG, as wide as one or two columns of a page, text of one size.
 
 
-ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.16
-"""widths of IEEE's columns"""
+ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.16  # widths of IEEE's columns
 TEXT_PT = 8.0
-_LEAST_PT = 5.0
-"""of the words in a cell that is too narrow for more"""
-_CURVE_IN = 2.1
-"""height of a panel that has no wish of its own"""
-_ROOM = 0.94
-"""of a cell's width that its words may take"""
+_LEAST_PT = 5.0  # of the words in a cell that is too narrow for more
+_CURVE_IN = 2.1  # height of a panel that has no wish of its own
+_ROOM = 0.94  # of a cell's width that its words may take
 
 _STYLE: dict[str, Any] = {
     "text.parse_math": False,  # a name with dollars is a name
@@ -72,10 +68,8 @@ class PaperPanel:
 
     draw: Callable[[Axes], Hover]
     height_in: Callable[[float], float]
-    is_cells: bool = False
-    """its words stand in cells of one unit"""
-    spans: bool = False
-    """takes the whole width, also of two columns"""
+    is_cells: bool = False  # its words stand in cells of one unit
+    spans: bool = False  # takes the whole width, also of two columns
 
 
 def of_panel(panel: Panel, is_cells: bool = False, spans: bool = False) -> PaperPanel:
@@ -169,10 +163,8 @@ def _style() -> Iterator[None]:
 
 
 _BAR_IN, _FRAME_IN = 0.21, 0.55
-_TOPS = (10.0, 20.0, 50.0, 100.0)
-"""ends of an axis of shares [%]"""
-_MOST_IN = 4.2
-"""height of a tank as deep as it is long"""
+_TOPS = (10.0, 20.0, 50.0, 100.0)  # ends of an axis of shares [%]
+_MOST_IN = 4.2  # height of a tank as deep as it is long
 _RESTS, _MOVES = "#8a929b", "#d9480f"
 
 

@@ -93,8 +93,7 @@ def _other(name: str) -> Column:
 # intervals over one.
 
 
-ON_HOVER = "Counts and intervals: on hover and below"
-"""said of a figure on a page, where it has both"""
+ON_HOVER = "Counts and intervals: on hover and below"  # said of a figure on a page, where it has both
 _NUMBERS = ("success_rate", "collision_rate", "time_mean_s", "tts_s", "time_to_success_mean_s")
 
 

@@ -9,8 +9,7 @@ from typing import Any
 from uuvtai.common.enums import COLLIDED
 from uuvtai.common.errors import SettingError
 
-TERMINAL, PAGE = "terminal", "page"
-"""where a table is shown; a page is HTML or Markdown"""
+TERMINAL, PAGE = "terminal", "page"  # where a table is shown; a page is HTML or Markdown
 
 
 @dataclass(frozen=True)
@@ -18,10 +17,8 @@ class Cell:
     """What a text alone does not say."""
 
     text: str
-    short: str = ""
-    """the same for a terminal, where room is scarce"""
-    style: str = ""
-    """of a terminal, as Rich names it"""
+    short: str = ""  # the same for a terminal, where room is scarce
+    style: str = ""  # of a terminal, as Rich names it
 
     def __str__(self) -> str:
         return self.text
@@ -37,16 +34,11 @@ class Column:
     """A column of a table: its head with the unit, and how gladly a narrow terminal leaves it out."""
 
     head: str
-    priority: int = 0
-    """0 = always shown; the highest number goes first"""
-    left: bool = False
-    """words; numbers stand on the right"""
-    prose: bool = False
-    """may be wrapped between words"""
-    short: str = ""
-    """head in a terminal, if another one; may hold line breaks"""
-    only: str = ""
-    """TERMINAL or PAGE; nothing = both"""
+    priority: int = 0  # 0 = always shown; the highest number goes first
+    left: bool = False  # words; numbers stand on the right
+    prose: bool = False  # may be wrapped between words
+    short: str = ""  # head in a terminal, if another one; may hold line breaks
+    only: str = ""  # TERMINAL or PAGE; nothing = both
     of: Callable[[Any], str | Cell] | None = None
     """from a row to the cell; without, a row is the list of its cells"""
 
@@ -77,12 +69,9 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Any]
     title: str = ""
-    sections: Sequence[int] = ()
-    """rows after which a terminal draws a rule"""
-    data: Data | None = None
-    """the same as numbers, for download"""
-    folded: bool = False
-    """long: shown when asked for"""
+    sections: Sequence[int] = ()  # rows after which a terminal draws a rule
+    data: Data | None = None  # the same as numbers, for download
+    folded: bool = False  # long: shown when asked for
     swatches: Sequence[str] = ()
     """colour of each row, '#rrggbb': the one that its method has in the figures; none = no colours"""
 
@@ -340,10 +329,8 @@ def _refuse_doubles(places: tuple[Place, ...]) -> None:
 # Pure.
 
 
-_SCENE = ("S", "D", "v_m_s")
-"""every cell states these, changed or not"""
-_TICK = 14
-"""characters that fit under a tick"""
+_SCENE = ("S", "D", "v_m_s")  # every cell states these, changed or not
+_TICK = 14  # characters that fit under a tick
 
 
 def varies_alone(document: dict[str, Any]) -> bool:

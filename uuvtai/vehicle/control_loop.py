@@ -58,8 +58,7 @@ from uuvtai.vehicle.telemetry import AUTOPILOT, COMPANION, Heard, Intake, Sender
 # What ``uuv pilot`` was told, checked before anything is opened or compiled.
 
 
-EDGE_M = 0.2
-"""the fence's depths keep so far from surface and floor of the tank where none are typed"""
+EDGE_M = 0.2  # the fence's depths keep so far from surface and floor of the tank where none are typed
 MOST_SPEED_M_S = 2.0
 
 
@@ -71,8 +70,7 @@ class FlightPlan:
     mission: Mission
     limits: SafetyLimits
     log: Path
-    arms: bool = False
-    """whether orders are sent; else a dry run"""
+    arms: bool = False  # whether orders are sent; else a dry run
     heading_rad: float | None = None
     """compass heading of the world's x axis; None = where the vehicle looks at first"""
     seconds: float = math.inf
@@ -81,8 +79,7 @@ class FlightPlan:
     followed"""
     system: int = 1
     operator: int = 255
-    senders: Senders | None = None
-    """from whom what counts; None = the usual ones of ``system``"""
+    senders: Senders | None = None  # from whom what counts; None = the usual ones of ``system``
 
     @classmethod
     def typed(
@@ -178,8 +175,7 @@ def _four(values: Sequence[float]) -> tuple[float, float, float, float]:
 _WANTED_HZ = {30: 50.0, 27: 50.0, 29: 10.0, 137: 10.0, 32: 20.0, 1: 2.0}
 """message id -> rate: ATTITUDE, RAW_IMU, SCALED_PRESSURE and 2, LOCAL_POSITION_NED, SYS_STATUS"""
 _GIVE_BACK_S = 6.0
-FEEDBACK_AGE_S = 0.5
-"""a velocity that is older is not fed back to the sticks"""
+FEEDBACK_AGE_S = 0.5  # a velocity that is older is not fed back to the sticks
 _LEAST_ASKED_M_S, _ANSWER = 0.15, 0.2
 """a vehicle that is asked for so much, and has less than this share of it, does not answer"""
 _REST_S, _LOOK_RAD_S = 5.0, 0.3
@@ -582,10 +578,8 @@ def warmed(config: Config, tree: FlatTree, mission: Mission) -> OnboardPilot:
     return OnboardPilot(sim, mission)
 
 
-EVERY_S = 1.0
-"""between two sentences"""
-DEAF_S = 5.0
-"""nothing at all has come for so long"""
+EVERY_S = 1.0  # between two sentences
+DEAF_S = 5.0  # nothing at all has come for so long
 
 
 class FlightNotes:

@@ -20,14 +20,10 @@ from uuvtai.vehicle.mavlink import (
 from uuvtai.vehicle.safety import STOP, SafeAction, SafeDecision, SafetyLimits, Velocity
 from uuvtai.vehicle.telemetry import Heard
 
-ORDER_S = 0.1
-"""between two velocities; ArduSub stops 3 s after the last"""
-REPEAT_S, REPEATS = 1.0, 5
-"""a mode or the arming is asked for again so often, so many times"""
-STICKS_S = 1.0
-"""age of the operator's sticks that counts as none"""
-_ACK_S = 0.1
-"""a heartbeat that comes so long after a request was granted tells what came of it"""
+ORDER_S = 0.1  # between two velocities; ArduSub stops 3 s after the last
+REPEAT_S, REPEATS = 1.0, 5  # a mode or the arming is asked for again so often, so many times
+STICKS_S = 1.0  # age of the operator's sticks that counts as none
+_ACK_S = 0.1  # a heartbeat that comes so long after a request was granted tells what came of it
 
 
 class Handover:

@@ -32,8 +32,7 @@ Address = tuple[str, int]
 
 MOST_DATAGRAMS, MOST_BYTES = 64, 24 * 1024
 """taken in one step; what is more waits, and is lost where the system's own queue is full"""
-LONGEST = 2048
-"""[bytes] a longer datagram is none of MAVLink's"""
+LONGEST = 2048  # [bytes] a longer datagram is none of MAVLink's
 _MOST_ROUNDS = 100
 _WRITTEN = re.compile(r"(udp|udpin|udpout):([A-Za-z0-9.\-]{1,253}):(\d{1,5})")
 
@@ -44,8 +43,7 @@ class LinkPlace:
 
     host: str
     port: int
-    calls: bool
-    """udpout: we speak first, to this place; else we listen there"""
+    calls: bool  # udpout: we speak first, to this place; else we listen there
 
 
 def place_of(text: str, option: str = "--mavlink") -> LinkPlace:
@@ -62,8 +60,7 @@ def place_of(text: str, option: str = "--mavlink") -> LinkPlace:
 class Endpoint:
     """One side of a UDP link. Use as a context."""
 
-    clock_jumps = 0
-    """how often the clock that it keeps, if any, ran on without its senders' clocks"""
+    clock_jumps = 0  # how often the clock that it keeps, if any, ran on without its senders' clocks
 
     def __init__(self, place: LinkPlace) -> None:
         """Raises LinkError where the address cannot be had."""
@@ -137,12 +134,9 @@ class Endpoint:
 SILENT_S = 5.0
 """by our clock: a vehicle that has told no time for so long is followed no further, lest a dead man's time
 stand still"""
-MOST_WAITING = 512
-"""datagrams between two steps; older ones are lost"""
-_FARTHEST_S = 5.0
-"""a time that jumps by more has begun anew"""
-_MAGIC, _HEAD, _ENDS = 0xFD, 10, 2
-"""MAVLink 2: first byte, bytes before and behind the payload"""
+MOST_WAITING = 512  # datagrams between two steps; older ones are lost
+_FARTHEST_S = 5.0  # a time that jumps by more has begun anew
+_MAGIC, _HEAD, _ENDS = 0xFD, 10, 2  # MAVLink 2: first byte, bytes before and behind the payload
 _SIGNED, _SIGNATURE = 1, 13
 _AUTOPILOT, _HEARTBEAT, _ATTITUDE = 1, 0, 30
 _LOOPBACK = ("127.", "localhost")
@@ -238,24 +232,19 @@ def _messages(datagram: bytes, system: int) -> list[tuple[int, bytes]]:
 # Every number is held within the limits here once more, whatever the caller asks for.
 
 
-BODY_NED = 8
-"""MAV_FRAME: axes turn with the yaw; z stays down"""
-VELOCITY_AND_YAW_RATE = 0x5C7
-"""type_mask: positions, accelerations and yaw are not given"""
-ALT_HOLD, GUIDED, SURFACE = 2, 4, 9
-"""modes of ArduSub"""
+BODY_NED = 8  # MAV_FRAME: axes turn with the yaw; z stays down
+VELOCITY_AND_YAW_RATE = 0x5C7  # type_mask: positions, accelerations and yaw are not given
+ALT_HOLD, GUIDED, SURFACE = 2, 4, 9  # modes of ArduSub
 MODE_NAMES = {
     0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 7: "CIRCLE", 9: "SURFACE",
     16: "POSHOLD", 19: "MANUAL", 20: "MOTOR_DETECT", 21: "SURFTRAK",
 }  # fmt: skip
 HARMLESS = ("HEARTBEAT", "MAV_CMD_SET_MESSAGE_INTERVAL")
 """kinds of orders that move nothing: they are sent in a dry run too"""
-STICK = 600
-"""of 1000: the farthest that a stick is ever pushed"""
+STICK = 600  # of 1000: the farthest that a stick is ever pushed
 FULL_STICK = (1.0, 1.0, 0.6, 2.0)
 """[m/s, m/s, m/s, rad/s] what a full stick is taken to give; the feedback corrects it"""
-FEEDBACK = 1.5
-"""of the missing velocity, added to the one asked for"""
+FEEDBACK = 1.5  # of the missing velocity, added to the one asked for
 
 DO_SET_MODE, ARM_DISARM, _SET_MESSAGE_INTERVAL = 176, 400, 511
 
@@ -264,12 +253,10 @@ DO_SET_MODE, ARM_DISARM, _SET_MESSAGE_INTERVAL = 176, 400, 511
 class Order:
     """A message on its way to the vehicle."""
 
-    kind: str
-    """its name; of a command the command's"""
+    kind: str  # its name; of a command the command's
     message: str
     fields: dict[str, Any]
-    as_operator: bool = False
-    """in the name of the ground station, from which alone ArduSub takes sticks"""
+    as_operator: bool = False  # in the name of the ground station, from which alone ArduSub takes sticks
 
 
 def set_velocity(velocity: Velocity, now_s: float, system: int, limits: SafetyLimits) -> Order:

@@ -29,8 +29,7 @@ class StaleLimits:
     imu: float = 0.5
     sonar: float = 1.0
     pressure: float = 2.0
-    position: float = 0.5
-    """where the pilot does not estimate its own"""
+    position: float = 0.5  # where the pilot does not estimate its own
     dvl: float = math.inf
     depth: float = math.inf
     thruster: float = math.inf
@@ -44,27 +43,19 @@ class PilotCommand:
     time_s: float
     action: np.ndarray
     """(4,) float32 in [-1, 1]: surge, sway, heave, yaw rate as shares of the vehicle's limits; zero = stop"""
-    velocity: np.ndarray
-    """(4,) the same in m/s and rad/s, body axes"""
-    chosen: np.ndarray
-    """(4,) the tree's own choice, which ``action`` is unless ``held``"""
-    asked_w: np.ndarray
-    """(3,) [m/s] velocity that the tree asks for, world"""
-    leaf: str
-    """node of the tree that chose, as logs name it; '' = none"""
-    trigger: str
-    """why the route was planned in this step, '' = it was not"""
-    pos_w: np.ndarray
-    """(3,) [m] where the vehicle takes itself to be"""
-    held: tuple[str, ...]
-    """why the pilot stops instead of doing what the tree chose; none = it does it"""
+    velocity: np.ndarray  # (4,) the same in m/s and rad/s, body axes
+    chosen: np.ndarray  # (4,) the tree's own choice, which ``action`` is unless ``held``
+    asked_w: np.ndarray  # (3,) [m/s] velocity that the tree asks for, world
+    leaf: str  # node of the tree that chose, as logs name it; '' = none
+    trigger: str  # why the route was planned in this step, '' = it was not
+    pos_w: np.ndarray  # (3,) [m] where the vehicle takes itself to be
+    held: tuple[str, ...]  # why the pilot stops instead of doing what the tree chose; none = it does it
 
 
 class StackRunner(Protocol):
     """Runs the stages behind the sensors for row 0."""
 
-    views: dict[str, np.ndarray]
-    """the stages' arrays in memory, by 'struct.field'"""
+    views: dict[str, np.ndarray]  # the stages' arrays in memory, by 'struct.field'
 
     def begin(self, mission: Mission, sensors: FedSensors) -> None:
         """The first step: forget everything, then as ``step``."""

@@ -39,8 +39,7 @@ from uuvtai.vehicle.onboard import (
 # decided then.
 
 
-_MAX_STEPS = 180_000
-"""an hour"""
+_MAX_STEPS = 180_000  # an hour
 
 
 @dataclass(frozen=True)
@@ -55,13 +54,10 @@ class Delivery:
 class LoggedStep:
     """What was decided in a control step; None where the log does not say."""
 
-    action: np.ndarray
-    """(4,) float32 the tree's"""
-    asked_w: np.ndarray
-    """(3,) float32"""
+    action: np.ndarray  # (4,) float32 the tree's
+    asked_w: np.ndarray  # (3,) float32
     leaf: str
-    pos_w: np.ndarray | None = None
-    """(3,) float32 own position as estimated"""
+    pos_w: np.ndarray | None = None  # (3,) float32 own position as estimated
 
 
 @dataclass
@@ -72,12 +68,9 @@ class LogFeed:
     config: Config
     tree: FlatTree
     mission: Mission
-    run: dict[str, str]
-    """metadata uuv.run"""
-    arrivals: list[Delivery] = field(default_factory=list)
-    """in the order of the log"""
-    steps: list[LoggedStep] = field(default_factory=list)
-    """from step 0 on, without a gap"""
+    run: dict[str, str]  # metadata uuv.run
+    arrivals: list[Delivery] = field(default_factory=list)  # in the order of the log
+    steps: list[LoggedStep] = field(default_factory=list)  # from step 0 on, without a gap
 
 
 def read_feed(path: Path, controller: str | None = None) -> LogFeed:
@@ -261,10 +254,8 @@ class Outage:
 class Faults:
     """All together; nothing at all unless asked for. Random ones depend on ``seed`` alone."""
 
-    drop: float = 0.0
-    """share of the messages that is lost"""
-    jitter_s: float = 0.0
-    """a message arrives up to this much later, uniformly: out of order too"""
+    drop: float = 0.0  # share of the messages that is lost
+    jitter_s: float = 0.0  # a message arrives up to this much later, uniformly: out of order too
     outages: tuple[Outage, ...] = ()
     seed: int = 0
 

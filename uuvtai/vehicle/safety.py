@@ -12,26 +12,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-Velocity = tuple[float, float, float, float]
-"""surge, sway, heave [m/s] and yaw rate [rad/s], body axes"""
+Velocity = tuple[float, float, float, float]  # surge, sway, heave [m/s] and yaw rate [rad/s], body axes
 STOP: Velocity = (0.0, 0.0, 0.0, 0.0)
-STALL_S = 0.25
-"""a step that is later than this is a stall"""
-LATE_S, LATE_WINDOW_S = 0.5, 3.0
-"""so much lateness in so long is too much"""
-UNANSWERED_S = 4.0
-"""it was asked to move for so long, and did not"""
+STALL_S = 0.25  # a step that is later than this is a stall
+LATE_S, LATE_WINDOW_S = 0.5, 3.0  # so much lateness in so long is too much
+UNANSWERED_S = 4.0  # it was asked to move for so long, and did not
 
 
 class SafeAction(IntEnum):
     """What is done, each graver than the one before."""
 
-    DRIVE = 0
-    """what the pilot wants, within the limits"""
-    HOLD = 1
-    """ask for zero speed; ends when its reason does"""
-    SURFACE = 2
-    """have the autopilot surface; for good"""
+    DRIVE = 0  # what the pilot wants, within the limits
+    HOLD = 1  # ask for zero speed; ends when its reason does
+    SURFACE = 2  # have the autopilot surface; for good
     HAND_BACK = 3
     """leave the vehicle to the autopilot's ALT_HOLD and to the operator, and say no more; for good"""
 
@@ -40,27 +33,20 @@ class SafeAction(IntEnum):
 class SafetyLimits:
     """What the vehicle must keep to."""
 
-    box_m: tuple[float, float, float, float]
-    """least x, least y, most x, most y"""
-    depth_m: tuple[float, float]
-    """least and most depth, positive down"""
-    speed_m_s: float = 0.5
-    """horizontal"""
+    box_m: tuple[float, float, float, float]  # least x, least y, most x, most y
+    depth_m: tuple[float, float]  # least and most depth, positive down
+    speed_m_s: float = 0.5  # horizontal
     heave_m_s: float = 0.3
     yaw_rate_rad_s: float = 0.8
-    operator_s: float = 2.0
-    """age of the operator's heartbeat"""
-    vehicle_s: float = 3.0
-    """age of the autopilot's heartbeat"""
+    operator_s: float = 2.0  # age of the operator's heartbeat
+    vehicle_s: float = 3.0  # age of the autopilot's heartbeat
     sensor_s: Mapping[str, float] = field(
         default_factory=lambda: {"imu": 0.5, "dvl": 2.0, "pressure": 2.0, "sonar": 1.0, "position": 0.5}
     )
     """age of the newest message of each sensor that the pilot needs"""
-    battery_v: float = 13.2
-    """of the pack; a BlueROV2's has four cells"""
+    battery_v: float = 13.2  # of the pack; a BlueROV2's has four cells
     battery_share: float = 0.2
-    battery_s: float = 10.0
-    """age of the battery's telemetry, once it has come"""
+    battery_s: float = 10.0  # age of the battery's telemetry, once it has come
     tilt_rad: float = math.radians(45.0)
 
 
@@ -69,49 +55,35 @@ class VehicleView:
     """What is known at one moment. An age is infinite where nothing has come yet."""
 
     now_s: float
-    wanted: Velocity
-    """by the pilot"""
-    held: tuple[str, ...]
-    """why the pilot itself stops"""
+    wanted: Velocity  # by the pilot
+    held: tuple[str, ...]  # why the pilot itself stops
     vehicle_age_s: float
     operator_age_s: float
     sensor_age_s: Mapping[str, float]
     """of the sensors that the pilot needs; of the sonar's newest scan that was placed in the map"""
     pos_w: tuple[float, float, float]
-    rpy: tuple[float, float, float]
-    """NaN: not known now"""
-    speed_m_s: float | None
-    """measured, over ground; None: not known now"""
-    battery_v: float | None
-    """None: nobody tells"""
+    rpy: tuple[float, float, float]  # NaN: not known now
+    speed_m_s: float | None  # measured, over ground; None: not known now
+    battery_v: float | None  # None: nobody tells
     battery_share: float | None
-    stalled_s: float
-    """by how much this computer was late with this step"""
+    stalled_s: float  # by how much this computer was late with this step
     lost_command: str
     """why the vehicle no longer does what we say (somebody took over, it disarmed, a mode was refused); '' =
     it does, or was never asked"""
-    late_s: float = 0.0
-    """lateness of all stalls in the last LATE_WINDOW_S"""
-    battery_age_s: float = 0.0
-    """of its telemetry; infinite: none has come yet"""
-    unanswered_s: float = 0.0
-    """for how long it was asked to move and did not"""
-    moved: str = ""
-    """how the given position jumped; '' = it did not"""
-    misfit: str = ""
-    """how the scans disagree with the known walls; '' = they do not"""
-    unchecked: str = ""
-    """what is missing to check the start by the walls; '' = nothing"""
+    late_s: float = 0.0  # lateness of all stalls in the last LATE_WINDOW_S
+    battery_age_s: float = 0.0  # of its telemetry; infinite: none has come yet
+    unanswered_s: float = 0.0  # for how long it was asked to move and did not
+    moved: str = ""  # how the given position jumped; '' = it did not
+    misfit: str = ""  # how the scans disagree with the known walls; '' = they do not
+    unchecked: str = ""  # what is missing to check the start by the walls; '' = nothing
 
 
 @dataclass(frozen=True)
 class SafetyMemory:
     """What must be remembered from one decision to the next."""
 
-    since_s: Mapping[str, float] = field(default_factory=dict)
-    """rule -> since when it has been broken"""
-    latched: SafeAction = SafeAction.DRIVE
-    """the gravest action that is for good"""
+    since_s: Mapping[str, float] = field(default_factory=dict)  # rule -> since when it has been broken
+    latched: SafeAction = SafeAction.DRIVE  # the gravest action that is for good
     latched_why: tuple[str, ...] = ()
 
 
@@ -120,10 +92,8 @@ class SafeDecision:
     """What to do."""
 
     action: SafeAction
-    velocity: Velocity
-    """to ask for; zero unless the action is DRIVE"""
-    reasons: tuple[str, ...]
-    """of the action; none = DRIVE"""
+    velocity: Velocity  # to ask for; zero unless the action is DRIVE
+    reasons: tuple[str, ...]  # of the action; none = DRIVE
 
 
 @dataclass(frozen=True)
@@ -131,12 +101,9 @@ class SafetyRule:
     """One thing that may go wrong."""
 
     name: str
-    broken: Callable[[VehicleView, SafetyLimits], str]
-    """what is wrong in words, '' = nothing"""
-    actions: tuple[tuple[float, SafeAction], ...]
-    """(broken for so many seconds, action)"""
-    meaning: str
-    """when it is broken, for the page"""
+    broken: Callable[[VehicleView, SafetyLimits], str]  # what is wrong in words, '' = nothing
+    actions: tuple[tuple[float, SafeAction], ...]  # (broken for so many seconds, action)
+    meaning: str  # when it is broken, for the page
 
     @property
     def case(self) -> str:
@@ -301,8 +268,7 @@ def decide(
 
 # ------------------------------------------------------------------------------------------------- the limits
 
-FENCE_RATE_HZ = 0.5
-"""towards the fence no faster than this times the distance to it"""
+FENCE_RATE_HZ = 0.5  # towards the fence no faster than this times the distance to it
 
 
 def allowed(wanted: Velocity, view: VehicleView, limits: SafetyLimits) -> Velocity:

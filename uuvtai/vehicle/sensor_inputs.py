@@ -94,14 +94,10 @@ def _nothing() -> np.ndarray:
 class OwnPose:
     """What the pilot takes for its own pose and velocity at one moment."""
 
-    pos_w: np.ndarray
-    """(3,) [m]"""
-    rpy: np.ndarray
-    """(3,) [rad]"""
-    vel_b: np.ndarray
-    """(3,) [m/s]"""
-    bias_b: np.ndarray = field(default_factory=_nothing)
-    """(3,) [m/s^2] error of the accelerometer"""
+    pos_w: np.ndarray  # (3,) [m]
+    rpy: np.ndarray  # (3,) [rad]
+    vel_b: np.ndarray  # (3,) [m/s]
+    bias_b: np.ndarray = field(default_factory=_nothing)  # (3,) [m/s^2] error of the accelerometer
 
 
 @dataclass(eq=False)
@@ -110,16 +106,13 @@ class MotionSums:
 
     won_b: np.ndarray = field(default_factory=_nothing)
     """(3,) [m/s] velocity by the accelerometer alone, less its error as it was known, body axes"""
-    risen_m: float = 0.0
-    """upwards, by the velocity alone"""
+    risen_m: float = 0.0  # upwards, by the velocity alone
     bias_w: np.ndarray = field(default_factory=_nothing)
     """(3,) [m/s^2] corrections of the accelerometer's error,"""
     vel_w: np.ndarray = field(default_factory=_nothing)
     """(3,) [m/s] of the velocity, led back to time 0 by those,"""
-    pos_w: np.ndarray = field(default_factory=_nothing)
-    """(3,) [m] and of the position, led back by both"""
-    yaw: float = 0.0
-    """[rad] corrections of the heading"""
+    pos_w: np.ndarray = field(default_factory=_nothing)  # (3,) [m] and of the position, led back by both
+    yaw: float = 0.0  # [rad] corrections of the heading
 
     def feel(self, accel_b: np.ndarray, vel_w: np.ndarray, dt_s: float) -> None:
         """A step of dt at an acceleration (3,) [m/s^2] and a velocity (3,) [m/s]."""
@@ -217,8 +210,7 @@ FIX_AGE_S = 0.3
 """[s] a scan or an image taken while attitude or position was older than this is not used: it would be drawn
 at the wrong place of the map. A velocity or depth later than this is not carried forward, and a velocity by
 positions is no older"""
-FASTEST_M_S = 3.0
-"""a position that changes faster was corrected, not driven"""
+FASTEST_M_S = 3.0  # a position that changes faster was corrected, not driven
 
 
 class FedSensors:
@@ -398,8 +390,7 @@ class FedSensors:
         return found
 
 
-KEPT = 75
-"""steps"""
+KEPT = 75  # steps
 
 
 class PoseHistory:

@@ -38,10 +38,8 @@ from uuvtai.vehicle.telemetry import Motors
 
 
 _HEAD = struct.Struct("<HHI")
-_CHANNELS = {18458: 16, 29569: 32}
-"""magic -> channels"""
-RATES_HZ = (50, 4000)
-"""physics steps in a second that are believed"""
+_CHANNELS = {18458: 16, 29569: 32}  # magic -> channels
+RATES_HZ = (50, 4000)  # physics steps in a second that are believed
 DOUBLED_S = 0.5
 """ArduSub sends a packet again after a second without an answer; what comes much sooner was doubled"""
 
@@ -307,8 +305,7 @@ def _three(values: Any) -> tuple[float, float, float]:
 # What ``uuv sitl`` says while it serves: who speaks, who does not, what begins and ends. Pure.
 
 
-SILENT_S = 10.0
-"""by the clock, without a packet"""
+SILENT_S = 10.0  # by the clock, without a packet
 
 
 @dataclass
@@ -381,14 +378,10 @@ class ServingNotes:
 # ------------------------------------------------------------------------------------------------------------
 
 
-NEXT_PORT = 10
-"""from one instance's port to the next one's, as ArduPilot counts"""
-SENSORS = 197
-"""MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY"""
-_LONGEST = 128
-"""[bytes] a longer packet is none of ArduSub's"""
-_SILENT_S = 2.0
-"""who has been silent for so long may be followed by somebody else"""
+NEXT_PORT = 10  # from one instance's port to the next one's, as ArduPilot counts
+SENSORS = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+_LONGEST = 128  # [bytes] a longer packet is none of ArduSub's
+_SILENT_S = 2.0  # who has been silent for so long may be followed by somebody else
 LINGER_S = 10.0
 """of the water's time, that it stays with ``once`` after the episode's end: for the pilot to notice"""
 _MOST_PEERS = 4
@@ -404,17 +397,13 @@ class SitlPlan:
     host: str = "127.0.0.1"
     port: int = 9002
     instances: int = 1
-    places: tuple[LinkPlace, ...] = ()
-    """of the sensors' MAVLink; ports count on with the instances"""
-    rate: float = 0.0
-    """seconds of the water in one of the clock's, at most; 0 = as ArduSub asks"""
+    places: tuple[LinkPlace, ...] = ()  # of the sensors' MAVLink; ports count on with the instances
+    rate: float = 0.0  # seconds of the water in one of the clock's, at most; 0 = as ArduSub asks
     seconds: float = math.inf
-    once: bool = False
-    """end when every instance's episode has ended"""
+    once: bool = False  # end when every instance's episode has ended
     seed: int = 0
     episode: int = 0
-    operator: bool = False
-    """be the ground station too"""
+    operator: bool = False  # be the ground station too
 
     @classmethod
     def typed(
@@ -599,8 +588,7 @@ def _pace(port: SitlPort, rate: float) -> None:
 BEAT_S, PLACE_S, PLACED_S = 1.0, 0.25, 60.0
 """a heartbeat so often; the place so often, until so long after the beginning. ArduSub takes it once, as soon
 as its filter is there: the heading that it aligns without a place lacks the magnetic declination"""
-PLACE = (-353600000, 1491600000, 0)
-"""latitude, longitude [1e-7 degrees], altitude [mm] of the surface"""
+PLACE = (-353600000, 1491600000, 0)  # latitude, longitude [1e-7 degrees], altitude [mm] of the surface
 
 
 class SimulatedOperator:

@@ -30,8 +30,7 @@ class Motion:
     quat_wb: tuple[float, float, float, float]
     rate_b: Three
     specific_force_b: Three
-    altitude_m: float
-    """above the floor"""
+    altitude_m: float  # above the floor
     volts: float = 16.0
     amperes: float = 1.0
 
@@ -77,8 +76,7 @@ def euler_of(quat_wb: Sequence[float]) -> Three:
 # What the sensors beside the autopilot say by MAVLink: a DVL, a sonar, an altimeter.
 
 
-LEAST_STEPS = 5
-"""control steps between two reports, at least: 10 Hz, as of an A50 and a multibeam"""
+LEAST_STEPS = 5  # control steps between two reports, at least: 10 Hz, as of an A50 and a multibeam
 _SONAR, _DOWN, _BOW = 1, 25, 12
 """MAV_DISTANCE_SENSOR_ULTRASOUND, MAV_SENSOR_ROTATION_PITCH_270, MAV_FRAME_BODY_FRD"""
 _MOST_ALTITUDE_CM = 5000

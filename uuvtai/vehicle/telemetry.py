@@ -34,10 +34,8 @@ from uuvtai.vehicle.onboard import (
 # Distances by sectors, as MAVLink tells them, into the beams of the pilot's sonar_cfg.
 
 
-UNKNOWN_CM = 65535
-"""of a sector that was not looked into (UINT16_MAX)"""
-SECTORS = 72
-"""at most, in OBSTACLE_DISTANCE"""
+UNKNOWN_CM = 65535  # of a sector that was not looked into (UINT16_MAX)
+SECTORS = 72  # at most, in OBSTACLE_DISTANCE
 
 
 def bearings_deg(sonar_cfg: SonarConfig) -> np.ndarray:
@@ -100,8 +98,7 @@ class Rangers:
     """Eight rangefinders around the hull make a ring of eight sectors, told when the one ahead speaks."""
 
     _TOGETHER_S = 1.0
-    _INVALID = 1
-    """signal_quality: no return that counts"""
+    _INVALID = 1  # signal_quality: no return that counts
 
     def __init__(self) -> None:
         self._rows: dict[int, tuple[float, int, int]] = {}
@@ -211,8 +208,7 @@ def _same(ours: np.ndarray, factors: np.ndarray) -> tuple[int, float]:
 # a sonar from whom they are known to come.
 
 
-AUTOPILOT = 1
-"""MAV_COMP_ID_AUTOPILOT1"""
+AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 KINDS = {
     "attitude": ("ATTITUDE",),
     "imu": ("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "HIGHRES_IMU"),
@@ -223,13 +219,11 @@ KINDS = {
     "sonar": ("OBSTACLE_DISTANCE", "DISTANCE_SENSOR"),
 }
 KIND_OF = {name: kind for kind, names in KINDS.items() for name in names}
-BLUEOS = (255, 0)
-"""as whom extensions of BlueOS speak, its DVL's among them (mavlink2rest)"""
+BLUEOS = (255, 0)  # as whom extensions of BlueOS speak, its DVL's among them (mavlink2rest)
 _OF_OTHERS = ("dvl", "sonar")
 _WRITTEN = re.compile(r"([a-z]+)=(\d{1,3})/(\d{1,3}|\*)")
 
-Sender = tuple[int, int | None]
-"""system and component; None = any component"""
+Sender = tuple[int, int | None]  # system and component; None = any component
 
 
 @dataclass(frozen=True)
@@ -268,16 +262,11 @@ class Senders:
 
 SUBMARINE, ARDUPILOT, GROUND_STATION = 12, 3, 6
 _ARMED = 128
-COMPANION = 191
-"""MAV_COMP_ID_ONBOARD_COMPUTER: what we are"""
-_STICK_MOVED = 200
-"""of 1000"""
-MOST_KINDS = 64
-"""senders of a kind of message that are told apart, and reasons why messages are left out"""
-_FRESH_S = 1.0
-"""a source that was heard within this time is preferred to a lesser one"""
-_BATTERY_S = 10.0
-"""of two tellers of a voltage the lower one counts, while it is heard so often"""
+COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: what we are
+_STICK_MOVED = 200  # of 1000
+MOST_KINDS = 64  # senders of a kind of message that are told apart, and reasons why messages are left out
+_FRESH_S = 1.0  # a source that was heard within this time is preferred to a lesser one
+_BATTERY_S = 10.0  # of two tellers of a voltage the lower one counts, while it is heard so often
 _MOST_NAMED = 4
 JUMP_M, _MOST_SPEED_M_S = 0.5, 2.0
 """a position that moves further than this, and faster than any vehicle, has jumped"""
@@ -297,26 +286,20 @@ class Heard:
     is_armed: bool = False
     battery_v: float | None = None
     battery_share: float | None = None
-    battery_s: float = -math.inf
-    """when a voltage or a charge came last"""
+    battery_s: float = -math.inf  # when a voltage or a charge came last
     rpy: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     """of the newest attitude, world axes of ours"""
-    rpy_s: float = -math.inf
-    """when it was measured"""
+    rpy_s: float = -math.inf  # when it was measured
     vel_b: tuple[float, float, float] | None = None
     vel_b_s: float = -math.inf
     yaw_rate: float = 0.0
     yaw_rate_s: float = -math.inf
-    sticks_s: float = -math.inf
-    """when the operator's own sticks came"""
-    sticks_moved_s: float = -math.inf
-    """and when they were off their middle"""
-    granted_s: dict[int, float] = field(default_factory=dict)
-    """command -> when the autopilot granted it"""
+    sticks_s: float = -math.inf  # when the operator's own sticks came
+    sticks_moved_s: float = -math.inf  # and when they were off their middle
+    granted_s: dict[int, float] = field(default_factory=dict)  # command -> when the autopilot granted it
     position_jump_s: float = -math.inf
     """when a position came last that no vehicle reaches from the one before"""
-    jumped: str = ""
-    """how it jumped; '' = it did not"""
+    jumped: str = ""  # how it jumped; '' = it did not
     refused: Counter[str] = field(default_factory=Counter)
     """why messages were not used -> how many; at most ``MOST_KINDS`` reasons"""
 

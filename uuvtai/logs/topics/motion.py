@@ -86,8 +86,7 @@ _COVARIANCE = record(
     sigma=described(FOUR, "[m, m, m, rad] standard deviations of x, y, z, yaw"),
     error=described(FOUR, "[m, m, m, rad] estimate less truth of x, y, z, yaw"),
 )
-_ROW_OF = (0, 1, 5)
-"""rows of x, y and heading among x, y, z, roll, pitch, yaw"""
+_ROW_OF = (0, 1, 5)  # rows of x, y and heading among x, y, z, roll, pitch, yaw
 
 
 def _covariance(moment: Moment) -> bytes:

@@ -128,8 +128,7 @@ _SIZES = {"sphere": [0], "cylinder": [0, 2], "box": [0, 1, 2]}
 _SHAPES = {"sphere": "spheres", "cylinder": "cylinders", "box": "cubes"}
 _TRACK_TEXT = '{"x":%.9g,"y":%.9g,"z":%.9g,"vx":%.9g,"vy":%.9g,"radius":%.9g,'
 _BELIEF_TEXT = '"turn_rate":%.9g,"turn_variance":%.9g,"present":%.9g,"above":%s,"below":%s,'
-_FREE_M = 1e5
-"""Bounds beyond are no bounds."""
+_FREE_M = 1e5  # Bounds beyond are no bounds.
 
 
 def _goal(moment: Moment) -> bytes:
@@ -289,8 +288,7 @@ BODY_ROWS = (
 # vehicle has.
 
 
-Paint = Callable[[np.ndarray], tuple[Any, Any, Any, Any]]
-"""red, green, blue, alpha of a layer's values"""
+Paint = Callable[[np.ndarray], tuple[Any, Any, Any, Any]]  # red, green, blue, alpha of a layer's values
 
 _CELL = np.dtype([("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1"), ("value", "<f4")])
 _FIELDS = [
@@ -305,10 +303,8 @@ class Layer:
 
     packed: bytes
     shape: tuple[int, int]
-    kind: str
-    """NumPy's name of the type of the values"""
-    origin_m: tuple[float, float]
-    """world x, y of the outer corner of cell [0, 0]"""
+    kind: str  # NumPy's name of the type of the values
+    origin_m: tuple[float, float]  # world x, y of the outer corner of cell [0, 0]
     cell_m: float
 
     @classmethod

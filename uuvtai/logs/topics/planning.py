@@ -128,10 +128,8 @@ PLAN_ROWS = (
 # What drives: action, policy, safety, behaviour tree.
 
 
-_FAR = 1e5
-"""A time to collision beyond stands for "nothing closes in" in the simulator."""
-_STATUSES = ("IDLE", "RUNNING", "SUCCESS", "FAILURE")
-"""by the codes of ``tree_codes``"""
+_FAR = 1e5  # A time to collision beyond stands for "nothing closes in" in the simulator.
+_STATUSES = ("IDLE", "RUNNING", "SUCCESS", "FAILURE")  # by the codes of ``tree_codes``
 
 _ACTION = record(
     "uuv.Action",

@@ -145,8 +145,7 @@ SONAR_ROWS = (
 
 _NO_RETURN_SHARE = 0.999
 """As in ``kernels.evidence``: a pixel beyond this share of the camera's range saw nothing."""
-_PNG_HEAD = struct.Struct(">8s4x4sII")
-"""signature, first chunk's name, width, height"""
+_PNG_HEAD = struct.Struct(">8s4x4sII")  # signature, first chunk's name, width, height
 _MAX_PIXELS = 1 << 24
 """of a depth image: a thousand times the camera's, and far below what a small file can claim"""
 

@@ -39,8 +39,7 @@ from uuvtai.vehicle.onboard import Mission, OnboardPilot, SensorMessage, SimStac
 # of each.
 
 
-Line = dict[str, Any]
-"""{"kernel": its number, "arguments": [..]} or {"do": what the host does}"""
+Line = dict[str, Any]  # {"kernel": its number, "arguments": [..]} or {"do": what the host does}
 
 
 @dataclass(frozen=True)
@@ -56,19 +55,14 @@ class RecordedKernel:
 class Tape:
     """What was written down."""
 
-    memory: np.ndarray
-    """all arrays before the first step, bytes"""
-    arrays: dict[str, dict[str, Any]]
-    """where each lies in it, by 'struct.field'"""
+    memory: np.ndarray  # all arrays before the first step, bytes
+    arrays: dict[str, dict[str, Any]]  # where each lies in it, by 'struct.field'
     kernels: list[RecordedKernel] = field(default_factory=list)
     tensors: list[tuple[list[int], str]] = field(default_factory=list)
     """(shape, dtype) of arguments that are arrays; the first three: mask, seed and number of the episode"""
-    begin: list[Line] = field(default_factory=list)
-    """the first step"""
-    step: list[Line] = field(default_factory=list)
-    """every other one"""
-    keep: list[Line] = field(default_factory=list)
-    """what is launched where a route could not be planned"""
+    begin: list[Line] = field(default_factory=list)  # the first step
+    step: list[Line] = field(default_factory=list)  # every other one
+    keep: list[Line] = field(default_factory=list)  # what is launched where a route could not be planned
 
 
 def record(config: Config, tree: FlatTree, mission: Mission) -> tuple[Tape, Sim]:
@@ -265,8 +259,7 @@ class MachineKind:
     triple: str
     cpu: str
     features: str
-    emulation: str
-    """LLD's word for it"""
+    emulation: str  # LLD's word for it
 
 
 KINDS = {
@@ -366,8 +359,7 @@ def _object(text: str, kind: MachineKind, public: str) -> bytes:
 # ------------------------------------------------------------------------------------------------------------
 
 
-PACKAGE = "uuv_stack"
-"""of the copied files"""
+PACKAGE = "uuv_stack"  # of the copied files
 CHECKED_STEPS = 500
 _ROOT = Path(__file__).parents[2]
 _COPIED = (

@@ -210,8 +210,7 @@ def _aligned(n_bytes: int) -> np.ndarray:
 # ``python -m uuv_stack FOLDER``. Copied into every exported folder.
 
 
-AGREES = 1e-4
-"""largest difference between two commands, each in [-1, 1], that counts as none"""
+AGREES = 1e-4  # largest difference between two commands, each in [-1, 1], that counts as none
 
 
 def packed_messages(arrivals: list[tuple[int, SensorMessage]]) -> dict[str, np.ndarray]:

@@ -47,8 +47,7 @@ from uuvtai.vehicle.identify.model import (
 )
 
 _ROUNDS = 25
-_WEIGHED = (1, 3)
-"""rounds after which readings are weighed anew, by what is left"""
+_WEIGHED = (1, 3)  # rounds after which readings are weighed anew, by what is left
 _NOTHING, _LITTLE, _KEPT = 0.01, 1.0, 0.1
 """falls of the sum of squares that a step promises, in units of noise: below the first it is the last one,
 for no parameter moves by more than a tenth of its standard deviation; below the second it is if it keeps less
@@ -62,15 +61,11 @@ _NOISE = 0.02
 class Fit:
     """What least squares found."""
 
-    value: np.ndarray
-    """(17,)"""
-    low: np.ndarray
-    """(17,) of the 95 % interval; where nothing was fitted, the value itself"""
+    value: np.ndarray  # (17,)
+    low: np.ndarray  # (17,) of the 95 % interval; where nothing was fitted, the value itself
     high: np.ndarray
-    start: np.ndarray
-    """(s, 4) initial velocity of each stretch"""
-    noise: np.ndarray
-    """(4,) rms of what is left [m/s, rad/s]"""
+    start: np.ndarray  # (s, 4) initial velocity of each stretch
+    noise: np.ndarray  # (4,) rms of what is left [m/s, rad/s]
 
 
 def fitted(given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray) -> Fit:
@@ -233,15 +228,13 @@ KNOWN = ("gain", "added-mass", "buoyancy")
 KINDS = ("added mass", "linear damping", "quadratic damping")
 HORIZONS = (1, 10, 100)
 _STRETCH_S = 5.0
-_HELD_OUT = 5
-"""one stretch in so many is predicted by a fit to the others"""
+_HELD_OUT = 5  # one stretch in so many is predicted by a fit to the others
 _MOST_SAMPLES = 150_000
 """of all stretches that are fitted, for each takes some seven kilobytes; 50 minutes at 50 Hz"""
 _NOTHING_FOUND = 0.02
 """share of an error ahead that is no difference: a fit is better where it is so by more at one horizon, and
 worse by more at none"""
-_LOOSE = 0.5
-"""An interval wider than this share of the value, to either side, is warned of."""
+_LOOSE = 0.5  # An interval wider than this share of the value, to either side, is warned of.
 _OTHERS = {
     NET: ("net buoyancy", "N"),
     GAIN: ("thruster gain", ""),
@@ -258,12 +251,9 @@ class Identified:
     """The document of ``uuv identify --json`` and what its files are made of."""
 
     document: dict[str, Any]
-    keys: dict[str, object]
-    """of the vehicle section, as found"""
-    measured: np.ndarray
-    """(s, n + 1, 4) readings, NaN = none"""
-    predicted: np.ndarray
-    """(s, n + 1, 4) by the fitted vehicle"""
+    keys: dict[str, object]  # of the vehicle section, as found
+    measured: np.ndarray  # (s, n + 1, 4) readings, NaN = none
+    predicted: np.ndarray  # (s, n + 1, 4) by the fitted vehicle
     dt_s: float
 
 
@@ -272,13 +262,10 @@ class FittedDrives:
     """What was fitted to drives."""
 
     given: Stretches
-    first: np.ndarray
-    """(17,) of the vehicle given"""
-    free: np.ndarray
-    """(17,) which were fitted"""
+    first: np.ndarray  # (17,) of the vehicle given
+    free: np.ndarray  # (17,) which were fitted
     fit: Fit
-    entries: list[dict[str, Any]]
-    """of the document, one for each parameter"""
+    entries: list[dict[str, Any]]  # of the document, one for each parameter
     warnings: list[str]
 
 

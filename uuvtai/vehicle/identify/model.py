@@ -16,23 +16,18 @@ from uuvtai.sim.setup import allocation_matrices
 from uuvtai.vehicle.identify.drive_log import LEAST_LAG_S, Drive, DriveError, mean_wrench
 
 AXES = ("surge", "sway", "heave", "yaw")
-_OF_SIX = (0, 1, 2, 5)
-"""where those stand among six"""
+_OF_SIX = (0, 1, 2, 5)  # where those stand among six
 NET, GAIN = 12, 13
 """places of net buoyancy and gain, behind added mass, linear and quadratic damping of the four axes"""
-LAG, LATE = 14, (15, 16)
-"""of the rotors' lag, and of the delays of velocity and yaw rate [s]"""
+LAG, LATE = 14, (15, 16)  # of the rotors' lag, and of the delays of velocity and yaw rate [s]
 SIZE = 17
 _LONGEST_STEP_S = 0.025
-_FAST = 20.0
-"""[m/s, rad/s] a trial's motion ends here"""
+_FAST = 20.0  # [m/s, rad/s] a trial's motion ends here
 _LAG_STEP_S = 1e-3
-_LATEST_S = 0.15
-"""readings at the begin of a stretch that a delay may have from before it; they are left out"""
+_LATEST_S = 0.15  # readings at the begin of a stretch that a delay may have from before it; they are left out
 _FORGOTTEN_S = 1.0
 """begin of a drive with commanded speeds that is left out: how the rotors turned before it is not known"""
-_READ = (slice(0, 3), slice(3, 4))
-"""axes of the two instruments"""
+_READ = (slice(0, 3), slice(3, 4))  # axes of the two instruments
 
 
 @dataclass(frozen=True)
@@ -40,22 +35,16 @@ class Stretches:
     """Stretches of equal length cut from drives: s of them, n steps each."""
 
     dt_s: float
-    velocity: np.ndarray
-    """(s, n + 1, 4), NaN = no reading"""
-    tilt_rate: np.ndarray
-    """(s, n, 2) in the middle of each step"""
-    up: np.ndarray
-    """(s, n, 3) likewise"""
+    velocity: np.ndarray  # (s, n + 1, 4), NaN = no reading
+    tilt_rate: np.ndarray  # (s, n, 2) in the middle of each step
+    up: np.ndarray  # (s, n, 3) likewise
     wrench: np.ndarray
     """(s, n, 2, 4) of each step by the vehicle's own thrust curve [N, N m], with the lag ``lag_s``: its mean,
     and that weighted by the time left of the step"""
-    slope: np.ndarray
-    """(s, n, 2, 4) its change with the lag [N/s, N m/s]"""
+    slope: np.ndarray  # (s, n, 2, 4) its change with the lag [N/s, N m/s]
     lag_s: float
-    after: np.ndarray
-    """(s, n + 1, 2) [s] by how much later than their sample velocity and yaw rate were read"""
-    cuts: tuple[tuple[Drive, int], ...]
-    """where each was cut from, and at which step it begins"""
+    after: np.ndarray  # (s, n + 1, 2) [s] by how much later than their sample velocity and yaw rate were read
+    cuts: tuple[tuple[Drive, int], ...]  # where each was cut from, and at which step it begins
 
     def some(self, which: np.ndarray) -> Stretches:
         """These of them."""
@@ -237,8 +226,7 @@ class _Body:
     gain: np.ndarray
     net: np.ndarray
     munk: np.ndarray
-    rolling: float
-    """[kg m2] yaw moment of roll rate times pitch rate"""
+    rolling: float  # [kg m2] yaw moment of roll rate times pitch rate
 
     @staticmethod
     def of(theta: np.ndarray, vehicle_cfg: VehicleConfig) -> _Body:
@@ -326,8 +314,7 @@ def linearised(
 _TRIES = 12
 _SHARES = (0.2, 0.5, 1.0)
 _DAMPING, _LESS, _MORE, _MOST = 1e-3, 0.1, 10.0, 1e9
-_NOTHING = 1e-3
-"""fall of the sum of squares, in units of noise, that is not worth a step"""
+_NOTHING = 1e-3  # fall of the sum of squares, in units of noise, that is not worth a step
 
 
 def first_readings(given: Stretches) -> np.ndarray:
@@ -384,15 +371,12 @@ def settled_starts(
 # What a log must hold for an axis to be identified, and what to drive where it does not.
 
 
-_FAST_SHARE = (0.12, 0.12, 0.12, 0.15)
-"""[m/s, m/s, m/s, rad/s] that a tenth of the readings must exceed"""
-_VARIED = (0.05, 0.05, 0.05, 0.08)
-"""standard deviation that the speed must have"""
+_FAST_SHARE = (0.12, 0.12, 0.12, 0.15)  # [m/s, m/s, m/s, rad/s] that a tenth of the readings must exceed
+_VARIED = (0.05, 0.05, 0.05, 0.08)  # standard deviation that the speed must have
 _LEAST_READINGS = 200
 _STEP_S, _STEP_RPM, _LEAST_STEPS = 0.1, 300.0, 20
 """jumps of a commanded speed that the rotors' lag can be seen in"""
-LEAST_STRETCHES = 12
-"""a bootstrap over fewer says nothing"""
+LEAST_STRETCHES = 12  # a bootstrap over fewer says nothing
 
 
 def unexcited(given: Stretches) -> dict[str, str]:
