@@ -11,10 +11,8 @@ LETTERS: dict[str, str] = dict(zip(ENDINGS, "scxot", strict=True))
 """of the endings, for a row of episodes as one word"""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Codes of planning: why a plan was wanted, who planned, why the Voronoi planner failed. Names are what
+# ---- Codes of planning: why a plan was wanted, who planned, why the Voronoi planner failed. Names are what
 # reports and logs print.
-
 
 TRIGGERS = ("initial", "stuck", "safety", "intersection")
 """In order of priority: exactly one is counted per replan. Code = index + 1, counter's column = index."""
@@ -32,9 +30,7 @@ N_REASON = len(REASONS)
 FAIL_NONE, FAIL_START_OUTSIDE, FAIL_GOAL_OUTSIDE, FAIL_DISCONNECTED, FAIL_BUDGET = range(N_REASON + 1)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What a learned forecast is told and what it says, in numbers: read by its kernels and by what learns.
-
+# ---- What a learned forecast is told and what it says, in numbers: read by its kernels and by what learns.
 
 PACKET = 16  # columns and units come in whole packets (``kernels.core.lanes.LANES``)
 
@@ -69,8 +65,7 @@ N_WEIGHT = LAST + (1 + N_HIDDEN) * N_SAID
 """numbers of the three layers, each its biases, then a row for each input"""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What only the simulator knows.
+# ---- What only the simulator knows.
 
 
 class Truth:
@@ -78,10 +73,8 @@ class Truth:
     ``tests/test_architecture.py`` reads it."""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A policy over a set of bodies in numbers: widths of what it is told, and of the rule that lays its wish on
-# the hull. Read by kernels, by what learns, and by what is exported without them.
-
+# ---- A policy over a set of bodies in numbers: widths of what it is told, and of the rule that lays its wish
+# on the hull. Read by kernels, by what learns, and by what is exported without them.
 
 N_BODY = 9  # moving bodies that the policy sees, the nearest ones
 BODY_WIDTH = 22  # columns of a body

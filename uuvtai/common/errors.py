@@ -43,9 +43,7 @@ class OwnCodeError(UserError, RuntimeError):
     """A piece that the user brought has failed; its ``__cause__`` is what was raised in her code."""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# How a command ends: an exit code, one message, and for a bug of ours a file with the traceback.
-
+# ---- How a command ends: an exit code, one message, and for a bug of ours a file with the traceback.
 
 OK, FAILED, USAGE, GATE, INTERRUPTED = 0, 1, 2, 3, 130
 

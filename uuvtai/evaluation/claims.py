@@ -26,8 +26,7 @@ from uuvtai.common.statistics import (
     wilson_interval,
 )
 
-# ------------------------------------------------------------------------------------------------------------
-# What the paper prints, as printed, and where its own figures do not add up.
+# ---- What the paper prints, as printed, and where its own figures do not add up.
 
 
 class PrintedRow(NamedTuple):
@@ -68,9 +67,6 @@ INCONSISTENCIES = (
     "The ablation is announced as four variants, but no table gives results of 'LWM risk' and 'LWM'.",
 )
 """found while rebuilding it; what we do instead is in docs/results.md"""
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be judged"

@@ -266,13 +266,9 @@ def _within(value: float | None, limit: float) -> bool:
     return value is not None and value <= limit
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Watch failed episodes as they are played again: keep the truth and the vehicle's beliefs of their last
-# seconds.
-#
-# An episode is the same in any batch, so only the failed ones are replayed, and their ends are known
+# ---- Watch failed episodes as they are played again: keep the truth and the vehicle's beliefs of their last
+# seconds. An episode is the same in any batch, so only the failed ones are replayed, and their ends are known
 # beforehand: nothing is kept of the time before the last ``facts.WINDOW_S`` but a coarse diary.
-
 
 _SAMPLE_S, _COARSE_S = 0.1, 0.5
 """Time between samples of the window and between entries of the diary; counted from the start, so that rows
@@ -437,9 +433,7 @@ def _bodies(config: Config, read: dict[str, np.ndarray]) -> Bodies:
     return Bodies(kind, read["world.size"].astype(float), read["world.yaw"].astype(float), speed, circle, lap)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Explain failed episodes: play them again, label each (``causes.py``), and record the worst.
-
+# ---- Explain failed episodes: play them again, label each (``causes.py``), and record the worst.
 
 EXAMPLES = 3  # Episodes named per label in the table.
 

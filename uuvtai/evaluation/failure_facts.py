@@ -19,14 +19,10 @@ from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.config import Config, SonarConfig, TankConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 
-# ------------------------------------------------------------------------------------------------------------
-# What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach, what
-# its beams met.
-#
-# For explanations after the fact only; nothing that drives a vehicle may import it. Same geometry as
-# ``kernels/core/hull.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode have the samples first,
-# shape (n, ...); bodies are on the next axis.
-
+# ---- What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach,
+# what its beams met. For explanations after the fact only; nothing that drives a vehicle may import it. Same
+# geometry as ``kernels/core/hull.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode have the
+# samples first, shape (n, ...); bodies are on the next axis.
 
 Array = np.ndarray
 
@@ -159,9 +155,7 @@ def _box_entry(x: Array, y: Array, dx: Array, dy: Array, size: Array) -> Array:
     return np.where(into <= out, into, np.inf)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What is kept of a failed episode to explain it: its bodies, its last seconds sample by sample, all of it
-# coarsely.
+# ---- What is kept of a failed episode: its bodies, its last seconds sample by sample, all of it coarsely.
 
 
 @dataclass(frozen=True)
@@ -223,10 +217,7 @@ class History:
     coarse: CoarseHistory
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Could the vehicle still have got away? Velocities held from some time before the end on, rolled out against
-# the true motion of all.
-
+# ---- Could the vehicle still have got away? Velocities held before the end, against the true motion of all.
 
 N_HEADING = 16
 SPEEDS = (0.5, 1.0)  # Shares of the fastest evasion in that direction.
@@ -326,9 +317,6 @@ def _reach(pos: Array, bodies: Bodies) -> Array:
     """(nb,) distance from that mean beyond which a body troubles none of the paths."""
     spread = np.linalg.norm(pos[..., :2] - pos[..., :2].mean(0), axis=-1).max()
     return spread + np.linalg.norm(bodies.size[:, :2], axis=1) + 1.0
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 WINDOW_S = 4.0  # How far back the facts look; a time "ago" that is None lies farther back or never was.

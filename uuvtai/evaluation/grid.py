@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from uuvtai.sim.sim import Sim
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The grid of a sweep: named axes and their values, and the cells they make.
-
+# ---- The grid of a sweep: named axes and their values, and the cells they make.
 
 SCENE_AXES = {"S": "world.n_static", "D": "world.n_dynamic", "v": "world.dynamic_speed_m_s"}
 """axes that vary as data within one simulator, and their config keys"""
@@ -157,10 +155,7 @@ def _check_values(name: str, values: Sequence[Value]) -> None:
             )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What a worker of a sweep is given and what it gives back: plain data, so that it may run in any process on
-# any machine.
-
+# ---- What a worker of a sweep is given and what it gives back: plain data, for any process on any machine.
 
 Row = dict[str, Any]  # one method in one cell, an entry of ``cells`` in ``uuv sweep --json``
 
@@ -259,9 +254,6 @@ def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> 
         "episode_outcomes": [entry["outcome"] for entry in details],
         "episode_times_s": [entry["time_s"] for entry in details],
     }
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 BATCH = 256  # episodes side by side in one simulator

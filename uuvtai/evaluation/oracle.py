@@ -27,9 +27,7 @@ import numpy as np
 from uuvtai.common.obstacle_motion import body_positions, path_positions
 from uuvtai.config import Config
 
-# ------------------------------------------------------------------------------------------------------------
-# Where the bodies of a scenario are at given times, and how far points are from them.
-
+# ---- Where the bodies of a scenario are at given times, and how far points are from them.
 
 _BEFORE_S = 1e-4  # Velocities are differences over this time: exact but for the moment of a sharp turn.
 
@@ -93,12 +91,8 @@ def rounding_m(body: Obstacle) -> float:
     return float(body.size[0]) if body.kind == "sphere" else 0.0
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Nodes in space at which a kinematic point may be, and which of them the referee's rules forbid at a time,
-# for every way to leave them.
-#
-# The hull is a ball of its own radius: the slimmest that the capsule can look, whatever its heading.
-
+# ---- Nodes at which a kinematic point may be, and which of them the referee's rules forbid at a time. The
+# hull is a ball of its own radius: the slimmest that the capsule can look, whatever its heading.
 
 CELL_M = 0.1  # Level distance of neighbouring nodes.
 
@@ -229,9 +223,6 @@ class Referee:
 def _widened(box: tuple[slice, slice, slice]) -> tuple[slice, ...]:
     """The ranges with one node more on every side."""
     return tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 Array = np.ndarray

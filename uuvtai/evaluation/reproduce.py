@@ -35,9 +35,7 @@ from uuvtai.report.reproduction import claim_table
 from uuvtai.report.tables import Table, change_name, markdown, seconds, text_table, varies_alone
 from uuvtai.report.timing import ENVS, SPEEDS, density_table, latency_table
 
-# ------------------------------------------------------------------------------------------------------------
-# A reproduction as sections of the report: what the page shows, in the order of the paper.
-
+# ---- A reproduction as sections of the report: what the page shows, in the order of the paper.
 
 Described = dict[str, Any]
 
@@ -152,8 +150,7 @@ def _point(cells: Sequence[dict[str, Any]], caution: float) -> Described:
     return {"collision_rate": pooled(own, *COLLIDED).rate, "success_rate": pooled(own, "success").rate}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The key tables of a reproduction as Markdown: docs/results.md is one of these pages.
+# ---- The key tables of a reproduction as Markdown: docs/results.md is one of these pages.
 
 
 def results_page(document: dict[str, Any]) -> str:
@@ -306,9 +303,6 @@ def _paper_notes(document: dict[str, Any]) -> str:
     return "## Where the paper's figures do not add up\n" + "\n".join(
         f"- {text}" for text in document["inconsistencies"]
     )
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 REQUEST, RESULT, PAGE = "reproduce_request.json", "reproduce.json", "results.md"

@@ -35,9 +35,7 @@ if TYPE_CHECKING:
     from uuvtai.evaluation.agents import Method
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Who does the work of a sweep: processes on this machine, or a Ray cluster. A worker that is lost costs its
-# task once more.
+# ---- Who does the work: processes on this machine, or a Ray cluster. A lost worker's task is done once more.
 
 
 class Engine(Protocol):
@@ -104,9 +102,6 @@ class RayEngine:
 def engine_of(name: str, workers: int, address: str) -> Engine:
     """The engine of ``uuv sweep --engine``: 'local' with so many ``workers``, or 'ray' at ``address``."""
     return LocalEngine(workers) if name == "local" else RayEngine(address)
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 ROWS, REQUEST, RESULT = "cells.jsonl", "sweep_request.json", "sweep.json"

@@ -22,8 +22,7 @@ from uuvtai.logs.encode import EpisodeEnd, EpisodeHeader, Topic, Values
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.writer import EpisodeReader, PolicyNote, Recordable, RecordedJob, TopicMessage, TopicStream
 
-# ------------------------------------------------------------------------------------------------------------
-# Running episodes as messages for viewers: the topics of the log, as they come, no faster than the clock.
+# ---- Running episodes as messages for viewers: the topics of the log, no faster than the clock.
 
 
 class Viewers(Protocol):
@@ -128,10 +127,8 @@ class RealTime:
         return self._steps * self._dt_s / spent if spent > 0 else 0.0
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Who may connect to the server of episodes: a relay in front of it, which looks at each request and passes
-# bytes on. The SDK's own server takes any web page's script, and any number of clients.
-
+# ---- Who may connect to the server of episodes: a relay in front of it, which looks at each request and
+# passes bytes on. The SDK's own server takes any web page's script, and any number of clients.
 
 MOST_CLIENTS = 8  # at once, whether they have sent a request already or not
 _REQUEST_S, _REQUEST_BYTES = 5.0, 16 << 10
@@ -267,9 +264,6 @@ def _ended(place: socket.socket) -> None:
     with contextlib.suppress(OSError):
         place.shutdown(socket.SHUT_RDWR)
     place.close()
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 EXTRA = "uuvtai[live]"

@@ -265,10 +265,7 @@ def _fixed(pixels: np.ndarray) -> np.ndarray:
     return np.round((np.asarray(pixels) - 0.5) * (1 << _SHIFT)).astype(np.int32)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What pictures and videos have in common: the tank, maps, true bodies, ruler, all on a canvas in world
-# coordinates.
-
+# ---- What pictures and videos have in common: the tank, maps, true bodies, ruler, in world coordinates.
 
 _MAX_MAP = 1000  # [px] greatest height of the map
 _HULL_RADIUS_M = 0.17  # half the height of the hull that ``Canvas.vehicle`` draws
@@ -380,8 +377,7 @@ def paint_ruler(canvas: Canvas) -> None:
     canvas.text((begin - 10, y + 5), f"{gap} m", 16, INK, align="right")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A log as arrays, ready to be drawn.
+# ---- A log as arrays, ready to be drawn.
 
 
 @dataclass

@@ -165,9 +165,7 @@ def checked(text: str) -> str:
     return text
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What a log is made of: an episode's header, and one control step at a time as the state's own rows.
-
+# ---- What a log is made of: an episode's header, and one control step at a time as the state's own rows.
 
 Values = Mapping[str, Any]
 """One env at one control step: 'struct.field' of the state -> copy of the env's row (shapes, units and frames
@@ -274,9 +272,7 @@ def time_text(time_ns: int) -> str:
     return '{"sec":%d,"nsec":%d}' % divmod(time_ns, 1_000_000_000)  # noqa: UP031
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A row of the table of topics: when a topic is written, from what, how, and how it is read back.
-
+# ---- A row of the table of topics: when a topic is written, from what, how, and how it is read back.
 
 Encode = Callable[[Moment], bytes | list[bytes]]
 """JSON text of a step's message, or of each of its messages. ValueError for numbers that are not finite."""
@@ -355,8 +351,7 @@ EVENTS = When(
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What can be wrong with a log file, and with the name of a file that is to be drawn from it.
+# ---- What can be wrong with a log file, and with the name of a file that is to be drawn from it.
 
 
 class LogError(UserError, RuntimeError):

@@ -255,8 +255,7 @@ def _arrays(data: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Make a readable log of one whose writing was cut off or that was damaged later.
+# ---- Make a readable log of one whose writing was cut off or that was damaged later.
 
 
 @dataclass(frozen=True)

@@ -110,9 +110,7 @@ def zeros(count: int) -> np.ndarray:
     return np.zeros(count)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A log's control steps as ROS 2's standard messages; the table of docs/viewers.md.
-
+# ---- A log's control steps as ROS 2's standard messages; the table of docs/viewers.md.
 
 Step = dict[str, dict[str, Any]]  # messages of one control step by topic
 
@@ -350,10 +348,8 @@ def _grid(ros: RosMessages, grid: dict[str, Any]) -> Any:
     return ros("nav_msgs/msg/OccupancyGrid", header=head, info=info, data=data)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ROS 2's standard messages as a log's JSON messages; the table of docs/viewers.md. Nothing in a message is
-# trusted: what does not fit together is a ValueError.
-
+# ---- ROS 2's standard messages as a log's JSON messages; the table of docs/viewers.md. Nothing in a message
+# is trusted: what does not fit together is a ValueError.
 
 _CLOUD = record(
     "foxglove.PointCloud",

@@ -367,11 +367,7 @@ class FrameArtist:
                 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Frames into a file: WebM (VP9), MP4 (H.264) and GIF, at a quality rather than a bit rate.
-#
-# What stands still costs next to nothing so.
-
+# ---- Frames into a file: WebM (VP9), MP4 (H.264) and GIF, at a quality rather than a bit rate.
 
 Frames = Iterable[np.ndarray]  # images (height, width, 3), blue green red, all of one size
 

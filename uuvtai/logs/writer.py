@@ -34,10 +34,7 @@ from uuvtai.logs.scenario import FRAMES, scenario_document
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topics import TOPICS
 
-# ------------------------------------------------------------------------------------------------------------
-# One episode as messages: of every control step the topics that are due, encoded. What becomes of them is
-# another's: ``mcap_log`` writes them to a file, ``live.broadcast`` shows them to viewers.
-
+# ---- One episode as messages, for a file or for viewers: of every control step the topics that are due.
 
 SIGNS = ("clock.step", *dict.fromkeys(name for topic in TOPICS for name in topic.when.reads))
 """what ``TopicStream.due`` looks at"""
@@ -105,9 +102,6 @@ class TopicStream:
         """Its last message is old enough for its rate."""
         hertz, last = topic.when.hertz, self._written.get(topic.name)
         return last is None or not hertz or time_s - last >= 1.0 / hertz - 1e-6
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 class McapEpisodeLog:
@@ -222,9 +216,7 @@ def _result_metadata(result: EpisodeEnd) -> dict[str, str]:
     }
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Chosen episodes of a running simulator: read what the table of topics names, hand it to a log or whoever
-# asks.
+# ---- Chosen episodes of a running simulator: what the table of topics names, for a log or whoever asks.
 
 
 class Recordable(Protocol):

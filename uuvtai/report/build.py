@@ -37,10 +37,7 @@ from uuvtai.report.tables import Table, heads, megabytes, number
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, training
 
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of pictures and videos: trajectories over the occupancy map, the worst episodes first, as many as
-# the page may hold.
-
+# ---- Pictures and videos: trajectories over the map, the worst episodes first, as many as the page may hold.
 
 MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
 """What all pictures and videos of a page, and the pictures of a run among them, may weigh: in base64 8.8 MB
@@ -192,9 +189,7 @@ def _outcome(detail: Detail) -> str:
     )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Where figures come from: the command, the machine, the versions, the config.
-
+# ---- Where figures come from: the command, the machine, the versions, the config.
 
 MANIFEST_BYTES = 16 << 20  # [bytes] more than any manifest of a checkpoint has
 
@@ -286,9 +281,6 @@ def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]
 
 def _sha256(path: Path, run: Path) -> str:
     return hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest()
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 NOTHING = (

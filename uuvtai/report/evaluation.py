@@ -148,9 +148,7 @@ def causes_table(method: dict[str, Any], title: str) -> Table:
     return Table(_CAUSES, method["causes"], title)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of an evaluation (the document of ``uuv eval --json``): methods, and why they failed.
-
+# ---- Blocks of an evaluation (the document of ``uuv eval --json``): methods, and why they failed.
 
 Method = dict[str, Any]
 

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From panels to SVG for the page and PNG for the disk. matplotlib is imported here and in ``figures.py``
-# only, when something is drawn.
-
+# ---- From panels to SVG for the page and PNG for the disk. matplotlib is imported when something is drawn.
 
 INK = "#1b1c1d"
 """Colour of text, axes and grids: a mark that becomes the page's own text colour, in light and dark"""
@@ -173,9 +170,6 @@ def _size(root: ElementTree.Element, panel: Panel, label: str) -> None:
 
 ElementTree.register_namespace("", _SVG)
 ElementTree.register_namespace("xlink", _XLINK)
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 _CELL_IN = (0.62, 0.36)

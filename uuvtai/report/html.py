@@ -107,9 +107,7 @@ def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Reading a run folder: what is wrong with a file is said, and nothing that stands in one is executed.
-
+# ---- Reading a run folder: what is wrong with a file is said, and nothing that stands in one is executed.
 
 _MAX_LINES = 1_000_000
 _MOST = {
@@ -211,9 +209,7 @@ def read_config(run: Path) -> str | None:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Texts of files without what no figure and no table can show.
-
+# ---- Texts of files without what no figure and no table can show.
 
 _LONGEST = 300  # characters of a text in a document: names, not novels
 

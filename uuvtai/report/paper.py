@@ -317,9 +317,7 @@ def _axis(name: str) -> Column:
     )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# LaTeX of tables and floats. Whatever a user can name is text in it, never a command.
-
+# ---- LaTeX of tables and floats. Whatever a user can name is text in it, never a command.
 
 _SPECIAL = {
     "\\": r"\textbackslash{}",
@@ -436,9 +434,7 @@ DOCUMENT = r"""% All figures and tables, to look at: pdflatex paper.tex
 """
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv report --paper DIR``: figures, tables and captions of finished runs, whole or not at all.
-
+# ---- ``uuv report --paper DIR``: figures, tables and captions of finished runs, whole or not at all.
 
 _WIDTHS = {"1col": ONE_COLUMN_IN, "2col": TWO_COLUMNS_IN}
 _NAME = re.compile(r"[^A-Za-z0-9]+")

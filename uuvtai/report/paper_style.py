@@ -24,9 +24,7 @@ if TYPE_CHECKING:
     from uuvtai.logs.drawing import Recording
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Figures as journals want them: PDF and SVG, as wide as one or two columns of a page, text of one size.
-
+# ---- Figures as journals want them: PDF and SVG, as wide as one or two columns of a page, text of one size.
 
 ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.16  # widths of IEEE's columns
 TEXT_PT = 8.0
@@ -157,9 +155,6 @@ def _style() -> Iterator[None]:
     settings: Any = {**matplotlib.rcParamsDefault, "backend": "agg", **_STYLE, **dict.fromkeys(inks, INK)}
     with matplotlib.rc_context(settings):
         yield
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 _BAR_IN, _FRAME_IN = 0.21, 0.55

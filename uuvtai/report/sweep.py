@@ -88,10 +88,7 @@ def _other(name: str) -> Column:
     return Column(name, left=True, only=TERMINAL, of=lambda cell: str(cell.get(name, "")))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of a sweep (the document of ``uuv sweep --json``): heat maps over two or more axes, curves with
-# intervals over one.
-
+# ---- Blocks of ``uuv sweep --json``: heat maps over two or more axes, curves with intervals over one.
 
 ON_HOVER = "Counts and intervals: on hover and below"  # said of a figure on a page, where it has both
 _NUMBERS = ("success_rate", "collision_rate", "time_mean_s", "tts_s", "time_to_success_mean_s")

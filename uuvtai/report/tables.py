@@ -108,10 +108,7 @@ def _escaped(text: str) -> str:
     return " ".join(text.split()).replace("|", r"\|")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Figures as tables and pages write them: every rate with its count and its interval, and what is not known
-# as a dash.
-
+# ---- Numbers in tables and pages: every rate with its count and its interval, what is not known as a dash.
 
 _NAMES = {"v_m_s": "v m/s"}
 _LOCALIZED = {
@@ -198,9 +195,7 @@ def megabytes(n_bytes: int) -> str:
     return f"{n_bytes / 1e6:.1f} MB"
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Layout of a heat map: cells of a sweep as rows and columns, for the figure and the terminal alike. Pure.
-
+# ---- Layout of a heat map: cells of a sweep as rows and columns, for the figure and the terminal alike.
 
 SPEED = "v_m_s"
 MapCell = dict[str, Any]
@@ -324,10 +319,7 @@ def _refuse_doubles(places: tuple[Place, ...]) -> None:
         taken |= spots
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A sweep of one axis at a time: which cells change which axis, around the cell that changes nothing.
-# Pure.
-
+# ---- A sweep of one axis at a time: which cells change which axis, around the cell that changes nothing.
 
 _SCENE = ("S", "D", "v_m_s")  # every cell states these, changed or not
 _TICK = 14  # characters that fit under a tick

@@ -59,9 +59,7 @@ def density_data(rows: list[dict[str, Any]]) -> Data:
     return Data(_DENSITY, [list(map(row.get, _DENSITY)) for row in rows])
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of a profile (the document of ``uuv profile --json``): rates, time per stage, the paper's two timing
-# tables beside ours.
+# ---- Blocks of ``uuv profile --json``: rates, time per stage, the paper's two timing tables beside ours.
 
 
 def timing(document: dict[str, Any], command: str = "") -> list[Block]:

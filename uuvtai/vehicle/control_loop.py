@@ -54,9 +54,7 @@ from uuvtai.vehicle.safety import (
 from uuvtai.vehicle.start_fix import MISFIT, StartFix, StartFound, WallWatch
 from uuvtai.vehicle.telemetry import AUTOPILOT, COMPANION, Heard, Intake, Senders, waiting_for
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv pilot`` was told, checked before anything is opened or compiled.
-
+# ---- What ``uuv pilot`` was told, checked before anything is opened or compiled.
 
 EDGE_M = 0.2  # the fence's depths keep so far from surface and floor of the tank where none are typed
 MOST_SPEED_M_S = 2.0
@@ -167,9 +165,6 @@ def _three(values: Sequence[float]) -> tuple[float, float, float]:
 def _four(values: Sequence[float]) -> tuple[float, float, float, float]:
     low_x, low_y, high_x, high_y = values
     return low_x, low_y, high_x, high_y
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 _WANTED_HZ = {30: 50.0, 27: 50.0, 29: 10.0, 137: 10.0, 32: 20.0, 1: 2.0}

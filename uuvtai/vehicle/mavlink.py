@@ -16,17 +16,14 @@ from typing import Any
 from uuvtai.common.errors import UserError
 from uuvtai.vehicle.safety import SafetyLimits, Velocity, bounded
 
-# ------------------------------------------------------------------------------------------------------------
-# What is refused about a link to a vehicle.
+# ---- What is refused about a link to a vehicle.
 
 
 class LinkError(UserError, RuntimeError):
     """A link that cannot be had, or used: what, where, why, what to type next."""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A UDP socket: datagrams in, as many as one step can digest, and out to whom the vehicle spoke from.
-
+# ---- A UDP socket: datagrams in, as many as one step can digest, and out to whom the vehicle spoke from.
 
 Address = tuple[str, int]
 
@@ -127,9 +124,7 @@ class Endpoint:
         self.close()
 
 
-# ------------------------------------------------------------------------------------------------------------
-# An endpoint that keeps the vehicle's clock: for a simulated one, be it slower or faster than ours.
-
+# ---- An endpoint that keeps the vehicle's clock: for a simulated one, be it slower or faster than ours.
 
 SILENT_S = 5.0
 """by our clock: a vehicle that has told no time for so long is followed no further, lest a dead man's time
@@ -226,11 +221,8 @@ def _messages(datagram: bytes, system: int) -> list[tuple[int, bytes]]:
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What may be said to a vehicle, and nothing else: each a message of MAVLink by name and fields.
-#
-# Every number is held within the limits here once more, whatever the caller asks for.
-
+# ---- What may be said to a vehicle, and nothing else: each a message of MAVLink by name and fields. Every
+# number is held within the limits here once more, whatever the caller asks for.
 
 BODY_NED = 8  # MAV_FRAME: axes turn with the yaw; z stays down
 VELOCITY_AND_YAW_RATE = 0x5C7  # type_mask: positions, accelerations and yaw are not given
@@ -317,9 +309,6 @@ def _command(kind: str, number: int, system: int, *given: float) -> Order:
     params = {f"param{i + 1}": given[i] if i < len(given) else 0.0 for i in range(7)}
     whom = {"target_system": system, "target_component": 1, "command": number, "confirmation": 0}
     return Order(kind, "COMMAND_LONG", {**whom, **params})
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 EXTRA = "uuvtai[mavlink]"

@@ -109,9 +109,7 @@ LIMITS = {
 not finite, makes the message a bad one"""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Messages on their way to the pilot: in any order, some twice, some never, some of them nonsense.
-
+# ---- Messages on their way to the pilot: in any order, some twice, some never, some of them nonsense.
 
 ANY = -1  # Length of an axis that may have any
 
@@ -199,8 +197,7 @@ def _believed(key: str, array: np.ndarray) -> bool:
     return bool((np.abs(array) <= LIMITS[key]).all())  # false for NaN too
 
 
-# ------------------------------------------------------------------------------------------------------------
-# One vehicle under way without a world: what it is told.
+# ---- One vehicle under way without a world: what it is told.
 
 
 @dataclass(frozen=True)
@@ -219,8 +216,7 @@ class Mission:
         return {"mission.start_w": self.start, "mission.goal_w": self.goal, "vehicle.pos_w": self.start}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the stack's frame needs to know of a config, as plain numbers: without Taichi, torch and pydantic.
+# ---- What the stack's frame needs to know of a config, as plain numbers: without Taichi, torch and pydantic.
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from uuvtai.vehicle.messages import (
 )
 from uuvtai.vehicle.onboard_core import FedPilot, PilotCommand, StaleLimits
 
-# ------------------------------------------------------------------------------------------------------------
-# The stages behind the sensors as a simulator's row 0 runs them.
+# ---- The stages behind the sensors as a simulator's row 0 runs them.
 
 
 class SimStack:
@@ -65,8 +64,7 @@ class SimStack:
         self.sim.perceive()
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The stack without the simulator: sensor messages in, commands with their reasons out.
+# ---- The stack without the simulator: sensor messages in, commands with their reasons out.
 #
 #     pilot = OnboardPilot.built(config, read_tree("bt"), Mission(start, goal))
 #     while True:                      # every control_dt_s (20 ms)
@@ -74,11 +72,8 @@ class SimStack:
 #             pilot.feed(message)
 #         command = pilot.tick()
 #
-# It runs the stages of ``Sim`` themselves, from the pose filter to the behaviour tree's tick: the same
-# kernels
-# on the same arrays, of which ``FedSensors`` fills the readings. Where nothing better can be done than to
-# stop,
-# the action is zero and ``held`` says why (``StaleLimits``).
+# It runs the stages of ``Sim`` themselves, on arrays of which ``FedSensors`` fills the readings. Where it can
+# only stop, the action is zero and ``held`` says why (``StaleLimits``).
 
 
 class OnboardPilot(FedPilot):
@@ -126,9 +121,6 @@ def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:
         image=(camera.rows, camera.cols),
         camera_m=camera.max_range_m,
     )
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 __all__ = [

@@ -34,10 +34,7 @@ from uuvtai.vehicle.onboard import (
     ThrusterLoss,
 )
 
-# ------------------------------------------------------------------------------------------------------------
-# A log as the pilot's sensors would have told it: messages with the step of their arrival, and what was
-# decided then.
-
+# ---- A log as the pilot's sensors would have told it: messages with the step of their arrival.
 
 _MAX_STEPS = 180_000  # an hour
 
@@ -237,8 +234,7 @@ def uses_camera(config: Config) -> bool:
     return config.spotting.use_camera or config.elevation.use_camera or config.mapping.depth_hit > 0
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What goes wrong between a log's sensors and the pilot: messages lost or late, a sensor dead for a while.
+# ---- What goes wrong on the way to the pilot: messages lost or late, a sensor dead for a while.
 
 
 @dataclass(frozen=True)
@@ -307,9 +303,6 @@ def disturbed(arrivals: Sequence[Delivery], faults: Faults) -> Disturbed:
             found.arrivals.append(Delivery(arrival.time_s + delay * faults.jitter_s, arrival.message))
     found.arrivals.sort(key=lambda arrival: arrival.time_s)
     return found
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 COMPARED = {

@@ -34,12 +34,9 @@ from uuvtai.vehicle.messages import (
     ThrusterLoss,
 )
 
-# ------------------------------------------------------------------------------------------------------------
-# Readings that come late, carried forward to now by what the vehicle knows of its motion since.
-#
-# The pose filter takes every reading for one of this very step. One of a tenth of a second ago is wrong by
-# what
-# the vehicle has done meanwhile, which is far more than the instrument's own error.
+# ---- Readings that come late, carried forward to now by what the vehicle knows of its motion since. The pose
+# filter takes every reading for one of this very step. One of a tenth of a second ago is wrong by what the
+# vehicle has done meanwhile, which is far more than the instrument's own error.
 
 
 def turned_on(imu: ImuReading, late_s: float) -> np.ndarray:
@@ -74,16 +71,12 @@ def to_world(vector_b: np.ndarray, rpy: np.ndarray) -> np.ndarray:
     return rotation @ np.asarray(vector_b, np.float64)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the vehicle has felt of its own motion, and what readings have corrected of the estimate of it.
-#
+# ---- What the vehicle has felt of its own motion, and what readings have corrected of the estimate of it.
 # Both are sums since the start; their differences between two steps carry a late reading forward, or take
-# what
-# was estimated at a ping to what is known now. Neither may hold the other: a reading carried by an estimate
-# that later readings have corrected, or compared with one that they have not, has one error corrected once
-# for
-# each reading on its way, and the estimate runs away (T. Larsen et al., Incorporation of time delayed
-# measurements in a discrete-time Kalman filter, CDC 1998).
+# what was estimated at a ping to what is known now. Neither may hold the other: a reading carried by an
+# estimate that later readings have corrected, or compared with one that they have not, has one error
+# corrected once for each reading on its way, and the estimate runs away (T. Larsen et al., Incorporation of
+# time delayed measurements in a discrete-time Kalman filter, CDC 1998).
 
 
 def _nothing() -> np.ndarray:
@@ -148,9 +141,7 @@ def to_body(vector_w: np.ndarray, rpy: np.ndarray) -> np.ndarray:
     return np.array([vector_w @ to_world(axis, rpy) for axis in np.eye(3)])
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Watches the pose filter from outside, step by step: what it predicts, and what readings have corrected.
-#
+# ---- Watches the pose filter from outside, step by step: what it predicts, and what readings have corrected.
 # A step goes: ``note_walls``, ``feel``, the filter's prediction with DVL and pressure, ``note_dvl``, the
 # filter's correction by the walls. Where the position is given nothing corrects it.
 
@@ -201,9 +192,6 @@ class MotionWatch:
         if not self._estimated:
             return np.zeros(3)
         return np.append(self._views["pose.mean"][0, 7:9], self._views["pose.depth"][0, 3]).astype(np.float64)
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 FIX_AGE_S = 0.3

@@ -29,13 +29,9 @@ from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavC
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
 from uuvtai.vehicle.telemetry import Motors
 
-# ------------------------------------------------------------------------------------------------------------
-# One ArduSub's water: a packet in, an answer out, and what the sensors say meanwhile. No sockets here.
-#
-# A packet (ArduPilot, libraries/SITL/SIM_JSON.h), little endian: magic, frame rate [Hz], frame count, then
-# the
+# ---- One ArduSub's water: a packet in, an answer out, and what the sensors say meanwhile. No sockets here. A
+# packet (ArduPilot, libraries/SITL/SIM_JSON.h), little endian: magic, frame rate [Hz], frame count, then the
 # pulse widths [us] of 16 channels, or of 32.
-
 
 _HEAD = struct.Struct("<HHI")
 _CHANNELS = {18458: 16, 29569: 32}  # magic -> channels
@@ -191,8 +187,7 @@ class Instance:
         }
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Rows of a simulator that move one at a time, each at the pace of the ArduSub that drives it.
+# ---- Rows of a simulator that move one at a time, each at the pace of the ArduSub that drives it.
 
 
 class WaterRows:
@@ -301,9 +296,7 @@ def _three(values: Any) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv sitl`` says while it serves: who speaks, who does not, what begins and ends. Pure.
-
+# ---- What ``uuv sitl`` says while it serves: who speaks, who does not, what begins and ends. Pure.
 
 SILENT_S = 10.0  # by the clock, without a packet
 
@@ -373,9 +366,6 @@ class ServingNotes:
             found.append(f"{self._name}: {instance.outcome} after {instance.driven_s:.1f} s")
         seen.held, seen.outcome = instance.is_held, instance.outcome
         return found
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 NEXT_PORT = 10  # from one instance's port to the next one's, as ArduPilot counts

@@ -72,9 +72,7 @@ def euler_of(quat_wb: Sequence[float]) -> Three:
     )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the sensors beside the autopilot say by MAVLink: a DVL, a sonar, an altimeter.
-
+# ---- What the sensors beside the autopilot say by MAVLink: a DVL, a sonar, an altimeter.
 
 LEAST_STEPS = 5  # control steps between two reports, at least: 10 Hz, as of an A50 and a multibeam
 _SONAR, _DOWN, _BOW = 1, 25, 12

@@ -460,7 +460,6 @@ def _side(tank: TankConfig, wall: int) -> str:
 
 # ------------------------------------------------------------------------------------------------- under way
 
-
 MISFIT = 0.5  # ``WallWatch.look`` beyond which the walls do not fit
 _WATCHED_S, _WATCH_STEPS = 3.0, 10  # window, and control steps between two scans that count
 _SAME_M = 0.2  # returns that fall short of a wall by as much, within this, may be that wall elsewhere

@@ -30,9 +30,7 @@ from uuvtai.vehicle.onboard import (
     SonarPing,
 )
 
-# ------------------------------------------------------------------------------------------------------------
-# Distances by sectors, as MAVLink tells them, into the beams of the pilot's sonar_cfg.
-
+# ---- Distances by sectors, as MAVLink tells them, into the beams of the pilot's sonar_cfg.
 
 UNKNOWN_CM = 65535  # of a sector that was not looked into (UINT16_MAX)
 SECTORS = 72  # at most, in OBSTACLE_DISTANCE
@@ -124,9 +122,7 @@ class Rangers:
         return np.where((distances > least) & (distances < UNKNOWN_CM), least + 1, distances), least
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From ArduSub's channels to our thrusters: which is which, by geometry, and how fast a pulse turns one.
-
+# ---- From ArduSub's channels to our thrusters: which is which, by geometry, and how fast a pulse turns one.
 
 NEUTRAL_US, SPAN_US = 1500.0, 400.0
 _SPEED_OF_PULSE = np.array(
@@ -203,10 +199,8 @@ def _same(ours: np.ndarray, factors: np.ndarray) -> tuple[int, float]:
     return 0, 0.0
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From whom each kind of message counts: what an autopilot says of itself from the autopilot alone, a DVL and
-# a sonar from whom they are known to come.
-
+# ---- From whom each kind of message counts: what an autopilot says of itself from the autopilot alone, a DVL
+# and a sonar from whom they are known to come.
 
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 KINDS = {
@@ -255,9 +249,6 @@ class Senders:
         kind = KIND_OF.get(name, "")
         usual = ((self.system, None), BLUEOS) if kind in _OF_OTHERS else ((self.system, AUTOPILOT),)
         return any(system == known and one in (None, component) for known, one in self.given.get(kind, usual))
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 SUBMARINE, ARDUPILOT, GROUND_STATION = 12, 3, 6

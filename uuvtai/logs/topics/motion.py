@@ -146,9 +146,7 @@ POSE_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# How the vehicle moves, in truth and by its instruments.
-
+# ---- How the vehicle moves, in truth and by its instruments.
 
 _STATE = record(
     "uuv.State",
@@ -197,10 +195,8 @@ STATE_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the instruments themselves say, before anything is made of it: with the scans, and the exact images
-# where they were asked for, all that the stack decides by (``uuv replay``).
-
+# ---- What the instruments themselves say, before anything is made of it: with the scans, and the exact
+# images where they were asked for, all that the stack decides by (``uuv replay``).
 
 _NEW_VELOCITY = When(
     "every reading of the DVL", lambda moment, waited: bool(moment["ego.dvl_fresh"]), ("ego.dvl_fresh",)
@@ -245,8 +241,7 @@ INSTRUMENT_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What happens now and then, as lines of text.
+# ---- What happens now and then, as lines of text.
 
 
 def _lines(moment: Moment) -> list[bytes]:

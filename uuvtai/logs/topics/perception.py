@@ -283,10 +283,7 @@ BODY_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The vehicle's map: occupancy, clearance and risk as grids. Colours are for viewers, ``value`` is what the
-# vehicle has.
-
+# ---- The map: occupancy, clearance and risk. Colours are for viewers, ``value`` is what the vehicle has.
 
 Paint = Callable[[np.ndarray], tuple[Any, Any, Any, Any]]  # red, green, blue, alpha of a layer's values
 

@@ -124,9 +124,7 @@ PLAN_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What drives: action, policy, safety, behaviour tree.
-
+# ---- What drives: action, policy, safety, behaviour tree.
 
 _FAR = 1e5  # A time to collision beyond stands for "nothing closes in" in the simulator.
 _STATUSES = ("IDLE", "RUNNING", "SUCCESS", "FAILURE")  # by the codes of ``tree_codes``

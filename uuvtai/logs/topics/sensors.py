@@ -138,10 +138,8 @@ SONAR_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the camera sees: on request whole images, and always what the map takes from them, without which
+# ---- What the camera sees: on request whole images, and always what the map takes from them, without which
 # nobody could redo the map.
-
 
 _NO_RETURN_SHARE = 0.999
 """As in ``kernels.evidence``: a pixel beyond this share of the camera's range saw nothing."""

@@ -34,10 +34,7 @@ from uuvtai.vehicle.embedded import runtime
 from uuvtai.vehicle.embedded.runtime import GOLDEN, MEMORY, SCHEMA, SPEC, decided, digest_of, packed_messages
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, SensorMessage, SimStack
 
-# ------------------------------------------------------------------------------------------------------------
-# One pilot's first steps, written down: which kernels run in which order on which arguments, and LLVM's text
-# of each.
-
+# ---- One pilot's first steps: which kernels run in which order on which arguments, and LLVM's text of each.
 
 Line = dict[str, Any]  # {"kernel": its number, "arguments": [..]} or {"do": what the host does}
 
@@ -218,10 +215,8 @@ class _ToldSensors:
         return told
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From LLVM's text of the stack's kernels to a shared library for another machine: compiled by llvmlite,
+# ---- From LLVM's text of the stack's kernels to a shared library for another machine: compiled by llvmlite,
 # linked by LLD (package ziglang).
-
 
 EXTRA = "uuvtai[aboard]"
 _OF_A_PROCESSOR = re.compile(r'"(?:target-cpu|target-features|tune-cpu)"="[^"]*"')
@@ -354,9 +349,6 @@ def _object(text: str, kind: MachineKind, public: str) -> bytes:
             function.linkage = "internal"
     module.verify()
     return machine.emit_object(module)
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 PACKAGE = "uuv_stack"  # of the copied files

@@ -205,10 +205,8 @@ def _aligned(n_bytes: int) -> np.ndarray:
     return whole[begin : begin + n_bytes]
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Messages of a log and what was decided on them, and whether a folder's code decides the same:
-# ``python -m uuv_stack FOLDER``. Copied into every exported folder.
-
+# ---- Messages of a log and what was decided on them, and whether a folder's code decides the same: ``python
+# -m uuv_stack FOLDER``. Copied into every exported folder.
 
 AGREES = 1e-4  # largest difference between two commands, each in [-1, 1], that counts as none
 

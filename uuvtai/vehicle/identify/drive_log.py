@@ -215,9 +215,7 @@ def _numbers(path: Path, number: int, row: list[str], width: int) -> list[float]
     return values
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From rotor speeds to thrust: speeds as turned, or as commanded and followed with a lag of first order.
-
+# ---- From rotor speeds to thrust: speeds as turned, or as commanded and followed with a lag of first order.
 
 LEAST_LAG_S = 1e-3
 _INSTANTS = (0.03, 0.1025, 0.20125, 0.3325, 0.50375, 0.7, 0.9)

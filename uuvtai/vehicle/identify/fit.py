@@ -219,9 +219,7 @@ def horizon_errors(
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv identify``: parameters with intervals, errors ahead and warnings from drives; the vehicle as YAML.
-
+# ---- ``uuv identify``: parameters with intervals, errors ahead and warnings from drives.
 
 KNOWN = ("gain", "added-mass", "buoyancy")
 """what may be held: speeds and rotor speeds alone tell ratios, one force or mass has to be known"""
@@ -472,8 +470,7 @@ def vehicle_yaml(found: Identified, base: str, files: Sequence[Path]) -> str:
     return "\n".join(line.replace("\n", " ") for line in lines) + "\n" + body
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From logs to files: the vehicle as YAML, predicted against measured as a picture beside it.
+# ---- From logs to files: the vehicle as YAML, predicted against measured as a picture beside it.
 
 
 def identify(

@@ -270,9 +270,7 @@ def _moved(
     return np.clip(x + dt_s / 6 * (first + 4 * second + third), -_FAST, _FAST)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Derivatives of the readings with respect to parameters and initial velocities, by differences.
-
+# ---- Derivatives of the readings with respect to parameters and initial velocities, by differences.
 
 SCALE = np.array(
     [1.0] * 3 + [0.05] + [1.0] * 3 + [0.05] + [5.0] * 3 + [0.3] + [0.5, 0.1] + [0.02, 0.01, 0.01]
@@ -307,9 +305,7 @@ def linearised(
     return flat[..., : len(places)], flat[..., len(places) :], rest.reshape(count, -1)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The velocity that each stretch begins with: a first guess, and the one that suits the readings best.
-
+# ---- The velocity that each stretch begins with: a first guess, and the one that suits the readings best.
 
 _TRIES = 12
 _SHARES = (0.2, 0.5, 1.0)
@@ -367,9 +363,7 @@ def settled_starts(
     return best
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What a log must hold for an axis to be identified, and what to drive where it does not.
-
+# ---- What a log must hold for an axis to be identified, and what to drive where it does not.
 
 _FAST_SHARE = (0.12, 0.12, 0.12, 0.15)  # [m/s, m/s, m/s, rad/s] that a tenth of the readings must exceed
 _VARIED = (0.05, 0.05, 0.05, 0.08)  # standard deviation that the speed must have
