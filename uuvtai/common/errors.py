@@ -87,7 +87,6 @@ def guarded(run: Callable[[], Any]) -> int:
 
 
 def reported(text: str, code: int) -> int:
-    """Say it on stderr; the code."""
     say(text)
     return code
 

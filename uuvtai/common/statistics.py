@@ -64,7 +64,6 @@ def rate(k: int, n: int) -> float | None:
 
 
 def mean(values: list[float]) -> float | None:
-    """Arithmetic mean, or None of nothing."""
     return sum(values) / len(values) if values else None
 
 

@@ -30,8 +30,6 @@ from uuvtai.common.statistics import (
 
 
 class PrintedRow(NamedTuple):
-    """A row of Table main."""
-
     success: float
     collision: float
     mean_time_s: float
@@ -95,7 +93,6 @@ class Claim:
 
 
 def claim(text: str, theirs: str, ours: str, finding: Finding) -> Claim:
-    """A claim with what was found."""
     return Claim(text, theirs, ours, finding.points_to, finding.p)
 
 

@@ -242,7 +242,6 @@ def _pilot_label(facts: Fact) -> str:
 
 
 def timeout_label(facts: Fact) -> str:
-    """Why an episode ran out of time."""
     if facts["no_route_share"] > 0.5:
         return "no_route"
     if facts["progress_m"] > PROGRESS_M:
@@ -318,7 +317,6 @@ class FailureRecorder:
         """episodes that the user's code did not play as before: they are not explained"""
 
     def begin(self, sim: Sim, row: int, job: Job) -> None:
-        """An episode has just been reset in this row."""
         self._rows[row] = _Watched(round(self._expected[job].time_s / self._dt))
 
     def step(self, sim: Sim) -> None:
@@ -440,13 +438,10 @@ EXAMPLES = 3  # Episodes named per label in the table.
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A failed episode with its explanation."""
-
     result: EpisodeResult
     explanation: Explanation
 
     def document(self) -> dict[str, Any]:
-        """One entry of ``explain`` in ``uuv eval --json``."""
         r, e = self.result, self.explanation
         shared = {
             "seed": r.seed,
@@ -483,7 +478,6 @@ def explain_failures(
 
 
 def failures(results: list[EpisodeResult]) -> list[EpisodeResult]:
-    """Everything that is no success."""
     return [r for r in results if r.outcome != "success"]
 
 

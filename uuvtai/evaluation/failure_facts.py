@@ -171,7 +171,6 @@ class Bodies:
 
     @property
     def moving(self) -> Array:
-        """Slots with a body that moves."""
         return (self.kind != NONE) & (self.speed_m_s > 0.01)
 
 
@@ -352,8 +351,6 @@ Shelter."""
 
 @dataclass
 class Killer:
-    """What ended the episode."""
-
     name: str  # sphere, cylinder, box, wall, floor or surface; "" = nothing (timeout)
     slot: int | None = None
     moving: bool = False
@@ -388,7 +385,6 @@ class Scene:
         self.vel_w = vel_w
 
     def killer(self, outcome: str) -> Killer:
-        """What the referee stopped the episode for."""
         rules, gap, closing = self.config.episode, self.gap[-1], self.closing[-1]
         if outcome == "ttc":
             approaching = closing > rules.ttc_closing_m_s
@@ -482,7 +478,6 @@ def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) ->
 
 
 def _belief_facts(history: History, slot: int, turned_ago_s: float | None, config: Config) -> dict[str, Any]:
-    """What the vehicle believed about the killer."""
     ago = history.t_s[-1] - history.t_s
     truth = history.body_w[:, slot, :2]
     away = np.where(

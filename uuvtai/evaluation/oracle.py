@@ -34,8 +34,6 @@ _BEFORE_S = 1e-4  # Velocities are differences over this time: exact but for the
 
 @dataclass(frozen=True)
 class Obstacle:
-    """One body of a scenario."""
-
     kind: str  # sphere, cylinder or box
     size: Array  # (3,) [m] as in ``WorldState``
     yaw: float
@@ -44,7 +42,6 @@ class Obstacle:
 
     @property
     def moves(self) -> bool:
-        """Whether it has a path and a speed."""
         return bool(np.any(self.vel_w))
 
     @property
@@ -116,7 +113,6 @@ class Lattice:
     start: tuple[int, int, int]  # node of the start (z, y, x)
 
     def near(self, point: Array, reach_m: float) -> Array:
-        """Mask of the nodes within ``reach_m`` of a point."""
         x, y, z = self.x_m - point[0], self.y_m - point[1], self.z_m - point[2]
         return x**2 + y[:, None] ** 2 + z[:, None, None] ** 2 <= reach_m**2
 

@@ -28,8 +28,6 @@ any other"""
 
 @dataclass(frozen=True)
 class Budget:
-    """How much of everything."""
-
     iterations: int
     """of 256 envs x 64 steps; 38 are 622,592 env-steps, the paper's budget, and 380 ten times as many"""
     training_seeds: int
@@ -176,7 +174,6 @@ def _controllers(*names: str) -> tuple[str, ...]:
 
 
 def is_done(step: Step, root: Path) -> bool:
-    """Whether the step was finished before."""
     if step.to_file:
         return result_file(step, root).exists()
     try:

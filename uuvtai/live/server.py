@@ -47,11 +47,9 @@ class LiveEpisode:
         viewers.begin(self._stream.schemas())
 
     def due(self, values: Values) -> list[Topic]:
-        """Topics that this step has messages on."""
         return self._stream.due(values)
 
     def write(self, values: Values) -> None:
-        """Show one control step."""
         self._viewers.tell_time(round(int(values["clock.step"]) * self._dt_s * 1e9))
         for message in self._stream.messages(values):
             self._viewers.send(message)
@@ -153,7 +151,6 @@ class Doorkeeper:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
-        """Let go of the port and of all who are connected."""
         for place in (self._listener, *self._open):
             _ended(place)
 
@@ -350,7 +347,6 @@ class ViewerServer:
             self._asked.add(topic)
 
     def close(self) -> None:
-        """Let go of the port and of all who are connected."""
         self._server.stop()
         self._door.close()
 

@@ -47,7 +47,6 @@ class McapFile:
         self._writer.add_metadata(name, entries)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """A file within the file."""
         self._writer.add_attachment(0, 0, name, media_type, data)
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:

@@ -29,7 +29,6 @@ _SHIFT = 4  # bits of sub-pixel precision
 
 
 def bgr(code: str) -> Color:
-    """A colour from '#rrggbb'."""
     red, green, blue = (int(code[i : i + 2], 16) for i in (1, 3, 5))
     return blue, green, red
 
@@ -84,7 +83,6 @@ class Canvas:
         )
 
     def strip(self, pixels: Any, color: Color, width: int = 2, closed: bool = False) -> None:
-        """Polyline in pixels."""
         cv2.polylines(self.image, [_fixed(pixels)], closed, color, width, cv2.LINE_AA, _SHIFT)
 
     def dot(
@@ -149,12 +147,10 @@ class Canvas:
         return (int(left), int(top)), (int(right), int(bottom))
 
     def line(self, points: Any, color: Color, width: int = 2, closed: bool = False) -> None:
-        """Polyline in the world."""
         if len(points) > 1:
             self.strip(self.pixels(points), color, width, closed)
 
     def dashes(self, points: Any, color: Color, width: int = 1, period_px: float = 9.0) -> None:
-        """Dashed polyline in the world."""
         path = self.pixels(points)
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         for begin in np.arange(0.0, along[-1], period_px):
@@ -164,7 +160,6 @@ class Canvas:
             )
 
     def area(self, points: Any, color: Color) -> None:
-        """Filled polygon in the world."""
         self.filled(self.pixels(points), color)
 
     def area_between(self, outer: Any, inner: Any, color: Color) -> None:
@@ -176,7 +171,6 @@ class Canvas:
         self.dot(self.pixels([center])[0], radius_px, color, width)
 
     def star(self, center: Sequence[float], radius_px: float, fill: Color = GOAL, edge: Color = INK) -> None:
-        """Five-pointed star."""
         pixels = self.pixels([center])[0] + star_shape(radius_px)
         self.filled(pixels, fill)
         self.strip(pixels, edge, 1, closed=True)
@@ -284,7 +278,6 @@ def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int
 
 
 def tank_outline(tank: dict[str, Any]) -> np.ndarray:
-    """(n, 2) corners of the tank."""
     (x0, x1), (y0, y1) = tank["x_m"], tank["y_m"]
     if tank["shape"] == "circle":
         angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
@@ -294,7 +287,6 @@ def tank_outline(tank: dict[str, Any]) -> np.ndarray:
 
 
 def paint_water(canvas: Canvas, tank: dict[str, Any]) -> None:
-    """The tank's inside."""
     canvas.area(tank_outline(tank), WATER)
 
 
@@ -425,7 +417,6 @@ class Recording:
 
     @property
     def ending(self) -> str:
-        """The outcome in words."""
         return _ENDINGS.get(self.outcome, self.outcome.replace("_", " "))
 
     @property

@@ -46,23 +46,19 @@ def _list_template(length: int) -> str:
 
 
 def numbers(values: Any) -> str:
-    """A JSON list."""
     flat = np.asarray(values).ravel()
     return finite(_list_template(len(flat)) % tuple(flat.tolist()))
 
 
 def number(value: float) -> str:
-    """A JSON number."""
     return finite("%.9g" % value)  # noqa: UP031 - the one way of printing numbers here
 
 
 def number_or_null(value: float | None) -> str:
-    """A JSON number, or null."""
     return "null" if value is None else number(value)
 
 
 def numbers_or_null(values: Any | None) -> str:
-    """A JSON list, or null."""
     return "null" if values is None else numbers(values)
 
 
@@ -74,7 +70,6 @@ def finite(text: str) -> str:
 
 
 def dumped(message: dict[str, Any]) -> bytes:
-    """A message given as a dict."""
     try:
         return json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
     except ValueError:
@@ -85,12 +80,10 @@ def dumped(message: dict[str, Any]) -> bytes:
 
 
 def transform(stamp: str, parent: str, child: str, translation: Vector, rotation: Vector) -> str:
-    """foxglove.FrameTransform."""
     return _TRANSFORM % (stamp, parent, child, *translation, *rotation)
 
 
 def pose_in_frame(stamp: str, position: Vector, quat: Vector) -> bytes:
-    """foxglove.PoseInFrame in the world."""
     pose = checked(_POSE % (*map(float, position), *map(float, quat)))
     return f'{{"timestamp":{stamp},"frame_id":"world","pose":{pose}}}'.encode()
 
@@ -114,7 +107,6 @@ def scene_entity(time_ns: int, name: str, **primitives: list) -> dict[str, Any]:
 
 
 def scene_update(*entities: dict[str, Any]) -> bytes:
-    """foxglove.SceneUpdate."""
     return dumped({"deletions": [], "entities": entities})
 
 
@@ -146,7 +138,6 @@ def short(value: float) -> float:
 
 
 def color(rgba: Sequence[float]) -> dict[str, float]:
-    """foxglove.Color."""
     return dict(zip("rgba", rgba, strict=True))
 
 
@@ -192,7 +183,6 @@ class EpisodeHeader:
 
     @cached_property
     def nodes(self) -> tuple[str, ...]:
-        """Names of the tree's nodes."""
         return numbered(self.tree_nodes)
 
 
@@ -235,12 +225,10 @@ class Moment:
 
     @cached_property
     def time_s(self) -> float:
-        """Simulation time."""
         return self.step * self.header.config.episode.control_dt_s
 
     @cached_property
     def time_ns(self) -> int:
-        """Simulation time."""
         return self.ns_of(self.step)
 
     @cached_property
@@ -253,7 +241,6 @@ class Moment:
         return time_text(self.ns_of(step))
 
     def ns_of(self, step: int) -> int:
-        """Time of a step [ns]."""
         return round(step * self.header.config.episode.control_dt_s * 1e9)
 
     @property
@@ -263,12 +250,10 @@ class Moment:
 
     @property
     def replanned(self) -> bool:
-        """The route was planned in this step."""
         return bool(self["route.n_way"] > 0 and self["route.plan_step"] == self.step)
 
 
 def time_text(time_ns: int) -> str:
-    """foxglove time."""
     return '{"sec":%d,"nsec":%d}' % divmod(time_ns, 1_000_000_000)  # noqa: UP031
 
 
@@ -307,7 +292,6 @@ class Topic:
     on_request: bool = False  # only in logs with depth images
 
     def schema_for(self, header: EpisodeHeader) -> Schema:
-        """Its schema in this run."""
         return self.schema(header) if callable(self.schema) else self.schema
 
 

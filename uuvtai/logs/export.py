@@ -260,8 +260,6 @@ def _arrays(data: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Repair:
-    """What was saved."""
-
     path: Path
     messages: int
     last_time_s: float

@@ -34,8 +34,6 @@ DAMAGE = (McapError, struct.error, ValueError, OverflowError, RuntimeError, zsta
 
 @dataclass(frozen=True)
 class LogMessage:
-    """One message."""
-
     topic: str
     time_s: float
     data: dict[str, Any]

@@ -65,7 +65,6 @@ class RosMessages:
         return self._store.types[kind](**fields)
 
     def packed(self, message: Any) -> bytes:
-        """CDR of a message."""
         return bytes(self._store.serialize_cdr(message, message.__msgtype__))
 
     def unpacked(self, data: bytes, kind: str) -> Any:
@@ -93,15 +92,12 @@ class RosMessages:
         return self("std_msgs/msg/Header", stamp=stamp, frame_id=FRAMES.get(frame, frame))
 
     def vector(self, x: float, y: float, z: float, kind: str = "Vector3") -> Any:
-        """geometry_msgs/Vector3 or Point."""
         return self(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
 
     def quaternion(self, w: float, x: float, y: float, z: float) -> Any:
-        """geometry_msgs/Quaternion."""
         return self("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
 
     def twist(self, linear: Any, angular: Any) -> Any:
-        """geometry_msgs/Twist."""
         return self("geometry_msgs/msg/Twist", linear=self.vector(*linear), angular=self.vector(*angular))
 
 
@@ -405,7 +401,6 @@ class Reader:
         """whether a stamp was of another clock than the bag's, not just late"""
 
     def head(self, header: Any) -> dict[str, Any]:
-        """timestamp and frame_id."""
         return {
             "timestamp": parsed_json(self.stamp(header), self.topic),
             "frame_id": FRAMES_BACK.get(header.frame_id, header.frame_id),

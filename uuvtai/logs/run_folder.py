@@ -165,7 +165,6 @@ class RunFolder:
             self.write_json(_RECORD, record | dict(zip(("status", "exit"), ended, strict=True)))
 
     def _read_record(self) -> dict[str, Any]:
-        """run.json, as far as it is gone on with."""
         file = self.path / _RECORD
         why = "it is no record of a run"
         try:
@@ -235,7 +234,6 @@ class RunFolder:
         return self.write_bytes(name, text.encode())
 
     def write_bytes(self, name: str, content: bytes) -> Path:
-        """Write a file atomically, as ``write``."""
         target = self.path / name
         self._guarded(f"write {target}", lambda: refuse_links(self.path, target))
         self._guarded(f"write {target}", lambda: write_atomic(target, content))
@@ -299,7 +297,6 @@ def _is_plain(path: Path) -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computes the results."""
     found = {"uuvtai": __version__, "python": platform.python_version()}
     for name in ("taichi", "torch", "numpy", "ompl", "mcap", "opencv-python-headless"):
         try:
@@ -310,7 +307,6 @@ def versions() -> dict[str, str]:
 
 
 def hardware() -> dict[str, Any]:
-    """The machine, as far as it tells."""
     cpu = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():

@@ -46,12 +46,10 @@ def record(
 
 
 def array_of(items: Schema) -> Schema:
-    """Schema of a list."""
     return {"type": "array", "items": items}
 
 
 def described(schema: Schema, text: str) -> Schema:
-    """The same with a description."""
     return {**schema, "description": text}
 
 

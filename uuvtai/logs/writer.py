@@ -75,7 +75,6 @@ class TopicStream:
         self._written: dict[str, float] = {}
 
     def schemas(self) -> dict[str, Schema]:
-        """JSON schema of every topic in this run."""
         return {topic.name: topic.schema_for(self._header) for topic in self._topics}
 
     def due(self, values: Values) -> list[Topic]:
@@ -162,7 +161,6 @@ class McapEpisodeLog:
             self._file.add_attachment("tree.xml", "application/xml", self.header.tree_xml)
 
     def _declared(self) -> dict[str, int]:
-        """Channel of every topic."""
         channels: dict[str, int] = {}
         known: dict[str, int] = {}
         for topic, schema in self._stream.schemas().items():
@@ -249,7 +247,6 @@ class PolicyNote:
     distill_lambda: float | None  # weight of the distillation when the checkpoint was written
 
     def outputs(self, row: int) -> dict[str, Any]:
-        """What the policy chooses and expects in this row."""
         decision, foresees = self.pilot.decision, self.pilot.world_model is not None
         return {
             "driver.action": decision.action[row].cpu().numpy(),
@@ -294,7 +291,6 @@ class EpisodeReader:
             self._write(sim, sorted(self._sinks))
 
     def end(self, sim: Recordable, row: int, result: EpisodeEnd) -> None:
-        """The episode of this row is over."""
         if row in self._sinks:
             self._sinks.pop(row).close(result)
 
@@ -305,7 +301,6 @@ class EpisodeReader:
         self._sinks.clear()
 
     def header(self, sim: Recordable, row: int, job: RecordedJob) -> EpisodeHeader:
-        """What comes before the first step."""
         described = describe_scenario(lambda name: sim.rows(attrgetter(name)(sim.s), [row])[0])
         return EpisodeHeader(
             controller=self._controller,
@@ -354,7 +349,6 @@ class EpisodeRecorder(EpisodeReader):
         self.paths = {job: folder / f"{controller}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
 
     def sink_for(self, sim: Recordable, row: int, job: RecordedJob) -> McapEpisodeLog | None:
-        """The log of a recorded job."""
         if job not in self.paths:
             return None
         for left in self.paths[job].parent.glob(f"{self.paths[job].name}.{'[0-9a-f]' * 8}.part"):

@@ -16,15 +16,11 @@ Hover = dict[str, str]  # id of a drawn thing -> what is shown while the pointer
 
 @dataclass(frozen=True)
 class Paragraph:
-    """A paragraph of plain text."""
-
     text: str
 
 
 @dataclass(frozen=True)
 class Heading:
-    """A heading within a section."""
-
     text: str
 
 
@@ -88,8 +84,6 @@ class Figure:
 
 @dataclass(frozen=True)
 class Media:
-    """A picture or video of an episode."""
-
     mime: str
     content: bytes
     caption: str
@@ -109,7 +103,5 @@ Block = Paragraph | Heading | Notice | Table | Facts | Code | Verdicts | Figure 
 
 @dataclass(frozen=True)
 class PageSection:
-    """A titled part of the page."""
-
     title: str
     blocks: Sequence[Block] = field(default_factory=list)

@@ -211,7 +211,6 @@ def status_notice(record: dict[str, Any]) -> list[Block]:
 
 
 def provenance(record: dict[str, Any]) -> list[Block]:
-    """Facts of run.json."""
     hardware, versions = record.get("hardware", {}), record.get("versions", {})
     facts = {
         "command": command_of(record),
@@ -236,7 +235,6 @@ def config_text(folder: Path) -> list[Block]:
 
 
 def checkpoints(folder: Path) -> list[Block]:
-    """Table of the checkpoints that are kept."""
     rows = []
     for path in sorted((folder / "checkpoints").glob("*/manifest.json")):
         manifest = read_json(folder, str(path.relative_to(folder))) or {}
@@ -294,8 +292,6 @@ PAGE, FIGURES = "report.html", "figures"
 
 @dataclass(frozen=True)
 class Report:
-    """What was written."""
-
     page: Path
     figures: list[Path]
 
@@ -435,7 +431,6 @@ def _subtitle(record: dict[str, Any]) -> str:
 
 
 def content(run: Path) -> list[PageSection]:
-    """Sections of whatever a run folder holds."""
     command = command_of(read_json(run, "run.json") or {})
     result = read_json(run, "eval/result.json")
     found = [
@@ -471,7 +466,6 @@ def _curves_of(runs: list[Path]) -> list[Block]:
 
 
 def training_of(run: Path) -> Training:
-    """What a training run recorded."""
     argv = [str(word) for word in (read_json(run, "run.json") or {}).get("argv", [])]
     after = argv[argv.index("train") + 1 :] if "train" in argv else []
     preset = Path(after[0]).stem if after and not after[0].startswith("-") else ""

@@ -174,7 +174,6 @@ _SHOWN = (
 
 
 def conditions(result: dict[str, Any]) -> str:
-    """The scene in a sentence."""
     speed = f", v = {result['v_m_s']} m/s" if result["D"] else ""
     seeds = ", ".join(map(str, result["seeds"]))
     return (
@@ -282,7 +281,6 @@ def _paired(pairs: list[dict[str, Any]]) -> list[Block]:
 
 
 def paired_data(pairs: list[dict[str, Any]]) -> Data:
-    """Pairs of methods as numbers."""
     keys = ("a", "b", "episodes", *_PAIRED)
     rows = [[*map(pair.get, keys), *(pair.get(_BOUNDS) or (None, None))] for pair in pairs]
     return Data([*keys, f"{_BOUNDS}_low", f"{_BOUNDS}_high"], rows)

@@ -251,7 +251,6 @@ def _draw_cell(axes: Axes, place: Place, key: str, identity: str) -> tuple[str, 
 
 
 def hover_text(cell: dict[str, Any]) -> str:
-    """Where a cell stands, and its rates."""
     where = ", ".join(f"{axis_name(name)} = {value_name(value)}" for name, value in place_of(cell).items())
     return f"{where}\n{rates_text(cell)}"
 

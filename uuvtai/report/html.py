@@ -33,8 +33,6 @@ _MAX_SHOWN_ROWS = 200  # A longer table of numbers is for download only.
 
 @dataclass(frozen=True)
 class Page:
-    """A titled page."""
-
     title: str
     subtitle: str
     notices: Sequence[Block]

@@ -65,7 +65,6 @@ class PaperItem:
 
 
 def origin_of(run: Path) -> str:
-    """The command and the commit of a run."""
     record = read_json(run, "run.json") or {}
     version = (record.get("versions") or {}).get("uuvtai", "unknown")
     commit = record.get("git_sha") or "not known"
@@ -102,7 +101,6 @@ def items_of_trainings(trainings: Sequence[Training], origin: str) -> list[Paper
 
 
 def _of_blocks(blocks: Iterable[Block], origin: str, n: str) -> Iterable[PaperItem]:
-    """Figures and tables of the report's page."""
     for i, block in enumerate(blocks):
         if isinstance(block, Figure):
             is_stages, is_cells = block.name == "stages", block.name.startswith("heat_map")
@@ -175,7 +173,6 @@ def _of_evaluation(result: dict[str, Any], origin: str) -> list[PaperItem]:
 
 
 def _causes(method: dict[str, Any], scene: str, origin: str) -> PaperItem:
-    """Why episodes of a method failed."""
     caption = (
         f"Why episodes of {method['name']} failed, judged from the truth. {scene} n = "
         f"{len(method['explain'])} failures of {method['episodes']} episodes; shares of the failures, "
@@ -404,7 +401,6 @@ def tabular(table: Table, remark: str) -> str:
 
 
 def is_wide(table: Table) -> bool:
-    """Whether a table wants both columns of a page."""
     columns, cells = table.on(PAGE)
     widths = [
         max(len(str(row[i])) for row in [[c.head for c in columns], *cells]) for i in range(len(columns))
@@ -447,14 +443,11 @@ _TALL_IN = 6.5  # a figure that is higher in one column stands in two
 
 @dataclass(frozen=True)
 class PaperKit:
-    """What was written."""
-
     folder: Path
     figures: list[Path]
     tables: list[Path]
 
     def document(self) -> dict[str, object]:
-        """``uuv report --paper --json``."""
         return {
             "schema": 1,
             "paper": str(self.folder),

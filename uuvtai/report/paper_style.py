@@ -71,7 +71,6 @@ class PaperPanel:
 
 
 def of_panel(panel: Panel, is_cells: bool = False, spans: bool = False) -> PaperPanel:
-    """A panel of the report's page."""
     height = _CURVE_IN if panel.height_in == Panel.height_in and not is_cells else panel.height_in
     return PaperPanel(panel.draw, lambda _width: height, is_cells, spans)
 

@@ -52,7 +52,6 @@ def cell_table(cells: list[MapCell], document: dict[str, Any], title: str, **pag
 
 
 def method_of(cell: MapCell) -> str:
-    """The method that played the cell."""
     return str(cell.get("method", "policy"))
 
 
@@ -95,7 +94,6 @@ _NUMBERS = ("success_rate", "collision_rate", "time_mean_s", "tts_s", "time_to_s
 
 
 def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
-    """Figures and the table of every cell."""
     cells, axes = document["cells"], document["axes"]
     if not cells:
         return [Notice("No cell of this sweep is finished yet.")]
@@ -204,7 +202,6 @@ def _cells(cells: list[MapCell], document: dict[str, Any], caption: str) -> Tabl
 
 
 def cells_data(cells: list[MapCell]) -> Data:
-    """Every cell as numbers."""
     axes = axes_of_cells(cells)
     bounds = [f"{key}_ci95_{end}" for key in ("success", "collision") for end in ("low", "high")]
     return Data(

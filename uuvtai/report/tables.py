@@ -100,7 +100,6 @@ def markdown(table: Table) -> str:
 
 
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Texts below their heads in Markdown."""
     return markdown(Table(heads(*head), rows))
 
 
@@ -181,7 +180,6 @@ def value_name(value: object) -> str:
 
 
 def axis_name(key: str) -> str:
-    """An axis as a person reads it."""
     return _NAMES.get(key, key)
 
 
@@ -248,7 +246,6 @@ class HeatMap:
 
     @property
     def column_names(self) -> list[str]:
-        """What stands under each column."""
         return [value_name(value) for value in self.column_values]
 
     @property

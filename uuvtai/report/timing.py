@@ -55,7 +55,6 @@ def density_table(rows: list[dict[str, Any]], title: str) -> Table:
 
 
 def density_data(rows: list[dict[str, Any]]) -> Data:
-    """The numbers of a density table."""
     return Data(_DENSITY, [list(map(row.get, _DENSITY)) for row in rows])
 
 
@@ -63,7 +62,6 @@ def density_data(rows: list[dict[str, Any]]) -> Data:
 
 
 def timing(document: dict[str, Any], command: str = "") -> list[Block]:
-    """Everything that a profile has to show."""
     machine, rows = document.get("machine", {}), document.get("rows", [])
     said = (
         f"Measured on {machine.get('cpu', 'an unnamed processor')}, {machine.get('cores', '-')} cores, "

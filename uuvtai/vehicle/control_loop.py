@@ -183,8 +183,6 @@ _FAREWELLS = (_REACHED, "time is up", _INTERRUPTED)
 
 @dataclass
 class FlightTally:
-    """What happened, in numbers."""
-
     steps: int = 0
     actions: Counter[str] = field(default_factory=Counter)
     reasons: Counter[str] = field(default_factory=Counter)
@@ -505,7 +503,6 @@ class OnboardLoop:
         return "time is up" if now_s >= self._plan.seconds else ""
 
     def document(self) -> dict[str, Any]:
-        """What ``uuv pilot --json`` prints."""
         tally, heard = self.tally, self._intake.heard
         reasons = list(self.last.reasons)
         return {

@@ -36,8 +36,6 @@ _WRITTEN = re.compile(r"(udp|udpin|udpout):([A-Za-z0-9.\-]{1,253}):(\d{1,5})")
 
 @dataclass(frozen=True)
 class LinkPlace:
-    """Where a link is."""
-
     host: str
     port: int
     calls: bool  # udpout: we speak first, to this place; else we listen there
@@ -114,7 +112,6 @@ class Endpoint:
             return False
 
     def close(self) -> None:
-        """Let go of the port."""
         self._socket.close()
 
     def __enter__(self) -> Endpoint:
@@ -166,7 +163,6 @@ class FollowedEndpoint(Endpoint):
         self._time_s, self._heard_s = 0.0, wall()
 
     def receive(self) -> list[tuple[Address, bytes]]:
-        """What has come since the last call."""
         self._take()
         found, self._waiting = self._waiting, []
         return found
@@ -283,7 +279,6 @@ def push_sticks(velocity: Velocity, measured: Velocity | None, system: int, limi
 
 
 def set_mode(mode: int, system: int) -> Order:
-    """One of ArduSub's modes."""
     return _command("MAV_CMD_DO_SET_MODE", DO_SET_MODE, system, 1.0, float(mode))
 
 
@@ -293,7 +288,6 @@ def arm(system: int) -> Order:
 
 
 def ask_for(message_id: int, rate_hz: float, system: int) -> Order:
-    """Have the autopilot tell something so often."""
     return _command(
         "MAV_CMD_SET_MESSAGE_INTERVAL", _SET_MESSAGE_INTERVAL, system, float(message_id), 1e6 / rate_hz
     )

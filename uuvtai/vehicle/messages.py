@@ -12,8 +12,6 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class ImuReading:
-    """Attitude, rates and acceleration in one message."""
-
     time_s: float
     rpy: np.ndarray  # (3,) [rad] roll, pitch, yaw; yaw counter-clockwise from the world's x axis
     rate_b: np.ndarray  # (3,) [rad/s] gyro, body axes (x ahead, y left, z up)
@@ -116,8 +114,6 @@ ANY = -1  # Length of an axis that may have any
 
 @dataclass
 class Tally:
-    """What became of one sensor's messages."""
-
     fed: int = 0
     used: int = 0
     late: int = 0  # as old as one that was used already, or superseded before a step could use it

@@ -53,7 +53,6 @@ class SimStack:
         episode.wake(sim.io.episode)
 
     def place(self, mission: Mission) -> None:
-        """Tell the stack start and goal."""
         for name, place in mission.places().items():
             self.views[name][0] = place
 
@@ -97,7 +96,6 @@ class OnboardPilot(FedPilot):
 
 
 def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:
-    """Of a config and a tree."""
     sensors, vehicle = config.sensors, config.vehicle
     sonar, camera = sensors.sonar, sensors.depth
     return PilotNumbers(

@@ -37,8 +37,6 @@ class StaleLimits:
 
 @dataclass(frozen=True, eq=False)
 class PilotCommand:
-    """What one step decided."""
-
     step: int
     time_s: float
     action: np.ndarray
@@ -88,7 +86,6 @@ class FedPilot:
 
     @property
     def tallies(self) -> dict[str, Tally]:
-        """What became of the messages, by sensor."""
         return self._inbox.tallies
 
     def feed(self, message: SensorMessage) -> None:

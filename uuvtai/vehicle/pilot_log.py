@@ -61,11 +61,9 @@ class LinkLog:
             ) from error
 
     def begin_step(self) -> None:
-        """Another step."""
         self._left = MOST_SEEN
 
     def saw(self, time_s: float, heard: MavMessage) -> None:
-        """A message came."""
         if self._left <= 0:
             self.unwritten += 1
             return
@@ -111,7 +109,6 @@ class LinkLog:
             self._give_up(error)
 
     def close(self) -> None:
-        """Finish the file under its name."""
         if not (self.trouble or self._closed):
             self._closed = True
             try:

@@ -263,7 +263,6 @@ class Faults:
 
     @property
     def any(self) -> bool:
-        """Whether anything goes wrong."""
         return self.drop > 0 or self.jitter_s > 0 or bool(self.outages)
 
 
@@ -349,7 +348,6 @@ def replay(
 
 
 def built(feed: LogFeed) -> OnboardPilot:
-    """A pilot of the log's config, tree and mission."""
     return OnboardPilot.built(feed.config, feed.tree, feed.mission)
 
 

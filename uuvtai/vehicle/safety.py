@@ -89,8 +89,6 @@ class SafetyMemory:
 
 @dataclass(frozen=True)
 class SafeDecision:
-    """What to do."""
-
     action: SafeAction
     velocity: Velocity  # to ask for; zero unless the action is DRIVE
     reasons: tuple[str, ...]  # of the action; none = DRIVE

@@ -122,7 +122,6 @@ class MotionSums:
         self.yaw += float(found.rpy[2] - expected.rpy[2] + np.pi) % (2 * np.pi) - np.pi
 
     def noted(self) -> dict[str, np.ndarray]:
-        """The sums, for a history."""
         return {name: np.array(value) for name, value in vars(self).items()}
 
     def known_now(self, then: OwnPose, noted: dict[str, np.ndarray], time_s: float) -> OwnPose:
@@ -228,7 +227,6 @@ class FedSensors:
 
     @property
     def step(self) -> int:
-        """Control steps since the start."""
         return int(self._clock["step"][0])
 
     @property
@@ -388,11 +386,9 @@ class PoseHistory:
         self._rows: dict[int, dict[str, np.ndarray]] = {}
 
     def clear(self) -> None:
-        """Forget all."""
         self._rows.clear()
 
     def note(self, step: int, **values: np.ndarray) -> None:
-        """Keep copies of this step's values."""
         self._rows[step] = {name: np.array(value) for name, value in values.items()}
         self._rows.pop(step - KEPT, None)
 

@@ -78,9 +78,7 @@ def turn_of(count: int, last: int | None, waited_s: float) -> Turn:
 class Water(Protocol):
     """What an instance needs of ``WaterRows``."""
 
-    def begin(self, row: int) -> None:
-        """The row's episode from its beginning."""
-        ...
+    def begin(self, row: int) -> None: ...
 
     def push(self, row: int, pwm: tuple[int, ...], dt_s: float) -> None:
         """Move the vehicle by one step."""
@@ -90,17 +88,11 @@ class Water(Protocol):
         """The world by a control step; how the episode ended, '' = not yet."""
         ...
 
-    def sense(self, row: int) -> None:
-        """Instruments and sonar."""
-        ...
+    def sense(self, row: int) -> None: ...
 
-    def motion(self, row: int, time_s: float) -> Motion:
-        """What the vehicle really does."""
-        ...
+    def motion(self, row: int, time_s: float) -> Motion: ...
 
-    def value(self, name: str, row: int) -> np.ndarray:
-        """Copy of 'struct.field'."""
-        ...
+    def value(self, name: str, row: int) -> np.ndarray: ...
 
     def turns(self, pwm: tuple[int, ...]) -> bool:
         """Whether any thruster is asked to turn."""
@@ -177,7 +169,6 @@ class Instance:
         return self.time_s - self._ended_s if self.outcome else 0.0
 
     def document(self) -> dict[str, Any]:
-        """Its line in ``uuv sitl --json``."""
         return {
             "row": self._row,
             "seconds": round(self.time_s, 3),
@@ -252,7 +243,6 @@ class WaterRows:
         self._sim.sensors.sense_sonar(self._sim.io)
 
     def motion(self, row: int, time_s: float) -> Motion:
-        """What the vehicle really does."""
         quat = self._vehicle["quat_wb"][row].astype(float)
         rotation = _rotation(quat)
         gravity = self.config.vehicle.gravity_m_s2
@@ -272,7 +262,6 @@ class WaterRows:
         return bool(np.any(self.motors.rpm(pwm)))
 
     def value(self, name: str, row: int) -> np.ndarray:
-        """Copy of 'struct.field' of the row."""
         return self._read[name][row].copy()
 
     def _wake(self, row: int) -> None:
@@ -320,7 +309,6 @@ class ServingNotes:
         self._seen = _Seen(heard_s=now_s)
 
     def look(self, instance: Instance, now_s: float) -> list[str]:
-        """Sentences about what is new."""
         seen, counts = self._seen, instance.counts
         found = [*self._packets(instance, now_s), *self._episode(instance)]
         if counts["bad"] > 0 and seen.bad == 0:
@@ -437,7 +425,6 @@ class SensorLink:
                 self.peers = [*self.peers, sender][-_MOST_PEERS:]
 
     def tell(self, data: bytes) -> None:
-        """Say it to all."""
         for peer in self.peers if self.endpoint.calls is None else [self.endpoint.calls]:
             self.endpoint.send(data, peer)
 
@@ -504,7 +491,6 @@ class SitlPort:
                 link.tell(data)
 
     def close(self) -> None:
-        """Let go of all ports."""
         self.socket.close()
         for link in self.links:
             link.endpoint.close()

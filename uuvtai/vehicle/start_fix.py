@@ -70,12 +70,10 @@ class Rays:
     beams: np.ndarray  # (n,) that share it
 
     def some(self, which: slice) -> Rays:
-        """Those of an index."""
         return Rays(*(part[which] for part in vars(self).values()))
 
     @classmethod
     def joined(cls, rows: list[Rays]) -> Rays:
-        """All of them in one."""
         return cls(
             *(np.concatenate(parts) for parts in zip(*(vars(row).values() for row in rows), strict=True))
         )
@@ -100,7 +98,6 @@ class Fit:
 
     @property
     def score(self) -> float:
-        """The better the larger."""
         return float(self.fits.sum()) - float(self.beyond.sum())
 
 
@@ -140,7 +137,6 @@ def expected(tank: TankConfig, at: np.ndarray, bearing: np.ndarray) -> tuple[np.
 
 
 def range_sigma(sonar_cfg: SonarConfig, range_m: np.ndarray) -> np.ndarray:
-    """[m] of single ranges."""
     normal = sonar_cfg.range_sigma_m + sonar_cfg.range_sigma_slope * range_m
     return np.sqrt(normal**2 + sonar_cfg.range_jitter_m**2 + sonar_cfg.range_quantum_m**2 / 12.0)
 
@@ -212,7 +208,6 @@ def candidates(tank: TankConfig, ends: np.ndarray, typed: np.ndarray) -> list[np
 
 
 def _peaks(votes: np.ndarray, most: int = 3) -> list[int]:
-    """Numbers of the largest local maxima."""
     padded = np.pad(votes, 4, constant_values=-1)
     highest = np.lib.stride_tricks.sliding_window_view(padded, 9).max(1)
     tops = np.flatnonzero((votes == highest) & (votes >= 0.5 * votes.max()))
@@ -319,7 +314,6 @@ class StartFix:
             self._rays.popleft()
 
     def _sought(self) -> StartFound | None:
-        """What all that was seen says."""
         at, tank = self._track.at, self._config.world.tank
         rays = Rays.joined([rays for _, _, rays in self._rays])
         rays = replace(rays, from_m=rays.from_m - at)

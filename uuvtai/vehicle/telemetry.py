@@ -400,7 +400,6 @@ class Intake:
         self.heard.jumped, self._origin = "", None
 
     def refuse(self, why: str) -> list[SensorMessage]:
-        """Count a message that is not used."""
         if why in self.heard.refused or len(self.heard.refused) < MOST_KINDS:
             self.heard.refused[why] += 1
         return []

@@ -148,7 +148,6 @@ def _goal(moment: Moment) -> bytes:
 
 
 def _tank_lines(tank: dict[str, Any]) -> list[dict[str, Any]]:
-    """Outline of floor and surface."""
     (x0, x1), (y0, y1) = tank["x_m"], tank["y_m"]
     flat = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
     if tank["shape"] == "circle":
@@ -184,7 +183,6 @@ def _scene(moment: Moment) -> bytes:
 
 
 def _truth(moment: Moment) -> bytes:
-    """The true bodies as numbers."""
     bodies = []
     for slot, kind in _kinds(moment):
         size = moment["world.size"][slot][_SIZES[kind]].tolist()
@@ -317,7 +315,6 @@ class Layer:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes."""
         return len(self.packed)
 
 
@@ -393,12 +390,10 @@ def map_origin(config: Config, shape: tuple[int, ...]) -> tuple[float, float]:
 
 
 def static_colors(values: np.ndarray) -> tuple[int, int, int, np.ndarray]:
-    """Paint of what rests."""
     return 38, 44, 56, _byte(values)
 
 
 def dynamic_colors(values: np.ndarray) -> tuple[int, int, int, np.ndarray]:
-    """Paint of what moves."""
     return 229, 57, 70, _byte(values)
 
 

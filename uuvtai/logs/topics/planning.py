@@ -61,7 +61,6 @@ def waypoints_of(moment: Moment) -> np.ndarray:
 
 
 def planner_of(moment: Moment) -> str:
-    """Who planned the route."""
     return code_name(PLANNERS, moment["route.planner"])
 
 

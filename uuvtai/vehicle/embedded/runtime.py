@@ -63,7 +63,6 @@ class CarriedStack:
         self._run(self._begin, sensors)
 
     def step(self, sensors: FedSensors) -> None:
-        """A control step."""
         self._run(self._step, sensors)
 
     def _run(self, lines: list[Any], sensors: FedSensors) -> None:

@@ -55,7 +55,6 @@ class Drive:
 
     @property
     def is_asked(self) -> bool:
-        """Whether rotor speeds are as commanded."""
         return self.command != ""
 
     def otherwise(self) -> Drive | None:

@@ -47,14 +47,12 @@ class Stretches:
     cuts: tuple[tuple[Drive, int], ...]  # where each was cut from, and at which step it begins
 
     def some(self, which: np.ndarray) -> Stretches:
-        """These of them."""
         names = ("velocity", "tilt_rate", "up", "wrench", "slope", "after")
         kept = np.arange(len(self.velocity))[which]
         cuts = tuple(self.cuts[i] for i in kept.tolist())
         return replace(self, cuts=cuts, **{name: getattr(self, name)[kept] for name in names})
 
     def begins(self, steps: int) -> Stretches:
-        """The first so many steps of each."""
         of_steps = {name: getattr(self, name)[:, :steps] for name in ("tilt_rate", "up", "wrench", "slope")}
         of_samples = {name: getattr(self, name)[:, : steps + 1] for name in ("velocity", "after")}
         return replace(self, **of_steps, **of_samples)
@@ -69,7 +67,6 @@ class Stretches:
         return replace(self, wrench=found[0], slope=found[1], cuts=cuts)
 
     def at_lag(self, lag_s: float, vehicle_cfg: VehicleConfig) -> Stretches:
-        """The same with the wrench of another lag."""
         lag_s = max(lag_s, LEAST_LAG_S)
         if lag_s == self.lag_s or not any(drive.is_asked for drive, _ in self.cuts):
             return self
