@@ -1,5 +1,4 @@
-"""Colours that page, figures, pictures, videos and terminal share, of methods too; the colour-blind can tell
-them apart."""
+"""Colours that page, figures, pictures, videos and terminal share, also for the colour-blind."""
 
 from __future__ import annotations
 
@@ -37,8 +36,7 @@ DARK, LIGHT = "#000000", "#ffffff"
 
 
 def shade(share: float) -> str:
-    """'#rrggbb' of a share in [0, 1]: dark is little, bright is much. Shares outside are taken as the nearest
-    end."""
+    """'#rrggbb' of a share: dark is little, bright is much. Outside [0, 1] the nearest end is taken."""
     place = min(max(share, 0.0), 1.0) * (len(_ANCHORS) - 1)
     below = min(int(place), len(_ANCHORS) - 2)
     low, high = _channels(_ANCHORS[below]), _channels(_ANCHORS[below + 1])

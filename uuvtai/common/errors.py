@@ -190,8 +190,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _flush() -> None:
-    """See the results out while an error can still be told; Python's own flush at the very end prints
-    tracebacks."""
+    """See the results out while an error can still be told, before Python's own flush at the end."""
     if sys.stdout is not None:
         sys.stdout.flush()
 

@@ -73,8 +73,7 @@ def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) ->
 
 
 def read_bytes(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) -> bytes:
-    """Content of a file, as ``open_file`` opens it; never more than ``limit`` bytes, also where the file
-    grows meanwhile."""
+    """Content of a file, as ``open_file`` opens it; never more than ``limit`` bytes, even if it grows."""
     with open_file(path, limit, folder) as file:
         content = file.read(limit + 1)
     if len(content) > limit:
@@ -134,8 +133,7 @@ def read_lines(
 
 
 def refuse_links(folder: Path, path: Path) -> None:
-    """Raise FileError where ``path``, which lies below ``folder``, is a link or lies behind one; what does
-    not exist is no link."""
+    """Raise FileError where ``path``, below ``folder``, is a link or behind one; absence is no link."""
     place = folder
     for part in _parts_below(folder, path):
         place = place / part
@@ -147,8 +145,7 @@ def refuse_links(folder: Path, path: Path) -> None:
 
 
 def refuse_links_in(folder: Path) -> None:
-    """Raise FileError for any link below ``folder``: all that lies there may be read, written and deleted.
-    Raises OSError."""
+    """Raise FileError for any link below ``folder``: all there may be read and deleted. Raises OSError."""
     waiting, count = [str(folder)], 0
     while waiting:
         with os.scandir(waiting.pop()) as entries:
@@ -166,8 +163,7 @@ def refuse_links_in(folder: Path) -> None:
 
 
 def open_new(path: Path, mode: int = 0o666) -> BinaryIO:
-    """Open a file for writing that did not exist; whatever is there already, a link too, is a
-    FileExistsError. Raises OSError."""
+    """Open a new file for writing; whatever is there, a link too, is a FileExistsError. Raises OSError."""
     return os.fdopen(os.open(path, _CREATE | os.O_EXCL, mode), "wb")
 
 
@@ -198,8 +194,7 @@ def whole_file(target: Path, ending: str = ".tmp") -> Iterator[tuple[BinaryIO, P
 
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
-    """A new folder to fill; it becomes ``target``, which may be an empty folder by then, or nothing is left.
-    Raises OSError."""
+    """A new folder to fill; it becomes ``target``, which may be empty by then, or goes. Raises OSError."""
     signals.engage()
     place = unfinished(target)
     place.mkdir(parents=True)
@@ -240,8 +235,7 @@ def flush(path: Path) -> None:
 
 
 def output_beside(sources: Sequence[Path], out: Path | None, suffix: str, force: bool) -> Path:
-    """Where to write what is made of files: ``out``, or the first one's name with another ending. Raises as
-    ``refuse_output``."""
+    """Where to write: ``out``, or the first file with another ending. Raises as ``refuse_output``."""
     target = out or sources[0].with_suffix(suffix)
     refuse_output(target, sources, force)
     return target
@@ -292,8 +286,7 @@ def _is_junction(entry: os.DirEntry[str]) -> bool:
 
 
 def _same(one: Path, other: Path) -> bool:
-    """Whether two paths name one file, by whatever links; a name that nothing has yet counts by where it
-    would lie."""
+    """Whether two paths name one file, by whatever links; a name without a file counts by its place."""
     try:
         return one.samefile(other)
     except OSError:
@@ -326,8 +319,7 @@ def _open(path: Path, folder: Path | None, flags: int) -> int:
 
 
 def _open_below(folder: Path, path: Path, flags: int) -> int:
-    """File descriptor of ``path``, opened name by name from ``folder`` on, so that no name can turn into a
-    link meanwhile."""
+    """File descriptor of ``path``, opened name by name from ``folder`` on: no name can become a link."""
     parts = _parts_below(folder, path)
     if os.open not in os.supports_dir_fd:
         refuse_links(folder, path)

@@ -41,8 +41,7 @@ class LocalEngine:
         self._workers, self._go_on = workers, go_on
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
-        """(number of the item, result) as they come. Errors of the work itself are raised; EngineError where
-        workers keep dying."""
+        """(item's number, result) as they come. Raises errors of the work; EngineError where workers die."""
         signals.engage()
         waiting, tries = list(range(len(items))), [0] * len(items)
         while waiting:
@@ -60,8 +59,7 @@ class LocalEngine:
     def _round(
         self, work: Work, items: Sequence[Item], todo: list[int]
     ) -> Generator[tuple[int, Any], None, list[int]]:
-        """Run what is ``todo``, taken from its front, until all is done or a worker dies; returns the numbers
-        that ran then."""
+        """Run ``todo``, from its front, until all is done or a worker dies; the numbers that ran then."""
         threads = max(1, (os.cpu_count() or 1) // self._workers)
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(min(self._workers, len(todo)), context, _begin_worker, (threads,))

@@ -121,14 +121,12 @@ class StopEvent:
 
 
 def finish(code: int) -> None:
-    """The command is over and the interpreter tidies up: a signal can only shorten that, with this exit
-    code."""
+    """The command is over, the interpreter tidies up: a signal only shortens that, with this code."""
     _finished[:] = [code]
 
 
 def end_at_second() -> None:
-    """Leave the second signal of a kind to the system, whose answer does not wait for the interpreter
-    (Linux)."""
+    """Leave the second signal of a kind to the system, which does not wait for the interpreter (Linux)."""
     if (
         not _installed
         or sys.platform != "linux"

@@ -1,5 +1,4 @@
-"""Intervals for rates and means, paired comparison of methods, and the two time figures. Hand-checked in
-tests/test_statistics.py."""
+"""Intervals for rates and means, paired comparison, the two time figures (tests/test_statistics.py)."""
 
 from __future__ import annotations
 
@@ -142,8 +141,7 @@ def normal_p(z: float) -> float:
 
 
 def holm_adjusted(p_values: Sequence[float]) -> list[float]:
-    """p values of several tests made together, adjusted by Holm (1979) so that the chance of any false alarm
-    stays bounded."""
+    """p values of several tests, adjusted by Holm (1979): bounds the chance of any false alarm."""
     order = sorted(range(len(p_values)), key=lambda i: p_values[i])
     adjusted, largest = [0.0] * len(p_values), 0.0
     for rank, i in enumerate(order):

@@ -73,8 +73,7 @@ LEVEL = 0.05  # of all tests of a reproduction together
 
 @dataclass(frozen=True)
 class Finding:
-    """Which way the numbers point, and how probable that would be by chance; p = None where nothing was
-    tested."""
+    """Which way the numbers point, and how probable that is by chance; p = None: nothing was tested."""
 
     points_to: str
     p: float | None
@@ -150,8 +149,7 @@ class Share:
 
 
 def pooled(methods: Sequence[dict[str, Any]], *outcomes: str) -> Share:
-    """Share of the episodes of all these entries (of ``uuv eval`` or a sweep) that ended in one of
-    ``outcomes``."""
+    """Share of the episodes of these entries (of ``uuv eval`` or a sweep) that ended in ``outcomes``."""
     k, n = sum(m["outcomes"][o] for m in methods for o in outcomes), sum(m["episodes"] for m in methods)
     return Share(k, n, _design(methods, outcomes) if len(methods) > 1 else 1.0)
 
@@ -231,8 +229,7 @@ def _softened(a: Share, design: float) -> tuple[float, float]:
 
 
 def times_as_large(a: Share, b: Share, factor: float) -> Finding:
-    """Whether a's rate is at least ``factor`` times b's: z of the logarithm of their ratio (Katz and others
-    1978)."""
+    """Whether a's rate is at least ``factor`` times b's: z of the log of their ratio (Katz et al. 1978)."""
     if not a.k or not b.k or a.design is None or b.design is None:
         return Finding(OPEN, None)
     z = (math.log(a.rate / b.rate) - math.log(factor)) / math.sqrt(
@@ -245,8 +242,7 @@ def times_as_large(a: Share, b: Share, factor: float) -> Finding:
 
 
 def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
-    """Claims about the four methods and the ablations; entries of ``uuv eval`` by preset, one per training
-    seed."""
+    """Claims about the methods and ablations; entries of ``uuv eval`` by preset, one per training seed."""
     success = {name: pooled(entries, "success") for name, entries in by_preset.items()}
     collision = {name: pooled(entries, *COLLIDED) for name, entries in by_preset.items()}
     ours, plain = success["curriculum"], success["ppo"]
@@ -311,15 +307,13 @@ _ABLATIONS = {
 
 
 def _far_below(ours_s: float | None, theirs_s: float | None, finding: Finding) -> Finding:
-    """Less than half; None = nobody ever arrived, as slow as can be. How sure that is follows from the rates
-    of success."""
+    """Less than half; None = nobody arrived, as slow as can be. Certainty follows from rates of success."""
     slower = ours_s is None or (theirs_s is not None and ours_s >= theirs_s / 2)
     return Finding(FAILS if slower else finding.points_to, finding.p)
 
 
 def tts_s(entries: Sequence[dict[str, Any]]) -> float | None:
-    """The paper's TTS [s] over all these entries: mean time of all episodes / rate of success; None without
-    success or times."""
+    """The paper's TTS [s] of these entries: mean time of all / rate of success; None without either."""
     n = sum(entry["episodes"] for entry in entries)
     times = [entry["time_mean_s"] for entry in entries]
     if not n or any(time is None for time in times):
@@ -405,8 +399,7 @@ def of_sweep(cells: Sequence[dict[str, Any]], method: str) -> list[Claim]:
 
 
 def of_timing(profile: dict[str, Any]) -> list[Claim]:
-    """Claims about time, from ``uuv profile --json`` with one env and density. Means of one machine: nothing
-    is tested."""
+    """Claims about time, from ``uuv profile --json``. Means of one machine: nothing is tested."""
     rows = {row["component"]: row["mean_ms"] for row in profile["paper_latency"]}
     if "Full loop" not in rows:
         return []
@@ -442,8 +435,7 @@ def of_timing(profile: dict[str, Any]) -> list[Claim]:
 
 
 def of_transfer(here: dict[str, Any], there: dict[str, Any]) -> list[Claim]:
-    """Whether the policy, untouched, drives in the second scene as well; entries of ``uuv eval`` of the same
-    policy."""
+    """Whether the same policy, untouched, drives in the second scene too; entries of ``uuv eval``."""
     a, b = pooled([here], "success"), pooled([there], "success")
     return [
         claim(

@@ -45,11 +45,9 @@ if TYPE_CHECKING:
 
 
 START_S = 2.0
-"""A younger episode starts in danger: track, forecast and evasion take about a second, and bodies start 1.5 m
-away."""
+"""A younger episode starts in danger: to see and evade takes a second, bodies start 1.5 m away."""
 UNSEEN_S = 0.3
-"""Unseen: out of the sonar's fan all through this time before the end (the design's measure: no
-track 0.3 s before)."""
+"""Unseen: out of the sonar's fan all this time before the end (no track 0.3 s before)."""
 TURN_S = 1.2
 """An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it
 was off by more than MISS_M at the end, or there was none."""
@@ -60,8 +58,7 @@ LATELY_S = 2.5  # Remarks look back this far.
 MISS_M = 0.35
 """A forecast missed when it was farther off than the pilot's margin at one second (0.25 m + 0.1 m/s)."""
 REACH_M = 0.4
-"""Squeezed: something static is nearer to the hull at the end: no room to give way (hull 0.17 m + contact 0.1
-m + margin)."""
+"""Squeezed: something static this near to the hull at the end leaves no room (0.17 + 0.1 m + margin)."""
 CROWD_M = 0.6  # Crowded: a second moving body came nearer to the hull in the last CROWD_S.
 NEAR_M = 1.0
 """Contact with something static is no accident of its own when a moving body came this near to the hull in
@@ -116,8 +113,7 @@ CAUSES: dict[str, str] = {
     "stuck": f"timeout: drove < {STUCK_M:g} m in the last {LAST_S:g} s",
     "circling": f"timeout: drove on without coming nearer in the last {LAST_S:g} s",
 }
-"""Every label with its meaning, in order of precedence (forecasts are judged LEAD_S before the end, escapes
-too)."""
+"""Every label with its meaning, in order of precedence (forecasts: LEAD_S before the end, escapes too)."""
 
 
 Fact = dict[str, Any]
@@ -300,8 +296,7 @@ class _Watched:
 
 
 class FailureRecorder:
-    """Recorder that watches failed episodes as they are replayed; ``found`` maps each job to its
-    explanation."""
+    """Recorder that watches failed episodes as they are replayed; ``found``: job -> explanation."""
 
     def __init__(
         self, config: Config, tree: FlatTree, failed: list[EpisodeResult], own_code: bool = False
@@ -332,8 +327,7 @@ class FailureRecorder:
             self._rows[row].coarse.append(read | {"step": np.array(self._rows[row].step)})
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
-        """Explain the episode and forget its history. Raises RuntimeError where the replay ended
-        differently."""
+        """Explain the episode, forget its history. Raises RuntimeError where the replay ended differently."""
         job, watched = Job(result.seed, result.episode), self._rows.pop(row)
         expected = self._expected[job]
         if (result.outcome, result.time_s) != (expected.outcome, expected.time_s):
@@ -517,8 +511,7 @@ def _median(found: list[Explanation], name: str, beyond: float) -> float | None:
 
 
 def worst_of(rows: list[Row], label: str) -> list[Row]:
-    """Episodes of a label, the worst first: the hardest hits, of timeouts those that ended farthest from the
-    goal."""
+    """Episodes of a label, worst first: the hardest hits; timeouts that ended farthest from the goal."""
 
     def severity(row: Row) -> tuple[float, float]:
         return (row.explanation.killer.closing_m_s or 0.0, row.explanation.facts.get("goal_m", 0.0))
@@ -527,8 +520,7 @@ def worst_of(rows: list[Row], label: str) -> list[Row]:
 
 
 def chosen_for_recording(rows: list[Row], wanted: int) -> list[Row]:
-    """The worst episode of the most frequent label, then of the second, ...; after the last label the next
-    worst of the first."""
+    """The worst episode of the most frequent label, of the second, ..., then the next worst of the first."""
     queues = [worst_of(rows, entry["label"]) for entry in table_of(rows)]
     rounds = [queue[i] for i in range(max(map(len, queues), default=0)) for queue in queues if i < len(queue)]
     return rounds[:wanted]

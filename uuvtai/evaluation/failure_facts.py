@@ -187,8 +187,7 @@ class CoarseHistory:
 
 @dataclass(frozen=True)
 class History:
-    """The last seconds of an episode, oldest sample first, the end last; ``coarse`` is the account of all of
-    it."""
+    """The last seconds of an episode, oldest sample first; ``coarse`` is the account of all of it."""
 
     t_s: Array  # (n,) since the start
     pos_w: Array
@@ -266,8 +265,7 @@ def candidates(config: Config, yaw: float) -> Array:
 
 
 def rolled_out(pos: Array, vel: Array, command: Array, t: Array, lag_s: float) -> tuple[Array, Array]:
-    """(n, n_t, 3) positions and velocities of a vehicle that approaches each commanded velocity with a
-    first-order lag."""
+    """(n, n_t, 3) positions and velocities of a vehicle that takes commanded ones with first-order lag."""
     left = np.exp(-t / lag_s)[:, None]
     off = (vel - command)[:, None]
     return pos + command[:, None] * t[:, None] + off * lag_s * (1.0 - left), command[:, None] + off * left
@@ -329,15 +327,13 @@ TURN_RAD = math.radians(30.0)  # A corner: the body's course changes by more bet
 BACK_RAD = math.radians(120.0)  # A turn back: a corner with more than this.
 BEFORE_TURN_S = 0.1  # The forecast that a turn is judged by was made this long before it.
 BELIEF_M = 0.5
-"""A forecast or track belongs to a body when its present position is this close to the truth, in the
-plane."""
+"""A forecast or track belongs to a body when its present place is this close to the truth, in plan."""
 CLIMB_S = 1.0  # Changes of the own depth are counted over this time before the end.
 BEAM_M = 0.1  # A beam met the body when its range agrees with the truth within this plus four sigma.
 CROWD_S = 0.5  # A second moving body counts when it came near in this time before the end.
 NEAR_S = 1.5  # Any moving body counts as near when it was so in this time before the end.
 CHANCES_S = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
-"""The last chance is the latest of these times before the end from which some velocity still escaped
-(``escape.py``)."""
+"""The last chance: the latest of these times before the end from which some velocity escaped."""
 BLIND_S = 1.0
 """The own velocity is lost when it was unknown in most of this time before the end; for floor and surface
 heave is enough."""
@@ -345,8 +341,7 @@ BREAK_S = 0.3  # A leaf that lost charge for no longer than this still counts as
 LAST_S = 10.0  # Timeouts are judged by their last ten seconds.
 EVADING = ("Evade", "BackOff")  # Leaves that give way to something.
 WAITING = ("Hold",)
-"""Leaves that stay in place on purpose; further ones are recognised by a name that begins with Wait, Yield or
-Shelter."""
+"""Leaves that stay in place on purpose; so do names that begin with Wait, Yield or Shelter."""
 
 
 @dataclass
@@ -509,8 +504,7 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
 
 
 def _believed_gap(history: History, slot: int, track: int) -> float:
-    """Vertical gap [m] that the vehicle believed in at the end, on the side where the killer was; 0 = it may
-    be level."""
+    """Vertical gap [m] that the vehicle believed in at the end, towards the killer; 0 = may be level."""
     own, above = history.pos_w[-1, 2], history.body_w[-1, slot, 2] > history.pos_w[-1, 2]
     return _round(
         max(
@@ -521,8 +515,7 @@ def _believed_gap(history: History, slot: int, track: int) -> float:
 
 
 def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
-    """Position (2,) that a forecast (n_forecast, 2) gave for ``lead_s`` after it was made (at most its
-    horizon)."""
+    """Position (2,) that a forecast (n_forecast, 2) gave for ``lead_s`` later (at most its horizon)."""
     steps = np.arange(len(forecast_w)) * dt_s
     return np.array([np.interp(lead_s, steps, forecast_w[:, axis]) for axis in range(2)])
 
@@ -542,8 +535,7 @@ def _course_facts(history: History, bodies: Bodies, slot: int, config: Config) -
 
 
 def _turns_in_reach(history: History, bodies: Bodies, slot: int, ago_s: float, config: Config) -> int:
-    """Earlier passes of the corner turned ``ago_s`` before the end that lay within the sonar's fan: could it
-    have been learnt?"""
+    """Earlier passes, in the sonar's fan, of the corner turned ``ago_s`` before the end: was it to learn?"""
     turned_s = float(history.t_s[-1]) - ago_s
     place = history.body_w[int(np.abs(history.t_s - turned_s).argmin()), slot]
     passes = np.arange(turned_s - bodies.lap_s[slot], 0.0, -bodies.lap_s[slot])

@@ -1,5 +1,4 @@
-"""From a request to tasks: which cells there are, which of them one simulator can serve, and how they are cut
-into tasks."""
+"""From a request to tasks: its cells, which of them one simulator can serve, cut into tasks."""
 
 from __future__ import annotations
 
@@ -38,15 +37,13 @@ Cell = dict[str, Value]  # value of every axis that the cell sets, by the axis's
 
 @dataclass(frozen=True)
 class Grid:
-    """Axes by name; ``one_at_a_time``: each axis alone around the unchanged condition, instead of all
-    combinations."""
+    """Axes by name; ``one_at_a_time``: each axis alone around the unchanged condition."""
 
     axes: dict[str, tuple[Value, ...]]
     one_at_a_time: bool = False
 
     def cells(self) -> list[Cell]:
-        """Every cell once; where nothing moves (D = 0) the obstacles' speed means nothing and stands for all
-        its values."""
+        """Every cell once; where nothing moves (D = 0) one speed of obstacles stands for all."""
         found = self._alone() if self.one_at_a_time else self._combined()
         kept: dict[str, Cell] = {repr(sorted(cell.items())): cell for cell in map(_without_speed, found)}
         return list(kept.values())
@@ -111,8 +108,7 @@ def _axis(text: str) -> tuple[str, tuple[Value, ...]]:
 
 
 def checked(grid: Grid) -> Grid:
-    """The grid itself. Raises ConfigError where an axis is unknown, empty, has a value twice, or the cells
-    are too many."""
+    """The grid. Raises ConfigError: an axis unknown, empty, with a value twice, or too many cells."""
     if not grid.axes:
         raise ConfigError("the grid has no axes; for example --grid S=4,8,12 --grid D=0,6")
     for name, values in grid.axes.items():
@@ -231,8 +227,7 @@ def _sim_of(task: Task, config: Config) -> Sim:
 
 
 def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> Row:
-    """One method in one cell: what ``uuv eval`` says of a method, without what a clock measured, and every
-    episode's end."""
+    """One method in one cell: as in ``uuv eval``, without what a clock measured, and how episodes end."""
     from uuvtai.evaluation.results import summary
 
     found = summary(method, results, 0, 0.0)
@@ -258,8 +253,7 @@ def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> 
 
 BATCH = 256  # episodes side by side in one simulator
 TASK_EPISODES = 1024
-"""episodes of a task, about: what a kill costs at most, and enough that the last stragglers of a batch cost
-little"""
+"""episodes of a task, about: what a kill costs at most, and enough to make stragglers cheap"""
 
 Overrides = list[Any]
 
@@ -328,8 +322,7 @@ def _typed(value: Any, of: Any) -> Any:
 
 
 def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:
-    """Config of a cell, or of none, with the scene as data and room for the grid's largest. Raises
-    ConfigError."""
+    """Config of a cell, or none, the scene as data, room for the grid's largest. Raises ConfigError."""
     cell = cell or {}
     presets = {kind: cell.get(kind, getattr(request, kind)) for kind in PRESET_AXES}
     keys = [
@@ -346,8 +339,7 @@ def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:
 
 
 def label_of(cell: Cell, config: Config) -> dict[str, Any]:
-    """What a row says of its cell: S, D, v_m_s (None where nothing moves) and every other axis by its
-    name."""
+    """What a row says of its cell: S, D, v_m_s (None = nothing moves) and every other axis by name."""
     world = config.world
     n_dynamic = cell.get("D", world.n_dynamic)
     scene = {
@@ -417,8 +409,7 @@ def _by_config(request: SweepRequest) -> list[tuple[Config, list[Cell]]]:
 
 
 def check_rows(request: SweepRequest, methods: Sequence[str]) -> list[str]:
-    """Keys of all rows in the order of the document. Raises ConfigError where two cells could not be told
-    apart."""
+    """Keys of all rows in the document's order. Raises ConfigError for cells that cannot be told apart."""
     keys = [
         row_key(label_of(cell, config), name)
         for config, cells in _by_config(request)

@@ -119,8 +119,7 @@ def _notes() -> list[Described]:
 
 
 def _trade_off(document: dict[str, Any]) -> list[Described]:
-    """Success against collision from fast to careful, with the paper's point; nothing where it was not
-    swept."""
+    """Success against collision from fast to careful, with the paper's point, where it was swept."""
     sweep = document["sweeps"].get("caution")
     if sweep is None:
         return []

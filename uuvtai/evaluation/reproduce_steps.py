@@ -22,8 +22,7 @@ EVALUATION_SEED = 90007
 """never trained or tuned on; it is for published figures alone, so do not look at it while you change
 anything"""
 RETIRED_SEEDS = (90001,)
-"""were evaluation seeds until somebody looked at their failures while tuning; now they are tuning seeds like
-any other"""
+"""evaluation seeds until somebody saw their failures while tuning; now tuning seeds like any other"""
 
 
 @dataclass(frozen=True)
@@ -191,8 +190,7 @@ _INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM)
 
 
 def run_step(step: Step, root: Path) -> None:
-    """Run what is not done; what was begun goes on or begins anew. KeyboardInterrupt and RunFolderError as
-    the command ends."""
+    """Run what is not done; what was begun goes on. KeyboardInterrupt, RunFolderError as commands end."""
     place = root / step.folder
     begun = place.exists() and any(place.iterdir())
     resume = begun and step.resumes and _can_resume(step, place)

@@ -42,18 +42,15 @@ class Engine(Protocol):
     """Runs tasks somewhere."""
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
-        """(number of the item, result) as they come. Errors of the work itself are raised; EngineError where
-        workers keep dying."""
+        """(item's number, result) as they come. Raises errors of the work; EngineError where workers die."""
         ...
 
 
 class RayEngine:
-    """Tasks on a Ray cluster that runs already, or on one inside this process; Ray itself runs lost tasks
-    again."""
+    """Tasks on a Ray cluster that runs already, or one in this process; Ray runs lost tasks again."""
 
     def __init__(self, address: str = "auto", cpus_per_task: float = 2.0) -> None:
-        """``address``: of the cluster, ``auto`` = the one that this machine belongs to, ``local`` = one
-        inside this process."""
+        """``address``: of the cluster, ``auto`` = this machine's, ``local`` = one in this process."""
         try:
             import ray  # type: ignore[import-not-found]  # an extra
         except ImportError:
@@ -178,8 +175,7 @@ def _refuse_other_policies(
     checkpoints: dict[str, str],
     watch: SweepWatch,
 ) -> None:
-    """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
-    nothing."""
+    """RunFolderError where a policy has changed: cells of two under one name would prove nothing."""
     from uuvtai.evaluation.agents import policies_of
 
     trained = policies_of(list(request.policies), base_config(request).teacher.max_node, watch.note)

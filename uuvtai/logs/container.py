@@ -26,8 +26,7 @@ LOSS_SHARE = 0.01
 
 
 class McapFile:
-    """One MCAP file under way as ``<path>.XXXXXXXX.part`` (eight random digits); ``finish`` makes it whole,
-    durable and gives it its name."""
+    """An MCAP file under way as ``<path>.XXXXXXXX.part``; ``finish`` makes it whole and names it."""
 
     def __init__(self, path: Path, profile: str = "") -> None:
         """``profile``: what the file says it keeps to, such as 'ros2'. Raises OSError."""

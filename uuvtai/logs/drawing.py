@@ -1,5 +1,4 @@
-"""Drawing in world coordinates with OpenCV: anti-aliased, with sub-pixel places, and text in a real font
-where OpenCV has one."""
+"""Drawing in world coordinates with OpenCV: anti-aliased, sub-pixel places, text in a real font if any."""
 
 from __future__ import annotations
 
@@ -66,8 +65,7 @@ class Canvas:
         x_m: Sequence[float],
         y_m: Sequence[float],
     ) -> None:
-        """``size`` = (width, height); ``corner`` = pixel of the map area's upper left corner, which shows
-        (x_m[0], y_m[1])."""
+        """``size`` = (width, height); ``corner``: pixel of the map's corner that shows (x_m[0], y_m[1])."""
         self.size = size
         self.corner, self.scale, self.x_m, self.y_m = corner, scale, tuple(x_m), tuple(y_m)
         self.image = np.full((size[1], size[0], 3), PAPER, np.uint8)
@@ -483,8 +481,7 @@ def read_value(topic: str, data: dict[str, Any]) -> Any:
 
 @contextlib.contextmanager
 def drawing(path: Path) -> Iterator[None]:
-    """Turn everything that a scenario or a message unlike ours can raise while it is drawn into a
-    LogError."""
+    """Turn all that a scenario or a message unlike ours can raise while it is drawn into a LogError."""
     try:
         yield
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, cv2.error) as error:

@@ -339,13 +339,11 @@ EVENTS = When(
 
 
 class LogError(UserError, RuntimeError):
-    """A log that cannot be written, read or drawn: the message says what, where, why and what to type
-    next."""
+    """A log that cannot be written, read or drawn: what, where, why and what to type next."""
 
 
 def checked_suffix(out: Path, formats: Sequence[str], what: str) -> str:
-    """The ending of ``out`` in small letters. Raises LogError for one that is not among ``formats``: no file
-    says what it is not."""
+    """The ending of ``out`` in small letters. Raises LogError for one that is not among ``formats``."""
     suffix = out.suffix.lower()
     if suffix not in formats:
         raise LogError(

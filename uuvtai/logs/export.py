@@ -74,8 +74,7 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
 
 
 def _refuse_place(out: Path) -> None:
-    """Raise LogError or FileError for a place that is taken: a log's own names must not meet anybody's
-    files."""
+    """Raise LogError or FileError for a place that is taken: a log's names must not meet anybody's files."""
     if out.is_symlink() or not out.is_dir():
         refuse_output(out, [], force=False)
     elif any(out.iterdir()):
@@ -99,8 +98,7 @@ def _as_log_error(path: Path, out: Path) -> Iterator[None]:
 
 
 def file_name(name: str) -> str:
-    """A plain file name from a topic or an attachment's name, which may be anything: no folders, hidden
-    files, options or devices."""
+    """A plain file name from any topic's or attachment's name: no folders, hidden files, options, devices."""
     plain = (
         re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/"))
         .lstrip(".-")[:_MAX_NAME]
@@ -110,8 +108,7 @@ def file_name(name: str) -> str:
 
 
 class _Names:
-    """Paths below a folder, none given out twice: neither on systems where a and A are one file, nor for
-    topics that give one name."""
+    """Paths below a folder, none given twice, also where a and A are one file or topics give one name."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -157,8 +154,7 @@ def _write_jsonl(path: Path, topics: list[str], names: _Names) -> None:
 
 
 def _write_csv(path: Path, topics: list[str], names: _Names) -> None:
-    """Columns are those of all messages of the topic: the widest list decides; what a message lacks stays
-    empty."""
+    """Columns are those of all messages: the widest list decides; what a message lacks stays empty."""
     columns: dict[str, dict[str, None]] = {topic: {} for topic in topics}
     counts = dict.fromkeys(topics, 0)
     for message in read_messages(path, topics):
@@ -208,8 +204,7 @@ def _write_npz(path: Path, topics: list[str], names: _Names) -> None:
 
 
 def _stacked(rows: list[dict[str, np.ndarray]]) -> Iterator[tuple[str, np.ndarray]]:
-    """(field, values with the message as first axis) of the fields that all messages have in one shape, as
-    numbers or words."""
+    """(field, values by message) of fields that all messages have in one shape, as numbers or words."""
     for name in rows[0]:
         if all(name in row for row in rows) and len({row[name].shape for row in rows}) == 1:
             values = np.array([row[name] for row in rows])

@@ -174,8 +174,7 @@ def records(path: Path, skip_chunks: bool = False, damages: list[str] | None = N
 
 
 class WholeReads(io.BufferedReader):
-    """A file for the readers of the package, which ask for whatever a length says: what is longer than any
-    record, or than the file, is refused."""
+    """A file for the package's readers: refused is what is longer than any record, or than the file."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Exactly so many bytes. Raises McapError."""
@@ -188,8 +187,7 @@ class WholeReads(io.BufferedReader):
 
 
 def opened(path: Path) -> WholeReads:
-    """The file, open for reading. Raises LogError for what cannot be opened, FileError for what is no plain
-    file."""
+    """The file, open for reading. Raises LogError where it cannot be opened, FileError for no plain file."""
     try:
         return WholeReads(open_file(path).detach())
     except OSError as error:

@@ -68,8 +68,7 @@ class RosMessages:
         return bytes(self._store.serialize_cdr(message, message.__msgtype__))
 
     def unpacked(self, data: bytes, kind: str) -> Any:
-        """Message of CDR, compressed by itself or not. Raises ValueError for bytes that are none of this
-        kind."""
+        """Message of CDR, compressed or not. Raises ValueError for bytes that are none of this kind."""
         try:
             if data.startswith(ZSTD) and 0 <= zstandard.frame_content_size(data) <= MAX_RECORD:
                 data = zstandard.ZstdDecompressor().decompress(data)
@@ -146,8 +145,7 @@ class Setup:
 
     @classmethod
     def of(cls, given: dict[str, Any]) -> Setup:
-        """From a config as read from YAML; what it lacks is the default. Raises ValueError, TypeError,
-        AttributeError."""
+        """From a config's YAML; what lacks is the default. Raises ValueError, TypeError, AttributeError."""
         vehicle, default = given.get("vehicle") or {}, Config()
         names = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
         sonar = (given.get("sensors") or {}).get("sonar") or {}

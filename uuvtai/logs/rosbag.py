@@ -30,8 +30,7 @@ FORMATS = ("mcap", "rosbag2")
 def converted(
     file: Path, out: Path | None, to: str | None, source: str, force: bool
 ) -> tuple[Path, int, list[str]]:
-    """A log as a bag or a bag as a log: (what was written, how many messages, what was left out). Raises
-    LogError, FileError."""
+    """Log to bag or bag to log: (written, number of messages, left out). Raises LogError, FileError."""
     for option, given in (("--to", to), ("--from", source)):
         if given not in (*FORMATS, None):
             raise LogError(f"{option} {given}: choose one of {', '.join(FORMATS)}")

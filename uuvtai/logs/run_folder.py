@@ -41,8 +41,7 @@ class RunFolderError(UserError, RuntimeError):
 
 
 def default_run_dir(preset: str) -> Path:
-    """A new folder ``runs/<time>_<preset>``, with a number behind it where the name is taken. Raises
-    RunFolderError."""
+    """A new folder ``runs/<time>_<preset>``, numbered where the name is taken. Raises RunFolderError."""
     name, number = f"{time.strftime('%Y%m%d-%H%M%S')}_{Path(preset).stem}", 1
     try:
         _RUNS.mkdir(exist_ok=True)
@@ -90,8 +89,7 @@ class RunFolder:
     _record: dict[str, Any]
 
     def __init__(self, path: Path, config: Config, seeds: list[int]) -> None:
-        """Raises RunFolderError where the folder exists with content, another process has just taken it, or
-        it cannot be written."""
+        """Raises RunFolderError where the folder has content, is held elsewhere, or cannot be written."""
         refuse_place(path)
         self.path = path
         self._started = time.time()
@@ -136,15 +134,13 @@ class RunFolder:
         return folder
 
     def _sweep(self) -> None:
-        """Remove what a kill left half-written; whoever holds the folder is the only one that writes
-        there."""
+        """Remove what a kill left half-written; only who holds the folder writes there."""
         for place in self.path.rglob(".*.tmp*"):
             if UNFINISHED.fullmatch(place.name) and place.is_file():
                 place.unlink()
 
     def go_on(self, since: dict[str, Any]) -> None:
-        """Mark a held folder's run as running again; ``since`` says from where. Raises RunFolderError for a
-        record that is none."""
+        """Mark a held run as running again; ``since``: from where. Raises RunFolderError for no record."""
         self._record = self._read_record()
         resumed = {
             "argv": sys.argv,
@@ -157,8 +153,7 @@ class RunFolder:
         self.write_json(_RECORD, self._record)
 
     def settle(self, is_complete: bool) -> None:
-        """Of a held folder with nothing left to do: say how its run ended, where a kill has kept it from
-        doing so."""
+        """Of a held folder with nothing left to do: say how its run ended, where a kill kept it from that."""
         record = self._read_record()
         if record.get("status") == "running":
             ended = ("finished", 0) if is_complete else ("interrupted", signals.exit_code())
@@ -182,8 +177,7 @@ class RunFolder:
         return record
 
     def hold(self) -> None:
-        """Keep other processes from writing into the same run until this one ends. Raises RunFolderError
-        where one does."""
+        """Keep other processes from writing into the run until this one ends. Raises RunFolderError."""
         try:
             import fcntl
         except ImportError:  # not on this system: nothing to hold it by
@@ -210,8 +204,7 @@ class RunFolder:
         self._lock = open_to_append(self.path / _LOCK, self.path)
 
     def _take(self) -> None:
-        """Hold a new folder. The lock is the first file in it, and of several processes that want to begin
-        here one makes it."""
+        """Hold a new folder. The lock is its first file: of several that begin here one makes it."""
         self._guarded("hold it", self._make_lock)
         self.hold()
         if any(place.name != _LOCK for place in self.path.iterdir()):
@@ -282,8 +275,7 @@ class RunFolder:
 
 
 def write_atomic(target: Path, content: bytes) -> None:
-    """Write to a new temporary neighbour, flush it to disk, rename; on any error nothing is left behind.
-    Raises OSError."""
+    """Write to a temporary neighbour, flush, rename; after an error nothing is left. Raises OSError."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(target) as (file, _):
         file.write(content)

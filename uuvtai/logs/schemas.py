@@ -30,8 +30,7 @@ _NSEC: Schema = {"type": "integer", "minimum": 0, "maximum": 999_999_999}
 def record(
     title: str, description: str = "", nullable: Mapping[str, Schema] | None = None, /, **properties: Schema
 ) -> Schema:
-    """Schema of an object that has all these properties, and perhaps more; those in ``nullable`` may be
-    null."""
+    """Schema of an object with these properties, and perhaps more; those in ``nullable`` may be null."""
     schema: Schema = {
         "title": title,
         "type": "object",

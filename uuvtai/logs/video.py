@@ -1,5 +1,4 @@
-"""Top-down video of an episode: what the vehicle senses, maps, plans and does, with the truth as thin
-lines."""
+"""Top-down video of an episode: what the vehicle senses, maps, plans and does, with the truth."""
 
 from __future__ import annotations
 
@@ -136,8 +135,7 @@ def _check_film(width_px: int, fps: float, speed: float) -> None:
 
 
 def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
-    """Moments [s] of the frames; the last one stays for a while. Raises LogError for more frames than anybody
-    waits for."""
+    """Moments [s] of the frames; the last stays for a while. Raises LogError for too many frames."""
     n_frames = recording.duration_s * fps / speed
     if n_frames > _MOST_FRAMES:
         raise LogError(
@@ -436,8 +434,7 @@ def _write_video(part: Path, frames: Frames, fps: float) -> int:
 def _write_gif(
     part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
 ) -> int:
-    """One palette for all frames and no dithering: what stands still stays the same pixel, which costs
-    nothing."""
+    """One palette for all frames, no dithering: what stands still stays the same pixel and costs nothing."""
     known = _palette(samples, inks)
     colors = Image.new("P", (1, 1))
     colors.putpalette(known.tobytes())

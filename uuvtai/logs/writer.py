@@ -52,8 +52,7 @@ class EpisodeSink(Protocol):
     """Takes one episode, step by step."""
 
     def due(self, values: Values) -> list[Topic]:
-        """Topics that this step has messages on; what they read must be in the values written. Needs SIGNS
-        alone."""
+        """Topics of this step; what they read must be in the values written. Needs SIGNS alone."""
         ...
 
     def write(self, values: Values) -> None:
@@ -104,8 +103,7 @@ class TopicStream:
 
 
 class McapEpisodeLog:
-    """One episode's log. Raises LogError where the file cannot be written; nothing half-written is left
-    then."""
+    """One episode's log. Raises LogError where the file cannot be written, of which nothing is left then."""
 
     def __init__(self, path: Path, header: EpisodeHeader, depth_images: bool = False) -> None:
         self.path, self.header = Path(path), header
@@ -119,8 +117,7 @@ class McapEpisodeLog:
             self._channels = self._declared()
 
     def due(self, values: Values) -> list[Topic]:
-        """Topics that this step has messages on; what they read must be in the values written. Needs SIGNS
-        alone."""
+        """Topics of this step; what they read must be in the values written. Needs SIGNS alone."""
         return self._stream.due(values)
 
     def write(self, values: Values) -> None:

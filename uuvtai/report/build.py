@@ -1,5 +1,4 @@
-"""``uuv report``: find what a run folder holds, compose its sections, draw, and write the page and its
-figures, whole or not at all."""
+"""``uuv report``: what a run folder holds as sections, drawn and written whole or not at all."""
 
 from __future__ import annotations
 
@@ -40,8 +39,7 @@ from uuvtai.report.training import Training, training
 # ---- Pictures and videos: trajectories over the map, the worst episodes first, as many as the page may hold.
 
 MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
-"""What all pictures and videos of a page, and the pictures of a run among them, may weigh: in base64 8.8 MB
-of a page's 10 MB"""
+"""What all pictures and videos of a page, and its pictures alone, may weigh: in base64 8.8 MB of 10"""
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
 _SUCCESS = "success"
@@ -73,8 +71,7 @@ class _Shown:
 
 
 def media(folder: Path, result: dict[str, Any] | None, budget: int = MEDIA_BYTES) -> list[Block]:
-    """Pictures, then videos, of a run folder; ``result`` is its ``uuv eval --json`` document, ``budget`` in
-    bytes."""
+    """Pictures, then videos, of a run; ``result``: document of ``uuv eval --json``; ``budget`` in bytes."""
     methods = (result or {}).get("methods", [])
     pictures = _worst_first(sorted([*folder.glob("pictures/*.png"), *folder.glob("explain/*.png")]), methods)
     videos = _worst_first(sorted([*folder.glob("explain/*.webm"), *folder.glob("videos/*.webm")]), methods)
@@ -114,8 +111,7 @@ def _note(left_out: Sequence[str]) -> str:
 
 
 def shared(sections: Sequence[PageSection]) -> list[PageSection]:
-    """The same sections with what the page's budget [bytes] holds: pictures of every run first, then videos,
-    in the page's order."""
+    """The sections with what the budget [bytes] holds: all runs' pictures, then videos, in order."""
     kept: dict[int, Gallery] = {}
     budget = MEDIA_BYTES
     galleries = [block for section in sections for block in section.blocks if isinstance(block, Gallery)]
@@ -402,8 +398,7 @@ def _of_several(runs: list[Path]) -> Page:
 
 
 def _named_after(run: Path, trainings: list[Path]) -> list[PageSection]:
-    """Sections of one of several folders. An evaluation says which of the trainings its policies come
-    from."""
+    """Sections of one of several folders. An evaluation names the trainings of its policies."""
     with damage_named(run):
         sections = content(run)
         methods = (read_json(run, "eval/result.json") or {}).get("methods", [])

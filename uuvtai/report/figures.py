@@ -67,8 +67,7 @@ _STYLE = {
 
 
 def svg(panel: Panel, prefix: str, label: str) -> str:
-    """The panel as an inline ``<svg>``: text in the page's colour, ids that begin with ``prefix``, hover
-    texts as ``<title>``."""
+    """The panel as ``<svg>``: text in the page's colour, ids with ``prefix``, hover texts as ``<title>``."""
     with _style():
         from matplotlib.figure import Figure
 
@@ -128,8 +127,7 @@ def _strip(root: ElementTree.Element) -> None:
 
 
 def _recolour(root: ElementTree.Element) -> None:
-    """The ink becomes the page's text colour, the series' colours variables of the page, which has lighter
-    ones for the dark."""
+    """The ink becomes the page's text colour, the series' colours become variables of the page."""
     named = {INK: "currentColor"} | {colour: on_page(colour) for colour in PALETTE}
     for element in root.iter():
         style = element.get("style")
@@ -183,8 +181,7 @@ _GOLDEN = 0.618034
 
 @dataclass(frozen=True)
 class Line:
-    """A named curve; ``low`` and ``high`` bound its band or its error bars, ``said`` is shown while the
-    pointer is over a point."""
+    """A curve; ``low`` and ``high`` bound its band or error bars, ``said``: shown over a point."""
 
     name: str
     x: Sequence[float]
@@ -199,8 +196,7 @@ class Line:
 
 
 def heat_map(chosen: HeatMap, key: str, title: str) -> Panel:
-    """Rate ``key`` of every cell in per cent, below it the mean time to success [s]; bright is good in both
-    maps of a pair."""
+    """Rate ``key`` [%] of every cell, below it the mean time to success [s]; bright is good in both maps."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_title(title, loc="left")
@@ -379,8 +375,7 @@ def _spans_decades(values: Sequence[float]) -> bool:
 
 
 def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]]) -> Panel:
-    """Success over collision [shares] along one setting per line; ``marks`` are single points (name,
-    collision, success)."""
+    """Success over collision [shares] along one setting per line; ``marks``: (name, collision, success)."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_xlabel("collision %")
@@ -416,8 +411,7 @@ def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]])
 
 
 def stages(rows: Sequence[tuple[str, dict[str, float]]], title: str) -> Panel:
-    """Time per stage as one bar a row, widest stage first, like a flame graph's floor: (row's name, stage ->
-    us per env-step)."""
+    """Time per stage as one bar a row, widest first: (row's name, stage -> us per env-step)."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_title(title, loc="left")

@@ -1,5 +1,4 @@
-"""From blocks to one self-contained HTML page: no script, no address, nothing but what stands in it;
-everything from files is escaped."""
+"""From blocks to one self-contained page: no script, no address; what comes from files is escaped."""
 
 from __future__ import annotations
 
@@ -121,8 +120,7 @@ _MOST_VALUES = 10_000  # of an axis of a sweep
 
 
 def read_json(run: Path, name: str) -> dict[str, Any] | None:
-    """The document ``name`` of a run folder, or None where there is no such file. Raises ConfigError for one
-    that is no JSON object."""
+    """The document ``name`` of a run, None = no such file. Raises ConfigError for no JSON object."""
     path = run / name
     try:
         document = files.read_json(path, folder=run)
@@ -156,8 +154,7 @@ def _refuse_many(document: dict[str, Any], path: Path) -> None:
 
 
 def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
-    """Objects of a JSONL file, [] where there is none; a last line that a kill cut off is left out. Raises
-    ConfigError."""
+    """Objects of a JSONL file, [] = no file; a last line that a kill cut is left out. Raises ConfigError."""
     path, found, damaged = run / name, [], 0
     try:
         for i, line in enumerate(files.read_lines(path, files.MAX_JSON_BYTES, run), start=1):

@@ -115,8 +115,7 @@ def _saved(sheet: Sheet, kind: str, date: str) -> bytes:
 
 
 def _settle(sheet: Sheet, cells: Sequence[Axes]) -> None:
-    """All text of one size, but smaller where cells are too narrow; names under an axis are turned where they
-    would touch."""
+    """All text of one size, smaller where cells are narrow; names under an axis turn where they touch."""
     from matplotlib.text import Text
 
     for text in sheet.findobj(Text):

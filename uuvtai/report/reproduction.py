@@ -58,8 +58,7 @@ OfCurves = Callable[[list[Path]], list[Block]]
 
 
 def reproduction(document: Described, folder: Path, of_run: OfRun, of_curves: OfCurves) -> list[PageSection]:
-    """Sections of a reproduction; ``of_run`` and ``of_curves`` give the blocks of run folders. Raises
-    ConfigError."""
+    """Sections of a reproduction; ``of_run``, ``of_curves``: blocks of run folders. Raises ConfigError."""
     if sum(len(section["blocks"]) for section in document["sections"]) > _MAX_BLOCKS:
         raise ConfigError(
             f"{folder / 'reproduce.json'}: has more than the {_MAX_BLOCKS:,} blocks that a page has room for"

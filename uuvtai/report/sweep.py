@@ -68,8 +68,7 @@ def _axis(name: str) -> Column:
 
 
 def _place(document: dict[str, Any]) -> list[Column]:
-    """Where a cell stands, in a terminal: the scene, of which what does not vary is the first to be left out,
-    and what else varies."""
+    """Where a cell stands, in a terminal: the scene, less what does not vary, and what else varies."""
     axes = document["axes"]
     fixed = {name for name in _SCENE if len(axes.get(name, ())) < 2}
     scene = [

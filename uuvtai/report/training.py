@@ -27,8 +27,7 @@ PANELS = (
     ("world_model/reconstruction_loss", "reconstruction loss", False),
     ("world_model/dynamics_loss", "dynamics loss", False),
 )
-"""(metric, title, is a share): the paper's four curves, collision, and the evaluations in between where there
-are any"""
+"""(metric, title, is a share): the paper's four curves, collision, evaluations in between if any"""
 
 
 @dataclass(frozen=True)

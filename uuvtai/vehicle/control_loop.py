@@ -278,8 +278,7 @@ class OnboardLoop:
         return (_INTERRUPTED,)
 
     def _leave(self, reasons: tuple[str, ...]) -> None:
-        """Stop and hand back until the vehicle has left our mode; neither an error nor another Ctrl-C keeps
-        it from that."""
+        """Stop and hand back until the vehicle has left our mode, whatever error or Ctrl-C comes."""
         self.last, self._is_leaving = SafeDecision(SafeAction.HAND_BACK, STOP, reasons), True
         until_s = time.monotonic() + _GIVE_BACK_S / min(self._rate, 1.0)
         heard, dt = self._intake.heard, self._config.episode.control_dt_s

@@ -88,8 +88,7 @@ class Handover:
     def orders(
         self, decision: SafeDecision, now_s: float, heard: Heard, measured: Velocity | None
     ) -> list[Order]:
-        """What to say in this step. ``measured``: velocity as it is now, NaN or None where it is not
-        known."""
+        """What to say in this step. ``measured``: velocity now, NaN or None = not known."""
         if self.ended:
             return []
         grave = decision.action == SafeAction.HAND_BACK and (self.has_asked or bool(self.lost))

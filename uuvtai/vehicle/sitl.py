@@ -499,8 +499,7 @@ class SitlPort:
 def serve_water(
     config: Config, tree: FlatTree, plan: SitlPlan, note: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Serve until Ctrl-C, ``seconds`` or ``once``; the document of ``uuv sitl --json``. Raises LinkError,
-    SettingError."""
+    """Serve until Ctrl-C, ``seconds`` or ``once``; gives the ``--json``. Raises LinkError, SettingError."""
     water = WaterRows(Sim(config, plan.instances, tree), folded_seed(plan.seed), plan.episode)
     ports: list[SitlPort] = []
     begun = time.monotonic()

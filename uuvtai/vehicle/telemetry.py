@@ -102,8 +102,7 @@ class Rangers:
         self._rows: dict[int, tuple[float, int, int]] = {}
 
     def ring(self, fields: Mapping[str, Any], time_s: float) -> tuple[np.ndarray, int] | None:
-        """(8,) [cm] clockwise from ahead, and how far all of them see; None = not yet. ``fields``: of a
-        DISTANCE_SENSOR."""
+        """(8,) [cm] clockwise from ahead, and how far they see, if known. ``fields``: DISTANCE_SENSOR."""
         turn = int(fields["orientation"])
         if not 0 <= turn < 8:
             return None
@@ -268,8 +267,7 @@ Fields = Mapping[str, Any]
 
 @dataclass
 class Heard:
-    """Who was heard last, and what they said of themselves. Times by the pilot's clock, minus infinity =
-    never."""
+    """Who was heard last, and what they said. Times by the pilot's clock, minus infinity = never."""
 
     vehicle_s: float = -math.inf
     operator_s: float = -math.inf
@@ -395,8 +393,7 @@ class Intake:
         return self._start
 
     def forget_jump(self) -> None:
-        """A position that jumped before the vehicle was taken (its autopilot has found an origin): count from
-        the start once more."""
+        """A position jumped before the vehicle was taken (a new origin): count from the start once more."""
         self.heard.jumped, self._origin = "", None
 
     def refuse(self, why: str) -> list[SensorMessage]:

@@ -49,8 +49,7 @@ def _transforms(moment: Moment) -> bytes:
 
 
 def _level_rotation(quat_wb: list[float]) -> tuple[float, float, float, float]:
-    """Quaternion (w, x, y, z) that turns a level frame with the vehicle's yaw into the body frame: undoes
-    roll and pitch."""
+    """Quaternion (w, x, y, z) from a level frame with the vehicle's yaw to the body frame: roll and pitch."""
     w, x, y, z = quat_wb
     half = 0.5 * math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     c, s = math.cos(half), math.sin(half)

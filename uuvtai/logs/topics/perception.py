@@ -377,8 +377,7 @@ def grid_text(
 
 
 def map_origin(config: Config, shape: tuple[int, ...]) -> tuple[float, float]:
-    """World (x, y) [m] of the outer corner of cell [0, 0] of a map of this shape (n_row, n_col), in whose
-    middle the tank lies."""
+    """World (x, y) [m] of the outer corner of cell [0, 0] of a map (n_row, n_col) around the tank."""
     cell_m = config.mapping.cell_m
     first_x, first_y = (
         low - (count - round((high - low) / cell_m)) // 2 * cell_m

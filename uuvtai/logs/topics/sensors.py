@@ -217,8 +217,7 @@ def _png(moment: Moment) -> bytes:
 
 
 def logged_image(data: dict[str, Any]) -> np.ndarray:
-    """PNG of a foxglove.CompressedImage (row, col): depth [mm] as uint16, a sonar's intensity as uint8.
-    Raises LogError."""
+    """PNG of a CompressedImage (row, col): depth [mm] uint16, sonar's intensity uint8. Raises LogError."""
     png = base64.b64decode(data["data"])
     signature, name, width, height = _PNG_HEAD.unpack_from(png.ljust(_PNG_HEAD.size, b"\0"))
     if signature != b"\x89PNG\r\n\x1a\n" or name != b"IHDR":

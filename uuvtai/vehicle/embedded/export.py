@@ -1,5 +1,4 @@
-"""``uuv export --stack``: the stack of a log as a folder that drives without Taichi and torch, written whole
-or not at all."""
+"""``uuv export --stack``: a log's stack as a folder that drives without Taichi and torch, whole or not."""
 
 from __future__ import annotations
 

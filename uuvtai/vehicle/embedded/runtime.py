@@ -140,8 +140,7 @@ class _Shape:
 def carried_pilot(
     folder: Path, mission: Mission | None = None, limits: StaleLimits | None = None
 ) -> FedPilot:
-    """The pilot of a folder; without a ``mission`` on that of the log that it was exported with. Raises
-    StackFolderError."""
+    """The pilot of a folder, on ``mission`` or that of the exported log. Raises StackFolderError."""
     stack = CarriedStack(folder)
     numbers: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
@@ -274,8 +273,7 @@ def decided(pilot: Any, arrivals: list[tuple[int, SensorMessage]], steps: int) -
 
 
 def compare(folder: Path) -> dict[str, Any]:
-    """What a folder's code decides on this computer beside what was decided at its export. Raises
-    StackFolderError."""
+    """What a folder's code decides here beside what it did at its export. Raises StackFolderError."""
     pilot = carried_pilot(folder)
     with np.load(folder / GOLDEN, allow_pickle=False) as golden:
         arrivals, wanted = messages_in(golden, pilot.numbers.image), golden["commands"]

@@ -270,8 +270,7 @@ class FittedDrives:
 def fitted_drives(
     drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain", held: Collection[int] = ()
 ) -> FittedDrives:
-    """Parameters with intervals, without errors ahead; as ``identified``. ``held``: places that stay as
-    given. Raises DriveError."""
+    """Parameters with intervals; as ``identified``. ``held``: places that stay. Raises DriveError."""
     if known not in KNOWN:
         raise DriveError(f"--known must be one of {', '.join(KNOWN)}, got {known!r}")
     if not drives:
