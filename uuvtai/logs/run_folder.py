@@ -15,18 +15,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from uuvtai.common import signals
+from uuvtai.common import files, signals
 from uuvtai.common.errors import UserError
-from uuvtai.common.files import (
-    UNFINISHED,
-    FileError,
-    open_new,
-    open_to_append,
-    read_json,
-    refuse_links,
-    refuse_links_in,
-    whole_file,
-)
 from uuvtai.common.version import __version__
 from uuvtai.config import Config
 from uuvtai.config.loader import to_yaml
@@ -126,7 +116,7 @@ class RunFolder:
             )
         folder.hold()
         try:
-            folder._guarded("read it", lambda: refuse_links_in(path))
+            folder._guarded("read it", lambda: files.refuse_links_in(path))
             folder._guarded("tidy it", folder._sweep)
         except BaseException:
             folder.release()
@@ -136,7 +126,7 @@ class RunFolder:
     def _sweep(self) -> None:
         """Remove what a kill left half-written; only who holds the folder writes there."""
         for place in self.path.rglob(".*.tmp*"):
-            if UNFINISHED.fullmatch(place.name) and place.is_file():
+            if files.UNFINISHED.fullmatch(place.name) and place.is_file():
                 place.unlink()
 
     def go_on(self, since: dict[str, Any]) -> None:
@@ -163,8 +153,8 @@ class RunFolder:
         file = self.path / _RECORD
         why = "it is no record of a run"
         try:
-            record = read_json(file, _MAX_RECORD_BYTES, self.path)
-        except (FileError, OSError) as error:
+            record = files.read_json(file, _MAX_RECORD_BYTES, self.path)
+        except (files.FileError, OSError) as error:
             record, why = None, str(error)
         if (
             not isinstance(record, dict)
@@ -201,7 +191,7 @@ class RunFolder:
 
     def _open_lock(self) -> None:
         signals.engage()
-        self._lock = open_to_append(self.path / _LOCK, self.path)
+        self._lock = files.open_to_append(self.path / _LOCK, self.path)
 
     def _take(self) -> None:
         """Hold a new folder. The lock is its first file: of several that begin here one makes it."""
@@ -216,7 +206,7 @@ class RunFolder:
     def _make_lock(self) -> None:
         signals.engage()
         try:
-            self._lock = open_new(self.path / _LOCK)
+            self._lock = files.open_new(self.path / _LOCK)
         except FileExistsError:
             raise RunFolderError(
                 f"{self.path}: another process has just begun a run there; give another --run-dir"
@@ -228,7 +218,7 @@ class RunFolder:
 
     def write_bytes(self, name: str, content: bytes) -> Path:
         target = self.path / name
-        self._guarded(f"write {target}", lambda: refuse_links(self.path, target))
+        self._guarded(f"write {target}", lambda: files.refuse_links(self.path, target))
         self._guarded(f"write {target}", lambda: write_atomic(target, content))
         return target
 
@@ -265,7 +255,7 @@ class RunFolder:
     def _guarded(self, what: str, work) -> None:
         try:
             work()
-        except FileError as error:
+        except files.FileError as error:
             raise RunFolderError(str(error)) from None
         except OSError as error:
             raise RunFolderError(
@@ -277,7 +267,7 @@ class RunFolder:
 def write_atomic(target: Path, content: bytes) -> None:
     """Write to a temporary neighbour, flush, rename; after an error nothing is left. Raises OSError."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(target) as (file, _):
+    with files.whole_file(target) as (file, _):
         file.write(content)
 
 

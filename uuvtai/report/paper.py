@@ -11,20 +11,11 @@ from typing import Any
 from uuvtai.common.statistics import holm_adjusted
 from uuvtai.config.loader import ConfigError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
+from uuvtai.report import paper_style
 from uuvtai.report.blocks import Block, Figure
 from uuvtai.report.build import NOTHING, command_of, damage_named, refuse_run, training_of
 from uuvtai.report.evaluation import causes_table, conditions, evaluation_data, paired_data
 from uuvtai.report.html import all_shown, read_json, shown
-from uuvtai.report.paper_style import (
-    ONE_COLUMN_IN,
-    TWO_COLUMNS_IN,
-    PaperPanel,
-    bars,
-    height_in,
-    of_panel,
-    sheets,
-    ways,
-)
 from uuvtai.report.sweep import ON_HOVER, by_method, cells_data, method_of, sweep
 from uuvtai.report.tables import (
     PAGE,
@@ -59,7 +50,7 @@ class PaperItem:
     caption: str
     origin: str  # the command and the commit, a line each
     data: Data | None
-    panels: Sequence[PaperPanel] = ()
+    panels: Sequence[paper_style.PaperPanel] = ()
     table: Table | None = None
     both_widths: bool = True  # a figure for one column too
 
@@ -104,7 +95,7 @@ def _of_blocks(blocks: Iterable[Block], origin: str, n: str) -> Iterable[PaperIt
     for i, block in enumerate(blocks):
         if isinstance(block, Figure):
             is_stages, is_cells = block.name == "stages", block.name.startswith("heat_map")
-            panels = [of_panel(panel, is_cells, is_stages) for panel in block.panels]
+            panels = [paper_style.of_panel(panel, is_cells, is_stages) for panel in block.panels]
             caption = _sentences(block.caption, n)
             yield PaperItem(block.name, caption, origin, block.data, panels=panels, both_widths=not is_stages)
         elif isinstance(block, Table):
@@ -156,7 +147,7 @@ def _of_evaluation(result: dict[str, Any], origin: str) -> list[PaperItem]:
             f"Success and collision of every method. {scene} {n}; whiskers: {_WILSON}.{note}",
             origin,
             data,
-            panels=[bars(methods, key) for key in ("success", "collision")],
+            panels=[paper_style.bars(methods, key) for key in ("success", "collision")],
         ),
         PaperItem(
             "methods",
@@ -223,7 +214,7 @@ def _of_logs(run: Path, origin: str) -> list[PaperItem]:
             episodes.setdefault((int(named["seed"]), int(named["episode"])), []).append(path)
     found = []
     for (seed, episode), logs in sorted(episodes.items())[:_MOST_EPISODES]:
-        panel, said = ways(logs)
+        panel, said = paper_style.ways(logs)
         caption = (
             f"Ways of {len(logs)} method{'s' if len(logs) > 1 else ''} through one episode, chosen by its "
             f"number: {said}; dashed: their ways. Grey: what rests; cross: an end that is no success. "
@@ -432,7 +423,7 @@ DOCUMENT = r"""% All figures and tables, to look at: pdflatex paper.tex
 
 # ---- ``uuv report --paper DIR``: figures, tables and captions of finished runs, whole or not at all.
 
-_WIDTHS = {"1col": ONE_COLUMN_IN, "2col": TWO_COLUMNS_IN}
+_WIDTHS = {"1col": paper_style.ONE_COLUMN_IN, "2col": paper_style.TWO_COLUMNS_IN}
 _NAME = re.compile(r"[^A-Za-z0-9]+")
 _LONGEST = 60
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet takes a text that begins so for
@@ -543,7 +534,7 @@ def _files_of(item: PaperItem) -> dict[str, bytes]:
     made = {} if item.data is None else {f"data/{item.name}.csv": _csv(item.data).encode()}
     for width, inches in _WIDTHS.items():
         if width == "2col" or item.both_widths:
-            for kind, content in sheets(item.panels, inches).items():
+            for kind, content in paper_style.sheets(item.panels, inches).items():
                 made[f"figures/{item.name}_{width}.{kind}"] = content
     return made
 
@@ -584,7 +575,7 @@ def _tex(items: Sequence[PaperItem]) -> str:
             body, kind = [rf"\input{{tables/{item.name}}}"], "table"
             wide = is_wide(item.table)
         else:
-            is_tall = height_in(item.panels, ONE_COLUMN_IN) > _TALL_IN
+            is_tall = paper_style.height_in(item.panels, paper_style.ONE_COLUMN_IN) > _TALL_IN
             wide, kind = is_tall or not item.both_widths, "figure"
             width = r"\textwidth" if wide else r"\columnwidth"
             file = f"figures/{item.name}_{'2col' if wide else '1col'}.pdf"
