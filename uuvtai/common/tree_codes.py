@@ -77,9 +77,7 @@ LEAVES = {
     "HasRoute": _condition(HAS_ROUTE, "", "a route exists"),
     "GoalNear": _condition(GOAL_NEAR, "distance_m", "the goal is closer than distance_m"),
     "SafeHere": _condition(
-        SAFE_HERE,
-        "within_s",
-        "stopping here conflicts with no forecast body within within_s, or at all",
+        SAFE_HERE, "within_s", "stopping here conflicts with no forecast body within within_s, or at all"
     ),
     "BackOff": _action(BACK_OFF, "speed_m_s", "retreat from the sensed threat"),
     "Evade": _action(EVADE, "", "drive the evasive velocity of least cost"),
@@ -105,8 +103,4 @@ CONTROLS = {
     "ReactiveSequence": REACTIVE_SEQUENCE,
     "ReactiveFallback": REACTIVE_FALLBACK,
 }
-DECORATORS = {
-    "Inverter": INVERTER,
-    "ForceSuccess": FORCE_SUCCESS,
-    "ForceFailure": FORCE_FAILURE,
-}
+DECORATORS = {"Inverter": INVERTER, "ForceSuccess": FORCE_SUCCESS, "ForceFailure": FORCE_FAILURE}

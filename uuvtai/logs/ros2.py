@@ -239,9 +239,7 @@ def _odometry(
 ) -> Any:
     place, turn = pose
     at = ros(
-        "geometry_msgs/msg/Pose",
-        position=ros.vector(*place, kind="Point"),
-        orientation=ros.quaternion(*turn),
+        "geometry_msgs/msg/Pose", position=ros.vector(*place, kind="Point"), orientation=ros.quaternion(*turn)
     )
     return ros(
         "nav_msgs/msg/Odometry",

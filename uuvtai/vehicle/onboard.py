@@ -100,12 +100,7 @@ def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:
     sonar, camera = sensors.sonar, sensors.depth
     return PilotNumbers(
         dt_s=config.episode.control_dt_s,
-        top=(
-            vehicle.max_surge_m_s,
-            vehicle.max_sway_m_s,
-            vehicle.max_heave_m_s,
-            vehicle.max_yaw_rate_rad_s,
-        ),
+        top=(vehicle.max_surge_m_s, vehicle.max_sway_m_s, vehicle.max_heave_m_s, vehicle.max_yaw_rate_rad_s),
         nodes=numbered(tree.names),
         gravity_m_s2=vehicle.gravity_m_s2,
         estimated=sensors.localization == "estimated",

@@ -256,9 +256,7 @@ def decide(
             reasons.append(reason)
     for_good = action >= SafeAction.SURFACE
     kept = SafetyMemory(
-        since,
-        action if for_good else memory.latched,
-        tuple(reasons) if for_good else memory.latched_why,
+        since, action if for_good else memory.latched, tuple(reasons) if for_good else memory.latched_why
     )
     velocity = allowed(view.wanted, view, limits) if action == SafeAction.DRIVE else STOP
     return SafeDecision(action, velocity, tuple(reasons)), kept

@@ -110,13 +110,7 @@ def _read_pose(data: dict[str, Any]) -> tuple[float, float, float, float]:
 
 
 POSE_ROWS = (
-    Topic(
-        "/tf",
-        EVERY_STEP,
-        FRAME_TRANSFORMS,
-        _transforms,
-        ("vehicle.pos_w", "vehicle.quat_wb"),
-    ),
+    Topic("/tf", EVERY_STEP, FRAME_TRANSFORMS, _transforms, ("vehicle.pos_w", "vehicle.quat_wb")),
     Topic(
         "/pose",
         EVERY_STEP,

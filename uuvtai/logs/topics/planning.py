@@ -291,13 +291,7 @@ DRIVER_ROWS = (
         ),
         varies="Each term of the reward under its own name ([`reward`](configuration/reward.md)): number",
     ),
-    Topic(
-        "/evasion",
-        EVADING,
-        _EVASION,
-        _evasion,
-        (*(f"teacher.{name}" for name in _DECISION), *_OWN),
-    ),
+    Topic("/evasion", EVADING, _EVASION, _evasion, (*(f"teacher.{name}" for name in _DECISION), *_OWN)),
     Topic(
         "/safety",
         EVERY_STEP,

@@ -117,14 +117,7 @@ SONAR_ROWS = (
         NEW_SCAN,
         LASER_SCAN,
         _scan,
-        (
-            "scan.ping_step",
-            "scan.hit",
-            "scan.range_m",
-            "scan.intensity",
-            "scan.new_from",
-            "scan.new_count",
-        ),
+        ("scan.ping_step", "scan.hit", "scan.range_m", "scan.intensity", "scan.new_from", "scan.new_count"),
         _read_scan,
     ),
     Topic(

@@ -233,10 +233,7 @@ def messages_in(packed: Any, image: tuple[int, ...]) -> list[tuple[int, SensorMe
     kinds = list(KINDS.items())
     fields = {
         f"{name}.{member.name}": iter(
-            np.split(
-                packed[f"{name}.{member.name}"],
-                np.cumsum(packed[f"{name}.{member.name}.length"])[:-1],
-            )
+            np.split(packed[f"{name}.{member.name}"], np.cumsum(packed[f"{name}.{member.name}.length"])[:-1])
         )
         for name, kind in kinds
         for member in dataclasses.fields(kind)
