@@ -210,7 +210,7 @@ def _knowledge_label(facts: Fact) -> str | None:
             return "depth_change"
         return "unseen_above" if above else "unseen_below"
     if _within(facts["turned_ago_s"], TURN_S) and not _within(facts["turn_error_m"], MISS_M):
-        return "turned_back" if _turned_back(facts) else "unannounced_turn"
+        return "turned_back" if facts["turned_deg"] > math.degrees(BACK_RAD) else "unannounced_turn"
     if facts["forecast_error_m"] is None:
         return (
             "seen_late"
@@ -247,10 +247,6 @@ def timeout_label(facts: Fact) -> str:
     if facts["evading_share"] > 0.5:
         return "kept_away"
     return "stuck" if facts["driven_m"] < STUCK_M else "circling"
-
-
-def _turned_back(facts: Fact) -> bool:
-    return _within(facts["turned_ago_s"], TURN_S) and facts["turned_deg"] > math.degrees(BACK_RAD)
 
 
 def _is_unseen(facts: Fact) -> bool:
@@ -554,7 +550,8 @@ def record_worst(
     finally:
         recorder.abort()
     paths = [
-        _renamed(recorder.paths[job], row.explanation.label) for job, row in zip(jobs, rows, strict=True)
+        (path := recorder.paths[job]).rename(path.with_name(f"{row.explanation.label}_{path.name}"))
+        for job, row in zip(jobs, rows, strict=True)
     ]
     for path, row in zip(paths, rows, strict=True):
         note(f"drawing {path.stem}")
@@ -563,7 +560,3 @@ def record_worst(
         picture(path, path.with_suffix(".png"), remark=f"{cause}: {CAUSES[label]}", methods=methods)
         video(path, path.with_suffix(".webm"), remark=cause, methods=methods, **SMALL)
     return paths
-
-
-def _renamed(path: Path, label: str) -> Path:
-    return path.rename(path.with_name(f"{label}_{path.name}"))

@@ -169,7 +169,8 @@ def results_page(document: dict[str, Any]) -> str:
         _ceilings(document),
         _sweeps(document),
         _timing(document),
-        _paper_notes(document),
+        "## Where the paper's figures do not add up\n"
+        + "\n".join(f"- {text}" for text in document["inconsistencies"]),
     ]
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 
@@ -295,12 +296,6 @@ def _timing(document: dict[str, Any]) -> str:
             markdown(density_table(profile["paper_density"], "")),
             markdown(Table((ENVS, *SPEEDS), profile["rows"])),
         ]
-    )
-
-
-def _paper_notes(document: dict[str, Any]) -> str:
-    return "## Where the paper's figures do not add up\n" + "\n".join(
-        f"- {text}" for text in document["inconsistencies"]
     )
 
 

@@ -32,20 +32,8 @@ def bgr(code: str) -> Color:
     return blue, green, red
 
 
-PAPER, WATER, INK, GREY, FAINT = (
-    bgr("#ffffff"),
-    bgr("#eef5f9"),
-    bgr("#1d2733"),
-    bgr("#66727f"),
-    bgr("#c9d2da"),
-)
-STATIC, DYNAMIC, GOAL, ROUTE, MOVER = (
-    bgr("#262c38"),
-    bgr("#e53946"),
-    bgr("#f7b801"),
-    bgr("#1f8fff"),
-    bgr("#d9480f"),
-)
+PAPER, WATER, INK, GREY, FAINT = map(bgr, ("#ffffff", "#eef5f9", "#1d2733", "#66727f", "#c9d2da"))
+STATIC, DYNAMIC, GOAL, ROUTE, MOVER = map(bgr, ("#262c38", "#e53946", "#f7b801", "#1f8fff", "#d9480f"))
 FAILED = bgr("#c92a2a")
 
 

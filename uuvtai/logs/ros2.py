@@ -264,10 +264,6 @@ def _imu(ros: RosMessages, time_ns: int, turn: Any, rates: Any) -> Any:
     )
 
 
-def _bearings(scan: dict[str, Any]) -> np.ndarray:
-    return np.linspace(scan["start_angle"], scan["end_angle"], len(scan["ranges"]))
-
-
 def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
     """REP 117: -inf where noise puts a return behind the sonar, NaN where nothing is known, +inf where
     nothing is."""
@@ -294,7 +290,8 @@ def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
 
 def _cloud(ros: RosMessages, scan: dict[str, Any], velocity: Any) -> Any:
     """Returns only; their velocity is NaN where the sonar measures none."""
-    ranges, bearing, shine = np.array(scan["ranges"]), _bearings(scan), np.array(scan["intensities"])
+    ranges, shine = np.array(scan["ranges"]), np.array(scan["intensities"])
+    bearing = np.linspace(scan["start_angle"], scan["end_angle"], len(ranges))
     hit = shine > 0
     speed = np.array(velocity) if len(velocity) else np.full(len(ranges), math.nan)
     columns = (ranges * np.cos(bearing), ranges * np.sin(bearing), 0 * ranges, shine, speed)

@@ -254,7 +254,7 @@ def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]
     """For every policy of an evaluation the training that made it, by the sha256 of its checkpoint's
     manifest; [] without trainings."""
     kept = {
-        _sha256(path, run): (run.name, path.parent.name)
+        hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest(): (run.name, path.parent.name)
         for run in trainings
         for path in (run / "checkpoints").glob("*/manifest.json")
     }
@@ -271,10 +271,6 @@ def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]
                 "trainings keep."
             )
     return [Paragraph(" ".join(sentences))] if sentences else []
-
-
-def _sha256(path: Path, run: Path) -> str:
-    return hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest()
 
 
 NOTHING = (
@@ -378,7 +374,10 @@ def _of_run(run: Path) -> Page:
     closing = PageSection(
         "Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)]
     )
-    return Page(title, _subtitle(record), status_notice(record), [*sections, closing])
+    about = (record.get("started"), record.get("hardware", {}).get("cpu"))
+    return Page(
+        title, ", ".join(str(part) for part in about if part), status_notice(record), [*sections, closing]
+    )
 
 
 def _of_several(runs: list[Path]) -> Page:
@@ -417,12 +416,6 @@ def _figures_of(run: Path, blocks: Sequence[Block]) -> list[Block]:
         replace(block, name=f"{run.name}_{block.name}") if isinstance(block, Figure) else block
         for block in blocks
     ]
-
-
-def _subtitle(record: dict[str, Any]) -> str:
-    return ", ".join(
-        str(part) for part in (record.get("started"), record.get("hardware", {}).get("cpu")) if part
-    )
 
 
 def content(run: Path) -> list[PageSection]:

@@ -208,16 +208,13 @@ def evaluation_data(methods: list[Method]) -> Data:
             m["name"],
             m["episodes"],
             *(m["outcomes"][name] for name in ENDINGS),
-            *_bounds(m),
+            *(m["success_ci95"] or (None, None)),
+            *(m["collision_ci95"] or (None, None)),
             *(m.get(name) for name in _PLAIN),
         ]
         for m in methods
     ]
     return Data(["method", "episodes", *ENDINGS, *bounds, *_PLAIN], rows)
-
-
-def _bounds(m: dict[str, Any]) -> list[float | None]:
-    return [*(m["success_ci95"] or (None, None)), *(m["collision_ci95"] or (None, None))]
 
 
 def _rates_figure(methods: list[Method], command: str) -> Figure:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -34,41 +34,33 @@ _SMALLEST = 0.8
 """A panel is never shown smaller than this share of its size, or its text could not be read: it scrolls in
 its box instead"""
 
-_STYLE = {
-    "text.parse_math": False,  # a name with dollars is a name
-    "text.usetex": False,
+_STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
-    "svg.hashsalt": "uuvtai",  # the same figure is the same file
     "font.size": 9,
     "font.family": "sans-serif",
     "axes.titlesize": 10,
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.6,
+}
+_COMMON: dict[str, Any] = {
+    "backend": "agg",
+    "text.parse_math": False,  # a name with dollars is a name
+    "text.usetex": False,
+    "svg.hashsalt": "uuvtai",  # the same figure is the same file
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
     "grid.alpha": 0.18,
-    "grid.linewidth": 0.6,
     "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.6,
-    **dict.fromkeys(
-        (
-            "text.color",
-            "axes.labelcolor",
-            "axes.edgecolor",
-            "axes.titlecolor",
-            "xtick.color",
-            "ytick.color",
-            "grid.color",
-        ),
-        INK,
-    ),
 }
+_INKED = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
 
 
 def svg(panel: Panel, prefix: str, label: str) -> str:
     """The panel as ``<svg>``: text in the page's colour, ids with ``prefix``, hover texts as ``<title>``."""
-    with _style():
+    with styled():
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(panel.width_in, panel.height_in), layout="constrained")
@@ -89,7 +81,7 @@ def png(panels: Sequence[Panel], columns: int = 2) -> bytes:
     rows = math.ceil(len(panels) / columns)
     columns = min(columns, len(panels))
     size = (columns * max(p.width_in for p in panels), rows * max(p.height_in for p in panels))
-    with _style():
+    with styled():
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=size, dpi=150, layout="constrained", facecolor="white")
@@ -104,12 +96,12 @@ def png(panels: Sequence[Panel], columns: int = 2) -> bytes:
 
 
 @contextmanager
-def _style() -> Iterator[None]:
+def styled(own: Mapping[str, Any] = _STYLE) -> Iterator[None]:
+    """matplotlib's defaults, what all figures share, and ``own``: a reader's matplotlibrc changes nothing."""
     import matplotlib
 
-    # the defaults first: a reader's own matplotlibrc does not change a report
-    settings: Any = {**matplotlib.rcParamsDefault, "backend": "agg", **_STYLE}
-    with matplotlib.rc_context(settings):
+    inks = dict.fromkeys(_INKED, INK)
+    with matplotlib.rc_context({**matplotlib.rcParamsDefault, **_COMMON, **inks, **own}):
         yield
 
 
@@ -364,14 +356,10 @@ def _frame(axes: Axes, lines: Sequence[Line], share: bool, zero: bool) -> None:
         axes.set_ylabel("%")
     elif zero:
         axes.set_ylim(bottom=0)
-    elif _spans_decades([y for line in lines for y in line.y]):
+    elif (y := [y for line in lines for y in line.y]) and max(y) > _LOG_SPAN * min(y) > 0:
         axes.set_yscale("log")
     if len(lines) > 1:
         axes.legend(loc="best")
-
-
-def _spans_decades(values: Sequence[float]) -> bool:
-    return bool(values) and min(values) > 0 and max(values) > _LOG_SPAN * min(values)
 
 
 def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]]) -> Panel:

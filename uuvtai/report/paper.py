@@ -307,31 +307,15 @@ def _axis(name: str) -> Column:
 
 # ---- LaTeX of tables and floats. Whatever a user can name is text in it, never a command.
 
+_COMMANDS = {
+    "\\": "backslash", "^": "asciicircum", "~": "asciitilde", "<": "less", ">": "greater", "|": "bar",
+    '"': "quotedbl", "'": "quotesingle", "`": "asciigrave", "·": "periodcentered", "°": "degree",
+    "†": "dagger", "–": "endash", "—": "emdash",
+}  # fmt: skip
 _SPECIAL = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "$": r"\$",
-    "&": r"\&",
-    "#": r"\#",
-    "%": r"\%",
-    "_": r"\_",
-    "^": r"\textasciicircum{}",
-    "~": r"\textasciitilde{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
-    "'": r"\textquotesingle{}",
-    "`": r"\textasciigrave{}",
-    "·": r"\textperiodcentered{}",
-    "±": r"$\pm$",
-    "µ": r"$\mu$",
-    "°": r"\textdegree{}",
-    "†": r"\textdagger{}",
-    "–": r"\textendash{}",
-    "—": r"\textemdash{}",
-    "−": "$-$",
+    **{c: rf"\{c}" for c in "{}$&#%_"},
+    **{c: rf"\text{name}{{}}" for c, name in _COMMANDS.items()},
+    **{"±": r"$\pm$", "µ": r"$\mu$", "−": "$-$"},
 }
 _LETTERS = range(0xC0, 0x100)  # letters with accents that every LaTeX knows in UTF-8
 _NO_LETTERS = (0xD7, 0xF7)
@@ -367,19 +351,16 @@ def _cell(text: str) -> str:
     return f"{{{found[0]}}}{found[1:]}" if found[:1] in ("[", "*") else found
 
 
-def _spec(column: Column) -> str:
-    return _PROSE if column.prose else "l" if column.left else "r"
-
-
 def tabular(table: Table, remark: str) -> str:
     """The table with the rules of booktabs, below a comment."""
     columns, cells = table.on(PAGE)
     lines = [[_cell(column.head) for column in columns], *([_cell(str(c)) for c in row] for row in cells)]
+    spec = "".join(_PROSE if column.prose else "l" if column.left else "r" for column in columns)
     head, *rows = (" & ".join(line) + r" \\" for line in lines)
     return "\n".join(
         [
             *map(comment, remark.splitlines()),
-            rf"\begin{{tabular}}{{{''.join(map(_spec, columns))}}}",
+            rf"\begin{{tabular}}{{{spec}}}",
             r"\toprule",
             head,
             r"\midrule",
@@ -492,16 +473,14 @@ def _all(runs: list[Path]) -> Iterator[tuple[Path, PaperItem]]:
         yield from ((trainings[0], item) for item in found)
     for run in runs:
         with damage_named(run):
-            _refuse_reproduction(run)
+            if read_json(run, "reproduce.json"):
+                raise ConfigError(
+                    f"{run}: is a reproduction; give the run folders in it one by one ({run}/...)"
+                )
             own = items_of(run)
         if not own and run not in trainings:
             raise ConfigError(f"{run}: {NOTHING}")
         yield from ((run, item) for item in own)
-
-
-def _refuse_reproduction(run: Path) -> None:
-    if read_json(run, "reproduce.json"):
-        raise ConfigError(f"{run}: is a reproduction; give the run folders in it one by one ({run}/...)")
 
 
 def _named(found: Iterator[tuple[Path, PaperItem]], several: bool) -> list[tuple[Path, PaperItem]]:
@@ -528,7 +507,8 @@ def _named(found: Iterator[tuple[Path, PaperItem]], several: bool) -> list[tuple
 def _files_of(item: PaperItem) -> dict[str, bytes]:
     """Content by path in the folder."""
     if item.table is not None:
-        made = {f"tables/{item.name}.tex": tabular(item.table, _remark(item)).encode()}
+        remark = f"{item.caption}\n{item.origin}\nneeds \\usepackage{{booktabs,textcomp}}"
+        made = {f"tables/{item.name}.tex": tabular(item.table, remark).encode()}
         data = item.data or _texts(item.table)
         return made | {f"tables/{item.name}.csv": _csv(data).encode()}
     made = {} if item.data is None else {f"data/{item.name}.csv": _csv(item.data).encode()}
@@ -537,10 +517,6 @@ def _files_of(item: PaperItem) -> dict[str, bytes]:
             for kind, content in paper_style.sheets(item.panels, inches).items():
                 made[f"figures/{item.name}_{width}.{kind}"] = content
     return made
-
-
-def _remark(item: PaperItem) -> str:
-    return f"{item.caption}\n{item.origin}\nneeds \\usepackage{{booktabs,textcomp}}"
 
 
 def _texts(table: Table) -> Data:

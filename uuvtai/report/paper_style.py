@@ -6,15 +6,14 @@ import io
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.common.colours import method_colours
 from uuvtai.report.blocks import Hover, Panel
-from uuvtai.report.figures import INK
+from uuvtai.report.figures import INK, styled
 from uuvtai.report.html import shown
 
 if TYPE_CHECKING:
@@ -33,8 +32,6 @@ _CURVE_IN = 2.1  # height of a panel that has no wish of its own
 _ROOM = 0.94  # of a cell's width that its words may take
 
 _STYLE: dict[str, Any] = {
-    "text.parse_math": False,  # a name with dollars is a name
-    "text.usetex": False,
     "font.family": ["STIXGeneral", "DejaVu Sans"],  # both come with matplotlib; the second has more letters
     "font.size": TEXT_PT,
     "axes.titlesize": TEXT_PT,
@@ -44,17 +41,10 @@ _STYLE: dict[str, Any] = {
     "legend.fontsize": TEXT_PT,
     "pdf.fonttype": 42,  # fonts that publishers accept, text that can be searched
     "svg.fonttype": "path",  # looks the same where the font is missing
-    "svg.hashsalt": "uuvtai",  # the same figure is the same file
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
     "axes.linewidth": 0.6,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
-    "grid.alpha": 0.18,
     "grid.linewidth": 0.5,
-    "legend.frameon": False,
     "legend.handlelength": 1.4,
     "lines.linewidth": 1.1,
 }
@@ -91,7 +81,7 @@ def _row_heights(panels: Sequence[PaperPanel], width_in: float) -> tuple[int, li
 def sheets(panels: Sequence[PaperPanel], width_in: float) -> dict[str, bytes]:
     """The figure as 'pdf' and 'svg': one panel below the other in one column, two side by side in two."""
     across, heights = _row_heights(panels, width_in)
-    with _style(), warnings.catch_warnings():
+    with styled(_STYLE), warnings.catch_warnings():
         from matplotlib.figure import Figure as Sheet
 
         warnings.filterwarnings("ignore", "Glyph")  # a name may have letters that no font here has
@@ -142,17 +132,6 @@ def _shrink(axes: Axes) -> None:
     share = _ROOM * (x1 - x0) / widest if widest else 1.0
     for text in axes.texts if share < 1.0 else []:
         text.set_fontsize(max(_LEAST_PT, share * TEXT_PT))
-
-
-@contextmanager
-def _style() -> Iterator[None]:
-    import matplotlib
-
-    # the defaults first: a reader's own matplotlibrc does not change a figure
-    inks = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
-    settings: Any = {**matplotlib.rcParamsDefault, "backend": "agg", **_STYLE, **dict.fromkeys(inks, INK)}
-    with matplotlib.rc_context(settings):
-        yield
 
 
 _BAR_IN, _FRAME_IN = 0.21, 0.55

@@ -96,15 +96,14 @@ def markdown(table: Table) -> str:
     """The table in Markdown; what would break its cells is escaped."""
     columns, cells = table.on(PAGE)
     lines = [[column.head for column in columns], ["---"] * len(columns), *cells]
-    return "\n".join("| " + " | ".join(_escaped(str(cell)) for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(" ".join(str(cell).split()).replace("|", r"\|") for cell in line) + " |"
+        for line in lines
+    )
 
 
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return markdown(Table(heads(*head), rows))
-
-
-def _escaped(text: str) -> str:
-    return " ".join(text.split()).replace("|", r"\|")
 
 
 # ---- Numbers in tables and pages: every rate with its count and its interval, what is not known as a dash.

@@ -372,18 +372,17 @@ def _agreement(name: str, commands: list[onboard.PilotCommand], feed: LogFeed) -
         (getattr(command, COMPARED[name]), getattr(logged, COMPARED[name]))
         for command, logged in zip(commands, feed.steps, strict=True)
     ]
-    wrong = [step for step, (ours, theirs) in enumerate(pairs) if not _is_equal(ours, theirs)]
+    wrong = [
+        step
+        for step, (ours, theirs) in enumerate(pairs)
+        if not (theirs is None or np.array_equal(ours, theirs))
+    ]
     first = None
     if wrong:
         step, (ours, theirs) = wrong[0], map(_plain, pairs[wrong[0]])
         time_s = round(step * feed.config.episode.control_dt_s, 9)
         first = {"step": step, "time_s": time_s, "replayed": ours, "logged": theirs}
     return {"what": name, "equal_steps": len(pairs) - len(wrong), "first_difference": first}
-
-
-def _is_equal(ours: Any, theirs: Any) -> bool:
-    """What the log does not say counts as equal."""
-    return theirs is None or bool(np.array_equal(ours, theirs))
 
 
 def _plain(value: Any) -> Any:

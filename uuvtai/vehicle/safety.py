@@ -112,26 +112,6 @@ class SafetyRule:
 # -------------------------------------------------------------------------------------------------- the rules
 
 
-def _lost_command(view: VehicleView, limits: SafetyLimits) -> str:
-    return view.lost_command
-
-
-def _vehicle_silent(view: VehicleView, limits: SafetyLimits) -> str:
-    return _old("autopilot", view.vehicle_age_s, limits.vehicle_s)
-
-
-def _operator_silent(view: VehicleView, limits: SafetyLimits) -> str:
-    return _old("operator", view.operator_age_s, limits.operator_s)
-
-
-def _navigation_lost(view: VehicleView, limits: SafetyLimits) -> str:
-    return _lost_sensors(view, limits, ("imu", "dvl", "pressure", "position"))
-
-
-def _sonar_lost(view: VehicleView, limits: SafetyLimits) -> str:
-    return _lost_sensors(view, limits, ("sonar",))
-
-
 def _pilot_stops(view: VehicleView, limits: SafetyLimits) -> str:
     wrong = [] if all(map(math.isfinite, view.wanted)) else ["its command is not finite"]
     return "; ".join([*view.held, *wrong])
@@ -155,18 +135,6 @@ def _unanswered(view: VehicleView, limits: SafetyLimits) -> str:
     if view.unanswered_s <= UNANSWERED_S:
         return ""
     return f"asked to move for {view.unanswered_s:.0f} s, and the measured speed stays near zero"
-
-
-def _position_jumped(view: VehicleView, limits: SafetyLimits) -> str:
-    return view.moved
-
-
-def _start_unchecked(view: VehicleView, limits: SafetyLimits) -> str:
-    return view.unchecked
-
-
-def _walls_misfit(view: VehicleView, limits: SafetyLimits) -> str:
-    return view.misfit
 
 
 def _battery_low(view: VehicleView, limits: SafetyLimits) -> str:
@@ -202,20 +170,26 @@ def _too_fast(view: VehicleView, limits: SafetyLimits) -> str:
 
 _A = SafeAction
 RULES = (
-    SafetyRule("command lost", _lost_command, ((0.0, _A.HAND_BACK),),
+    SafetyRule("command lost", lambda view, _: view.lost_command, ((0.0, _A.HAND_BACK),),
                "somebody else changed the mode or disarmed, or the vehicle refused GUIDED and ALT_HOLD"),
-    SafetyRule("autopilot silent", _vehicle_silent, ((0.0, _A.HAND_BACK),), "no heartbeat of the autopilot"),
-    SafetyRule("operator silent", _operator_silent, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
-               "no heartbeat of the operator's ground station"),
-    SafetyRule("navigation lost", _navigation_lost, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
+    SafetyRule("autopilot silent",
+               lambda view, limits: _old("autopilot", view.vehicle_age_s, limits.vehicle_s),
+               ((0.0, _A.HAND_BACK),), "no heartbeat of the autopilot"),
+    SafetyRule("operator silent",
+               lambda view, limits: _old("operator", view.operator_age_s, limits.operator_s),
+               ((0.0, _A.HOLD), (30.0, _A.SURFACE)), "no heartbeat of the operator's ground station"),
+    SafetyRule("navigation lost",
+               lambda view, limits: _lost_sensors(view, limits, ("imu", "dvl", "pressure", "position")),
+               ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
                "attitude, velocity, depth or a needed position is missing or old"),
-    SafetyRule("position jumped", _position_jumped, ((0.0, _A.HAND_BACK),),
+    SafetyRule("position jumped", lambda view, _: view.moved, ((0.0, _A.HAND_BACK),),
                "the given position changed by more than the vehicle can move"),
-    SafetyRule("start unchecked", _start_unchecked, ((0.0, _A.HOLD),),
+    SafetyRule("start unchecked", lambda view, _: view.unchecked, ((0.0, _A.HOLD),),
                "the walls have not confirmed the start yet; after 60 s it is refused"),
-    SafetyRule("walls misfit", _walls_misfit, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
+    SafetyRule("walls misfit", lambda view, _: view.misfit, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
                "the scans do not fit the known walls where the vehicle takes itself to be"),
-    SafetyRule("sonar lost", _sonar_lost, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
+    SafetyRule("sonar lost", lambda view, limits: _lost_sensors(view, limits, ("sonar",)),
+               ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
                "no scan could be placed in the map, or the last one is old"),
     SafetyRule("pilot stops", _pilot_stops, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
                "the stack itself says that it cannot go on, or its command is not finite"),

@@ -449,10 +449,6 @@ def _servos(heard: _Heard, m: Any, time_s: float) -> None:
         heard.pulse.add(time_s, *widths)
 
 
-def _beat(heard: _Heard, m: Any, time_s: float) -> None:
-    heard.armed.add(time_s, float(bool(m.base_mode & 128)))
-
-
 _OF_TLOG: dict[str, Take] = {
     "PARAM_VALUE": lambda heard, m, time_s: _parameter(heard, m.param_id, float(m.param_value)),
     "SERVO_OUTPUT_RAW": _servos,
@@ -461,5 +457,5 @@ _OF_TLOG: dict[str, Take] = {
         heard, time_s, m.time_delta_usec / 1e6, tuple(m.position_delta), m.confidence
     ),
     "LOCAL_POSITION_NED": lambda heard, m, time_s: heard.filtered.add(time_s, m.vx, m.vy, m.vz),
-    "HEARTBEAT": _beat,
+    "HEARTBEAT": lambda heard, m, time_s: heard.armed.add(time_s, float(bool(m.base_mode & 128))),
 }

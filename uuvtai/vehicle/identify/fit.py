@@ -317,7 +317,8 @@ def _judged(
     kept, given = [], []
     while True:
         made = fitted_drives(drives, vehicle_cfg, known, held)
-        negative = [entry for entry in made.entries if entry["fitted"] and _is_negative(entry)]
+        signed = (model.NET, *model.LATE)
+        negative = [e for e in made.entries if e["fitted"] and e["value"] < 0 and e["place"] not in signed]
         if negative:
             held.update(entry["place"] for entry in negative)
             kept += [
@@ -346,10 +347,6 @@ def _judged(
         if not worse:
             kept += [f"{text} on stretches that were not fitted; the axis stays as given" for text in given]
             return made, horizons, kept
-
-
-def _is_negative(entry: dict[str, Any]) -> bool:
-    return entry["value"] < 0 and entry["place"] not in (model.NET, *model.LATE)
 
 
 def _worse(axis: int, horizons: dict[str, Any], free: np.ndarray) -> list[tuple[str, list[int]]]:
