@@ -13,8 +13,7 @@ from typing import Any
 JUMP_S = 1.0  # a clock that is off by more has jumped, or its message is late
 SEVERAL = 5  # moments in a row at which a sender contradicts its clock; then it is believed
 _DRIFT = 1e-4  # two clocks run apart by no more
-_OVERRUN_S = 10.0
-"""next to where its clock should be by so much, a small stamp is that of a counter that ran over"""
+_OVERRUN_S = 10.0  # so near to where its clock should be, a small stamp is of a counter that ran over
 _COUNTERS = {"time_boot_ms": 1e3, "time_usec": 1e6}
 """field of MAVLink: units in a second, 32 bits of them unless a stamp has more"""
 

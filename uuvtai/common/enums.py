@@ -60,8 +60,7 @@ N_SAID = PACKET * -(-N_TOLD // PACKET)  # with padding
 N_SPREAD = 2 * ANCHORS * N_MODE  # the trained network says spreads too, which the kernel leaves out
 MIDDLE = (1 + N_COLUMN) * N_HIDDEN
 LAST = MIDDLE + (1 + N_HIDDEN) * N_HIDDEN
-N_WEIGHT = LAST + (1 + N_HIDDEN) * N_SAID
-"""numbers of the three layers, each its biases, then a row for each input"""
+N_WEIGHT = LAST + (1 + N_HIDDEN) * N_SAID  # of the three layers: biases, then a row for each input
 
 
 # ---- What only the simulator knows.

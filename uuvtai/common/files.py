@@ -41,8 +41,7 @@ _CREATE = os.O_WRONLY | os.O_CREAT | _NO_FOLLOW | _ALWAYS
 _FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
 _NO_FILE = (errno.ENXIO, errno.ENODEV, errno.EISDIR)
 """what opening a socket, a pipe that nobody reads or a folder may say"""
-UNFINISHED = re.compile(r"\..+\.[0-9a-f]{8}\.tmp(\.\w+)?")
-"""names that ``unfinished`` gives to what goes with its writer"""
+UNFINISHED = re.compile(r"\..+\.[0-9a-f]{8}\.tmp(\.\w+)?")  # names by ``unfinished`` that go with the writer
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 

@@ -44,10 +44,8 @@ if TYPE_CHECKING:
     from uuvtai.logs.writer import PolicyNote
 
 
-START_S = 2.0
-"""A younger episode starts in danger: to see and evade takes a second, bodies start 1.5 m away."""
-UNSEEN_S = 0.3
-"""Unseen: out of the sonar's fan all this time before the end (no track 0.3 s before)."""
+START_S = 2.0  # a younger episode starts in danger: evading takes a second, bodies start 1.5 m away
+UNSEEN_S = 0.3  # out of the sonar's fan all this time before the end (no track 0.3 s before)
 TURN_S = 1.2
 """An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it
 was off by more than MISS_M at the end, or there was none."""
@@ -55,10 +53,8 @@ CLEAR_M = 0.1
 """A body that is remembered farther above or below than this counts as clear of the own depth (what the
 referee calls contact)."""
 LATELY_S = 2.5  # Remarks look back this far.
-MISS_M = 0.35
-"""A forecast missed when it was farther off than the pilot's margin at one second (0.25 m + 0.1 m/s)."""
-REACH_M = 0.4
-"""Squeezed: something static this near to the hull at the end leaves no room (0.17 + 0.1 m + margin)."""
+MISS_M = 0.35  # a forecast missed when farther off than the pilot's margin at a second (0.25 m + 0.1 m/s)
+REACH_M = 0.4  # squeezed: something static this near to the hull leaves no room (0.17 + 0.1 m + margin)
 CROWD_M = 0.6  # Crowded: a second moving body came nearer to the hull in the last CROWD_S.
 NEAR_M = 1.0
 """Contact with something static is no accident of its own when a moving body came this near to the hull in

@@ -326,8 +326,7 @@ seen but not tracked."""
 TURN_RAD = math.radians(30.0)  # A corner: the body's course changes by more between two samples.
 BACK_RAD = math.radians(120.0)  # A turn back: a corner with more than this.
 BEFORE_TURN_S = 0.1  # The forecast that a turn is judged by was made this long before it.
-BELIEF_M = 0.5
-"""A forecast or track belongs to a body when its present place is this close to the truth, in plan."""
+BELIEF_M = 0.5  # a forecast or track belongs to a body when its place is this close to the truth, in plan
 CLIMB_S = 1.0  # Changes of the own depth are counted over this time before the end.
 BEAM_M = 0.1  # A beam met the body when its range agrees with the truth within this plus four sigma.
 CROWD_S = 0.5  # A second moving body counts when it came near in this time before the end.
@@ -340,8 +339,7 @@ heave is enough."""
 BREAK_S = 0.3  # A leaf that lost charge for no longer than this still counts as in charge.
 LAST_S = 10.0  # Timeouts are judged by their last ten seconds.
 EVADING = ("Evade", "BackOff")  # Leaves that give way to something.
-WAITING = ("Hold",)
-"""Leaves that stay in place on purpose; so do names that begin with Wait, Yield or Shelter."""
+WAITING = ("Hold",)  # leaves that stay in place on purpose; so do names that begin with Wait, Yield, Shelter
 
 
 @dataclass

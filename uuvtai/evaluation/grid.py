@@ -252,8 +252,7 @@ def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> 
 
 
 BATCH = 256  # episodes side by side in one simulator
-TASK_EPISODES = 1024
-"""episodes of a task, about: what a kill costs at most, and enough to make stragglers cheap"""
+TASK_EPISODES = 1024  # about: what a kill costs at most, and enough to make stragglers cheap
 
 Overrides = list[Any]
 

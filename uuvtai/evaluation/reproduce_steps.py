@@ -21,8 +21,7 @@ TRAINED = ("ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model
 EVALUATION_SEED = 90007
 """never trained or tuned on; it is for published figures alone, so do not look at it while you change
 anything"""
-RETIRED_SEEDS = (90001,)
-"""evaluation seeds until somebody saw their failures while tuning; now tuning seeds like any other"""
+RETIRED_SEEDS = (90001,)  # evaluation seeds whose failures somebody saw while tuning; now tuning seeds
 
 
 @dataclass(frozen=True)

@@ -103,8 +103,7 @@ def engine_of(name: str, workers: int, address: str) -> Engine:
 
 ROWS, REQUEST, RESULT = "cells.jsonl", "sweep_request.json", "sweep.json"
 
-MethodKey = tuple[str, str | None, str | None]
-"""(name in the table, controller, policy): exactly one of the last two"""
+MethodKey = tuple[str, str | None, str | None]  # (name in the table, controller, policy): one of the last two
 
 
 class SweepWatch(Protocol):

@@ -423,8 +423,7 @@ _ENDINGS = {"ttc": "TTC stop"}
 _MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_BODIES = 3600.0, 1000.0, 1e4, 1000
 """what is drawn must fit a picture and a video that somebody waits for"""
 _MAX_NUMBERS = 100_000  # of a scenario: corners of paths are drawn in every frame
-_MAX_ARRAYS, _OVERHEAD = 384 << 20, 200
-"""[bytes] all that is drawn together, and what a message takes beyond its arrays"""
+_MAX_ARRAYS, _OVERHEAD = 384 << 20, 200  # [bytes] drawn together, and what a message takes beyond its arrays
 _READERS = {topic.name: topic.read for topic in TOPICS if topic.read is not None}
 VIDEO_TOPICS = tuple(_READERS)
 PICTURE_TOPICS = tuple(topic.name for topic in TOPICS if topic.in_picture)

@@ -174,8 +174,7 @@ class EpisodeHeader:
     config_yaml: str  # the same as text
     scenario: dict[str, Any]  # of ``scenario_document``: everything true about the world, in closed form
     reward_terms: tuple[str, ...] = ()  # names of ``reward.term``'s entries
-    tree_nodes: tuple[str, ...] = ()
-    """names of ``teacher.status``'s entries; numbered by the log where two are equal"""
+    tree_nodes: tuple[str, ...] = ()  # names of ``teacher.status``'s entries; numbered where two are equal
     tree_xml: bytes = b""  # the tree as it was read; empty = unknown
     git_sha: str = "unknown"
     checkpoint_sha256: str = ""  # of the policy's checkpoint; empty = no policy

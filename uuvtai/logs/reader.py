@@ -25,8 +25,7 @@ from mcap.writer import MCAP0_MAGIC
 from uuvtai.common.files import open_file
 from uuvtai.logs.encode import LogError
 
-MAX_RECORD = 64 << 20
-"""[bytes] of a record, and of what a chunk unpacks to: six times the map of a tank of 200 x 100 m"""
+MAX_RECORD = 64 << 20  # [bytes] of a record, and of an unpacked chunk: six times the map of 200 x 100 m
 ZSTD = b"\x28\xb5\x2f\xfd"  # what a frame of zstd begins with
 DAMAGE = (McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError)
 """what the package, zstandard and lz4 raise for bytes that are none of theirs"""

@@ -63,8 +63,7 @@ _LEGEND = (
     (GREY, "true, resting"),
 )
 _HOLD_S = 1.0  # The last frame stays this long.
-_DRAWN_PX = 1280
-"""Narrower frames are drawn this wide and made smaller: the panel below the map needs the room."""
+_DRAWN_PX = 1280  # Narrower frames are drawn this wide and made smaller: the panel below needs the room.
 FORMATS = {".webm": (1280, 15.0), ".mp4": (1280, 15.0), ".gif": (800, 10.0)}
 """what a video's name may end in: (width [px], frames per second) unless told"""
 WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)  # least and most
@@ -369,8 +368,7 @@ class FrameArtist:
 
 Frames = Iterable[np.ndarray]  # images (height, width, 3), blue green red, all of one size
 
-_BT601 = 6
-"""the matrix by which frames are turned into YUV; named in the file, or a player would guess by the height"""
+_BT601 = 6  # the matrix by which frames become YUV; named in the file, or players guess by the height
 _LIMITED_RANGE = 1
 _CODECS: dict[str, tuple[str, dict[str, str]]] = {
     # VP9 as for a call, at its quickest: drawing the frames takes longer

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 # ---- From panels to SVG for the page and PNG for the disk. matplotlib is imported when something is drawn.
 
-INK = "#1b1c1d"
-"""Colour of text, axes and grids: a mark that becomes the page's own text colour, in light and dark"""
+INK = "#1b1c1d"  # text, axes and grids: a mark that becomes the page's own colour, in light and dark
 
 _SVG = "http://www.w3.org/2000/svg"
 _XLINK = "http://www.w3.org/1999/xlink"
@@ -164,11 +163,9 @@ ElementTree.register_namespace("xlink", _XLINK)
 
 _CELL_IN = (0.62, 0.36)
 _MARGIN_IN = (1.15, 0.95)
-_LOG_SPAN = 20.0
-"""A quantity that is positive throughout and spans more than this factor is drawn on a logarithmic axis."""
+_LOG_SPAN = 20.0  # A quantity that is positive and spans more than this factor has a logarithmic axis.
 _ROOM = 0.09  # A stage is named in its bar where it takes more than this share of the longest one.
-_GOLDEN = 0.618034
-"""Stages that follow each other get colours this share of the scale apart, so that neighbours differ."""
+_GOLDEN = 0.618034  # Stages that follow each other get colours this share of the scale apart.
 
 
 @dataclass(frozen=True)

@@ -319,8 +319,7 @@ _SPECIAL = {
 }
 _LETTERS = range(0xC0, 0x100)  # letters with accents that every LaTeX knows in UTF-8
 _NO_LETTERS = (0xD7, 0xF7)
-_COLUMN_CHARACTERS, _GAP = 52, 2
-"""what fits one column of a page, and what a column of the table takes beside its words"""
+_COLUMN_CHARACTERS, _GAP = 52, 2  # what fits one column of a page, and a table's column beside its words
 _MINUS = re.compile(r"(?<![\w.-])-(?=\d)")  # before a number of a table
 _PROSE = "p{0.3\\linewidth}"
 

@@ -39,8 +39,7 @@ class Column:
     prose: bool = False  # may be wrapped between words
     short: str = ""  # head in a terminal, if another one; may hold line breaks
     only: str = ""  # TERMINAL or PAGE; nothing = both
-    of: Callable[[Any], str | Cell] | None = None
-    """from a row to the cell; without, a row is the list of its cells"""
+    of: Callable[[Any], str | Cell] | None = None  # from a row to the cell; without, a row is its cells
 
 
 @dataclass(frozen=True)

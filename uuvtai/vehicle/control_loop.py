@@ -57,8 +57,7 @@ class FlightPlan:
     limits: safety.SafetyLimits
     log: Path
     arms: bool = False  # whether orders are sent; else a dry run
-    heading_rad: float | None = None
-    """compass heading of the world's x axis; None = where the vehicle looks at first"""
+    heading_rad: float | None = None  # compass heading of the world's x axis; None = where the vehicle looks
     seconds: float = math.inf
     rate: float = 1.0
     """seconds of the vehicle's clock in one of ours: a simulated one may be slower or faster; 0 = it is

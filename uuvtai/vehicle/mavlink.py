@@ -227,8 +227,7 @@ MODE_NAMES = {
     0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 7: "CIRCLE", 9: "SURFACE",
     16: "POSHOLD", 19: "MANUAL", 20: "MOTOR_DETECT", 21: "SURFTRAK",
 }  # fmt: skip
-HARMLESS = ("HEARTBEAT", "MAV_CMD_SET_MESSAGE_INTERVAL")
-"""kinds of orders that move nothing: they are sent in a dry run too"""
+HARMLESS = ("HEARTBEAT", "MAV_CMD_SET_MESSAGE_INTERVAL")  # orders that move nothing: sent in a dry run too
 STICK = 600  # of 1000: the farthest that a stick is ever pushed
 FULL_STICK = (1.0, 1.0, 0.6, 2.0)
 """[m/s, m/s, m/s, rad/s] what a full stick is taken to give; the feedback corrects it"""
@@ -307,8 +306,7 @@ def _command(kind: str, number: int, system: int, *given: float) -> Order:
 
 EXTRA = "uuvtai[mavlink]"
 _NEEDED = "pymavlink.dialects.v20"
-_MOST_MESSAGES = 64
-"""of one datagram; a full one of the shortest messages holds no more than that in an Ethernet frame"""
+_MOST_MESSAGES = 64  # of one datagram; a full one of the shortest has no more in an Ethernet frame
 _BROKEN = (ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError)
 
 

@@ -226,8 +226,7 @@ class PilotNumbers:
     estimated: bool  # the pilot estimates its own position, nobody gives it
     dvl_steps: int  # control steps from one expected reading to the next
     beams: int
-    beam_limit: int
-    """beams [0, limit) may follow each other in a ping of a mechanical sonar: a ring goes round"""
+    beam_limit: int  # beams [0, limit) may follow each other in a ping of a mechanical sonar, as in a ring
     mechanical: bool
     doppler: bool
     sonar_latency_steps: int  # control steps from a ping to its scan, always

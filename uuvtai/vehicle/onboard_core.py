@@ -13,8 +13,7 @@ from uuvtai.common.enums import TRIGGERS
 from uuvtai.vehicle.messages import ANY, Inbox, Mission, PilotNumbers, SensorMessage, SonarPing, Tally
 from uuvtai.vehicle.sensor_inputs import FedSensors
 
-_START = [0, 1, 2, 9, 10, 17]
-"""places of the covariance of x, y and heading in the pose filter's (perception/pose.py)"""
+_START = [0, 1, 2, 9, 10, 17]  # places of x, y and heading in the covariance of perception/pose.py
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,7 @@ class StaleLimits:
 class PilotCommand:
     step: int
     time_s: float
-    action: np.ndarray
-    """(4,) float32 in [-1, 1]: surge, sway, heave, yaw rate as shares of the vehicle's limits; zero = stop"""
+    action: np.ndarray  # (4,) float32 in [-1, 1]: surge, sway, heave, yaw rate over the limits; zero = stop
     velocity: np.ndarray  # (4,) the same in m/s and rad/s, body axes
     chosen: np.ndarray  # (4,) the tree's own choice, which ``action`` is unless ``held``
     asked_w: np.ndarray  # (3,) [m/s] velocity that the tree asks for, world

@@ -34,8 +34,7 @@ _SCHEMAS = {
         action=STRING, asked=FOUR, reasons=array_of(STRING), mode=INT, armed=BOOLEAN, speed=NUMBER,
     ),
 }  # fmt: skip
-MOST_SEEN = 10
-"""messages heard in one step that are written; more are counted only, lest a stranger fill the disk"""
+MOST_SEEN = 10  # messages heard in one step that are written; more are counted, lest the disk fill
 
 
 class LinkLog:

@@ -25,8 +25,7 @@ class SafeAction(IntEnum):
     DRIVE = 0  # what the pilot wants, within the limits
     HOLD = 1  # ask for zero speed; ends when its reason does
     SURFACE = 2  # have the autopilot surface; for good
-    HAND_BACK = 3
-    """leave the vehicle to the autopilot's ALT_HOLD and to the operator, and say no more; for good"""
+    HAND_BACK = 3  # leave the vehicle to the autopilot's ALT_HOLD and the operator, and say no more; for good
 
 
 @dataclass(frozen=True)

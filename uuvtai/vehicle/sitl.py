@@ -36,8 +36,7 @@ from uuvtai.vehicle.telemetry import Motors
 _HEAD = struct.Struct("<HHI")
 _CHANNELS = {18458: 16, 29569: 32}  # magic -> channels
 RATES_HZ = (50, 4000)  # physics steps in a second that are believed
-DOUBLED_S = 0.5
-"""ArduSub sends a packet again after a second without an answer; what comes much sooner was doubled"""
+DOUBLED_S = 0.5  # ArduSub repeats a packet after a second without answer; sooner it was doubled
 
 Turn = Literal["reset", "step", "again", "ignore"]
 
@@ -360,8 +359,7 @@ NEXT_PORT = 10  # from one instance's port to the next one's, as ArduPilot count
 SENSORS = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _LONGEST = 128  # [bytes] a longer packet is none of ArduSub's
 _SILENT_S = 2.0  # who has been silent for so long may be followed by somebody else
-LINGER_S = 10.0
-"""of the water's time, that it stays with ``once`` after the episode's end: for the pilot to notice"""
+LINGER_S = 10.0  # of the water's time, that it stays with ``once`` after the end: for the pilot to notice
 _MOST_PEERS = 4
 _MOST_INSTANCES = 64
 PLACES = ("udp:127.0.0.1:14660", "udpout:127.0.0.1:14550")

@@ -27,8 +27,7 @@ NEAR_M, NEAR_RAD = 1.2, math.radians(26.0)  # so far from what was typed a fix i
 LONGEST_S = 60.0  # from the first scan on; without a fix until then the start is refused
 _LEAST_S, _EVERY_S = 1.0, 0.5  # looked at before a fix is sought, and between two searches, at first
 _KEPT_S, _SCAN_RAYS = 45.0, 64
-_TURN_RAD, _REST_S = math.radians(4.0), 0.5
-"""a scan is kept when the vehicle has turned or waited so much since the last one"""
+_TURN_RAD, _REST_S = math.radians(4.0), 0.5  # a scan is kept when turned or waited so much since the last
 _CELL_M, _STEP_RAD = 0.05, math.radians(1.0)  # of the histograms
 _SEARCH_RAYS, _FARTHEST_M = 800, 60.0
 _FLOOR_M, _FLOOR_RAD = 0.02, math.radians(0.3)  # what a fix is never better than: errors that rays share
@@ -39,8 +38,7 @@ _WIDE_RAD = math.radians(12.0)  # sectors that are wider are rangefinders, which
 _NEAREST = np.array([0.0, 0.0, 0.56, 0.85, 1.03, 1.16, 1.27, 1.35, 1.42])
 """standard deviations by which the least of so many normal values falls short of their mean"""
 _GRAZING = 0.4  # cosine of incidence below which a beam may stay without return
-_AGREED = 0.2
-"""square of standard deviations by which a typed start and heading may disagree where no wall decides"""
+_AGREED = 0.2  # square of deviations by which typed start and heading may disagree where no wall decides
 _REST_M_S, _GAP_S = 0.3, 1.0
 """faster is not at rest: what comes then is left out; and attitude or velocity that is missing for longer
 (twice that) leaves unknown where the vehicle has drifted"""

@@ -258,8 +258,7 @@ MOST_KINDS = 64  # senders of a kind of message that are told apart, and reasons
 _FRESH_S = 1.0  # a source that was heard within this time is preferred to a lesser one
 _BATTERY_S = 10.0  # of two tellers of a voltage the lower one counts, while it is heard so often
 _MOST_NAMED = 4
-JUMP_M, _MOST_SPEED_M_S = 0.5, 2.0
-"""a position that moves further than this, and faster than any vehicle, has jumped"""
+JUMP_M, _MOST_SPEED_M_S = 0.5, 2.0  # a position that moves further, and faster than any vehicle, has jumped
 _PASCAL, _MILLI_G = 100.0, 9.80665e-3
 
 Fields = Mapping[str, Any]
@@ -276,8 +275,7 @@ class Heard:
     battery_v: float | None = None
     battery_share: float | None = None
     battery_s: float = -math.inf  # when a voltage or a charge came last
-    rpy: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-    """of the newest attitude, world axes of ours"""
+    rpy: tuple[float, float, float] = (math.nan, math.nan, math.nan)  # of the newest attitude, our world axes
     rpy_s: float = -math.inf  # when it was measured
     vel_b: tuple[float, float, float] | None = None
     vel_b_s: float = -math.inf
@@ -286,8 +284,7 @@ class Heard:
     sticks_s: float = -math.inf  # when the operator's own sticks came
     sticks_moved_s: float = -math.inf  # and when they were off their middle
     granted_s: dict[int, float] = field(default_factory=dict)  # command -> when the autopilot granted it
-    position_jump_s: float = -math.inf
-    """when a position came last that no vehicle reaches from the one before"""
+    position_jump_s: float = -math.inf  # when a position came last that no vehicle reaches from its last
     jumped: str = ""  # how it jumped; '' = it did not
     refused: Counter[str] = field(default_factory=Counter)
     """why messages were not used -> how many; at most ``MOST_KINDS`` reasons"""

@@ -134,11 +134,9 @@ SONAR_ROWS = (
 # ---- What the camera sees: on request whole images, and always what the map takes from them, without which
 # nobody could redo the map.
 
-_NO_RETURN_SHARE = 0.999
-"""As in ``kernels.evidence``: a pixel beyond this share of the camera's range saw nothing."""
+_NO_RETURN_SHARE = 0.999  # as in ``kernels.evidence``: a pixel beyond this share of the range saw nothing
 _PNG_HEAD = struct.Struct(">8s4x4sII")  # signature, first chunk's name, width, height
-_MAX_PIXELS = 1 << 24
-"""of a depth image: a thousand times the camera's, and far below what a small file can claim"""
+_MAX_PIXELS = 1 << 24  # of a depth image: a thousand times the camera's, far below what a file can claim
 
 _DEPTH_LINE = record(
     "uuv.DepthLine",

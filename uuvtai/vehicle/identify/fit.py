@@ -206,8 +206,7 @@ KINDS = ("added mass", "linear damping", "quadratic damping")
 HORIZONS = (1, 10, 100)
 _STRETCH_S = 5.0
 _HELD_OUT = 5  # one stretch in so many is predicted by a fit to the others
-_MOST_SAMPLES = 150_000
-"""of all stretches that are fitted, for each takes some seven kilobytes; 50 minutes at 50 Hz"""
+_MOST_SAMPLES = 150_000  # of all stretches fitted, each some seven kilobytes; 50 minutes at 50 Hz
 _NOTHING_FOUND = 0.02
 """share of an error ahead that is no difference: a fit is better where it is so by more at one horizon, and
 worse by more at none"""

@@ -17,8 +17,7 @@ from uuvtai.vehicle.identify.drive_log import LEAST_LAG_S, Drive, DriveError, me
 
 AXES = ("surge", "sway", "heave", "yaw")
 _OF_SIX = (0, 1, 2, 5)  # where those stand among six
-NET, GAIN = 12, 13
-"""places of net buoyancy and gain, behind added mass, linear and quadratic damping of the four axes"""
+NET, GAIN = 12, 13  # places of net buoyancy and gain, behind added mass and damping of the four axes
 LAG, LATE = 14, (15, 16)  # of the rotors' lag, and of the delays of velocity and yaw rate [s]
 SIZE = 17
 _LONGEST_STEP_S = 0.025
@@ -365,8 +364,7 @@ def settled_starts(
 _FAST_SHARE = (0.12, 0.12, 0.12, 0.15)  # [m/s, m/s, m/s, rad/s] that a tenth of the readings must exceed
 _VARIED = (0.05, 0.05, 0.05, 0.08)  # standard deviation that the speed must have
 _LEAST_READINGS = 200
-_STEP_S, _STEP_RPM, _LEAST_STEPS = 0.1, 300.0, 20
-"""jumps of a commanded speed that the rotors' lag can be seen in"""
+_STEP_S, _STEP_RPM, _LEAST_STEPS = 0.1, 300.0, 20  # jumps of a commanded speed that show the rotors' lag
 LEAST_STRETCHES = 12  # a bootstrap over fewer says nothing
 
 
