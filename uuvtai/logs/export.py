@@ -19,6 +19,7 @@ import numpy as np
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
+from uuvtai.common.errors import ODD
 from uuvtai.common.files import refuse_output, whole_folder
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.encode import LogError
@@ -35,18 +36,6 @@ _OVERHEAD = 64  # [bytes] an array or a number takes beyond its values
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
 """names that open a device on some systems"""
 _MAX_NAME = 100
-_ODD = (
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    ArithmeticError,
-    RecursionError,
-    struct.error,
-    csv.Error,
-    cv2.error,
-)
-"""what a message unlike its schema can raise"""
 
 
 def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt: str = "json") -> list[Path]:
@@ -86,7 +75,7 @@ def _as_log_error(path: Path, out: Path) -> Iterator[None]:
     """What a log unlike its schemas, or the disk, raises, as LogError."""
     try:
         yield
-    except _ODD as error:
+    except (*ODD, struct.error, csv.Error, cv2.error) as error:
         raise LogError(
             f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
             f"{path}"

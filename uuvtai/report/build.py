@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from uuvtai.common.errors import UserError
+from uuvtai.common.errors import ODD, UserError
 from uuvtai.common.files import FileError, read_bytes, refuse_links_in, refuse_output
 from uuvtai.config.loader import ConfigError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
@@ -251,8 +251,7 @@ def checkpoints(folder: Path) -> list[Block]:
 
 
 def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]:
-    """For every policy of an evaluation the training that made it, by the sha256 of its checkpoint's
-    manifest; [] without trainings."""
+    """By its checkpoint's sha256, the training that made each policy of an evaluation; [] without."""
     kept = {
         hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest(): (run.name, path.parent.name)
         for run in trainings
@@ -333,8 +332,7 @@ def refuse_run(run: Path) -> None:
 
 
 def _refuse_place(target: Path, runs: list[Path], force: bool) -> None:
-    """Raise FileError where a file must not be written: what the report of a run wrote before may be renewed,
-    no other file of a run."""
+    """Raise FileError where no file may go: a run's earlier report may be renewed, its other files not."""
     place, renewed = Path(os.path.realpath(target)), force
     for run in (Path(os.path.realpath(run)) for run in runs):
         if place == run / PAGE or place.parent == run / FIGURES:
@@ -467,16 +465,7 @@ def damage_named(run: Path) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except (
-        ArithmeticError,
-        AssertionError,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        SyntaxError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except (*ODD, AssertionError, SyntaxError) as error:
         what = f"{type(error).__name__}: {error}"
         raise ConfigError(
             f"{run}: a result file there is not as this version writes it ({what}); make the run again"

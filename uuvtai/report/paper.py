@@ -16,7 +16,7 @@ from uuvtai.report.blocks import Block, Figure
 from uuvtai.report.build import NOTHING, command_of, damage_named, refuse_run, training_of
 from uuvtai.report.evaluation import causes_table, conditions, evaluation_data, paired_data
 from uuvtai.report.html import all_shown, read_json, shown
-from uuvtai.report.sweep import ON_HOVER, by_method, cells_data, method_of, sweep
+from uuvtai.report.sweep import ON_HOVER, axis_column, by_method, cells_data, method_of, sweep
 from uuvtai.report.tables import (
     PAGE,
     Column,
@@ -28,7 +28,6 @@ from uuvtai.report.tables import (
     number,
     pivot,
     probability,
-    value_name,
     varies_alone,
     varying,
     with_interval,
@@ -288,7 +287,7 @@ def _cells(cells: list[dict[str, Any]], document: dict[str, Any]) -> Table:
     if varies_alone(document):
         where = [Column("changed", left=True, of=lambda cell: change_name(cell, document))]
     else:
-        where = [_axis(name) for name in varying(document["axes"])]
+        where = [axis_column(name) for name in varying(document["axes"])]
     columns = [
         *where,
         Column("method", left=True, of=method_of),
@@ -297,12 +296,6 @@ def _cells(cells: list[dict[str, Any]], document: dict[str, Any]) -> Table:
         Column("collision % [95 %]", of=lambda cell: _interval(cell, "collision")),
     ]
     return Table(columns, cells)
-
-
-def _axis(name: str) -> Column:
-    return Column(
-        axis_name(name), left=True, of=lambda cell: "-" if cell.get(name) is None else value_name(cell[name])
-    )
 
 
 # ---- LaTeX of tables and floats. Whatever a user can name is text in it, never a command.

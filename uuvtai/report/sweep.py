@@ -39,7 +39,7 @@ def cell_table(cells: list[MapCell], document: dict[str, Any], title: str, **pag
     method = Column("method", left=True, of=method_of)
     columns = [
         replace(method, only=PAGE),
-        *(_axis(name) for name in axes_of_cells(cells)),
+        *(axis_column(name) for name in axes_of_cells(cells)),
         *_place(document),
         replace(method, only=TERMINAL),
         SUCCESS,
@@ -60,7 +60,7 @@ def axes_of_cells(cells: list[MapCell]) -> list[str]:
     return list(dict.fromkeys(name for cell in cells for name in place_of(cell)))
 
 
-def _axis(name: str) -> Column:
+def axis_column(name: str) -> Column:
     def value(cell: MapCell) -> str:
         return "-" if cell.get(name) is None else value_name(cell[name])
 

@@ -7,7 +7,6 @@ vector, and a line between two line feeds.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -60,16 +59,6 @@ def reply_of(motion: Motion) -> bytes:
 
 def _vector(values: Sequence[float]) -> str:
     return "[" + ",".join(f"{value:.9g}" for value in values) + "]"
-
-
-def euler_of(quat_wb: Sequence[float]) -> Three:
-    """[rad] roll, pitch, yaw in the axes of the quaternion."""
-    w, x, y, z = (float(value) for value in quat_wb)
-    return (
-        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )
 
 
 # ---- What the sensors beside the autopilot say by MAVLink: a DVL, a sonar, an altimeter.
