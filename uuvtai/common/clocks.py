@@ -19,8 +19,7 @@ _COUNTERS = {"time_boot_ms": 1e3, "time_usec": 1e6}
 
 
 def stamp_of(fields: Mapping[str, Any]) -> tuple[float | None, float]:
-    """(what a message of MAVLink says of its time, after how much its counter begins anew), both in s; None
-    where it has no time."""
+    """(a MAVLink message's time, after how much its counter begins anew) [s]; None = it has no time."""
     for name, units in _COUNTERS.items():
         if name in fields:
             return float(fields[name]) / units, 2**32 / units
@@ -86,8 +85,7 @@ class SourceClock:
         return not is_up and (not self.has_risen or self._still >= SEVERAL)
 
     def _is_sure(self, offset: float, come_s: float) -> bool:
-        """Whether the sender has now said several times in a row that its clock jumped by so much; what comes
-        at one moment counts once."""
+        """Whether the sender has told several times in a row (moments apart) a clock that jumped so."""
         if not abs(offset - self._odd_offset_s) <= JUMP_S:
             self._odd = 0
         self._odd += self._odd == 0 or come_s > self._odd_come_s

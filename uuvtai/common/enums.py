@@ -67,8 +67,7 @@ N_WEIGHT = LAST + (1 + N_HIDDEN) * N_SAID  # of the three layers: biases, then a
 
 
 class Truth:
-    """Base of structs and sections that no stage of the stack may name, nor be handed:
-    ``tests/test_architecture.py`` reads it."""
+    """Base of structs and sections that no stage may name or take (``tests/test_architecture.py``)."""
 
 
 # ---- A policy over a set of bodies in numbers: widths of what it is told, and of the rule that lays its wish

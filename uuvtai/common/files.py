@@ -1,5 +1,4 @@
-"""The one way in for files that a run folder or a stranger brings: regular files only, bounded in size, no
-link that leads elsewhere."""
+"""The one way in for files that a stranger brings: regular, bounded in size, no link elsewhere."""
 
 from __future__ import annotations
 
@@ -175,8 +174,7 @@ def unfinished(target: Path, ending: str = ".tmp") -> Path:
 
 @contextmanager
 def whole_file(target: Path, ending: str = ".tmp") -> Iterator[tuple[BinaryIO, Path]]:
-    """A new file to write, and its name meanwhile; it becomes ``target`` when it is on the disk, and on any
-    error nothing is left. Raises OSError."""
+    """A new file and its name meanwhile; it becomes ``target`` when on the disk, or goes. OSError."""
     signals.engage()
     place = unfinished(target, ending)
     opened = open_new(place)

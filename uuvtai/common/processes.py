@@ -1,5 +1,4 @@
-"""Processes side by side on this machine: they end with the one that started them, however it ends, and what
-a lost one was at is done once more."""
+"""Processes side by side: they end with who started them, and what a lost one did is done again."""
 
 from __future__ import annotations
 
@@ -105,8 +104,7 @@ class LocalEngine:
 
 @contextlib.contextmanager
 def _ctrl_c_held() -> Iterator[None]:
-    """Processes that are started inside do not hear Ctrl-C, which a terminal sends to all of them, before
-    they can leave it to us."""
+    """Processes started inside do not hear Ctrl-C, sent to all by a terminal, before they can ignore it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -96,8 +96,7 @@ def claim(text: str, theirs: str, ours: str, finding: Finding) -> Claim:
 
 
 def judged(claims: Sequence[Claim]) -> list[Claim]:
-    """The claims with final verdicts: a test decides where its p value, adjusted by Holm (1979) over all of
-    them, is below ``LEVEL``."""
+    """The claims with verdicts: a test decides where its Holm-adjusted p is below ``LEVEL``."""
     adjusted = iter(holm_adjusted([c.p for c in claims if c.p is not None]))
     return [_judged(c, next(adjusted)) if c.p is not None else c for c in claims]
 
@@ -122,8 +121,7 @@ class Share:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % Wilson of the independent episodes; everything where there is nothing, None where it is not
-        known."""
+        """95 % Wilson of the independent episodes; everything for nothing, None = not known."""
         if self.design is None:
             return None
         return wilson_interval(self.k / self.design, self.n / self.design) or (0.0, 1.0)

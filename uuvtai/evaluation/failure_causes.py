@@ -50,18 +50,15 @@ TURN_S = 1.2
 """An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it
 was off by more than MISS_M at the end, or there was none."""
 CLEAR_M = 0.1
-"""A body that is remembered farther above or below than this counts as clear of the own depth (what the
-referee calls contact)."""
+"""A body remembered farther above or below counts as clear of the own depth (the referee's contact)."""
 LATELY_S = 2.5  # Remarks look back this far.
 MISS_M = 0.35  # a forecast missed when farther off than the pilot's margin at a second (0.25 m + 0.1 m/s)
 REACH_M = 0.4  # squeezed: something static this near to the hull leaves no room (0.17 + 0.1 m + margin)
 CROWD_M = 0.6  # Crowded: a second moving body came nearer to the hull in the last CROWD_S.
 NEAR_M = 1.0
-"""Contact with something static is no accident of its own when a moving body came this near to the hull in
-the last NEAR_S."""
+"""Contact with something static is no accident of its own with a mover this near in the last NEAR_S."""
 PLACE_M = 0.1
-"""Lost its place: the own position was farther off than the pilot's margin from what stands still
-(``teacher.static_margin_m``)."""
+"""Lost its place: the own position was off by more than the margin (``teacher.static_margin_m``)."""
 DEPTH_M = 0.05
 """Took floor or surface for farther than it was: the own depth was off by more, towards it; the pilot keeps
 the hull 0.03 m off and three standard deviations of the depth."""
@@ -130,8 +127,7 @@ REMARKS: dict[str, Callable[[Fact], bool]] = {
     ),
     "only heave escaped": lambda f: not f["escapes"] and bool(f["escapes_by_heave"]),
 }
-"""What may have contributed, where the killer moves. "Corner passed in reach before": the turn could have
-been learnt."""
+"""What may have contributed, where the killer moves. "Corner passed in reach before": was learnable."""
 
 _IMPLIED = {
     ("unannounced_turn", "turned lately"),
@@ -258,8 +254,7 @@ def _within(value: float | None, limit: float) -> bool:
 # beforehand: nothing is kept of the time before the last ``facts.WINDOW_S`` but a coarse diary.
 
 _SAMPLE_S, _COARSE_S = 0.1, 0.5
-"""Time between samples of the window and between entries of the diary; counted from the start, so that rows
-are read together."""
+"""Time between samples, and entries of the diary; counted from the start, so that rows go together."""
 
 _WINDOW_FIELDS = {
     "vehicle": ("pos_w", "quat_wb", "vel_b", "rate_b"),

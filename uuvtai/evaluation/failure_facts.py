@@ -27,8 +27,7 @@ from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 Array = np.ndarray
 
 _AXIS_SAMPLES = 9
-"""Points along the hull's axis: 25 mm apart, which overestimates the clearance by less than 1 mm (0.0125^2 /
-(2 x 0.27 m + clearance))."""
+"""Points along the hull's axis, 25 mm apart: the clearance is less than 1 mm too large."""
 
 
 def rotation(quat_wb: Array) -> Array:
@@ -117,8 +116,7 @@ def floor_and_surface_gaps(
 
 
 def vertical_gap(pos_w: Array, kind: int, body_w: Array, size: Array) -> Array:
-    """(n,) signed gap [m] from the sonar's plane to a body's vertical extent: positive = the body is above, 0
-    = it crosses the plane."""
+    """(n,) signed gap [m] from the sonar's plane to a body: positive = it is above, 0 = it crosses."""
     rise = body_w[:, 2] - pos_w[:, 2]
     half = size[0] if kind == SPHERE else size[2]
     return np.where(np.abs(rise) > half, rise - np.sign(rise) * half, 0.0)
@@ -127,8 +125,7 @@ def vertical_gap(pos_w: Array, kind: int, body_w: Array, size: Array) -> Array:
 def beam_entries(
     pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array, body_yaw: float, sonar_cfg: SonarConfig
 ) -> Array:
-    """(n, n_ray) range at which each beam enters one body's outline within the sonar's vertical fan; inf = it
-    does not (4-sensing.md)."""
+    """(n, n_ray) range at which each beam enters a body's outline within the vertical fan; inf = none."""
     slope = math.tan(math.radians(sonar_cfg.vertical_half_aperture_deg))
     beams = np.arange(sonar_cfg.n_ray)
     bearing = yaw[:, None] + sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * beams
@@ -205,8 +202,7 @@ class History:
     forecast_w: Array  # (n, n_track, n_forecast, 2)
     forecast_m: Array  # (n, n_track) present radius, negative = no forecast
     forecast_above_w: Array
-    """(n, n_track) z of the lowest edge of what it may hold above the vehicle; the vehicle's own z where it
-    may be level with it"""
+    """(n, n_track) z of the lowest edge it may have above the vehicle; the own z where it may be level"""
     forecast_below_w: Array  # (n, n_track) z of the highest edge of what it may hold below
     conflict: Array  # (n,) bool: the pilot foresees a conflict
     leaf: list[str]  # type of the leaf in charge, "" = none
@@ -318,11 +314,9 @@ def _reach(pos: Array, bodies: Bodies) -> Array:
 
 WINDOW_S = 4.0  # How far back the facts look; a time "ago" that is None lies farther back or never was.
 LEAD_S = 1.0
-"""Forecasts are judged by what they said this long before the end: half a second to react, half a second to
-get out of the way."""
+"""Forecasts are judged by what they said this long before the end: to react, and to get away."""
 SIGHT_S = (1.5, 0.5)
-"""Without a forecast LEAD_S before the end, this interval tells why: mostly out of the fan, mostly hidden, or
-seen but not tracked."""
+"""Without a forecast LEAD_S before the end, why in this interval: out of the fan, hidden, not tracked."""
 TURN_RAD = math.radians(30.0)  # A corner: the body's course changes by more between two samples.
 BACK_RAD = math.radians(120.0)  # A turn back: a corner with more than this.
 BEFORE_TURN_S = 0.1  # The forecast that a turn is judged by was made this long before it.
@@ -334,8 +328,7 @@ NEAR_S = 1.5  # Any moving body counts as near when it was so in this time befor
 CHANCES_S = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 """The last chance: the latest of these times before the end from which some velocity escaped."""
 BLIND_S = 1.0
-"""The own velocity is lost when it was unknown in most of this time before the end; for floor and surface
-heave is enough."""
+"""The own velocity is lost when mostly unknown this time before the end (heave, for floor and surface)."""
 BREAK_S = 0.3  # A leaf that lost charge for no longer than this still counts as in charge.
 LAST_S = 10.0  # Timeouts are judged by their last ten seconds.
 EVADING = ("Evade", "BackOff")  # Leaves that give way to something.
@@ -519,8 +512,7 @@ def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
 
 
 def _course_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
-    """When the killer last turned a corner (a circle has none), and how often it had turned there before
-    within the sonar's reach."""
+    """When the killer last turned a corner (circles have none), and how often there before in reach."""
     vel = history.body_vel_w[:, slot, :2]
     turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(vel[:, 1], vel[:, 0])))))
     corner = (turn > TURN_RAD) & (bodies.circle_m[slot] == 0)

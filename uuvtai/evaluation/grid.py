@@ -291,8 +291,7 @@ class SweepRequest:
 
 
 def request_of(document: dict[str, Any]) -> SweepRequest:
-    """The request that ``document`` came from. Raises KeyError or TypeError for another document, ConfigError
-    for another grid."""
+    """The request of ``document``. KeyError or TypeError for no such document, ConfigError for a grid."""
     one_at_a_time, axes = document["grid"]["one_at_a_time"], document["grid"]["axes"]
     grid = checked(Grid({name: tuple(values) for name, values in axes.items()}, _typed(one_at_a_time, bool)))
     lists = {name: tuple(document[name]) for name in ("controllers", "policies", "seeds")}
@@ -370,8 +369,7 @@ def row_key(label: dict[str, Any], method: str) -> str:
 def tasks_of(
     request: SweepRequest, methods: Sequence[tuple[str, str | None, str | None]], done: set[str]
 ) -> list[Task]:
-    """Tasks for the rows that are not ``done`` (keys). ``methods``: (name, controller, policy), exactly one
-    of the two. ConfigError."""
+    """Tasks for rows not ``done`` (keys). ``methods``: (name, controller or policy). ConfigError."""
     each = len(request.seeds) * request.episodes
     per_task = max(1, TASK_EPISODES // each)
     found = []

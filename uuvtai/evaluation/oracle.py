@@ -65,8 +65,7 @@ def _obstacle(body: dict[str, Any], t_s: Array) -> Obstacle:
 
 
 def level_excess(body: Obstacle, dx: Array, dy: Array) -> tuple[Array, Array]:
-    """(x, y) parts [m] of the way from the body's core to points at (dx, dy) from its middle; the core of a
-    sphere is its centre."""
+    """(x, y) parts [m] of the way from the body's core (a sphere's centre) to points at (dx, dy)."""
     if body.kind == "sphere":
         return dx, dy
     if body.kind == "cylinder":
@@ -172,8 +171,7 @@ class Referee:
             self._forbid(self._base, body, 0, None)
 
     def blocked(self, moving: list[Obstacle], step: int, near: Array) -> Array:
-        """Masks at a time step, right wherever ``near`` (n_z, n_y, n_x) and its neighbours are; elsewhere
-        bodies may be left out."""
+        """Masks at a time step, right wherever ``near`` (n_z, n_y, n_x) and its neighbours are."""
         out = self._base.copy()
         for body in moving:
             self._forbid(out, body, step, near)
@@ -224,8 +222,7 @@ def _widened(box: tuple[slice, slice, slice]) -> tuple[slice, ...]:
 Array = np.ndarray
 
 _DIAGONAL_SHARE = math.sqrt(2.0) - 1.0
-"""Share of the time steps that allow diagonal moves: then the diagonal is as fast as the axes, and what can
-be reached is an octagon."""
+"""Share of the time steps that allow diagonal moves, which then are as fast: the reach is an octagon."""
 
 
 @dataclass(frozen=True)
@@ -261,8 +258,7 @@ def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
 
 
 def _moved(reached: Array, blocked: Array, after: Array, step: int) -> Array:
-    """Nodes that can be reached one step later; ``blocked`` and ``after`` are the referee's masks at both
-    ends of the step."""
+    """Nodes in reach a step later; ``blocked`` and ``after``: the referee's masks at both its ends."""
     out = np.zeros_like(reached)
     for move in _moves_of(step):
         here, there = _shifted(MOVES[move])

@@ -1,5 +1,4 @@
-"""The steps of a reproduction: each is one command of ours in a folder of its own, so that every figure names
-the command that made it."""
+"""The steps of a reproduction: each one command of ours in its own folder, named by its figures."""
 
 from __future__ import annotations
 
@@ -19,8 +18,7 @@ from uuvtai.logs.run_folder import RunFolderError, write_atomic
 TRAINED = ("ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model")
 """presets that are trained; in the ablation's table ``curriculum`` is "Full" and ``ppo`` is "BT distill\""""
 EVALUATION_SEED = 90007
-"""never trained or tuned on; it is for published figures alone, so do not look at it while you change
-anything"""
+"""never trained or tuned on; for published figures alone: do not look while you change things"""
 RETIRED_SEEDS = (90001,)  # evaluation seeds whose failures somebody saw while tuning; now tuning seeds
 
 
@@ -235,7 +233,6 @@ def _can_resume(step: Step, place: Path) -> bool:
 
 
 def _die_with_parent() -> None:
-    """A killed reproduction leaves no training behind that would fight with the next one (Linux; elsewhere it
-    runs to its end)."""
+    """A killed reproduction leaves no training behind to fight the next one (Linux; else it runs on)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG

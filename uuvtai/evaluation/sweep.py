@@ -1,5 +1,4 @@
-"""A sweep's run folder: every finished row is on disk at once, so that a sweep killed at any moment goes on
-where it was."""
+"""A sweep's run folder: finished rows are on disk at once, so a killed sweep goes on from there."""
 
 from __future__ import annotations
 

@@ -265,8 +265,7 @@ def _imu(ros: RosMessages, time_ns: int, turn: Any, rates: Any) -> Any:
 
 
 def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
-    """REP 117: -inf where noise puts a return behind the sonar, NaN where nothing is known, +inf where
-    nothing is."""
+    """REP 117: -inf = noise puts a return behind the sonar, NaN = nothing known, +inf = nothing there."""
     ranges, intensities = np.array(scan["ranges"], np.float32), np.array(scan["intensities"], np.float32)
     first, last = float(scan["start_angle"]), float(scan["end_angle"])
     return ros(

@@ -236,8 +236,7 @@ class FrameArtist:
             canvas.disc(ahead, 5, ROUTE)
 
     def _paint_echoes(self, time_s: float) -> None:
-        """Returns of the newest scan, seen from where it was taken; of a mechanical beam those of the last
-        ``_ECHO_BEAMS``."""
+        """Returns of the newest scan, from where it was taken; of a mechanical one ``_ECHO_BEAMS``."""
         beams = 0
         for ranges, away, hit, ping_s in self.recording["/sonar/scan"].until(time_s):
             x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]

@@ -328,8 +328,7 @@ class EpisodeReader:
 
 
 class EpisodeRecorder(EpisodeReader):
-    """Writes one MCAP file per recorded job; ``paths`` maps each to its file. Unfinished ones stay ``.part``;
-    ``uuv log repair`` reads them."""
+    """Writes an MCAP file per recorded job, ``paths``; unfinished ones stay ``.part`` for uuv log repair."""
 
     def __init__(
         self,

@@ -93,8 +93,7 @@ _OWN = Column("own code: ms a decision", 1, short="own code ms\n(slowest)", of=_
 
 
 def methods_table(methods: list[dict[str, Any]], title: str, **page: Any) -> Table:
-    """One row a method: rates with counts and 95 % Wilson intervals, how the rest ended, both times; the time
-    of the user's own code where there is any."""
+    """One row a method: rates with counts and 95 % Wilson intervals, other ends, times, own code's time."""
     columns = (*_METHODS, _OWN) if any(m.get("own") for m in methods) else _METHODS
     return Table(columns, methods, title, **page)
 
@@ -121,8 +120,7 @@ _PAIRS = (
 
 
 def paired_table(pairs: list[dict[str, Any]], title: str, **page: Any) -> Table:
-    """Every two methods on the episodes that both played (``measure.paired``): who alone arrives, how sure
-    that is, and the difference in time where both do."""
+    """Two methods on the episodes of both: who alone arrives, how sure, difference in time of both."""
     return Table(_PAIRS, pairs, title, **page)
 
 

@@ -30,8 +30,7 @@ _SVG = "http://www.w3.org/2000/svg"
 _XLINK = "http://www.w3.org/1999/xlink"
 _INCH_PX = 96
 _SMALLEST = 0.8
-"""A panel is never shown smaller than this share of its size, or its text could not be read: it scrolls in
-its box instead"""
+"""A panel is never smaller than this share of its size, or nobody could read it: it scrolls instead"""
 
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",

@@ -1,5 +1,4 @@
-"""Blocks of trainings: reward, success, reconstruction and dynamics loss; several seeds of one method as a
-mean line with a band."""
+"""Blocks of trainings: reward, success, losses; seeds of one method as a mean line with a band."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""``uuv pilot``: fifty times a second hear, think, decide, speak. Everything it decides is elsewhere;
-what it says meanwhile is here."""
+"""``uuv pilot``: fifty times a second hear, think, decide, speak. What it decides is elsewhere."""
 
 from __future__ import annotations
 
@@ -60,8 +59,7 @@ class FlightPlan:
     heading_rad: float | None = None  # compass heading of the world's x axis; None = where the vehicle looks
     seconds: float = math.inf
     rate: float = 1.0
-    """seconds of the vehicle's clock in one of ours: a simulated one may be slower or faster; 0 = it is
-    followed"""
+    """seconds of the vehicle's clock in one of ours, if simulated; 0 = it is followed"""
     system: int = 1
     operator: int = 255
     senders: Senders | None = None  # from whom what counts; None = the usual ones of ``system``

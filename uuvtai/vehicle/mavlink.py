@@ -124,8 +124,7 @@ class Endpoint:
 # ---- An endpoint that keeps the vehicle's clock: for a simulated one, be it slower or faster than ours.
 
 SILENT_S = 5.0
-"""by our clock: a vehicle that has told no time for so long is followed no further, lest a dead man's time
-stand still"""
+"""by our clock: who told no time for so long is followed no further, lest time stand still"""
 MOST_WAITING = 512  # datagrams between two steps; older ones are lost
 _FARTHEST_S = 5.0  # a time that jumps by more has begun anew
 _MAGIC, _HEAD, _ENDS = 0xFD, 10, 2  # MAVLink 2: first byte, bytes before and behind the payload
@@ -205,8 +204,7 @@ class FollowedEndpoint(Endpoint):
 
 
 def _messages(datagram: bytes, system: int) -> list[tuple[int, bytes]]:
-    """(number, payload) of the messages of a vehicle's autopilot; anybody's heartbeats too. Checksums are
-    looked at by who reads them."""
+    """(number, payload) of an autopilot's messages and anybody's heartbeats. Checksums are unchecked."""
     found, at = [], 0
     while at + _HEAD < len(datagram) and datagram[at] == _MAGIC:
         size, flags, sender = datagram[at + 1], datagram[at + 2], tuple(datagram[at + 5 : at + 7])

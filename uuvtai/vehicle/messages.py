@@ -32,8 +32,7 @@ class PressureReading:
 
     time_s: float
     depth_m: float
-    """[m] positive down; zeroed at the known start (reading there less the start's depth) unless the
-    position is given"""
+    """[m] positive down; zeroed at the known start (less its depth) unless the position is given"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +51,7 @@ class SonarPing:
 
     time_s: float
     range_m: np.ndarray
-    """(n_ray,) [m] counter-clockwise, beam 0 of a ring ahead, of a fan at its right edge; without a return
-    anything finite"""
+    """(n_ray,) [m] counter-clockwise, beam 0 ahead or at a fan's right edge; finite without return"""
     hit: np.ndarray  # (n_ray,) 1 = return
     doppler_m_s: np.ndarray
     """(n_ray,) [m/s] rate of change of the distance to what returned, own motion included; empty where the

@@ -90,8 +90,7 @@ class OnboardPilot(FedPilot):
     def built(
         cls, config: Config, tree: FlatTree, mission: Mission, limits: StaleLimits | None = None
     ) -> OnboardPilot:
-        """A pilot with a simulator of its own; its kernels are compiled, or found compiled, at the first
-        steps (``uuv warm --num-envs 1``)."""
+        """A pilot with its own simulator, whose kernels are compiled at the first steps (or ``uuv warm``)."""
         return cls(Sim(config, 1, tree), mission, limits)
 
 

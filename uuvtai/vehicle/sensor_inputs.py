@@ -50,8 +50,7 @@ def turned_on(imu: ImuReading, late_s: float) -> np.ndarray:
 
 
 def acceleration_b(imu: ImuReading, vel_b: np.ndarray, gravity_m_s2: float) -> np.ndarray:
-    """(3,) [m/s^2] rate of change of the velocity in body axes: specific force, gravity, and the turning of
-    the axes."""
+    """(3,) [m/s^2] rate of change of the velocity in body axes: specific force, gravity, turning axes."""
     roll, pitch, _ = np.asarray(imu.rpy, np.float64)
     down_b = np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
     turning = np.cross(np.asarray(imu.rate_b, np.float64), np.asarray(vel_b, np.float64))
@@ -125,8 +124,7 @@ class MotionSums:
         return {name: np.array(value) for name, value in vars(self).items()}
 
     def known_now(self, then: OwnPose, noted: dict[str, np.ndarray], time_s: float) -> OwnPose:
-        """``then``, the pose of ``time_s`` as it was taken to be when the sums were those ``noted``, as it is
-        known now."""
+        """``then``, a past pose as taken when the sums were those ``noted``, as it is known now."""
         pos_w, vel_w, bias_w = (getattr(self, name) - noted[name] for name in ("pos_w", "vel_w", "bias_w"))
         return OwnPose(
             then.pos_w + pos_w + time_s * (vel_w - 0.5 * time_s * bias_w),
@@ -174,8 +172,7 @@ class MotionWatch:
         self.sums.feel(accel_b, vel_w, dt)
 
     def note_dvl(self, step: int) -> None:
-        """After the filter's prediction: what a DVL's reading has corrected in it; in other steps there is
-        none of the horizontal pose."""
+        """After the prediction: what a DVL's reading has corrected in it; other steps have none."""
         now = self._own()
         if self._estimated and step > 0 and self._views["ego.dvl_fresh"][0]:
             self.sums.correct(self._expected, now, self._dt * step)

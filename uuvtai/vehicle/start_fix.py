@@ -100,8 +100,7 @@ class Fit:
 
 
 def rays_of(sonar_cfg: SonarConfig, ping: SonarPing, from_m: np.ndarray, yaw: float) -> Rays:
-    """A ping's beams at a place and a yaw. Neighbours of one and the same range are one sector, in which the
-    nearest point returned."""
+    """A ping's beams at a place and a yaw; neighbours of one range are one sector with one return."""
     ranges, hit = np.asarray(ping.range_m, float), np.asarray(ping.hit) > 0
     beams = ping.first_beam + np.arange(len(ranges))
     bearings = yaw + sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * beams

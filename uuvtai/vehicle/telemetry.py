@@ -378,8 +378,7 @@ class Intake:
         self._clocks.clear()
 
     def correct(self, place: tuple[float, float], turn_rad: float) -> tuple[float, float, float]:
-        """Count from where the vehicle is now on: it is at ``place`` [m], and ``turn_rad`` is added to its
-        yaw. Where it is, with its depth."""
+        """Count from ``place`` [m] on, ``turn_rad`` added to the yaw; gives where it is, with its depth."""
         if self._heading is not None:
             self._heading += turn_rad
         roll, pitch, yaw = self.heard.rpy

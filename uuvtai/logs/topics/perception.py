@@ -355,8 +355,7 @@ def _grid(moment: Moment, stamp: str, values: np.ndarray, paint: Paint) -> bytes
 def grid_text(
     stamp: str, frame: str, pose: dict[str, Any], cell_m: float, values: np.ndarray, paint: Paint
 ) -> bytes:
-    """foxglove.Grid of ``values`` (row, col); ``pose``: of the outer corner of cell [0, 0]. Raises ValueError
-    for values that are not finite."""
+    """foxglove.Grid of ``values`` (row, col), its outer corner at ``pose``. ValueError unless finite."""
     if not np.isfinite(values).all():
         raise ValueError("a map with values that are not finite")
     cells = np.empty(values.shape, _CELL)

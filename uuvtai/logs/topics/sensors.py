@@ -232,8 +232,7 @@ def _exact(moment: Moment) -> bytes:
 
 
 def exact_image(data: dict[str, Any], shape: tuple[int, int]) -> np.ndarray:
-    """Depth image [m] of a uuv.DepthExact, float32 (rows, cols). Raises LogError for one that is damaged or
-    has another shape than the config's camera."""
+    """Depth image [m] of a uuv.DepthExact, float32 of ``shape``. Raises LogError for a damaged one."""
     if (data["rows"], data["columns"]) != shape:
         raise LogError(
             f"an exact depth image of the log has {data['rows']} x {data['columns']} pixels, but its "

@@ -269,8 +269,7 @@ def function_name(number: int) -> str:
 
 
 def library_of(kernels: Sequence[RecordedKernel], kind: MachineKind) -> bytes:
-    """A shared library with a function ``function_name(i)(arguments, runtime)`` for each kernel, and
-    ``uuv_parallel_for``. Raises CrossError."""
+    """Library with ``function_name(i)(arguments, runtime)`` a kernel, ``uuv_parallel_for``. CrossError."""
     words = linker()
     objects = [_object(PARALLEL_FOR, kind, "uuv_parallel_for")]
     for number, kernel in enumerate(kernels):

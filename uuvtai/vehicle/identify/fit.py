@@ -143,8 +143,7 @@ def _left_open(
 
 
 def _bootstrap(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(low, high) (k,) about the fit: one Gauss-Newton step for each draw of stretches, widened for the
-    parameters that were spent."""
+    """(low, high) (k,) about the fit: a Gauss-Newton step per draw of stretches, widened for parameters."""
     square, right = _apart(jacobian, own, rest)
     count, size = right.shape
     if not size:
@@ -208,8 +207,7 @@ _STRETCH_S = 5.0
 _HELD_OUT = 5  # one stretch in so many is predicted by a fit to the others
 _MOST_SAMPLES = 150_000  # of all stretches fitted, each some seven kilobytes; 50 minutes at 50 Hz
 _NOTHING_FOUND = 0.02
-"""share of an error ahead that is no difference: a fit is better where it is so by more at one horizon, and
-worse by more at none"""
+"""a smaller share of an error ahead is no difference: fits are compared at every horizon by it"""
 _LOOSE = 0.5  # An interval wider than this share of the value, to either side, is warned of.
 _OTHERS = {
     model.NET: ("net buoyancy", "N"),

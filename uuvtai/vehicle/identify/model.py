@@ -282,8 +282,7 @@ def linearised(
     free: np.ndarray,
     noise: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(s, readings, free), (s, readings, 4), (s, readings): derivatives and what is left, in units of
-    noise."""
+    """(s, readings, free), (s, readings, 4), (s, readings): derivatives and rest, in units of noise."""
     places = np.flatnonzero(free)
     runs = 1 + len(places) + len(AXES)
     theta, begin = np.tile(value, (runs, 1)), np.tile(start, (runs, 1, 1))
