@@ -221,16 +221,8 @@ def _hershey_text(
     scale, thickness = size / 28.0, 2 if bold and size >= 20 else 1
     (width, _), _ = cv2.getTextSize(plain, cv2.FONT_HERSHEY_DUPLEX, scale, thickness)
     x = place[0] - {"left": 0, "center": width / 2, "right": width}[align]
-    cv2.putText(
-        image,
-        plain,
-        (round(x), round(place[1])),
-        cv2.FONT_HERSHEY_DUPLEX,
-        scale,
-        color,
-        thickness,
-        cv2.LINE_AA,
-    )
+    corner, font = (round(x), round(place[1])), cv2.FONT_HERSHEY_DUPLEX
+    cv2.putText(image, plain, corner, font, scale, color, thickness, cv2.LINE_AA)
     return int(width)
 
 
@@ -484,14 +476,10 @@ def _check_scenario(path: Path, scenario: Any) -> None:
         extents = [float(tank[axis][1]) - float(tank[axis][0]) for axis in ("x_m", "y_m")]
         if not all(0 < extent <= _MAX_EXTENT_M for extent in extents):
             raise ValueError(f"a tank of {extents[0]:g} x {extents[1]:g} m")
-        numbers = list(
-            itertools.islice(_numbers([tank, bodies, scenario["goal"], scenario["start"]]), _MAX_NUMBERS + 1)
-        )
-        if (
-            len(numbers) > _MAX_NUMBERS
-            or len(bodies) > _MAX_BODIES
-            or not all(abs(number) <= _FARTHEST_M for number in numbers)
-        ):
+        all_numbers = _numbers([tank, bodies, scenario["goal"], scenario["start"]])
+        numbers = list(itertools.islice(all_numbers, _MAX_NUMBERS + 1))
+        is_near = all(abs(number) <= _FARTHEST_M for number in numbers)
+        if not is_near or len(numbers) > _MAX_NUMBERS or len(bodies) > _MAX_BODIES:
             raise ValueError("bodies beyond all bounds")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
         raise LogError(

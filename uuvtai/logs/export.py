@@ -88,11 +88,8 @@ def _as_log_error(path: Path, out: Path) -> Iterator[None]:
 
 def file_name(name: str) -> str:
     """A plain file name from any topic's or attachment's name: no folders, hidden files, options, devices."""
-    plain = (
-        re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/"))
-        .lstrip(".-")[:_MAX_NAME]
-        .rstrip(".")
-    )
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/"))
+    plain = plain.lstrip(".-")[:_MAX_NAME].rstrip(".")
     return f"_{plain}" if _RESERVED.fullmatch(plain) else plain or "unnamed"
 
 
@@ -137,9 +134,8 @@ def _files(topics: list[str], ending: str, names: _Names) -> Iterator[dict[str, 
 def _write_jsonl(path: Path, topics: list[str], names: _Names) -> None:
     with _files(topics, "jsonl", names) as files:
         for message in read_messages(path, topics):
-            files[message.topic].write(
-                json.dumps({"t": message.time_s, **message.data}, separators=(",", ":")) + "\n"
-            )
+            line = json.dumps({"t": message.time_s, **message.data}, separators=(",", ":"))
+            files[message.topic].write(f"{line}\n")
 
 
 def _write_csv(path: Path, topics: list[str], names: _Names) -> None:
@@ -172,9 +168,8 @@ def _write_npz(path: Path, topics: list[str], names: _Names) -> None:
     rows: dict[str, list[dict[str, np.ndarray]]] = {topic: [] for topic in topics}
     size = 0
     for message in read_messages(path, topics):
-        row = {
-            name: np.asarray(value) for name, value in {"t": message.time_s, **_arrays(message.data)}.items()
-        }
+        values = {"t": message.time_s, **_arrays(message.data)}
+        row = {name: np.asarray(value) for name, value in values.items()}
         size += sum(array.nbytes + _OVERHEAD for array in row.values())
         if size > MAX_ARRAYS:
             raise LogError(
@@ -205,29 +200,19 @@ def flattened(value: Any, name: str = "") -> dict[str, Any]:
     """Dotted names to plain values; packed bytes are left out."""
     if isinstance(value, dict):
         items = {f"{name}.{key}" if name else key: inner for key, inner in value.items() if key != "data"}
-        return {
-            key: leaf
-            for inner_name, inner in items.items()
-            for key, leaf in flattened(inner, inner_name).items()
-        }
-    if isinstance(value, list):
-        return {
-            key: leaf
-            for i, inner in enumerate(value)
-            for key, leaf in flattened(inner, f"{name}.{i}").items()
-        }
-    return {name: value}
+    elif isinstance(value, list):
+        items = {f"{name}.{i}": inner for i, inner in enumerate(value)}
+    else:
+        return {name: value}
+    return {key: leaf for where, inner in items.items() for key, leaf in flattened(inner, where).items()}
 
 
 def _arrays(data: dict[str, Any]) -> dict[str, Any]:
     """One message's arrays: lists of numbers as they are, grids and images unpacked, null as NaN."""
     if "cell_stride" in data:
         origin = data["pose"]["position"]
-        return {
-            "value": grid_values(data),
-            "origin_m": [origin["x"], origin["y"]],
-            "cell_m": data["cell_size"]["x"],
-        }
+        place = {"origin_m": [origin["x"], origin["y"]], "cell_m": data["cell_size"]["x"]}
+        return {"value": grid_values(data), **place}
     if data.get("format") == "png":
         return {"intensity" if data["frame_id"] == "sonar" else "depth_mm": logged_image(data)}
     found: dict[str, Any] = {}
@@ -264,11 +249,8 @@ def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
     exists and ``force`` is not set.
     """
     path = Path(path)
-    out = (
-        path.with_name(_PART.sub("", path.name).removesuffix(".mcap") + ".repaired.mcap")
-        if out is None
-        else Path(out)
-    )
+    stem = _PART.sub("", path.name).removesuffix(".mcap")
+    out = path.with_name(f"{stem}.repaired.mcap") if out is None else Path(out)
     declared = _declared(path)
     refuse_output(out, [path], force)
     try:

@@ -228,10 +228,8 @@ def _motion(ros: RosMessages, setup: Setup, time_ns: int, step: Step) -> Iterato
         yield "/imu/data", _imu(ros, time_ns, turn, measured["rates"])
     pressure = SURFACE_PA + measured["depth_m"] * setup.pa_per_m
     head = ros.header(time_ns, "base")
-    yield (
-        "/pressure",
-        ros("sensor_msgs/msg/FluidPressure", header=head, fluid_pressure=pressure, variance=0.0),
-    )
+    told = ros("sensor_msgs/msg/FluidPressure", header=head, fluid_pressure=pressure, variance=0.0)
+    yield "/pressure", told
 
 
 def _odometry(
@@ -514,11 +512,8 @@ def _read_odometry(reader: Reader, message: Any) -> bytes:
 
 def _read_imu(reader: Reader, message: Any) -> bytes:
     """What a covariance of -1, or an orientation of zeros, says is not measured is null."""
-    q, attitude, acceleration = (
-        message.orientation,
-        message.orientation_covariance[0],
-        message.linear_acceleration_covariance[0],
-    )
+    q, attitude = message.orientation, message.orientation_covariance[0]
+    acceleration = message.linear_acceleration_covariance[0]
     return dumped(
         {
             **reader.head(message.header),

@@ -124,11 +124,8 @@ def _filmed(
 
 def _check_film(width_px: int, fps: float, speed: float) -> None:
     """Raise LogError for a width, a rate or a speed beyond what a film may have."""
-    for name, value, (least, most) in (
-        ("--width", width_px, WIDTHS),
-        ("--fps", fps, FPS),
-        ("--speed", speed, SPEEDS),
-    ):
+    given = ("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)
+    for name, value, (least, most) in given:
         if not least <= value <= most:
             raise LogError(f"{name} {value:g}: must be from {least:g} to {most:g}")
 
@@ -166,11 +163,8 @@ def _sized(frame: np.ndarray, width_px: int) -> np.ndarray:
     """The frame in this width (one less where that is odd), with an even height, as the codecs want it."""
     height, width = frame.shape[:2]
     wanted = width_px - width_px % 2
-    return (
-        frame
-        if wanted == width
-        else cv2.resize(frame, (wanted, 2 * round(height * wanted / width / 2)), interpolation=cv2.INTER_AREA)
-    )
+    size = wanted, 2 * round(height * wanted / width / 2)
+    return frame if wanted == width else cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
 
 
 class FrameArtist:
@@ -250,11 +244,8 @@ class FrameArtist:
                 return
 
     def _paint_goal(self) -> None:
-        canvas, goal, radius = (
-            self._canvas,
-            self.recording.scenario["goal"],
-            self.recording.scenario["goal_radius_m"],
-        )
+        canvas, scenario = self._canvas, self.recording.scenario
+        goal, radius = scenario["goal"], scenario["goal_radius_m"]
         angles = np.linspace(0, 2 * np.pi, 72)
         canvas.dashes(np.array(goal[:2]) + radius * np.column_stack([np.cos(angles), np.sin(angles)]), INK, 1)
         canvas.star(goal, 14)
@@ -262,11 +253,8 @@ class FrameArtist:
     def _paint_head(self, time_s: float) -> None:
         canvas, recording, scenario = self._canvas, self.recording, self.recording.scenario
         width = canvas.image.shape[1]
-        title = (
-            f"{recording.method} · {scenario['world']} · seed {scenario['seed']} · episode "
-            f"{scenario['episode']}"
-        )
-        end = 24 + canvas.text((24, 34), title, 22, INK, bold=True)
+        which = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
+        end = 24 + canvas.text((24, 34), f"{recording.method} · {which}", 22, INK, bold=True)
         canvas.text((end + 20, 34), self.remark, 17, FAILED)
         moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
         canvas.text(
@@ -278,9 +266,8 @@ class FrameArtist:
         canvas.text((width - 28, 36), f"{time_s:5.1f} s", 26, INK, bold=True, align="right")
         if time_s >= recording.duration_s:
             good = recording.outcome == "success"
-            canvas.text(
-                (width - 150, 36), recording.ending, 24, _GOOD if good else FAILED, bold=True, align="right"
-            )
+            ink = _GOOD if good else FAILED
+            canvas.text((width - 150, 36), recording.ending, 24, ink, bold=True, align="right")
 
     # -------------------------------------------------------------------------------------------- panel below
 
@@ -290,16 +277,10 @@ class FrameArtist:
         safety, leaf, speed = (recording[name].at(time_s) for name in ("/safety", "/action", "/state"))
         clearance = None if safety is None else safety[0]
         near = clearance is not None and clearance < 0.3
-        self._figure(
-            24, top, "clearance", "-" if clearance is None else f"{clearance:.2f} m", FAILED if near else INK
-        )
-        self._figure(
-            164,
-            top,
-            "time to collision",
-            "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s",
-            INK,
-        )
+        said = "-" if clearance is None else f"{clearance:.2f} m"
+        self._figure(24, top, "clearance", said, FAILED if near else INK)
+        said = "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s"
+        self._figure(164, top, "time to collision", said, INK)
         self._figure(320, top, "speed", "-" if speed is None else f"{speed:.2f} m/s", INK)
         canvas.text((24, top + 86), "tree", 15, GREY)
         canvas.text((24, top + 112), leaf or "-", 21, INK, bold=True)
@@ -353,14 +334,8 @@ class FrameArtist:
         for at, trigger in replans:
             if at <= time_s:
                 px = round(float(place(np.array([at]), np.zeros(1))[0, 0]))
-                cv2.line(
-                    canvas.image,
-                    (px, low),
-                    (px, low - 12),
-                    _TRIGGER_COLORS.get(trigger, GREY),
-                    2,
-                    cv2.LINE_AA,
-                )
+                ink = _TRIGGER_COLORS.get(trigger, GREY)
+                cv2.line(canvas.image, (px, low), (px, low - 12), ink, 2, cv2.LINE_AA)
 
 
 # ---- Frames into a file: WebM (VP9), MP4 (H.264) and GIF, at a quality rather than a bit rate.
@@ -386,11 +361,9 @@ def write_film(
     A GIF gets the colours of ``samples``, which are frames, and the ``inks``, which may be rare and must stay
     what they are.
     """
-    return (
-        _write_gif(part, frames, fps, samples, inks)
-        if part.suffix == ".gif"
-        else _write_video(part, frames, fps)
-    )
+    if part.suffix == ".gif":
+        return _write_gif(part, frames, fps, samples, inks)
+    return _write_video(part, frames, fps)
 
 
 def check_whole(part: Path, n_frames: int, out: Path) -> None:
@@ -455,11 +428,8 @@ def _write_gif(
 
 def _palette(samples: Sequence[np.ndarray], inks: Sequence[Color]) -> np.ndarray:
     """(256, 3) red green blue."""
-    found = (
-        _image(np.concatenate(samples)).quantize(256 - len(inks), dither=Image.Dither.NONE).getpalette("RGB")
-        or []
-    )
-    known = [*(ink[::-1] for ink in inks), *np.reshape(found, (-1, 3))]
+    seen = _image(np.concatenate(samples)).quantize(256 - len(inks), dither=Image.Dither.NONE)
+    known = [*(ink[::-1] for ink in inks), *np.reshape(seen.getpalette("RGB") or [], (-1, 3))]
     return np.array([*known, *[known[0]] * (256 - len(known))], np.uint8)
 
 

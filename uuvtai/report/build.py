@@ -236,14 +236,8 @@ def checkpoints(folder: Path) -> list[Block]:
         manifest = read_json(folder, str(path.relative_to(folder))) or {}
         files = manifest.get("files", {})
         digest = (files.get("model.safetensors") or {}).get("sha256", "-")
-        rows.append(
-            [
-                path.parent.name,
-                str(manifest.get("step", "-")),
-                number(manifest.get("score"), 3),
-                str(digest)[:16],
-            ]
-        )
+        step, score = str(manifest.get("step", "-")), number(manifest.get("score"), 3)
+        rows.append([path.parent.name, step, score, str(digest)[:16]])
     if not rows:
         return []
     columns = heads("checkpoint", "iteration", "score", "sha256 of the model (first 16 digits)")

@@ -201,17 +201,11 @@ _PLAIN = (
 def evaluation_data(methods: list[Method]) -> Data:
     """Counts, rates, bounds and times of every method as numbers."""
     bounds = ("success_ci95_low", "success_ci95_high", "collision_ci95_low", "collision_ci95_high")
-    rows = [
-        [
-            m["name"],
-            m["episodes"],
-            *(m["outcomes"][name] for name in ENDINGS),
-            *(m["success_ci95"] or (None, None)),
-            *(m["collision_ci95"] or (None, None)),
-            *(m.get(name) for name in _PLAIN),
-        ]
-        for m in methods
-    ]
+    rows = []
+    for m in methods:
+        rates = [*(m["success_ci95"] or (None, None)), *(m["collision_ci95"] or (None, None))]
+        counts = [m["outcomes"][name] for name in ENDINGS]
+        rows.append([m["name"], m["episodes"], *counts, *rates, *(m.get(name) for name in _PLAIN)])
     return Data(["method", "episodes", *ENDINGS, *bounds, *_PLAIN], rows)
 
 
@@ -224,29 +218,16 @@ def _rates_figure(methods: list[Method], command: str) -> Figure:
         )
         for key in ("success", "collision")
     ]
-    return Figure(
-        "methods",
-        panels,
-        "Success and collision of every method with 95 % Wilson intervals",
-        evaluation_data(methods),
-        command,
-    )
+    caption = "Success and collision of every method with 95 % Wilson intervals"
+    return Figure("methods", panels, caption, evaluation_data(methods), command)
 
 
 def _rates_line(place: int, method: Method, key: str, colour: str) -> Line:
     """The one point of a method; none where it played nothing."""
     if method[f"{key}_rate"] is None:
         return Line(method["name"], [], [], [], [], colour=colour)
-    low, high = method[f"{key}_ci95"]
-    return Line(
-        method["name"],
-        [place],
-        [method[f"{key}_rate"]],
-        [low],
-        [high],
-        [f"{method['name']}\n{rates_text(method)}"],
-        colour,
-    )
+    name, value, (low, high) = method["name"], method[f"{key}_rate"], method[f"{key}_ci95"]
+    return Line(name, [place], [value], [low], [high], [f"{name}\n{rates_text(method)}"], colour)
 
 
 _PAIRED = (

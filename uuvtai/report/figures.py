@@ -99,7 +99,8 @@ def styled(own: Mapping[str, Any] = _STYLE) -> Iterator[None]:
     import matplotlib
 
     inks = dict.fromkeys(_INKED, INK)
-    with matplotlib.rc_context({**matplotlib.rcParamsDefault, **_COMMON, **inks, **own}):
+    settings: Any = {**matplotlib.rcParamsDefault, **_COMMON, **inks, **own}
+    with matplotlib.rc_context(settings):
         yield
 
 
@@ -218,19 +219,11 @@ def _draw_cell(axes: Axes, place: Place, key: str, identity: str) -> tuple[str, 
     axes.add_patch(box)
     ink = INK if value is None else ink_on(ground)
     middle = place.first + place.n_columns / 2
-    axes.text(
-        middle,
-        place.row + 0.34,
-        percent(value, 0),
-        color=ink,
-        ha="center",
-        va="center",
-        fontsize=8.5,
-        fontweight="bold",
-    )
+    centred: Any = {"color": ink, "ha": "center", "va": "center"}
+    axes.text(middle, place.row + 0.34, percent(value, 0), fontsize=8.5, fontweight="bold", **centred)
     mean_s = place.cell.get("time_to_success_mean_s")
     below = "" if mean_s is None else f"{number(mean_s)} s"
-    axes.text(middle, place.row + 0.73, below, color=ink, ha="center", va="center", fontsize=7)
+    axes.text(middle, place.row + 0.73, below, fontsize=7, **centred)
     return identity, hover_text(place.cell)
 
 
@@ -273,14 +266,8 @@ def curves(lines: Sequence[Line], title: str, x_label: str, share: bool = False,
             few = {"marker": "o", "markersize": 3} if len(line.x) <= 12 else {}
             axes.plot(line.x, [scale * y for y in line.y], color=colour, label=line.name, **few)
             if line.low is not None and line.high is not None:
-                axes.fill_between(
-                    line.x,
-                    [scale * y for y in line.low],
-                    [scale * y for y in line.high],
-                    color=colour,
-                    alpha=0.2,
-                    linewidth=0,
-                )
+                low, high = ([scale * y for y in bound] for bound in (line.low, line.high))
+                axes.fill_between(line.x, low, high, color=colour, alpha=0.2, linewidth=0)
         _frame(axes, lines, share, zero)
         return {}
 

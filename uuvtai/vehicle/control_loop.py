@@ -264,10 +264,8 @@ class OnboardLoop:
 
     def _leave(self, reasons: tuple[str, ...]) -> None:
         """Stop and hand back until the vehicle has left our mode, whatever error or Ctrl-C comes."""
-        self.last, self._is_leaving = (
-            safety.SafeDecision(safety.SafeAction.HAND_BACK, safety.STOP, reasons),
-            True,
-        )
+        self.last = safety.SafeDecision(safety.SafeAction.HAND_BACK, safety.STOP, reasons)
+        self._is_leaving = True
         until_s = time.monotonic() + _GIVE_BACK_S / min(self._rate, 1.0)
         heard, dt = self._intake.heard, self._config.episode.control_dt_s
         while not self._handover.ended and time.monotonic() < until_s:
@@ -536,11 +534,8 @@ def fly(
             endpoint.forget()  # what came while kernels were compiled
             fix = StartFix(config, plan.mission.start)
             loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix)
-            what = (
-                "ARMS AND DRIVES the vehicle"
-                if plan.arms
-                else "dry run: no order that moves the vehicle is sent"
-            )
+            dry = "dry run: no order that moves the vehicle is sent"
+            what = "ARMS AND DRIVES the vehicle" if plan.arms else dry
             where = "speaks to" if plan.place.calls else "listens at"
             loop.tell(f"{what}; {where} {plan.place.host}:{plan.place.port}; Ctrl-C gives the vehicle back")
             try:

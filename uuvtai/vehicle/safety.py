@@ -148,11 +148,9 @@ def _tilted(view: VehicleView, limits: SafetyLimits) -> str:
     upright = math.cos(view.rpy[0]) * math.cos(view.rpy[1]) if all(map(math.isfinite, view.rpy)) else math.nan
     if upright >= math.cos(limits.tilt_rad):
         return ""
-    return (
-        f"tilted by {math.degrees(math.acos(upright)):.0f} degrees"
-        if math.isfinite(upright)
-        else "no attitude"
-    )
+    if not math.isfinite(upright):
+        return "no attitude"
+    return f"tilted by {math.degrees(math.acos(upright)):.0f} degrees"
 
 
 def _outside(view: VehicleView, limits: SafetyLimits) -> str:

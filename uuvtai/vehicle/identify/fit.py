@@ -330,9 +330,7 @@ def _judged(
             text: places for i in range(len(model.AXES)) for text, places in _worse(i, horizons, made.free)
         }
         given += worse
-        held.update(
-            place for places in worse.values() for place in (*places, model.GAIN)
-        )  # what it is given for
+        held.update(place for places in worse.values() for place in (*places, model.GAIN))
         left = made.free.copy()
         left[list(held)] = False
         if not left[: model.NET + 1].any():
@@ -424,11 +422,8 @@ def _horizons(
     where this one sets out."""
     held = np.arange(len(given.velocity)) % _HELD_OUT == _HELD_OUT - 1
     first, found = values
-    seen, unseen, late = (
-        given.some(~held),
-        given.some(held),
-        free & np.isin(np.arange(model.SIZE), model.LATE),
-    )
+    seen, unseen = given.some(~held), given.some(held)
+    late = free & np.isin(np.arange(model.SIZE), model.LATE)
     fits = (("identified", found, free), ("given", first, late))
     models = {name: fitted(seen, vehicle_cfg, begin, which).value for name, begin, which in fits}
     return {
@@ -481,12 +476,8 @@ def identify(
         with whole_file(path) as (file, _):
             file.write(content)
     warnings = [*found.document["warnings"], *notes]
-    return {
-        **found.document,
-        "warnings": warnings,
-        "files": [str(file) for file in files],
-        "vehicle": str(out),
-    }
+    named = {"files": [str(file) for file in files], "vehicle": str(out)}
+    return {**found.document, "warnings": warnings, **named}
 
 
 def _drives(
