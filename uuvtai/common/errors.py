@@ -4,8 +4,7 @@ from __future__ import annotations
 
 
 class UserError(Exception):
-    """A refusal: what is wrong, where, why, and what to type next. The command line prints it as one message
-    and ends with exit code 2."""
+    """A refusal: what is wrong, where, why, what to type next. The command prints it, exit code 2."""
 
 
 class SettingError(UserError, ValueError):
