@@ -25,3 +25,7 @@ class DeviceError(UserError, RuntimeError):
 
 class OwnCodeError(UserError, RuntimeError):
     """A piece that the user brought has failed; its ``__cause__`` is what was raised in her code."""
+
+
+ODD = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""what reading data of another shape than expected can raise"""

@@ -22,8 +22,6 @@ from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import LogHead, read_head, read_messages, records
 from uuvtai.logs.ros2 import NAMES, READ, SOURCES, WRITTEN, Reader, RosMessages, Setup, ros_messages
 
-_ODD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
-
 
 def converted(file: Path, out: Path | None, source: str, force: bool) -> tuple[Path, int, list[str]]:
     """A log as a bag or a bag as a log: (what was written, how many messages, what was left out). Raises
