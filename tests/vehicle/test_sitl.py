@@ -12,6 +12,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
+from scipy.spatial.transform import Rotation
 
 from tests.command import uuv
 from tests.mavlink_vehicle import START, free_port, link_config
@@ -22,7 +23,7 @@ from uuvtai.vehicle import sitl
 from uuvtai.vehicle.mavlink import LinkError, LinkPlace, MavCodec
 from uuvtai.vehicle.onboard import DvlReading, SonarPing
 from uuvtai.vehicle.sitl import Instance, SitlPlan, SitlPort, WaterRows, frame_of, turn_of
-from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, euler_of, reply_of
+from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
 from uuvtai.vehicle.telemetry import Intake, Motors
 
 NEUTRAL = (1500,) * 16
@@ -95,7 +96,8 @@ def test_turning_over_the_axes_turns_attitudes_over():
         quat = [math.cos(half), 0.0, 0.0, 0.0]
         quat[axis] = math.sin(half)
         turned = json.loads(reply_of(Motion(0, (0, 0, 0), (0, 0, 0), tuple(quat), (0, 0, 0), (0, 0, 0), 1)))
-        ours, theirs = euler_of(quat), euler_of(turned["quaternion"])
+        quats = np.roll([quat, turned["quaternion"]], -1, axis=1)  # SciPy has w last
+        ours, theirs = Rotation.from_quat(quats).as_euler("xyz")
         assert ours[axis - 1] == pytest.approx(2 * half)
         assert theirs[axis - 1] == pytest.approx(sign * 2 * half)
 

@@ -10,21 +10,16 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-JUMP_S = 1.0
-"""a clock that is off by more has jumped, or its message is late"""
-SEVERAL = 5
-"""moments in a row at which a sender contradicts its clock; then it is believed"""
-_DRIFT = 1e-4
-"""two clocks run apart by no more"""
-_OVERRUN_S = 10.0
-"""next to where its clock should be by so much, a small stamp is that of a counter that ran over"""
+JUMP_S = 1.0  # a clock that is off by more has jumped, or its message is late
+SEVERAL = 5  # moments in a row at which a sender contradicts its clock; then it is believed
+_DRIFT = 1e-4  # two clocks run apart by no more
+_OVERRUN_S = 10.0  # so near to where its clock should be, a small stamp is of a counter that ran over
 _COUNTERS = {"time_boot_ms": 1e3, "time_usec": 1e6}
 """field of MAVLink: units in a second, 32 bits of them unless a stamp has more"""
 
 
 def stamp_of(fields: Mapping[str, Any]) -> tuple[float | None, float]:
-    """(what a message of MAVLink says of its time, after how much its counter begins anew), both in s; None
-    where it has no time."""
+    """(a MAVLink message's time, after how much its counter begins anew) [s]; None = it has no time."""
     for name, units in _COUNTERS.items():
         if name in fields:
             return float(fields[name]) / units, 2**32 / units
@@ -90,8 +85,7 @@ class SourceClock:
         return not is_up and (not self.has_risen or self._still >= SEVERAL)
 
     def _is_sure(self, offset: float, come_s: float) -> bool:
-        """Whether the sender has now said several times in a row that its clock jumped by so much; what comes
-        at one moment counts once."""
+        """Whether the sender has told several times in a row (moments apart) a clock that jumped so."""
         if not abs(offset - self._odd_offset_s) <= JUMP_S:
             self._odd = 0
         self._odd += self._odd == 0 or come_s > self._odd_come_s

@@ -1,13 +1,11 @@
-"""Colours that page, figures, pictures, videos and terminal share, of methods too; the colour-blind can tell
-them apart."""
+"""Colours that page, figures, pictures, videos and terminal share, also for the colour-blind."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 _ANCHORS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725")
-"""Viridis (Smith and van der Walt 2015) at every eighth: its lightness rises evenly, also in grey and to
-every kind of colour vision."""
+"""Viridis (Smith and van der Walt 2015) at every eighth: its lightness rises evenly for all eyes."""
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito 2008 without black and yellow, which a dark or a light page would swallow."""
@@ -30,15 +28,13 @@ _METHODS = {
 }
 _TRUTH = "+truth"
 _SPARE = (_PURPLE, _BROWN, _VIOLET, _SKY, _GREEN, _ORANGE, _BLUE)
-"""For methods without a colour of their own, in this order. Vermillion means moving bodies in pictures, so no
-method has it."""
+"""For methods without a colour, in this order. Vermillion is for moving bodies in pictures."""
 
 DARK, LIGHT = "#000000", "#ffffff"
 
 
 def shade(share: float) -> str:
-    """'#rrggbb' of a share in [0, 1]: dark is little, bright is much. Shares outside are taken as the nearest
-    end."""
+    """'#rrggbb' of a share: dark is little, bright is much. Outside [0, 1] the nearest end is taken."""
     place = min(max(share, 0.0), 1.0) * (len(_ANCHORS) - 1)
     below = min(int(place), len(_ANCHORS) - 2)
     low, high = _channels(_ANCHORS[below]), _channels(_ANCHORS[below + 1])
@@ -48,8 +44,7 @@ def shade(share: float) -> str:
 
 
 def method_colours(names: Sequence[str]) -> dict[str, str]:
-    """Name -> '#rrggbb'. A known method has the same colour everywhere; the others take, in their order, what
-    is free, then begin anew."""
+    """Name -> '#rrggbb'. A known method has one colour everywhere; others take what is free, in order."""
     known = {name: colour for name in names if (colour := _known(name)) is not None}
     free = [colour for colour in _SPARE if colour not in known.values()] or list(_SPARE)
     others = list(dict.fromkeys(name for name in names if name not in known))

@@ -1,30 +1,24 @@
 """How an episode can stand and end: codes for kernels, names for logs, results and tables."""
 
-OUTCOMES = ("running", "success", "collision", "ttc", "out_of_tank", "timeout")
-"""names by code"""
+OUTCOMES = ("running", "success", "collision", "ttc", "out_of_tank", "timeout")  # names by code
 RUNNING, SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT = range(len(OUTCOMES))
 
-ENDINGS = OUTCOMES[1:]
-"""exclusive; every finished episode has one"""
+ENDINGS = OUTCOMES[1:]  # exclusive; every finished episode has one
 COLLIDED = ("collision", "ttc", "out_of_tank")
-"""what counts as a collision in every rate: contact, a stop for the time to collision, and leaving the
-tank"""
+"""what counts as a collision in every rate: contact, a stop by time to collision, leaving the tank"""
 LETTERS: dict[str, str] = dict(zip(ENDINGS, "scxot", strict=True))
 """of the endings, for a row of episodes as one word"""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Codes of planning: why a plan was wanted, who planned, why the Voronoi planner failed. Names are what
+# ---- Codes of planning: why a plan was wanted, who planned, why the Voronoi planner failed. Names are what
 # reports and logs print.
-
 
 TRIGGERS = ("initial", "stuck", "safety", "intersection")
 """In order of priority: exactly one is counted per replan. Code = index + 1, counter's column = index."""
 N_TRIGGER = len(TRIGGERS)
 TRIGGER_NONE, TRIGGER_INITIAL, TRIGGER_STUCK, TRIGGER_SAFETY, TRIGGER_INTERSECTION = range(N_TRIGGER + 1)
 
-PLANNERS = ("voronoi", "rrt", "own")
-"""own = a planner that the user brought (``own``)"""
+PLANNERS = ("voronoi", "rrt", "own")  # own = a planner that the user brought (``own``)
 N_PLANNER = len(PLANNERS)
 PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT, PLANNER_OWN = range(N_PLANNER + 1)
 
@@ -35,25 +29,18 @@ N_REASON = len(REASONS)
 FAIL_NONE, FAIL_START_OUTSIDE, FAIL_GOAL_OUTSIDE, FAIL_DISCONNECTED, FAIL_BUDGET = range(N_REASON + 1)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What a learned forecast is told and what it says, in numbers: read by its kernels and by what learns.
+# ---- What a learned forecast is told and what it says, in numbers: read by its kernels and by what learns.
 
+PACKET = 16  # columns and units come in whole packets (``kernels.core.lanes.LANES``)
 
-PACKET = 16
-"""columns and units come in whole packets (``kernels.core.lanes.LANES``)"""
-
-N_PAST, PAST_S = 10, 0.3
-"""places remembered of each track, and the time between them"""
-N_BEND = 4
-"""turns remembered of each track"""
+N_PAST, PAST_S = 10, 0.3  # places remembered of each track, and the time between them
+N_BEND = 4  # turns remembered of each track
 LENGTH_M, FAR = 4.0, 2.0
-AHEAD_STEPS = (5, 10, 15, 20, 25)
-"""samples of the forecast that are told"""
+AHEAD_STEPS = (5, 10, 15, 20, 25)  # samples of the forecast that are told
 N_FRAME = 5
 N_MOTION, N_AHEAD = 12, 9
 COLUMNS = N_MOTION + N_AHEAD + 2 * len(AHEAD_STEPS) + 3 * N_BEND + 2 * N_PAST + 1
-N_COLUMN = PACKET * -(-COLUMNS // PACKET)
-"""with padding, which is 0"""
+N_COLUMN = PACKET * -(-COLUMNS // PACKET)  # with padding, which is 0
 SIDE_COLUMNS = (
     1,
     N_MOTION + 6,
@@ -69,18 +56,14 @@ FAR_COLUMNS = ((N_MOTION + 2, N_MOTION + 3),)
 N_MODE, ANCHORS, ANCHOR_S = 6, 5, 0.5
 N_HIDDEN = 64
 N_TOLD = N_MODE * (1 + 2 * ANCHORS)
-N_SAID = PACKET * -(-N_TOLD // PACKET)
-"""with padding"""
-N_SPREAD = 2 * ANCHORS * N_MODE
-"""the trained network says spreads too, which the kernel leaves out"""
+N_SAID = PACKET * -(-N_TOLD // PACKET)  # with padding
+N_SPREAD = 2 * ANCHORS * N_MODE  # the trained network says spreads too, which the kernel leaves out
 MIDDLE = (1 + N_COLUMN) * N_HIDDEN
 LAST = MIDDLE + (1 + N_HIDDEN) * N_HIDDEN
-N_WEIGHT = LAST + (1 + N_HIDDEN) * N_SAID
-"""numbers of the three layers, each its biases, then a row for each input"""
+N_WEIGHT = LAST + (1 + N_HIDDEN) * N_SAID  # of the three layers: biases, then a row for each input
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What only the simulator knows.
+# ---- What only the simulator knows.
 
 
 class Truth:
@@ -88,23 +71,14 @@ class Truth:
     ``tests/repository/test_architecture.py`` reads it."""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A policy over a set of bodies in numbers: widths of what it is told, and of the rule that lays its wish on
-# the hull. Read by kernels, by what learns, and by what is exported without them.
+# ---- A policy over a set of bodies in numbers: widths of what it is told, and of the rule that lays its wish
+# on the hull. Read by kernels, by what learns, and by what is exported without them.
 
+N_BODY = 9  # moving bodies that the policy sees, the nearest ones
+BODY_WIDTH = 22  # columns of a body
+OWN_WIDTH = 17  # columns of the vehicle and its goal
+N_RAY = 24  # rays of free distance around the vehicle
+EGO_COLUMNS = OWN_WIDTH + N_RAY  # columns of the vehicle's own, rays included
 
-N_BODY = 9
-"""moving bodies that the policy sees, the nearest ones"""
-BODY_WIDTH = 22
-"""columns of a body"""
-OWN_WIDTH = 17
-"""columns of the vehicle and its goal"""
-N_RAY = 24
-"""rays of free distance around the vehicle"""
-EGO_COLUMNS = OWN_WIDTH + N_RAY
-"""columns of the vehicle's own, rays included"""
-
-TURN_GAIN = 2.5
-"""[1/s] yaw rate by the angle that is still to turn"""
-LEAST_SPEED_M_S = 0.1
-"""below it the vehicle keeps its heading"""
+TURN_GAIN = 2.5  # [1/s] yaw rate by the angle that is still to turn
+LEAST_SPEED_M_S = 0.1  # below it the vehicle keeps its heading

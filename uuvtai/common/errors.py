@@ -4,8 +4,7 @@ from __future__ import annotations
 
 
 class UserError(Exception):
-    """A refusal: what is wrong, where, why, and what to type next. The command line prints it as one message
-    and ends with exit code 2."""
+    """A refusal: what is wrong, where, why, what to type next. The command prints it, exit code 2."""
 
 
 class SettingError(UserError, ValueError):
@@ -26,3 +25,7 @@ class DeviceError(UserError, RuntimeError):
 
 class OwnCodeError(UserError, RuntimeError):
     """A piece that the user brought has failed; its ``__cause__`` is what was raised in her code."""
+
+
+ODD = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""what reading data of another shape than expected can raise"""

@@ -1,5 +1,4 @@
-"""The one way in for files that a run folder or a stranger brings: regular files only, bounded in size, no
-link that leads elsewhere."""
+"""The one way in for files that a stranger brings: regular, bounded in size, no link elsewhere."""
 
 from __future__ import annotations
 
@@ -20,16 +19,12 @@ from typing import Any, BinaryIO
 from uuvtai.common import signals
 from uuvtai.common.errors import UserError
 
-MAX_BYTES = 1 << 30
-"""[bytes] most that any file may bring into memory"""
-MAX_JSON_BYTES = 64 << 20
-"""[bytes] most that a JSON document may have"""
+MAX_BYTES = 1 << 30  # [bytes] most that any file may bring into memory
+MAX_JSON_BYTES = 64 << 20  # [bytes] most that a JSON document may have
 _MAX_JSON_CONTAINERS, _MAX_JSON_VALUES = 1_000_000, 8_000_000
 """of one document: in memory an empty list takes thirty times the two bytes that it is written with"""
-_MAX_INTEGER = 1 << 128
-"""what the state of a random generator takes; a float holds it too"""
-_MAX_ENTRIES = 1_000_000
-"""files and folders of one run folder: more are not counted"""
+_MAX_INTEGER = 1 << 128  # what the state of a random generator takes; a float holds it too
+_MAX_ENTRIES = 1_000_000  # files and folders of one run folder: more are not counted
 
 _NO_FOLLOW = getattr(
     os, "O_NOFOLLOW", 0
@@ -45,8 +40,7 @@ _CREATE = os.O_WRONLY | os.O_CREAT | _NO_FOLLOW | _ALWAYS
 _FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
 _NO_FILE = (errno.ENXIO, errno.ENODEV, errno.EISDIR)
 """what opening a socket, a pipe that nobody reads or a folder may say"""
-UNFINISHED = re.compile(r"\..+\.[0-9a-f]{8}\.tmp(\.\w+)?")
-"""names that ``unfinished`` gives to what goes with its writer"""
+UNFINISHED = re.compile(r"\..+\.[0-9a-f]{8}\.tmp(\.\w+)?")  # names by ``unfinished`` that go with the writer
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -77,8 +71,7 @@ def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) ->
 
 
 def read_bytes(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) -> bytes:
-    """Content of a file, as ``open_file`` opens it; never more than ``limit`` bytes, also where the file
-    grows meanwhile."""
+    """Content of a file, as ``open_file`` opens it; never more than ``limit`` bytes, even if it grows."""
     with open_file(path, limit, folder) as file:
         content = file.read(limit + 1)
     if len(content) > limit:
@@ -138,8 +131,7 @@ def read_lines(
 
 
 def refuse_links(folder: Path, path: Path) -> None:
-    """Raise FileError where ``path``, which lies below ``folder``, is a link or lies behind one; what does
-    not exist is no link."""
+    """Raise FileError where ``path``, below ``folder``, is a link or behind one; absence is no link."""
     place = folder
     for part in _parts_below(folder, path):
         place = place / part
@@ -151,8 +143,7 @@ def refuse_links(folder: Path, path: Path) -> None:
 
 
 def refuse_links_in(folder: Path) -> None:
-    """Raise FileError for any link below ``folder``: all that lies there may be read, written and deleted.
-    Raises OSError."""
+    """Raise FileError for any link below ``folder``: all there may be read and deleted. Raises OSError."""
     waiting, count = [str(folder)], 0
     while waiting:
         with os.scandir(waiting.pop()) as entries:
@@ -170,8 +161,7 @@ def refuse_links_in(folder: Path) -> None:
 
 
 def open_new(path: Path, mode: int = 0o666) -> BinaryIO:
-    """Open a file for writing that did not exist; whatever is there already, a link too, is a
-    FileExistsError. Raises OSError."""
+    """Open a new file for writing; whatever is there, a link too, is a FileExistsError. Raises OSError."""
     return os.fdopen(os.open(path, _CREATE | os.O_EXCL, mode), "wb")
 
 
@@ -184,8 +174,7 @@ def unfinished(target: Path, ending: str = ".tmp") -> Path:
 
 @contextmanager
 def whole_file(target: Path, ending: str = ".tmp") -> Iterator[tuple[BinaryIO, Path]]:
-    """A new file to write, and its name meanwhile; it becomes ``target`` when it is on the disk, and on any
-    error nothing is left. Raises OSError."""
+    """A new file and its name meanwhile; it becomes ``target`` when on the disk, or goes. OSError."""
     signals.engage()
     place = unfinished(target, ending)
     opened = open_new(place)
@@ -202,8 +191,7 @@ def whole_file(target: Path, ending: str = ".tmp") -> Iterator[tuple[BinaryIO, P
 
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
-    """A new folder to fill; it becomes ``target``, which may be an empty folder by then, or nothing is left.
-    Raises OSError."""
+    """A new folder to fill; it becomes ``target``, which may be empty by then, or goes. Raises OSError."""
     signals.engage()
     place = unfinished(target)
     place.mkdir(parents=True)
@@ -244,8 +232,7 @@ def flush(path: Path) -> None:
 
 
 def output_beside(sources: Sequence[Path], out: Path | None, suffix: str, force: bool) -> Path:
-    """Where to write what is made of files: ``out``, or the first one's name with another ending. Raises as
-    ``refuse_output``."""
+    """Where to write: ``out``, or the first file with another ending. Raises as ``refuse_output``."""
     target = out or sources[0].with_suffix(suffix)
     refuse_output(target, sources, force)
     return target
@@ -296,8 +283,7 @@ def _is_junction(entry: os.DirEntry[str]) -> bool:
 
 
 def _same(one: Path, other: Path) -> bool:
-    """Whether two paths name one file, by whatever links; a name that nothing has yet counts by where it
-    would lie."""
+    """Whether two paths name one file, by whatever links; a name without a file counts by its place."""
     try:
         return one.samefile(other)
     except OSError:
@@ -330,8 +316,7 @@ def _open(path: Path, folder: Path | None, flags: int) -> int:
 
 
 def _open_below(folder: Path, path: Path, flags: int) -> int:
-    """File descriptor of ``path``, opened name by name from ``folder`` on, so that no name can turn into a
-    link meanwhile."""
+    """File descriptor of ``path``, opened name by name from ``folder`` on: no name can become a link."""
     parts = _parts_below(folder, path)
     if os.open not in os.supports_dir_fd:
         refuse_links(folder, path)

@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 
-KIND_NAMES = {1: "sphere", 2: "cylinder", 3: "box"}
-"""by code of ``kernels.core.geometry``; other codes are empty slots"""
+KIND_NAMES = {1: "sphere", 2: "cylinder", 3: "box"}  # by code of ``kernels.core.geometry``; others are empty
 
-Read = Callable[[str], np.ndarray]
-"""One env's row of a field of the state, by 'struct.field'."""
+Read = Callable[[str], np.ndarray]  # One env's row of a field of the state, by 'struct.field'.
 
 
 def describe_scenario(read: Read) -> dict[str, Any]:

@@ -1,5 +1,4 @@
-"""Processes side by side on this machine: they end with the one that started them, however it ends, and what
-a lost one was at is done once more."""
+"""Processes side by side: they end with who started them, and what a lost one did is done again."""
 
 from __future__ import annotations
 
@@ -18,11 +17,9 @@ from uuvtai.common import signals
 from uuvtai.common.errors import SettingError, UserError
 
 Item = TypeVar("Item")
-Work = Callable[[Item], Any]
-"""a module's function of one picklable argument"""
+Work = Callable[[Item], Any]  # a module's function of one picklable argument
 
-ATTEMPTS = 3
-"""how often a task is tried that loses its worker"""
+ATTEMPTS = 3  # how often a task is tried that loses its worker
 
 signals.never_within(popen_spawn_posix.__file__)
 """A process that has been started and is then not told what to do would print a traceback."""
@@ -43,8 +40,7 @@ class LocalEngine:
         self._workers, self._go_on = workers, go_on
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
-        """(number of the item, result) as they come. Errors of the work itself are raised; EngineError where
-        workers keep dying."""
+        """(item's number, result) as they come. Raises errors of the work; EngineError where workers die."""
         signals.engage()
         waiting, tries = list(range(len(items))), [0] * len(items)
         while waiting:
@@ -62,8 +58,7 @@ class LocalEngine:
     def _round(
         self, work: Work, items: Sequence[Item], todo: list[int]
     ) -> Generator[tuple[int, Any], None, list[int]]:
-        """Run what is ``todo``, taken from its front, until all is done or a worker dies; returns the numbers
-        that ran then."""
+        """Run ``todo``, from its front, until all is done or a worker dies; the numbers that ran then."""
         threads = max(1, (os.cpu_count() or 1) // self._workers)
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(min(self._workers, len(todo)), context, _begin_worker, (threads,))
@@ -109,8 +104,7 @@ class LocalEngine:
 
 @contextlib.contextmanager
 def _ctrl_c_held() -> Iterator[None]:
-    """Processes that are started inside do not hear Ctrl-C, which a terminal sends to all of them, before
-    they can leave it to us."""
+    """Processes started inside do not hear Ctrl-C, sent to all by a terminal, before they can ignore it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -51,8 +51,7 @@ def was_received() -> bool:
 
 
 def install() -> None:
-    """Hear these signals from now on, also where a library has set its own handlers meanwhile; one that is
-    ignored stays so (nohup)."""
+    """Hear these signals, also where a library has set its handlers; an ignored one stays so (nohup)."""
     for number in STOPPING:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _on_signal)
@@ -121,14 +120,12 @@ class StopEvent:
 
 
 def finish(code: int) -> None:
-    """The command is over and the interpreter tidies up: a signal can only shorten that, with this exit
-    code."""
+    """The command is over, the interpreter tidies up: a signal only shortens that, with this code."""
     _finished[:] = [code]
 
 
 def end_at_second() -> None:
-    """Leave the second signal of a kind to the system, whose answer does not wait for the interpreter
-    (Linux)."""
+    """Leave the second signal of a kind to the system, which does not wait for the interpreter (Linux)."""
     if (
         not _installed
         or sys.platform != "linux"
@@ -195,8 +192,7 @@ def _unraisable(unraisable: Any) -> None:
 
 
 def _rest() -> None:
-    """Python is about to put the system's own handlers back: in what little is left a signal would change the
-    exit code, and only that."""
+    """Python is about to restore the system's handlers: a signal then would change the exit code only."""
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
 

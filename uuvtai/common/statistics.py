@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-Z95 = 1.959963984540054
-"""Two-sided 95 % quantile of the standard normal."""
+Z95 = 1.959963984540054  # Two-sided 95 % quantile of the standard normal.
 
 
 def wilson_interval(k: float, n: float) -> tuple[float, float] | None:
@@ -65,7 +64,6 @@ def rate(k: int, n: int) -> float | None:
 
 
 def mean(values: list[float]) -> float | None:
-    """Arithmetic mean, or None of nothing."""
     return sum(values) / len(values) if values else None
 
 
@@ -76,10 +74,8 @@ def time_to_success_s(mean_time_s: float | None, success_rate: float | None) -> 
     return mean_time_s / success_rate
 
 
-_RESAMPLES = 2000
-"""of a bootstrap: the ends of a 95 % interval then vary by about a twentieth of its width"""
-_BOOTSTRAP_SEED = 20_240_229
-"""the same samples give the same interval"""
+_RESAMPLES = 2000  # of a bootstrap: the ends of a 95 % interval then vary by about a twentieth of its width
+_BOOTSTRAP_SEED = 20_240_229  # the same samples give the same interval
 
 
 def bootstrap_interval(values: Sequence[float], resamples: int = _RESAMPLES) -> tuple[float, float] | None:
@@ -146,8 +142,7 @@ def normal_p(z: float) -> float:
 
 
 def holm_adjusted(p_values: Sequence[float]) -> list[float]:
-    """p values of several tests made together, adjusted by Holm (1979) so that the chance of any false alarm
-    stays bounded."""
+    """p values of several tests, adjusted by Holm (1979): bounds the chance of any false alarm."""
     order = sorted(range(len(p_values)), key=lambda i: p_values[i])
     adjusted, largest = [0.0] * len(p_values), 0.0
     for rank, i in enumerate(order):

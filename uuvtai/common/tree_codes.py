@@ -36,15 +36,13 @@ HOLD = 18
 UNSTICK = 19
 FOLLOW_ROUTE = 20
 DRIVE_STRAIGHT = 21
-FIRST_BASELINE = 32
-"""Codes from here on are local planners of the literature."""
+FIRST_BASELINE = 32  # Codes from here on are local planners of the literature.
 DYNAMIC_WINDOW = FIRST_BASELINE
 POTENTIAL_FIELD = 33
 VELOCITY_OBSTACLE = 34
 PATH_INTEGRAL = 35
 
-MAX_PORTS = 4
-"""Numbers that a leaf can be given."""
+MAX_PORTS = 4  # Numbers that a leaf can be given.
 
 
 @dataclass(frozen=True)
@@ -79,9 +77,7 @@ LEAVES = {
     "HasRoute": _condition(HAS_ROUTE, "", "a route exists"),
     "GoalNear": _condition(GOAL_NEAR, "distance_m", "the goal is closer than distance_m"),
     "SafeHere": _condition(
-        SAFE_HERE,
-        "within_s",
-        "stopping here conflicts with no forecast body within within_s, or at all",
+        SAFE_HERE, "within_s", "stopping here conflicts with no forecast body within within_s, or at all"
     ),
     "BackOff": _action(BACK_OFF, "speed_m_s", "retreat from the sensed threat"),
     "Evade": _action(EVADE, "", "drive the evasive velocity of least cost"),
@@ -107,8 +103,4 @@ CONTROLS = {
     "ReactiveSequence": REACTIVE_SEQUENCE,
     "ReactiveFallback": REACTIVE_FALLBACK,
 }
-DECORATORS = {
-    "Inverter": INVERTER,
-    "ForceSuccess": FORCE_SUCCESS,
-    "ForceFailure": FORCE_FAILURE,
-}
+DECORATORS = {"Inverter": INVERTER, "ForceSuccess": FORCE_SUCCESS, "ForceFailure": FORCE_FAILURE}

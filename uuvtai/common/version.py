@@ -2,6 +2,5 @@
 
 import time
 
-BEGUN_NS = time.time_ns()
-"""when this process began to import the package [ns]"""
+BEGUN_NS = time.time_ns()  # when this process began to import the package [ns]
 __version__ = "0.1.0"

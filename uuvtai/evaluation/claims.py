@@ -26,13 +26,10 @@ from uuvtai.common.statistics import (
     wilson_interval,
 )
 
-# ------------------------------------------------------------------------------------------------------------
-# What the paper prints, as printed, and where its own figures do not add up.
+# ---- What the paper prints, as printed, and where its own figures do not add up.
 
 
 class PrintedRow(NamedTuple):
-    """A row of Table main."""
-
     success: float
     collision: float
     mean_time_s: float
@@ -47,8 +44,7 @@ TABLE_MAIN = {
 }
 """by the names of our presets; 25 episodes a method"""
 
-MODERATE = {"S": 8, "D": 9, "v_m_s": 1.5}
-"""largest values of the conditions over which the paper gives means"""
+MODERATE = {"S": 8, "D": 9, "v_m_s": 1.5}  # largest values of the conditions over which the paper gives means
 MODERATE_SUCCESS, MODERATE_COLLISION = 0.828, 0.011
 MODERATE_CONDITIONS, WITHOUT_COLLISION = 40, 38
 FEW_MOVERS, FEW_MOVERS_COLLISION = 3, 0.004
@@ -71,18 +67,13 @@ INCONSISTENCIES = (
 """found while rebuilding it; what we do instead is in docs/results.md"""
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be judged"
-LEVEL = 0.05
-"""of all tests of a reproduction together"""
+LEVEL = 0.05  # of all tests of a reproduction together
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Which way the numbers point, and how probable that would be by chance; p = None where nothing was
-    tested."""
+    """Which way the numbers point, and how probable that is by chance; p = None: nothing was tested."""
 
     points_to: str
     p: float | None
@@ -96,20 +87,16 @@ class Claim:
     theirs: str
     ours: str
     verdict: str
-    p: float | None = None
-    """of the claim's own test"""
-    p_holm: float | None = None
-    """adjusted for all tests of the reproduction"""
+    p: float | None = None  # of the claim's own test
+    p_holm: float | None = None  # adjusted for all tests of the reproduction
 
 
 def claim(text: str, theirs: str, ours: str, finding: Finding) -> Claim:
-    """A claim with what was found."""
     return Claim(text, theirs, ours, finding.points_to, finding.p)
 
 
 def judged(claims: Sequence[Claim]) -> list[Claim]:
-    """The claims with final verdicts: a test decides where its p value, adjusted by Holm (1979) over all of
-    them, is below ``LEVEL``."""
+    """The claims with verdicts: a test decides where its Holm-adjusted p is below ``LEVEL``."""
     adjusted = iter(holm_adjusted([c.p for c in claims if c.p is not None]))
     return [_judged(c, next(adjusted)) if c.p is not None else c for c in claims]
 
@@ -134,8 +121,7 @@ class Share:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % Wilson of the independent episodes; everything where there is nothing, None where it is not
-        known."""
+        """95 % Wilson of the independent episodes; everything for nothing, None = not known."""
         if self.design is None:
             return None
         return wilson_interval(self.k / self.design, self.n / self.design) or (0.0, 1.0)
@@ -161,8 +147,7 @@ class Share:
 
 
 def pooled(methods: Sequence[dict[str, Any]], *outcomes: str) -> Share:
-    """Share of the episodes of all these entries (of ``uuv eval`` or a sweep) that ended in one of
-    ``outcomes``."""
+    """Share of the episodes of these entries (of ``uuv eval`` or a sweep) that ended in ``outcomes``."""
     k, n = sum(m["outcomes"][o] for m in methods for o in outcomes), sum(m["episodes"] for m in methods)
     return Share(k, n, _design(methods, outcomes) if len(methods) > 1 else 1.0)
 
@@ -218,8 +203,7 @@ def _by_binomial(a: Share, value: float, holds: bool) -> Finding:
     )
 
 
-_MARGIN = 0.1
-"""how far a rate may fall behind another one that it is said to come near"""
+_MARGIN = 0.1  # how far a rate may fall behind another one that it is said to come near
 
 
 def near(a: Share, b: Share) -> Finding:
@@ -243,8 +227,7 @@ def _softened(a: Share, design: float) -> tuple[float, float]:
 
 
 def times_as_large(a: Share, b: Share, factor: float) -> Finding:
-    """Whether a's rate is at least ``factor`` times b's: z of the logarithm of their ratio (Katz and others
-    1978)."""
+    """Whether a's rate is at least ``factor`` times b's: z of the log of their ratio (Katz et al. 1978)."""
     if not a.k or not b.k or a.design is None or b.design is None:
         return Finding(OPEN, None)
     z = (math.log(a.rate / b.rate) - math.log(factor)) / math.sqrt(
@@ -257,8 +240,7 @@ def times_as_large(a: Share, b: Share, factor: float) -> Finding:
 
 
 def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
-    """Claims about the four methods and the ablations; entries of ``uuv eval`` by preset, one per training
-    seed."""
+    """Claims about the methods and ablations; entries of ``uuv eval`` by preset, one per training seed."""
     success = {name: pooled(entries, "success") for name, entries in by_preset.items()}
     collision = {name: pooled(entries, *COLLIDED) for name, entries in by_preset.items()}
     ours, plain = success["curriculum"], success["ppo"]
@@ -323,15 +305,13 @@ _ABLATIONS = {
 
 
 def _far_below(ours_s: float | None, theirs_s: float | None, finding: Finding) -> Finding:
-    """Less than half; None = nobody ever arrived, as slow as can be. How sure that is follows from the rates
-    of success."""
+    """Less than half; None = nobody arrived, as slow as can be. Certainty follows from rates of success."""
     slower = ours_s is None or (theirs_s is not None and ours_s >= theirs_s / 2)
     return Finding(FAILS if slower else finding.points_to, finding.p)
 
 
 def tts_s(entries: Sequence[dict[str, Any]]) -> float | None:
-    """The paper's TTS [s] over all these entries: mean time of all episodes / rate of success; None without
-    success or times."""
+    """The paper's TTS [s] of these entries: mean time of all / rate of success; None without either."""
     n = sum(entry["episodes"] for entry in entries)
     times = [entry["time_mean_s"] for entry in entries]
     if not n or any(time is None for time in times):
@@ -417,8 +397,7 @@ def of_sweep(cells: Sequence[dict[str, Any]], method: str) -> list[Claim]:
 
 
 def of_timing(profile: dict[str, Any]) -> list[Claim]:
-    """Claims about time, from ``uuv profile --json`` with one env and density. Means of one machine: nothing
-    is tested."""
+    """Claims about time, from ``uuv profile --json``. Means of one machine: nothing is tested."""
     rows = {row["component"]: row["mean_ms"] for row in profile["paper_latency"]}
     if "Full loop" not in rows:
         return []
@@ -454,8 +433,7 @@ def of_timing(profile: dict[str, Any]) -> list[Claim]:
 
 
 def of_transfer(here: dict[str, Any], there: dict[str, Any]) -> list[Claim]:
-    """Whether the policy, untouched, drives in the second scene as well; entries of ``uuv eval`` of the same
-    policy."""
+    """Whether the same policy, untouched, drives in the second scene too; entries of ``uuv eval``."""
     a, b = pooled([here], "success"), pooled([there], "success")
     return [
         claim(

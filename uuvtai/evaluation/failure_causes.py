@@ -44,42 +44,27 @@ if TYPE_CHECKING:
     from uuvtai.logs.writer import PolicyNote
 
 
-START_S = 2.0
-"""A younger episode starts in danger: track, forecast and evasion take about a second, and bodies start 1.5 m
-away."""
-UNSEEN_S = 0.3
-"""Unseen: out of the sonar's fan all through this time before the end (the design's measure: no
-track 0.3 s before)."""
+START_S = 2.0  # a younger episode starts in danger: evading takes a second, bodies start 1.5 m away
+UNSEEN_S = 0.3  # out of the sonar's fan all this time before the end (no track 0.3 s before)
 TURN_S = 1.2
 """An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it
 was off by more than MISS_M at the end, or there was none."""
 CLEAR_M = 0.1
-"""A body that is remembered farther above or below than this counts as clear of the own depth (what the
-referee calls contact)."""
-LATELY_S = 2.5
-"""Remarks look back this far."""
-MISS_M = 0.35
-"""A forecast missed when it was farther off than the pilot's margin at one second (0.25 m + 0.1 m/s)."""
-REACH_M = 0.4
-"""Squeezed: something static is nearer to the hull at the end: no room to give way (hull 0.17 m + contact 0.1
-m + margin)."""
-CROWD_M = 0.6
-"""Crowded: a second moving body came nearer to the hull in the last CROWD_S."""
+"""A body remembered farther above or below counts as clear of the own depth (the referee's contact)."""
+LATELY_S = 2.5  # Remarks look back this far.
+MISS_M = 0.35  # a forecast missed when farther off than the pilot's margin at a second (0.25 m + 0.1 m/s)
+REACH_M = 0.4  # squeezed: something static this near to the hull leaves no room (0.17 + 0.1 m + margin)
+CROWD_M = 0.6  # Crowded: a second moving body came nearer to the hull in the last CROWD_S.
 NEAR_M = 1.0
-"""Contact with something static is no accident of its own when a moving body came this near to the hull in
-the last NEAR_S."""
+"""Contact with something static is no accident of its own with a mover this near in the last NEAR_S."""
 PLACE_M = 0.1
-"""Lost its place: the own position was farther off than the pilot's margin from what stands still
-(``teacher.static_margin_m``)."""
+"""Lost its place: the own position was off by more than the margin (``teacher.static_margin_m``)."""
 DEPTH_M = 0.05
 """Took floor or surface for farther than it was: the own depth was off by more, towards it; the pilot keeps
 the hull 0.03 m off and three standard deviations of the depth."""
-CLIMB_M = 0.15
-"""Changed its depth: moved by more, upwards or downwards, in the last second."""
-PROGRESS_M = 1.0
-"""A timeout that came this much nearer to the goal in that time was only slow."""
-STUCK_M = 0.5
-"""A vehicle that drove less in that time did not move."""
+CLIMB_M = 0.15  # Changed its depth: moved by more, upwards or downwards, in the last second.
+PROGRESS_M = 1.0  # A timeout that came this much nearer to the goal in that time was only slow.
+STUCK_M = 0.5  # A vehicle that drove less in that time did not move.
 
 CAUSES: dict[str, str] = {
     "out_of_tank": "left the tank",
@@ -121,8 +106,7 @@ CAUSES: dict[str, str] = {
     "stuck": f"timeout: drove < {STUCK_M:g} m in the last {LAST_S:g} s",
     "circling": f"timeout: drove on without coming nearer in the last {LAST_S:g} s",
 }
-"""Every label with its meaning, in order of precedence (forecasts are judged LEAD_S before the end, escapes
-too)."""
+"""Every label with its meaning, in order of precedence (forecasts: LEAD_S before the end, escapes too)."""
 
 
 Fact = dict[str, Any]
@@ -143,8 +127,7 @@ REMARKS: dict[str, Callable[[Fact], bool]] = {
     ),
     "only heave escaped": lambda f: not f["escapes"] and bool(f["escapes_by_heave"]),
 }
-"""What may have contributed, where the killer moves. "Corner passed in reach before": the turn could have
-been learnt."""
+"""What may have contributed, where the killer moves. "Corner passed in reach before": was learnable."""
 
 _IMPLIED = {
     ("unannounced_turn", "turned lately"),
@@ -219,7 +202,7 @@ def _knowledge_label(facts: Fact) -> str | None:
             return "depth_change"
         return "unseen_above" if above else "unseen_below"
     if _within(facts["turned_ago_s"], TURN_S) and not _within(facts["turn_error_m"], MISS_M):
-        return "turned_back" if _turned_back(facts) else "unannounced_turn"
+        return "turned_back" if facts["turned_deg"] > math.degrees(BACK_RAD) else "unannounced_turn"
     if facts["forecast_error_m"] is None:
         return (
             "seen_late"
@@ -247,7 +230,6 @@ def _pilot_label(facts: Fact) -> str:
 
 
 def timeout_label(facts: Fact) -> str:
-    """Why an episode ran out of time."""
     if facts["no_route_share"] > 0.5:
         return "no_route"
     if facts["progress_m"] > PROGRESS_M:
@@ -259,10 +241,6 @@ def timeout_label(facts: Fact) -> str:
     return "stuck" if facts["driven_m"] < STUCK_M else "circling"
 
 
-def _turned_back(facts: Fact) -> bool:
-    return _within(facts["turned_ago_s"], TURN_S) and facts["turned_deg"] > math.degrees(BACK_RAD)
-
-
 def _is_unseen(facts: Fact) -> bool:
     return facts["fan_ago_s"] is None or facts["fan_ago_s"] >= UNSEEN_S
 
@@ -271,17 +249,12 @@ def _within(value: float | None, limit: float) -> bool:
     return value is not None and value <= limit
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Watch failed episodes as they are played again: keep the truth and the vehicle's beliefs of their last
-# seconds.
-#
-# An episode is the same in any batch, so only the failed ones are replayed, and their ends are known
+# ---- Watch failed episodes as they are played again: keep the truth and the vehicle's beliefs of their last
+# seconds. An episode is the same in any batch, so only the failed ones are replayed, and their ends are known
 # beforehand: nothing is kept of the time before the last ``facts.WINDOW_S`` but a coarse diary.
 
-
 _SAMPLE_S, _COARSE_S = 0.1, 0.5
-"""Time between samples of the window and between entries of the diary; counted from the start, so that rows
-are read together."""
+"""Time between samples, and entries of the diary; counted from the start, so that rows go together."""
 
 _WINDOW_FIELDS = {
     "vehicle": ("pos_w", "quat_wb", "vel_b", "rate_b"),
@@ -295,8 +268,7 @@ _WINDOW_FIELDS = {
 _COARSE_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
 _BODY_FIELDS = {"world": ("kind", "size", "yaw"), "path": ("n_way", "radius_m", "length_m", "speed_m_s")}
 
-_FORESEEN_S = 1.0e3
-"""A predicted conflict; beyond = none (geometry.FAR_M)."""
+_FORESEEN_S = 1.0e3  # A predicted conflict; beyond = none (geometry.FAR_M).
 
 
 @dataclass
@@ -311,8 +283,7 @@ class _Watched:
 
 
 class FailureRecorder:
-    """Recorder that watches failed episodes as they are replayed; ``found`` maps each job to its
-    explanation."""
+    """Recorder that watches failed episodes as they are replayed; ``found``: job -> explanation."""
 
     def __init__(
         self, config: Config, tree: FlatTree, failed: list[EpisodeResult], own_code: bool = False
@@ -328,7 +299,6 @@ class FailureRecorder:
         """episodes that the user's code did not play as before: they are not explained"""
 
     def begin(self, sim: Sim, row: int, job: Job) -> None:
-        """An episode has just been reset in this row."""
         self._rows[row] = _Watched(round(self._expected[job].time_s / self._dt))
 
     def step(self, sim: Sim) -> None:
@@ -344,8 +314,7 @@ class FailureRecorder:
             self._rows[row].coarse.append(read | {"step": np.array(self._rows[row].step)})
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
-        """Explain the episode and forget its history. Raises RuntimeError where the replay ended
-        differently."""
+        """Explain the episode, forget its history. Raises RuntimeError where the replay ended differently."""
         job, watched = Job(result.seed, result.episode), self._rows.pop(row)
         expected = self._expected[job]
         if (result.outcome, result.time_s) != (expected.outcome, expected.time_s):
@@ -443,23 +412,17 @@ def _bodies(config: Config, read: dict[str, np.ndarray]) -> Bodies:
     return Bodies(kind, read["world.size"].astype(float), read["world.yaw"].astype(float), speed, circle, lap)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Explain failed episodes: play them again, label each (``causes.py``), and record the worst.
+# ---- Explain failed episodes: play them again, label each (``causes.py``), and record the worst.
 
-
-EXAMPLES = 3
-"""Episodes named per label in the table."""
+EXAMPLES = 3  # Episodes named per label in the table.
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A failed episode with its explanation."""
-
     result: EpisodeResult
     explanation: Explanation
 
     def document(self) -> dict[str, Any]:
-        """One entry of ``explain`` in ``uuv eval --json``."""
         r, e = self.result, self.explanation
         shared = {
             "seed": r.seed,
@@ -496,7 +459,6 @@ def explain_failures(
 
 
 def failures(results: list[EpisodeResult]) -> list[EpisodeResult]:
-    """Everything that is no success."""
     return [r for r in results if r.outcome != "success"]
 
 
@@ -536,8 +498,7 @@ def _median(found: list[Explanation], name: str, beyond: float) -> float | None:
 
 
 def worst_of(rows: list[Row], label: str) -> list[Row]:
-    """Episodes of a label, the worst first: the hardest hits, of timeouts those that ended farthest from the
-    goal."""
+    """Episodes of a label, worst first: the hardest hits; timeouts that ended farthest from the goal."""
 
     def severity(row: Row) -> tuple[float, float]:
         return (row.explanation.killer.closing_m_s or 0.0, row.explanation.facts.get("goal_m", 0.0))
@@ -546,8 +507,7 @@ def worst_of(rows: list[Row], label: str) -> list[Row]:
 
 
 def chosen_for_recording(rows: list[Row], wanted: int) -> list[Row]:
-    """The worst episode of the most frequent label, then of the second, ...; after the last label the next
-    worst of the first."""
+    """The worst episode of the most frequent label, of the second, ..., then the next worst of the first."""
     queues = [worst_of(rows, entry["label"]) for entry in table_of(rows)]
     rounds = [queue[i] for i in range(max(map(len, queues), default=0)) for queue in queues if i < len(queue)]
     return rounds[:wanted]
@@ -581,7 +541,8 @@ def record_worst(
     finally:
         recorder.abort()
     paths = [
-        _renamed(recorder.paths[job], row.explanation.label) for job, row in zip(jobs, rows, strict=True)
+        (path := recorder.paths[job]).rename(path.with_name(f"{row.explanation.label}_{path.name}"))
+        for job, row in zip(jobs, rows, strict=True)
     ]
     for path, row in zip(paths, rows, strict=True):
         note(f"drawing {path.stem}")
@@ -590,7 +551,3 @@ def record_worst(
         picture(path, path.with_suffix(".png"), remark=f"{cause}: {CAUSES[label]}", methods=methods)
         video(path, path.with_suffix(".webm"), remark=cause, methods=methods, **SMALL)
     return paths
-
-
-def _renamed(path: Path, label: str) -> Path:
-    return path.rename(path.with_name(f"{label}_{path.name}"))

@@ -19,20 +19,15 @@ from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.config import Config, SonarConfig, TankConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 
-# ------------------------------------------------------------------------------------------------------------
-# What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach, what
-# its beams met.
-#
-# For explanations after the fact only; nothing that drives a vehicle may import it. Same geometry as
-# ``kernels/core/hull.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode have the samples first,
-# shape (n, ...); bodies are on the next axis.
-
+# ---- What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach,
+# what its beams met. For explanations after the fact only; nothing that drives a vehicle may import it. Same
+# geometry as ``kernels/core/hull.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode have the
+# samples first, shape (n, ...); bodies are on the next axis.
 
 Array = np.ndarray
 
 _AXIS_SAMPLES = 9
-"""Points along the hull's axis: 25 mm apart, which overestimates the clearance by less than 1 mm (0.0125^2 /
-(2 x 0.27 m + clearance))."""
+"""Points along the hull's axis, 25 mm apart: the clearance is less than 1 mm too large."""
 
 
 def rotation(quat_wb: Array) -> Array:
@@ -121,8 +116,7 @@ def floor_and_surface_gaps(
 
 
 def vertical_gap(pos_w: Array, kind: int, body_w: Array, size: Array) -> Array:
-    """(n,) signed gap [m] from the sonar's plane to a body's vertical extent: positive = the body is above, 0
-    = it crosses the plane."""
+    """(n,) signed gap [m] from the sonar's plane to a body: positive = it is above, 0 = it crosses."""
     rise = body_w[:, 2] - pos_w[:, 2]
     half = size[0] if kind == SPHERE else size[2]
     return np.where(np.abs(rise) > half, rise - np.sign(rise) * half, 0.0)
@@ -131,8 +125,7 @@ def vertical_gap(pos_w: Array, kind: int, body_w: Array, size: Array) -> Array:
 def beam_entries(
     pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array, body_yaw: float, sonar_cfg: SonarConfig
 ) -> Array:
-    """(n, n_ray) range at which each beam enters one body's outline within the sonar's vertical fan; inf = it
-    does not (4-sensing.md)."""
+    """(n, n_ray) range at which each beam enters a body's outline within the vertical fan; inf = none."""
     slope = math.tan(math.radians(sonar_cfg.vertical_half_aperture_deg))
     beams = np.arange(sonar_cfg.n_ray)
     bearing = yaw[:, None] + sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * beams
@@ -159,9 +152,7 @@ def _box_entry(x: Array, y: Array, dx: Array, dy: Array, size: Array) -> Array:
     return np.where(into <= out, into, np.inf)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What is kept of a failed episode to explain it: its bodies, its last seconds sample by sample, all of it
-# coarsely.
+# ---- What is kept of a failed episode: its bodies, its last seconds sample by sample, all of it coarsely.
 
 
 @dataclass(frozen=True)
@@ -171,16 +162,12 @@ class Bodies:
     kind: Array
     size: Array
     yaw: Array
-    speed_m_s: Array
-    """nominal; 0 = at rest"""
-    circle_m: Array
-    """radius of the circle it drives on; 0 = a polyline or at rest"""
-    lap_s: Array
-    """time once around its closed path; inf = at rest"""
+    speed_m_s: Array  # nominal; 0 = at rest
+    circle_m: Array  # radius of the circle it drives on; 0 = a polyline or at rest
+    lap_s: Array  # time once around its closed path; inf = at rest
 
     @property
     def moving(self) -> Array:
-        """Slots with a body that moves."""
         return (self.kind != NONE) & (self.speed_m_s > 0.01)
 
 
@@ -190,70 +177,47 @@ class CoarseHistory:
 
     t_s: Array
     pos_w: Array
-    goal_m: Array
-    """3-D distance to the goal"""
+    goal_m: Array  # 3-D distance to the goal
     has_route: Array
     leaf: list[str]
 
 
 @dataclass(frozen=True)
 class History:
-    """The last seconds of an episode, oldest sample first, the end last; ``coarse`` is the account of all of
-    it."""
+    """The last seconds of an episode, oldest sample first; ``coarse`` is the account of all of it."""
 
-    t_s: Array
-    """(n,) since the start"""
+    t_s: Array  # (n,) since the start
     pos_w: Array
-    believed_pos_w: Array
-    """(n, 3) own position as the vehicle estimates it"""
-    vel_valid: Array
-    """(n,) whether it knows its velocity: 1, 2 = heave alone, 0 = not"""
+    believed_pos_w: Array  # (n, 3) own position as the vehicle estimates it
+    vel_valid: Array  # (n,) whether it knows its velocity: 1, 2 = heave alone, 0 = not
     quat_wb: Array
     vel_b: Array
     rate_b: Array
-    body_w: Array
-    """(n, nb, 3)"""
+    body_w: Array  # (n, nb, 3)
     body_vel_w: Array
-    ping_age_s: Array
-    """(n,) age of the newest delivered scan"""
-    range_m: Array
-    """(n, n_ray) that scan; no return = maximum range"""
-    track_moving: Array
-    """(n, n_track) 1 = confirmed, 0 = taken to be static, -1 = empty slot"""
-    track_w: Array
-    """(n, n_track, 2)"""
-    forecast_w: Array
-    """(n, n_track, n_forecast, 2)"""
-    forecast_m: Array
-    """(n, n_track) present radius, negative = no forecast"""
+    ping_age_s: Array  # (n,) age of the newest delivered scan
+    range_m: Array  # (n, n_ray) that scan; no return = maximum range
+    track_moving: Array  # (n, n_track) 1 = confirmed, 0 = taken to be static, -1 = empty slot
+    track_w: Array  # (n, n_track, 2)
+    forecast_w: Array  # (n, n_track, n_forecast, 2)
+    forecast_m: Array  # (n, n_track) present radius, negative = no forecast
     forecast_above_w: Array
-    """(n, n_track) z of the lowest edge of what it may hold above the vehicle; the vehicle's own z where it
-    may be level with it"""
-    forecast_below_w: Array
-    """(n, n_track) z of the highest edge of what it may hold below"""
-    conflict: Array
-    """(n,) bool: the pilot foresees a conflict"""
-    leaf: list[str]
-    """type of the leaf in charge, "" = none"""
-    action: Array
-    """(n, 4)"""
-    map_clearance_m: Array
-    """(n,) what the vehicle's own map says"""
+    """(n, n_track) z of the lowest edge it may have above the vehicle; the own z where it may be level"""
+    forecast_below_w: Array  # (n, n_track) z of the highest edge of what it may hold below
+    conflict: Array  # (n,) bool: the pilot foresees a conflict
+    leaf: list[str]  # type of the leaf in charge, "" = none
+    action: Array  # (n, 4)
+    map_clearance_m: Array  # (n,) what the vehicle's own map says
     coarse: CoarseHistory
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Could the vehicle still have got away? Velocities held from some time before the end on, rolled out against
-# the true motion of all.
-
+# ---- Could the vehicle still have got away? Velocities held before the end, against the true motion of all.
 
 N_HEADING = 16
-SPEEDS = (0.5, 1.0)
-"""Shares of the fastest evasion in that direction."""
+SPEEDS = (0.5, 1.0)  # Shares of the fastest evasion in that direction.
 STEP_S = 0.05
 _DEEP_M = 1e3
-AFTER_S = 0.5
-"""An escape keeps clear up to this after the end."""
+AFTER_S = 0.5  # An escape keeps clear up to this after the end.
 
 
 def escapes(history: History, bodies: Bodies, config: Config, lead_s: float) -> tuple[int, int]:
@@ -297,8 +261,7 @@ def candidates(config: Config, yaw: float) -> Array:
 
 
 def rolled_out(pos: Array, vel: Array, command: Array, t: Array, lag_s: float) -> tuple[Array, Array]:
-    """(n, n_t, 3) positions and velocities of a vehicle that approaches each commanded velocity with a
-    first-order lag."""
+    """(n, n_t, 3) positions and velocities of a vehicle that takes commanded ones with first-order lag."""
     left = np.exp(-t / lag_s)[:, None]
     off = (vel - command)[:, None]
     return pos + command[:, None] * t[:, None] + off * lag_s * (1.0 - left), command[:, None] + off * left
@@ -349,57 +312,32 @@ def _reach(pos: Array, bodies: Bodies) -> Array:
     return spread + np.linalg.norm(bodies.size[:, :2], axis=1) + 1.0
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
-WINDOW_S = 4.0
-"""How far back the facts look; a time "ago" that is None lies farther back or never was."""
+WINDOW_S = 4.0  # How far back the facts look; a time "ago" that is None lies farther back or never was.
 LEAD_S = 1.0
-"""Forecasts are judged by what they said this long before the end: half a second to react, half a second to
-get out of the way."""
+"""Forecasts are judged by what they said this long before the end: to react, and to get away."""
 SIGHT_S = (1.5, 0.5)
-"""Without a forecast LEAD_S before the end, this interval tells why: mostly out of the fan, mostly hidden, or
-seen but not tracked."""
-TURN_RAD = math.radians(30.0)
-"""A corner: the body's course changes by more between two samples."""
-BACK_RAD = math.radians(120.0)
-"""A turn back: a corner with more than this."""
-BEFORE_TURN_S = 0.1
-"""The forecast that a turn is judged by was made this long before it."""
-BELIEF_M = 0.5
-"""A forecast or track belongs to a body when its present position is this close to the truth, in the
-plane."""
-CLIMB_S = 1.0
-"""Changes of the own depth are counted over this time before the end."""
-BEAM_M = 0.1
-"""A beam met the body when its range agrees with the truth within this plus four sigma."""
-CROWD_S = 0.5
-"""A second moving body counts when it came near in this time before the end."""
-NEAR_S = 1.5
-"""Any moving body counts as near when it was so in this time before the end."""
+"""Without a forecast LEAD_S before the end, why in this interval: out of the fan, hidden, not tracked."""
+TURN_RAD = math.radians(30.0)  # A corner: the body's course changes by more between two samples.
+BACK_RAD = math.radians(120.0)  # A turn back: a corner with more than this.
+BEFORE_TURN_S = 0.1  # The forecast that a turn is judged by was made this long before it.
+BELIEF_M = 0.5  # a forecast or track belongs to a body when its place is this close to the truth, in plan
+CLIMB_S = 1.0  # Changes of the own depth are counted over this time before the end.
+BEAM_M = 0.1  # A beam met the body when its range agrees with the truth within this plus four sigma.
+CROWD_S = 0.5  # A second moving body counts when it came near in this time before the end.
+NEAR_S = 1.5  # Any moving body counts as near when it was so in this time before the end.
 CHANCES_S = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
-"""The last chance is the latest of these times before the end from which some velocity still escaped
-(``escape.py``)."""
+"""The last chance: the latest of these times before the end from which some velocity escaped."""
 BLIND_S = 1.0
-"""The own velocity is lost when it was unknown in most of this time before the end; for floor and surface
-heave is enough."""
-BREAK_S = 0.3
-"""A leaf that lost charge for no longer than this still counts as in charge."""
-LAST_S = 10.0
-"""Timeouts are judged by their last ten seconds."""
-EVADING = ("Evade", "BackOff")
-"""Leaves that give way to something."""
-WAITING = ("Hold",)
-"""Leaves that stay in place on purpose; further ones are recognised by a name that begins with Wait, Yield or
-Shelter."""
+"""The own velocity is lost when mostly unknown this time before the end (heave, for floor and surface)."""
+BREAK_S = 0.3  # A leaf that lost charge for no longer than this still counts as in charge.
+LAST_S = 10.0  # Timeouts are judged by their last ten seconds.
+EVADING = ("Evade", "BackOff")  # Leaves that give way to something.
+WAITING = ("Hold",)  # leaves that stay in place on purpose; so do names that begin with Wait, Yield, Shelter
 
 
 @dataclass
 class Killer:
-    """What ended the episode."""
-
-    name: str
-    """sphere, cylinder, box, wall, floor or surface; "" = nothing (timeout)"""
+    name: str  # sphere, cylinder, box, wall, floor or surface; "" = nothing (timeout)
     slot: int | None = None
     moving: bool = False
     gap_m: float | None = None
@@ -433,7 +371,6 @@ class Scene:
         self.vel_w = vel_w
 
     def killer(self, outcome: str) -> Killer:
-        """What the referee stopped the episode for."""
         rules, gap, closing = self.config.episode, self.gap[-1], self.closing[-1]
         if outcome == "ttc":
             approaching = closing > rules.ttc_closing_m_s
@@ -527,7 +464,6 @@ def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) ->
 
 
 def _belief_facts(history: History, slot: int, turned_ago_s: float | None, config: Config) -> dict[str, Any]:
-    """What the vehicle believed about the killer."""
     ago = history.t_s[-1] - history.t_s
     truth = history.body_w[:, slot, :2]
     away = np.where(
@@ -559,8 +495,7 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
 
 
 def _believed_gap(history: History, slot: int, track: int) -> float:
-    """Vertical gap [m] that the vehicle believed in at the end, on the side where the killer was; 0 = it may
-    be level."""
+    """Vertical gap [m] that the vehicle believed in at the end, towards the killer; 0 = may be level."""
     own, above = history.pos_w[-1, 2], history.body_w[-1, slot, 2] > history.pos_w[-1, 2]
     return _round(
         max(
@@ -571,15 +506,13 @@ def _believed_gap(history: History, slot: int, track: int) -> float:
 
 
 def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
-    """Position (2,) that a forecast (n_forecast, 2) gave for ``lead_s`` after it was made (at most its
-    horizon)."""
+    """Position (2,) that a forecast (n_forecast, 2) gave for ``lead_s`` later (at most its horizon)."""
     steps = np.arange(len(forecast_w)) * dt_s
     return np.array([np.interp(lead_s, steps, forecast_w[:, axis]) for axis in range(2)])
 
 
 def _course_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
-    """When the killer last turned a corner (a circle has none), and how often it had turned there before
-    within the sonar's reach."""
+    """When the killer last turned a corner (circles have none), and how often there before in reach."""
     vel = history.body_vel_w[:, slot, :2]
     turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(vel[:, 1], vel[:, 0])))))
     corner = (turn > TURN_RAD) & (bodies.circle_m[slot] == 0)
@@ -592,8 +525,7 @@ def _course_facts(history: History, bodies: Bodies, slot: int, config: Config) -
 
 
 def _turns_in_reach(history: History, bodies: Bodies, slot: int, ago_s: float, config: Config) -> int:
-    """Earlier passes of the corner turned ``ago_s`` before the end that lay within the sonar's fan: could it
-    have been learnt?"""
+    """Earlier passes, in the sonar's fan, of the corner turned ``ago_s`` before the end: was it to learn?"""
     turned_s = float(history.t_s[-1]) - ago_s
     place = history.body_w[int(np.abs(history.t_s - turned_s).argmin()), slot]
     passes = np.arange(turned_s - bodies.lap_s[slot], 0.0, -bodies.lap_s[slot])

@@ -1,5 +1,4 @@
-"""From a request to tasks: which cells there are, which of them one simulator can serve, and how they are cut
-into tasks."""
+"""From a request to tasks: its cells, which of them one simulator can serve, cut into tasks."""
 
 from __future__ import annotations
 
@@ -24,35 +23,28 @@ if TYPE_CHECKING:
     from uuvtai.sim.sim import Sim
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The grid of a sweep: named axes and their values, and the cells they make.
-
+# ---- The grid of a sweep: named axes and their values, and the cells they make.
 
 SCENE_AXES = {"S": "world.n_static", "D": "world.n_dynamic", "v": "world.dynamic_speed_m_s"}
 """axes that vary as data within one simulator, and their config keys"""
-PRESET_AXES = ("sensors", "vehicle", "world")
-"""axes whose values are names of presets"""
+PRESET_AXES = ("sensors", "vehicle", "world")  # axes whose values are names of presets
 MAX_CELLS = 10_000
-DEFAULT = "paper"
-"""grid preset of a sweep that names no axes"""
+DEFAULT = "paper"  # grid preset of a sweep that names no axes
 _KEY = re.compile(r"[a-z_][a-z0-9_]*(\.[a-z_][a-z0-9_]*)+")
 
 Value = Any
-Cell = dict[str, Value]
-"""value of every axis that the cell sets, by the axis's name"""
+Cell = dict[str, Value]  # value of every axis that the cell sets, by the axis's name
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Axes by name; ``one_at_a_time``: each axis alone around the unchanged condition, instead of all
-    combinations."""
+    """Axes by name; ``one_at_a_time``: each axis alone around the unchanged condition."""
 
     axes: dict[str, tuple[Value, ...]]
     one_at_a_time: bool = False
 
     def cells(self) -> list[Cell]:
-        """Every cell once; where nothing moves (D = 0) the obstacles' speed means nothing and stands for all
-        its values."""
+        """Every cell once; where nothing moves (D = 0) one speed of obstacles stands for all."""
         found = self._alone() if self.one_at_a_time else self._combined()
         kept: dict[str, Cell] = {repr(sorted(cell.items())): cell for cell in map(_without_speed, found)}
         return list(kept.values())
@@ -117,8 +109,7 @@ def _axis(text: str) -> tuple[str, tuple[Value, ...]]:
 
 
 def checked(grid: Grid) -> Grid:
-    """The grid itself. Raises ConfigError where an axis is unknown, empty, has a value twice, or the cells
-    are too many."""
+    """The grid. Raises ConfigError: an axis unknown, empty, with a value twice, or too many cells."""
     if not grid.axes:
         raise ConfigError("the grid has no axes; for example --grid S=4,8,12 --grid D=0,6")
     for name, values in grid.axes.items():
@@ -161,13 +152,9 @@ def _check_values(name: str, values: Sequence[Value]) -> None:
             )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What a worker of a sweep is given and what it gives back: plain data, so that it may run in any process on
-# any machine.
+# ---- What a worker of a sweep is given and what it gives back: plain data, for any process on any machine.
 
-
-Row = dict[str, Any]
-"""one method in one cell, an entry of ``cells`` in ``uuv sweep --json``"""
+Row = dict[str, Any]  # one method in one cell, an entry of ``cells`` in ``uuv sweep --json``
 
 
 @dataclass(frozen=True)
@@ -183,8 +170,7 @@ class Task:
     labels: tuple[dict[str, Any], ...]
     """of the cells: values of the axes, which go into the rows"""
     seeds: tuple[int, ...]
-    episodes: int
-    """per seed"""
+    episodes: int  # per seed
     num_envs: int
     device: str = "auto"
 
@@ -239,8 +225,7 @@ def _sim_of(task: Task, config: Config) -> Sim:
 
 
 def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> Row:
-    """One method in one cell: what ``uuv eval`` says of a method, without what a clock measured, and every
-    episode's end."""
+    """One method in one cell: as in ``uuv eval``, without what a clock measured, and how episodes end."""
     from uuvtai.evaluation.results import summary
 
     found = summary(method, results, 0, 0.0)
@@ -264,14 +249,8 @@ def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> 
     }
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
-BATCH = 256
-"""episodes side by side in one simulator"""
-TASK_EPISODES = 1024
-"""episodes of a task, about: what a kill costs at most, and enough that the last stragglers of a batch cost
-little"""
+BATCH = 256  # episodes side by side in one simulator
+TASK_EPISODES = 1024  # about: what a kill costs at most, and enough to make stragglers cheap
 
 Overrides = list[Any]
 
@@ -288,8 +267,7 @@ class SweepRequest:
     """of the config, for every cell: ``key=value`` texts and (key, value) pairs"""
     agents: tuple[str, ...]
     seeds: tuple[int, ...]
-    episodes: int
-    """per seed, cell and method"""
+    episodes: int  # per seed, cell and method
     num_envs: int | None = None
     device: str = "auto"
 
@@ -311,8 +289,7 @@ class SweepRequest:
 
 
 def request_of(document: dict[str, Any]) -> SweepRequest:
-    """The request that ``document`` came from. Raises KeyError or TypeError for another document, ConfigError
-    for another grid."""
+    """The request of ``document``. KeyError or TypeError for no such document, ConfigError for a grid."""
     one_at_a_time, axes = document["grid"]["one_at_a_time"], document["grid"]["axes"]
     grid = checked(Grid({name: tuple(values) for name, values in axes.items()}, _typed(one_at_a_time, bool)))
     lists = {name: tuple(document[name]) for name in ("agents", "seeds")}
@@ -341,8 +318,7 @@ def _typed(value: Any, of: Any) -> Any:
 
 
 def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:
-    """Config of a cell, or of none, with the scene as data and room for the grid's largest. Raises
-    ConfigError."""
+    """Config of a cell, or none, the scene as data, room for the grid's largest. Raises ConfigError."""
     cell = cell or {}
     presets = {kind: cell.get(kind, getattr(request, kind)) for kind in PRESET_AXES}
     keys = [
@@ -359,8 +335,7 @@ def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:
 
 
 def label_of(cell: Cell, config: Config) -> dict[str, Any]:
-    """What a row says of its cell: S, D, v_m_s (None where nothing moves) and every other axis by its
-    name."""
+    """What a row says of its cell: S, D, v_m_s (None = nothing moves) and every other axis by name."""
     world = config.world
     n_dynamic = cell.get("D", world.n_dynamic)
     scene = {
@@ -426,8 +401,7 @@ def _by_config(request: SweepRequest) -> list[tuple[Config, list[Cell]]]:
 
 
 def check_rows(request: SweepRequest, methods: Sequence[str]) -> list[str]:
-    """Keys of all rows in the order of the document. Raises ConfigError where two cells could not be told
-    apart."""
+    """Keys of all rows in the document's order. Raises ConfigError for cells that cannot be told apart."""
     keys = [
         row_key(label_of(cell, config), name)
         for config, cells in _by_config(request)

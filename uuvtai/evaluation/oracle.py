@@ -27,31 +27,21 @@ import numpy as np
 from uuvtai.common.obstacle_motion import body_positions, path_positions
 from uuvtai.config import Config
 
-# ------------------------------------------------------------------------------------------------------------
-# Where the bodies of a scenario are at given times, and how far points are from them.
+# ---- Where the bodies of a scenario are at given times, and how far points are from them.
 
-
-_BEFORE_S = 1e-4
-"""Velocities are differences over this time: exact but for the moment of a sharp turn."""
+_BEFORE_S = 1e-4  # Velocities are differences over this time: exact but for the moment of a sharp turn.
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """One body of a scenario."""
-
-    kind: str
-    """sphere, cylinder or box"""
-    size: Array
-    """(3,) [m] as in ``WorldState``"""
+    kind: str  # sphere, cylinder or box
+    size: Array  # (3,) [m] as in ``WorldState``
     yaw: float
-    pos_w: Array
-    """(n_t, 3) [m]; n_t = 1 for a body at rest"""
-    vel_w: Array
-    """(n_t, 2) [m/s] horizontal"""
+    pos_w: Array  # (n_t, 3) [m]; n_t = 1 for a body at rest
+    vel_w: Array  # (n_t, 2) [m/s] horizontal
 
     @property
     def moves(self) -> bool:
-        """Whether it has a path and a speed."""
         return bool(np.any(self.vel_w))
 
     @property
@@ -75,8 +65,7 @@ def _obstacle(body: dict[str, Any], t_s: Array) -> Obstacle:
 
 
 def level_excess(body: Obstacle, dx: Array, dy: Array) -> tuple[Array, Array]:
-    """(x, y) parts [m] of the way from the body's core to points at (dx, dy) from its middle; the core of a
-    sphere is its centre."""
+    """(x, y) parts [m] of the way from the body's core (a sphere's centre) to points at (dx, dy)."""
     if body.kind == "sphere":
         return dx, dy
     if body.kind == "cylinder":
@@ -98,18 +87,12 @@ def rounding_m(body: Obstacle) -> float:
     return float(body.size[0]) if body.kind == "sphere" else 0.0
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Nodes in space at which a kinematic point may be, and which of them the referee's rules forbid at a time,
-# for every way to leave them.
-#
-# The hull is a ball of its own radius: the slimmest that the capsule can look, whatever its heading.
+# ---- Nodes at which a kinematic point may be, and which of them the referee's rules forbid at a time. The
+# hull is a ball of its own radius: the slimmest that the capsule can look, whatever its heading.
 
+CELL_M = 0.1  # Level distance of neighbouring nodes.
 
-CELL_M = 0.1
-"""Level distance of neighbouring nodes."""
-
-HEAVE_EVERY = 2
-"""Nodes above each other lie as far apart as full heave goes in so many time steps."""
+HEAVE_EVERY = 2  # Nodes above each other lie as far apart as full heave goes in so many time steps.
 
 STAY, AXES, DIAGONALS = slice(0, 1), slice(1, 5), slice(5, 9)
 MOVES = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)])
@@ -123,16 +106,12 @@ class Lattice:
     x_m: Array
     y_m: Array
     z_m: Array
-    dt_s: float
-    """one level step at full speed"""
+    dt_s: float  # one level step at full speed
     speed_m_s: float
-    inside: Array
-    """far enough from side walls, floor and surface"""
-    start: tuple[int, int, int]
-    """node of the start (z, y, x)"""
+    inside: Array  # far enough from side walls, floor and surface
+    start: tuple[int, int, int]  # node of the start (z, y, x)
 
     def near(self, point: Array, reach_m: float) -> Array:
-        """Mask of the nodes within ``reach_m`` of a point."""
         x, y, z = self.x_m - point[0], self.y_m - point[1], self.z_m - point[2]
         return x**2 + y[:, None] ** 2 + z[:, None, None] ** 2 <= reach_m**2
 
@@ -192,8 +171,7 @@ class Referee:
             self._forbid(self._base, body, 0, None)
 
     def blocked(self, moving: list[Obstacle], step: int, near: Array) -> Array:
-        """Masks at a time step, right wherever ``near`` (n_z, n_y, n_x) and its neighbours are; elsewhere
-        bodies may be left out."""
+        """Masks at a time step, right wherever ``near`` (n_z, n_y, n_x) and its neighbours are."""
         out = self._base.copy()
         for body in moving:
             self._forbid(out, body, step, near)
@@ -241,22 +219,17 @@ def _widened(box: tuple[slice, slice, slice]) -> tuple[slice, ...]:
     return tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 Array = np.ndarray
 
 _DIAGONAL_SHARE = math.sqrt(2.0) - 1.0
-"""Share of the time steps that allow diagonal moves: then the diagonal is as fast as the axes, and what can
-be reached is an octagon."""
+"""Share of the time steps that allow diagonal moves, which then are as fast: the reach is an octagon."""
 
 
 @dataclass(frozen=True)
 class Arrival:
     """What the oracle says of one scenario."""
 
-    time_s: float | None
-    """earliest arrival; None = not reachable within the horizon"""
+    time_s: float | None  # earliest arrival; None = not reachable within the horizon
 
 
 def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
@@ -285,8 +258,7 @@ def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
 
 
 def _moved(reached: Array, blocked: Array, after: Array, step: int) -> Array:
-    """Nodes that can be reached one step later; ``blocked`` and ``after`` are the referee's masks at both
-    ends of the step."""
+    """Nodes in reach a step later; ``blocked`` and ``after``: the referee's masks at both its ends."""
     out = np.zeros_like(reached)
     for move in _moves_of(step):
         here, there = _shifted(MOVES[move])

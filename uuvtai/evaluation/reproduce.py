@@ -35,9 +35,7 @@ from uuvtai.report.reproduction import claim_table
 from uuvtai.report.tables import Table, change_name, markdown, seconds, text_table, varies_alone
 from uuvtai.report.timing import ENVS, SPEEDS, density_table, latency_table
 
-# ------------------------------------------------------------------------------------------------------------
-# A reproduction as sections of the report: what the page shows, in the order of the paper.
-
+# ---- A reproduction as sections of the report: what the page shows, in the order of the paper.
 
 Described = dict[str, Any]
 
@@ -89,28 +87,14 @@ def _main_table(document: dict[str, Any]) -> Described:
     rows = []
     for name, entries in document["table_main"].items():
         printed = claims.TABLE_MAIN.get(name)
-        theirs = (
-            [f"{printed.success:.2f}", f"{printed.collision:.2f}", f"{printed.tts_s}"]
-            if printed
-            else ["-"] * 3
-        )
+        theirs = ["-"] * 3
+        if printed:
+            theirs = [f"{printed.success:.2f}", f"{printed.collision:.2f}", f"{printed.tts_s}"]
         own = tts_s(entries)
-        ours = [
-            str(pooled(entries, "success")),
-            str(pooled(entries, *COLLIDED)),
-            "-" if own is None else f"{own:.1f}",
-        ]
-        rows.append([name, str(len(entries)), *ours, *theirs])
-    columns = [
-        "method",
-        "training seeds",
-        "success",
-        "collision",
-        "TTS s",
-        "paper: success",
-        "paper: collision",
-        "paper: TTS s",
-    ]
+        rates = [str(pooled(entries, "success")), str(pooled(entries, *COLLIDED))]
+        rows.append([name, str(len(entries)), *rates, "-" if own is None else f"{own:.1f}", *theirs])
+    measured = ["success", "collision", "TTS s"]
+    columns = ["method", "training seeds", *measured, *(f"paper: {name}" for name in measured)]
     caption = f"Table main, ours beside the paper's as printed; {document['commands']['eval/main']}"
     return {"kind": "table", "columns": columns, "rows": rows, "caption": caption, "n_left": 1}
 
@@ -121,30 +105,20 @@ def _notes() -> list[Described]:
 
 
 def _trade_off(document: dict[str, Any]) -> list[Described]:
-    """Success against collision from fast to careful, with the paper's point; nothing where it was not
-    swept."""
+    """Success against collision from fast to careful, with the paper's point, where it was swept."""
     sweep = document["sweeps"].get("caution")
     if sweep is None:
         return []
     points = [_point(sweep["cells"], caution) for caution in sweep["axes"]["teacher.caution"]]
-    series = [{"name": "bt, teacher.caution from fast to careful", "points": points}]
-    marks = [
-        {
-            "name": "paper",
-            "collision_rate": claims.MODERATE_COLLISION,
-            "success_rate": claims.MODERATE_SUCCESS,
-        }
-    ]
-    caption = "Mean over S <= 8, D <= 9, v <= 1.5 m/s (D = 0 once per S)"
-    return [
-        {
-            "kind": "trade_off",
-            "series": series,
-            "marks": marks,
-            "caption": caption,
-            "command": document["commands"]["sweep/caution"],
-        }
-    ]
+    rates = {"collision_rate": claims.MODERATE_COLLISION, "success_rate": claims.MODERATE_SUCCESS}
+    block = {
+        "kind": "trade_off",
+        "series": [{"name": "bt, teacher.caution from fast to careful", "points": points}],
+        "marks": [{"name": "paper", **rates}],
+        "caption": "Mean over S <= 8, D <= 9, v <= 1.5 m/s (D = 0 once per S)",
+        "command": document["commands"]["sweep/caution"],
+    }
+    return [block]
 
 
 def _point(cells: Sequence[dict[str, Any]], caution: float) -> Described:
@@ -152,8 +126,7 @@ def _point(cells: Sequence[dict[str, Any]], caution: float) -> Described:
     return {"collision_rate": pooled(own, *COLLIDED).rate, "success_rate": pooled(own, "success").rate}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The key tables of a reproduction as Markdown: docs/results.md is one of these pages.
+# ---- The key tables of a reproduction as Markdown: docs/results.md is one of these pages.
 
 
 def results_page(document: dict[str, Any]) -> str:
@@ -173,7 +146,8 @@ def results_page(document: dict[str, Any]) -> str:
         _ceilings(document),
         _sweeps(document),
         _timing(document),
-        _paper_notes(document),
+        "## Where the paper's figures do not add up\n"
+        + "\n".join(f"- {text}" for text in document["inconsistencies"]),
     ]
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 
@@ -195,15 +169,10 @@ def _main(document: dict[str, Any]) -> str:
     rows = []
     for name, entries in document["table_main"].items():
         printed = claims.TABLE_MAIN.get(name)
-        theirs = (
-            [
-                f"{printed.success:.2f} / {printed.collision:.2f}",
-                f"{printed.tts_s} s",
-                f"{printed.mean_time_s} s",
-            ]
-            if printed
-            else ["-"] * 3
-        )
+        theirs = ["-"] * 3
+        if printed:
+            shares = f"{printed.success:.2f} / {printed.collision:.2f}"
+            theirs = [shares, f"{printed.tts_s} s", f"{printed.mean_time_s} s"]
         rates = [str(pooled(entries, "success")), str(pooled(entries, *COLLIDED))]
         mean_s = mean([m["time_mean_s"] for m in entries if m["time_mean_s"] is not None])
         arrived = mean(
@@ -223,15 +192,10 @@ def _main(document: dict[str, Any]) -> str:
 
 
 def _ceilings(document: dict[str, Any]) -> str:
-    rows = [
-        [
-            f"`{m['name']}`",
-            str(pooled([m], "success")),
-            str(pooled([m], *COLLIDED)),
-            seconds(m["time_to_success_mean_s"]),
-        ]
-        for m in document["ceilings"]["methods"]
-    ]
+    rows = []
+    for m in document["ceilings"]["methods"]:
+        rates = [str(pooled([m], "success")), str(pooled([m], *COLLIDED))]
+        rows.append([f"`{m['name']}`", *rates, seconds(m["time_to_success_mean_s"])])
     note = "`bt+truth` is told the true bodies, `oracle` knows the future: privileged, no methods."
     return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + text_table(
         ["", "success", "collision", "mean time of successes"], rows
@@ -257,15 +221,11 @@ def _sweep_lines(sweep: dict[str, Any]) -> str:
     for cell in sweep["cells"]:
         key = (cell["method"], *(str(cell.get(name, "")) for name in down))
         lines.setdefault(key, {})[str(cell.get(across))] = _both(cell)
-    columns = [
-        "method",
-        *down,
-        *("nothing moves" if value is None else f"{across} = {value}" for value in values),
-    ]
+    speeds = ["nothing moves" if value is None else f"{across} = {value}" for value in values]
     rows = [
         [*map(str, key), *(found.get(str(value), "") for value in values)] for key, found in lines.items()
     ]
-    return "success / collision in %\n\n" + text_table(columns, rows)
+    return "success / collision in %\n\n" + text_table(["method", *down, *speeds], rows)
 
 
 def _alone(sweep: dict[str, Any]) -> str:
@@ -300,15 +260,6 @@ def _timing(document: dict[str, Any]) -> str:
             markdown(Table((ENVS, *SPEEDS), profile["rows"])),
         ]
     )
-
-
-def _paper_notes(document: dict[str, Any]) -> str:
-    return "## Where the paper's figures do not add up\n" + "\n".join(
-        f"- {text}" for text in document["inconsistencies"]
-    )
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 REQUEST, RESULT, PAGE = "reproduce_request.json", "reproduce.json", "results.md"

@@ -1,5 +1,4 @@
-"""The steps of a reproduction: each is one command of ours in a folder of its own, so that every figure names
-the command that made it."""
+"""The steps of a reproduction: each one command of ours in its own folder, named by its figures."""
 
 from __future__ import annotations
 
@@ -19,28 +18,20 @@ from uuvtai.logs.run_folder import RunFolderError, write_atomic
 TRAINED = ("ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model")
 """presets that are trained; in the ablation's table ``curriculum`` is "Full" and ``ppo`` is "BT distill\""""
 EVALUATION_SEED = 90007
-"""never trained or tuned on; it is for published figures alone, so do not look at it while you change
-anything"""
-RETIRED_SEEDS = (90001,)
-"""were evaluation seeds until somebody looked at their failures while tuning; now they are tuning seeds like
-any other"""
+"""never trained or tuned on; for published figures alone: do not look while you change things"""
+RETIRED_SEEDS = (90001,)  # evaluation seeds whose failures somebody saw while tuning; now tuning seeds
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How much of everything."""
-
     iterations: int
     """of 256 envs x 64 steps; 38 are 622,592 env-steps, the paper's budget, and 380 ten times as many"""
     training_seeds: int
-    episodes: int
-    """per method in Table main"""
+    episodes: int  # per method in Table main
     ceiling_episodes: int
-    sweep_episodes: int
-    """per cell"""
+    sweep_episodes: int  # per cell
     profile_seconds: float
-    beyond: bool
-    """also trade-off, robustness and gauntlet sweeps"""
+    beyond: bool  # also trade-off, robustness and gauntlet sweeps
 
 
 BUDGETS = {
@@ -54,13 +45,10 @@ class Step:
     """One command. ``folder`` is relative to the reproduction's."""
 
     name: str
-    command: tuple[str, ...]
-    """arguments of ``uuv``, without folder"""
+    command: tuple[str, ...]  # arguments of ``uuv``, without folder
     folder: str
-    resumes: bool = False
-    """what was begun is gone on with by ``--resume``; other commands begin anew"""
-    to_file: bool = False
-    """the command has no run folder: what it prints is kept"""
+    resumes: bool = False  # what was begun is gone on with by ``--resume``; other commands begin anew
+    to_file: bool = False  # the command has no run folder: what it prints is kept
 
     def argv(self, root: Path, resume: bool = False) -> list[str]:
         """Arguments of ``uuv`` with the folder, as they are run."""
@@ -181,7 +169,6 @@ def _agents(*names: str) -> tuple[str, ...]:
 
 
 def is_done(step: Step, root: Path) -> bool:
-    """Whether the step was finished before."""
     if step.to_file:
         return result_file(step, root).exists()
     try:
@@ -199,8 +186,7 @@ _INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM)
 
 
 def run_step(step: Step, root: Path) -> None:
-    """Run what is not done; what was begun goes on or begins anew. KeyboardInterrupt and RunFolderError as
-    the command ends."""
+    """Run what is not done; what was begun goes on. KeyboardInterrupt, RunFolderError as commands end."""
     place = root / step.folder
     begun = place.exists() and any(place.iterdir())
     resume = begun and step.resumes and _can_resume(step, place)
@@ -246,7 +232,6 @@ def _can_resume(step: Step, place: Path) -> bool:
 
 
 def _die_with_parent() -> None:
-    """A killed reproduction leaves no training behind that would fight with the next one (Linux; elsewhere it
-    runs to its end)."""
+    """A killed reproduction leaves no training behind to fight the next one (Linux; else it runs on)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG

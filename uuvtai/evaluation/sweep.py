@@ -1,5 +1,4 @@
-"""A sweep's run folder: every finished row is on disk at once, so that a sweep killed at any moment goes on
-where it was."""
+"""A sweep's run folder: finished rows are on disk at once, so a killed sweep goes on from there."""
 
 from __future__ import annotations
 
@@ -34,27 +33,22 @@ if TYPE_CHECKING:
     from uuvtai.evaluation.agents import Method
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Who does the work of a sweep: processes on this machine, or a Ray cluster. A worker that is lost costs its
-# task once more.
+# ---- Who does the work: processes on this machine, or a Ray cluster. A lost worker's task is done once more.
 
 
 class Engine(Protocol):
     """Runs tasks somewhere."""
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
-        """(number of the item, result) as they come. Errors of the work itself are raised; EngineError where
-        workers keep dying."""
+        """(item's number, result) as they come. Raises errors of the work; EngineError where workers die."""
         ...
 
 
 class RayEngine:
-    """Tasks on a Ray cluster that runs already, or on one inside this process; Ray itself runs lost tasks
-    again."""
+    """Tasks on a Ray cluster that runs already, or one in this process; Ray runs lost tasks again."""
 
     def __init__(self, address: str = "auto", cpus_per_task: float = 2.0) -> None:
-        """``address``: of the cluster, ``auto`` = the one that this machine belongs to, ``local`` = one
-        inside this process."""
+        """``address``: of the cluster, ``auto`` = this machine's, ``local`` = one in this process."""
         try:
             import ray  # type: ignore[import-not-found]  # an extra
         except ImportError:
@@ -103,9 +97,6 @@ class RayEngine:
 def engine_of(name: str, workers: int, address: str) -> Engine:
     """The engine of ``uuv sweep --engine``: 'local' with so many ``workers``, or 'ray' at ``address``."""
     return LocalEngine(workers) if name == "local" else RayEngine(address)
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 ROWS, REQUEST, RESULT = "cells.jsonl", "sweep_request.json", "sweep.json"

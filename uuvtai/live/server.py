@@ -23,8 +23,7 @@ from uuvtai.logs.encode import EpisodeEnd, EpisodeHeader, Topic, Values
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.writer import EpisodeReader, PolicyNote, Recordable, RecordedJob, TopicMessage, TopicStream
 
-# ------------------------------------------------------------------------------------------------------------
-# Running episodes as messages for viewers: the topics of the log, as they come, no faster than the clock.
+# ---- Running episodes as messages for viewers: the topics of the log, no faster than the clock.
 
 
 class Viewers(Protocol):
@@ -49,11 +48,9 @@ class LiveEpisode:
         viewers.begin(self._stream.schemas())
 
     def due(self, values: Values) -> list[Topic]:
-        """Topics that this step has messages on."""
         return self._stream.due(values)
 
     def write(self, values: Values) -> None:
-        """Show one control step."""
         self._viewers.tell_time(round(int(values["clock.step"]) * self._dt_s * 1e9))
         for message in self._stream.messages(values):
             self._viewers.send(message)
@@ -86,8 +83,7 @@ class Broadcast(EpisodeReader):
         )
 
 
-_FORGIVEN_S = 0.25
-"""who is later than this does not catch up: a viewer would see a jump"""
+_FORGIVEN_S = 0.25  # who is later than this does not catch up: a viewer would see a jump
 
 
 class RealTime:
@@ -130,21 +126,15 @@ class RealTime:
         return self._steps * self._dt_s / spent if spent > 0 else 0.0
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Who may connect to the server of episodes: a relay in front of it, which looks at each request and passes
-# bytes on. The SDK's own server takes any web page's script, and any number of clients.
+# ---- Who may connect to the server of episodes: a relay in front of it, which looks at each request and
+# passes bytes on. The SDK's own server takes any web page's script, and any number of clients.
 
-
-MOST_CLIENTS = 8
-"""at once, whether they have sent a request already or not"""
+MOST_CLIENTS = 8  # at once, whether they have sent a request already or not
 _REQUEST_S, _REQUEST_BYTES = 5.0, 16 << 10
-_SLOW_S = 10.0
-"""a client that takes nothing for as long is dropped [s]"""
-_BUFFER = 256 << 10
-"""[bytes] that the system keeps for each side of a client"""
+_SLOW_S = 10.0  # a client that takes nothing for as long is dropped [s]
+_BUFFER = 256 << 10  # [bytes] that the system keeps for each side of a client
 _OWN_NAMES = ("localhost", "127.0.0.1", "::1")
-_DESKTOP = "file://"
-"""origin of Foxglove's and Lichtblick's programs; no web page can name it"""
+_DESKTOP = "file://"  # origin of Foxglove's and Lichtblick's programs; no web page can name it
 
 
 class Doorkeeper:
@@ -162,7 +152,6 @@ class Doorkeeper:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
-        """Let go of the port and of all who are connected."""
         for place in (self._listener, *self._open):
             _ended(place)
 
@@ -275,15 +264,10 @@ def _ended(place: socket.socket) -> None:
     place.close()
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 EXTRA = "uuvtai[live]"
-BACKLOG = 64
-"""messages that wait for a client; when more do, the oldest are dropped"""
+BACKLOG = 64  # messages that wait for a client; when more do, the oldest are dropped
 _NEEDED = "foxglove.websocket"
-_MOST_TOLD = 300
-"""characters"""
+_MOST_TOLD = 300  # characters
 
 
 class LiveError(UserError, RuntimeError):
@@ -364,7 +348,6 @@ class ViewerServer:
             self._asked.add(topic)
 
     def close(self) -> None:
-        """Let go of the port and of all who are connected."""
         self._server.stop()
         self._door.close()
 

@@ -26,8 +26,7 @@ LOSS_SHARE = 0.01
 
 
 class McapFile:
-    """One MCAP file under way as ``<path>.XXXXXXXX.part`` (eight random digits); ``finish`` makes it whole,
-    durable and gives it its name."""
+    """An MCAP file under way as ``<path>.XXXXXXXX.part``; ``finish`` makes it whole and names it."""
 
     def __init__(self, path: Path, profile: str = "") -> None:
         """``profile``: what the file says it keeps to, such as 'ros2'. Raises OSError."""
@@ -47,7 +46,6 @@ class McapFile:
         self._writer.add_metadata(name, entries)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """A file within the file."""
         self._writer.add_attachment(0, 0, name, media_type, data)
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:

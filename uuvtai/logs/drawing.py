@@ -1,5 +1,4 @@
-"""Drawing in world coordinates with OpenCV: anti-aliased, with sub-pixel places, and text in a real font
-where OpenCV has one."""
+"""Drawing in world coordinates with OpenCV: anti-aliased, sub-pixel places, text in a real font if any."""
 
 from __future__ import annotations
 
@@ -23,33 +22,18 @@ from uuvtai.logs.reader import LogHead, read_head, read_messages
 from uuvtai.logs.topics import TOPICS
 from uuvtai.logs.topics.perception import Layer
 
-Color = tuple[int, int, int]
-"""blue, green, red"""
+Color = tuple[int, int, int]  # blue, green, red
 
-_SHIFT = 4
-"""bits of sub-pixel precision"""
+_SHIFT = 4  # bits of sub-pixel precision
 
 
 def bgr(code: str) -> Color:
-    """A colour from '#rrggbb'."""
     red, green, blue = (int(code[i : i + 2], 16) for i in (1, 3, 5))
     return blue, green, red
 
 
-PAPER, WATER, INK, GREY, FAINT = (
-    bgr("#ffffff"),
-    bgr("#eef5f9"),
-    bgr("#1d2733"),
-    bgr("#66727f"),
-    bgr("#c9d2da"),
-)
-STATIC, DYNAMIC, GOAL, ROUTE, MOVER = (
-    bgr("#262c38"),
-    bgr("#e53946"),
-    bgr("#f7b801"),
-    bgr("#1f8fff"),
-    bgr("#d9480f"),
-)
+PAPER, WATER, INK, GREY, FAINT = map(bgr, ("#ffffff", "#eef5f9", "#1d2733", "#66727f", "#c9d2da"))
+STATIC, DYNAMIC, GOAL, ROUTE, MOVER = map(bgr, ("#262c38", "#e53946", "#f7b801", "#1f8fff", "#d9480f"))
 FAILED = bgr("#c92a2a")
 
 
@@ -69,8 +53,7 @@ class Canvas:
         x_m: Sequence[float],
         y_m: Sequence[float],
     ) -> None:
-        """``size`` = (width, height); ``corner`` = pixel of the map area's upper left corner, which shows
-        (x_m[0], y_m[1])."""
+        """``size`` = (width, height); ``corner``: pixel of the map's corner that shows (x_m[0], y_m[1])."""
         self.size = size
         self.corner, self.scale, self.x_m, self.y_m = corner, scale, tuple(x_m), tuple(y_m)
         self.image = np.full((size[1], size[0], 3), PAPER, np.uint8)
@@ -86,7 +69,6 @@ class Canvas:
         )
 
     def strip(self, pixels: Any, color: Color, width: int = 2, closed: bool = False) -> None:
-        """Polyline in pixels."""
         cv2.polylines(self.image, [_fixed(pixels)], closed, color, width, cv2.LINE_AA, _SHIFT)
 
     def dot(
@@ -151,12 +133,10 @@ class Canvas:
         return (int(left), int(top)), (int(right), int(bottom))
 
     def line(self, points: Any, color: Color, width: int = 2, closed: bool = False) -> None:
-        """Polyline in the world."""
         if len(points) > 1:
             self.strip(self.pixels(points), color, width, closed)
 
     def dashes(self, points: Any, color: Color, width: int = 1, period_px: float = 9.0) -> None:
-        """Dashed polyline in the world."""
         path = self.pixels(points)
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         for begin in np.arange(0.0, along[-1], period_px):
@@ -166,7 +146,6 @@ class Canvas:
             )
 
     def area(self, points: Any, color: Color) -> None:
-        """Filled polygon in the world."""
         self.filled(self.pixels(points), color)
 
     def area_between(self, outer: Any, inner: Any, color: Color) -> None:
@@ -178,7 +157,6 @@ class Canvas:
         self.dot(self.pixels([center])[0], radius_px, color, width)
 
     def star(self, center: Sequence[float], radius_px: float, fill: Color = GOAL, edge: Color = INK) -> None:
-        """Five-pointed star."""
         pixels = self.pixels([center])[0] + star_shape(radius_px)
         self.filled(pixels, fill)
         self.strip(pixels, edge, 1, closed=True)
@@ -243,16 +221,8 @@ def _hershey_text(
     scale, thickness = size / 28.0, 2 if bold and size >= 20 else 1
     (width, _), _ = cv2.getTextSize(plain, cv2.FONT_HERSHEY_DUPLEX, scale, thickness)
     x = place[0] - {"left": 0, "center": width / 2, "right": width}[align]
-    cv2.putText(
-        image,
-        plain,
-        (round(x), round(place[1])),
-        cv2.FONT_HERSHEY_DUPLEX,
-        scale,
-        color,
-        thickness,
-        cv2.LINE_AA,
-    )
+    corner, font = (round(x), round(place[1])), cv2.FONT_HERSHEY_DUPLEX
+    cv2.putText(image, plain, corner, font, scale, color, thickness, cv2.LINE_AA)
     return int(width)
 
 
@@ -267,15 +237,10 @@ def _fixed(pixels: np.ndarray) -> np.ndarray:
     return np.round((np.asarray(pixels) - 0.5) * (1 << _SHIFT)).astype(np.int32)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What pictures and videos have in common: the tank, maps, true bodies, ruler, all on a canvas in world
-# coordinates.
+# ---- What pictures and videos have in common: the tank, maps, true bodies, ruler, in world coordinates.
 
-
-_MAX_MAP = 1000
-"""[px] greatest height of the map"""
-_HULL_RADIUS_M = 0.17
-"""half the height of the hull that ``Canvas.vehicle`` draws"""
+_MAX_MAP = 1000  # [px] greatest height of the map
+_HULL_RADIUS_M = 0.17  # half the height of the hull that ``Canvas.vehicle`` draws
 
 
 def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int]) -> Canvas:
@@ -291,7 +256,6 @@ def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int
 
 
 def tank_outline(tank: dict[str, Any]) -> np.ndarray:
-    """(n, 2) corners of the tank."""
     (x0, x1), (y0, y1) = tank["x_m"], tank["y_m"]
     if tank["shape"] == "circle":
         angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
@@ -301,7 +265,6 @@ def tank_outline(tank: dict[str, Any]) -> np.ndarray:
 
 
 def paint_water(canvas: Canvas, tank: dict[str, Any]) -> None:
-    """The tank's inside."""
     canvas.area(tank_outline(tank), WATER)
 
 
@@ -384,8 +347,7 @@ def paint_ruler(canvas: Canvas) -> None:
     canvas.text((begin - 10, y + 5), f"{gap} m", 16, INK, align="right")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A log as arrays, ready to be drawn.
+# ---- A log as arrays, ready to be drawn.
 
 
 @dataclass
@@ -433,7 +395,6 @@ class Recording:
 
     @property
     def ending(self) -> str:
-        """The outcome in words."""
         return _ENDINGS.get(self.outcome, self.outcome.replace("_", " "))
 
     @property
@@ -453,10 +414,8 @@ class Recording:
 _ENDINGS = {"ttc": "TTC stop"}
 _MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_BODIES = 3600.0, 1000.0, 1e4, 1000
 """what is drawn must fit a picture and a video that somebody waits for"""
-_MAX_NUMBERS = 100_000
-"""of a scenario: corners of paths are drawn in every frame"""
-_MAX_ARRAYS, _OVERHEAD = 384 << 20, 200
-"""[bytes] all that is drawn together, and what a message takes beyond its arrays"""
+_MAX_NUMBERS = 100_000  # of a scenario: corners of paths are drawn in every frame
+_MAX_ARRAYS, _OVERHEAD = 384 << 20, 200  # [bytes] drawn together, and what a message takes beyond its arrays
 _READERS = {topic.name: topic.read for topic in TOPICS if topic.read is not None}
 VIDEO_TOPICS = tuple(_READERS)
 PICTURE_TOPICS = tuple(topic.name for topic in TOPICS if topic.in_picture)
@@ -501,8 +460,7 @@ def read_value(topic: str, data: dict[str, Any]) -> Any:
 
 @contextlib.contextmanager
 def drawing(path: Path) -> Iterator[None]:
-    """Turn everything that a scenario or a message unlike ours can raise while it is drawn into a
-    LogError."""
+    """Turn all that a scenario or a message unlike ours can raise while it is drawn into a LogError."""
     try:
         yield
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, cv2.error) as error:
@@ -518,14 +476,10 @@ def _check_scenario(path: Path, scenario: Any) -> None:
         extents = [float(tank[axis][1]) - float(tank[axis][0]) for axis in ("x_m", "y_m")]
         if not all(0 < extent <= _MAX_EXTENT_M for extent in extents):
             raise ValueError(f"a tank of {extents[0]:g} x {extents[1]:g} m")
-        numbers = list(
-            itertools.islice(_numbers([tank, bodies, scenario["goal"], scenario["start"]]), _MAX_NUMBERS + 1)
-        )
-        if (
-            len(numbers) > _MAX_NUMBERS
-            or len(bodies) > _MAX_BODIES
-            or not all(abs(number) <= _FARTHEST_M for number in numbers)
-        ):
+        all_numbers = _numbers([tank, bodies, scenario["goal"], scenario["start"]])
+        numbers = list(itertools.islice(all_numbers, _MAX_NUMBERS + 1))
+        is_near = all(abs(number) <= _FARTHEST_M for number in numbers)
+        if not is_near or len(numbers) > _MAX_NUMBERS or len(bodies) > _MAX_BODIES:
             raise ValueError("bodies beyond all bounds")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
         raise LogError(

@@ -46,23 +46,19 @@ def _list_template(length: int) -> str:
 
 
 def numbers(values: Any) -> str:
-    """A JSON list."""
     flat = np.asarray(values).ravel()
     return finite(_list_template(len(flat)) % tuple(flat.tolist()))
 
 
 def number(value: float) -> str:
-    """A JSON number."""
     return finite("%.9g" % value)  # noqa: UP031 - the one way of printing numbers here
 
 
 def number_or_null(value: float | None) -> str:
-    """A JSON number, or null."""
     return "null" if value is None else number(value)
 
 
 def numbers_or_null(values: Any | None) -> str:
-    """A JSON list, or null."""
     return "null" if values is None else numbers(values)
 
 
@@ -74,7 +70,6 @@ def finite(text: str) -> str:
 
 
 def dumped(message: dict[str, Any]) -> bytes:
-    """A message given as a dict."""
     try:
         return json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
     except ValueError:
@@ -85,12 +80,10 @@ def dumped(message: dict[str, Any]) -> bytes:
 
 
 def transform(stamp: str, parent: str, child: str, translation: Vector, rotation: Vector) -> str:
-    """foxglove.FrameTransform."""
     return _TRANSFORM % (stamp, parent, child, *translation, *rotation)
 
 
 def pose_in_frame(stamp: str, position: Vector, quat: Vector) -> bytes:
-    """foxglove.PoseInFrame in the world."""
     pose = checked(_POSE % (*map(float, position), *map(float, quat)))
     return f'{{"timestamp":{stamp},"frame_id":"world","pose":{pose}}}'.encode()
 
@@ -114,7 +107,6 @@ def scene_entity(time_ns: int, name: str, **primitives: list) -> dict[str, Any]:
 
 
 def scene_update(*entities: dict[str, Any]) -> bytes:
-    """foxglove.SceneUpdate."""
     return dumped({"deletions": [], "entities": entities})
 
 
@@ -146,7 +138,6 @@ def short(value: float) -> float:
 
 
 def color(rgba: Sequence[float]) -> dict[str, float]:
-    """foxglove.Color."""
     return dict(zip("rgba", rgba, strict=True))
 
 
@@ -165,9 +156,7 @@ def checked(text: str) -> str:
     return text
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What a log is made of: an episode's header, and one control step at a time as the state's own rows.
-
+# ---- What a log is made of: an episode's header, and one control step at a time as the state's own rows.
 
 Values = Mapping[str, Any]
 """One env at one control step: 'struct.field' of the state -> copy of the env's row (shapes, units and frames
@@ -180,27 +169,19 @@ None where there is none."""
 class EpisodeHeader:
     """What is known before the first step; it comes first in the log."""
 
-    controller: str
-    """name of the method that drives: 'bt', 'planner', 'straight' or a policy's name"""
+    controller: str  # name of the method that drives: 'bt', 'planner', 'straight' or a policy's name
     config: Config
-    config_yaml: str
-    """the same as text"""
-    scenario: dict[str, Any]
-    """of ``scenario_document``: everything true about the world, in closed form"""
-    reward_terms: tuple[str, ...] = ()
-    """names of ``reward.term``'s entries"""
-    tree_nodes: tuple[str, ...] = ()
-    """names of ``teacher.status``'s entries; numbered by the log where two are equal"""
-    tree_xml: bytes = b""
-    """the tree as it was read; empty = unknown"""
+    config_yaml: str  # the same as text
+    scenario: dict[str, Any]  # of ``scenario_document``: everything true about the world, in closed form
+    reward_terms: tuple[str, ...] = ()  # names of ``reward.term``'s entries
+    tree_nodes: tuple[str, ...] = ()  # names of ``teacher.status``'s entries; numbered where two are equal
+    tree_xml: bytes = b""  # the tree as it was read; empty = unknown
     git_sha: str = "unknown"
-    checkpoint_sha256: str = ""
-    """of the policy's checkpoint; empty = no policy"""
+    checkpoint_sha256: str = ""  # of the policy's checkpoint; empty = no policy
     version: str = __version__
 
     @cached_property
     def nodes(self) -> tuple[str, ...]:
-        """Names of the tree's nodes."""
         return numbered(self.tree_nodes)
 
 
@@ -243,12 +224,10 @@ class Moment:
 
     @cached_property
     def time_s(self) -> float:
-        """Simulation time."""
         return self.step * self.header.config.episode.control_dt_s
 
     @cached_property
     def time_ns(self) -> int:
-        """Simulation time."""
         return self.ns_of(self.step)
 
     @cached_property
@@ -261,7 +240,6 @@ class Moment:
         return time_text(self.ns_of(step))
 
     def ns_of(self, step: int) -> int:
-        """Time of a step [ns]."""
         return round(step * self.header.config.episode.control_dt_s * 1e9)
 
     @property
@@ -271,18 +249,14 @@ class Moment:
 
     @property
     def replanned(self) -> bool:
-        """The route was planned in this step."""
         return bool(self["route.n_way"] > 0 and self["route.plan_step"] == self.step)
 
 
 def time_text(time_ns: int) -> str:
-    """foxglove time."""
     return '{"sec":%d,"nsec":%d}' % divmod(time_ns, 1_000_000_000)  # noqa: UP031
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A row of the table of topics: when a topic is written, from what, how, and how it is read back.
-
+# ---- A row of the table of topics: when a topic is written, from what, how, and how it is read back.
 
 Encode = Callable[[Moment], bytes | list[bytes]]
 """JSON text of a step's message, or of each of its messages. ValueError for numbers that are not finite."""
@@ -292,12 +266,10 @@ Encode = Callable[[Moment], bytes | list[bytes]]
 class When:
     """The steps in which a topic is written."""
 
-    text: str
-    """for the reference"""
+    text: str  # for the reference
     holds: Callable[[Moment, bool], bool]
     """whether a step is one; the second value: the last message is ``1 / hertz`` old, or there is none"""
-    reads: tuple[str, ...] = ()
-    """what ``holds`` looks at; 'struct.field' of the state"""
+    reads: tuple[str, ...] = ()  # what ``holds`` looks at; 'struct.field' of the state
     hertz: float = 0.0
 
 
@@ -307,24 +279,18 @@ class Topic:
 
     name: str
     when: When
-    schema: Schema | Callable[[EpisodeHeader], Schema]
-    """a function where it depends on the run"""
+    schema: Schema | Callable[[EpisodeHeader], Schema]  # a function where it depends on the run
     encode: Encode
     reads: tuple[str, ...] = ()
     """what ``encode`` looks at; 'struct.field' of the state, or 'driver.' (``moment.Values``)"""
     read: Callable[[dict[str, Any]], Any] | None = None
     """what pictures and videos take of a message: an array, a Layer, or a tuple with some of them"""
-    in_picture: bool = False
-    """pictures show it too, not videos alone"""
-    note: str = ""
-    """follows ``when.text`` in the reference"""
-    varies: str = ""
-    """which of its fields depend on the run, for the reference"""
-    on_request: bool = False
-    """only in logs with depth images"""
+    in_picture: bool = False  # pictures show it too, not videos alone
+    note: str = ""  # follows ``when.text`` in the reference
+    varies: str = ""  # which of its fields depend on the run, for the reference
+    on_request: bool = False  # only in logs with depth images
 
     def schema_for(self, header: EpisodeHeader) -> Schema:
-        """Its schema in this run."""
         return self.schema(header) if callable(self.schema) else self.schema
 
 
@@ -368,18 +334,15 @@ EVENTS = When(
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What can be wrong with a log file, and with the name of a file that is to be drawn from it.
+# ---- What can be wrong with a log file, and with the name of a file that is to be drawn from it.
 
 
 class LogError(UserError, RuntimeError):
-    """A log that cannot be written, read or drawn: the message says what, where, why and what to type
-    next."""
+    """A log that cannot be written, read or drawn: what, where, why and what to type next."""
 
 
 def checked_suffix(out: Path, formats: Sequence[str], what: str) -> str:
-    """The ending of ``out`` in small letters. Raises LogError for one that is not among ``formats``: no file
-    says what it is not."""
+    """The ending of ``out`` in small letters. Raises LogError for one that is not among ``formats``."""
     suffix = out.suffix.lower()
     if suffix not in formats:
         raise LogError(

@@ -19,6 +19,7 @@ import numpy as np
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
+from uuvtai.common.errors import ODD
 from uuvtai.common.files import refuse_output, whole_folder
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.encode import LogError
@@ -27,29 +28,14 @@ from uuvtai.logs.topics.perception import grid_values
 from uuvtai.logs.topics.sensors import logged_image
 
 FORMATS = ("json", "csv", "npz")
-ATTACHMENTS = "attachments"
-"""folder within an export"""
+ATTACHMENTS = "attachments"  # folder within an export
 MAX_COLUMNS, MAX_CELLS = 20_000, 50_000_000
 """of a topic as CSV, and of all topics together: what is written grows with the widest message"""
-MAX_ARRAYS = 256 << 20
-"""[bytes] arrays of one export, which wait in memory"""
-_OVERHEAD = 64
-"""[bytes] an array or a number takes beyond its values"""
+MAX_ARRAYS = 256 << 20  # [bytes] arrays of one export, which wait in memory
+_OVERHEAD = 64  # [bytes] an array or a number takes beyond its values
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
 """names that open a device on some systems"""
 _MAX_NAME = 100
-_ODD = (
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    ArithmeticError,
-    RecursionError,
-    struct.error,
-    csv.Error,
-    cv2.error,
-)
-"""what a message unlike its schema can raise"""
 
 
 def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt: str = "json") -> list[Path]:
@@ -77,8 +63,7 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
 
 
 def _refuse_place(out: Path) -> None:
-    """Raise LogError or FileError for a place that is taken: a log's own names must not meet anybody's
-    files."""
+    """Raise LogError or FileError for a place that is taken: a log's names must not meet anybody's files."""
     if out.is_symlink() or not out.is_dir():
         refuse_output(out, [], force=False)
     elif any(out.iterdir()):
@@ -90,7 +75,7 @@ def _as_log_error(path: Path, out: Path) -> Iterator[None]:
     """What a log unlike its schemas, or the disk, raises, as LogError."""
     try:
         yield
-    except _ODD as error:
+    except (*ODD, struct.error, csv.Error, cv2.error) as error:
         raise LogError(
             f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
             f"{path}"
@@ -102,19 +87,14 @@ def _as_log_error(path: Path, out: Path) -> Iterator[None]:
 
 
 def file_name(name: str) -> str:
-    """A plain file name from a topic or an attachment's name, which may be anything: no folders, hidden
-    files, options or devices."""
-    plain = (
-        re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/"))
-        .lstrip(".-")[:_MAX_NAME]
-        .rstrip(".")
-    )
+    """A plain file name from any topic's or attachment's name: no folders, hidden files, options, devices."""
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/"))
+    plain = plain.lstrip(".-")[:_MAX_NAME].rstrip(".")
     return f"_{plain}" if _RESERVED.fullmatch(plain) else plain or "unnamed"
 
 
 class _Names:
-    """Paths below a folder, none given out twice: neither on systems where a and A are one file, nor for
-    topics that give one name."""
+    """Paths below a folder, none given twice, also where a and A are one file or topics give one name."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -154,14 +134,12 @@ def _files(topics: list[str], ending: str, names: _Names) -> Iterator[dict[str, 
 def _write_jsonl(path: Path, topics: list[str], names: _Names) -> None:
     with _files(topics, "jsonl", names) as files:
         for message in read_messages(path, topics):
-            files[message.topic].write(
-                json.dumps({"t": message.time_s, **message.data}, separators=(",", ":")) + "\n"
-            )
+            line = json.dumps({"t": message.time_s, **message.data}, separators=(",", ":"))
+            files[message.topic].write(f"{line}\n")
 
 
 def _write_csv(path: Path, topics: list[str], names: _Names) -> None:
-    """Columns are those of all messages of the topic: the widest list decides; what a message lacks stays
-    empty."""
+    """Columns are those of all messages: the widest list decides; what a message lacks stays empty."""
     columns: dict[str, dict[str, None]] = {topic: {} for topic in topics}
     counts = dict.fromkeys(topics, 0)
     for message in read_messages(path, topics):
@@ -190,9 +168,8 @@ def _write_npz(path: Path, topics: list[str], names: _Names) -> None:
     rows: dict[str, list[dict[str, np.ndarray]]] = {topic: [] for topic in topics}
     size = 0
     for message in read_messages(path, topics):
-        row = {
-            name: np.asarray(value) for name, value in {"t": message.time_s, **_arrays(message.data)}.items()
-        }
+        values = {"t": message.time_s, **_arrays(message.data)}
+        row = {name: np.asarray(value) for name, value in values.items()}
         size += sum(array.nbytes + _OVERHEAD for array in row.values())
         if size > MAX_ARRAYS:
             raise LogError(
@@ -211,8 +188,7 @@ def _write_npz(path: Path, topics: list[str], names: _Names) -> None:
 
 
 def _stacked(rows: list[dict[str, np.ndarray]]) -> Iterator[tuple[str, np.ndarray]]:
-    """(field, values with the message as first axis) of the fields that all messages have in one shape, as
-    numbers or words."""
+    """(field, values by message) of fields that all messages have in one shape, as numbers or words."""
     for name in rows[0]:
         if all(name in row for row in rows) and len({row[name].shape for row in rows}) == 1:
             values = np.array([row[name] for row in rows])
@@ -224,29 +200,19 @@ def flattened(value: Any, name: str = "") -> dict[str, Any]:
     """Dotted names to plain values; packed bytes are left out."""
     if isinstance(value, dict):
         items = {f"{name}.{key}" if name else key: inner for key, inner in value.items() if key != "data"}
-        return {
-            key: leaf
-            for inner_name, inner in items.items()
-            for key, leaf in flattened(inner, inner_name).items()
-        }
-    if isinstance(value, list):
-        return {
-            key: leaf
-            for i, inner in enumerate(value)
-            for key, leaf in flattened(inner, f"{name}.{i}").items()
-        }
-    return {name: value}
+    elif isinstance(value, list):
+        items = {f"{name}.{i}": inner for i, inner in enumerate(value)}
+    else:
+        return {name: value}
+    return {key: leaf for where, inner in items.items() for key, leaf in flattened(inner, where).items()}
 
 
 def _arrays(data: dict[str, Any]) -> dict[str, Any]:
     """One message's arrays: lists of numbers as they are, grids and images unpacked, null as NaN."""
     if "cell_stride" in data:
         origin = data["pose"]["position"]
-        return {
-            "value": grid_values(data),
-            "origin_m": [origin["x"], origin["y"]],
-            "cell_m": data["cell_size"]["x"],
-        }
+        place = {"origin_m": [origin["x"], origin["y"]], "cell_m": data["cell_size"]["x"]}
+        return {"value": grid_values(data), **place}
     if data.get("format") == "png":
         return {"intensity" if data["frame_id"] == "sonar" else "depth_mm": logged_image(data)}
     found: dict[str, Any] = {}
@@ -258,27 +224,20 @@ def _arrays(data: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Make a readable log of one whose writing was cut off or that was damaged later.
+# ---- Make a readable log of one whose writing was cut off or that was damaged later.
 
 
 @dataclass(frozen=True)
 class Repair:
-    """What was saved."""
-
     path: Path
     messages: int
     last_time_s: float
-    complete: bool
-    """nothing was wrong with the file"""
-    damages: tuple[str, ...]
-    """what was wrong, with the byte"""
+    complete: bool  # nothing was wrong with the file
+    damages: tuple[str, ...]  # what was wrong, with the byte
 
 
-_PART = re.compile(r"(\.[0-9a-f]{8})?\.part$")
-"""what an unfinished recording's name ends in, today or before"""
-MAX_DAMAGES = 100
-"""that are told one by one"""
+_PART = re.compile(r"(\.[0-9a-f]{8})?\.part$")  # what an unfinished recording's name ends in, today or before
+MAX_DAMAGES = 100  # that are told one by one
 
 
 def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
@@ -290,11 +249,8 @@ def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
     exists and ``force`` is not set.
     """
     path = Path(path)
-    out = (
-        path.with_name(_PART.sub("", path.name).removesuffix(".mcap") + ".repaired.mcap")
-        if out is None
-        else Path(out)
-    )
+    stem = _PART.sub("", path.name).removesuffix(".mcap")
+    out = path.with_name(f"{stem}.repaired.mcap") if out is None else Path(out)
     declared = _declared(path)
     refuse_output(out, [path], force)
     try:

@@ -1,5 +1,4 @@
-"""One picture per episode: what the vehicle mapped, every method's trajectory, the goal, the truth as thin
-lines."""
+"""One picture per episode: what the vehicle mapped, every method's trajectory, goal and truth."""
 
 from __future__ import annotations
 
@@ -39,8 +38,7 @@ from uuvtai.logs.drawing import (
 from uuvtai.logs.encode import LogError, checked_suffix
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 44, 96, 62
-_ROW = 30
-"""[px] per line of the legend"""
+_ROW = 30  # [px] per line of the legend
 
 
 def picture(
@@ -122,8 +120,7 @@ def paint_picture(
 
 
 def _inks(recordings: list[Recording], methods: Sequence[str]) -> list[Color]:
-    """Colour of each recording: its method's; logs of one method (of several policies, say) are told apart by
-    their place."""
+    """Colour of each recording: its method's; several logs of one method are told apart by their place."""
     names = [recording.method for recording in recordings]
     if len(set(names)) < len(names):
         names = [f"{i} {name}" for i, name in enumerate(names)]
@@ -170,8 +167,7 @@ def _paint_color_bar(canvas: Canvas, top_m: float) -> None:
 
 
 def _paint_trajectories(canvas: Canvas, recordings: list[Recording], inks: list[Color]) -> None:
-    """The first method on top; the others below it a little wider each, so that their edges show where all go
-    the same way."""
+    """The first method on top; those below a little wider each, so that all show where they go one way."""
     wide = [3 + 3 * min(i, 3) for i in range(len(recordings))]
     for recording, width in zip(recordings, wide, strict=True):
         canvas.line(recording.positions[:, :2], PAPER, width + 3)

@@ -25,18 +25,14 @@ from mcap.writer import MCAP0_MAGIC
 from uuvtai.common.files import open_file
 from uuvtai.logs.encode import LogError
 
-MAX_RECORD = 64 << 20
-"""[bytes] of a record, and of what a chunk unpacks to: six times the map of a tank of 200 x 100 m"""
-ZSTD = b"\x28\xb5\x2f\xfd"
-"""what a frame of zstd begins with"""
+MAX_RECORD = 64 << 20  # [bytes] of a record, and of an unpacked chunk: six times the map of 200 x 100 m
+ZSTD = b"\x28\xb5\x2f\xfd"  # what a frame of zstd begins with
 DAMAGE = (McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError)
 """what the package, zstandard and lz4 raise for bytes that are none of theirs"""
 
 
 @dataclass(frozen=True)
 class LogMessage:
-    """One message."""
-
     topic: str
     time_s: float
     data: dict[str, Any]
@@ -177,8 +173,7 @@ def records(path: Path, skip_chunks: bool = False, damages: list[str] | None = N
 
 
 class WholeReads(io.BufferedReader):
-    """A file for the readers of the package, which ask for whatever a length says: what is longer than any
-    record, or than the file, is refused."""
+    """A file for the package's readers: refused is what is longer than any record, or than the file."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Exactly so many bytes. Raises McapError."""
@@ -191,8 +186,7 @@ class WholeReads(io.BufferedReader):
 
 
 def opened(path: Path) -> WholeReads:
-    """The file, open for reading. Raises LogError for what cannot be opened, FileError for what is no plain
-    file."""
+    """The file, open for reading. Raises LogError where it cannot be opened, FileError for no plain file."""
     try:
         return WholeReads(open_file(path).detach())
     except OSError as error:

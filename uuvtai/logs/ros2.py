@@ -40,16 +40,14 @@ from uuvtai.logs.schemas import (
 )
 from uuvtai.logs.topics.perception import dynamic_colors, grid_text, grid_values, static_colors
 
-EXTRA = "uuvtai[ros]"
-"""extra that brings ``rosbags``"""
+EXTRA = "uuvtai[ros]"  # extra that brings ``rosbags``
 _PACKAGE = "rosbags"
 
 FRAMES = {"world": "map", "base": "base_link", "sonar": "sonar_link", "camera": "camera_optical_frame"}
 """frame of a log: the same one in ROS"""
 FRAMES_BACK = {ros: ours for ours, ros in FRAMES.items()}
 
-SURFACE_PA = 101_325.0
-"""standard atmosphere, which FluidPressure has on top of the water's"""
+SURFACE_PA = 101_325.0  # standard atmosphere, which FluidPressure has on top of the water's
 
 
 class RosMessages:
@@ -67,12 +65,10 @@ class RosMessages:
         return self._store.types[kind](**fields)
 
     def packed(self, message: Any) -> bytes:
-        """CDR of a message."""
         return bytes(self._store.serialize_cdr(message, message.__msgtype__))
 
     def unpacked(self, data: bytes, kind: str) -> Any:
-        """Message of CDR, compressed by itself or not. Raises ValueError for bytes that are none of this
-        kind."""
+        """Message of CDR, compressed or not. Raises ValueError for bytes that are none of this kind."""
         try:
             if data.startswith(ZSTD) and 0 <= zstandard.frame_content_size(data) <= MAX_RECORD:
                 data = zstandard.ZstdDecompressor().decompress(data)
@@ -95,15 +91,12 @@ class RosMessages:
         return self("std_msgs/msg/Header", stamp=stamp, frame_id=FRAMES.get(frame, frame))
 
     def vector(self, x: float, y: float, z: float, kind: str = "Vector3") -> Any:
-        """geometry_msgs/Vector3 or Point."""
         return self(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
 
     def quaternion(self, w: float, x: float, y: float, z: float) -> Any:
-        """geometry_msgs/Quaternion."""
         return self("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
 
     def twist(self, linear: Any, angular: Any) -> Any:
-        """geometry_msgs/Twist."""
         return self("geometry_msgs/msg/Twist", linear=self.vector(*linear), angular=self.vector(*angular))
 
 
@@ -115,9 +108,7 @@ def zeros(count: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------------
 # A log's control steps as ROS 2's standard messages; the table of docs/logs.md.
 
-
-Step = dict[str, dict[str, Any]]
-"""messages of one control step by topic"""
+Step = dict[str, dict[str, Any]]  # messages of one control step by topic
 
 WRITTEN = {
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -140,8 +131,7 @@ SOURCES = frozenset(
     )
 )
 """topics of a log that anything is made of"""
-INVALID_VAR = 1e6
-"""[m^2/s^2] variance of a velocity that the instrument calls invalid"""
+INVALID_VAR = 1e6  # [m^2/s^2] variance of a velocity that the instrument calls invalid
 _FLOAT32 = 7
 _CLOUD_FIELDS = ("x", "y", "z", "intensity", "velocity")
 
@@ -151,15 +141,12 @@ class Setup:
     """What a run's config says about its messages."""
 
     max_range_m: float
-    pa_per_m: float
-    """pressure of a metre of water"""
-    limits: tuple[float, ...]
-    """[m/s, m/s, m/s, rad/s] that an action of 1 asks for"""
+    pa_per_m: float  # pressure of a metre of water
+    limits: tuple[float, ...]  # [m/s, m/s, m/s, rad/s] that an action of 1 asks for
 
     @classmethod
     def of(cls, given: dict[str, Any]) -> Setup:
-        """From a config as read from YAML; what it lacks is the default. Raises ValueError, TypeError,
-        AttributeError."""
+        """From a config's YAML; what lacks is the default. Raises ValueError, TypeError, AttributeError."""
         vehicle, default = given.get("vehicle") or {}, Config()
         names = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
         sonar = (given.get("sensors") or {}).get("sonar") or {}
@@ -242,10 +229,8 @@ def _motion(ros: RosMessages, setup: Setup, time_ns: int, step: Step) -> Iterato
         yield "/imu/data", _imu(ros, time_ns, turn, measured["rates"])
     pressure = SURFACE_PA + measured["depth_m"] * setup.pa_per_m
     head = ros.header(time_ns, "base")
-    yield (
-        "/pressure",
-        ros("sensor_msgs/msg/FluidPressure", header=head, fluid_pressure=pressure, variance=0.0),
-    )
+    told = ros("sensor_msgs/msg/FluidPressure", header=head, fluid_pressure=pressure, variance=0.0)
+    yield "/pressure", told
 
 
 def _odometry(
@@ -253,9 +238,7 @@ def _odometry(
 ) -> Any:
     place, turn = pose
     at = ros(
-        "geometry_msgs/msg/Pose",
-        position=ros.vector(*place, kind="Point"),
-        orientation=ros.quaternion(*turn),
+        "geometry_msgs/msg/Pose", position=ros.vector(*place, kind="Point"), orientation=ros.quaternion(*turn)
     )
     return ros(
         "nav_msgs/msg/Odometry",
@@ -280,13 +263,8 @@ def _imu(ros: RosMessages, time_ns: int, turn: Any, rates: Any) -> Any:
     )
 
 
-def _bearings(scan: dict[str, Any]) -> np.ndarray:
-    return np.linspace(scan["start_angle"], scan["end_angle"], len(scan["ranges"]))
-
-
 def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
-    """REP 117: -inf where noise puts a return behind the sonar, NaN where nothing is known, +inf where
-    nothing is."""
+    """REP 117: -inf = noise puts a return behind the sonar, NaN = nothing known, +inf = nothing there."""
     ranges, intensities = np.array(scan["ranges"], np.float32), np.array(scan["intensities"], np.float32)
     first, last = float(scan["start_angle"]), float(scan["end_angle"])
     return ros(
@@ -310,7 +288,8 @@ def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
 
 def _cloud(ros: RosMessages, scan: dict[str, Any], velocity: Any) -> Any:
     """Returns only; their velocity is NaN where the sonar measures none."""
-    ranges, bearing, shine = np.array(scan["ranges"]), _bearings(scan), np.array(scan["intensities"])
+    ranges, shine = np.array(scan["ranges"]), np.array(scan["intensities"])
+    bearing = np.linspace(scan["start_angle"], scan["end_angle"], len(ranges))
     hit = shine > 0
     speed = np.array(velocity) if len(velocity) else np.full(len(ranges), math.nan)
     columns = (ranges * np.cos(bearing), ranges * np.sin(bearing), 0 * ranges, shine, speed)
@@ -393,12 +372,9 @@ _TWIST = record("uuv.Twist", linear=THREE, angular=THREE)
 _TWIST_STAMPED = record("uuv.TwistStamped", timestamp=TIME, frame_id=STRING, linear=THREE, angular=THREE)
 
 _LATE_NS = round(1e9 * JUMP_S)
-NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}
-"""ROS topic: the log's, where it is another"""
-_UNIT = 0.1
-"""by which the square of a quaternion's length may be off 1"""
-_TYPES = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
-"""PointField's codes: Foxglove's"""
+NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}  # ROS topic: the log's, where it is another
+_UNIT = 0.1  # by which the square of a quaternion's length may be off 1
+_TYPES = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # PointField's codes: Foxglove's
 
 
 @dataclass(frozen=True)
@@ -418,7 +394,6 @@ class Reader:
         """whether a stamp was of another clock than the bag's, not just late"""
 
     def head(self, header: Any) -> dict[str, Any]:
-        """timestamp and frame_id."""
         return {
             "timestamp": parsed_json(self.stamp(header), self.topic),
             "frame_id": FRAMES_BACK.get(header.frame_id, header.frame_id),
@@ -540,11 +515,8 @@ def _read_odometry(reader: Reader, message: Any) -> bytes:
 
 def _read_imu(reader: Reader, message: Any) -> bytes:
     """What a covariance of -1, or an orientation of zeros, says is not measured is null."""
-    q, attitude, acceleration = (
-        message.orientation,
-        message.orientation_covariance[0],
-        message.linear_acceleration_covariance[0],
-    )
+    q, attitude = message.orientation, message.orientation_covariance[0]
+    acceleration = message.linear_acceleration_covariance[0]
     return dumped(
         {
             **reader.head(message.header),

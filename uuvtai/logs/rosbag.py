@@ -14,14 +14,13 @@ from typing import Any
 import yaml
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
+from uuvtai.common.errors import ODD
 from uuvtai.common.files import refuse_output, whole_folder
 from uuvtai.config.loader import ConfigError, parsed_yaml
 from uuvtai.logs.container import MAX_MESSAGE, McapFile
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import LogHead, read_head, read_messages, records
 from uuvtai.logs.ros2 import NAMES, READ, SOURCES, WRITTEN, Reader, RosMessages, Setup, ros_messages
-
-_ODD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
 
 
 def converted(file: Path, out: Path | None, source: str, force: bool) -> tuple[Path, int, list[str]]:
@@ -87,7 +86,7 @@ def from_rosbag2(path: Path, out: Path, force: bool = False) -> tuple[int, list[
 def _as_log_error(path: Path, out: Path) -> Iterator[None]:
     try:
         yield
-    except _ODD as error:
+    except ODD as error:
         raise LogError(
             f"{path}: a message is not as its schema says ({str(error)[:200]!r}); see what is in it: uuv "
             f"log info {path}"
@@ -280,7 +279,7 @@ class _Reading:
             data = reading.read(reader, self._ros.unpacked(record.data, kind))
             if len(data) > MAX_MESSAGE:
                 raise ValueError(f"{len(data):,} bytes, more than a log's message may have")
-        except _ODD as error:
+        except ODD as error:
             self.odd[channel.topic] += 1
             reason = str(error) if isinstance(error, ValueError) else repr(error)
             self.why.setdefault(channel.topic, reason.partition(": {")[0][:200])

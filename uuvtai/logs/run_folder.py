@@ -15,18 +15,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from uuvtai.common import signals
+from uuvtai.common import files, signals
 from uuvtai.common.errors import UserError
-from uuvtai.common.files import (
-    UNFINISHED,
-    FileError,
-    open_new,
-    open_to_append,
-    read_json,
-    refuse_links,
-    refuse_links_in,
-    whole_file,
-)
 from uuvtai.common.version import __version__
 from uuvtai.config import Config
 from uuvtai.config.loader import to_yaml
@@ -41,8 +31,7 @@ class RunFolderError(UserError, RuntimeError):
 
 
 def default_run_dir(preset: str) -> Path:
-    """A new folder ``runs/<time>_<preset>``, with a number behind it where the name is taken. Raises
-    RunFolderError."""
+    """A new folder ``runs/<time>_<preset>``, numbered where the name is taken. Raises RunFolderError."""
     name, number = f"{time.strftime('%Y%m%d-%H%M%S')}_{Path(preset).stem}", 1
     try:
         _RUNS.mkdir(exist_ok=True)
@@ -90,8 +79,7 @@ class RunFolder:
     _record: dict[str, Any]
 
     def __init__(self, path: Path, config: Config, seeds: list[int]) -> None:
-        """Raises RunFolderError where the folder exists with content, another process has just taken it, or
-        it cannot be written."""
+        """Raises RunFolderError where the folder has content, is held elsewhere, or cannot be written."""
         refuse_place(path)
         self.path = path
         self._started = time.time()
@@ -128,7 +116,7 @@ class RunFolder:
             )
         folder.hold()
         try:
-            folder._guarded("read it", lambda: refuse_links_in(path))
+            folder._guarded("read it", lambda: files.refuse_links_in(path))
             folder._guarded("tidy it", folder._sweep)
         except BaseException:
             folder.release()
@@ -136,15 +124,13 @@ class RunFolder:
         return folder
 
     def _sweep(self) -> None:
-        """Remove what a kill left half-written; whoever holds the folder is the only one that writes
-        there."""
+        """Remove what a kill left half-written; only who holds the folder writes there."""
         for place in self.path.rglob(".*.tmp*"):
-            if UNFINISHED.fullmatch(place.name) and place.is_file():
+            if files.UNFINISHED.fullmatch(place.name) and place.is_file():
                 place.unlink()
 
     def go_on(self, since: dict[str, Any]) -> None:
-        """Mark a held folder's run as running again; ``since`` says from where. Raises RunFolderError for a
-        record that is none."""
+        """Mark a held run as running again; ``since``: from where. Raises RunFolderError for no record."""
         self._record = self._read_record()
         resumed = {
             "argv": sys.argv,
@@ -157,20 +143,18 @@ class RunFolder:
         self.write_json(_RECORD, self._record)
 
     def settle(self, is_complete: bool) -> None:
-        """Of a held folder with nothing left to do: say how its run ended, where a kill has kept it from
-        doing so."""
+        """Of a held folder with nothing left to do: say how its run ended, where a kill kept it from that."""
         record = self._read_record()
         if record.get("status") == "running":
             ended = ("finished", 0) if is_complete else ("interrupted", signals.exit_code())
             self.write_json(_RECORD, record | dict(zip(("status", "exit"), ended, strict=True)))
 
     def _read_record(self) -> dict[str, Any]:
-        """run.json, as far as it is gone on with."""
         file = self.path / _RECORD
         why = "it is no record of a run"
         try:
-            record = read_json(file, _MAX_RECORD_BYTES, self.path)
-        except (FileError, OSError) as error:
+            record = files.read_json(file, _MAX_RECORD_BYTES, self.path)
+        except (files.FileError, OSError) as error:
             record, why = None, str(error)
         if (
             not isinstance(record, dict)
@@ -183,8 +167,7 @@ class RunFolder:
         return record
 
     def hold(self) -> None:
-        """Keep other processes from writing into the same run until this one ends. Raises RunFolderError
-        where one does."""
+        """Keep other processes from writing into the run until this one ends. Raises RunFolderError."""
         try:
             import fcntl
         except ImportError:  # not on this system: nothing to hold it by
@@ -208,11 +191,10 @@ class RunFolder:
 
     def _open_lock(self) -> None:
         signals.engage()
-        self._lock = open_to_append(self.path / _LOCK, self.path)
+        self._lock = files.open_to_append(self.path / _LOCK, self.path)
 
     def _take(self) -> None:
-        """Hold a new folder. The lock is the first file in it, and of several processes that want to begin
-        here one makes it."""
+        """Hold a new folder. The lock is its first file: of several that begin here one makes it."""
         self._guarded("hold it", self._make_lock)
         self.hold()
         if any(place.name != _LOCK for place in self.path.iterdir()):
@@ -224,7 +206,7 @@ class RunFolder:
     def _make_lock(self) -> None:
         signals.engage()
         try:
-            self._lock = open_new(self.path / _LOCK)
+            self._lock = files.open_new(self.path / _LOCK)
         except FileExistsError:
             raise RunFolderError(
                 f"{self.path}: another process has just begun a run there; give another --run-dir"
@@ -235,9 +217,8 @@ class RunFolder:
         return self.write_bytes(name, text.encode())
 
     def write_bytes(self, name: str, content: bytes) -> Path:
-        """Write a file atomically, as ``write``."""
         target = self.path / name
-        self._guarded(f"write {target}", lambda: refuse_links(self.path, target))
+        self._guarded(f"write {target}", lambda: files.refuse_links(self.path, target))
         self._guarded(f"write {target}", lambda: write_atomic(target, content))
         return target
 
@@ -274,7 +255,7 @@ class RunFolder:
     def _guarded(self, what: str, work) -> None:
         try:
             work()
-        except FileError as error:
+        except files.FileError as error:
             raise RunFolderError(str(error)) from None
         except OSError as error:
             raise RunFolderError(
@@ -284,10 +265,9 @@ class RunFolder:
 
 
 def write_atomic(target: Path, content: bytes) -> None:
-    """Write to a new temporary neighbour, flush it to disk, rename; on any error nothing is left behind.
-    Raises OSError."""
+    """Write to a temporary neighbour, flush, rename; after an error nothing is left. Raises OSError."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(target) as (file, _):
+    with files.whole_file(target) as (file, _):
         file.write(content)
 
 
@@ -299,7 +279,6 @@ def _is_plain(path: Path) -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computes the results."""
     found = {"uuvtai": __version__, "python": platform.python_version()}
     for name in ("taichi", "torch", "numpy", "ompl", "mcap", "opencv-python-headless"):
         try:
@@ -310,7 +289,6 @@ def versions() -> dict[str, str]:
 
 
 def hardware() -> dict[str, Any]:
-    """The machine, as far as it tells."""
     cpu = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():

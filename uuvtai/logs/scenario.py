@@ -1,5 +1,4 @@
-"""scenario.json: everything true about an episode's world in closed form, and how an outsider recomputes from
-it what the log claims."""
+"""scenario.json: the truth about an episode's world in closed form, to recompute what a log claims."""
 
 from __future__ import annotations
 
@@ -152,8 +151,7 @@ FORMULAS = {
 def scenario_document(
     config: Any, described: dict[str, Any], world: str, seed: int, episode: int
 ) -> dict[str, Any]:
-    """Content of scenario.json. ``config`` is a Config, ``described`` comes from
-    ``closed_form.describe_scenario`` at step 0."""
+    """Content of scenario.json. ``described``: ``closed_form.describe_scenario`` at step 0."""
     wanted, tank = config.world, config.world.tank
     moving = sum(body["path"] is not None for body in described["bodies"])
     return {

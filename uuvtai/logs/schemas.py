@@ -30,8 +30,7 @@ _NSEC: Schema = {"type": "integer", "minimum": 0, "maximum": 999_999_999}
 def record(
     title: str, description: str = "", nullable: Mapping[str, Schema] | None = None, /, **properties: Schema
 ) -> Schema:
-    """Schema of an object that has all these properties, and perhaps more; those in ``nullable`` may be
-    null."""
+    """Schema of an object with these properties, and perhaps more; those in ``nullable`` may be null."""
     schema: Schema = {
         "title": title,
         "type": "object",
@@ -46,17 +45,16 @@ def record(
 
 
 def array_of(items: Schema) -> Schema:
-    """Schema of a list."""
     return {"type": "array", "items": items}
 
 
 def described(schema: Schema, text: str) -> Schema:
-    """The same with a description."""
     return {**schema, "description": text}
 
 
-def _choice(title: str, **names: int) -> Schema:
-    return {"title": title, "oneOf": [{"title": name, "const": value} for name, value in names.items()]}
+def _choice(title: str, names: str) -> Schema:
+    """Of numbers, which count the names from 0."""
+    return {"title": title, "oneOf": [{"title": n, "const": i} for i, n in enumerate(names.split())]}
 
 
 # --------------------------------------------------------------------------------------------------- Foxglove
@@ -108,24 +106,12 @@ def compressed_image(text: str) -> Schema:
     )
 
 
-UINT8, FLOAT32 = 1, 7
-"""numeric types of packed fields"""
+UINT8, FLOAT32 = 1, 7  # numeric types of packed fields
 PACKED_FIELD = record(
     "foxglove.PackedElementField",
     name=STRING,
     offset=UINT,
-    type=_choice(
-        "foxglove.NumericType",
-        UNKNOWN=0,
-        UINT8=1,
-        INT8=2,
-        UINT16=3,
-        INT16=4,
-        UINT32=5,
-        INT32=6,
-        FLOAT32=7,
-        FLOAT64=8,
-    ),
+    type=_choice("foxglove.NumericType", "UNKNOWN UINT8 INT8 UINT16 INT16 UINT32 INT32 FLOAT32 FLOAT64"),
 )
 GRID = record(
     "foxglove.Grid",
@@ -140,23 +126,21 @@ GRID = record(
     data=described(BASE64, "rows along y, cells of a row along x"),
 )
 
-DEBUG, INFO, WARNING, ERROR = 1, 2, 3, 4
-"""levels of foxglove.Log"""
+DEBUG, INFO, WARNING, ERROR = 1, 2, 3, 4  # levels of foxglove.Log
 LOG = record(
     "foxglove.Log",
     timestamp=TIME,
-    level=_choice("foxglove.LogLevel", UNKNOWN=0, DEBUG=1, INFO=2, WARNING=3, ERROR=4, FATAL=5),
+    level=_choice("foxglove.LogLevel", "UNKNOWN DEBUG INFO WARNING ERROR FATAL"),
     message=STRING,
     name=STRING,
     file=STRING,
     line=UINT,
 )
 
-LINE_STRIP, LINE_LOOP = 0, 1
-"""types of foxglove.LinePrimitive"""
+LINE_STRIP, LINE_LOOP = 0, 1  # types of foxglove.LinePrimitive
 _LINE = record(
     "foxglove.LinePrimitive",
-    type=_choice("foxglove.LineType", LINE_STRIP=0, LINE_LOOP=1, LINE_LIST=2),
+    type=_choice("foxglove.LineType", "LINE_STRIP LINE_LOOP LINE_LIST"),
     pose=POSE,
     thickness=NUMBER,
     scale_invariant=BOOLEAN,
@@ -229,7 +213,7 @@ SCENE_UPDATE = record(
         record(
             "foxglove.SceneEntityDeletion",
             timestamp=TIME,
-            type=_choice("foxglove.SceneEntityDeletionType", MATCHING_ID=0, ALL=1),
+            type=_choice("foxglove.SceneEntityDeletionType", "MATCHING_ID ALL"),
             id=STRING,
         )
     ),

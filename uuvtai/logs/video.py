@@ -1,5 +1,4 @@
-"""Top-down video of an episode: what the vehicle senses, maps, plans and does, with the truth as thin
-lines."""
+"""Top-down video of an episode: what the vehicle senses, maps, plans and does, with the truth."""
 
 from __future__ import annotations
 
@@ -45,13 +44,10 @@ from uuvtai.logs.drawing import (
 from uuvtai.logs.encode import LogError, checked_suffix
 from uuvtai.logs.topics.perception import Layer
 
-_MARGINS = (52, 28, 84, 212)
-"""[px] left, right, top, bottom"""
-_PANEL = 160
-"""[px] height of the panel below the map"""
+_MARGINS = (52, 28, 84, 212)  # [px] left, right, top, bottom
+_PANEL = 160  # [px] height of the panel below the map
 _ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
-_ECHO_BEAMS = 64
-"""A scan of fewer beams is painted together with those before it."""
+_ECHO_BEAMS = 64  # A scan of fewer beams is painted together with those before it.
 _TRIGGER_COLORS = {
     "initial": GREY,
     "stuck": bgr("#ae3ec9"),
@@ -66,14 +62,11 @@ _LEGEND = (
     (MOVER, "true, moving"),
     (GREY, "true, resting"),
 )
-_HOLD_S = 1.0
-"""The last frame stays this long."""
-_DRAWN_PX = 1280
-"""Narrower frames are drawn this wide and made smaller: the panel below the map needs the room."""
+_HOLD_S = 1.0  # The last frame stays this long.
+_DRAWN_PX = 1280  # Narrower frames are drawn this wide and made smaller: the panel below needs the room.
 FORMATS = {".webm": (1280, 15.0), ".mp4": (1280, 15.0), ".gif": (800, 10.0)}
 """what a video's name may end in: (width [px], frames per second) unless told"""
-WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)
-"""least and most"""
+WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)  # least and most
 SMALL: dict[str, Any] = {"width_px": 960, "speed": 2.0}
 """what a run folder holds, so that several fit a page: some 40 kB per second of the episode"""
 _MOST_FRAMES = 100_000
@@ -81,8 +74,7 @@ _FEW_FRAMES, _FRAMES_PER_POSE = 1000, 10
 """a small file must not cost minutes: beyond so many frames a log has to hold something new for them (ours
 hold 50 poses a second)"""
 
-Progress = Callable[[int, int], None]
-"""Called with (frames done, frames in all)."""
+Progress = Callable[[int, int], None]  # Called with (frames done, frames in all).
 
 
 def video(
@@ -132,18 +124,14 @@ def _filmed(
 
 def _check_film(width_px: int, fps: float, speed: float) -> None:
     """Raise LogError for a width, a rate or a speed beyond what a film may have."""
-    for name, value, (least, most) in (
-        ("--width", width_px, WIDTHS),
-        ("--fps", fps, FPS),
-        ("--speed", speed, SPEEDS),
-    ):
+    given = ("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)
+    for name, value, (least, most) in given:
         if not least <= value <= most:
             raise LogError(f"{name} {value:g}: must be from {least:g} to {most:g}")
 
 
 def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
-    """Moments [s] of the frames; the last one stays for a while. Raises LogError for more frames than anybody
-    waits for."""
+    """Moments [s] of the frames; the last stays for a while. Raises LogError for too many frames."""
     n_frames = recording.duration_s * fps / speed
     if n_frames > _MOST_FRAMES:
         raise LogError(
@@ -175,11 +163,8 @@ def _sized(frame: np.ndarray, width_px: int) -> np.ndarray:
     """The frame in this width (one less where that is odd), with an even height, as the codecs want it."""
     height, width = frame.shape[:2]
     wanted = width_px - width_px % 2
-    return (
-        frame
-        if wanted == width
-        else cv2.resize(frame, (wanted, 2 * round(height * wanted / width / 2)), interpolation=cv2.INTER_AREA)
-    )
+    size = wanted, 2 * round(height * wanted / width / 2)
+    return frame if wanted == width else cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
 
 
 class FrameArtist:
@@ -245,8 +230,7 @@ class FrameArtist:
             canvas.disc(ahead, 5, ROUTE)
 
     def _paint_echoes(self, time_s: float) -> None:
-        """Returns of the newest scan, seen from where it was taken; of a mechanical beam those of the last
-        ``_ECHO_BEAMS``."""
+        """Returns of the newest scan, from where it was taken; of a mechanical one ``_ECHO_BEAMS``."""
         beams = 0
         for ranges, away, hit, ping_s in self.recording["/sonar/scan"].until(time_s):
             x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]
@@ -260,11 +244,8 @@ class FrameArtist:
                 return
 
     def _paint_goal(self) -> None:
-        canvas, goal, radius = (
-            self._canvas,
-            self.recording.scenario["goal"],
-            self.recording.scenario["goal_radius_m"],
-        )
+        canvas, scenario = self._canvas, self.recording.scenario
+        goal, radius = scenario["goal"], scenario["goal_radius_m"]
         angles = np.linspace(0, 2 * np.pi, 72)
         canvas.dashes(np.array(goal[:2]) + radius * np.column_stack([np.cos(angles), np.sin(angles)]), INK, 1)
         canvas.star(goal, 14)
@@ -272,11 +253,8 @@ class FrameArtist:
     def _paint_head(self, time_s: float) -> None:
         canvas, recording, scenario = self._canvas, self.recording, self.recording.scenario
         width = canvas.image.shape[1]
-        title = (
-            f"{recording.method} · {scenario['world']} · seed {scenario['seed']} · episode "
-            f"{scenario['episode']}"
-        )
-        end = 24 + canvas.text((24, 34), title, 22, INK, bold=True)
+        which = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
+        end = 24 + canvas.text((24, 34), f"{recording.method} · {which}", 22, INK, bold=True)
         canvas.text((end + 20, 34), self.remark, 17, FAILED)
         moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
         canvas.text(
@@ -288,9 +266,8 @@ class FrameArtist:
         canvas.text((width - 28, 36), f"{time_s:5.1f} s", 26, INK, bold=True, align="right")
         if time_s >= recording.duration_s:
             good = recording.outcome == "success"
-            canvas.text(
-                (width - 150, 36), recording.ending, 24, _GOOD if good else FAILED, bold=True, align="right"
-            )
+            ink = _GOOD if good else FAILED
+            canvas.text((width - 150, 36), recording.ending, 24, ink, bold=True, align="right")
 
     # -------------------------------------------------------------------------------------------- panel below
 
@@ -300,16 +277,10 @@ class FrameArtist:
         safety, leaf, speed = (recording[name].at(time_s) for name in ("/safety", "/action", "/state"))
         clearance = None if safety is None else safety[0]
         near = clearance is not None and clearance < 0.3
-        self._figure(
-            24, top, "clearance", "-" if clearance is None else f"{clearance:.2f} m", FAILED if near else INK
-        )
-        self._figure(
-            164,
-            top,
-            "time to collision",
-            "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s",
-            INK,
-        )
+        said = "-" if clearance is None else f"{clearance:.2f} m"
+        self._figure(24, top, "clearance", said, FAILED if near else INK)
+        said = "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s"
+        self._figure(164, top, "time to collision", said, INK)
         self._figure(320, top, "speed", "-" if speed is None else f"{speed:.2f} m/s", INK)
         canvas.text((24, top + 86), "tree", 15, GREY)
         canvas.text((24, top + 112), leaf or "-", 21, INK, bold=True)
@@ -363,27 +334,15 @@ class FrameArtist:
         for at, trigger in replans:
             if at <= time_s:
                 px = round(float(place(np.array([at]), np.zeros(1))[0, 0]))
-                cv2.line(
-                    canvas.image,
-                    (px, low),
-                    (px, low - 12),
-                    _TRIGGER_COLORS.get(trigger, GREY),
-                    2,
-                    cv2.LINE_AA,
-                )
+                ink = _TRIGGER_COLORS.get(trigger, GREY)
+                cv2.line(canvas.image, (px, low), (px, low - 12), ink, 2, cv2.LINE_AA)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Frames into a file: WebM (VP9), MP4 (H.264) and GIF, at a quality rather than a bit rate.
-#
-# What stands still costs next to nothing so.
+# ---- Frames into a file: WebM (VP9), MP4 (H.264) and GIF, at a quality rather than a bit rate.
 
+Frames = Iterable[np.ndarray]  # images (height, width, 3), blue green red, all of one size
 
-Frames = Iterable[np.ndarray]
-"""images (height, width, 3), blue green red, all of one size"""
-
-_BT601 = 6
-"""the matrix by which frames are turned into YUV; named in the file, or a player would guess by the height"""
+_BT601 = 6  # the matrix by which frames become YUV; named in the file, or players guess by the height
 _LIMITED_RANGE = 1
 _CODECS: dict[str, tuple[str, dict[str, str]]] = {
     # VP9 as for a call, at its quickest: drawing the frames takes longer
@@ -391,8 +350,7 @@ _CODECS: dict[str, tuple[str, dict[str, str]]] = {
     # H.264 in 4:2:0 with its index first: what slides, phones and browsers all play
     ".mp4": ("libx264", {"crf": "26", "preset": "veryfast"}),
 }
-_GIF_TICKS = 100
-"""per second: a GIF counts hundredths"""
+_GIF_TICKS = 100  # per second: a GIF counts hundredths
 
 
 def write_film(
@@ -403,11 +361,9 @@ def write_film(
     A GIF gets the colours of ``samples``, which are frames, and the ``inks``, which may be rare and must stay
     what they are.
     """
-    return (
-        _write_gif(part, frames, fps, samples, inks)
-        if part.suffix == ".gif"
-        else _write_video(part, frames, fps)
-    )
+    if part.suffix == ".gif":
+        return _write_gif(part, frames, fps, samples, inks)
+    return _write_video(part, frames, fps)
 
 
 def check_whole(part: Path, n_frames: int, out: Path) -> None:
@@ -448,8 +404,7 @@ def _write_video(part: Path, frames: Frames, fps: float) -> int:
 def _write_gif(
     part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
 ) -> int:
-    """One palette for all frames and no dithering: what stands still stays the same pixel, which costs
-    nothing."""
+    """One palette for all frames, no dithering: what stands still stays the same pixel and costs nothing."""
     known = _palette(samples, inks)
     colors = Image.new("P", (1, 1))
     colors.putpalette(known.tobytes())
@@ -473,11 +428,8 @@ def _write_gif(
 
 def _palette(samples: Sequence[np.ndarray], inks: Sequence[Color]) -> np.ndarray:
     """(256, 3) red green blue."""
-    found = (
-        _image(np.concatenate(samples)).quantize(256 - len(inks), dither=Image.Dither.NONE).getpalette("RGB")
-        or []
-    )
-    known = [*(ink[::-1] for ink in inks), *np.reshape(found, (-1, 3))]
+    seen = _image(np.concatenate(samples)).quantize(256 - len(inks), dither=Image.Dither.NONE)
+    known = [*(ink[::-1] for ink in inks), *np.reshape(seen.getpalette("RGB") or [], (-1, 3))]
     return np.array([*known, *[known[0]] * (256 - len(known))], np.uint8)
 
 

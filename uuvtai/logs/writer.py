@@ -34,10 +34,7 @@ from uuvtai.logs.scenario import FRAMES, scenario_document
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topics import TOPICS
 
-# ------------------------------------------------------------------------------------------------------------
-# One episode as messages: of every control step the topics that are due, encoded. What becomes of them is
-# another's: ``mcap_log`` writes them to a file, ``live.broadcast`` shows them to viewers.
-
+# ---- One episode as messages, for a file or for viewers: of every control step the topics that are due.
 
 SIGNS = ("clock.step", *dict.fromkeys(name for topic in TOPICS for name in topic.when.reads))
 """what ``TopicStream.due`` looks at"""
@@ -55,8 +52,7 @@ class EpisodeSink(Protocol):
     """Takes one episode, step by step."""
 
     def due(self, values: Values) -> list[Topic]:
-        """Topics that this step has messages on; what they read must be in the values written. Needs SIGNS
-        alone."""
+        """Topics of this step; what they read must be in the values written. Needs SIGNS alone."""
         ...
 
     def write(self, values: Values) -> None:
@@ -78,7 +74,6 @@ class TopicStream:
         self._written: dict[str, float] = {}
 
     def schemas(self) -> dict[str, Schema]:
-        """JSON schema of every topic in this run."""
         return {topic.name: topic.schema_for(self._header) for topic in self._topics}
 
     def due(self, values: Values) -> list[Topic]:
@@ -107,12 +102,8 @@ class TopicStream:
         return last is None or not hertz or time_s - last >= 1.0 / hertz - 1e-6
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 class McapEpisodeLog:
-    """One episode's log. Raises LogError where the file cannot be written; nothing half-written is left
-    then."""
+    """One episode's log. Raises LogError where the file cannot be written, of which nothing is left then."""
 
     def __init__(self, path: Path, header: EpisodeHeader, depth_images: bool = False) -> None:
         self.path, self.header = Path(path), header
@@ -126,8 +117,7 @@ class McapEpisodeLog:
             self._channels = self._declared()
 
     def due(self, values: Values) -> list[Topic]:
-        """Topics that this step has messages on; what they read must be in the values written. Needs SIGNS
-        alone."""
+        """Topics of this step; what they read must be in the values written. Needs SIGNS alone."""
         return self._stream.due(values)
 
     def write(self, values: Values) -> None:
@@ -168,7 +158,6 @@ class McapEpisodeLog:
             self._file.add_attachment("tree.xml", "application/xml", self.header.tree_xml)
 
     def _declared(self) -> dict[str, int]:
-        """Channel of every topic."""
         channels: dict[str, int] = {}
         known: dict[str, int] = {}
         for topic, schema in self._stream.schemas().items():
@@ -222,19 +211,15 @@ def _result_metadata(result: EpisodeEnd) -> dict[str, str]:
     }
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Chosen episodes of a running simulator: read what the table of topics names, hand it to a log or whoever
-# asks.
+# ---- Chosen episodes of a running simulator: what the table of topics names, for a log or whoever asks.
 
 
 class Recordable(Protocol):
     """What a recorder needs of a simulator."""
 
     config: Config
-    s: Any
-    """the state's structs by name"""
-    tree: Any
-    """the ``FlatTree`` that drives"""
+    s: Any  # the state's structs by name
+    tree: Any  # the ``FlatTree`` that drives
 
     def rows(self, field: Any, envs: list[int] | None = None) -> np.ndarray:
         """Host copy of a field's rows."""
@@ -254,14 +239,11 @@ class RecordedJob(Protocol):
 class PolicyNote:
     """What a log says of the policy that drives."""
 
-    pilot: Any
-    """its ``learn.pilot.Pilot``, or an ``own.own_driver.OwnDriver``, which expects nothing"""
+    pilot: Any  # its ``learn.pilot.Pilot``, or an ``own.own_driver.OwnDriver``, which expects nothing
     checkpoint_sha256: str
-    distill_lambda: float | None
-    """weight of the distillation when the checkpoint was written"""
+    distill_lambda: float | None  # weight of the distillation when the checkpoint was written
 
     def outputs(self, row: int) -> dict[str, Any]:
-        """What the policy chooses and expects in this row."""
         decision, foresees = self.pilot.decision, self.pilot.world_model is not None
         return {
             "driver.action": decision.action[row].cpu().numpy(),
@@ -306,7 +288,6 @@ class EpisodeReader:
             self._write(sim, sorted(self._sinks))
 
     def end(self, sim: Recordable, row: int, result: EpisodeEnd) -> None:
-        """The episode of this row is over."""
         if row in self._sinks:
             self._sinks.pop(row).close(result)
 
@@ -317,7 +298,6 @@ class EpisodeReader:
         self._sinks.clear()
 
     def header(self, sim: Recordable, row: int, job: RecordedJob) -> EpisodeHeader:
-        """What comes before the first step."""
         described = describe_scenario(lambda name: sim.rows(attrgetter(name)(sim.s), [row])[0])
         return EpisodeHeader(
             controller=self._controller,
@@ -348,8 +328,7 @@ class EpisodeReader:
 
 
 class EpisodeRecorder(EpisodeReader):
-    """Writes one MCAP file per recorded job; ``paths`` maps each to its file. Unfinished ones stay ``.part``;
-    ``uuv log repair`` reads them."""
+    """Writes an MCAP file per recorded job, ``paths``; unfinished ones stay ``.part`` for uuv log repair."""
 
     def __init__(
         self,
@@ -366,7 +345,6 @@ class EpisodeRecorder(EpisodeReader):
         self.paths = {job: folder / f"{controller}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
 
     def sink_for(self, sim: Recordable, row: int, job: RecordedJob) -> McapEpisodeLog | None:
-        """The log of a recorded job."""
         if job not in self.paths:
             return None
         for left in self.paths[job].parent.glob(f"{self.paths[job].name}.{'[0-9a-f]' * 8}.part"):

@@ -11,21 +11,16 @@ from uuvtai.report.tables import Data, Table
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Hover = dict[str, str]
-"""id of a drawn thing -> what is shown while the pointer is over it"""
+Hover = dict[str, str]  # id of a drawn thing -> what is shown while the pointer is over it
 
 
 @dataclass(frozen=True)
 class Paragraph:
-    """A paragraph of plain text."""
-
     text: str
 
 
 @dataclass(frozen=True)
 class Heading:
-    """A heading within a section."""
-
     text: str
 
 
@@ -89,13 +84,10 @@ class Figure:
 
 @dataclass(frozen=True)
 class Media:
-    """A picture or video of an episode."""
-
     mime: str
     content: bytes
     caption: str
-    name: str = ""
-    """where it lies in the run folder"""
+    name: str = ""  # where it lies in the run folder
 
 
 @dataclass(frozen=True)
@@ -111,7 +103,5 @@ Block = Paragraph | Heading | Notice | Table | Facts | Code | Verdicts | Figure 
 
 @dataclass(frozen=True)
 class PageSection:
-    """A titled part of the page."""
-
     title: str
     blocks: Sequence[Block] = field(default_factory=list)

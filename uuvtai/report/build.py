@@ -1,5 +1,4 @@
-"""``uuv report``: find what a run folder holds, compose its sections, draw, and write the page and its
-figures, whole or not at all."""
+"""``uuv report``: what a run folder holds as sections, drawn and written whole or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from uuvtai.common.errors import UserError
+from uuvtai.common.errors import ODD, UserError
 from uuvtai.common.files import FileError, read_bytes, refuse_links_in, refuse_output
 from uuvtai.config.loader import ConfigError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
@@ -37,14 +36,10 @@ from uuvtai.report.tables import Table, heads, megabytes, number
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, training
 
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of pictures and videos: trajectories over the occupancy map, the worst episodes first, as many as
-# the page may hold.
-
+# ---- Pictures and videos: trajectories over the map, the worst episodes first, as many as the page may hold.
 
 MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
-"""What all pictures and videos of a page, and the pictures of a run among them, may weigh: in base64 8.8 MB
-of a page's 10 MB"""
+"""What all pictures and videos of a page, and its pictures alone, may weigh: in base64 8.8 MB of 10"""
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
 _SUCCESS = "success"
@@ -60,8 +55,7 @@ class _Shown:
     path: Path
     method: str
     episode: tuple[int, int] | None
-    details: tuple[tuple[str, Detail], ...]
-    """(method, how its episode went)"""
+    details: tuple[tuple[str, Detail], ...]  # (method, how its episode went)
     remark: str
 
     @property
@@ -77,8 +71,7 @@ class _Shown:
 
 
 def media(folder: Path, result: dict[str, Any] | None, budget: int = MEDIA_BYTES) -> list[Block]:
-    """Pictures, then videos, of a run folder; ``result`` is its ``uuv eval --json`` document, ``budget`` in
-    bytes."""
+    """Pictures, then videos, of a run; ``result``: document of ``uuv eval --json``; ``budget`` in bytes."""
     methods = (result or {}).get("methods", [])
     pictures = _worst_first(sorted([*folder.glob("pictures/*.png"), *folder.glob("explain/*.png")]), methods)
     videos = _worst_first(sorted([*folder.glob("explain/*.webm"), *folder.glob("videos/*.webm")]), methods)
@@ -118,8 +111,7 @@ def _note(left_out: Sequence[str]) -> str:
 
 
 def shared(sections: Sequence[PageSection]) -> list[PageSection]:
-    """The same sections with what the page's budget [bytes] holds: pictures of every run first, then videos,
-    in the page's order."""
+    """The sections with what the budget [bytes] holds: all runs' pictures, then videos, in order."""
     kept: dict[int, Gallery] = {}
     budget = MEDIA_BYTES
     galleries = [block for section in sections for block in section.blocks if isinstance(block, Gallery)]
@@ -193,12 +185,9 @@ def _outcome(detail: Detail) -> str:
     )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Where figures come from: the command, the machine, the versions, the config.
+# ---- Where figures come from: the command, the machine, the versions, the config.
 
-
-MANIFEST_BYTES = 16 << 20
-"""[bytes] more than any manifest of a checkpoint has"""
+MANIFEST_BYTES = 16 << 20  # [bytes] more than any manifest of a checkpoint has
 
 
 def command_of(record: dict[str, Any]) -> str:
@@ -218,7 +207,6 @@ def status_notice(record: dict[str, Any]) -> list[Block]:
 
 
 def provenance(record: dict[str, Any]) -> list[Block]:
-    """Facts of run.json."""
     hardware, versions = record.get("hardware", {}), record.get("versions", {})
     facts = {
         "command": command_of(record),
@@ -243,20 +231,13 @@ def config_text(folder: Path) -> list[Block]:
 
 
 def checkpoints(folder: Path) -> list[Block]:
-    """Table of the checkpoints that are kept."""
     rows = []
     for path in sorted((folder / "checkpoints").glob("*/manifest.json")):
         manifest = read_json(folder, str(path.relative_to(folder))) or {}
         files = manifest.get("files", {})
         digest = (files.get("model.safetensors") or {}).get("sha256", "-")
-        rows.append(
-            [
-                path.parent.name,
-                str(manifest.get("step", "-")),
-                number(manifest.get("score"), 3),
-                str(digest)[:16],
-            ]
-        )
+        step, score = str(manifest.get("step", "-")), number(manifest.get("score"), 3)
+        rows.append([path.parent.name, step, score, str(digest)[:16]])
     if not rows:
         return []
     columns = heads("checkpoint", "iteration", "score", "sha256 of the model (first 16 digits)")
@@ -264,10 +245,9 @@ def checkpoints(folder: Path) -> list[Block]:
 
 
 def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]:
-    """For every policy of an evaluation the training that made it, by the sha256 of its checkpoint's
-    manifest; [] without trainings."""
+    """By its checkpoint's sha256, the training that made each policy of an evaluation; [] without."""
     kept = {
-        _sha256(path, run): (run.name, path.parent.name)
+        hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest(): (run.name, path.parent.name)
         for run in trainings
         for path in (run / "checkpoints").glob("*/manifest.json")
     }
@@ -286,13 +266,6 @@ def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]
     return [Paragraph(" ".join(sentences))] if sentences else []
 
 
-def _sha256(path: Path, run: Path) -> str:
-    return hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest()
-
-
-# ------------------------------------------------------------------------------------------------------------
-
-
 NOTHING = (
     "has nothing to report yet: no eval/result.json, metrics.jsonl, sweep.json, profile.json or "
     "reproduce.json"
@@ -304,8 +277,6 @@ PAGE, FIGURES = "report.html", "figures"
 
 @dataclass(frozen=True)
 class Report:
-    """What was written."""
-
     page: Path
     figures: list[Path]
 
@@ -355,8 +326,7 @@ def refuse_run(run: Path) -> None:
 
 
 def _refuse_place(target: Path, runs: list[Path], force: bool) -> None:
-    """Raise FileError where a file must not be written: what the report of a run wrote before may be renewed,
-    no other file of a run."""
+    """Raise FileError where no file may go: a run's earlier report may be renewed, its other files not."""
     place, renewed = Path(os.path.realpath(target)), force
     for run in (Path(os.path.realpath(run)) for run in runs):
         if place == run / PAGE or place.parent == run / FIGURES:
@@ -396,7 +366,10 @@ def _of_run(run: Path) -> Page:
     closing = PageSection(
         "Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)]
     )
-    return Page(title, _subtitle(record), status_notice(record), [*sections, closing])
+    about = (record.get("started"), record.get("hardware", {}).get("cpu"))
+    return Page(
+        title, ", ".join(str(part) for part in about if part), status_notice(record), [*sections, closing]
+    )
 
 
 def _of_several(runs: list[Path]) -> Page:
@@ -416,8 +389,7 @@ def _of_several(runs: list[Path]) -> Page:
 
 
 def _named_after(run: Path, trainings: list[Path]) -> list[PageSection]:
-    """Sections of one of several folders. An evaluation says which of the trainings its policies come
-    from."""
+    """Sections of one of several folders. An evaluation names the trainings of its policies."""
     with damage_named(run):
         sections = content(run)
         methods = (read_json(run, "eval/result.json") or {}).get("methods", [])
@@ -438,14 +410,7 @@ def _figures_of(run: Path, blocks: Sequence[Block]) -> list[Block]:
     ]
 
 
-def _subtitle(record: dict[str, Any]) -> str:
-    return ", ".join(
-        str(part) for part in (record.get("started"), record.get("hardware", {}).get("cpu")) if part
-    )
-
-
 def content(run: Path) -> list[PageSection]:
-    """Sections of whatever a run folder holds."""
     command = command_of(read_json(run, "run.json") or {})
     result = read_json(run, "eval/result.json")
     found = [
@@ -481,7 +446,6 @@ def _curves_of(runs: list[Path]) -> list[Block]:
 
 
 def training_of(run: Path) -> Training:
-    """What a training run recorded."""
     argv = [str(word) for word in (read_json(run, "run.json") or {}).get("argv", [])]
     after = argv[argv.index("train") + 1 :] if "train" in argv else []
     preset = Path(after[0]).stem if after and not after[0].startswith("-") else ""
@@ -495,16 +459,7 @@ def damage_named(run: Path) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except (
-        ArithmeticError,
-        AssertionError,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        SyntaxError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except (*ODD, AssertionError, SyntaxError) as error:
         what = f"{type(error).__name__}: {error}"
         raise ConfigError(
             f"{run}: a result file there is not as this version writes it ({what}); make the run again"

@@ -28,8 +28,7 @@ from uuvtai.report.tables import (
     with_interval,
 )
 
-DAGGER = "\u2020"
-"""marks privileged methods in the terminal"""
+DAGGER = "\u2020"  # marks privileged methods in the terminal
 
 _ENDS = ("collision", "ttc", "out_of_tank", "timeout")
 
@@ -94,8 +93,7 @@ _OWN = Column("own code: ms a decision", 1, short="own code ms\n(slowest)", of=_
 
 
 def methods_table(methods: list[dict[str, Any]], title: str, **page: Any) -> Table:
-    """One row a method: rates with counts and 95 % Wilson intervals, how the rest ended, both times; the time
-    of the user's own code where there is any."""
+    """One row a method: rates with counts and 95 % Wilson intervals, other ends, times, own code's time."""
     columns = (*_METHODS, _OWN) if any(m.get("own") for m in methods) else _METHODS
     return Table(columns, methods, title, **page)
 
@@ -122,8 +120,7 @@ _PAIRS = (
 
 
 def paired_table(pairs: list[dict[str, Any]], title: str, **page: Any) -> Table:
-    """Every two methods on the episodes that both played (``measure.paired``): who alone arrives, how sure
-    that is, and the difference in time where both do."""
+    """Two methods on the episodes of both: who alone arrives, how sure, difference in time of both."""
     return Table(_PAIRS, pairs, title, **page)
 
 
@@ -149,9 +146,7 @@ def causes_table(method: dict[str, Any], title: str) -> Table:
     return Table(_CAUSES, method["causes"], title)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of an evaluation (the document of ``uuv eval --json``): methods, and why they failed.
-
+# ---- Blocks of an evaluation (the document of ``uuv eval --json``): methods, and why they failed.
 
 Method = dict[str, Any]
 
@@ -177,7 +172,6 @@ _SHOWN = (
 
 
 def conditions(result: dict[str, Any]) -> str:
-    """The scene in a sentence."""
     speed = f", v = {result['v_m_s']} m/s" if result["D"] else ""
     seeds = ", ".join(map(str, result["seeds"]))
     return (
@@ -207,21 +201,12 @@ _PLAIN = (
 def evaluation_data(methods: list[Method]) -> Data:
     """Counts, rates, bounds and times of every method as numbers."""
     bounds = ("success_ci95_low", "success_ci95_high", "collision_ci95_low", "collision_ci95_high")
-    rows = [
-        [
-            m["name"],
-            m["episodes"],
-            *(m["outcomes"][name] for name in ENDINGS),
-            *_bounds(m),
-            *(m.get(name) for name in _PLAIN),
-        ]
-        for m in methods
-    ]
+    rows = []
+    for m in methods:
+        rates = [*(m["success_ci95"] or (None, None)), *(m["collision_ci95"] or (None, None))]
+        counts = [m["outcomes"][name] for name in ENDINGS]
+        rows.append([m["name"], m["episodes"], *counts, *rates, *(m.get(name) for name in _PLAIN)])
     return Data(["method", "episodes", *ENDINGS, *bounds, *_PLAIN], rows)
-
-
-def _bounds(m: dict[str, Any]) -> list[float | None]:
-    return [*(m["success_ci95"] or (None, None)), *(m["collision_ci95"] or (None, None))]
 
 
 def _rates_figure(methods: list[Method], command: str) -> Figure:
@@ -233,29 +218,16 @@ def _rates_figure(methods: list[Method], command: str) -> Figure:
         )
         for key in ("success", "collision")
     ]
-    return Figure(
-        "methods",
-        panels,
-        "Success and collision of every method with 95 % Wilson intervals",
-        evaluation_data(methods),
-        command,
-    )
+    caption = "Success and collision of every method with 95 % Wilson intervals"
+    return Figure("methods", panels, caption, evaluation_data(methods), command)
 
 
 def _rates_line(place: int, method: Method, key: str, colour: str) -> Line:
     """The one point of a method; none where it played nothing."""
     if method[f"{key}_rate"] is None:
         return Line(method["name"], [], [], [], [], colour=colour)
-    low, high = method[f"{key}_ci95"]
-    return Line(
-        method["name"],
-        [place],
-        [method[f"{key}_rate"]],
-        [low],
-        [high],
-        [f"{method['name']}\n{rates_text(method)}"],
-        colour,
-    )
+    name, value, (low, high) = method["name"], method[f"{key}_rate"], method[f"{key}_ci95"]
+    return Line(name, [place], [value], [low], [high], [f"{name}\n{rates_text(method)}"], colour)
 
 
 _PAIRED = (
@@ -285,7 +257,6 @@ def _paired(pairs: list[dict[str, Any]]) -> list[Block]:
 
 
 def paired_data(pairs: list[dict[str, Any]]) -> Data:
-    """Pairs of methods as numbers."""
     keys = ("a", "b", "episodes", *_PAIRED)
     rows = [[*map(pair.get, keys), *(pair.get(_BOUNDS) or (None, None))] for pair in pairs]
     return Data([*keys, f"{_BOUNDS}_low", f"{_BOUNDS}_high"], rows)

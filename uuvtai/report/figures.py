@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -22,57 +22,43 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From panels to SVG for the page and PNG for the disk. matplotlib is imported here and in ``figures.py``
-# only, when something is drawn.
+# ---- From panels to SVG for the page and PNG for the disk. matplotlib is imported when something is drawn.
 
-
-INK = "#1b1c1d"
-"""Colour of text, axes and grids: a mark that becomes the page's own text colour, in light and dark"""
+INK = "#1b1c1d"  # text, axes and grids: a mark that becomes the page's own colour, in light and dark
 
 _SVG = "http://www.w3.org/2000/svg"
 _XLINK = "http://www.w3.org/1999/xlink"
 _INCH_PX = 96
 _SMALLEST = 0.8
-"""A panel is never shown smaller than this share of its size, or its text could not be read: it scrolls in
-its box instead"""
+"""A panel is never smaller than this share of its size, or nobody could read it: it scrolls instead"""
 
-_STYLE = {
-    "text.parse_math": False,  # a name with dollars is a name
-    "text.usetex": False,
+_STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
-    "svg.hashsalt": "uuvtai",  # the same figure is the same file
     "font.size": 9,
     "font.family": "sans-serif",
     "axes.titlesize": 10,
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.6,
+}
+_COMMON: dict[str, Any] = {
+    "backend": "agg",
+    "text.parse_math": False,  # a name with dollars is a name
+    "text.usetex": False,
+    "svg.hashsalt": "uuvtai",  # the same figure is the same file
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
     "grid.alpha": 0.18,
-    "grid.linewidth": 0.6,
     "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.6,
-    **dict.fromkeys(
-        (
-            "text.color",
-            "axes.labelcolor",
-            "axes.edgecolor",
-            "axes.titlecolor",
-            "xtick.color",
-            "ytick.color",
-            "grid.color",
-        ),
-        INK,
-    ),
 }
+_INKED = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
 
 
 def svg(panel: Panel, prefix: str, label: str) -> str:
-    """The panel as an inline ``<svg>``: text in the page's colour, ids that begin with ``prefix``, hover
-    texts as ``<title>``."""
-    with _style():
+    """The panel as ``<svg>``: text in the page's colour, ids with ``prefix``, hover texts as ``<title>``."""
+    with styled():
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(panel.width_in, panel.height_in), layout="constrained")
@@ -93,7 +79,7 @@ def png(panels: Sequence[Panel], columns: int = 2) -> bytes:
     rows = math.ceil(len(panels) / columns)
     columns = min(columns, len(panels))
     size = (columns * max(p.width_in for p in panels), rows * max(p.height_in for p in panels))
-    with _style():
+    with styled():
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=size, dpi=150, layout="constrained", facecolor="white")
@@ -108,11 +94,12 @@ def png(panels: Sequence[Panel], columns: int = 2) -> bytes:
 
 
 @contextmanager
-def _style() -> Iterator[None]:
+def styled(own: Mapping[str, Any] = _STYLE) -> Iterator[None]:
+    """matplotlib's defaults, what all figures share, and ``own``: a reader's matplotlibrc changes nothing."""
     import matplotlib
 
-    # the defaults first: a reader's own matplotlibrc does not change a report
-    settings: Any = {**matplotlib.rcParamsDefault, "backend": "agg", **_STYLE}
+    inks = dict.fromkeys(_INKED, INK)
+    settings: Any = {**matplotlib.rcParamsDefault, **_COMMON, **inks, **own}
     with matplotlib.rc_context(settings):
         yield
 
@@ -131,8 +118,7 @@ def _strip(root: ElementTree.Element) -> None:
 
 
 def _recolour(root: ElementTree.Element) -> None:
-    """The ink becomes the page's text colour, the series' colours variables of the page, which has lighter
-    ones for the dark."""
+    """The ink becomes the page's text colour, the series' colours become variables of the page."""
     named = {INK: "currentColor"} | {colour: on_page(colour) for colour in PALETTE}
     for element in root.iter():
         style = element.get("style")
@@ -175,23 +161,16 @@ ElementTree.register_namespace("", _SVG)
 ElementTree.register_namespace("xlink", _XLINK)
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 _CELL_IN = (0.62, 0.36)
 _MARGIN_IN = (1.15, 0.95)
-_LOG_SPAN = 20.0
-"""A quantity that is positive throughout and spans more than this factor is drawn on a logarithmic axis."""
-_ROOM = 0.09
-"""A stage is named in its bar where it takes more than this share of the longest one."""
-_GOLDEN = 0.618034
-"""Stages that follow each other get colours this share of the scale apart, so that neighbours differ."""
+_LOG_SPAN = 20.0  # A quantity that is positive and spans more than this factor has a logarithmic axis.
+_ROOM = 0.09  # A stage is named in its bar where it takes more than this share of the longest one.
+_GOLDEN = 0.618034  # Stages that follow each other get colours this share of the scale apart.
 
 
 @dataclass(frozen=True)
 class Line:
-    """A named curve; ``low`` and ``high`` bound its band or its error bars, ``said`` is shown while the
-    pointer is over a point."""
+    """A curve; ``low`` and ``high`` bound its band or error bars, ``said``: shown over a point."""
 
     name: str
     x: Sequence[float]
@@ -199,16 +178,14 @@ class Line:
     low: Sequence[float] | None = None
     high: Sequence[float] | None = None
     said: Sequence[str] = ()
-    colour: str = ""
-    """'#rrggbb' of a method; none = by the order of the lines"""
+    colour: str = ""  # '#rrggbb' of a method; none = by the order of the lines
 
 
 # -------------------------------------------------------------------------------------------------- heat maps
 
 
 def heat_map(chosen: HeatMap, key: str, title: str) -> Panel:
-    """Rate ``key`` of every cell in per cent, below it the mean time to success [s]; bright is good in both
-    maps of a pair."""
+    """Rate ``key`` [%] of every cell, below it the mean time to success [s]; bright is good in both maps."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_title(title, loc="left")
@@ -242,24 +219,15 @@ def _draw_cell(axes: Axes, place: Place, key: str, identity: str) -> tuple[str, 
     axes.add_patch(box)
     ink = INK if value is None else ink_on(ground)
     middle = place.first + place.n_columns / 2
-    axes.text(
-        middle,
-        place.row + 0.34,
-        percent(value, 0),
-        color=ink,
-        ha="center",
-        va="center",
-        fontsize=8.5,
-        fontweight="bold",
-    )
+    centred: Any = {"color": ink, "ha": "center", "va": "center"}
+    axes.text(middle, place.row + 0.34, percent(value, 0), fontsize=8.5, fontweight="bold", **centred)
     mean_s = place.cell.get("time_to_success_mean_s")
     below = "" if mean_s is None else f"{number(mean_s)} s"
-    axes.text(middle, place.row + 0.73, below, color=ink, ha="center", va="center", fontsize=7)
+    axes.text(middle, place.row + 0.73, below, fontsize=7, **centred)
     return identity, hover_text(place.cell)
 
 
 def hover_text(cell: dict[str, Any]) -> str:
-    """Where a cell stands, and its rates."""
     where = ", ".join(f"{axis_name(name)} = {value_name(value)}" for name, value in place_of(cell).items())
     return f"{where}\n{rates_text(cell)}"
 
@@ -298,14 +266,8 @@ def curves(lines: Sequence[Line], title: str, x_label: str, share: bool = False,
             few = {"marker": "o", "markersize": 3} if len(line.x) <= 12 else {}
             axes.plot(line.x, [scale * y for y in line.y], color=colour, label=line.name, **few)
             if line.low is not None and line.high is not None:
-                axes.fill_between(
-                    line.x,
-                    [scale * y for y in line.low],
-                    [scale * y for y in line.high],
-                    color=colour,
-                    alpha=0.2,
-                    linewidth=0,
-                )
+                low, high = ([scale * y for y in bound] for bound in (line.low, line.high))
+                axes.fill_between(line.x, low, high, color=colour, alpha=0.2, linewidth=0)
         _frame(axes, lines, share, zero)
         return {}
 
@@ -377,19 +339,14 @@ def _frame(axes: Axes, lines: Sequence[Line], share: bool, zero: bool) -> None:
         axes.set_ylabel("%")
     elif zero:
         axes.set_ylim(bottom=0)
-    elif _spans_decades([y for line in lines for y in line.y]):
+    elif (y := [y for line in lines for y in line.y]) and max(y) > _LOG_SPAN * min(y) > 0:
         axes.set_yscale("log")
     if len(lines) > 1:
         axes.legend(loc="best")
 
 
-def _spans_decades(values: Sequence[float]) -> bool:
-    return bool(values) and min(values) > 0 and max(values) > _LOG_SPAN * min(values)
-
-
 def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]]) -> Panel:
-    """Success over collision [shares] along one setting per line; ``marks`` are single points (name,
-    collision, success)."""
+    """Success over collision [shares] along one setting per line; ``marks``: (name, collision, success)."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_xlabel("collision %")
@@ -425,8 +382,7 @@ def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]])
 
 
 def stages(rows: Sequence[tuple[str, dict[str, float]]], title: str) -> Panel:
-    """Time per stage as one bar a row, widest stage first, like a flame graph's floor: (row's name, stage ->
-    us per env-step)."""
+    """Time per stage as one bar a row, widest first: (row's name, stage -> us per env-step)."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_title(title, loc="left")

@@ -1,5 +1,4 @@
-"""From blocks to one self-contained HTML page: no script, no address, nothing but what stands in it;
-everything from files is escaped."""
+"""From blocks to one self-contained page: no script, no address; what comes from files is escaped."""
 
 from __future__ import annotations
 
@@ -28,14 +27,11 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 
-_MAX_SHOWN_ROWS = 200
-"""A longer table of numbers is for download only."""
+_MAX_SHOWN_ROWS = 200  # A longer table of numbers is for download only.
 
 
 @dataclass(frozen=True)
 class Page:
-    """A titled page."""
-
     title: str
     subtitle: str
     notices: Sequence[Block]
@@ -108,9 +104,7 @@ def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Reading a run folder: what is wrong with a file is said, and nothing that stands in one is executed.
-
+# ---- Reading a run folder: what is wrong with a file is said, and nothing that stands in one is executed.
 
 _MAX_LINES = 1_000_000
 _MOST = {
@@ -122,13 +116,11 @@ _MOST = {
     "sections": 200,
 }
 """entries of a result's lists that a page has room for: each is drawn, and drawing takes time"""
-_MOST_VALUES = 10_000
-"""of an axis of a sweep"""
+_MOST_VALUES = 10_000  # of an axis of a sweep
 
 
 def read_json(run: Path, name: str) -> dict[str, Any] | None:
-    """The document ``name`` of a run folder, or None where there is no such file. Raises ConfigError for one
-    that is no JSON object."""
+    """The document ``name`` of a run, None = no such file. Raises ConfigError for no JSON object."""
     path = run / name
     try:
         document = files.read_json(path, folder=run)
@@ -162,8 +154,7 @@ def _refuse_many(document: dict[str, Any], path: Path) -> None:
 
 
 def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
-    """Objects of a JSONL file, [] where there is none; a last line that a kill cut off is left out. Raises
-    ConfigError."""
+    """Objects of a JSONL file, [] = no file; a last line that a kill cut is left out. Raises ConfigError."""
     path, found, damaged = run / name, [], 0
     try:
         for i, line in enumerate(files.read_lines(path, files.MAX_JSON_BYTES, run), start=1):
@@ -213,12 +204,9 @@ def read_config(run: Path) -> str | None:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Texts of files without what no figure and no table can show.
+# ---- Texts of files without what no figure and no table can show.
 
-
-_LONGEST = 300
-"""characters of a text in a document: names, not novels"""
+_LONGEST = 300  # characters of a text in a document: names, not novels
 
 
 def shown(text: str) -> str:

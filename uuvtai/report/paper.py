@@ -11,21 +11,12 @@ from typing import Any
 from uuvtai.common.statistics import holm_adjusted
 from uuvtai.config.loader import ConfigError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
+from uuvtai.report import paper_style
 from uuvtai.report.blocks import Block, Figure
 from uuvtai.report.build import NOTHING, command_of, damage_named, refuse_run, training_of
 from uuvtai.report.evaluation import causes_table, conditions, evaluation_data, paired_data
 from uuvtai.report.html import all_shown, read_json, shown
-from uuvtai.report.paper_style import (
-    ONE_COLUMN_IN,
-    TWO_COLUMNS_IN,
-    PaperPanel,
-    bars,
-    height_in,
-    of_panel,
-    sheets,
-    ways,
-)
-from uuvtai.report.sweep import ON_HOVER, by_method, cells_data, method_of, sweep
+from uuvtai.report.sweep import ON_HOVER, axis_column, by_method, cells_data, method_of, sweep
 from uuvtai.report.tables import (
     PAGE,
     Column,
@@ -37,7 +28,6 @@ from uuvtai.report.tables import (
     number,
     pivot,
     probability,
-    value_name,
     varies_alone,
     varying,
     with_interval,
@@ -45,11 +35,9 @@ from uuvtai.report.tables import (
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, training
 
-_MOST_EPISODES = 6
-"""whose ways are drawn"""
+_MOST_EPISODES = 6  # whose ways are drawn
 _LOG = re.compile(r"(?P<method>.+)_seed(?P<seed>-?\d+)_episode(?P<episode>\d+)")
-_WORDS = 3
-"""of a table's title that name it"""
+_WORDS = 3  # of a table's title that name it
 _WILSON = "95 % Wilson intervals"
 
 
@@ -59,17 +47,14 @@ class PaperItem:
 
     name: str
     caption: str
-    origin: str
-    """the command and the commit, a line each"""
+    origin: str  # the command and the commit, a line each
     data: Data | None
-    panels: Sequence[PaperPanel] = ()
+    panels: Sequence[paper_style.PaperPanel] = ()
     table: Table | None = None
-    both_widths: bool = True
-    """a figure for one column too"""
+    both_widths: bool = True  # a figure for one column too
 
 
 def origin_of(run: Path) -> str:
-    """The command and the commit of a run."""
     record = read_json(run, "run.json") or {}
     version = (record.get("versions") or {}).get("uuvtai", "unknown")
     commit = record.get("git_sha") or "not known"
@@ -106,11 +91,10 @@ def items_of_trainings(trainings: Sequence[Training], origin: str) -> list[Paper
 
 
 def _of_blocks(blocks: Iterable[Block], origin: str, n: str) -> Iterable[PaperItem]:
-    """Figures and tables of the report's page."""
     for i, block in enumerate(blocks):
         if isinstance(block, Figure):
             is_stages, is_cells = block.name == "stages", block.name.startswith("heat_map")
-            panels = [of_panel(panel, is_cells, is_stages) for panel in block.panels]
+            panels = [paper_style.of_panel(panel, is_cells, is_stages) for panel in block.panels]
             caption = _sentences(block.caption, n)
             yield PaperItem(block.name, caption, origin, block.data, panels=panels, both_widths=not is_stages)
         elif isinstance(block, Table):
@@ -162,7 +146,7 @@ def _of_evaluation(result: dict[str, Any], origin: str) -> list[PaperItem]:
             f"Success and collision of every method. {scene} {n}; whiskers: {_WILSON}.{note}",
             origin,
             data,
-            panels=[bars(methods, key) for key in ("success", "collision")],
+            panels=[paper_style.bars(methods, key) for key in ("success", "collision")],
         ),
         PaperItem(
             "methods",
@@ -179,7 +163,6 @@ def _of_evaluation(result: dict[str, Any], origin: str) -> list[PaperItem]:
 
 
 def _causes(method: dict[str, Any], scene: str, origin: str) -> PaperItem:
-    """Why episodes of a method failed."""
     caption = (
         f"Why episodes of {method['name']} failed, judged from the truth. {scene} n = "
         f"{len(method['explain'])} failures of {method['episodes']} episodes; shares of the failures, "
@@ -230,7 +213,7 @@ def _of_logs(run: Path, origin: str) -> list[PaperItem]:
             episodes.setdefault((int(named["seed"]), int(named["episode"])), []).append(path)
     found = []
     for (seed, episode), logs in sorted(episodes.items())[:_MOST_EPISODES]:
-        panel, said = ways(logs)
+        panel, said = paper_style.ways(logs)
         caption = (
             f"Ways of {len(logs)} method{'s' if len(logs) > 1 else ''} through one episode, chosen by its "
             f"number: {said}; dashed: their ways. Grey: what rests; cross: an end that is no success. "
@@ -304,7 +287,7 @@ def _cells(cells: list[dict[str, Any]], document: dict[str, Any]) -> Table:
     if varies_alone(document):
         where = [Column("changed", left=True, of=lambda cell: change_name(cell, document))]
     else:
-        where = [_axis(name) for name in varying(document["axes"])]
+        where = [axis_column(name) for name in varying(document["axes"])]
     columns = [
         *where,
         Column("method", left=True, of=method_of),
@@ -315,49 +298,22 @@ def _cells(cells: list[dict[str, Any]], document: dict[str, Any]) -> Table:
     return Table(columns, cells)
 
 
-def _axis(name: str) -> Column:
-    return Column(
-        axis_name(name), left=True, of=lambda cell: "-" if cell.get(name) is None else value_name(cell[name])
-    )
+# ---- LaTeX of tables and floats. Whatever a user can name is text in it, never a command.
 
-
-# ------------------------------------------------------------------------------------------------------------
-# LaTeX of tables and floats. Whatever a user can name is text in it, never a command.
-
-
+_COMMANDS = {
+    "\\": "backslash", "^": "asciicircum", "~": "asciitilde", "<": "less", ">": "greater", "|": "bar",
+    '"': "quotedbl", "'": "quotesingle", "`": "asciigrave", "·": "periodcentered", "°": "degree",
+    "†": "dagger", "–": "endash", "—": "emdash",
+}  # fmt: skip
 _SPECIAL = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "$": r"\$",
-    "&": r"\&",
-    "#": r"\#",
-    "%": r"\%",
-    "_": r"\_",
-    "^": r"\textasciicircum{}",
-    "~": r"\textasciitilde{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
-    "'": r"\textquotesingle{}",
-    "`": r"\textasciigrave{}",
-    "·": r"\textperiodcentered{}",
-    "±": r"$\pm$",
-    "µ": r"$\mu$",
-    "°": r"\textdegree{}",
-    "†": r"\textdagger{}",
-    "–": r"\textendash{}",
-    "—": r"\textemdash{}",
-    "−": "$-$",
+    **{c: rf"\{c}" for c in "{}$&#%_"},
+    **{c: rf"\text{name}{{}}" for c, name in _COMMANDS.items()},
+    **{"±": r"$\pm$", "µ": r"$\mu$", "−": "$-$"},
 }
-_LETTERS = range(0xC0, 0x100)
-"""letters with accents that every LaTeX knows in UTF-8"""
+_LETTERS = range(0xC0, 0x100)  # letters with accents that every LaTeX knows in UTF-8
 _NO_LETTERS = (0xD7, 0xF7)
-_COLUMN_CHARACTERS, _GAP = 52, 2
-"""what fits one column of a page, and what a column of the table takes beside its words"""
-_MINUS = re.compile(r"(?<![\w.-])-(?=\d)")
-"""before a number of a table"""
+_COLUMN_CHARACTERS, _GAP = 52, 2  # what fits one column of a page, and a table's column beside its words
+_MINUS = re.compile(r"(?<![\w.-])-(?=\d)")  # before a number of a table
 _PROSE = "p{0.3\\linewidth}"
 
 
@@ -387,19 +343,16 @@ def _cell(text: str) -> str:
     return f"{{{found[0]}}}{found[1:]}" if found[:1] in ("[", "*") else found
 
 
-def _spec(column: Column) -> str:
-    return _PROSE if column.prose else "l" if column.left else "r"
-
-
 def tabular(table: Table, remark: str) -> str:
     """The table with the rules of booktabs, below a comment."""
     columns, cells = table.on(PAGE)
     lines = [[_cell(column.head) for column in columns], *([_cell(str(c)) for c in row] for row in cells)]
+    spec = "".join(_PROSE if column.prose else "l" if column.left else "r" for column in columns)
     head, *rows = (" & ".join(line) + r" \\" for line in lines)
     return "\n".join(
         [
             *map(comment, remark.splitlines()),
-            rf"\begin{{tabular}}{{{''.join(map(_spec, columns))}}}",
+            rf"\begin{{tabular}}{{{spec}}}",
             r"\toprule",
             head,
             r"\midrule",
@@ -412,7 +365,6 @@ def tabular(table: Table, remark: str) -> str:
 
 
 def is_wide(table: Table) -> bool:
-    """Whether a table wants both columns of a page."""
     columns, cells = table.on(PAGE)
     widths = [
         max(len(str(row[i])) for row in [[c.head for c in columns], *cells]) for i in range(len(columns))
@@ -442,31 +394,24 @@ DOCUMENT = r"""% All figures and tables, to look at: pdflatex paper.tex
 """
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv report --paper DIR``: figures, tables and captions of finished runs, whole or not at all.
+# ---- ``uuv report --paper DIR``: figures, tables and captions of finished runs, whole or not at all.
 
-
-_WIDTHS = {"1col": ONE_COLUMN_IN, "2col": TWO_COLUMNS_IN}
+_WIDTHS = {"1col": paper_style.ONE_COLUMN_IN, "2col": paper_style.TWO_COLUMNS_IN}
 _NAME = re.compile(r"[^A-Za-z0-9]+")
 _LONGEST = 60
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""what a spreadsheet takes a text that begins so for"""
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet takes a text that begins so for
 _MARKDOWN = re.compile(r"([\\`*_{}\[\]<>#|&!])")
 _MOST_ITEMS = 400
-_TALL_IN = 6.5
-"""a figure that is higher in one column stands in two"""
+_TALL_IN = 6.5  # a figure that is higher in one column stands in two
 
 
 @dataclass(frozen=True)
 class PaperKit:
-    """What was written."""
-
     folder: Path
     figures: list[Path]
     tables: list[Path]
 
     def document(self) -> dict[str, object]:
-        """``uuv report --paper --json``."""
         return {
             "schema": 1,
             "paper": str(self.folder),
@@ -520,16 +465,14 @@ def _all(runs: list[Path]) -> Iterator[tuple[Path, PaperItem]]:
         yield from ((trainings[0], item) for item in found)
     for run in runs:
         with damage_named(run):
-            _refuse_reproduction(run)
+            if read_json(run, "reproduce.json"):
+                raise ConfigError(
+                    f"{run}: is a reproduction; give the run folders in it one by one ({run}/...)"
+                )
             own = items_of(run)
         if not own and run not in trainings:
             raise ConfigError(f"{run}: {NOTHING}")
         yield from ((run, item) for item in own)
-
-
-def _refuse_reproduction(run: Path) -> None:
-    if read_json(run, "reproduce.json"):
-        raise ConfigError(f"{run}: is a reproduction; give the run folders in it one by one ({run}/...)")
 
 
 def _named(found: Iterator[tuple[Path, PaperItem]], several: bool) -> list[tuple[Path, PaperItem]]:
@@ -556,19 +499,16 @@ def _named(found: Iterator[tuple[Path, PaperItem]], several: bool) -> list[tuple
 def _files_of(item: PaperItem) -> dict[str, bytes]:
     """Content by path in the folder."""
     if item.table is not None:
-        made = {f"tables/{item.name}.tex": tabular(item.table, _remark(item)).encode()}
+        remark = f"{item.caption}\n{item.origin}\nneeds \\usepackage{{booktabs,textcomp}}"
+        made = {f"tables/{item.name}.tex": tabular(item.table, remark).encode()}
         data = item.data or _texts(item.table)
         return made | {f"tables/{item.name}.csv": _csv(data).encode()}
     made = {} if item.data is None else {f"data/{item.name}.csv": _csv(item.data).encode()}
     for width, inches in _WIDTHS.items():
         if width == "2col" or item.both_widths:
-            for kind, content in sheets(item.panels, inches).items():
+            for kind, content in paper_style.sheets(item.panels, inches).items():
                 made[f"figures/{item.name}_{width}.{kind}"] = content
     return made
-
-
-def _remark(item: PaperItem) -> str:
-    return f"{item.caption}\n{item.origin}\nneeds \\usepackage{{booktabs,textcomp}}"
 
 
 def _texts(table: Table) -> Data:
@@ -603,7 +543,7 @@ def _tex(items: Sequence[PaperItem]) -> str:
             body, kind = [rf"\input{{tables/{item.name}}}"], "table"
             wide = is_wide(item.table)
         else:
-            is_tall = height_in(item.panels, ONE_COLUMN_IN) > _TALL_IN
+            is_tall = paper_style.height_in(item.panels, paper_style.ONE_COLUMN_IN) > _TALL_IN
             wide, kind = is_tall or not item.both_widths, "figure"
             width = r"\textwidth" if wide else r"\columnwidth"
             file = f"figures/{item.name}_{'2col' if wide else '1col'}.pdf"

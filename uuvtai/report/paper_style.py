@@ -6,15 +6,14 @@ import io
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.common.colours import method_colours
 from uuvtai.report.blocks import Hover, Panel
-from uuvtai.report.figures import INK
+from uuvtai.report.figures import INK, styled
 from uuvtai.report.html import shown
 
 if TYPE_CHECKING:
@@ -24,23 +23,15 @@ if TYPE_CHECKING:
     from uuvtai.logs.drawing import Recording
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Figures as journals want them: PDF and SVG, as wide as one or two columns of a page, text of one size.
+# ---- Figures as journals want them: PDF and SVG, as wide as one or two columns of a page, text of one size.
 
-
-ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.16
-"""widths of IEEE's columns"""
+ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.16  # widths of IEEE's columns
 TEXT_PT = 8.0
-_LEAST_PT = 5.0
-"""of the words in a cell that is too narrow for more"""
-_CURVE_IN = 2.1
-"""height of a panel that has no wish of its own"""
-_ROOM = 0.94
-"""of a cell's width that its words may take"""
+_LEAST_PT = 5.0  # of the words in a cell that is too narrow for more
+_CURVE_IN = 2.1  # height of a panel that has no wish of its own
+_ROOM = 0.94  # of a cell's width that its words may take
 
 _STYLE: dict[str, Any] = {
-    "text.parse_math": False,  # a name with dollars is a name
-    "text.usetex": False,
     "font.family": ["STIXGeneral", "DejaVu Sans"],  # both come with matplotlib; the second has more letters
     "font.size": TEXT_PT,
     "axes.titlesize": TEXT_PT,
@@ -50,17 +41,10 @@ _STYLE: dict[str, Any] = {
     "legend.fontsize": TEXT_PT,
     "pdf.fonttype": 42,  # fonts that publishers accept, text that can be searched
     "svg.fonttype": "path",  # looks the same where the font is missing
-    "svg.hashsalt": "uuvtai",  # the same figure is the same file
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
     "axes.linewidth": 0.6,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
-    "grid.alpha": 0.18,
     "grid.linewidth": 0.5,
-    "legend.frameon": False,
     "legend.handlelength": 1.4,
     "lines.linewidth": 1.1,
 }
@@ -72,14 +56,11 @@ class PaperPanel:
 
     draw: Callable[[Axes], Hover]
     height_in: Callable[[float], float]
-    is_cells: bool = False
-    """its words stand in cells of one unit"""
-    spans: bool = False
-    """takes the whole width, also of two columns"""
+    is_cells: bool = False  # its words stand in cells of one unit
+    spans: bool = False  # takes the whole width, also of two columns
 
 
 def of_panel(panel: Panel, is_cells: bool = False, spans: bool = False) -> PaperPanel:
-    """A panel of the report's page."""
     height = _CURVE_IN if panel.height_in == Panel.height_in and not is_cells else panel.height_in
     return PaperPanel(panel.draw, lambda _width: height, is_cells, spans)
 
@@ -100,7 +81,7 @@ def _row_heights(panels: Sequence[PaperPanel], width_in: float) -> tuple[int, li
 def sheets(panels: Sequence[PaperPanel], width_in: float) -> dict[str, bytes]:
     """The figure as 'pdf' and 'svg': one panel below the other in one column, two side by side in two."""
     across, heights = _row_heights(panels, width_in)
-    with _style(), warnings.catch_warnings():
+    with styled(_STYLE), warnings.catch_warnings():
         from matplotlib.figure import Figure as Sheet
 
         warnings.filterwarnings("ignore", "Glyph")  # a name may have letters that no font here has
@@ -124,8 +105,7 @@ def _saved(sheet: Sheet, kind: str, date: str) -> bytes:
 
 
 def _settle(sheet: Sheet, cells: Sequence[Axes]) -> None:
-    """All text of one size, but smaller where cells are too narrow; names under an axis are turned where they
-    would touch."""
+    """All text of one size, smaller where cells are narrow; names under an axis turn where they touch."""
     from matplotlib.text import Text
 
     for text in sheet.findobj(Text):
@@ -154,25 +134,9 @@ def _shrink(axes: Axes) -> None:
         text.set_fontsize(max(_LEAST_PT, share * TEXT_PT))
 
 
-@contextmanager
-def _style() -> Iterator[None]:
-    import matplotlib
-
-    # the defaults first: a reader's own matplotlibrc does not change a figure
-    inks = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
-    settings: Any = {**matplotlib.rcParamsDefault, "backend": "agg", **_STYLE, **dict.fromkeys(inks, INK)}
-    with matplotlib.rc_context(settings):
-        yield
-
-
-# ------------------------------------------------------------------------------------------------------------
-
-
 _BAR_IN, _FRAME_IN = 0.21, 0.55
-_TOPS = (10.0, 20.0, 50.0, 100.0)
-"""ends of an axis of shares [%]"""
-_MOST_IN = 4.2
-"""height of a tank as deep as it is long"""
+_TOPS = (10.0, 20.0, 50.0, 100.0)  # ends of an axis of shares [%]
+_MOST_IN = 4.2  # height of a tank as deep as it is long
 _RESTS, _MOVES = "#8a929b", "#d9480f"
 
 

@@ -37,25 +37,16 @@ def claim_table(document: dict[str, Any]) -> Table:
     return Table(_CLAIMS, claims, title, sections=range(len(claims)))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of ``reproduce.json``: sections of prose, tables, verdicts and the runs that they rest on.
+# ---- Blocks of ``reproduce.json``: sections of prose, tables, verdicts and the runs that they rest on.
 #
-# ``{"schema": 1, "title": "..", "sections": [{"title": "..", "blocks": [BLOCK, ..]}]}`` where a BLOCK is one
-# of
-#
+# ``{"schema": 1, "title": "..", "sections": [{"title": "..", "blocks": [BLOCK, ..]}]}``, a BLOCK being one of
 # - ``{"kind": "prose" | "heading" | "notice", "text": ".."}``
 # - ``{"kind": "table", "columns": [..], "rows": [[..], ..], "caption": "..", "n_left": 1}``
-# - ``{"kind": "verdicts", "items": [{"claim": "..", "verdict": "holds" | "does not hold" | "cannot be
-# judged",
-#   "numbers": ".."}]}``
+# - ``{"kind": "verdicts", "items": [{"claim": "..", "verdict": one of RULINGS, "numbers": ".."}]}``
 # - ``{"kind": "trade_off", "series": [{"name": "..", "points": [{"collision_rate": 0, "success_rate": 0}]}],
-#   "marks": [{"name": "paper", "collision_rate": 0.011, "success_rate": 0.828}], "caption": "..", "command":
-#   ".."}``
-# - ``{"kind": "run", "path": ".."}``: what a run folder inside this one has to show (evaluation, sweep,
-#   profile, pictures, videos)
-# - ``{"kind": "curves", "paths": ["..", ..]}``: training curves of run folders inside this one, seeds of one
-#   method as a band
-
+#   "marks": [{"name": "paper", "collision_rate": 0, "success_rate": 0}], "caption": "..", "command": ".."}``
+# - ``{"kind": "run", "path": ".."}``: all that a run folder inside this one has to show
+# - ``{"kind": "curves", "paths": ["..", ..]}``: curves of trainings inside this one, seeds as one band
 
 RULINGS = ("holds", "does not hold", "cannot be judged")
 
@@ -67,8 +58,7 @@ OfCurves = Callable[[list[Path]], list[Block]]
 
 
 def reproduction(document: Described, folder: Path, of_run: OfRun, of_curves: OfCurves) -> list[PageSection]:
-    """Sections of a reproduction; ``of_run`` and ``of_curves`` give the blocks of run folders. Raises
-    ConfigError."""
+    """Sections of a reproduction; ``of_run``, ``of_curves``: blocks of run folders. Raises ConfigError."""
     if sum(len(section["blocks"]) for section in document["sections"]) > _MAX_BLOCKS:
         raise ConfigError(
             f"{folder / 'reproduce.json'}: has more than the {_MAX_BLOCKS:,} blocks that a page has room for"

@@ -39,7 +39,7 @@ def cell_table(cells: list[MapCell], document: dict[str, Any], title: str, **pag
     method = Column("method", left=True, of=method_of)
     columns = [
         replace(method, only=PAGE),
-        *(_axis(name) for name in axes_of_cells(cells)),
+        *(axis_column(name) for name in axes_of_cells(cells)),
         *_place(document),
         replace(method, only=TERMINAL),
         SUCCESS,
@@ -52,7 +52,6 @@ def cell_table(cells: list[MapCell], document: dict[str, Any], title: str, **pag
 
 
 def method_of(cell: MapCell) -> str:
-    """The method that played the cell."""
     return str(cell.get("method", "policy"))
 
 
@@ -61,7 +60,7 @@ def axes_of_cells(cells: list[MapCell]) -> list[str]:
     return list(dict.fromkeys(name for cell in cells for name in place_of(cell)))
 
 
-def _axis(name: str) -> Column:
+def axis_column(name: str) -> Column:
     def value(cell: MapCell) -> str:
         return "-" if cell.get(name) is None else value_name(cell[name])
 
@@ -69,8 +68,7 @@ def _axis(name: str) -> Column:
 
 
 def _place(document: dict[str, Any]) -> list[Column]:
-    """Where a cell stands, in a terminal: the scene, of which what does not vary is the first to be left out,
-    and what else varies."""
+    """Where a cell stands, in a terminal: the scene, less what does not vary, and what else varies."""
     axes = document["axes"]
     fixed = {name for name in _SCENE if len(axes.get(name, ())) < 2}
     scene = [
@@ -88,18 +86,13 @@ def _other(name: str) -> Column:
     return Column(name, left=True, only=TERMINAL, of=lambda cell: str(cell.get(name, "")))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of a sweep (the document of ``uuv sweep --json``): heat maps over two or more axes, curves with
-# intervals over one.
+# ---- Blocks of ``uuv sweep --json``: heat maps over two or more axes, curves with intervals over one.
 
-
-ON_HOVER = "Counts and intervals: on hover and below"
-"""said of a figure on a page, where it has both"""
+ON_HOVER = "Counts and intervals: on hover and below"  # said of a figure on a page, where it has both
 _NUMBERS = ("success_rate", "collision_rate", "time_mean_s", "tts_s", "time_to_success_mean_s")
 
 
 def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
-    """Figures and the table of every cell."""
     cells, axes = document["cells"], document["axes"]
     if not cells:
         return [Notice("No cell of this sweep is finished yet.")]
@@ -208,7 +201,6 @@ def _cells(cells: list[MapCell], document: dict[str, Any], caption: str) -> Tabl
 
 
 def cells_data(cells: list[MapCell]) -> Data:
-    """Every cell as numbers."""
     axes = axes_of_cells(cells)
     bounds = [f"{key}_ci95_{end}" for key in ("success", "collision") for end in ("low", "high")]
     return Data(

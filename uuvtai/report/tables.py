@@ -9,8 +9,7 @@ from typing import Any
 from uuvtai.common.enums import COLLIDED
 from uuvtai.common.errors import SettingError
 
-TERMINAL, PAGE = "terminal", "page"
-"""where a table is shown; a page is HTML or Markdown"""
+TERMINAL, PAGE = "terminal", "page"  # where a table is shown; a page is HTML or Markdown
 
 
 @dataclass(frozen=True)
@@ -18,10 +17,8 @@ class Cell:
     """What a text alone does not say."""
 
     text: str
-    short: str = ""
-    """the same for a terminal, where room is scarce"""
-    style: str = ""
-    """of a terminal, as Rich names it"""
+    short: str = ""  # the same for a terminal, where room is scarce
+    style: str = ""  # of a terminal, as Rich names it
 
     def __str__(self) -> str:
         return self.text
@@ -37,18 +34,12 @@ class Column:
     """A column of a table: its head with the unit, and how gladly a narrow terminal leaves it out."""
 
     head: str
-    priority: int = 0
-    """0 = always shown; the highest number goes first"""
-    left: bool = False
-    """words; numbers stand on the right"""
-    prose: bool = False
-    """may be wrapped between words"""
-    short: str = ""
-    """head in a terminal, if another one; may hold line breaks"""
-    only: str = ""
-    """TERMINAL or PAGE; nothing = both"""
-    of: Callable[[Any], str | Cell] | None = None
-    """from a row to the cell; without, a row is the list of its cells"""
+    priority: int = 0  # 0 = always shown; the highest number goes first
+    left: bool = False  # words; numbers stand on the right
+    prose: bool = False  # may be wrapped between words
+    short: str = ""  # head in a terminal, if another one; may hold line breaks
+    only: str = ""  # TERMINAL or PAGE; nothing = both
+    of: Callable[[Any], str | Cell] | None = None  # from a row to the cell; without, a row is its cells
 
 
 @dataclass(frozen=True)
@@ -77,12 +68,9 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Any]
     title: str = ""
-    sections: Sequence[int] = ()
-    """rows after which a terminal draws a rule"""
-    data: Data | None = None
-    """the same as numbers, for download"""
-    folded: bool = False
-    """long: shown when asked for"""
+    sections: Sequence[int] = ()  # rows after which a terminal draws a rule
+    data: Data | None = None  # the same as numbers, for download
+    folded: bool = False  # long: shown when asked for
     swatches: Sequence[str] = ()
     """colour of each row, '#rrggbb': the one that its method has in the figures; none = no colours"""
 
@@ -107,22 +95,17 @@ def markdown(table: Table) -> str:
     """The table in Markdown; what would break its cells is escaped."""
     columns, cells = table.on(PAGE)
     lines = [[column.head for column in columns], ["---"] * len(columns), *cells]
-    return "\n".join("| " + " | ".join(_escaped(str(cell)) for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(" ".join(str(cell).split()).replace("|", r"\|") for cell in line) + " |"
+        for line in lines
+    )
 
 
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Texts below their heads in Markdown."""
     return markdown(Table(heads(*head), rows))
 
 
-def _escaped(text: str) -> str:
-    return " ".join(text.split()).replace("|", r"\|")
-
-
-# ------------------------------------------------------------------------------------------------------------
-# Figures as tables and pages write them: every rate with its count and its interval, and what is not known
-# as a dash.
-
+# ---- Numbers in tables and pages: every rate with its count and its interval, what is not known as a dash.
 
 _NAMES = {"v_m_s": "v m/s"}
 _LOCALIZED = {
@@ -195,7 +178,6 @@ def value_name(value: object) -> str:
 
 
 def axis_name(key: str) -> str:
-    """An axis as a person reads it."""
     return _NAMES.get(key, key)
 
 
@@ -209,9 +191,7 @@ def megabytes(n_bytes: int) -> str:
     return f"{n_bytes / 1e6:.1f} MB"
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Layout of a heat map: cells of a sweep as rows and columns, for the figure and the terminal alike. Pure.
-
+# ---- Layout of a heat map: cells of a sweep as rows and columns, for the figure and the terminal alike.
 
 SPEED = "v_m_s"
 MapCell = dict[str, Any]
@@ -264,7 +244,6 @@ class HeatMap:
 
     @property
     def column_names(self) -> list[str]:
-        """What stands under each column."""
         return [value_name(value) for value in self.column_values]
 
     @property
@@ -335,15 +314,10 @@ def _refuse_doubles(places: tuple[Place, ...]) -> None:
         taken |= spots
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A sweep of one axis at a time: which cells change which axis, around the cell that changes nothing.
-# Pure.
+# ---- A sweep of one axis at a time: which cells change which axis, around the cell that changes nothing.
 
-
-_SCENE = ("S", "D", "v_m_s")
-"""every cell states these, changed or not"""
-_TICK = 14
-"""characters that fit under a tick"""
+_SCENE = ("S", "D", "v_m_s")  # every cell states these, changed or not
+_TICK = 14  # characters that fit under a tick
 
 
 def varies_alone(document: dict[str, Any]) -> bool:

@@ -54,18 +54,10 @@ def density_table(rows: list[dict[str, Any]], title: str) -> Table:
     return Table(columns, rows, title)
 
 
-def density_data(rows: list[dict[str, Any]]) -> Data:
-    """The numbers of a density table."""
-    return Data(_DENSITY, [list(map(row.get, _DENSITY)) for row in rows])
-
-
-# ------------------------------------------------------------------------------------------------------------
-# Blocks of a profile (the document of ``uuv profile --json``): rates, time per stage, the paper's two timing
-# tables beside ours.
+# ---- Blocks of ``uuv profile --json``: rates, time per stage, the paper's two timing tables beside ours.
 
 
 def timing(document: dict[str, Any], command: str = "") -> list[Block]:
-    """Everything that a profile has to show."""
     machine, rows = document.get("machine", {}), document.get("rows", [])
     said = (
         f"Measured on {machine.get('cpu', 'an unnamed processor')}, {machine.get('cores', '-')} cores, "
@@ -129,6 +121,12 @@ def _density(rows: list[dict[str, Any]], command: str) -> list[Block]:
     panel = curves(lines, "Loop time over moving obstacles", "D", zero=True)
     caption = "Loop time [ms] over D, beside the paper's"
     return [
-        Figure("density", [panel], caption, density_data(rows), command),
+        Figure(
+            "density",
+            [panel],
+            caption,
+            Data(_DENSITY, [list(map(row.get, _DENSITY)) for row in rows]),
+            command,
+        ),
         density_table(rows, "Runtime versus obstacle density"),
     ]

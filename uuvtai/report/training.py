@@ -1,5 +1,4 @@
-"""Blocks of trainings: reward, success, reconstruction and dynamics loss; several seeds of one method as a
-mean line with a band."""
+"""Blocks of trainings: reward, success, losses; seeds of one method as a mean line with a band."""
 
 from __future__ import annotations
 
@@ -27,8 +26,7 @@ PANELS = (
     ("world_model/reconstruction_loss", "reconstruction loss", False),
     ("world_model/dynamics_loss", "dynamics loss", False),
 )
-"""(metric, title, is a share): the paper's four curves, collision, and the evaluations in between where there
-are any"""
+"""(metric, title, is a share): the paper's four curves, collision, evaluations in between if any"""
 
 
 @dataclass(frozen=True)
@@ -58,13 +56,17 @@ def training(runs: Sequence[Training], command: str = "") -> list[Block]:
         lines = [line for method in methods if (line := _line(method, key, colours[method.name])) is not None]
         if lines:
             panels.append(curves(lines, title, "million env-steps", share))
-            rows += [[line.name, key, *point] for line in lines for point in _points(line)]
+            rows += [
+                [line.name, key, *point]
+                for line in lines
+                for point in zip(line.x, line.y, line.low or line.y, line.high or line.y, strict=True)
+            ]
     if not panels:
         return [Paragraph("No iteration was recorded.")]
     data = Data(["method", "metric", "million_env_steps", "mean", "lowest", "highest"], rows)
     seeds = (
         "the line is the mean over seeds, the band reaches from the lowest to the highest seed; "
-        if _several(methods)
+        if any(len(method.runs) > 1 for method in methods)
         else ""
     )
     caption = (
@@ -116,10 +118,6 @@ def _method_name(group: Sequence[Training]) -> str:
     return group[0].preset or (name.rstrip("_-0123456789") if len(group) > 1 else "") or name
 
 
-def _several(methods: Sequence[MethodRuns]) -> bool:
-    return any(len(method.runs) > 1 for method in methods)
-
-
 def _line(method: MethodRuns, key: str, colour: str) -> Line | None:
     """Mean over the seeds at the iterations that all of them have; None where the metric is missing."""
     by_iteration = [
@@ -138,12 +136,6 @@ def _line(method: MethodRuns, key: str, colour: str) -> Line | None:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _points(line: Line) -> list[list[float]]:
-    return [
-        list(point) for point in zip(line.x, line.y, line.low or line.y, line.high or line.y, strict=True)
-    ]
 
 
 def _judged(run: Training) -> str | Cell:

@@ -1,5 +1,4 @@
-"""``uuv pilot``: fifty times a second hear, think, decide, speak. Everything it decides is elsewhere;
-what it says meanwhile is here."""
+"""``uuv pilot``: fifty times a second hear, think, decide, speak. What it decides is elsewhere."""
 
 from __future__ import annotations
 
@@ -18,6 +17,7 @@ from uuvtai.common.signals import StopEvent
 from uuvtai.config import Config
 from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
+from uuvtai.vehicle import safety
 from uuvtai.vehicle.handover import Handover
 from uuvtai.vehicle.mavlink import (
     ALT_HOLD,
@@ -38,28 +38,12 @@ from uuvtai.vehicle.mavlink import (
 from uuvtai.vehicle.messages import NAMES, SensorMessage
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
 from uuvtai.vehicle.pilot_log import LinkLog
-from uuvtai.vehicle.safety import (
-    LATE_WINDOW_S,
-    STALL_S,
-    STOP,
-    SafeAction,
-    SafeDecision,
-    SafetyLimits,
-    SafetyMemory,
-    VehicleView,
-    Velocity,
-    decide,
-    outside_m,
-)
 from uuvtai.vehicle.start_fix import MISFIT, StartFix, StartFound, WallWatch
 from uuvtai.vehicle.telemetry import AUTOPILOT, COMPANION, Heard, Intake, Senders, waiting_for
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv pilot`` was told, checked before anything is opened or compiled.
+# ---- What ``uuv pilot`` was told, checked before anything is opened or compiled.
 
-
-EDGE_M = 0.2
-"""the fence's depths keep so far from surface and floor of the tank where none are typed"""
+EDGE_M = 0.2  # the fence's depths keep so far from surface and floor of the tank where none are typed
 MOST_SPEED_M_S = 2.0
 
 
@@ -69,20 +53,16 @@ class FlightPlan:
 
     place: LinkPlace
     mission: Mission
-    limits: SafetyLimits
+    limits: safety.SafetyLimits
     log: Path
-    arms: bool = False
-    """whether orders are sent; else a dry run"""
-    heading_rad: float | None = None
-    """compass heading of the world's x axis; None = where the vehicle looks at first"""
+    arms: bool = False  # whether orders are sent; else a dry run
+    heading_rad: float | None = None  # compass heading of the world's x axis; None = where the vehicle looks
     seconds: float = math.inf
     rate: float = 1.0
-    """seconds of the vehicle's clock in one of ours: a simulated one may be slower or faster; 0 = it is
-    followed"""
+    """seconds of the vehicle's clock in one of ours, if simulated; 0 = it is followed"""
     system: int = 1
     operator: int = 255
-    senders: Senders | None = None
-    """from whom what counts; None = the usual ones of ``system``"""
+    senders: Senders | None = None  # from whom what counts; None = the usual ones of ``system``
 
     @classmethod
     def typed(
@@ -122,7 +102,7 @@ class FlightPlan:
             raise LinkError(f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90")
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
-        limits = SafetyLimits(
+        limits = safety.SafetyLimits(
             box_m=_four(box or (tank.x_m[0], tank.y_m[0], tank.x_m[1], tank.y_m[1])),
             depth_m=(depth[0], depth[1]) if depth else (EDGE_M - tank.z_m[1], -tank.z_m[0] - EDGE_M),
             speed_m_s=max_speed,
@@ -147,14 +127,14 @@ class FlightPlan:
         )
 
 
-def _refuse_places(mission: Mission, limits: SafetyLimits) -> None:
+def _refuse_places(mission: Mission, limits: safety.SafetyLimits) -> None:
     low_x, low_y, high_x, high_y = limits.box_m
     if not (low_x < high_x and low_y < high_y):
         raise LinkError("--box: give least x, least y, most x, most y, for example --box 0,0,20,6")
     if not 0 <= limits.depth_m[0] < limits.depth_m[1]:
         raise LinkError("--depth: give the least depth, then the most, for example --depth 0.3,1.4")
     for option, place in (("--start", mission.start), ("--goal", mission.goal)):
-        if (out := outside_m(place, limits)) > 0:
+        if (out := safety.outside_m(place, limits)) > 0:
             where = ",".join(f"{value:g}" for value in place)
             raise LinkError(
                 f"{option} {where}: is {out:.2f} m outside the fence; z is up and 0 at the surface, so a "
@@ -172,14 +152,10 @@ def _four(values: Sequence[float]) -> tuple[float, float, float, float]:
     return low_x, low_y, high_x, high_y
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 _WANTED_HZ = {30: 50.0, 27: 50.0, 29: 10.0, 137: 10.0, 32: 20.0, 1: 2.0}
 """message id -> rate: ATTITUDE, RAW_IMU, SCALED_PRESSURE and 2, LOCAL_POSITION_NED, SYS_STATUS"""
 _GIVE_BACK_S = 6.0
-FEEDBACK_AGE_S = 0.5
-"""a velocity that is older is not fed back to the sticks"""
+FEEDBACK_AGE_S = 0.5  # a velocity that is older is not fed back to the sticks
 _LEAST_ASKED_M_S, _ANSWER = 0.15, 0.2
 """a vehicle that is asked for so much, and has less than this share of it, does not answer"""
 _REST_S, _LOOK_RAD_S = 5.0, 0.3
@@ -192,8 +168,6 @@ _FAREWELLS = (_REACHED, "time is up", _INTERRUPTED)
 
 @dataclass
 class FlightTally:
-    """What happened, in numbers."""
-
     steps: int = 0
     actions: Counter[str] = field(default_factory=Counter)
     reasons: Counter[str] = field(default_factory=Counter)
@@ -227,7 +201,7 @@ class OnboardLoop:
             config, plan.mission.start, plan.heading_rad, plan.system, plan.operator, plan.senders
         )
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
-        self._memory, self.tally = SafetyMemory(), FlightTally()
+        self._memory, self.tally = safety.SafetyMemory(), FlightTally()
         self._needed = [name for name in NAMES.values() if name not in ("depth", "thruster")]
         if config.sensors.localization == "estimated":
             self._needed.remove("position")
@@ -244,7 +218,7 @@ class OnboardLoop:
         self._lag_s = self._unanswered_s = 0.0
         """pilot's clock behind ours: what was lost in stalls; how long the vehicle did not move as asked"""
         self._stalls: list[tuple[float, float]] = []
-        self.last = SafeDecision(SafeAction.HOLD, STOP, ("nothing was decided yet",))
+        self.last = safety.SafeDecision(safety.SafeAction.HOLD, safety.STOP, ("nothing was decided yet",))
         self._is_leaving, self._told = False, ""
         self._fix, self._start, self._walls = fix, StartFound(), WallWatch(config) if fix else None
         self.failure: BaseException | None = None
@@ -272,7 +246,7 @@ class OnboardLoop:
         while not (stop is not None and stop.is_set()):
             now_s = self._time_s()
             stalled_s = max(0.0, now_s - due_s)
-            if stalled_s > STALL_S:
+            if stalled_s > safety.STALL_S:
                 self._lag_s, due_s = self._lag_s + stalled_s, now_s
             command = self.step(now_s, stalled_s)
             if self._start.refusal:
@@ -280,7 +254,7 @@ class OnboardLoop:
             if farewell := self._farewell(now_s, command):
                 return (farewell,)
             if self._handover.ended or (
-                self.last.action == SafeAction.HAND_BACK and self._handover.has_asked
+                self.last.action == safety.SafeAction.HAND_BACK and self._handover.has_asked
             ):
                 return self.last.reasons
             due_s += dt
@@ -289,9 +263,9 @@ class OnboardLoop:
         return (_INTERRUPTED,)
 
     def _leave(self, reasons: tuple[str, ...]) -> None:
-        """Stop and hand back until the vehicle has left our mode; neither an error nor another Ctrl-C keeps
-        it from that."""
-        self.last, self._is_leaving = SafeDecision(SafeAction.HAND_BACK, STOP, reasons), True
+        """Stop and hand back until the vehicle has left our mode, whatever error or Ctrl-C comes."""
+        self.last = safety.SafeDecision(safety.SafeAction.HAND_BACK, safety.STOP, reasons)
+        self._is_leaving = True
         until_s = time.monotonic() + _GIVE_BACK_S / min(self._rate, 1.0)
         heard, dt = self._intake.heard, self._config.episode.control_dt_s
         while not self._handover.ended and time.monotonic() < until_s:
@@ -327,11 +301,11 @@ class OnboardLoop:
         command = self._pilot.tick()
         self._note_scan()
         view = self._view(now_s, stalled_s, command)
-        decision, memory = decide(view, self._memory, self._plan.limits)
-        self._memory = memory if self._handover.has_asked else SafetyMemory(memory.since_s)
+        decision, memory = safety.decide(view, self._memory, self._plan.limits)
+        self._memory = memory if self._handover.has_asked else safety.SafetyMemory(memory.since_s)
         heard, measured = self._intake.heard, self._measured(now_s)
         if farewell:
-            decision = SafeDecision(SafeAction.HAND_BACK, STOP, (farewell,))
+            decision = safety.SafeDecision(safety.SafeAction.HAND_BACK, safety.STOP, (farewell,))
             said = self._handover.leave(now_s, heard)
         else:
             said = self._handover.orders(decision, now_s, heard, measured)
@@ -414,16 +388,16 @@ class OnboardLoop:
         if (used := self._pilot.tallies["sonar"].used) != self._scans:
             self._scans, self._measured_s["sonar"] = used, self._scan_s
 
-    def _view(self, now_s: float, stalled_s: float, command: PilotCommand) -> VehicleView:
+    def _view(self, now_s: float, stalled_s: float, command: PilotCommand) -> safety.VehicleView:
         heard, limits = self._intake.heard, self._plan.limits
         surge, sway, heave, turn = (float(value) for value in command.velocity)
         x, y, z = (float(value) for value in command.pos_w)
-        self._stalls = [row for row in self._stalls if now_s - row[0] <= LATE_WINDOW_S]
-        if stalled_s > STALL_S:
+        self._stalls = [row for row in self._stalls if now_s - row[0] <= safety.LATE_WINDOW_S]
+        if stalled_s > safety.STALL_S:
             self._stalls.append((now_s, stalled_s))
         is_fresh = now_s - heard.vel_b_s <= limits.sensor_s["dvl"]
         looks_around = self._fix is not None and self._plan.arms and now_s - self._fix.first_s >= _REST_S
-        return VehicleView(
+        return safety.VehicleView(
             now_s=now_s,
             wanted=(0.0, 0.0, 0.0, _LOOK_RAD_S) if looks_around else (surge, sway, heave, turn),
             held=command.held,
@@ -445,17 +419,17 @@ class OnboardLoop:
             unchecked="" if self._fix is None or looks_around else self._fix.waits_for,
         )
 
-    def _measured(self, now_s: float) -> Velocity | None:
+    def _measured(self, now_s: float) -> safety.Velocity | None:
         """What may be fed back now; an axis that was not measured lately is NaN."""
         heard = self._intake.heard
         is_fresh = heard.vel_b is not None and now_s - heard.vel_b_s <= FEEDBACK_AGE_S
         turn = heard.yaw_rate if now_s - heard.yaw_rate_s <= FEEDBACK_AGE_S else math.nan
         return (*(heard.vel_b if heard.vel_b and is_fresh else _UNKNOWN), turn)
 
-    def _note_answer(self, decision: SafeDecision, view: VehicleView) -> None:
+    def _note_answer(self, decision: safety.SafeDecision, view: safety.VehicleView) -> None:
         """For how long the vehicle was asked to move and did not; while it is held nothing is known."""
         asked_m_s = math.hypot(*decision.velocity[:2])
-        if not (self._plan.arms and self._handover.engaged) or decision.action != SafeAction.DRIVE:
+        if not (self._plan.arms and self._handover.engaged) or decision.action != safety.SafeAction.DRIVE:
             return
         moves = view.speed_m_s is None or view.speed_m_s >= _ANSWER * asked_m_s
         if moves or asked_m_s < _LEAST_ASKED_M_S:
@@ -487,7 +461,9 @@ class OnboardLoop:
                 for number, rate in _WANTED_HZ.items():
                     self._say(now_s, ask_for(number, rate, self._plan.system))
 
-    def _note(self, now_s: float, command: PilotCommand, decision: SafeDecision, speed: float | None) -> None:
+    def _note(
+        self, now_s: float, command: PilotCommand, decision: safety.SafeDecision, speed: float | None
+    ) -> None:
         heard, self.last = self._intake.heard, decision
         self.tally.steps += 1
         self.tally.actions[decision.action.name] += 1
@@ -514,7 +490,6 @@ class OnboardLoop:
         return "time is up" if now_s >= self._plan.seconds else ""
 
     def document(self) -> dict[str, Any]:
-        """What ``uuv pilot --json`` prints."""
         tally, heard = self.tally, self._intake.heard
         reasons = list(self.last.reasons)
         return {
@@ -532,7 +507,7 @@ class OnboardLoop:
             "mode": MODE_NAMES.get(heard.mode, "none"),
             "driven_in": MODE_NAMES[self._handover.mode] if self._handover.engaged else "",
             "fallback": self._handover.mode == ALT_HOLD,
-            "actions": {action.name: tally.actions[action.name] for action in SafeAction},
+            "actions": {action.name: tally.actions[action.name] for action in safety.SafeAction},
             "reasons": dict(tally.reasons),
             "heard": dict(tally.heard),
             "broken": self._codec.broken,
@@ -559,11 +534,8 @@ def fly(
             endpoint.forget()  # what came while kernels were compiled
             fix = StartFix(config, plan.mission.start)
             loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix)
-            what = (
-                "ARMS AND DRIVES the vehicle"
-                if plan.arms
-                else "dry run: no order that moves the vehicle is sent"
-            )
+            dry = "dry run: no order that moves the vehicle is sent"
+            what = "ARMS AND DRIVES the vehicle" if plan.arms else dry
             where = "speaks to" if plan.place.calls else "listens at"
             loop.tell(f"{what}; {where} {plan.place.host}:{plan.place.port}; Ctrl-C gives the vehicle back")
             try:
@@ -582,10 +554,8 @@ def warmed(config: Config, tree: FlatTree, mission: Mission) -> OnboardPilot:
     return OnboardPilot(sim, mission)
 
 
-EVERY_S = 1.0
-"""between two sentences"""
-DEAF_S = 5.0
-"""nothing at all has come for so long"""
+EVERY_S = 1.0  # between two sentences
+DEAF_S = 5.0  # nothing at all has come for so long
 
 
 class FlightNotes:
@@ -598,7 +568,7 @@ class FlightNotes:
         self._missing: set[str] = set()
 
     def look(
-        self, now_s: float, decision: SafeDecision, is_engaged: bool, messages: int, heard: Heard
+        self, now_s: float, decision: safety.SafeDecision, is_engaged: bool, messages: int, heard: Heard
     ) -> str:
         """A sentence about what is new, or ''. ``messages``: heard so far."""
         if now_s >= DEAF_S and not is_engaged:
@@ -614,7 +584,7 @@ class FlightNotes:
         if what == self._told or now_s - self._told_s < EVERY_S:
             return ""
         self._told, self._told_s = what, now_s
-        if decision.action == SafeAction.DRIVE:
+        if decision.action == safety.SafeAction.DRIVE:
             return "drives" if is_engaged else "nothing is wrong: takes the vehicle"
         doing = decision.action.name.lower().replace("_", " ") if is_engaged else "waits"
         return f"{doing}: {'; '.join(decision.reasons)}" + (f" (not used: {wrong})" if wrong else "")

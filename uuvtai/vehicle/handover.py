@@ -4,30 +4,14 @@ from __future__ import annotations
 
 import math
 
-from uuvtai.vehicle.mavlink import (
-    ALT_HOLD,
-    ARM_DISARM,
-    DO_SET_MODE,
-    GUIDED,
-    MODE_NAMES,
-    SURFACE,
-    Order,
-    arm,
-    push_sticks,
-    set_mode,
-    set_velocity,
-)
+from uuvtai.vehicle import mavlink
 from uuvtai.vehicle.safety import STOP, SafeAction, SafeDecision, SafetyLimits, Velocity
 from uuvtai.vehicle.telemetry import Heard
 
-ORDER_S = 0.1
-"""between two velocities; ArduSub stops 3 s after the last"""
-REPEAT_S, REPEATS = 1.0, 5
-"""a mode or the arming is asked for again so often, so many times"""
-STICKS_S = 1.0
-"""age of the operator's sticks that counts as none"""
-_ACK_S = 0.1
-"""a heartbeat that comes so long after a request was granted tells what came of it"""
+ORDER_S = 0.1  # between two velocities; ArduSub stops 3 s after the last
+REPEAT_S, REPEATS = 1.0, 5  # a mode or the arming is asked for again so often, so many times
+STICKS_S = 1.0  # age of the operator's sticks that counts as none
+_ACK_S = 0.1  # a heartbeat that comes so long after a request was granted tells what came of it
 
 
 class Handover:
@@ -46,7 +30,7 @@ class Handover:
         self.ended = False
         """whether the vehicle was given back, or never had; nothing is said any more"""
         self.lost = ""
-        self.mode = GUIDED
+        self.mode = mavlink.GUIDED
         """in which it is driven"""
         self._system, self._limits, self._pretended = system, limits, pretended
         self._leaving = False
@@ -73,27 +57,26 @@ class Handover:
         self._took |= heard.mode in self._modes
         self._was_armed |= heard.is_armed
         if heard.mode not in self._modes and (self._took or heard.mode != self._before):
-            self.lost = f"the mode is {MODE_NAMES.get(heard.mode, heard.mode)} now"
+            self.lost = f"the mode is {mavlink.MODE_NAMES.get(heard.mode, heard.mode)} now"
         elif self._was_armed and not heard.is_armed:
             self.lost = "it is disarmed"
-        elif self.mode == ALT_HOLD and now_s - heard.sticks_s <= STICKS_S:
+        elif self.mode == mavlink.ALT_HOLD and now_s - heard.sticks_s <= STICKS_S:
             self.lost = "the operator's sticks are heard"
         elif now_s - heard.sticks_moved_s <= STICKS_S:
             self.lost = "the operator moves the sticks"
 
     def _note_answers(self, heard: Heard) -> None:
         """What was granted, and is not so at the next heartbeat, was taken back by somebody."""
-        for command, what in ((DO_SET_MODE, f"mode {self.mode}"), (ARM_DISARM, "arm")):
+        for command, what in ((mavlink.DO_SET_MODE, f"mode {self.mode}"), (mavlink.ARM_DISARM, "arm")):
             asked_s, _ = self._asked.get(what, (math.inf, 0))
             if asked_s <= heard.granted_s.get(command, -math.inf) <= heard.vehicle_s - _ACK_S:
-                self._took |= command == DO_SET_MODE
-                self._was_armed |= command == ARM_DISARM
+                self._took |= command == mavlink.DO_SET_MODE
+                self._was_armed |= command == mavlink.ARM_DISARM
 
     def orders(
         self, decision: SafeDecision, now_s: float, heard: Heard, measured: Velocity | None
-    ) -> list[Order]:
-        """What to say in this step. ``measured``: velocity as it is now, NaN or None where it is not
-        known."""
+    ) -> list[mavlink.Order]:
+        """What to say in this step. ``measured``: velocity now, NaN or None = not known."""
         if self.ended:
             return []
         grave = decision.action == SafeAction.HAND_BACK and (self.has_asked or bool(self.lost))
@@ -106,28 +89,32 @@ class Handover:
             return self._velocity(decision.velocity, now_s, measured if is_driving else None)
         return self._take(now_s, heard) if decision.action == SafeAction.DRIVE else []
 
-    def leave(self, now_s: float, heard: Heard) -> list[Order]:
+    def leave(self, now_s: float, heard: Heard) -> list[mavlink.Order]:
         """What to say from now on, whatever was decided: stop, and the mode that gives the vehicle back."""
         self._leaving = True
         if not self.has_asked:
             self.ended = True
         return [] if self.ended else self._leave(now_s, heard)
 
-    def last_words(self) -> list[Order]:
+    def last_words(self) -> list[mavlink.Order]:
         """Stop and hand back, for the case that nothing else works any more."""
-        stop = set_velocity(STOP, 0.0, self._system, self._limits)
-        return [stop, set_mode(ALT_HOLD, self._system)] if self.has_asked and not self.lost else []
+        stop = mavlink.set_velocity(STOP, 0.0, self._system, self._limits)
+        return (
+            [stop, mavlink.set_mode(mavlink.ALT_HOLD, self._system)]
+            if self.has_asked and not self.lost
+            else []
+        )
 
-    def _take(self, now_s: float, heard: Heard) -> list[Order]:
+    def _take(self, now_s: float, heard: Heard) -> list[mavlink.Order]:
         if not self.has_asked:
             self._before = heard.mode
         if self._pretended:
             self.engaged, self._asked["arm"] = True, (now_s, 1)
-            return [arm(self._system), set_mode(GUIDED, self._system)]
+            return [mavlink.arm(self._system), mavlink.set_mode(mavlink.GUIDED, self._system)]
         if now_s - heard.sticks_moved_s <= STICKS_S:  # the operator drives
             return []
         if not heard.is_armed:
-            if (found := self._repeated("arm", now_s, arm(self._system))) is not None:
+            if (found := self._repeated("arm", now_s, mavlink.arm(self._system))) is not None:
                 return found
             self.lost = "it does not arm"
             return []
@@ -137,53 +124,53 @@ class Handover:
             self.engaged = self._took = True
             return []
         self._modes.add(self.mode)
-        asked = self._repeated(f"mode {self.mode}", now_s, set_mode(self.mode, self._system))
+        asked = self._repeated(f"mode {self.mode}", now_s, mavlink.set_mode(self.mode, self._system))
         if asked is not None:
             return asked
-        if self.mode == GUIDED:
-            self.mode = ALT_HOLD
+        if self.mode == mavlink.GUIDED:
+            self.mode = mavlink.ALT_HOLD
         else:
             self.lost = "it takes neither GUIDED nor ALT_HOLD"
         return []
 
-    def _velocity(self, velocity: Velocity, now_s: float, measured: Velocity | None) -> list[Order]:
+    def _velocity(self, velocity: Velocity, now_s: float, measured: Velocity | None) -> list[mavlink.Order]:
         if now_s - self._spoke_s < ORDER_S - 1e-6:
             return []
         self._spoke_s = now_s
-        if self.mode == GUIDED:
-            return [set_velocity(velocity, now_s, self._system, self._limits)]
-        return [push_sticks(velocity, measured, self._system, self._limits)]
+        if self.mode == mavlink.GUIDED:
+            return [mavlink.set_velocity(velocity, now_s, self._system, self._limits)]
+        return [mavlink.push_sticks(velocity, measured, self._system, self._limits)]
 
-    def _surface(self, now_s: float, heard: Heard) -> list[Order]:
-        if heard.mode == SURFACE:
+    def _surface(self, now_s: float, heard: Heard) -> list[mavlink.Order]:
+        if heard.mode == mavlink.SURFACE:
             self.ended = True
             return []
-        self._modes.add(SURFACE)
-        found = self._repeated("surface", now_s, set_mode(SURFACE, self._system))
+        self._modes.add(mavlink.SURFACE)
+        found = self._repeated("surface", now_s, mavlink.set_mode(mavlink.SURFACE, self._system))
         if found is None:
             self._leaving = True
             return self._leave(now_s, heard)
         self.ended = self._pretended
         return [*found, *self._velocity(STOP, now_s, None)]
 
-    def _leave(self, now_s: float, heard: Heard) -> list[Order]:
+    def _leave(self, now_s: float, heard: Heard) -> list[mavlink.Order]:
         """Stop, then ALT_HOLD, until a heartbeat says that the vehicle has left our mode. A vehicle in a mode
         that somebody else chose, or whose sticks the operator holds, is left alone."""
-        left = heard.mode != GUIDED and (self._took or heard.mode != self._before)
+        left = heard.mode != mavlink.GUIDED and (self._took or heard.mode != self._before)
         said_s, _ = self._asked.setdefault("back", (-math.inf, 0))
-        if self.lost and (left or self.mode == ALT_HOLD or not self._modes):
+        if self.lost and (left or self.mode == mavlink.ALT_HOLD or not self._modes):
             self.ended = True
-        elif heard.vehicle_s > said_s > -math.inf and (left or heard.mode == ALT_HOLD):
+        elif heard.vehicle_s > said_s > -math.inf and (left or heard.mode == mavlink.ALT_HOLD):
             self.ended = True
         if self.ended:
             return []
         if math.isinf(said_s):  # the stop comes first
             self._spoke_s = -math.inf
-        found = self._repeated("back", now_s, set_mode(ALT_HOLD, self._system))
+        found = self._repeated("back", now_s, mavlink.set_mode(mavlink.ALT_HOLD, self._system))
         self.ended = found is None or self._pretended
         return [] if found is None else [*self._velocity(STOP, now_s, None), *found]
 
-    def _repeated(self, what: str, now_s: float, order: Order) -> list[Order] | None:
+    def _repeated(self, what: str, now_s: float, order: mavlink.Order) -> list[mavlink.Order] | None:
         """The order where it is due, nothing while waiting for an answer; None = asked for in vain."""
         last_s, count = self._asked.get(what, (-math.inf, 0))
         if now_s - last_s < REPEAT_S:

@@ -16,36 +16,29 @@ from typing import Any
 from uuvtai.common.errors import UserError
 from uuvtai.vehicle.safety import SafetyLimits, Velocity, bounded
 
-# ------------------------------------------------------------------------------------------------------------
-# What is refused about a link to a vehicle.
+# ---- What is refused about a link to a vehicle.
 
 
 class LinkError(UserError, RuntimeError):
     """A link that cannot be had, or used: what, where, why, what to type next."""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A UDP socket: datagrams in, as many as one step can digest, and out to whom the vehicle spoke from.
-
+# ---- A UDP socket: datagrams in, as many as one step can digest, and out to whom the vehicle spoke from.
 
 Address = tuple[str, int]
 
 MOST_DATAGRAMS, MOST_BYTES = 64, 24 * 1024
 """taken in one step; what is more waits, and is lost where the system's own queue is full"""
-LONGEST = 2048
-"""[bytes] a longer datagram is none of MAVLink's"""
+LONGEST = 2048  # [bytes] a longer datagram is none of MAVLink's
 _MOST_ROUNDS = 100
 _WRITTEN = re.compile(r"(udp|udpin|udpout):([A-Za-z0-9.\-]{1,253}):(\d{1,5})")
 
 
 @dataclass(frozen=True)
 class LinkPlace:
-    """Where a link is."""
-
     host: str
     port: int
-    calls: bool
-    """udpout: we speak first, to this place; else we listen there"""
+    calls: bool  # udpout: we speak first, to this place; else we listen there
 
 
 def place_of(text: str, option: str = "--mavlink") -> LinkPlace:
@@ -62,8 +55,7 @@ def place_of(text: str, option: str = "--mavlink") -> LinkPlace:
 class Endpoint:
     """One side of a UDP link. Use as a context."""
 
-    clock_jumps = 0
-    """how often the clock that it keeps, if any, ran on without its senders' clocks"""
+    clock_jumps = 0  # how often the clock that it keeps, if any, ran on without its senders' clocks
 
     def __init__(self, place: LinkPlace) -> None:
         """Raises LinkError where the address cannot be had."""
@@ -120,7 +112,6 @@ class Endpoint:
             return False
 
     def close(self) -> None:
-        """Let go of the port."""
         self._socket.close()
 
     def __enter__(self) -> Endpoint:
@@ -130,19 +121,13 @@ class Endpoint:
         self.close()
 
 
-# ------------------------------------------------------------------------------------------------------------
-# An endpoint that keeps the vehicle's clock: for a simulated one, be it slower or faster than ours.
-
+# ---- An endpoint that keeps the vehicle's clock: for a simulated one, be it slower or faster than ours.
 
 SILENT_S = 5.0
-"""by our clock: a vehicle that has told no time for so long is followed no further, lest a dead man's time
-stand still"""
-MOST_WAITING = 512
-"""datagrams between two steps; older ones are lost"""
-_FARTHEST_S = 5.0
-"""a time that jumps by more has begun anew"""
-_MAGIC, _HEAD, _ENDS = 0xFD, 10, 2
-"""MAVLink 2: first byte, bytes before and behind the payload"""
+"""by our clock: who told no time for so long is followed no further, lest time stand still"""
+MOST_WAITING = 512  # datagrams between two steps; older ones are lost
+_FARTHEST_S = 5.0  # a time that jumps by more has begun anew
+_MAGIC, _HEAD, _ENDS = 0xFD, 10, 2  # MAVLink 2: first byte, bytes before and behind the payload
 _SIGNED, _SIGNATURE = 1, 13
 _AUTOPILOT, _HEARTBEAT, _ATTITUDE = 1, 0, 30
 _LOOPBACK = ("127.", "localhost")
@@ -177,7 +162,6 @@ class FollowedEndpoint(Endpoint):
         self._time_s, self._heard_s = 0.0, wall()
 
     def receive(self) -> list[tuple[Address, bytes]]:
-        """What has come since the last call."""
         self._take()
         found, self._waiting = self._waiting, []
         return found
@@ -220,8 +204,7 @@ class FollowedEndpoint(Endpoint):
 
 
 def _messages(datagram: bytes, system: int) -> list[tuple[int, bytes]]:
-    """(number, payload) of the messages of a vehicle's autopilot; anybody's heartbeats too. Checksums are
-    looked at by who reads them."""
+    """(number, payload) of an autopilot's messages and anybody's heartbeats. Checksums are unchecked."""
     found, at = [], 0
     while at + _HEAD < len(datagram) and datagram[at] == _MAGIC:
         size, flags, sender = datagram[at + 1], datagram[at + 2], tuple(datagram[at + 5 : at + 7])
@@ -232,30 +215,21 @@ def _messages(datagram: bytes, system: int) -> list[tuple[int, bytes]]:
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What may be said to a vehicle, and nothing else: each a message of MAVLink by name and fields.
-#
-# Every number is held within the limits here once more, whatever the caller asks for.
+# ---- What may be said to a vehicle, and nothing else: each a message of MAVLink by name and fields. Every
+# number is held within the limits here once more, whatever the caller asks for.
 
-
-BODY_NED = 8
-"""MAV_FRAME: axes turn with the yaw; z stays down"""
-VELOCITY_AND_YAW_RATE = 0x5C7
-"""type_mask: positions, accelerations and yaw are not given"""
-ALT_HOLD, GUIDED, SURFACE = 2, 4, 9
-"""modes of ArduSub"""
+BODY_NED = 8  # MAV_FRAME: axes turn with the yaw; z stays down
+VELOCITY_AND_YAW_RATE = 0x5C7  # type_mask: positions, accelerations and yaw are not given
+ALT_HOLD, GUIDED, SURFACE = 2, 4, 9  # modes of ArduSub
 MODE_NAMES = {
     0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 7: "CIRCLE", 9: "SURFACE",
     16: "POSHOLD", 19: "MANUAL", 20: "MOTOR_DETECT", 21: "SURFTRAK",
 }  # fmt: skip
-HARMLESS = ("HEARTBEAT", "MAV_CMD_SET_MESSAGE_INTERVAL")
-"""kinds of orders that move nothing: they are sent in a dry run too"""
-STICK = 600
-"""of 1000: the farthest that a stick is ever pushed"""
+HARMLESS = ("HEARTBEAT", "MAV_CMD_SET_MESSAGE_INTERVAL")  # orders that move nothing: sent in a dry run too
+STICK = 600  # of 1000: the farthest that a stick is ever pushed
 FULL_STICK = (1.0, 1.0, 0.6, 2.0)
 """[m/s, m/s, m/s, rad/s] what a full stick is taken to give; the feedback corrects it"""
-FEEDBACK = 1.5
-"""of the missing velocity, added to the one asked for"""
+FEEDBACK = 1.5  # of the missing velocity, added to the one asked for
 
 DO_SET_MODE, ARM_DISARM, _SET_MESSAGE_INTERVAL = 176, 400, 511
 
@@ -264,12 +238,10 @@ DO_SET_MODE, ARM_DISARM, _SET_MESSAGE_INTERVAL = 176, 400, 511
 class Order:
     """A message on its way to the vehicle."""
 
-    kind: str
-    """its name; of a command the command's"""
+    kind: str  # its name; of a command the command's
     message: str
     fields: dict[str, Any]
-    as_operator: bool = False
-    """in the name of the ground station, from which alone ArduSub takes sticks"""
+    as_operator: bool = False  # in the name of the ground station, from which alone ArduSub takes sticks
 
 
 def set_velocity(velocity: Velocity, now_s: float, system: int, limits: SafetyLimits) -> Order:
@@ -304,7 +276,6 @@ def push_sticks(velocity: Velocity, measured: Velocity | None, system: int, limi
 
 
 def set_mode(mode: int, system: int) -> Order:
-    """One of ArduSub's modes."""
     return _command("MAV_CMD_DO_SET_MODE", DO_SET_MODE, system, 1.0, float(mode))
 
 
@@ -314,7 +285,6 @@ def arm(system: int) -> Order:
 
 
 def ask_for(message_id: int, rate_hz: float, system: int) -> Order:
-    """Have the autopilot tell something so often."""
     return _command(
         "MAV_CMD_SET_MESSAGE_INTERVAL", _SET_MESSAGE_INTERVAL, system, float(message_id), 1e6 / rate_hz
     )
@@ -332,13 +302,9 @@ def _command(kind: str, number: int, system: int, *given: float) -> Order:
     return Order(kind, "COMMAND_LONG", {**whom, **params})
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 EXTRA = "uuvtai[mavlink]"
 _NEEDED = "pymavlink.dialects.v20"
-_MOST_MESSAGES = 64
-"""of one datagram; a full one of the shortest messages holds no more than that in an Ethernet frame"""
+_MOST_MESSAGES = 64  # of one datagram; a full one of the shortest has no more in an Ethernet frame
 _BROKEN = (ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError)
 
 

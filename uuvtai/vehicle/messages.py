@@ -12,15 +12,10 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class ImuReading:
-    """Attitude, rates and acceleration in one message."""
-
     time_s: float
-    rpy: np.ndarray
-    """(3,) [rad] roll, pitch, yaw; yaw counter-clockwise from the world's x axis"""
-    rate_b: np.ndarray
-    """(3,) [rad/s] gyro, body axes (x ahead, y left, z up)"""
-    specific_force_b: np.ndarray
-    """(3,) [m/s^2] acceleration less gravity, body axes: at rest (0, 0, 9.81)"""
+    rpy: np.ndarray  # (3,) [rad] roll, pitch, yaw; yaw counter-clockwise from the world's x axis
+    rate_b: np.ndarray  # (3,) [rad/s] gyro, body axes (x ahead, y left, z up)
+    specific_force_b: np.ndarray  # (3,) [m/s^2] acceleration less gravity, body axes: at rest (0, 0, 9.81)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +23,7 @@ class DvlReading:
     """A valid velocity; while the bottom is lost there is no message."""
 
     time_s: float
-    vel_b: np.ndarray
-    """(3,) [m/s] over ground, body axes"""
+    vel_b: np.ndarray  # (3,) [m/s] over ground, body axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +32,7 @@ class PressureReading:
 
     time_s: float
     depth_m: float
-    """[m] positive down; zeroed at the known start (reading there less the start's depth) unless the
-    position is given"""
+    """[m] positive down; zeroed at the known start (less its depth) unless the position is given"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +40,7 @@ class PositionFix:
     """A position from elsewhere, needed unless the pilot estimates its own (``sensors.localization``)."""
 
     time_s: float
-    pos_w: np.ndarray
-    """(3,) [m] world"""
+    pos_w: np.ndarray  # (3,) [m] world
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +51,12 @@ class SonarPing:
 
     time_s: float
     range_m: np.ndarray
-    """(n_ray,) [m] counter-clockwise, beam 0 of a ring ahead, of a fan at its right edge; without a return
-    anything finite"""
-    hit: np.ndarray
-    """(n_ray,) 1 = return"""
+    """(n_ray,) [m] counter-clockwise, beam 0 ahead or at a fan's right edge; finite without return"""
+    hit: np.ndarray  # (n_ray,) 1 = return
     doppler_m_s: np.ndarray
     """(n_ray,) [m/s] rate of change of the distance to what returned, own motion included; empty where the
     sonar measures none (``sensors.sonar.doppler``)"""
-    first_beam: int = 0
-    """number of the first of these beams; 0 unless the beam is a mechanical one"""
+    first_beam: int = 0  # number of the first of these beams; 0 unless the beam is a mechanical one
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +64,7 @@ class DepthShot:
     """An image of the forward depth camera."""
 
     time_s: float
-    depth_m: np.ndarray
-    """(rows, columns) [m] z-depth, row 0 at the top; no return = maximum range"""
+    depth_m: np.ndarray  # (rows, columns) [m] z-depth, row 0 at the top; no return = maximum range
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +72,7 @@ class ThrusterLoss:
     """A vertical thruster is dead, until the end."""
 
     time_s: float
-    thruster: float
-    """its number, counted from 1; -1 = not known, or only suspected"""
+    thruster: float  # its number, counted from 1; -1 = not known, or only suspected
 
 
 SensorMessage = ImuReading | DvlReading | PressureReading | PositionFix | SonarPing | DepthShot | ThrusterLoss
@@ -118,26 +105,18 @@ LIMITS = {
 not finite, makes the message a bad one"""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Messages on their way to the pilot: in any order, some twice, some never, some of them nonsense.
+# ---- Messages on their way to the pilot: in any order, some twice, some never, some of them nonsense.
 
-
-ANY = -1
-"""Length of an axis that may have any"""
+ANY = -1  # Length of an axis that may have any
 
 
 @dataclass
 class Tally:
-    """What became of one sensor's messages."""
-
     fed: int = 0
     used: int = 0
-    late: int = 0
-    """as old as one that was used already, or superseded before a step could use it"""
-    bad: int = 0
-    """with a number that is not finite, or larger than anything believed"""
-    unplaced: int = 0
-    """scans and images taken when the own attitude or position was not known"""
+    late: int = 0  # as old as one that was used already, or superseded before a step could use it
+    bad: int = 0  # with a number that is not finite, or larger than anything believed
+    unplaced: int = 0  # scans and images taken when the own attitude or position was not known
 
 
 class Inbox:
@@ -212,20 +191,16 @@ def _believed(key: str, array: np.ndarray) -> bool:
     return bool((np.abs(array) <= LIMITS[key]).all())  # false for NaN too
 
 
-# ------------------------------------------------------------------------------------------------------------
-# One vehicle under way without a world: what it is told.
+# ---- One vehicle under way without a world: what it is told.
 
 
 @dataclass(frozen=True)
 class Mission:
     """What a vehicle is told before it begins."""
 
-    start: tuple[float, float, float]
-    """[m] world, where it begins"""
-    goal: tuple[float, float, float]
-    """[m] world"""
-    seed: int = 0
-    """with ``episode``: of the fallback planner's random numbers"""
+    start: tuple[float, float, float]  # [m] world, where it begins
+    goal: tuple[float, float, float]  # [m] world
+    seed: int = 0  # with ``episode``: of the fallback planner's random numbers
     episode: int = 0
     spread: tuple[float, ...] = ()
     """covariance of start and heading (x, y [m], yaw [rad]), upper triangle of six; none = exactly known"""
@@ -235,35 +210,24 @@ class Mission:
         return {"mission.start_w": self.start, "mission.goal_w": self.goal, "vehicle.pos_w": self.start}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the stack's frame needs to know of a config, as plain numbers: without Taichi, torch and pydantic.
+# ---- What the stack's frame needs to know of a config, as plain numbers: without Taichi, torch and pydantic.
 
 
 @dataclass(frozen=True)
 class PilotNumbers:
     """Of one vehicle with its sensors and its tree."""
 
-    dt_s: float
-    """control step"""
-    top: tuple[float, float, float, float]
-    """[m/s, m/s, m/s, rad/s] full command in surge, sway, heave, yaw"""
-    nodes: tuple[str, ...]
-    """the tree's nodes as logs name them"""
+    dt_s: float  # control step
+    top: tuple[float, float, float, float]  # [m/s, m/s, m/s, rad/s] full command in surge, sway, heave, yaw
+    nodes: tuple[str, ...]  # the tree's nodes as logs name them
     gravity_m_s2: float
-    estimated: bool
-    """the pilot estimates its own position, nobody gives it"""
-    dvl_steps: int
-    """control steps from one expected reading to the next"""
+    estimated: bool  # the pilot estimates its own position, nobody gives it
+    dvl_steps: int  # control steps from one expected reading to the next
     beams: int
-    beam_limit: int
-    """beams [0, limit) may follow each other in a ping of a mechanical sonar: a ring goes round"""
+    beam_limit: int  # beams [0, limit) may follow each other in a ping of a mechanical sonar, as in a ring
     mechanical: bool
     doppler: bool
-    sonar_latency_steps: int
-    """control steps from a ping to its scan, always"""
-    sonar_m: float
-    """maximum range"""
-    image: tuple[int, int]
-    """rows, columns of a depth image"""
-    camera_m: float
-    """maximum range"""
+    sonar_latency_steps: int  # control steps from a ping to its scan, always
+    sonar_m: float  # maximum range
+    image: tuple[int, int]  # rows, columns of a depth image
+    camera_m: float  # maximum range

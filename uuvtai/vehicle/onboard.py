@@ -27,8 +27,7 @@ from uuvtai.vehicle.messages import (
 )
 from uuvtai.vehicle.onboard_core import FedPilot, PilotCommand, StaleLimits
 
-# ------------------------------------------------------------------------------------------------------------
-# The stages behind the sensors as a simulator's row 0 runs them.
+# ---- The stages behind the sensors as a simulator's row 0 runs them.
 
 
 class SimStack:
@@ -54,7 +53,6 @@ class SimStack:
         episode.wake(sim.io.episode)
 
     def place(self, mission: Mission) -> None:
-        """Tell the stack start and goal."""
         for name, place in mission.places().items():
             self.views[name][0] = place
 
@@ -65,8 +63,7 @@ class SimStack:
         self.sim.perceive()
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The stack without the simulator: sensor messages in, commands with their reasons out.
+# ---- The stack without the simulator: sensor messages in, commands with their reasons out.
 #
 #     pilot = OnboardPilot.built(config, read_tree("bt"), Mission(start, goal))
 #     while True:                      # every control_dt_s (20 ms)
@@ -74,11 +71,8 @@ class SimStack:
 #             pilot.feed(message)
 #         command = pilot.tick()
 #
-# It runs the stages of ``Sim`` themselves, from the pose filter to the behaviour tree's tick: the same
-# kernels
-# on the same arrays, of which ``FedSensors`` fills the readings. Where nothing better can be done than to
-# stop,
-# the action is zero and ``held`` says why (``StaleLimits``).
+# It runs the stages of ``Sim`` themselves, on arrays of which ``FedSensors`` fills the readings. Where it can
+# only stop, the action is zero and ``held`` says why (``StaleLimits``).
 
 
 class OnboardPilot(FedPilot):
@@ -102,17 +96,11 @@ class OnboardPilot(FedPilot):
 
 
 def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:
-    """Of a config and a tree."""
     sensors, vehicle = config.sensors, config.vehicle
     sonar, camera = sensors.sonar, sensors.depth
     return PilotNumbers(
         dt_s=config.episode.control_dt_s,
-        top=(
-            vehicle.max_surge_m_s,
-            vehicle.max_sway_m_s,
-            vehicle.max_heave_m_s,
-            vehicle.max_yaw_rate_rad_s,
-        ),
+        top=(vehicle.max_surge_m_s, vehicle.max_sway_m_s, vehicle.max_heave_m_s, vehicle.max_yaw_rate_rad_s),
         nodes=numbered(tree.names),
         gravity_m_s2=vehicle.gravity_m_s2,
         estimated=sensors.localization == "estimated",
@@ -126,9 +114,6 @@ def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:
         image=(camera.rows, camera.cols),
         camera_m=camera.max_range_m,
     )
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 __all__ = [

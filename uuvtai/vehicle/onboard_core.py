@@ -13,8 +13,7 @@ from uuvtai.common.enums import TRIGGERS
 from uuvtai.vehicle.messages import ANY, Inbox, Mission, PilotNumbers, SensorMessage, SonarPing, Tally
 from uuvtai.vehicle.sensor_inputs import FedSensors
 
-_START = [0, 1, 2, 9, 10, 17]
-"""places of the covariance of x, y and heading in the pose filter's (perception/pose.py)"""
+_START = [0, 1, 2, 9, 10, 17]  # places of x, y and heading in the covariance of perception/pose.py
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,7 @@ class StaleLimits:
     imu: float = 0.5
     sonar: float = 1.0
     pressure: float = 2.0
-    position: float = 0.5
-    """where the pilot does not estimate its own"""
+    position: float = 0.5  # where the pilot does not estimate its own
     dvl: float = math.inf
     depth: float = math.inf
     thruster: float = math.inf
@@ -38,33 +36,22 @@ class StaleLimits:
 
 @dataclass(frozen=True, eq=False)
 class PilotCommand:
-    """What one step decided."""
-
     step: int
     time_s: float
-    action: np.ndarray
-    """(4,) float32 in [-1, 1]: surge, sway, heave, yaw rate as shares of the vehicle's limits; zero = stop"""
-    velocity: np.ndarray
-    """(4,) the same in m/s and rad/s, body axes"""
-    chosen: np.ndarray
-    """(4,) the tree's own choice, which ``action`` is unless ``held``"""
-    asked_w: np.ndarray
-    """(3,) [m/s] velocity that the tree asks for, world"""
-    leaf: str
-    """node of the tree that chose, as logs name it; '' = none"""
-    trigger: str
-    """why the route was planned in this step, '' = it was not"""
-    pos_w: np.ndarray
-    """(3,) [m] where the vehicle takes itself to be"""
-    held: tuple[str, ...]
-    """why the pilot stops instead of doing what the tree chose; none = it does it"""
+    action: np.ndarray  # (4,) float32 in [-1, 1]: surge, sway, heave, yaw rate over the limits; zero = stop
+    velocity: np.ndarray  # (4,) the same in m/s and rad/s, body axes
+    chosen: np.ndarray  # (4,) the tree's own choice, which ``action`` is unless ``held``
+    asked_w: np.ndarray  # (3,) [m/s] velocity that the tree asks for, world
+    leaf: str  # node of the tree that chose, as logs name it; '' = none
+    trigger: str  # why the route was planned in this step, '' = it was not
+    pos_w: np.ndarray  # (3,) [m] where the vehicle takes itself to be
+    held: tuple[str, ...]  # why the pilot stops instead of doing what the tree chose; none = it does it
 
 
 class StackRunner(Protocol):
     """Runs the stages behind the sensors for row 0."""
 
-    views: dict[str, np.ndarray]
-    """the stages' arrays in memory, by 'struct.field'"""
+    views: dict[str, np.ndarray]  # the stages' arrays in memory, by 'struct.field'
 
     def begin(self, mission: Mission, sensors: FedSensors) -> None:
         """The first step: forget everything, then as ``step``."""
@@ -97,7 +84,6 @@ class FedPilot:
 
     @property
     def tallies(self) -> dict[str, Tally]:
-        """What became of the messages, by sensor."""
         return self._inbox.tallies
 
     def feed(self, message: SensorMessage) -> None:

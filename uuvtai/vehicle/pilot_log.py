@@ -34,8 +34,7 @@ _SCHEMAS = {
         action=STRING, asked=FOUR, reasons=array_of(STRING), mode=INT, armed=BOOLEAN, speed=NUMBER,
     ),
 }  # fmt: skip
-MOST_SEEN = 10
-"""messages heard in one step that are written; more are counted only, lest a stranger fill the disk"""
+MOST_SEEN = 10  # messages heard in one step that are written; more are counted, lest the disk fill
 
 
 class LinkLog:
@@ -61,11 +60,9 @@ class LinkLog:
             ) from error
 
     def begin_step(self) -> None:
-        """Another step."""
         self._left = MOST_SEEN
 
     def saw(self, time_s: float, heard: MavMessage) -> None:
-        """A message came."""
         if self._left <= 0:
             self.unwritten += 1
             return
@@ -111,7 +108,6 @@ class LinkLog:
             self._give_up(error)
 
     def close(self) -> None:
-        """Finish the file under its name."""
         if not (self.trouble or self._closed):
             self._closed = True
             try:

@@ -19,28 +19,12 @@ from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import LogHead, LogMessage, read_head, read_messages
 from uuvtai.logs.topics.sensors import exact_image
 from uuvtai.sim.behavior_tree import FlatTree, parse_tree, read_tree
+from uuvtai.vehicle import onboard
 from uuvtai.vehicle.messages import KINDS, NAMES
-from uuvtai.vehicle.onboard import (
-    DepthShot,
-    DvlReading,
-    ImuReading,
-    Mission,
-    OnboardPilot,
-    PilotCommand,
-    PositionFix,
-    PressureReading,
-    SensorMessage,
-    SonarPing,
-    ThrusterLoss,
-)
 
-# ------------------------------------------------------------------------------------------------------------
-# A log as the pilot's sensors would have told it: messages with the step of their arrival, and what was
-# decided then.
+# ---- A log as the pilot's sensors would have told it: messages with the step of their arrival.
 
-
-_MAX_STEPS = 180_000
-"""an hour"""
+_MAX_STEPS = 180_000  # an hour
 
 
 @dataclass(frozen=True)
@@ -48,20 +32,17 @@ class Delivery:
     """A message and when it reaches the pilot."""
 
     time_s: float
-    message: SensorMessage
+    message: onboard.SensorMessage
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedStep:
     """What was decided in a control step; None where the log does not say."""
 
-    action: np.ndarray
-    """(4,) float32 the tree's"""
-    asked_w: np.ndarray
-    """(3,) float32"""
+    action: np.ndarray  # (4,) float32 the tree's
+    asked_w: np.ndarray  # (3,) float32
     leaf: str
-    pos_w: np.ndarray | None = None
-    """(3,) float32 own position as estimated"""
+    pos_w: np.ndarray | None = None  # (3,) float32 own position as estimated
 
 
 @dataclass
@@ -71,13 +52,10 @@ class LogFeed:
     path: Path
     config: Config
     tree: FlatTree
-    mission: Mission
-    run: dict[str, str]
-    """metadata uuv.run"""
-    arrivals: list[Delivery] = field(default_factory=list)
-    """in the order of the log"""
-    steps: list[LoggedStep] = field(default_factory=list)
-    """from step 0 on, without a gap"""
+    mission: onboard.Mission
+    run: dict[str, str]  # metadata uuv.run
+    arrivals: list[Delivery] = field(default_factory=list)  # in the order of the log
+    steps: list[LoggedStep] = field(default_factory=list)  # from step 0 on, without a gap
 
 
 def read_feed(path: Path, controller: str | None = None) -> LogFeed:
@@ -99,7 +77,7 @@ def read_feed(path: Path, controller: str | None = None) -> LogFeed:
 def _begun(path: Path, head: LogHead, controller: str | None) -> LogFeed:
     config, run = _config(path, head), head.metadata.get("uuv.run", {})
     scenario = head.scenario
-    mission = Mission(
+    mission = onboard.Mission(
         start=_place(scenario["start"]),
         goal=_place(scenario["goal"]),
         seed=int(run["seed"]),
@@ -180,24 +158,24 @@ class _FeedReader:
                 "record it again: uuv eval --record 1 --depth-images"
             )
 
-    def _arrives(self, m: LogMessage, message: SensorMessage) -> None:
+    def _arrives(self, m: LogMessage, message: onboard.SensorMessage) -> None:
         self._feed.arrivals.append(Delivery(m.time_s, message))
 
     def _imu(self, m: LogMessage) -> None:
         parts = (_array(m.data[name]) for name in ("attitude", "rates", "specific_force"))
-        self._arrives(m, ImuReading(m.time_s, *parts))
+        self._arrives(m, onboard.ImuReading(m.time_s, *parts))
 
     def _dvl(self, m: LogMessage) -> None:
-        self._arrives(m, DvlReading(m.time_s, _array(m.data["velocity"])))
+        self._arrives(m, onboard.DvlReading(m.time_s, _array(m.data["velocity"])))
 
     def _pressure(self, m: LogMessage) -> None:
-        self._arrives(m, PressureReading(m.time_s, float(m.data["depth_m"])))
+        self._arrives(m, onboard.PressureReading(m.time_s, float(m.data["depth_m"])))
 
     def _position(self, m: LogMessage) -> None:
         place = m.data["pose"]["position"]
         self._pos_w = _array([place[axis] for axis in "xyz"])
         if self._given:
-            self._arrives(m, PositionFix(m.time_s, self._pos_w))
+            self._arrives(m, onboard.PositionFix(m.time_s, self._pos_w))
 
     def _keep_scan(self, m: LogMessage) -> None:
         self._scan = m.data
@@ -211,11 +189,11 @@ class _FeedReader:
         ranges, velocity = _array(self._scan["ranges"]), _array(m.data["velocity"])
         sonar = self._config.sensors.sonar
         first = round((self._scan["start_angle"] - sonar.first_beam_rad) / sonar.beam_step_rad)
-        self._arrives(m, SonarPing(ping_s, ranges, hit, velocity, first))
+        self._arrives(m, onboard.SonarPing(ping_s, ranges, hit, velocity, first))
 
     def _shot(self, m: LogMessage) -> None:
         camera = self._config.sensors.depth
-        self._arrives(m, DepthShot(m.time_s, exact_image(m.data, (camera.rows, camera.cols))))
+        self._arrives(m, onboard.DepthShot(m.time_s, exact_image(m.data, (camera.rows, camera.cols))))
 
     def _plan(self, m: LogMessage) -> None:
         if m.data["planner"] == "own":
@@ -234,7 +212,7 @@ class _FeedReader:
         if step > _MAX_STEPS:
             raise LogError(f"{self._feed.path}: is longer than {_MAX_STEPS} steps; no episode of ours is")
         if given_up := m.data.get("given_up"):
-            self._arrives(m, ThrusterLoss(m.time_s, float(given_up)))
+            self._arrives(m, onboard.ThrusterLoss(m.time_s, float(given_up)))
         logged = LoggedStep(_array(m.data["teacher"]), _array(m.data["asked"]), m.data["leaf"], self._pos_w)
         self._feed.steps.append(logged)
 
@@ -244,8 +222,7 @@ def uses_camera(config: Config) -> bool:
     return config.spotting.use_camera or config.elevation.use_camera or config.mapping.depth_hit > 0
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What goes wrong between a log's sensors and the pilot: messages lost or late, a sensor dead for a while.
+# ---- What goes wrong on the way to the pilot: messages lost or late, a sensor dead for a while.
 
 
 @dataclass(frozen=True)
@@ -261,10 +238,8 @@ class Outage:
 class Faults:
     """All together; nothing at all unless asked for. Random ones depend on ``seed`` alone."""
 
-    drop: float = 0.0
-    """share of the messages that is lost"""
-    jitter_s: float = 0.0
-    """a message arrives up to this much later, uniformly: out of order too"""
+    drop: float = 0.0  # share of the messages that is lost
+    jitter_s: float = 0.0  # a message arrives up to this much later, uniformly: out of order too
     outages: tuple[Outage, ...] = ()
     seed: int = 0
 
@@ -276,7 +251,6 @@ class Faults:
 
     @property
     def any(self) -> bool:
-        """Whether anything goes wrong."""
         return self.drop > 0 or self.jitter_s > 0 or bool(self.outages)
 
 
@@ -318,9 +292,6 @@ def disturbed(arrivals: Sequence[Delivery], faults: Faults) -> Disturbed:
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 COMPARED = {
     "command": "action",
     "asked velocity": "asked_w",
@@ -329,7 +300,7 @@ COMPARED = {
 }
 """what is compared per step: attribute of a PilotCommand and of a LoggedStep"""
 
-Build = Callable[[LogFeed], OnboardPilot]
+Build = Callable[[LogFeed], onboard.OnboardPilot]
 
 
 def replay(
@@ -364,12 +335,13 @@ def replay(
     }
 
 
-def built(feed: LogFeed) -> OnboardPilot:
-    """A pilot of the log's config, tree and mission."""
-    return OnboardPilot.built(feed.config, feed.tree, feed.mission)
+def built(feed: LogFeed) -> onboard.OnboardPilot:
+    return onboard.OnboardPilot.built(feed.config, feed.tree, feed.mission)
 
 
-def _played(pilot: OnboardPilot, feed: LogFeed, told: Disturbed) -> tuple[list[PilotCommand], list[float]]:
+def _played(
+    pilot: onboard.OnboardPilot, feed: LogFeed, told: Disturbed
+) -> tuple[list[onboard.PilotCommand], list[float]]:
     """(commands of all steps, seconds that each took)."""
     commands, tick_s, sent = [], [], 0
     dt, arrivals = feed.config.episode.control_dt_s, told.arrivals
@@ -384,7 +356,7 @@ def _played(pilot: OnboardPilot, feed: LogFeed, told: Disturbed) -> tuple[list[P
     return commands, tick_s
 
 
-def _feed(pilot: OnboardPilot, message: SensorMessage, path: Path) -> None:
+def _feed(pilot: onboard.OnboardPilot, message: onboard.SensorMessage, path: Path) -> None:
     try:
         pilot.feed(message)
     except ValueError as error:
@@ -394,13 +366,17 @@ def _feed(pilot: OnboardPilot, message: SensorMessage, path: Path) -> None:
         ) from None
 
 
-def _agreement(name: str, commands: list[PilotCommand], feed: LogFeed) -> dict[str, Any]:
+def _agreement(name: str, commands: list[onboard.PilotCommand], feed: LogFeed) -> dict[str, Any]:
     """Of one of COMPARED: how many steps are equal, and where the first is not."""
     pairs = [
         (getattr(command, COMPARED[name]), getattr(logged, COMPARED[name]))
         for command, logged in zip(commands, feed.steps, strict=True)
     ]
-    wrong = [step for step, (ours, theirs) in enumerate(pairs) if not _is_equal(ours, theirs)]
+    wrong = [
+        step
+        for step, (ours, theirs) in enumerate(pairs)
+        if not (theirs is None or np.array_equal(ours, theirs))
+    ]
     first = None
     if wrong:
         step, (ours, theirs) = wrong[0], map(_plain, pairs[wrong[0]])
@@ -409,16 +385,11 @@ def _agreement(name: str, commands: list[PilotCommand], feed: LogFeed) -> dict[s
     return {"what": name, "equal_steps": len(pairs) - len(wrong), "first_difference": first}
 
 
-def _is_equal(ours: Any, theirs: Any) -> bool:
-    """What the log does not say counts as equal."""
-    return theirs is None or bool(np.array_equal(ours, theirs))
-
-
 def _plain(value: Any) -> Any:
     return value if isinstance(value, str) else value.tolist()
 
 
-def _change(commands: list[PilotCommand], feed: LogFeed) -> dict[str, Any]:
+def _change(commands: list[onboard.PilotCommand], feed: LogFeed) -> dict[str, Any]:
     """How far the commands are from the logged ones, and how often the pilot stopped."""
     actions = np.array([command.action for command in commands], np.float64)
     off = np.abs(actions - np.array([logged.action for logged in feed.steps], np.float64)).max(axis=1)

@@ -12,55 +12,40 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-Velocity = tuple[float, float, float, float]
-"""surge, sway, heave [m/s] and yaw rate [rad/s], body axes"""
+Velocity = tuple[float, float, float, float]  # surge, sway, heave [m/s] and yaw rate [rad/s], body axes
 STOP: Velocity = (0.0, 0.0, 0.0, 0.0)
-STALL_S = 0.25
-"""a step that is later than this is a stall"""
-LATE_S, LATE_WINDOW_S = 0.5, 3.0
-"""so much lateness in so long is too much"""
-UNANSWERED_S = 4.0
-"""it was asked to move for so long, and did not"""
+STALL_S = 0.25  # a step that is later than this is a stall
+LATE_S, LATE_WINDOW_S = 0.5, 3.0  # so much lateness in so long is too much
+UNANSWERED_S = 4.0  # it was asked to move for so long, and did not
 
 
 class SafeAction(IntEnum):
     """What is done, each graver than the one before."""
 
-    DRIVE = 0
-    """what the pilot wants, within the limits"""
-    HOLD = 1
-    """ask for zero speed; ends when its reason does"""
-    SURFACE = 2
-    """have the autopilot surface; for good"""
-    HAND_BACK = 3
-    """leave the vehicle to the autopilot's ALT_HOLD and to the operator, and say no more; for good"""
+    DRIVE = 0  # what the pilot wants, within the limits
+    HOLD = 1  # ask for zero speed; ends when its reason does
+    SURFACE = 2  # have the autopilot surface; for good
+    HAND_BACK = 3  # leave the vehicle to the autopilot's ALT_HOLD and the operator, and say no more; for good
 
 
 @dataclass(frozen=True)
 class SafetyLimits:
     """What the vehicle must keep to."""
 
-    box_m: tuple[float, float, float, float]
-    """least x, least y, most x, most y"""
-    depth_m: tuple[float, float]
-    """least and most depth, positive down"""
-    speed_m_s: float = 0.5
-    """horizontal"""
+    box_m: tuple[float, float, float, float]  # least x, least y, most x, most y
+    depth_m: tuple[float, float]  # least and most depth, positive down
+    speed_m_s: float = 0.5  # horizontal
     heave_m_s: float = 0.3
     yaw_rate_rad_s: float = 0.8
-    operator_s: float = 2.0
-    """age of the operator's heartbeat"""
-    vehicle_s: float = 3.0
-    """age of the autopilot's heartbeat"""
+    operator_s: float = 2.0  # age of the operator's heartbeat
+    vehicle_s: float = 3.0  # age of the autopilot's heartbeat
     sensor_s: Mapping[str, float] = field(
         default_factory=lambda: {"imu": 0.5, "dvl": 2.0, "pressure": 2.0, "sonar": 1.0, "position": 0.5}
     )
     """age of the newest message of each sensor that the pilot needs"""
-    battery_v: float = 13.2
-    """of the pack; a BlueROV2's has four cells"""
+    battery_v: float = 13.2  # of the pack; a BlueROV2's has four cells
     battery_share: float = 0.2
-    battery_s: float = 10.0
-    """age of the battery's telemetry, once it has come"""
+    battery_s: float = 10.0  # age of the battery's telemetry, once it has come
     tilt_rad: float = math.radians(45.0)
 
 
@@ -69,61 +54,43 @@ class VehicleView:
     """What is known at one moment. An age is infinite where nothing has come yet."""
 
     now_s: float
-    wanted: Velocity
-    """by the pilot"""
-    held: tuple[str, ...]
-    """why the pilot itself stops"""
+    wanted: Velocity  # by the pilot
+    held: tuple[str, ...]  # why the pilot itself stops
     vehicle_age_s: float
     operator_age_s: float
     sensor_age_s: Mapping[str, float]
     """of the sensors that the pilot needs; of the sonar's newest scan that was placed in the map"""
     pos_w: tuple[float, float, float]
-    rpy: tuple[float, float, float]
-    """NaN: not known now"""
-    speed_m_s: float | None
-    """measured, over ground; None: not known now"""
-    battery_v: float | None
-    """None: nobody tells"""
+    rpy: tuple[float, float, float]  # NaN: not known now
+    speed_m_s: float | None  # measured, over ground; None: not known now
+    battery_v: float | None  # None: nobody tells
     battery_share: float | None
-    stalled_s: float
-    """by how much this computer was late with this step"""
+    stalled_s: float  # by how much this computer was late with this step
     lost_command: str
     """why the vehicle no longer does what we say (somebody took over, it disarmed, a mode was refused); '' =
     it does, or was never asked"""
-    late_s: float = 0.0
-    """lateness of all stalls in the last LATE_WINDOW_S"""
-    battery_age_s: float = 0.0
-    """of its telemetry; infinite: none has come yet"""
-    unanswered_s: float = 0.0
-    """for how long it was asked to move and did not"""
-    moved: str = ""
-    """how the given position jumped; '' = it did not"""
-    misfit: str = ""
-    """how the scans disagree with the known walls; '' = they do not"""
-    unchecked: str = ""
-    """what is missing to check the start by the walls; '' = nothing"""
+    late_s: float = 0.0  # lateness of all stalls in the last LATE_WINDOW_S
+    battery_age_s: float = 0.0  # of its telemetry; infinite: none has come yet
+    unanswered_s: float = 0.0  # for how long it was asked to move and did not
+    moved: str = ""  # how the given position jumped; '' = it did not
+    misfit: str = ""  # how the scans disagree with the known walls; '' = they do not
+    unchecked: str = ""  # what is missing to check the start by the walls; '' = nothing
 
 
 @dataclass(frozen=True)
 class SafetyMemory:
     """What must be remembered from one decision to the next."""
 
-    since_s: Mapping[str, float] = field(default_factory=dict)
-    """rule -> since when it has been broken"""
-    latched: SafeAction = SafeAction.DRIVE
-    """the gravest action that is for good"""
+    since_s: Mapping[str, float] = field(default_factory=dict)  # rule -> since when it has been broken
+    latched: SafeAction = SafeAction.DRIVE  # the gravest action that is for good
     latched_why: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class SafeDecision:
-    """What to do."""
-
     action: SafeAction
-    velocity: Velocity
-    """to ask for; zero unless the action is DRIVE"""
-    reasons: tuple[str, ...]
-    """of the action; none = DRIVE"""
+    velocity: Velocity  # to ask for; zero unless the action is DRIVE
+    reasons: tuple[str, ...]  # of the action; none = DRIVE
 
 
 @dataclass(frozen=True)
@@ -131,12 +98,9 @@ class SafetyRule:
     """One thing that may go wrong."""
 
     name: str
-    broken: Callable[[VehicleView, SafetyLimits], str]
-    """what is wrong in words, '' = nothing"""
-    actions: tuple[tuple[float, SafeAction], ...]
-    """(broken for so many seconds, action)"""
-    meaning: str
-    """when it is broken, for the page"""
+    broken: Callable[[VehicleView, SafetyLimits], str]  # what is wrong in words, '' = nothing
+    actions: tuple[tuple[float, SafeAction], ...]  # (broken for so many seconds, action)
+    meaning: str  # when it is broken, for the page
 
     @property
     def case(self) -> str:
@@ -145,26 +109,6 @@ class SafetyRule:
 
 
 # -------------------------------------------------------------------------------------------------- the rules
-
-
-def _lost_command(view: VehicleView, limits: SafetyLimits) -> str:
-    return view.lost_command
-
-
-def _vehicle_silent(view: VehicleView, limits: SafetyLimits) -> str:
-    return _old("autopilot", view.vehicle_age_s, limits.vehicle_s)
-
-
-def _operator_silent(view: VehicleView, limits: SafetyLimits) -> str:
-    return _old("operator", view.operator_age_s, limits.operator_s)
-
-
-def _navigation_lost(view: VehicleView, limits: SafetyLimits) -> str:
-    return _lost_sensors(view, limits, ("imu", "dvl", "pressure", "position"))
-
-
-def _sonar_lost(view: VehicleView, limits: SafetyLimits) -> str:
-    return _lost_sensors(view, limits, ("sonar",))
 
 
 def _pilot_stops(view: VehicleView, limits: SafetyLimits) -> str:
@@ -192,18 +136,6 @@ def _unanswered(view: VehicleView, limits: SafetyLimits) -> str:
     return f"asked to move for {view.unanswered_s:.0f} s, and the measured speed stays near zero"
 
 
-def _position_jumped(view: VehicleView, limits: SafetyLimits) -> str:
-    return view.moved
-
-
-def _start_unchecked(view: VehicleView, limits: SafetyLimits) -> str:
-    return view.unchecked
-
-
-def _walls_misfit(view: VehicleView, limits: SafetyLimits) -> str:
-    return view.misfit
-
-
 def _battery_low(view: VehicleView, limits: SafetyLimits) -> str:
     if view.battery_v is not None and view.battery_v < limits.battery_v:
         return f"battery at {view.battery_v:.1f} V"
@@ -216,11 +148,9 @@ def _tilted(view: VehicleView, limits: SafetyLimits) -> str:
     upright = math.cos(view.rpy[0]) * math.cos(view.rpy[1]) if all(map(math.isfinite, view.rpy)) else math.nan
     if upright >= math.cos(limits.tilt_rad):
         return ""
-    return (
-        f"tilted by {math.degrees(math.acos(upright)):.0f} degrees"
-        if math.isfinite(upright)
-        else "no attitude"
-    )
+    if not math.isfinite(upright):
+        return "no attitude"
+    return f"tilted by {math.degrees(math.acos(upright)):.0f} degrees"
 
 
 def _outside(view: VehicleView, limits: SafetyLimits) -> str:
@@ -237,20 +167,26 @@ def _too_fast(view: VehicleView, limits: SafetyLimits) -> str:
 
 _A = SafeAction
 RULES = (
-    SafetyRule("command lost", _lost_command, ((0.0, _A.HAND_BACK),),
+    SafetyRule("command lost", lambda view, _: view.lost_command, ((0.0, _A.HAND_BACK),),
                "somebody else changed the mode or disarmed, or the vehicle refused GUIDED and ALT_HOLD"),
-    SafetyRule("autopilot silent", _vehicle_silent, ((0.0, _A.HAND_BACK),), "no heartbeat of the autopilot"),
-    SafetyRule("operator silent", _operator_silent, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
-               "no heartbeat of the operator's ground station"),
-    SafetyRule("navigation lost", _navigation_lost, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
+    SafetyRule("autopilot silent",
+               lambda view, limits: _old("autopilot", view.vehicle_age_s, limits.vehicle_s),
+               ((0.0, _A.HAND_BACK),), "no heartbeat of the autopilot"),
+    SafetyRule("operator silent",
+               lambda view, limits: _old("operator", view.operator_age_s, limits.operator_s),
+               ((0.0, _A.HOLD), (30.0, _A.SURFACE)), "no heartbeat of the operator's ground station"),
+    SafetyRule("navigation lost",
+               lambda view, limits: _lost_sensors(view, limits, ("imu", "dvl", "pressure", "position")),
+               ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
                "attitude, velocity, depth or a needed position is missing or old"),
-    SafetyRule("position jumped", _position_jumped, ((0.0, _A.HAND_BACK),),
+    SafetyRule("position jumped", lambda view, _: view.moved, ((0.0, _A.HAND_BACK),),
                "the given position changed by more than the vehicle can move"),
-    SafetyRule("start unchecked", _start_unchecked, ((0.0, _A.HOLD),),
+    SafetyRule("start unchecked", lambda view, _: view.unchecked, ((0.0, _A.HOLD),),
                "the walls have not confirmed the start yet; after 60 s it is refused"),
-    SafetyRule("walls misfit", _walls_misfit, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
+    SafetyRule("walls misfit", lambda view, _: view.misfit, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
                "the scans do not fit the known walls where the vehicle takes itself to be"),
-    SafetyRule("sonar lost", _sonar_lost, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
+    SafetyRule("sonar lost", lambda view, limits: _lost_sensors(view, limits, ("sonar",)),
+               ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
                "no scan could be placed in the map, or the last one is old"),
     SafetyRule("pilot stops", _pilot_stops, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
                "the stack itself says that it cannot go on, or its command is not finite"),
@@ -291,9 +227,7 @@ def decide(
             reasons.append(reason)
     for_good = action >= SafeAction.SURFACE
     kept = SafetyMemory(
-        since,
-        action if for_good else memory.latched,
-        tuple(reasons) if for_good else memory.latched_why,
+        since, action if for_good else memory.latched, tuple(reasons) if for_good else memory.latched_why
     )
     velocity = allowed(view.wanted, view, limits) if action == SafeAction.DRIVE else STOP
     return SafeDecision(action, velocity, tuple(reasons)), kept
@@ -301,8 +235,7 @@ def decide(
 
 # ------------------------------------------------------------------------------------------------- the limits
 
-FENCE_RATE_HZ = 0.5
-"""towards the fence no faster than this times the distance to it"""
+FENCE_RATE_HZ = 0.5  # towards the fence no faster than this times the distance to it
 
 
 def allowed(wanted: Velocity, view: VehicleView, limits: SafetyLimits) -> Velocity:

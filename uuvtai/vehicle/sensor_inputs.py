@@ -34,12 +34,9 @@ from uuvtai.vehicle.messages import (
     ThrusterLoss,
 )
 
-# ------------------------------------------------------------------------------------------------------------
-# Readings that come late, carried forward to now by what the vehicle knows of its motion since.
-#
-# The pose filter takes every reading for one of this very step. One of a tenth of a second ago is wrong by
-# what
-# the vehicle has done meanwhile, which is far more than the instrument's own error.
+# ---- Readings that come late, carried forward to now by what the vehicle knows of its motion since. The pose
+# filter takes every reading for one of this very step. One of a tenth of a second ago is wrong by what the
+# vehicle has done meanwhile, which is far more than the instrument's own error.
 
 
 def turned_on(imu: ImuReading, late_s: float) -> np.ndarray:
@@ -53,8 +50,7 @@ def turned_on(imu: ImuReading, late_s: float) -> np.ndarray:
 
 
 def acceleration_b(imu: ImuReading, vel_b: np.ndarray, gravity_m_s2: float) -> np.ndarray:
-    """(3,) [m/s^2] rate of change of the velocity in body axes: specific force, gravity, and the turning of
-    the axes."""
+    """(3,) [m/s^2] rate of change of the velocity in body axes: specific force, gravity, turning axes."""
     roll, pitch, _ = np.asarray(imu.rpy, np.float64)
     down_b = np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
     turning = np.cross(np.asarray(imu.rate_b, np.float64), np.asarray(vel_b, np.float64))
@@ -74,16 +70,12 @@ def to_world(vector_b: np.ndarray, rpy: np.ndarray) -> np.ndarray:
     return rotation @ np.asarray(vector_b, np.float64)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the vehicle has felt of its own motion, and what readings have corrected of the estimate of it.
-#
+# ---- What the vehicle has felt of its own motion, and what readings have corrected of the estimate of it.
 # Both are sums since the start; their differences between two steps carry a late reading forward, or take
-# what
-# was estimated at a ping to what is known now. Neither may hold the other: a reading carried by an estimate
-# that later readings have corrected, or compared with one that they have not, has one error corrected once
-# for
-# each reading on its way, and the estimate runs away (T. Larsen et al., Incorporation of time delayed
-# measurements in a discrete-time Kalman filter, CDC 1998).
+# what was estimated at a ping to what is known now. Neither may hold the other: a reading carried by an
+# estimate that later readings have corrected, or compared with one that they have not, has one error
+# corrected once for each reading on its way, and the estimate runs away (T. Larsen et al., Incorporation of
+# time delayed measurements in a discrete-time Kalman filter, CDC 1998).
 
 
 def _nothing() -> np.ndarray:
@@ -94,14 +86,10 @@ def _nothing() -> np.ndarray:
 class OwnPose:
     """What the pilot takes for its own pose and velocity at one moment."""
 
-    pos_w: np.ndarray
-    """(3,) [m]"""
-    rpy: np.ndarray
-    """(3,) [rad]"""
-    vel_b: np.ndarray
-    """(3,) [m/s]"""
-    bias_b: np.ndarray = field(default_factory=_nothing)
-    """(3,) [m/s^2] error of the accelerometer"""
+    pos_w: np.ndarray  # (3,) [m]
+    rpy: np.ndarray  # (3,) [rad]
+    vel_b: np.ndarray  # (3,) [m/s]
+    bias_b: np.ndarray = field(default_factory=_nothing)  # (3,) [m/s^2] error of the accelerometer
 
 
 @dataclass(eq=False)
@@ -110,16 +98,13 @@ class MotionSums:
 
     won_b: np.ndarray = field(default_factory=_nothing)
     """(3,) [m/s] velocity by the accelerometer alone, less its error as it was known, body axes"""
-    risen_m: float = 0.0
-    """upwards, by the velocity alone"""
+    risen_m: float = 0.0  # upwards, by the velocity alone
     bias_w: np.ndarray = field(default_factory=_nothing)
     """(3,) [m/s^2] corrections of the accelerometer's error,"""
     vel_w: np.ndarray = field(default_factory=_nothing)
     """(3,) [m/s] of the velocity, led back to time 0 by those,"""
-    pos_w: np.ndarray = field(default_factory=_nothing)
-    """(3,) [m] and of the position, led back by both"""
-    yaw: float = 0.0
-    """[rad] corrections of the heading"""
+    pos_w: np.ndarray = field(default_factory=_nothing)  # (3,) [m] and of the position, led back by both
+    yaw: float = 0.0  # [rad] corrections of the heading
 
     def feel(self, accel_b: np.ndarray, vel_w: np.ndarray, dt_s: float) -> None:
         """A step of dt at an acceleration (3,) [m/s^2] and a velocity (3,) [m/s]."""
@@ -136,12 +121,10 @@ class MotionSums:
         self.yaw += float(found.rpy[2] - expected.rpy[2] + np.pi) % (2 * np.pi) - np.pi
 
     def noted(self) -> dict[str, np.ndarray]:
-        """The sums, for a history."""
         return {name: np.array(value) for name, value in vars(self).items()}
 
     def known_now(self, then: OwnPose, noted: dict[str, np.ndarray], time_s: float) -> OwnPose:
-        """``then``, the pose of ``time_s`` as it was taken to be when the sums were those ``noted``, as it is
-        known now."""
+        """``then``, a past pose as taken when the sums were those ``noted``, as it is known now."""
         pos_w, vel_w, bias_w = (getattr(self, name) - noted[name] for name in ("pos_w", "vel_w", "bias_w"))
         return OwnPose(
             then.pos_w + pos_w + time_s * (vel_w - 0.5 * time_s * bias_w),
@@ -155,9 +138,7 @@ def to_body(vector_w: np.ndarray, rpy: np.ndarray) -> np.ndarray:
     return np.array([vector_w @ to_world(axis, rpy) for axis in np.eye(3)])
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Watches the pose filter from outside, step by step: what it predicts, and what readings have corrected.
-#
+# ---- Watches the pose filter from outside, step by step: what it predicts, and what readings have corrected.
 # A step goes: ``note_walls``, ``feel``, the filter's prediction with DVL and pressure, ``note_dvl``, the
 # filter's correction by the walls. Where the position is given nothing corrects it.
 
@@ -191,8 +172,7 @@ class MotionWatch:
         self.sums.feel(accel_b, vel_w, dt)
 
     def note_dvl(self, step: int) -> None:
-        """After the filter's prediction: what a DVL's reading has corrected in it; in other steps there is
-        none of the horizontal pose."""
+        """After the prediction: what a DVL's reading has corrected in it; other steps have none."""
         now = self._own()
         if self._estimated and step > 0 and self._views["ego.dvl_fresh"][0]:
             self.sums.correct(self._expected, now, self._dt * step)
@@ -210,15 +190,11 @@ class MotionWatch:
         return np.append(self._views["pose.mean"][0, 7:9], self._views["pose.depth"][0, 3]).astype(np.float64)
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 FIX_AGE_S = 0.3
 """[s] a scan or an image taken while attitude or position was older than this is not used: it would be drawn
 at the wrong place of the map. A velocity or depth later than this is not carried forward, and a velocity by
 positions is no older"""
-FASTEST_M_S = 3.0
-"""a position that changes faster was corrected, not driven"""
+FASTEST_M_S = 3.0  # a position that changes faster was corrected, not driven
 
 
 class FedSensors:
@@ -248,7 +224,6 @@ class FedSensors:
 
     @property
     def step(self) -> int:
-        """Control steps since the start."""
         return int(self._clock["step"][0])
 
     @property
@@ -398,8 +373,7 @@ class FedSensors:
         return found
 
 
-KEPT = 75
-"""steps"""
+KEPT = 75  # steps
 
 
 class PoseHistory:
@@ -409,11 +383,9 @@ class PoseHistory:
         self._rows: dict[int, dict[str, np.ndarray]] = {}
 
     def clear(self) -> None:
-        """Forget all."""
         self._rows.clear()
 
     def note(self, step: int, **values: np.ndarray) -> None:
-        """Keep copies of this step's values."""
         self._rows[step] = {name: np.array(value) for name, value in values.items()}
         self._rows.pop(step - KEPT, None)
 

@@ -29,21 +29,14 @@ from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavC
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
 from uuvtai.vehicle.telemetry import Motors
 
-# ------------------------------------------------------------------------------------------------------------
-# One ArduSub's water: a packet in, an answer out, and what the sensors say meanwhile. No sockets here.
-#
-# A packet (ArduPilot, libraries/SITL/SIM_JSON.h), little endian: magic, frame rate [Hz], frame count, then
-# the
+# ---- One ArduSub's water: a packet in, an answer out, and what the sensors say meanwhile. No sockets here. A
+# packet (ArduPilot, libraries/SITL/SIM_JSON.h), little endian: magic, frame rate [Hz], frame count, then the
 # pulse widths [us] of 16 channels, or of 32.
 
-
 _HEAD = struct.Struct("<HHI")
-_CHANNELS = {18458: 16, 29569: 32}
-"""magic -> channels"""
-RATES_HZ = (50, 4000)
-"""physics steps in a second that are believed"""
-DOUBLED_S = 0.5
-"""ArduSub sends a packet again after a second without an answer; what comes much sooner was doubled"""
+_CHANNELS = {18458: 16, 29569: 32}  # magic -> channels
+RATES_HZ = (50, 4000)  # physics steps in a second that are believed
+DOUBLED_S = 0.5  # ArduSub repeats a packet after a second without answer; sooner it was doubled
 
 Turn = Literal["reset", "step", "again", "ignore"]
 
@@ -84,9 +77,7 @@ def turn_of(count: int, last: int | None, waited_s: float) -> Turn:
 class Water(Protocol):
     """What an instance needs of ``WaterRows``."""
 
-    def begin(self, row: int) -> None:
-        """The row's episode from its beginning."""
-        ...
+    def begin(self, row: int) -> None: ...
 
     def push(self, row: int, pwm: tuple[int, ...], dt_s: float) -> None:
         """Move the vehicle by one step."""
@@ -96,17 +87,11 @@ class Water(Protocol):
         """The world by a control step; how the episode ended, '' = not yet."""
         ...
 
-    def sense(self, row: int) -> None:
-        """Instruments and sonar."""
-        ...
+    def sense(self, row: int) -> None: ...
 
-    def motion(self, row: int, time_s: float) -> Motion:
-        """What the vehicle really does."""
-        ...
+    def motion(self, row: int, time_s: float) -> Motion: ...
 
-    def value(self, name: str, row: int) -> np.ndarray:
-        """Copy of 'struct.field'."""
-        ...
+    def value(self, name: str, row: int) -> np.ndarray: ...
 
     def turns(self, pwm: tuple[int, ...]) -> bool:
         """Whether any thruster is asked to turn."""
@@ -183,7 +168,6 @@ class Instance:
         return self.time_s - self._ended_s if self.outcome else 0.0
 
     def document(self) -> dict[str, Any]:
-        """Its line in ``uuv sitl --json``."""
         return {
             "row": self._row,
             "seconds": round(self.time_s, 3),
@@ -193,8 +177,7 @@ class Instance:
         }
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Rows of a simulator that move one at a time, each at the pace of the ArduSub that drives it.
+# ---- Rows of a simulator that move one at a time, each at the pace of the ArduSub that drives it.
 
 
 class WaterRows:
@@ -259,7 +242,6 @@ class WaterRows:
         self._sim.sensors.sense_sonar(self._sim.io)
 
     def motion(self, row: int, time_s: float) -> Motion:
-        """What the vehicle really does."""
         quat = self._vehicle["quat_wb"][row].astype(float)
         rotation = _rotation(quat)
         gravity = self.config.vehicle.gravity_m_s2
@@ -279,7 +261,6 @@ class WaterRows:
         return bool(np.any(self.motors.rpm(pwm)))
 
     def value(self, name: str, row: int) -> np.ndarray:
-        """Copy of 'struct.field' of the row."""
         return self._read[name][row].copy()
 
     def _wake(self, row: int) -> None:
@@ -303,12 +284,9 @@ def _three(values: Any) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv sitl`` says while it serves: who speaks, who does not, what begins and ends. Pure.
+# ---- What ``uuv sitl`` says while it serves: who speaks, who does not, what begins and ends. Pure.
 
-
-SILENT_S = 10.0
-"""by the clock, without a packet"""
+SILENT_S = 10.0  # by the clock, without a packet
 
 
 @dataclass
@@ -330,7 +308,6 @@ class ServingNotes:
         self._seen = _Seen(heard_s=now_s)
 
     def look(self, instance: Instance, now_s: float) -> list[str]:
-        """Sentences about what is new."""
         seen, counts = self._seen, instance.counts
         found = [*self._packets(instance, now_s), *self._episode(instance)]
         if counts["bad"] > 0 and seen.bad == 0:
@@ -378,19 +355,11 @@ class ServingNotes:
         return found
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
-NEXT_PORT = 10
-"""from one instance's port to the next one's, as ArduPilot counts"""
-SENSORS = 197
-"""MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY"""
-_LONGEST = 128
-"""[bytes] a longer packet is none of ArduSub's"""
-_SILENT_S = 2.0
-"""who has been silent for so long may be followed by somebody else"""
-LINGER_S = 10.0
-"""of the water's time, that it stays with ``once`` after the episode's end: for the pilot to notice"""
+NEXT_PORT = 10  # from one instance's port to the next one's, as ArduPilot counts
+SENSORS = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+_LONGEST = 128  # [bytes] a longer packet is none of ArduSub's
+_SILENT_S = 2.0  # who has been silent for so long may be followed by somebody else
+LINGER_S = 10.0  # of the water's time, that it stays with ``once`` after the end: for the pilot to notice
 _MOST_PEERS = 4
 _MOST_INSTANCES = 64
 PLACES = ("udp:127.0.0.1:14660", "udpout:127.0.0.1:14550")
@@ -404,17 +373,13 @@ class SitlPlan:
     host: str = "127.0.0.1"
     port: int = 9002
     instances: int = 1
-    places: tuple[LinkPlace, ...] = ()
-    """of the sensors' MAVLink; ports count on with the instances"""
-    rate: float = 0.0
-    """seconds of the water in one of the clock's, at most; 0 = as ArduSub asks"""
+    places: tuple[LinkPlace, ...] = ()  # of the sensors' MAVLink; ports count on with the instances
+    rate: float = 0.0  # seconds of the water in one of the clock's, at most; 0 = as ArduSub asks
     seconds: float = math.inf
-    once: bool = False
-    """end when every instance's episode has ended"""
+    once: bool = False  # end when every instance's episode has ended
     seed: int = 0
     episode: int = 0
-    operator: bool = False
-    """be the ground station too"""
+    operator: bool = False  # be the ground station too
 
     @classmethod
     def typed(
@@ -458,7 +423,6 @@ class SensorLink:
                 self.peers = [*self.peers, sender][-_MOST_PEERS:]
 
     def tell(self, data: bytes) -> None:
-        """Say it to all."""
         for peer in self.peers if self.endpoint.calls is None else [self.endpoint.calls]:
             self.endpoint.send(data, peer)
 
@@ -525,7 +489,6 @@ class SitlPort:
                 link.tell(data)
 
     def close(self) -> None:
-        """Let go of all ports."""
         self.socket.close()
         for link in self.links:
             link.endpoint.close()
@@ -534,8 +497,7 @@ class SitlPort:
 def serve_water(
     config: Config, tree: FlatTree, plan: SitlPlan, note: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Serve until Ctrl-C, ``seconds`` or ``once``; the document of ``uuv sitl --json``. Raises LinkError,
-    SettingError."""
+    """Serve until Ctrl-C, ``seconds`` or ``once``; gives the ``--json``. Raises LinkError, SettingError."""
     water = WaterRows(Sim(config, plan.instances, tree), folded_seed(plan.seed), plan.episode)
     ports: list[SitlPort] = []
     begun = time.monotonic()
@@ -599,8 +561,7 @@ def _pace(port: SitlPort, rate: float) -> None:
 BEAT_S, PLACE_S, PLACED_S = 1.0, 0.25, 60.0
 """a heartbeat so often; the place so often, until so long after the beginning. ArduSub takes it once, as soon
 as its filter is there: the heading that it aligns without a place lacks the magnetic declination"""
-PLACE = (-353600000, 1491600000, 0)
-"""latitude, longitude [1e-7 degrees], altitude [mm] of the surface"""
+PLACE = (-353600000, 1491600000, 0)  # latitude, longitude [1e-7 degrees], altitude [mm] of the surface
 
 
 class SimulatedOperator:

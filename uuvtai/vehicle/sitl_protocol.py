@@ -7,7 +7,6 @@ vector, and a line between two line feeds.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -30,8 +29,7 @@ class Motion:
     quat_wb: tuple[float, float, float, float]
     rate_b: Three
     specific_force_b: Three
-    altitude_m: float
-    """above the floor"""
+    altitude_m: float  # above the floor
     volts: float = 16.0
     amperes: float = 1.0
 
@@ -63,22 +61,9 @@ def _vector(values: Sequence[float]) -> str:
     return "[" + ",".join(f"{value:.9g}" for value in values) + "]"
 
 
-def euler_of(quat_wb: Sequence[float]) -> Three:
-    """[rad] roll, pitch, yaw in the axes of the quaternion."""
-    w, x, y, z = (float(value) for value in quat_wb)
-    return (
-        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )
+# ---- What the sensors beside the autopilot say by MAVLink: a DVL, a sonar, an altimeter.
 
-
-# ------------------------------------------------------------------------------------------------------------
-# What the sensors beside the autopilot say by MAVLink: a DVL, a sonar, an altimeter.
-
-
-LEAST_STEPS = 5
-"""control steps between two reports, at least: 10 Hz, as of an A50 and a multibeam"""
+LEAST_STEPS = 5  # control steps between two reports, at least: 10 Hz, as of an A50 and a multibeam
 _SONAR, _DOWN, _BOW = 1, 25, 12
 """MAV_DISTANCE_SENSOR_ULTRASOUND, MAV_SENSOR_ROTATION_PITCH_270, MAV_FRAME_BODY_FRD"""
 _MOST_ALTITUDE_CM = 5000

@@ -22,34 +22,23 @@ from uuvtai.config import Config, SonarConfig, TankConfig
 from uuvtai.vehicle.onboard import DvlReading, ImuReading, SensorMessage, SonarPing
 from uuvtai.vehicle.sensor_inputs import to_world
 
-MOST_M, MOST_RAD = 0.15, math.radians(3.0)
-"""standard deviations of a fix, at most"""
-NEAR_M, NEAR_RAD = 1.2, math.radians(26.0)
-"""so far from what was typed a fix is looked for"""
-LONGEST_S = 60.0
-"""from the first scan on; without a fix until then the start is refused"""
-_LEAST_S, _EVERY_S = 1.0, 0.5
-"""looked at before a fix is sought, and between two searches, at first"""
+MOST_M, MOST_RAD = 0.15, math.radians(3.0)  # standard deviations of a fix, at most
+NEAR_M, NEAR_RAD = 1.2, math.radians(26.0)  # so far from what was typed a fix is looked for
+LONGEST_S = 60.0  # from the first scan on; without a fix until then the start is refused
+_LEAST_S, _EVERY_S = 1.0, 0.5  # looked at before a fix is sought, and between two searches, at first
 _KEPT_S, _SCAN_RAYS = 45.0, 64
-_TURN_RAD, _REST_S = math.radians(4.0), 0.5
-"""a scan is kept when the vehicle has turned or waited so much since the last one"""
-_CELL_M, _STEP_RAD = 0.05, math.radians(1.0)
-"""of the histograms"""
+_TURN_RAD, _REST_S = math.radians(4.0), 0.5  # a scan is kept when turned or waited so much since the last
+_CELL_M, _STEP_RAD = 0.05, math.radians(1.0)  # of the histograms
 _SEARCH_RAYS, _FARTHEST_M = 800, 60.0
-_FLOOR_M, _FLOOR_RAD = 0.02, math.radians(0.3)
-"""what a fix is never better than: errors that rays share"""
-_INDEPENDENT = 100
-"""rays count as no more measurements than this"""
+_FLOOR_M, _FLOOR_RAD = 0.02, math.radians(0.3)  # what a fix is never better than: errors that rays share
+_INDEPENDENT = 100  # rays count as no more measurements than this
 _WALL_RAYS, _WALL_M = 12, 1.5
 """a wall is seen by so many returns at least, that lie so far apart: larger than the face of a body"""
-_WIDE_RAD = math.radians(12.0)
-"""sectors that are wider are rangefinders, which measure along their axis"""
+_WIDE_RAD = math.radians(12.0)  # sectors that are wider are rangefinders, which measure along their axis
 _NEAREST = np.array([0.0, 0.0, 0.56, 0.85, 1.03, 1.16, 1.27, 1.35, 1.42])
 """standard deviations by which the least of so many normal values falls short of their mean"""
-_GRAZING = 0.4
-"""cosine of incidence below which a beam may stay without return"""
-_AGREED = 0.2
-"""square of standard deviations by which a typed start and heading may disagree where no wall decides"""
+_GRAZING = 0.4  # cosine of incidence below which a beam may stay without return
+_AGREED = 0.2  # square of deviations by which typed start and heading may disagree where no wall decides
 _REST_M_S, _GAP_S = 0.3, 1.0
 """faster is not at rest: what comes then is left out; and attitude or velocity that is missing for longer
 (twice that) leaves unknown where the vehicle has drifted"""
@@ -59,42 +48,30 @@ _REST_M_S, _GAP_S = 0.3, 1.0
 class StartFound:
     """What the walls say of the start."""
 
-    place: tuple[float, float] = (math.nan, math.nan)
-    """[m] where the vehicle is at the last scan"""
-    shift: tuple[float, float] = (0.0, 0.0)
-    """[m] by which the typed start was wrong"""
-    turn_rad: float = 0.0
-    """to be added to the yaw as typed"""
-    spread: tuple[float, ...] = ()
-    """(6,) covariance of x, y [m], heading [rad]: upper triangle"""
-    residual_m: float = math.nan
-    """root mean square of what fits"""
+    place: tuple[float, float] = (math.nan, math.nan)  # [m] where the vehicle is at the last scan
+    shift: tuple[float, float] = (0.0, 0.0)  # [m] by which the typed start was wrong
+    turn_rad: float = 0.0  # to be added to the yaw as typed
+    spread: tuple[float, ...] = ()  # (6,) covariance of x, y [m], heading [rad]: upper triangle
+    residual_m: float = math.nan  # root mean square of what fits
     scans: int = 0
-    refusal: str = ""
-    """why there is no fix, and what to do; '' = there is one"""
+    refusal: str = ""  # why there is no fix, and what to do; '' = there is one
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
     """n beams in one frame; a sector that several beams share is one, between two bearings."""
 
-    from_m: np.ndarray
-    """(n, 2)"""
-    bearing: np.ndarray
-    """(n, 2) [rad] of its edges"""
+    from_m: np.ndarray  # (n, 2)
+    bearing: np.ndarray  # (n, 2) [rad] of its edges
     range_m: np.ndarray
-    hit: np.ndarray
-    """(n,) whether it returned"""
-    beams: np.ndarray
-    """(n,) that share it"""
+    hit: np.ndarray  # (n,) whether it returned
+    beams: np.ndarray  # (n,) that share it
 
     def some(self, which: slice) -> Rays:
-        """Those of an index."""
         return Rays(*(part[which] for part in vars(self).values()))
 
     @classmethod
     def joined(cls, rows: list[Rays]) -> Rays:
-        """All of them in one."""
         return cls(
             *(np.concatenate(parts) for parts in zip(*(vars(row).values() for row in rows), strict=True))
         )
@@ -110,26 +87,20 @@ class Fit:
     """How rays fit the walls at one pose (x, y, turn)."""
 
     pose: np.ndarray
-    off_m: np.ndarray
-    """(n,) by which they end beyond their wall, along its normal"""
-    slope: np.ndarray
-    """(n, 3) change of that with the pose, sign of a correction"""
-    wall: np.ndarray
-    """(n,) number of the wall"""
+    off_m: np.ndarray  # (n,) by which they end beyond their wall, along its normal
+    slope: np.ndarray  # (n, 3) change of that with the pose, sign of a correction
+    wall: np.ndarray  # (n,) number of the wall
     fits: np.ndarray
-    beyond: np.ndarray
-    """(n,) that end behind the wall, or found none where it stands in reach"""
+    beyond: np.ndarray  # (n,) that end behind the wall, or found none where it stands in reach
     short: np.ndarray
 
     @property
     def score(self) -> float:
-        """The better the larger."""
         return float(self.fits.sum()) - float(self.beyond.sum())
 
 
 def rays_of(sonar_cfg: SonarConfig, ping: SonarPing, from_m: np.ndarray, yaw: float) -> Rays:
-    """A ping's beams at a place and a yaw. Neighbours of one and the same range are one sector, in which the
-    nearest point returned."""
+    """A ping's beams at a place and a yaw; neighbours of one range are one sector with one return."""
     ranges, hit = np.asarray(ping.range_m, float), np.asarray(ping.hit) > 0
     beams = ping.first_beam + np.arange(len(ranges))
     bearings = yaw + sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * beams
@@ -163,7 +134,6 @@ def expected(tank: TankConfig, at: np.ndarray, bearing: np.ndarray) -> tuple[np.
 
 
 def range_sigma(sonar_cfg: SonarConfig, range_m: np.ndarray) -> np.ndarray:
-    """[m] of single ranges."""
     normal = sonar_cfg.range_sigma_m + sonar_cfg.range_sigma_slope * range_m
     return np.sqrt(normal**2 + sonar_cfg.range_jitter_m**2 + sonar_cfg.range_quantum_m**2 / 12.0)
 
@@ -235,7 +205,6 @@ def candidates(tank: TankConfig, ends: np.ndarray, typed: np.ndarray) -> list[np
 
 
 def _peaks(votes: np.ndarray, most: int = 3) -> list[int]:
-    """Numbers of the largest local maxima."""
     padded = np.pad(votes, 4, constant_values=-1)
     highest = np.lib.stride_tricks.sliding_window_view(padded, 9).max(1)
     tops = np.flatnonzero((votes == highest) & (votes >= 0.5 * votes.max()))
@@ -342,7 +311,6 @@ class StartFix:
             self._rays.popleft()
 
     def _sought(self) -> StartFound | None:
-        """What all that was seen says."""
         at, tank = self._track.at, self._config.world.tank
         rays = Rays.joined([rays for _, _, rays in self._rays])
         rays = replace(rays, from_m=rays.from_m - at)
@@ -483,13 +451,9 @@ def _side(tank: TankConfig, wall: int) -> str:
 
 # ------------------------------------------------------------------------------------------------- under way
 
-
-MISFIT = 0.5
-"""``WallWatch.look`` beyond which the walls do not fit"""
-_WATCHED_S, _WATCH_STEPS = 3.0, 10
-"""window, and control steps between two scans that count"""
-_SAME_M = 0.2
-"""returns that fall short of a wall by as much, within this, may be that wall elsewhere"""
+MISFIT = 0.5  # ``WallWatch.look`` beyond which the walls do not fit
+_WATCHED_S, _WATCH_STEPS = 3.0, 10  # window, and control steps between two scans that count
+_SAME_M = 0.2  # returns that fall short of a wall by as much, within this, may be that wall elsewhere
 
 
 class WallWatch:

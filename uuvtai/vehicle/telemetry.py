@@ -30,14 +30,10 @@ from uuvtai.vehicle.onboard import (
     SonarPing,
 )
 
-# ------------------------------------------------------------------------------------------------------------
-# Distances by sectors, as MAVLink tells them, into the beams of the pilot's sonar_cfg.
+# ---- Distances by sectors, as MAVLink tells them, into the beams of the pilot's sonar_cfg.
 
-
-UNKNOWN_CM = 65535
-"""of a sector that was not looked into (UINT16_MAX)"""
-SECTORS = 72
-"""at most, in OBSTACLE_DISTANCE"""
+UNKNOWN_CM = 65535  # of a sector that was not looked into (UINT16_MAX)
+SECTORS = 72  # at most, in OBSTACLE_DISTANCE
 
 
 def bearings_deg(sonar_cfg: SonarConfig) -> np.ndarray:
@@ -100,15 +96,13 @@ class Rangers:
     """Eight rangefinders around the hull make a ring of eight sectors, told when the one ahead speaks."""
 
     _TOGETHER_S = 1.0
-    _INVALID = 1
-    """signal_quality: no return that counts"""
+    _INVALID = 1  # signal_quality: no return that counts
 
     def __init__(self) -> None:
         self._rows: dict[int, tuple[float, int, int]] = {}
 
     def ring(self, fields: Mapping[str, Any], time_s: float) -> tuple[np.ndarray, int] | None:
-        """(8,) [cm] clockwise from ahead, and how far all of them see; None = not yet. ``fields``: of a
-        DISTANCE_SENSOR."""
+        """(8,) [cm] clockwise from ahead, and how far they see, if known. ``fields``: DISTANCE_SENSOR."""
         turn = int(fields["orientation"])
         if not 0 <= turn < 8:
             return None
@@ -127,9 +121,7 @@ class Rangers:
         return np.where((distances > least) & (distances < UNKNOWN_CM), least + 1, distances), least
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From ArduSub's channels to our thrusters: which is which, by geometry, and how fast a pulse turns one.
-
+# ---- From ArduSub's channels to our thrusters: which is which, by geometry, and how fast a pulse turns one.
 
 NEUTRAL_US, SPAN_US = 1500.0, 400.0
 _SPEED_OF_PULSE = np.array(
@@ -206,13 +198,10 @@ def _same(ours: np.ndarray, factors: np.ndarray) -> tuple[int, float]:
     return 0, 0.0
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From whom each kind of message counts: what an autopilot says of itself from the autopilot alone, a DVL and
-# a sonar from whom they are known to come.
+# ---- From whom each kind of message counts: what an autopilot says of itself from the autopilot alone, a DVL
+# and a sonar from whom they are known to come.
 
-
-AUTOPILOT = 1
-"""MAV_COMP_ID_AUTOPILOT1"""
+AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 KINDS = {
     "attitude": ("ATTITUDE",),
     "imu": ("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "HIGHRES_IMU"),
@@ -223,13 +212,11 @@ KINDS = {
     "sonar": ("OBSTACLE_DISTANCE", "DISTANCE_SENSOR"),
 }
 KIND_OF = {name: kind for kind, names in KINDS.items() for name in names}
-BLUEOS = (255, 0)
-"""as whom extensions of BlueOS speak, its DVL's among them (mavlink2rest)"""
+BLUEOS = (255, 0)  # as whom extensions of BlueOS speak, its DVL's among them (mavlink2rest)
 _OF_OTHERS = ("dvl", "sonar")
 _WRITTEN = re.compile(r"([a-z]+)=(\d{1,3})/(\d{1,3}|\*)")
 
-Sender = tuple[int, int | None]
-"""system and component; None = any component"""
+Sender = tuple[int, int | None]  # system and component; None = any component
 
 
 @dataclass(frozen=True)
@@ -263,24 +250,15 @@ class Senders:
         return any(system == known and one in (None, component) for known, one in self.given.get(kind, usual))
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 SUBMARINE, ARDUPILOT, GROUND_STATION = 12, 3, 6
 _ARMED = 128
-COMPANION = 191
-"""MAV_COMP_ID_ONBOARD_COMPUTER: what we are"""
-_STICK_MOVED = 200
-"""of 1000"""
-MOST_KINDS = 64
-"""senders of a kind of message that are told apart, and reasons why messages are left out"""
-_FRESH_S = 1.0
-"""a source that was heard within this time is preferred to a lesser one"""
-_BATTERY_S = 10.0
-"""of two tellers of a voltage the lower one counts, while it is heard so often"""
+COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: what we are
+_STICK_MOVED = 200  # of 1000
+MOST_KINDS = 64  # senders of a kind of message that are told apart, and reasons why messages are left out
+_FRESH_S = 1.0  # a source that was heard within this time is preferred to a lesser one
+_BATTERY_S = 10.0  # of two tellers of a voltage the lower one counts, while it is heard so often
 _MOST_NAMED = 4
-JUMP_M, _MOST_SPEED_M_S = 0.5, 2.0
-"""a position that moves further than this, and faster than any vehicle, has jumped"""
+JUMP_M, _MOST_SPEED_M_S = 0.5, 2.0  # a position that moves further, and faster than any vehicle, has jumped
 _PASCAL, _MILLI_G = 100.0, 9.80665e-3
 
 Fields = Mapping[str, Any]
@@ -288,8 +266,7 @@ Fields = Mapping[str, Any]
 
 @dataclass
 class Heard:
-    """Who was heard last, and what they said of themselves. Times by the pilot's clock, minus infinity =
-    never."""
+    """Who was heard last, and what they said. Times by the pilot's clock, minus infinity = never."""
 
     vehicle_s: float = -math.inf
     operator_s: float = -math.inf
@@ -297,26 +274,18 @@ class Heard:
     is_armed: bool = False
     battery_v: float | None = None
     battery_share: float | None = None
-    battery_s: float = -math.inf
-    """when a voltage or a charge came last"""
-    rpy: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-    """of the newest attitude, world axes of ours"""
-    rpy_s: float = -math.inf
-    """when it was measured"""
+    battery_s: float = -math.inf  # when a voltage or a charge came last
+    rpy: tuple[float, float, float] = (math.nan, math.nan, math.nan)  # of the newest attitude, our world axes
+    rpy_s: float = -math.inf  # when it was measured
     vel_b: tuple[float, float, float] | None = None
     vel_b_s: float = -math.inf
     yaw_rate: float = 0.0
     yaw_rate_s: float = -math.inf
-    sticks_s: float = -math.inf
-    """when the operator's own sticks came"""
-    sticks_moved_s: float = -math.inf
-    """and when they were off their middle"""
-    granted_s: dict[int, float] = field(default_factory=dict)
-    """command -> when the autopilot granted it"""
-    position_jump_s: float = -math.inf
-    """when a position came last that no vehicle reaches from the one before"""
-    jumped: str = ""
-    """how it jumped; '' = it did not"""
+    sticks_s: float = -math.inf  # when the operator's own sticks came
+    sticks_moved_s: float = -math.inf  # and when they were off their middle
+    granted_s: dict[int, float] = field(default_factory=dict)  # command -> when the autopilot granted it
+    position_jump_s: float = -math.inf  # when a position came last that no vehicle reaches from its last
+    jumped: str = ""  # how it jumped; '' = it did not
     refused: Counter[str] = field(default_factory=Counter)
     """why messages were not used -> how many; at most ``MOST_KINDS`` reasons"""
 
@@ -409,8 +378,7 @@ class Intake:
         self._clocks.clear()
 
     def correct(self, place: tuple[float, float], turn_rad: float) -> tuple[float, float, float]:
-        """Count from where the vehicle is now on: it is at ``place`` [m], and ``turn_rad`` is added to its
-        yaw. Where it is, with its depth."""
+        """Count from ``place`` [m] on, ``turn_rad`` added to the yaw; gives where it is, with its depth."""
         if self._heading is not None:
             self._heading += turn_rad
         roll, pitch, yaw = self.heard.rpy
@@ -421,12 +389,10 @@ class Intake:
         return self._start
 
     def forget_jump(self) -> None:
-        """A position that jumped before the vehicle was taken (its autopilot has found an origin): count from
-        the start once more."""
+        """A position jumped before the vehicle was taken (a new origin): count from the start once more."""
         self.heard.jumped, self._origin = "", None
 
     def refuse(self, why: str) -> list[SensorMessage]:
-        """Count a message that is not used."""
         if why in self.heard.refused or len(self.heard.refused) < MOST_KINDS:
             self.heard.refused[why] += 1
         return []

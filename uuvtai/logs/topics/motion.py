@@ -49,8 +49,7 @@ def _transforms(moment: Moment) -> bytes:
 
 
 def _level_rotation(quat_wb: list[float]) -> tuple[float, float, float, float]:
-    """Quaternion (w, x, y, z) that turns a level frame with the vehicle's yaw into the body frame: undoes
-    roll and pitch."""
+    """Quaternion (w, x, y, z) from a level frame with the vehicle's yaw to the body frame: roll and pitch."""
     w, x, y, z = quat_wb
     half = 0.5 * math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     c, s = math.cos(half), math.sin(half)
@@ -86,8 +85,7 @@ _COVARIANCE = record(
     sigma=described(FOUR, "[m, m, m, rad] standard deviations of x, y, z, yaw"),
     error=described(FOUR, "[m, m, m, rad] estimate less truth of x, y, z, yaw"),
 )
-_ROW_OF = (0, 1, 5)
-"""rows of x, y and heading among x, y, z, roll, pitch, yaw"""
+_ROW_OF = (0, 1, 5)  # rows of x, y and heading among x, y, z, roll, pitch, yaw
 
 
 def _covariance(moment: Moment) -> bytes:
@@ -112,13 +110,7 @@ def _read_pose(data: dict[str, Any]) -> tuple[float, float, float, float]:
 
 
 POSE_ROWS = (
-    Topic(
-        "/tf",
-        EVERY_STEP,
-        FRAME_TRANSFORMS,
-        _transforms,
-        ("vehicle.pos_w", "vehicle.quat_wb"),
-    ),
+    Topic("/tf", EVERY_STEP, FRAME_TRANSFORMS, _transforms, ("vehicle.pos_w", "vehicle.quat_wb")),
     Topic(
         "/pose",
         EVERY_STEP,
@@ -147,9 +139,7 @@ POSE_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# How the vehicle moves, in truth and by its instruments.
-
+# ---- How the vehicle moves, in truth and by its instruments.
 
 _STATE = record(
     "uuv.State",
@@ -198,10 +188,8 @@ STATE_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the instruments themselves say, before anything is made of it: with the scans, and the exact images
-# where they were asked for, all that the stack decides by (``uuv replay``).
-
+# ---- What the instruments themselves say, before anything is made of it: with the scans, and the exact
+# images where they were asked for, all that the stack decides by (``uuv replay``).
 
 _NEW_VELOCITY = When(
     "every reading of the DVL", lambda moment, waited: bool(moment["ego.dvl_fresh"]), ("ego.dvl_fresh",)
@@ -246,8 +234,7 @@ INSTRUMENT_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What happens now and then, as lines of text.
+# ---- What happens now and then, as lines of text.
 
 
 def _lines(moment: Moment) -> list[bytes]:

@@ -128,8 +128,7 @@ _SIZES = {"sphere": [0], "cylinder": [0, 2], "box": [0, 1, 2]}
 _SHAPES = {"sphere": "spheres", "cylinder": "cylinders", "box": "cubes"}
 _TRACK_TEXT = '{"x":%.9g,"y":%.9g,"z":%.9g,"vx":%.9g,"vy":%.9g,"radius":%.9g,'
 _BELIEF_TEXT = '"turn_rate":%.9g,"turn_variance":%.9g,"present":%.9g,"above":%s,"below":%s,'
-_FREE_M = 1e5
-"""Bounds beyond are no bounds."""
+_FREE_M = 1e5  # Bounds beyond are no bounds.
 
 
 def _goal(moment: Moment) -> bytes:
@@ -149,7 +148,6 @@ def _goal(moment: Moment) -> bytes:
 
 
 def _tank_lines(tank: dict[str, Any]) -> list[dict[str, Any]]:
-    """Outline of floor and surface."""
     (x0, x1), (y0, y1) = tank["x_m"], tank["y_m"]
     flat = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
     if tank["shape"] == "circle":
@@ -185,7 +183,6 @@ def _scene(moment: Moment) -> bytes:
 
 
 def _truth(moment: Moment) -> bytes:
-    """The true bodies as numbers."""
     bodies = []
     for slot, kind in _kinds(moment):
         size = moment["world.size"][slot][_SIZES[kind]].tolist()
@@ -284,13 +281,9 @@ BODY_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The vehicle's map: occupancy, clearance and risk as grids. Colours are for viewers, ``value`` is what the
-# vehicle has.
+# ---- The map: occupancy, clearance and risk. Colours are for viewers, ``value`` is what the vehicle has.
 
-
-Paint = Callable[[np.ndarray], tuple[Any, Any, Any, Any]]
-"""red, green, blue, alpha of a layer's values"""
+Paint = Callable[[np.ndarray], tuple[Any, Any, Any, Any]]  # red, green, blue, alpha of a layer's values
 
 _CELL = np.dtype([("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1"), ("value", "<f4")])
 _FIELDS = [
@@ -305,10 +298,8 @@ class Layer:
 
     packed: bytes
     shape: tuple[int, int]
-    kind: str
-    """NumPy's name of the type of the values"""
-    origin_m: tuple[float, float]
-    """world x, y of the outer corner of cell [0, 0]"""
+    kind: str  # NumPy's name of the type of the values
+    origin_m: tuple[float, float]  # world x, y of the outer corner of cell [0, 0]
     cell_m: float
 
     @classmethod
@@ -324,7 +315,6 @@ class Layer:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes."""
         return len(self.packed)
 
 
@@ -365,8 +355,7 @@ def _grid(moment: Moment, stamp: str, values: np.ndarray, paint: Paint) -> bytes
 def grid_text(
     stamp: str, frame: str, pose: dict[str, Any], cell_m: float, values: np.ndarray, paint: Paint
 ) -> bytes:
-    """foxglove.Grid of ``values`` (row, col); ``pose``: of the outer corner of cell [0, 0]. Raises ValueError
-    for values that are not finite."""
+    """foxglove.Grid of ``values`` (row, col), its outer corner at ``pose``. ValueError unless finite."""
     if not np.isfinite(values).all():
         raise ValueError("a map with values that are not finite")
     cells = np.empty(values.shape, _CELL)
@@ -387,8 +376,7 @@ def grid_text(
 
 
 def map_origin(config: Config, shape: tuple[int, ...]) -> tuple[float, float]:
-    """World (x, y) [m] of the outer corner of cell [0, 0] of a map of this shape (n_row, n_col), in whose
-    middle the tank lies."""
+    """World (x, y) [m] of the outer corner of cell [0, 0] of a map (n_row, n_col) around the tank."""
     cell_m = config.mapping.cell_m
     first_x, first_y = (
         low - (count - round((high - low) / cell_m)) // 2 * cell_m
@@ -400,12 +388,10 @@ def map_origin(config: Config, shape: tuple[int, ...]) -> tuple[float, float]:
 
 
 def static_colors(values: np.ndarray) -> tuple[int, int, int, np.ndarray]:
-    """Paint of what rests."""
     return 38, 44, 56, _byte(values)
 
 
 def dynamic_colors(values: np.ndarray) -> tuple[int, int, int, np.ndarray]:
-    """Paint of what moves."""
     return 229, 57, 70, _byte(values)
 
 

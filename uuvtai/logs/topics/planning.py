@@ -61,7 +61,6 @@ def waypoints_of(moment: Moment) -> np.ndarray:
 
 
 def planner_of(moment: Moment) -> str:
-    """Who planned the route."""
     return code_name(PLANNERS, moment["route.planner"])
 
 
@@ -124,14 +123,10 @@ PLAN_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What drives: action, policy, safety, behaviour tree.
+# ---- What drives: action, policy, safety, behaviour tree.
 
-
-_FAR = 1e5
-"""A time to collision beyond stands for "nothing closes in" in the simulator."""
-_STATUSES = ("IDLE", "RUNNING", "SUCCESS", "FAILURE")
-"""by the codes of ``tree_codes``"""
+_FAR = 1e5  # A time to collision beyond stands for "nothing closes in" in the simulator.
+_STATUSES = ("IDLE", "RUNNING", "SUCCESS", "FAILURE")  # by the codes of ``tree_codes``
 
 _ACTION = record(
     "uuv.Action",
@@ -296,13 +291,7 @@ DRIVER_ROWS = (
         ),
         varies="Each term of the reward under its own name ([`reward`](configuration/reward.md)): number",
     ),
-    Topic(
-        "/evasion",
-        EVADING,
-        _EVASION,
-        _evasion,
-        (*(f"teacher.{name}" for name in _DECISION), *_OWN),
-    ),
+    Topic("/evasion", EVADING, _EVASION, _evasion, (*(f"teacher.{name}" for name in _DECISION), *_OWN)),
     Topic(
         "/safety",
         EVERY_STEP,

@@ -117,14 +117,7 @@ SONAR_ROWS = (
         NEW_SCAN,
         LASER_SCAN,
         _scan,
-        (
-            "scan.ping_step",
-            "scan.hit",
-            "scan.range_m",
-            "scan.intensity",
-            "scan.new_from",
-            "scan.new_count",
-        ),
+        ("scan.ping_step", "scan.hit", "scan.range_m", "scan.intensity", "scan.new_from", "scan.new_count"),
         _read_scan,
     ),
     Topic(
@@ -138,17 +131,12 @@ SONAR_ROWS = (
 )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What the camera sees: on request whole images, and always what the map takes from them, without which
+# ---- What the camera sees: on request whole images, and always what the map takes from them, without which
 # nobody could redo the map.
 
-
-_NO_RETURN_SHARE = 0.999
-"""As in ``kernels.evidence``: a pixel beyond this share of the camera's range saw nothing."""
-_PNG_HEAD = struct.Struct(">8s4x4sII")
-"""signature, first chunk's name, width, height"""
-_MAX_PIXELS = 1 << 24
-"""of a depth image: a thousand times the camera's, and far below what a small file can claim"""
+_NO_RETURN_SHARE = 0.999  # as in ``kernels.evidence``: a pixel beyond this share of the range saw nothing
+_PNG_HEAD = struct.Struct(">8s4x4sII")  # signature, first chunk's name, width, height
+_MAX_PIXELS = 1 << 24  # of a depth image: a thousand times the camera's, far below what a file can claim
 
 _DEPTH_LINE = record(
     "uuv.DepthLine",
@@ -220,8 +208,7 @@ def _png(moment: Moment) -> bytes:
 
 
 def logged_image(data: dict[str, Any]) -> np.ndarray:
-    """PNG of a foxglove.CompressedImage (row, col): depth [mm] as uint16, a sonar's intensity as uint8.
-    Raises LogError."""
+    """PNG of a CompressedImage (row, col): depth [mm] uint16, sonar's intensity uint8. Raises LogError."""
     png = base64.b64decode(data["data"])
     signature, name, width, height = _PNG_HEAD.unpack_from(png.ljust(_PNG_HEAD.size, b"\0"))
     if signature != b"\x89PNG\r\n\x1a\n" or name != b"IHDR":
@@ -245,8 +232,7 @@ def _exact(moment: Moment) -> bytes:
 
 
 def exact_image(data: dict[str, Any], shape: tuple[int, int]) -> np.ndarray:
-    """Depth image [m] of a uuv.DepthExact, float32 (rows, cols). Raises LogError for one that is damaged or
-    has another shape than the config's camera."""
+    """Depth image [m] of a uuv.DepthExact, float32 of ``shape``. Raises LogError for a damaged one."""
     if (data["rows"], data["columns"]) != shape:
         raise LogError(
             f"an exact depth image of the log has {data['rows']} x {data['columns']} pixels, but its "

@@ -34,13 +34,9 @@ from uuvtai.vehicle.embedded import runtime
 from uuvtai.vehicle.embedded.runtime import GOLDEN, MEMORY, SCHEMA, SPEC, decided, digest_of, packed_messages
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, SensorMessage, SimStack
 
-# ------------------------------------------------------------------------------------------------------------
-# One pilot's first steps, written down: which kernels run in which order on which arguments, and LLVM's text
-# of each.
+# ---- One pilot's first steps: which kernels run in which order on which arguments, and LLVM's text of each.
 
-
-Line = dict[str, Any]
-"""{"kernel": its number, "arguments": [..]} or {"do": what the host does}"""
+Line = dict[str, Any]  # {"kernel": its number, "arguments": [..]} or {"do": what the host does}
 
 
 @dataclass(frozen=True)
@@ -56,19 +52,14 @@ class RecordedKernel:
 class Tape:
     """What was written down."""
 
-    memory: np.ndarray
-    """all arrays before the first step, bytes"""
-    arrays: dict[str, dict[str, Any]]
-    """where each lies in it, by 'struct.field'"""
+    memory: np.ndarray  # all arrays before the first step, bytes
+    arrays: dict[str, dict[str, Any]]  # where each lies in it, by 'struct.field'
     kernels: list[RecordedKernel] = field(default_factory=list)
     tensors: list[tuple[list[int], str]] = field(default_factory=list)
     """(shape, dtype) of arguments that are arrays; the first three: mask, seed and number of the episode"""
-    begin: list[Line] = field(default_factory=list)
-    """the first step"""
-    step: list[Line] = field(default_factory=list)
-    """every other one"""
-    keep: list[Line] = field(default_factory=list)
-    """what is launched where a route could not be planned"""
+    begin: list[Line] = field(default_factory=list)  # the first step
+    step: list[Line] = field(default_factory=list)  # every other one
+    keep: list[Line] = field(default_factory=list)  # what is launched where a route could not be planned
 
 
 def record(config: Config, tree: FlatTree, mission: Mission) -> tuple[Tape, Sim]:
@@ -224,10 +215,8 @@ class _ToldSensors:
         return told
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From LLVM's text of the stack's kernels to a shared library for another machine: compiled by llvmlite,
+# ---- From LLVM's text of the stack's kernels to a shared library for another machine: compiled by llvmlite,
 # linked by LLD (package ziglang).
-
 
 EXTRA = "uuvtai[aboard]"
 _OF_A_PROCESSOR = re.compile(r'"(?:target-cpu|target-features|tune-cpu)"="[^"]*"')
@@ -265,8 +254,7 @@ class MachineKind:
     triple: str
     cpu: str
     features: str
-    emulation: str
-    """LLD's word for it"""
+    emulation: str  # LLD's word for it
 
 
 KINDS = {
@@ -282,8 +270,7 @@ def function_name(number: int) -> str:
 
 
 def library_of(kernels: Sequence[RecordedKernel], kind: MachineKind) -> bytes:
-    """A shared library with a function ``function_name(i)(arguments, runtime)`` for each kernel, and
-    ``uuv_parallel_for``. Raises CrossError."""
+    """Library with ``function_name(i)(arguments, runtime)`` a kernel, ``uuv_parallel_for``. CrossError."""
     words = linker()
     objects = [_object(PARALLEL_FOR, kind, "uuv_parallel_for")]
     for number, kernel in enumerate(kernels):
@@ -363,11 +350,7 @@ def _object(text: str, kind: MachineKind, public: str) -> bytes:
     return machine.emit_object(module)
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
-PACKAGE = "uuv_stack"
-"""of the copied files"""
+PACKAGE = "uuv_stack"  # of the copied files
 CHECKED_STEPS = 500
 _ROOT = Path(__file__).parents[2]
 _COPIED = (

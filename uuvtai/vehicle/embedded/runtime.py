@@ -63,7 +63,6 @@ class CarriedStack:
         self._run(self._begin, sensors)
 
     def step(self, sensors: FedSensors) -> None:
-        """A control step."""
         self._run(self._step, sensors)
 
     def _run(self, lines: list[Any], sensors: FedSensors) -> None:
@@ -141,8 +140,7 @@ class _Shape:
 def carried_pilot(
     folder: Path, mission: Mission | None = None, limits: StaleLimits | None = None
 ) -> FedPilot:
-    """The pilot of a folder; without a ``mission`` on that of the log that it was exported with. Raises
-    StackFolderError."""
+    """The pilot of a folder, on ``mission`` or that of the exported log. Raises StackFolderError."""
     stack = CarriedStack(folder)
     numbers: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
@@ -205,13 +203,10 @@ def _aligned(n_bytes: int) -> np.ndarray:
     return whole[begin : begin + n_bytes]
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Messages of a log and what was decided on them, and whether a folder's code decides the same:
-# ``python -m uuv_stack FOLDER``. Copied into every exported folder.
+# ---- Messages of a log and what was decided on them, and whether a folder's code decides the same: ``python
+# -m uuv_stack FOLDER``. Copied into every exported folder.
 
-
-AGREES = 1e-4
-"""largest difference between two commands, each in [-1, 1], that counts as none"""
+AGREES = 1e-4  # largest difference between two commands, each in [-1, 1], that counts as none
 
 
 def packed_messages(arrivals: list[tuple[int, SensorMessage]]) -> dict[str, np.ndarray]:
@@ -238,10 +233,7 @@ def messages_in(packed: Any, image: tuple[int, ...]) -> list[tuple[int, SensorMe
     kinds = list(KINDS.items())
     fields = {
         f"{name}.{member.name}": iter(
-            np.split(
-                packed[f"{name}.{member.name}"],
-                np.cumsum(packed[f"{name}.{member.name}.length"])[:-1],
-            )
+            np.split(packed[f"{name}.{member.name}"], np.cumsum(packed[f"{name}.{member.name}.length"])[:-1])
         )
         for name, kind in kinds
         for member in dataclasses.fields(kind)
@@ -278,8 +270,7 @@ def decided(pilot: Any, arrivals: list[tuple[int, SensorMessage]], steps: int) -
 
 
 def compare(folder: Path) -> dict[str, Any]:
-    """What a folder's code decides on this computer beside what was decided at its export. Raises
-    StackFolderError."""
+    """What a folder's code decides here beside what it did at its export. Raises StackFolderError."""
     pilot = carried_pilot(folder)
     with np.load(folder / GOLDEN, allow_pickle=False) as golden:
         arrivals, wanted = messages_in(golden, pilot.numbers.image), golden["commands"]

@@ -31,22 +31,17 @@ from uuvtai.vehicle.telemetry import AUTOPILOT, NEUTRAL_US, Motors, Senders
 
 ENDINGS = (".bin", ".tlog")
 STEP_S = 0.02
-_HOLE_S = 1.0
-"""pulses or attitude that are further apart part a log"""
+_HOLE_S = 1.0  # pulses or attitude that are further apart part a log
 _MOST_BYTES = 2 << 30
 _MOST_READINGS = 5_000_000
 _BIN_HEAD = b"\xa3\x95\x80"
 _CHANNELS = 16
 _STILL_N = 1e-6
-_FIRST_MOTOR = 33
-"""SERVOn_FUNCTION of the first motor; 40 is the eighth"""
-_EKF2 = 2
-"""AHRS_EKF_TYPE that steers by NKF1"""
+_FIRST_MOTOR = 33  # SERVOn_FUNCTION of the first motor; 40 is the eighth
+_EKF2 = 2  # AHRS_EKF_TYPE that steers by NKF1
 _MOST_NAMED = 8
-_APART_S = 10.0
-"""the file's clock and ArduSub's that run apart by more belong to another start"""
-_OF_A_BIN = 0
-"""system of a DataFlash log, which is one vehicle's"""
+_APART_S = 10.0  # the file's clock and ArduSub's that run apart by more belong to another start
+_OF_A_BIN = 0  # system of a DataFlash log, which is one vehicle's
 
 
 @dataclass
@@ -76,23 +71,15 @@ class _Readings:
 class _Heard:
     """What a log holds of one vehicle between two starts of its autopilot."""
 
-    pulse: _Readings = field(default_factory=_Readings)
-    """[us] of 16 channels"""
-    angle: _Readings = field(default_factory=_Readings)
-    """[rad] roll, pitch, yaw"""
-    rate: _Readings = field(default_factory=_Readings)
-    """[rad/s]"""
-    dvl: _Readings = field(default_factory=_Readings)
-    """[m/s] ahead, right, down"""
-    filtered: _Readings = field(default_factory=_Readings)
-    """[m/s] north, east, down, by EKF3"""
-    older: _Readings = field(default_factory=_Readings)
-    """the same by EKF2, before ArduSub 4.1"""
+    pulse: _Readings = field(default_factory=_Readings)  # [us] of 16 channels
+    angle: _Readings = field(default_factory=_Readings)  # [rad] roll, pitch, yaw
+    rate: _Readings = field(default_factory=_Readings)  # [rad/s]
+    dvl: _Readings = field(default_factory=_Readings)  # [m/s] ahead, right, down
+    filtered: _Readings = field(default_factory=_Readings)  # [m/s] north, east, down, by EKF3
+    older: _Readings = field(default_factory=_Readings)  # the same by EKF2, before ArduSub 4.1
     armed: _Readings = field(default_factory=_Readings)
-    behind_s: float = math.inf
-    """the file's clock less ArduSub's, by the message that came soonest"""
-    apart: int = 0
-    """messages in a row that say something else of this"""
+    behind_s: float = math.inf  # the file's clock less ArduSub's, by the message that came soonest
+    apart: int = 0  # messages in a row that say something else of this
     parameters: dict[str, float] = field(default_factory=dict)
 
 
@@ -462,10 +449,6 @@ def _servos(heard: _Heard, m: Any, time_s: float) -> None:
         heard.pulse.add(time_s, *widths)
 
 
-def _beat(heard: _Heard, m: Any, time_s: float) -> None:
-    heard.armed.add(time_s, float(bool(m.base_mode & 128)))
-
-
 _OF_TLOG: dict[str, Take] = {
     "PARAM_VALUE": lambda heard, m, time_s: _parameter(heard, m.param_id, float(m.param_value)),
     "SERVO_OUTPUT_RAW": _servos,
@@ -474,5 +457,5 @@ _OF_TLOG: dict[str, Take] = {
         heard, time_s, m.time_delta_usec / 1e6, tuple(m.position_delta), m.confidence
     ),
     "LOCAL_POSITION_NED": lambda heard, m, time_s: heard.filtered.add(time_s, m.vx, m.vy, m.vz),
-    "HEARTBEAT": _beat,
+    "HEARTBEAT": lambda heard, m, time_s: heard.armed.add(time_s, float(bool(m.base_mode & 128))),
 }

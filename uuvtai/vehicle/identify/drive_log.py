@@ -21,8 +21,7 @@ from uuvtai.logs.reader import read_messages
 
 _MAX_CSV_BYTES = 256 << 20
 MAX_SAMPLES = 1_000_000
-_GAP = 0.3
-"""A step that differs from the usual one by more than this share parts a log in two."""
+_GAP = 0.3  # A step that differs from the usual one by more than this share parts a log in two.
 _SLOWEST_S = 0.5
 _NEEDED = ("t", "u", "v", "w", "r")
 
@@ -39,14 +38,10 @@ class Drive:
     """One drive without a gap, n samples ``dt_s`` apart."""
 
     dt_s: float
-    velocity: np.ndarray
-    """(n, 4) surge, sway, heave [m/s] and yaw rate [rad/s]; NaN = no reading"""
-    tilt_rate: np.ndarray
-    """(n, 2) roll and pitch rate [rad/s]"""
-    up: np.ndarray
-    """(n, 3) world z axis in body axes"""
-    rpm: np.ndarray
-    """(n, thrusters) rotor speeds, as turned"""
+    velocity: np.ndarray  # (n, 4) surge, sway, heave [m/s] and yaw rate [rad/s]; NaN = no reading
+    tilt_rate: np.ndarray  # (n, 2) roll and pitch rate [rad/s]
+    up: np.ndarray  # (n, 3) world z axis in body axes
+    rpm: np.ndarray  # (n, thrusters) rotor speeds, as turned
     command: Command = ""
     """whether they are as commanded instead: each ``held`` until the next sample, or on a ``line`` to it"""
     after: np.ndarray | None = None
@@ -60,7 +55,6 @@ class Drive:
 
     @property
     def is_asked(self) -> bool:
-        """Whether rotor speeds are as commanded."""
         return self.command != ""
 
     def otherwise(self) -> Drive | None:
@@ -220,9 +214,7 @@ def _numbers(path: Path, number: int, row: list[str], width: int) -> list[float]
     return values
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From rotor speeds to thrust: speeds as turned, or as commanded and followed with a lag of first order.
-
+# ---- From rotor speeds to thrust: speeds as turned, or as commanded and followed with a lag of first order.
 
 LEAST_LAG_S = 1e-3
 _INSTANTS = (0.03, 0.1025, 0.20125, 0.3325, 0.50375, 0.7, 0.9)
@@ -233,8 +225,7 @@ _WEIGHTS /= _WEIGHTS.sum(axis=1, keepdims=True)
 _NEAREST_RPM = 1e-3
 """A lagging rotor never quite arrives: one that comes to the dead band's edge from within does not push."""
 
-_STRAIGHT = 1e-6
-"""of a step to a lag, at which what decays runs straight"""
+_STRAIGHT = 1e-6  # of a step to a lag, at which what decays runs straight
 
 
 def mean_wrench(drive: Drive, vehicle_cfg: VehicleConfig, lags_s: np.ndarray) -> np.ndarray:

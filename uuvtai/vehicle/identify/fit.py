@@ -19,36 +19,12 @@ from uuvtai.common.files import refuse_output, whole_file
 from uuvtai.common.presets import preset_names
 from uuvtai.config import VehicleConfig
 from uuvtai.report.figures import Line, curves, png
+from uuvtai.vehicle.identify import model
 from uuvtai.vehicle.identify.ardusub_log import ENDINGS, read_ardusub
 from uuvtai.vehicle.identify.drive_log import Drive, DriveError, read_drives
-from uuvtai.vehicle.identify.model import (
-    AXES,
-    GAIN,
-    LAG,
-    LATE,
-    LEAST_STRETCHES,
-    MORE,
-    NET,
-    SCALE,
-    SIZE,
-    Stretches,
-    changed,
-    first_readings,
-    grown_starts,
-    linearised,
-    motion,
-    parameters_of,
-    readings,
-    settled_starts,
-    stretches,
-    undelayed,
-    unexcited,
-    unstepped,
-)
 
 _ROUNDS = 25
-_WEIGHED = (1, 3)
-"""rounds after which readings are weighed anew, by what is left"""
+_WEIGHED = (1, 3)  # rounds after which readings are weighed anew, by what is left
 _NOTHING, _LITTLE, _KEPT = 0.01, 1.0, 0.1
 """falls of the sum of squares that a step promises, in units of noise: below the first it is the last one,
 for no parameter moves by more than a tenth of its standard deviation; below the second it is if it keeps less
@@ -62,31 +38,27 @@ _NOISE = 0.02
 class Fit:
     """What least squares found."""
 
-    value: np.ndarray
-    """(17,)"""
-    low: np.ndarray
-    """(17,) of the 95 % interval; where nothing was fitted, the value itself"""
+    value: np.ndarray  # (17,)
+    low: np.ndarray  # (17,) of the 95 % interval; where nothing was fitted, the value itself
     high: np.ndarray
-    start: np.ndarray
-    """(s, 4) initial velocity of each stretch"""
-    noise: np.ndarray
-    """(4,) rms of what is left [m/s, rad/s]"""
+    start: np.ndarray  # (s, 4) initial velocity of each stretch
+    noise: np.ndarray  # (4,) rms of what is left [m/s, rad/s]
 
 
-def fitted(given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray) -> Fit:
+def fitted(given: model.Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray) -> Fit:
     """Fit the parameters ``free`` (17, bool), from ``first`` (17,) on; the others stay."""
-    value, start = first.copy(), first_readings(given)
-    noise = np.full(len(AXES), _NOISE)
+    value, start = first.copy(), model.first_readings(given)
+    noise = np.full(len(model.AXES), _NOISE)
     fault = np.inf
     back = (value, start)
     shrink, promised = 1.0, np.inf
     for i in range(_ROUNDS):
-        given = given.at_lag(value[LAG], vehicle_cfg)
+        given = given.at_lag(value[model.LAG], vehicle_cfg)
         if i <= _WEIGHED[-1]:
-            start = grown_starts(given, vehicle_cfg, value, noise)
+            start = model.grown_starts(given, vehicle_cfg, value, noise)
         else:
-            start = settled_starts(given, vehicle_cfg, value, start, noise)
-        jacobian, own, rest = linearised(given, vehicle_cfg, value, start, free, noise)
+            start = model.settled_starts(given, vehicle_cfg, value, start, noise)
+        jacobian, own, rest = model.linearised(given, vehicle_cfg, value, start, free, noise)
         now = float(np.sum(rest**2))
         if i > _WEIGHED[-1] + 1 and promised < _LITTLE and now > fault - _KEPT * promised:
             break
@@ -98,28 +70,30 @@ def fitted(given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free
         step, moved, promised = _step(jacobian, own, rest)
         settled = promised < _NOTHING
         value = value.copy()
-        value[free] += step * SCALE[free]
+        value[free] += step * model.SCALE[free]
         start = start + moved
         if settled or i in _WEIGHED:
-            given = given.at_lag(value[LAG], vehicle_cfg)
+            given = given.at_lag(value[model.LAG], vehicle_cfg)
             noise = _left(given, vehicle_cfg, value, start)
             fault = np.inf
         if settled and i > _WEIGHED[-1]:
             break
-    given = given.at_lag(value[LAG], vehicle_cfg)
-    start = settled_starts(given, vehicle_cfg, value, start, noise)
-    jacobian, own, rest = linearised(given, vehicle_cfg, value, start, free, noise)
+    given = given.at_lag(value[model.LAG], vehicle_cfg)
+    start = model.settled_starts(given, vehicle_cfg, value, start, noise)
+    jacobian, own, rest = model.linearised(given, vehicle_cfg, value, start, free, noise)
     low, high = _bootstrap(jacobian, own, rest)
     apart = _left_open(given, vehicle_cfg, (value, start), noise, jacobian, own)
     low, high = low - apart, high + apart
     bounds = [value.copy(), value.copy()]
     for bound, apart in zip(bounds, (low, high), strict=True):
-        bound[free] += apart * SCALE[free]
+        bound[free] += apart * model.SCALE[free]
     return Fit(value, bounds[0], bounds[1], start, _left(given, vehicle_cfg, value, start))
 
 
-def _left(given: Stretches, vehicle_cfg: VehicleConfig, value: np.ndarray, start: np.ndarray) -> np.ndarray:
-    away = given.velocity - readings(value[None], start[None], given, vehicle_cfg)[0]
+def _left(
+    given: model.Stretches, vehicle_cfg: VehicleConfig, value: np.ndarray, start: np.ndarray
+) -> np.ndarray:
+    away = given.velocity - model.readings(value[None], start[None], given, vehicle_cfg)[0]
     seen = ~np.isnan(away)
     count = np.maximum(1, seen.sum(axis=(0, 1)))
     return np.maximum(1e-5, np.sqrt(np.square(np.where(seen, away, 0.0)).sum(axis=(0, 1)) / count))
@@ -149,7 +123,7 @@ def _solved(square: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _left_open(
-    given: Stretches,
+    given: model.Stretches,
     vehicle_cfg: VehicleConfig,
     fit: tuple[np.ndarray, np.ndarray],
     noise: np.ndarray,
@@ -162,15 +136,14 @@ def _left_open(
     if other is None:
         return np.zeros(jacobian.shape[2])
     value, start = fit
-    said = [readings(value[None], start[None], one, vehicle_cfg)[0] for one in (given, other)]
+    said = [model.readings(value[None], start[None], one, vehicle_cfg)[0] for one in (given, other)]
     moved = np.where(np.isnan(given.velocity), 0.0, (said[0] - said[1]) / noise)
     square, right = _apart(jacobian, own, moved.reshape(len(moved), -1))
     return np.abs(_solved(square.sum(axis=0), right.sum(axis=0)))
 
 
 def _bootstrap(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(low, high) (k,) about the fit: one Gauss-Newton step for each draw of stretches, widened for the
-    parameters that were spent."""
+    """(low, high) (k,) about the fit: a Gauss-Newton step per draw of stretches, widened for parameters."""
     square, right = _apart(jacobian, own, rest)
     count, size = right.shape
     if not size:
@@ -186,16 +159,16 @@ def _bootstrap(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple
 
 
 def horizon_errors(
-    given: Stretches, vehicle_cfg: VehicleConfig, theta: np.ndarray, horizons: tuple[int, ...]
+    given: model.Stretches, vehicle_cfg: VehicleConfig, theta: np.ndarray, horizons: tuple[int, ...]
 ) -> dict[int, list[float | None]]:
     """Rms error (surge, sway, heave, yaw) of what is predicted that many steps ahead of a reading, by
     ``theta`` (17,), whose delays tell when it was so; None where no reading stands there. Horizons longer
     than a stretch are left out."""
     steps = given.wrench.shape[1]
-    assert theta.shape == (SIZE,)
-    given = given.at_lag(theta[LAG], vehicle_cfg)
+    assert theta.shape == (model.SIZE,)
+    given = given.at_lag(theta[model.LAG], vehicle_cfg)
     inputs = ("tilt_rate", "up", "wrench", "slope")
-    early = undelayed(given, theta)
+    early = model.undelayed(given, theta)
     if not np.isnan(early).any(axis=2).all():
         given = replace(given, velocity=early)
     whole = np.asarray(~np.isnan(given.velocity).any(axis=2))
@@ -213,7 +186,7 @@ def horizon_errors(
                 part = replace(given, velocity=given.velocity[:, begin : begin + ahead + 1], **cut).some(
                     picked
                 )
-                end = motion(theta[None], part.velocity[None, :, 0], part, vehicle_cfg)[0, :, -1]
+                end = model.motion(theta[None], part.velocity[None, :, 0], part, vehicle_cfg)[0, :, -1]
                 errors.append(end - part.velocity[:, -1])
         if errors:
             away = np.concatenate(errors)
@@ -224,30 +197,24 @@ def horizon_errors(
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv identify``: parameters with intervals, errors ahead and warnings from drives; the vehicle as YAML.
-
+# ---- ``uuv identify``: parameters with intervals, errors ahead and warnings from drives.
 
 KNOWN = ("gain", "added-mass", "buoyancy")
 """what may be held: speeds and rotor speeds alone tell ratios, one force or mass has to be known"""
 KINDS = ("added mass", "linear damping", "quadratic damping")
 HORIZONS = (1, 10, 100)
 _STRETCH_S = 5.0
-_HELD_OUT = 5
-"""one stretch in so many is predicted by a fit to the others"""
-_MOST_SAMPLES = 150_000
-"""of all stretches that are fitted, for each takes some seven kilobytes; 50 minutes at 50 Hz"""
+_HELD_OUT = 5  # one stretch in so many is predicted by a fit to the others
+_MOST_SAMPLES = 150_000  # of all stretches fitted, each some seven kilobytes; 50 minutes at 50 Hz
 _NOTHING_FOUND = 0.02
-"""share of an error ahead that is no difference: a fit is better where it is so by more at one horizon, and
-worse by more at none"""
-_LOOSE = 0.5
-"""An interval wider than this share of the value, to either side, is warned of."""
+"""a smaller share of an error ahead is no difference: fits are compared at every horizon by it"""
+_LOOSE = 0.5  # An interval wider than this share of the value, to either side, is warned of.
 _OTHERS = {
-    NET: ("net buoyancy", "N"),
-    GAIN: ("thruster gain", ""),
-    LAG: ("rotor lag", "s"),
-    LATE[0]: ("delay, velocity", "s"),
-    LATE[1]: ("delay, yaw rate", "s"),
+    model.NET: ("net buoyancy", "N"),
+    model.GAIN: ("thruster gain", ""),
+    model.LAG: ("rotor lag", "s"),
+    model.LATE[0]: ("delay, velocity", "s"),
+    model.LATE[1]: ("delay, yaw rate", "s"),
 }
 """name and unit of what no axis has"""
 _UNITS = ("kg", "N s/m", "N s2/m2"), ("kg m2", "N m s", "N m s2")
@@ -258,12 +225,9 @@ class Identified:
     """The document of ``uuv identify --json`` and what its files are made of."""
 
     document: dict[str, Any]
-    keys: dict[str, object]
-    """of the vehicle section, as found"""
-    measured: np.ndarray
-    """(s, n + 1, 4) readings, NaN = none"""
-    predicted: np.ndarray
-    """(s, n + 1, 4) by the fitted vehicle"""
+    keys: dict[str, object]  # of the vehicle section, as found
+    measured: np.ndarray  # (s, n + 1, 4) readings, NaN = none
+    predicted: np.ndarray  # (s, n + 1, 4) by the fitted vehicle
     dt_s: float
 
 
@@ -271,45 +235,41 @@ class Identified:
 class FittedDrives:
     """What was fitted to drives."""
 
-    given: Stretches
-    first: np.ndarray
-    """(17,) of the vehicle given"""
-    free: np.ndarray
-    """(17,) which were fitted"""
+    given: model.Stretches
+    first: np.ndarray  # (17,) of the vehicle given
+    free: np.ndarray  # (17,) which were fitted
     fit: Fit
-    entries: list[dict[str, Any]]
-    """of the document, one for each parameter"""
+    entries: list[dict[str, Any]]  # of the document, one for each parameter
     warnings: list[str]
 
 
 def fitted_drives(
     drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain", held: Collection[int] = ()
 ) -> FittedDrives:
-    """Parameters with intervals, without errors ahead; as ``identified``. ``held``: places that stay as
-    given. Raises DriveError."""
+    """Parameters with intervals; as ``identified``. ``held``: places that stay. Raises DriveError."""
     if known not in KNOWN:
         raise DriveError(f"--known must be one of {', '.join(KNOWN)}, got {known!r}")
     if not drives:
         raise DriveError("the logs hold no drive: drive for five minutes")
-    given = stretches(drives, vehicle_cfg, _STRETCH_S)
+    given = model.stretches(drives, vehicle_cfg, _STRETCH_S)
     count = len(given.velocity)
-    if count < LEAST_STRETCHES:
+    if count < model.LEAST_STRETCHES:
         raise DriveError(
-            f"the logs hold {count} stretches of {_STRETCH_S:g} s without a gap, {LEAST_STRETCHES} are "
+            f"the logs hold {count} stretches of {_STRETCH_S:g} s without a gap, {model.LEAST_STRETCHES} are "
             "needed: drive for five minutes, or give more logs"
         )
     warnings, most = [], _MOST_SAMPLES // given.wrench.shape[1]
     if count > most:
         given = given.some(np.linspace(0, count - 1, most).astype(int))
         warnings.append(f"of {count} stretches {most} are fitted, evenly spread; five minutes are enough")
-    idle = unexcited(given)
-    if len(idle) == len(AXES):
+    idle = model.unexcited(given)
+    if len(idle) == len(model.AXES):
         raise DriveError(f"the logs excite no axis; {'; '.join(idle.values())}")
-    lagless = unstepped(drives)
-    first, free = parameters_of(vehicle_cfg), _free(idle, known, not lagless)
+    lagless = model.unstepped(drives)
+    first, free = model.parameters_of(vehicle_cfg), _free(idle, known, not lagless)
     free[list(held)] = False
     fit = fitted(given, vehicle_cfg, first, free)
-    entries = [_entry(place, first, fit, bool(free[place])) for place in range(SIZE)]
+    entries = [_entry(place, first, fit, bool(free[place])) for place in range(model.SIZE)]
     warnings += [f"{text}; its numbers stay those of the vehicle given" for text in idle.values()]
     if lagless:
         warnings.append(f"rotor lag: {lagless}; it stays that of the vehicle given")
@@ -336,13 +296,13 @@ def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "ga
         "seconds": round(count * _STRETCH_S, 3),
         "stretches": count,
         "parameters": made.entries,
-        "residual_rms": dict(zip(AXES, fit.noise.tolist(), strict=True)),
+        "residual_rms": dict(zip(model.AXES, fit.noise.tolist(), strict=True)),
         "horizons": horizons,
         "warnings": [*kept, *made.warnings],
     }
-    given = given.at_lag(fit.value[LAG], vehicle_cfg)
-    predicted = readings(fit.value[None], fit.start[None], given, vehicle_cfg)[0]
-    return Identified(document, changed(vehicle_cfg, fit.value), given.velocity, predicted, given.dt_s)
+    given = given.at_lag(fit.value[model.LAG], vehicle_cfg)
+    predicted = model.readings(fit.value[None], fit.start[None], given, vehicle_cfg)[0]
+    return Identified(document, model.changed(vehicle_cfg, fit.value), given.velocity, predicted, given.dt_s)
 
 
 def _judged(
@@ -354,23 +314,26 @@ def _judged(
     kept, given = [], []
     while True:
         made = fitted_drives(drives, vehicle_cfg, known, held)
-        negative = [entry for entry in made.entries if entry["fitted"] and _is_negative(entry)]
+        signed = (model.NET, *model.LATE)
+        negative = [e for e in made.entries if e["fitted"] and e["value"] < 0 and e["place"] not in signed]
         if negative:
             held.update(entry["place"] for entry in negative)
             kept += [
                 f"{entry['name']}: came out negative ({entry['value']:.3g} {entry['unit']}) and stays that "
-                f"of the vehicle given; {MORE[entry['kind']]}"
+                f"of the vehicle given; {model.MORE[entry['kind']]}"
                 for entry in negative
             ]
             continue
         values = made.first, made.fit.value
         horizons = _horizons(made.given, vehicle_cfg, values, made.free)
-        worse = {text: places for i in range(len(AXES)) for text, places in _worse(i, horizons, made.free)}
+        worse = {
+            text: places for i in range(len(model.AXES)) for text, places in _worse(i, horizons, made.free)
+        }
         given += worse
-        held.update(place for places in worse.values() for place in (*places, GAIN))  # what it is given for
+        held.update(place for places in worse.values() for place in (*places, model.GAIN))
         left = made.free.copy()
         left[list(held)] = False
-        if not left[: NET + 1].any():
+        if not left[: model.NET + 1].any():
             raise DriveError(
                 "the logs improve no number of the vehicle given, and nothing is written; on stretches that "
                 f"were not fitted: {'; '.join(given) or 'no axis is left'}. Keep that vehicle, or see that "
@@ -381,15 +344,13 @@ def _judged(
             return made, horizons, kept
 
 
-def _is_negative(entry: dict[str, Any]) -> bool:
-    return entry["value"] < 0 and entry["place"] not in (NET, *LATE)
-
-
 def _worse(axis: int, horizons: dict[str, Any], free: np.ndarray) -> list[tuple[str, list[int]]]:
     """[] where the fit is better on an axis than the vehicle given, or nothing of it is fitted; else how much
     worse it is, and the places of the axis."""
     places = [
-        place for place in (axis, axis + 4, axis + 8, NET) if free[place] and (place != NET or axis == 2)
+        place
+        for place in (axis, axis + 4, axis + 8, model.NET)
+        if free[place] and (place != model.NET or axis == 2)
     ]
     pairs = [
         (steps, ours[axis], horizons["given"][steps][axis])
@@ -399,29 +360,29 @@ def _worse(axis: int, horizons: dict[str, Any], free: np.ndarray) -> list[tuple[
     shares = [ours / max(given, 1e-9) for _, ours, given in pairs]
     if not places or (shares and min(shares) < 1 - _NOTHING_FOUND and max(shares) < 1 + _NOTHING_FOUND):
         return []
-    unit = "rad/s" if AXES[axis] == "yaw" else "m/s"
+    unit = "rad/s" if model.AXES[axis] == "yaw" else "m/s"
     said = ", ".join(
         f"{ours:.3g} against {given:.3g} {unit} {steps} steps ahead" for steps, ours, given in pairs
     )
-    return [(f"{AXES[axis]} is no better ({said or 'no readings'})", places)]
+    return [(f"{model.AXES[axis]} is no better ({said or 'no readings'})", places)]
 
 
 def _free(idle: dict[str, str], known: str, shows_lag: bool) -> np.ndarray:
     """(17,) which parameters are fitted."""
-    late = [any(axis not in idle for axis in axes) for axes in (AXES[:3], AXES[3:])]
-    free = np.array([axis not in idle for _ in KINDS for axis in AXES] + [True, True, shows_lag, *late])
+    late = [any(axis not in idle for axis in axes) for axes in (model.AXES[:3], model.AXES[3:])]
+    free = np.array([axis not in idle for _ in KINDS for axis in model.AXES] + [True, True, shows_lag, *late])
     if known == "gain":
-        free[GAIN] = False
+        free[model.GAIN] = False
     elif known == "buoyancy":
-        free[NET] = False
+        free[model.NET] = False
     else:
-        free[: len(AXES)] = False
+        free[: len(model.AXES)] = False
     return free
 
 
 def _entry(place: int, first: np.ndarray, fit: Fit, is_fitted: bool) -> dict[str, Any]:
-    if place < NET:
-        kind, axis = KINDS[place // 4], AXES[place % 4]
+    if place < model.NET:
+        kind, axis = KINDS[place // 4], model.AXES[place % 4]
         name, unit = f"{kind}, {axis}", _UNITS[axis == "yaw"][place // 4]
     else:
         name, unit = _OTHERS[place]
@@ -444,14 +405,14 @@ def _warning(entry: dict[str, Any]) -> str:
     if not entry["fitted"]:
         return ""
     half = 0.5 * (entry["high"] - entry["low"])
-    size = max(abs(entry["value"]), abs(entry["given"]), float(SCALE[entry["place"]]))
+    size = max(abs(entry["value"]), abs(entry["given"]), float(model.SCALE[entry["place"]]))
     if half > _LOOSE * size:
-        return f"{entry['name']}: known to {half:.2g} {entry['unit']} only; {MORE[entry['kind']]}"
+        return f"{entry['name']}: known to {half:.2g} {entry['unit']} only; {model.MORE[entry['kind']]}"
     return ""
 
 
 def _horizons(
-    given: Stretches,
+    given: model.Stretches,
     vehicle_cfg: VehicleConfig,
     values: tuple[np.ndarray, np.ndarray],
     free: np.ndarray,
@@ -461,7 +422,8 @@ def _horizons(
     where this one sets out."""
     held = np.arange(len(given.velocity)) % _HELD_OUT == _HELD_OUT - 1
     first, found = values
-    seen, unseen, late = given.some(~held), given.some(held), free & np.isin(np.arange(SIZE), LATE)
+    seen, unseen = given.some(~held), given.some(held)
+    late = free & np.isin(np.arange(model.SIZE), model.LATE)
     fits = (("identified", found, free), ("given", first, late))
     models = {name: fitted(seen, vehicle_cfg, begin, which).value for name, begin, which in fits}
     return {
@@ -485,8 +447,7 @@ def vehicle_yaml(found: Identified, base: str, files: Sequence[Path]) -> str:
     return "\n".join(line.replace("\n", " ") for line in lines) + "\n" + body
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From logs to files: the vehicle as YAML, predicted against measured as a picture beside it.
+# ---- From logs to files: the vehicle as YAML, predicted against measured as a picture beside it.
 
 
 def identify(
@@ -515,12 +476,8 @@ def identify(
         with whole_file(path) as (file, _):
             file.write(content)
     warnings = [*found.document["warnings"], *notes]
-    return {
-        **found.document,
-        "warnings": warnings,
-        "files": [str(file) for file in files],
-        "vehicle": str(out),
-    }
+    named = {"files": [str(file) for file in files], "vehicle": str(out)}
+    return {**found.document, "warnings": warnings, **named}
 
 
 def _drives(
@@ -543,7 +500,7 @@ def prediction_png(found: Identified) -> bytes:
     count = max(1, round(_SHOWN_S / (steps * found.dt_s)))
     time_s = np.arange(min(count, len(found.measured)) * steps) * found.dt_s
     panels = []
-    for i, axis in enumerate(AXES):
+    for i, axis in enumerate(model.AXES):
         measured, predicted = (
             speeds[:count, :steps, i].ravel() for speeds in (found.measured, found.predicted)
         )

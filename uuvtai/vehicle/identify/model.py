@@ -16,23 +16,17 @@ from uuvtai.sim.setup import allocation_matrices
 from uuvtai.vehicle.identify.drive_log import LEAST_LAG_S, Drive, DriveError, mean_wrench
 
 AXES = ("surge", "sway", "heave", "yaw")
-_OF_SIX = (0, 1, 2, 5)
-"""where those stand among six"""
-NET, GAIN = 12, 13
-"""places of net buoyancy and gain, behind added mass, linear and quadratic damping of the four axes"""
-LAG, LATE = 14, (15, 16)
-"""of the rotors' lag, and of the delays of velocity and yaw rate [s]"""
+_OF_SIX = (0, 1, 2, 5)  # where those stand among six
+NET, GAIN = 12, 13  # places of net buoyancy and gain, behind added mass and damping of the four axes
+LAG, LATE = 14, (15, 16)  # of the rotors' lag, and of the delays of velocity and yaw rate [s]
 SIZE = 17
 _LONGEST_STEP_S = 0.025
-_FAST = 20.0
-"""[m/s, rad/s] a trial's motion ends here"""
+_FAST = 20.0  # [m/s, rad/s] a trial's motion ends here
 _LAG_STEP_S = 1e-3
-_LATEST_S = 0.15
-"""readings at the begin of a stretch that a delay may have from before it; they are left out"""
+_LATEST_S = 0.15  # readings at the begin of a stretch that a delay may have from before it; they are left out
 _FORGOTTEN_S = 1.0
 """begin of a drive with commanded speeds that is left out: how the rotors turned before it is not known"""
-_READ = (slice(0, 3), slice(3, 4))
-"""axes of the two instruments"""
+_READ = (slice(0, 3), slice(3, 4))  # axes of the two instruments
 
 
 @dataclass(frozen=True)
@@ -40,32 +34,24 @@ class Stretches:
     """Stretches of equal length cut from drives: s of them, n steps each."""
 
     dt_s: float
-    velocity: np.ndarray
-    """(s, n + 1, 4), NaN = no reading"""
-    tilt_rate: np.ndarray
-    """(s, n, 2) in the middle of each step"""
-    up: np.ndarray
-    """(s, n, 3) likewise"""
+    velocity: np.ndarray  # (s, n + 1, 4), NaN = no reading
+    tilt_rate: np.ndarray  # (s, n, 2) in the middle of each step
+    up: np.ndarray  # (s, n, 3) likewise
     wrench: np.ndarray
     """(s, n, 2, 4) of each step by the vehicle's own thrust curve [N, N m], with the lag ``lag_s``: its mean,
     and that weighted by the time left of the step"""
-    slope: np.ndarray
-    """(s, n, 2, 4) its change with the lag [N/s, N m/s]"""
+    slope: np.ndarray  # (s, n, 2, 4) its change with the lag [N/s, N m/s]
     lag_s: float
-    after: np.ndarray
-    """(s, n + 1, 2) [s] by how much later than their sample velocity and yaw rate were read"""
-    cuts: tuple[tuple[Drive, int], ...]
-    """where each was cut from, and at which step it begins"""
+    after: np.ndarray  # (s, n + 1, 2) [s] by how much later than their sample velocity and yaw rate were read
+    cuts: tuple[tuple[Drive, int], ...]  # where each was cut from, and at which step it begins
 
     def some(self, which: np.ndarray) -> Stretches:
-        """These of them."""
         names = ("velocity", "tilt_rate", "up", "wrench", "slope", "after")
         kept = np.arange(len(self.velocity))[which]
         cuts = tuple(self.cuts[i] for i in kept.tolist())
         return replace(self, cuts=cuts, **{name: getattr(self, name)[kept] for name in names})
 
     def begins(self, steps: int) -> Stretches:
-        """The first so many steps of each."""
         of_steps = {name: getattr(self, name)[:, :steps] for name in ("tilt_rate", "up", "wrench", "slope")}
         of_samples = {name: getattr(self, name)[:, : steps + 1] for name in ("velocity", "after")}
         return replace(self, **of_steps, **of_samples)
@@ -80,7 +66,6 @@ class Stretches:
         return replace(self, wrench=found[0], slope=found[1], cuts=cuts)
 
     def at_lag(self, lag_s: float, vehicle_cfg: VehicleConfig) -> Stretches:
-        """The same with the wrench of another lag."""
         lag_s = max(lag_s, LEAST_LAG_S)
         if lag_s == self.lag_s or not any(drive.is_asked for drive, _ in self.cuts):
             return self
@@ -237,8 +222,7 @@ class _Body:
     gain: np.ndarray
     net: np.ndarray
     munk: np.ndarray
-    rolling: float
-    """[kg m2] yaw moment of roll rate times pitch rate"""
+    rolling: float  # [kg m2] yaw moment of roll rate times pitch rate
 
     @staticmethod
     def of(theta: np.ndarray, vehicle_cfg: VehicleConfig) -> _Body:
@@ -282,9 +266,7 @@ def _moved(
     return np.clip(x + dt_s / 6 * (first + 4 * second + third), -_FAST, _FAST)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Derivatives of the readings with respect to parameters and initial velocities, by differences.
-
+# ---- Derivatives of the readings with respect to parameters and initial velocities, by differences.
 
 SCALE = np.array(
     [1.0] * 3 + [0.05] + [1.0] * 3 + [0.05] + [5.0] * 3 + [0.3] + [0.5, 0.1] + [0.02, 0.01, 0.01]
@@ -300,8 +282,7 @@ def linearised(
     free: np.ndarray,
     noise: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(s, readings, free), (s, readings, 4), (s, readings): derivatives and what is left, in units of
-    noise."""
+    """(s, readings, free), (s, readings, 4), (s, readings): derivatives and rest, in units of noise."""
     places = np.flatnonzero(free)
     runs = 1 + len(places) + len(AXES)
     theta, begin = np.tile(value, (runs, 1)), np.tile(start, (runs, 1, 1))
@@ -319,15 +300,12 @@ def linearised(
     return flat[..., : len(places)], flat[..., len(places) :], rest.reshape(count, -1)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The velocity that each stretch begins with: a first guess, and the one that suits the readings best.
-
+# ---- The velocity that each stretch begins with: a first guess, and the one that suits the readings best.
 
 _TRIES = 12
 _SHARES = (0.2, 0.5, 1.0)
 _DAMPING, _LESS, _MORE, _MOST = 1e-3, 0.1, 10.0, 1e9
-_NOTHING = 1e-3
-"""fall of the sum of squares, in units of noise, that is not worth a step"""
+_NOTHING = 1e-3  # fall of the sum of squares, in units of noise, that is not worth a step
 
 
 def first_readings(given: Stretches) -> np.ndarray:
@@ -380,19 +358,13 @@ def settled_starts(
     return best
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What a log must hold for an axis to be identified, and what to drive where it does not.
+# ---- What a log must hold for an axis to be identified, and what to drive where it does not.
 
-
-_FAST_SHARE = (0.12, 0.12, 0.12, 0.15)
-"""[m/s, m/s, m/s, rad/s] that a tenth of the readings must exceed"""
-_VARIED = (0.05, 0.05, 0.05, 0.08)
-"""standard deviation that the speed must have"""
+_FAST_SHARE = (0.12, 0.12, 0.12, 0.15)  # [m/s, m/s, m/s, rad/s] that a tenth of the readings must exceed
+_VARIED = (0.05, 0.05, 0.05, 0.08)  # standard deviation that the speed must have
 _LEAST_READINGS = 200
-_STEP_S, _STEP_RPM, _LEAST_STEPS = 0.1, 300.0, 20
-"""jumps of a commanded speed that the rotors' lag can be seen in"""
-LEAST_STRETCHES = 12
-"""a bootstrap over fewer says nothing"""
+_STEP_S, _STEP_RPM, _LEAST_STEPS = 0.1, 300.0, 20  # jumps of a commanded speed that show the rotors' lag
+LEAST_STRETCHES = 12  # a bootstrap over fewer says nothing
 
 
 def unexcited(given: Stretches) -> dict[str, str]:
