@@ -310,7 +310,7 @@ def test_a_pipe_is_not_waited_for(tmp_path, command):
 # ---------------------------------------------------------------------------------------------------- outputs
 
 
-@pytest.mark.parametrize("command", ["picture", "video", "convert", "repair"])
+@pytest.mark.parametrize("command", ["render", "convert", "repair"])
 def test_no_output_is_the_input_or_replaces_a_file(log_path, tmp_path, command, capfd):
     mine, log = tmp_path / "mine", tmp_path / "a.mcap"
     mine.write_text("precious")

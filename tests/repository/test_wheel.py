@@ -186,7 +186,7 @@ def test_the_installed_command_is_the_wheels_and_works_in_any_folder(installed, 
     assert "observation-only navigation" in uuv("--help")
     listed = json.loads(uuv("presets", "--json"))
     assert "pool" in listed["world"] and "bt" in listed["tree"]
-    assert "BTCPP_format" in uuv("presets", "show", "tree/bt")
+    assert "BTCPP_format" in uuv("presets", "show", "tree/bt", "--all")
 
 
 def test_the_examples_are_a_users_by_one_command_and_none_of_hers_is_overwritten(installed, uuv, tmp_path):

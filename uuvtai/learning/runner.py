@@ -3,7 +3,6 @@ how it all ends."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 import threading
@@ -187,22 +186,42 @@ def _policy(config: LearningConfig, device: str) -> AnyTrainer:
     return Trainer(_env(config, device), config)
 
 
-def _on_the_cpu(module: str, name: str) -> Callable[[LearningConfig, str], AnyTrainer]:
+def _surrogate() -> Callable[[LearningConfig], AnyTrainer]:
+    from uuvtai.learning.surrogate_trainer import TwinTrainer
+
+    return TwinTrainer
+
+
+def _numbers() -> Callable[[LearningConfig], AnyTrainer]:
+    from uuvtai.learning.parameter_search import TunerTrainer
+
+    return TunerTrainer
+
+
+def _forecast() -> Callable[[LearningConfig], AnyTrainer]:
+    from uuvtai.learning.forecast import ForecastTrainer
+
+    return ForecastTrainer
+
+
+def _on_the_cpu(
+    trainer: Callable[[], Callable[[LearningConfig], AnyTrainer]],
+) -> Callable[[LearningConfig, str], AnyTrainer]:
     """A trainer that brings its own environment. ConfigError for a GPU."""
 
     def made(config: LearningConfig, device: str) -> AnyTrainer:
         if device == "cuda":
             raise ConfigError(f"{config.learner}.enabled: it learns on the CPU; leave out --device cuda")
-        return getattr(importlib.import_module(f"uuvtai.learning.{module}"), name)(config)
+        return trainer()(config)
 
     return made
 
 
 _TRAINERS: dict[str, Callable[[LearningConfig, str], AnyTrainer]] = {
     "policy": _policy,
-    "twin": _on_the_cpu("surrogate_trainer", "TwinTrainer"),
-    "tuner": _on_the_cpu("parameter_search", "TunerTrainer"),
-    "forecaster": _on_the_cpu("forecast", "ForecastTrainer"),
+    "twin": _on_the_cpu(_surrogate),
+    "tuner": _on_the_cpu(_numbers),
+    "forecaster": _on_the_cpu(_forecast),
 }
 """by ``LearningConfig.learner``"""
 
