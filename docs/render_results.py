@@ -57,11 +57,7 @@ def measured(root: Path) -> str:
     """The lines above a table of evaluations."""
     document = _read(root / EVALUATIONS)
     seed = document["seed"]
-    seen = (
-        "This seed was looked at while tuning."
-        if seed in RETIRED_SEEDS
-        else "No tuning used this seed, and each agent was evaluated on it once."
-    )
+    seen = "This seed was looked at while tuning." if seed in RETIRED_SEEDS else "No tuning used this seed."
     return f"{document['episodes']:,} episodes of seed {seed} in each row, eight static obstacles.\n{seen}"
 
 
