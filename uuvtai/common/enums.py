@@ -1,4 +1,4 @@
-"""How an episode can stand and end: codes for kernels, names for logs, results and tables."""
+"""Codes for kernels, and their names for logs, results and tables: outcomes, plans, forecasts, sets."""
 
 OUTCOMES = ("running", "success", "collision", "ttc", "out_of_tank", "timeout")  # names by code
 RUNNING, SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT = range(len(OUTCOMES))

@@ -1,7 +1,7 @@
 """One scenario in closed form: what is in it, and where its bodies are at any time.
 
 Plain Python and NumPy in float64. The simulator moves its bodies by the same formula in float32
-(``kernels/world/paths.py``); logs, pictures and the privileged yardsticks take it from here.
+(``kernels/world/motion.py``); logs, pictures and the privileged yardsticks take it from here.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Launching kernels again without having Taichi look at them again: by machine code of their own where a
-simulator has offered its bundles (``making.adopt``), else by Taichi's."""
+simulator has offered its bundles (``codegen.adopt``), else by Taichi's."""
 
 from __future__ import annotations
 

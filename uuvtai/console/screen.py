@@ -312,7 +312,7 @@ _REDRAW_S = 5.0
 
 
 class TrainingProgress:
-    """What ``learn.run`` tells while it runs. The first iteration compiles: it is no part of the speed
+    """What ``learning.runner`` tells while it runs. The first iteration compiles: it is no part of the speed
     and of the time left."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""An evaluation in the terminal: the table of methods, pairs of methods, and why episodes failed."""
+"""What each command shows in the terminal."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def show_methods(screen: Screen, result: dict[str, Any]) -> None:
 
 
 def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
-    """Every two methods on the episodes that both played (``measure.evaluate.paired``); nothing where one
+    """Every two methods on the episodes that both played (``evaluation.results``); nothing where one
     method played alone."""
     if not pairs:
         return
@@ -525,7 +525,7 @@ def show_stack(document: dict[str, Any]) -> None:
 
 
 def show_export(screen: Screen, found: Any) -> None:
-    """One row per engine of a ``deploy.export`` result, where any could run, and what is damaged."""
+    """One row per engine of a ``learning.export`` result, where any could run, and what is damaged."""
     for damage in found.damages:
         say(damage)
     if found.agreements:

@@ -247,7 +247,7 @@ def _label(name: str) -> str:
 def export_run(
     run: str, out: Path | None, evaluations: list[Path], note: Callable[[str], None], force: bool
 ) -> Export:
-    """Export to ``out`` or runs/NAME_export. Raises as ``find_policy`` and ``deploy.export.export``."""
+    """Export to ``out`` or runs/NAME_export. Raises as ``find_policy`` and ``export``."""
     checkpoint = find_policy(run, note)
     name = policy_name(run, checkpoint)
     return export(checkpoint, name, out or Path("runs") / f"{name}_export", evaluations, note, force)
@@ -255,7 +255,7 @@ def export_run(
 
 def export_log(log: Path, out: Path | None, machines: Sequence[str]) -> dict[str, Any]:
     """Export the stack of a log of ``uuv eval --record`` to ``out`` or runs/NAME_export, with its messages as
-    a check. Raises as ``read_feed`` and ``aboard.stack_folder.export_stack``."""
+    a check. Raises as ``read_feed`` and ``vehicle.embedded.export.export_stack``."""
     from uuvtai.vehicle.embedded.export import export_stack
     from uuvtai.vehicle.replay import read_feed
 

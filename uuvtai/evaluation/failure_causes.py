@@ -412,7 +412,7 @@ def _bodies(config: Config, read: dict[str, np.ndarray]) -> Bodies:
     return Bodies(kind, read["world.size"].astype(float), read["world.yaw"].astype(float), speed, circle, lap)
 
 
-# ---- Explain failed episodes: play them again, label each (``causes.py``), and record the worst.
+# ---- Explain failed episodes: play them again, label each, and record the worst.
 
 EXAMPLES = 3  # Episodes named per label in the table.
 

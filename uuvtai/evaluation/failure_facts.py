@@ -1,5 +1,5 @@
-"""What was true in the last seconds of a failed episode, as numbers with names. Pure NumPy; ``causes.py``
-makes labels of them.
+"""What was true in the last seconds of a failed episode, as numbers with names. Pure NumPy;
+``failure_causes.py`` makes labels of them.
 
 The killer is what the referee stopped the episode for: the body with the least time to collision of a ``ttc``
 stop, otherwise what the hull touches. "Seen" means that a beam of a delivered scan met the body, "believed"
@@ -21,7 +21,7 @@ from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 
 # ---- What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach,
 # what its beams met. For explanations after the fact only; nothing that drives a vehicle may import it. Same
-# geometry as ``kernels/core/hull.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode have the
+# geometry as ``kernels/core/geometry.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode have the
 # samples first, shape (n, ...); bodies are on the next axis.
 
 Array = np.ndarray

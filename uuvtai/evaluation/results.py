@@ -1,5 +1,5 @@
-"""Finished episodes of an evaluation, on disk as soon as each is over: what an interrupted ``uuv eval`` need
-not play again."""
+"""What ``uuv eval`` was asked for and what it found: the request, each finished episode on disk as soon as it
+is over, paired differences, and the summary of an agent."""
 
 from __future__ import annotations
 

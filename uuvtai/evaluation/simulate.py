@@ -1,5 +1,4 @@
-"""Open-loop physics in endless water: what ``uuv simulate`` runs, to hold a vehicle against theory or one's
-own data."""
+"""One vehicle: open-loop physics in endless water (``uuv simulate``), and live episodes (``uuv watch``)."""
 
 from __future__ import annotations
 

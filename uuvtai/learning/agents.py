@@ -1,4 +1,4 @@
-"""The behaviour tree with numbers that were learnt: factors on its config's, row by row."""
+"""Learned agents that need the simulator: the tree with learned numbers, a policy over a set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Learn what moving bodies will do: what ``learn/run.py`` drives where ``forecaster.enabled``.
+"""Learn what moving bodies will do: what ``learning/runner.py`` drives where ``forecaster.enabled``.
 
 Every iteration plays episodes of one world in the simulator, driven by the tree, and fits a mixture density
 network to what the bodies behind the tracks then did, by likelihood.

@@ -1,4 +1,4 @@
-"""Multilayer perceptron with orthogonal initial weights drawn from a generator of its own."""
+"""Networks and what they need: perceptrons, actor and critic, normalisation, Adam, bfloat16, a NaN guard."""
 
 from __future__ import annotations
 

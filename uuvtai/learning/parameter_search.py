@@ -1,4 +1,4 @@
-"""Learn the behaviour tree's numbers: what ``learn/run.py`` drives where ``tuner.enabled``.
+"""Learn the behaviour tree's numbers: what ``learning/runner.py`` drives where ``tuner.enabled``.
 
 Every iteration plays episodes of one scene in the simulator, each with numbers of its own, and moves the best
 numbers so far: those for slow bodies or those for fast ones (``number_search``).

@@ -77,7 +77,7 @@ class TrainWatch(Protocol):
 AnyTrainer = Union["Trainer", "TwinTrainer", "TunerTrainer", "ForecastTrainer"]
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
-(``measure.evaluate.while_training.evaluate_now``, which knows what learning does not)"""
+(``evaluation.evaluate.evaluate_now``, which knows what learning does not)"""
 
 
 def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple[dict[str, Any], Path]:

@@ -1,4 +1,4 @@
-"""PPO in the kinematic twin: what ``learn/run.py`` drives where ``twin.enabled``."""
+"""PPO in the kinematic surrogate: what ``learning/runner.py`` drives where ``twin.enabled``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """An MCAP file under way, written by the package ``mcap`` so that a killed process loses next to nothing: a
-chunk goes to disk before its messages are a hundredth of all, and ``repair.py`` reads every chunk that is
+chunk goes to disk before its messages are a hundredth of all, and ``export.py`` reads every chunk that is
 whole. A signal interrupts between two calls of this file, never within one.
 """
 

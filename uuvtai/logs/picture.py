@@ -196,10 +196,10 @@ def _paint_frame(
     title = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
     width = canvas.text((_LEFT - 2, 40), title, 27, INK, bold=True)
     canvas.text((_LEFT - 2 + width + 24, 40), remark, 19, FAILED)
-    moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
+    moving = f", {scenario['D']} dynamic at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
     canvas.text(
         (_LEFT - 2, 70),
-        f"{scenario['S']} resting obstacles{moving}; map and bodies when {recordings[0].method} ends",
+        f"{scenario['S']} static obstacles{moving}; map and obstacles when {recordings[0].method} ends",
         18,
         GREY,
     )
@@ -238,7 +238,7 @@ def _legend_symbols(canvas: Canvas, base: float, trace: bool) -> None:
     ring = np.array([goal[0], goal[1] - 2 * down]) + 7 / canvas.scale * _ring(32)
     canvas.line(ring, GREY, 1, closed=True)
     canvas.line(ring + np.array([18 / canvas.scale, 0]), MOVER, 1, closed=True)
-    canvas.text((left + 44, base + 2 * _ROW), "true, resting / moving", 17, GREY)
+    canvas.text((left + 44, base + 2 * _ROW), "true, static / dynamic", 17, GREY)
 
 
 def _ring(corners: int) -> np.ndarray:

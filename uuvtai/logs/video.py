@@ -59,8 +59,8 @@ _LEGEND = (
     (_ECHO, "sonar"),
     (STATIC, "mapped"),
     (DYNAMIC, "tracked"),
-    (MOVER, "true, moving"),
-    (GREY, "true, resting"),
+    (MOVER, "true, dynamic"),
+    (GREY, "true, static"),
 )
 _HOLD_S = 1.0  # The last frame stays this long.
 _DRAWN_PX = 1280  # Narrower frames are drawn this wide and made smaller: the panel below needs the room.
@@ -256,10 +256,10 @@ class FrameArtist:
         which = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
         end = 24 + canvas.text((24, 34), f"{recording.method} · {which}", 22, INK, bold=True)
         canvas.text((end + 20, 34), self.remark, 17, FAILED)
-        moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
+        moving = f", {scenario['D']} dynamic at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
         canvas.text(
             (24, 60),
-            f"{scenario['S']} resting obstacles{moving}; dashed while wholly above or below the vehicle",
+            f"{scenario['S']} static obstacles{moving}; dashed while wholly above or below the vehicle",
             16,
             GREY,
         )

@@ -1,4 +1,4 @@
-"""A controller or a policy of the user's at the wheel, as ``measure.episodes.playing`` wants it."""
+"""A controller or a policy of the user's as ``evaluation.episodes`` wants it."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ def place_of(found: Any, spec: PieceSpec) -> str:
 
 # ------------------------------------------------------------------------------------------------------------
 # A policy as an ONNX graph of whoever's: it holds our operators alone, and its size, memory and work are
-# reckoned before ONNX Runtime sees it (``deploy.graph_check``).
+# reckoned before ONNX Runtime sees it (``learning.export.graph``).
 
 
 HOLD = "hold_steps"

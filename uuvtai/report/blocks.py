@@ -1,4 +1,4 @@
-"""What a page is made of: sections of blocks. Sections are built from dicts; only ``page.py`` knows HTML."""
+"""What a page is made of: sections of blocks. Sections are built from dicts; only ``html.py`` knows HTML."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ def conditions(result: dict[str, Any]) -> str:
     speed = f", v = {result['v_m_s']} m/s" if result["D"] else ""
     seeds = ", ".join(map(str, result["seeds"]))
     return (
-        f"World {result['world']}, {bodies(result, ' resting', ' moving obstacles')}{speed}, "
+        f"World {result['world']}, {bodies(result, ' static', ' dynamic obstacles')}{speed}, "
         f"{vehicle(result)}{sensing(result)}; seeds {seeds}, {result['episodes_per_seed']} episodes each, "
         "the same ones for every method."
     )

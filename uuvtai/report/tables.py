@@ -1,4 +1,4 @@
-"""The one table: columns that say how they are shown, and rows."""
+"""The one table: columns that say how they are shown, and rows; its words, and heat maps of a grid."""
 
 from __future__ import annotations
 

@@ -237,7 +237,7 @@ class PlanRequest(NamedTuple):
 
 
 class RoutePlanner(Protocol):
-    """Plans routes on the host in place of the simulator's own planners (``own.own_piece``)."""
+    """Plans routes on the host in place of the simulator's own planners (``plugins.loading``)."""
 
     def reset(self, mask: torch.Tensor) -> None:
         """New episodes begin in the rows (n_env,) where this is not 0."""

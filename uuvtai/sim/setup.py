@@ -1,5 +1,5 @@
-"""Arrays and bundles of closed simulators, for the next ones. Taichi gives neither the memory of fields back
-nor the code that it has compiled for them, and a process can hold 512 trees of fields in all."""
+"""What a simulator is made of before its first step: sizes, arrays, scenarios, constants. Arrays of closed
+ones are used again, for Taichi gives neither their memory nor their code back."""
 
 from __future__ import annotations
 
@@ -252,7 +252,7 @@ LENGTHENED = (
 
 
 def allocate_state(sizes: dict[str, int]) -> SimState:
-    """Every struct, with the lengths of ``sizes.array_sizes``; those that other options lengthen lie last, so
+    """Every struct, with the lengths of ``array_sizes``; those that other options lengthen lie last, so
     that the others keep their places, and what was compiled for them holds."""
     kinds = get_type_hints(SimState)
     built = {name: state.allocate(kinds[name], sizes) for name in sorted(kinds, key=lambda n: rank(kinds[n]))}

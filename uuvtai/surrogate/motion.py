@@ -1,7 +1,7 @@
 """The twin's step: the vehicle's velocity loops axis by axis, bodies in closed form, and the referee's rules,
 by the simulator's own distances.
 
-Arrays are the caller's tensors. A scenario is three rows of a bank (``scenario_bank.py``), which is never
+Arrays are the caller's tensors. A scenario is three rows of a bank (``world.py``), which is never
 written: an env knows the number of its scenario.
 """
 

@@ -1,4 +1,4 @@
-"""The twin: as many episodes side by side as one likes, decided ten times a second."""
+"""The surrogate: as many episodes side by side as one likes, decided ten times a second."""
 
 from __future__ import annotations
 

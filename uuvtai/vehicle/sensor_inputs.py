@@ -1,6 +1,6 @@
 """The stack's readings, filled from messages in place of the simulator's sensor kernels.
 
-What each stage reads (``kernels/*/bundles.py``), and where it comes from here:
+What each stage reads (``kernels/*/io.py``), and where it comes from here:
 
 - pose filter: ``ego.rpy``, ``rate_b``, ``specific_force_b`` and ``depth_m`` in every step, ``vel_b`` and
   ``vel_valid`` where ``step % sensors.dvl.period_steps == 0``, and the scan's ranges, Doppler and ping. It
@@ -10,10 +10,10 @@ What each stage reads (``kernels/*/bundles.py``), and where it comes from here:
 - all others: ``ego`` as it is now, ``clock``, ``mission``, and what those before them wrote.
 
 Nobody behind the sensors reads the truth (``tests/sim/test_observation_only.py``). Between two messages the
-last one is held, and one that comes late is carried forward to this step (``carrying.py``); a DVL without a
+last one is held, and one that comes late is carried forward to this step; a DVL without a
 message in its turn has lost the bottom. Until its next message how the given position changes stands for it,
 as that was told and not as it was carried (``find_velocity`` takes it). Nothing late is compared with, or
-carried by, corrections that came after it (``own_motion.py``). Sonar intensity is read by nobody.
+carried by, corrections that came after it. Sonar intensity is read by nobody.
 """
 
 from __future__ import annotations

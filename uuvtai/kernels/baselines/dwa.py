@@ -3,7 +3,7 @@ Avoidance", IEEE Robotics & Automation Magazine 4(1), 1997.
 
 Of the velocities that can be reached within a short time those are admissible that come to rest before they
 touch anything, and of these the best has the largest weighted sum of heading, clearance and speed. Adapted:
-the vehicle moves sideways too (``reachable.py``); bodies move, so a velocity is rolled out with the
+the vehicle moves sideways too (``local_planner.py``); bodies move, so a velocity is rolled out with the
 vehicle's lag against their forecast; speed beyond the wanted one is worth nothing more; where nothing is
 admissible, the velocity that touches least and latest is driven.
 """

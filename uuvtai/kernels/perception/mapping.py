@@ -1,6 +1,6 @@
 """Two-layer occupancy map from sonar and depth: M^s (what stays) and M^d (what moves), fused by max.
 
-One scan becomes binary indicators per cell (``fan.py``, ``evidence.py``), then the paper's two equations
+One scan becomes binary indicators per cell (``sensor_model.py``), then the paper's two equations
 apply:
 
     M^s = clip((1 - lambda_s) M^s + eta_occ I^s-hit - eta_free I^free + eta_depth I^depth, 0, 1)

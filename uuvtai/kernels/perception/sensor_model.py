@@ -1,7 +1,7 @@
 """What a scan and a depth image say about the cells of the map: a return that stays or moves, a point seen by
 the camera.
 
-Each is a bit per cell, set by those that share an env's returns (``n_item``); ``fan.py`` adds free water,
+Each is a bit per cell, set by those that share an env's returns (``n_item``); ``mark_fan`` adds free water,
 ``mapping.py`` merges all of it into the two layers.
 """
 

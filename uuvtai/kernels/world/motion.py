@@ -52,7 +52,7 @@ def is_chosen(i, fraction: Const[float]):
 
 
 FAULT_MOVING = 8
-"""Continues the faults of ``layout.py``."""
+"""Continues the faults of ``scenario.py``."""
 
 _PATH_DRAWS = 64
 _CORNER_DRAWS = 16

@@ -163,7 +163,7 @@ def _graph(pilot: Pilot) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------------------------
 # What every column of a policy over a set of bodies is, in words, for policy_spec.json
-# (``twin/set_columns.py`` writes them).
+# (``surrogate/observation.py`` writes them).
 
 
 MEANING = (

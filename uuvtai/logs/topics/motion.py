@@ -1,4 +1,4 @@
-"""Where the vehicle is: frames, true pose, its own estimate."""
+"""Topics of motion: frames, true and estimated pose, state, instruments, events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bodies in the water: goal and tank, the true ones, and those that the vehicle believes in."""
+"""Topics of perception: goal and tank, true and tracked obstacles, the map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the planner found, and the point that is steered at."""
+"""Topics of planning: the route, the point that is steered at, what the agent decided."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the sonar hears."""
+"""Topics of sensors: sonar and depth camera."""
 
 from __future__ import annotations
 
