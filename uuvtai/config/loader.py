@@ -23,30 +23,30 @@ from pydantic import BaseModel, ValidationError
 
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import FileError, read_text
-from uuvtai.common.presets import preset_names, shipped_file
+from uuvtai.common.presets import built_in_file, preset_names
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 
 DEFAULT_WORLD, DEFAULT_SENSORS, DEFAULT_VEHICLE = "pool", "paper", "bluerov2"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 STACK_SECTIONS = (
-    "pose",
+    "localization",
     "tracking",
     "forecast",
-    "elevation",
-    "spotting",
+    "height",
+    "camera_tracking",
     "mapping",
     "clearance",
     "voronoi",
     "quiet",
     "route",
-    "teacher",
+    "behavior",
     "slow",
     "fast",
     "baselines",
 )
-"""what a stack preset may set: nothing that a scenario, a sensor, the referee or the observation's columns
-depend on"""
+"""what a stack preset may set: nothing that a scenario, a sensor, the termination check or the observation's
+columns depend on"""
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
 MAX_BYTES = 1 << 20
 """of a YAML file"""
@@ -258,7 +258,7 @@ def preset_path(kind: str, name: str) -> Path:
             f"{kind} {name!r} is no preset{nearest(name, preset_names(kind))}; there are: "
             f"{', '.join(preset_names(kind))} (see 'uuv presets'), or give the path of a {suffix} file"
         )
-    return shipped_file(kind, name)
+    return built_in_file(kind, name)
 
 
 def read_preset(kind: str, name: str) -> dict[str, Any]:
