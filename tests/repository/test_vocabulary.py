@@ -12,7 +12,7 @@ from uuvtai.config.loader import RENAMED, ConfigError, load_config, load_trainin
 from uuvtai.evaluation.failure_causes import CAUSES
 from uuvtai.learning.checkpoint import CheckpointError, refused
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NAMES = {
     # who drives: agents and plugins
     r"\bMethodRuns?\b|\bmethods_of\b|\bmethod_(?:inks|colours)\b": "agent",
