@@ -20,7 +20,7 @@ from uuvtai.vehicle.messages import KINDS, Mission, PilotNumbers, SensorMessage
 from uuvtai.vehicle.onboard_core import FedPilot, StaleLimits
 from uuvtai.vehicle.sensor_inputs import FedSensors
 
-SCHEMA = 2
+SCHEMA = 3
 SPEC, MEMORY, GOLDEN = "stack.json", "memory.npz", "golden.npz"
 _PAGE = 4096
 
