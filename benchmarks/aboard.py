@@ -23,7 +23,7 @@ LONGEST_S = 3600
 SEED = 77001
 FOREIGN, BEFORE = "UUV_AARCH64", "UUV_STACK_FOLDER"
 CASES = (("pool", "multibeam", "6", "0.6"),)
-"""world, sensors, moving bodies, their speed [m/s]"""
+"""world, sensors, moving obstacles, their speed [m/s]"""
 _EMPTY = """
 import runpy, sys
 class Nobody:
@@ -54,10 +54,12 @@ def measure(job: Job) -> list[Row]:
 
 
 def _exported(case: tuple[str, ...], folder: Path) -> Path:
-    world, sensors, bodies, speed = case
+    world, sensors, obstacles, speed = case
     run, out = folder / f"{world}_{sensors}", folder / f"{world}_{sensors}_stack"
     uuv = [sys.executable, "-m", "uuvtai"]
-    scene = f"--world {world} --sensors {sensors} --vehicle bluerov2_16v -D {bodies} --speed {speed}".split()
+    scene = (
+        f"--world {world} --sensors {sensors} --vehicle bluerov2_16v -D {obstacles} --speed {speed}".split()
+    )
     count = ["--episodes", "1", "--record", "1", "--seeds", str(SEED)]
     _done([*uuv, "eval", "--agent", "bt", *scene, *count, "--depth-images", "--run-dir", str(run)])
     (log,) = (run / "logs").glob("*.mcap")

@@ -35,10 +35,10 @@ _SMALL = {
     "curriculum": {
         "train.num_envs": 16,
         "ppo.rollout_steps": 16,
-        "distill.batch": 64,
+        "distillation.batch": 64,
         "world_model.batch": 64,
     },
-    "quick": {"train.num_envs": 64, "twin.scenarios": 64},
+    "quick": {"train.num_envs": 64, "surrogate.scenarios": 64},
 }
 """trainings in the simulator and in the surrogate, as small as they go"""
 _PAIRS, _LOGS = 16, 5

@@ -32,13 +32,13 @@ _WHOLE_M = 3.2
 def occupancies(rng: np.random.Generator, shape: tuple[int, int]) -> dict[str, np.ndarray]:
     """Maps (n_map, n_row, n_col) by kind, True where occupied."""
     row, col = np.indices(shape)
-    bodies = np.zeros((_MAPS, *shape), bool)
+    obstacles = np.zeros((_MAPS, *shape), bool)
     for i in range(8 * _MAPS):
         away = np.hypot(row - rng.uniform(0, shape[0]), col - rng.uniform(0, shape[1]))
-        bodies[i % _MAPS] |= np.abs(away - rng.uniform(2, 6)) < 0.7
+        obstacles[i % _MAPS] |= np.abs(away - rng.uniform(2, 6)) < 0.7
     return {
         "empty": np.zeros((_MAPS, *shape), bool),
-        "8 bodies": bodies,
+        "8 obstacles": obstacles,
         "2 % at random": rng.random((_MAPS, *shape)) < 0.02,
         "20 % at random": rng.random((_MAPS, *shape)) < 0.2,
     }
@@ -56,7 +56,7 @@ class Maps:
         names = ("ClearanceState", "ClearanceMemory", "MapState", "GridMask", "ClockState")
         self.structs = [state.allocate(getattr(state, name), sizes) for name in names]
         self.clearance, self.memory, self.grid_map, self.mask, clock = self.structs
-        clock.awake.fill(1)
+        clock.active.fill(1)
         load_bounds(self.mask, self.outside)
 
     def put(self, occupied: np.ndarray) -> None:

@@ -127,6 +127,6 @@ def simulated(sim: Sim, number: int) -> str:
     one, seeds, numbers = (torch.ones(sim.num_envs, dtype=torch.int32) for _ in range(3))
     sim.sleep()
     sim.reset(one, SEED * seeds, number * numbers)
-    while (outcome := int(sim.rows(sim.s.referee.outcome, [0])[0])) == RUNNING:
+    while (outcome := int(sim.rows(sim.s.termination.outcome, [0])[0])) == RUNNING:
         sim.step()
     return OUTCOMES[outcome]

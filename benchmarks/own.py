@@ -1,4 +1,4 @@
-"""Pieces of the user's in the loop: env-steps per second of the whole step with a NumPy controller for 64
+"""Plugins of the user's in the loop: env-steps per second of the whole step with a NumPy controller for 64
 envs and a batched torch one for 1,024 (pool, S = 8, D = 6, paper sensing, resets on)."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import torch
 
 from benchmarks.common import Job, Row
 from uuvtai.config.loader import load_config
-from uuvtai.evaluation.agents import Method, load_agents
+from uuvtai.evaluation.agents import AgentSpec, load_agents
 from uuvtai.evaluation.profile import WARM_STEPS, SimBatch
 from uuvtai.sim.sim import Sim
 
@@ -23,14 +23,14 @@ PIECES = (
 
 
 def measure(job: Job) -> list[Row]:
-    """One row a piece."""
+    """One row a plugin."""
     return [_row(job, what, 8 if job.quick else n, name, floor) for what, n, name, floor in PIECES]
 
 
 def _row(job: Job, what: str, n_env: int, name: str, floor: float) -> Row:
     job.say(f"{n_env} envs, {name}")
     config = load_config("pool", "paper")
-    (own,) = load_agents([f"controller:{EXAMPLES / name}"], config.teacher.max_node)
+    (own,) = load_agents([f"controller:{EXAMPLES / name}"], config.behavior.max_node)
     sim = Sim(config, n_env, own.tree, job.device)
     cpu = time.process_time()
     speed, steps = _speed(sim, own, 4 * job.seconds)
@@ -52,20 +52,20 @@ def _row(job: Job, what: str, n_env: int, name: str, floor: float) -> Row:
     )
 
 
-def _speed(sim: Sim, method: Method, seconds: float) -> tuple[float, int]:
-    """(env-steps/s while a method drives, env steps with those to warm up); ended rows begin anew at once."""
-    note, obs = method.driver_for(sim), sim.observe()
-    driver = note.pilot if note else None
+def _speed(sim: Sim, agent: AgentSpec, seconds: float) -> tuple[float, int]:
+    """(env-steps/s while an agent drives, env steps with those to warm up); ended rows begin anew at once."""
+    note, obs = agent.agent_for(sim), sim.observe()
+    acting = note.agent if note else None
     batch = SimBatch(sim)
     everybody = torch.ones(sim.num_envs, dtype=torch.int32, device=sim.device)
-    if driver:
-        driver.reset(everybody)
+    if acting:
+        acting.reset(everybody)
 
     def step() -> None:
-        batch.step(driver.decide(obs).action if driver else None)
-        if driver:
-            driver.advance()
-            driver.reset(sim.terminated | sim.truncated)
+        batch.step(acting.decide(obs).action if acting else None)
+        if acting:
+            acting.advance()
+            acting.reset(sim.terminated | sim.truncated)
 
     for _ in range(WARM_STEPS):
         step()

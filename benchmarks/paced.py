@@ -1,7 +1,7 @@
 """Time of a control step beside another commit (``--against``, default HEAD): one vehicle paced at 50 Hz, and
 1,024 on all cores.
 
-Back to back, one step warms the caches and keeps the threads awake for the next; a vehicle's loop sleeps in
+Back to back, one step warms the caches and keeps the threads active for the next; a vehicle's loop sleeps in
 between. Both sides run in this environment with caches of their own, in turns.
 """
 

@@ -18,13 +18,13 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.evaluation.agents import find_policy
 from uuvtai.evaluation.episodes import Job as Episode
 from uuvtai.evaluation.episodes import run_episodes
-from uuvtai.learning.agents import load_set_pilot
+from uuvtai.learning.agents import load_set_agent
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.parameter_search import simulator_of
 from uuvtai.learning.set_networks import MOST_WISH, SetActor, actor_of
 from uuvtai.sim.setup import Scene
 from uuvtai.sim.sim import Sim
-from uuvtai.surrogate.world import Twin, draw_bank
+from uuvtai.surrogate.world import Surrogate, draw_bank
 
 LONGEST_S = 3600
 THREADS = 1
@@ -45,21 +45,23 @@ def measure(job: Job) -> list[Row]:
     for world, scene in scenes:
         began = time.perf_counter()
         config = _config(checkpoint.config, world, scene, min(count, NUM_ENVS))
-        twin = in_twin(config, scene, actor_of(checkpoint), count)
+        surrogate = in_surrogate(config, scene, actor_of(checkpoint), count)
         if world not in sims:
             sims[world] = simulator_of(config, world, tuple(scene for name, scene in SCENES if name == world))
         sim = in_simulator(sims[world], scene, checkpoint, count)
-        rows.append(_row(f"success, {world} {scene}", twin, sim))
+        rows.append(_row(f"success, {world} {scene}", surrogate, sim))
         job.say(f"{rows[-1].what}: {rows[-1].note}; {time.perf_counter() - began:.0f} s")
     return rows
 
 
 def _policy(run: str) -> Checkpoint:
     if not run:
-        raise SystemExit("parity: give a policy that learnt in the twin: --policy RUN (uuv train twin)")
+        raise SystemExit(
+            "parity: give a policy that learnt in the surrogate: --policy RUN (uuv train surrogate)"
+        )
     found = find_policy(run)
-    if not found.config.twin.enabled:
-        raise SystemExit(f"parity: {run} did not learn in the twin; train one: uuv train twin")
+    if not found.config.surrogate.enabled:
+        raise SystemExit(f"parity: {run} did not learn in the surrogate; train one: uuv train surrogate")
     return found
 
 
@@ -67,21 +69,21 @@ def _config(config: LearningConfig, world: str, scene: Scene, num_envs: int) -> 
     """The run's config for one scene."""
     return config.model_copy(
         update={
-            "twin": config.twin.model_copy(update={"worlds": (world,)}),
+            "surrogate": config.surrogate.model_copy(update={"worlds": (world,)}),
             "train": config.train.model_copy(update={"num_envs": num_envs, "scenes": (scene,)}),
         }
     )
 
 
 @torch.no_grad()
-def in_twin(config: LearningConfig, scene: Scene, actor: SetActor, count: int) -> np.ndarray:
+def in_surrogate(config: LearningConfig, scene: Scene, actor: SetActor, count: int) -> np.ndarray:
     """Successes (count,) in the surrogate, by the mean action."""
-    twin = Twin(config, draw_bank(config, (scene,), SEED, count), count, SEED)
-    twin.begin(torch.ones(count, dtype=torch.bool), torch.arange(count))
+    surrogate = Surrogate(config, draw_bank(config, (scene,), SEED, count), count, SEED)
+    surrogate.begin(torch.ones(count, dtype=torch.bool), torch.arange(count))
     outcome = np.full(count, RUNNING)
     while (running := outcome == RUNNING).any():
-        view = twin.look()
-        _, now = twin.step(actor(view.bodies, view.own).clamp(-MOST_WISH, MOST_WISH))
+        view = surrogate.look()
+        _, now = surrogate.step(actor(view.obstacles, view.own).clamp(-MOST_WISH, MOST_WISH))
         outcome[running] = now.numpy()[running]
     return outcome == SUCCESS
 
@@ -89,22 +91,22 @@ def in_twin(config: LearningConfig, scene: Scene, actor: SetActor, count: int) -
 def in_simulator(sim: Sim, scene: Scene, checkpoint: Checkpoint, count: int) -> np.ndarray:
     """Successes (count,) in the simulator."""
     episodes = [Episode(SEED, i, scene) for i in range(count)]
-    results, _ = run_episodes(sim, episodes, driver=load_set_pilot(checkpoint, sim))
+    results, _ = run_episodes(sim, episodes, agent=load_set_agent(checkpoint, sim))
     return np.array([result.outcome == "success" for result in results])
 
 
-def _row(what: str, twin: np.ndarray, sim: np.ndarray) -> Row:
-    difference = 100.0 * (twin.astype(float) - sim)
+def _row(what: str, surrogate: np.ndarray, sim: np.ndarray) -> Row:
+    difference = 100.0 * (surrogate.astype(float) - sim)
     mean, half = float(difference.mean()), 1.96 * float(difference.std()) / len(difference) ** 0.5
-    sides = {"surrogate": twin, "simulator": sim}
+    sides = {"surrogate": surrogate, "simulator": sim}
     counts = {
         name: {"success": int(k.sum()), "episodes": len(k), "interval": wilson_interval(int(k.sum()), len(k))}
         for name, k in sides.items()
     }
-    apart = {"only surrogate": int((twin & ~sim).sum()), "only simulator": int((sim & ~twin).sum())}
+    apart = {"only surrogate": int((surrogate & ~sim).sum()), "only simulator": int((sim & ~surrogate).sum())}
     within = "within" if abs(mean) <= POINTS else "NOT within"
     note = f"{mean:+.1f} points, 95 % in {mean - half:+.1f} .. {mean + half:+.1f}: {within} {POINTS:g}"
     return Row(
-        what, float(twin.mean()), "surrogate", float(sim.mean()), "simulator", note=note,
+        what, float(surrogate.mean()), "surrogate", float(sim.mean()), "simulator", note=note,
         details={**counts, **apart, "difference": mean, "half": half},
     )  # fmt: skip

@@ -426,9 +426,9 @@ def _newest_checkpoint(run: Path) -> dict[str, bytes]:
 def _result(run: Path) -> dict[str, Any]:
     """The document of an evaluation without the machine's times."""
     document = _read(run / "eval/result.json")
-    for method in document["methods"]:
+    for agent in document["agents"]:
         for name in _TIMES:
-            method.pop(name)
+            agent.pop(name)
     return document
 
 

@@ -23,7 +23,7 @@ THREADS = 1
 FLOOR = 4.0
 _START, _GOAL, _Z_M = (1.55, 3.05), (18.45, 3.05), -0.8
 """[m] along the tank, as the missions of ``pool``"""
-_N_BODY = 14
+_N_OBSTACLE = 14
 
 
 def measure(job: Job) -> list[Row]:
@@ -67,7 +67,7 @@ def measure(job: Job) -> list[Row]:
     for name, ways in (("OMPL RRT", theirs()), ("pyastar2d", shortest())):
         others = _peer_cost(name, ways, grids)
         row = Row(
-            what=f"plans over {_N_BODY} bodies, grid {maps.SHAPE[1]} x {maps.SHAPE[0]}",
+            what=f"plans over {_N_OBSTACLE} obstacles, grid {maps.SHAPE[1]} x {maps.SHAPE[0]}",
             ours=n_env / cost["ours"],
             peer=n_env / cost[name],
             peer_name=name,
@@ -108,7 +108,7 @@ def _maps(n: int, config: Config) -> list[tuple]:
 
     out, rng = [], np.random.default_rng(0)
     while len(out) < n:
-        occ = maps.scene(rng, _N_BODY)
+        occ = maps.scene(rng, _N_OBSTACLE)
         found = clearance_of(occ | maps.OUTSIDE, maps.CELL_M, config.clearance.max_m)
         wide = found[0] >= config.voronoi.min_clearance_m - 1e-5
         regions, _count = label(wide & ~occ)  # type: ignore[misc]
@@ -132,7 +132,7 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     }  # fmt: skip
     s = {name: state.allocate(getattr(state, struct), sizes) for name, struct in names.items()}
     s["mask"].outside.from_numpy(maps.OUTSIDE.astype(np.int32))
-    s["clock"].awake.fill(1)
+    s["clock"].active.fill(1)
     route.reset_route(bind(RouteIO, s["route"], s["clock"], partial=True))
     for field, i, dtype in (
         (s["grid_map"].static_occ, 0, np.float32), (s["clearance"].clearance_m, 1, np.float32),

@@ -18,7 +18,7 @@ from uuvtai.sim.stages import bind
 
 THREADS = 1
 FLOOR = 8.0
-N_BODY = 14
+N_OBSTACLE = 14
 """Eight at rest and six that move, as in the world that the speed of the whole step is measured in."""
 _MODELS = 64
 """Scenes compiled for MuJoCo: the first of ours."""
@@ -81,10 +81,10 @@ def measure(job: Job) -> list[Row]:
     n_env = 128 if job.quick else 1024
     start_taichi(job.device)
     flat, wide = SonarConfig(vertical_half_aperture_deg=0.0), SonarConfig()
-    scene = scenes.random_scenes(np.random.default_rng(0), n_env, N_BODY, TankConfig())
+    scene = scenes.random_scenes(np.random.default_rng(0), n_env, N_OBSTACLE, TankConfig())
     sizes = {
         "n_env": n_env,
-        "n_body": N_BODY,
+        "n_obstacle": N_OBSTACLE,
         "n_ray": flat.n_ray,
         "n_latency": 2,
         "n_cloud": 8,
@@ -103,7 +103,7 @@ def measure(job: Job) -> list[Row]:
         state.allocate(getattr(state, name), sizes) for name in names
     ]
     scenes.load(scene, vehicle, world)
-    clock.awake.fill(1)
+    clock.active.fill(1)
     sonar.reset_sonar(bind(SonarIO, scan, memory, clock, partial=True))
     peer = Rays(scene, flat.n_ray, flat.max_range_m)
 
@@ -119,7 +119,7 @@ def measure(job: Job) -> list[Row]:
     cost = seconds_per_call({"flat": ours(flat), "wide": ours(wide), "peer": peer.cast_all}, job.seconds)
     return [
         Row(
-            what=f"{flat.n_ray} {what}, {N_BODY} bodies",
+            what=f"{flat.n_ray} {what}, {N_OBSTACLE} obstacles",
             ours=n_env / cost[side],
             peer=_MODELS / cost["peer"],
             peer_name="mj_multiRay",

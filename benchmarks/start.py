@@ -34,7 +34,7 @@ _NEW = {
     "uuv eval with a batch never run before": [[*_EVAL, "--episodes", text] for text in ("5", "7", "11")],
     "uuv eval with a speed never run before": [[*_EIGHT, "--speed", text] for text in ("0.5", "0.7", "0.9")],
     "uuv eval with a threshold never run before": [
-        [*_EIGHT, "--set", f"teacher.caution={text}"] for text in ("0.8", "1.2", "1.4")
+        [*_EIGHT, "--set", f"behavior.caution={text}"] for text in ("0.8", "1.2", "1.4")
     ],
 }
 

@@ -14,7 +14,7 @@ from uuvtai import state
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
 from uuvtai.kernels.behavior import tree as tree_tick
-from uuvtai.kernels.behavior.io import TeacherIO
+from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.sim.behavior_tree import load_tree, read_tree
 from uuvtai.sim.setup import array_sizes
 from uuvtai.sim.stages import bind
@@ -33,20 +33,20 @@ def measure(job: Job) -> list[Row]:
     start_taichi(job.device)
     tree, config = read_tree("bt"), Config()
     sizes = array_sizes(config, n_env)
-    teacher, table = state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
+    behavior, table = state.allocate(state.BehaviorState, sizes), state.allocate(state.TreeTable, sizes)
     load_tree(table, tree)
-    shape = (_TURNS, n_env, config.teacher.max_node)
+    shape = (_TURNS, n_env, config.behavior.max_node)
     answers = np.random.default_rng(0).integers(
         tree_tick.RUNNING, tree_tick.FAILURE + 1, shape, dtype=np.int8
     )
     given = [torch.from_numpy(a) for a in answers]
     n_node = len(tree.kind)
     peers = [PyTree(tree) for _ in range(_BLACKBOARDS)]
-    check(teacher, table, peers, answers, n_node)
+    check(behavior, table, peers, answers, n_node)
     prepared = [[peers[0].prepared(row[:n_node]) for row in a[:_BLACKBOARDS]] for a in answers]
     ours_next, theirs_next = itertools.cycle(given), itertools.cycle(prepared)
 
-    io = bind(TeacherIO, teacher, table, partial=True)
+    io = bind(BehaviorIO, behavior, table, partial=True)
 
     def ours() -> None:
         tree_tick.tick_with_given_statuses(io, next(ours_next))
@@ -73,11 +73,15 @@ def measure(job: Job) -> list[Row]:
 
 
 def check(
-    teacher: state.TeacherState, table: state.TreeTable, peers: list[PyTree], answers: np.ndarray, n_node: int
+    behavior: state.BehaviorState,
+    table: state.TreeTable,
+    peers: list[PyTree],
+    answers: np.ndarray,
+    n_node: int,
 ) -> None:
     """Raise AssertionError unless every node's status is the peers', tick by tick, memories included."""
-    io = bind(TeacherIO, teacher, table, partial=True)
+    io = bind(BehaviorIO, behavior, table, partial=True)
     for answer in answers:
         tree_tick.tick_with_given_statuses(io, torch.from_numpy(answer))
-        found = teacher.status.to_numpy()[: len(peers), :n_node]
+        found = behavior.status.to_numpy()[: len(peers), :n_node]
         np.testing.assert_array_equal(found, [peer.tick(answer[i, :n_node]) for i, peer in enumerate(peers)])

@@ -23,7 +23,7 @@ _SIMULATOR = ["--sensors", "nominal", "--set", "train.num_envs=1024", "--iterati
 _RECIPES = {"curriculum": _SIMULATOR, "quick": ["--iterations", "10"]}
 _QUICK = [
     *("--iterations", "3", "--set", "train.num_envs=16", "--set", "ppo.minibatches=1"),
-    *("--set", "twin.scenarios=16"),
+    *("--set", "surrogate.scenarios=16"),
 ]
 _PARTS = ("simulate", "infer", "learn")
 

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uuvtai.common.enums import COLLIDED, ENDINGS, LETTERS
+from uuvtai.common.enums import COLLIDED, FINAL_OUTCOMES, LETTERS
 from uuvtai.evaluation import claims
 from uuvtai.evaluation.claims import ends_of, pooled
 from uuvtai.evaluation.reproduce import results_page
@@ -63,7 +63,7 @@ def measured(root: Path) -> str:
 
 def short(root: Path) -> str:
     """README's table: success and collision of the tree and of the best agent in five worlds."""
-    rows, lines = {row["name"]: row["methods"] for row in _read(root / EVALUATIONS)["rows"]}, []
+    rows, lines = {row["name"]: row["agents"] for row in _read(root / EVALUATIONS)["rows"]}, []
     for name, title in SHORT.items():
         bt, best = (_both(rows[name][agent]) if agent in rows[name] else "-" for agent in ("bt", "best"))
         lines.append([title, *(bt.split(" / ") * 2)[:2], best])
@@ -78,7 +78,7 @@ def evaluations(root: Path) -> str:
         "world (D, v in m/s)", "success", "collision", "contact / TTC stop / out / timeout",
         "`best`: success / collision", "`planner`", "most frequent causes of failure",
     ]  # fmt: skip
-    shown = [row for row in document["rows"] if row["methods"] and LITERATURE.isdisjoint(row["methods"])]
+    shown = [row for row in document["rows"] if row["agents"] and LITERATURE.isdisjoint(row["agents"])]
     note = (
         "Success, collision and endings are those of `bt`, in the last row of `paper`; `-` = not evaluated.\n"
         f"Counts: `{EVALUATIONS}`.\n\n"
@@ -87,17 +87,17 @@ def evaluations(root: Path) -> str:
 
 
 def _evaluated(row: Document) -> list[str]:
-    methods, own = row["methods"], row["methods"][row["shows"]]
+    agents, own = row["agents"], row["agents"][row["shows"]]
     ends = " / ".join(str(own["outcomes"][end]) for end in ("collision", "ttc", "out_of_tank", "timeout"))
-    best = _both(methods["best"]) if "best" in methods else "-"
-    planner = f"{_percent(methods['planner'], 'success')} %" if "planner" in methods else "-"
+    best = _both(agents["best"]) if "best" in agents else "-"
+    planner = f"{_percent(agents['planner'], 'success')} %" if "planner" in agents else "-"
     causes = ", ".join(f"{cause['label']} {cause['count']}" for cause in own["causes"][:2])
     collision = str(pooled([own], *COLLIDED)).partition(" = ")[2]
     return [row["title"], str(pooled([own], "success")), collision, ends, best, planner, causes]
 
 
-def _percent(method: Document, *outcomes: str) -> str:
-    return f"{100 * pooled([method], *outcomes).rate:.1f}"
+def _percent(agent: Document, *outcomes: str) -> str:
+    return f"{100 * pooled([agent], *outcomes).rate:.1f}"
 
 
 # --------------------------------------------------------------------------------------------- other pages
@@ -109,7 +109,7 @@ def local_planners(root: Path) -> str:
     worlds = [rows[name] for name in ("pool_6_local", "pool_9_fast_local", "gauntlet_9_fast_local")]
     paper = rows["pool_6_paper"]
     worlds[0] = worlds[0] | {
-        "methods": paper["methods"] | worlds[0]["methods"],
+        "agents": paper["agents"] | worlds[0]["agents"],
         "paired": [*worlds[0]["paired"], *paper["paired"]],
     }
     names = ("bt", "paper", "mppi", "dwa", "potential_field", "velocity_obstacle")
@@ -118,16 +118,16 @@ def local_planners(root: Path) -> str:
 
 
 def _beside_bt(row: Document, name: str) -> str:
-    if name not in row["methods"]:
+    if name not in row["agents"]:
         return "-"
-    own = row["methods"][name]
+    own = row["agents"][name]
     said = f"{_both(own)}, {own['time_to_success_mean_s']:.1f} s"
     pair = next((pair for pair in row["paired"] if {pair["a"], pair["b"]} == {"bt", name}), None)
     return said + (f", p = {pair['mcnemar_p']:.2g}" if pair else "")
 
 
-def _both(method: Document) -> str:
-    return f"{_percent(method, 'success')} / {_percent(method, *COLLIDED)}"
+def _both(agent: Document) -> str:
+    return f"{_percent(agent, 'success')} / {_percent(agent, *COLLIDED)}"
 
 
 def sweep_commands(root: Path) -> str:
@@ -144,34 +144,34 @@ def grid(root: Path) -> str:
     lines = [
         [f"`pool`, {moderate}: the paper", f"{100 * claims.MODERATE_SUCCESS:.1f} %",
          f"{100 * claims.MODERATE_COLLISION:.1f} %", "", theirs],
-        *_by_method(_moderate(pool), f"`pool`, {moderate}", True),
+        *_by_agent(_moderate(pool), f"`pool`, {moderate}", True),
         ["`pool`, D <= 3, all S and v: the paper", "",
          f"below {100 * claims.FEW_MOVERS_COLLISION:.1f} %", "", ""],
-        *_by_method(few, "`pool`, D <= 3, all S and v"),
-        *_by_method(corner, "the corner S = 12, D = 15, v = 3.0"),
-        *_by_method(_moderate(gauntlet), f"`gauntlet`, {moderate}", True),
-        *_by_method(gauntlet, "`gauntlet`, all cells"),
+        *_by_agent(few, "`pool`, D <= 3, all S and v"),
+        *_by_agent(corner, "the corner S = 12, D = 15, v = 3.0"),
+        *_by_agent(_moderate(gauntlet), f"`gauntlet`, {moderate}", True),
+        *_by_agent(gauntlet, "`gauntlet`, all cells"),
     ]  # fmt: skip
     head = ["", "success", "collision", "weighted as the paper's 40 conditions", "cells without a collision"]
     return text_table(head, lines)
 
 
-def _by_method(cells: Cells, where: str, weighted: bool = False) -> list[list[str]]:
+def _by_agent(cells: Cells, where: str, weighted: bool = False) -> list[list[str]]:
     return [
         [
-            f"{where}: `{method}`",
+            f"{where}: `{agent}`",
             str(pooled(own, "success")),
             str(pooled(own, *COLLIDED)).partition(" = ")[2],
             _weighted(own) if weighted else "",
             f"{sum(not any(cell['outcomes'][o] for o in COLLIDED) for cell in own)} of {len(own)}",
         ]
-        for method, own in _of_methods(cells).items()
+        for agent, own in _of_agents(cells).items()
     ]
 
 
-def _of_methods(cells: Cells) -> dict[str, Cells]:
-    names = sorted({cell["method"] for cell in cells}, key=lambda name: (name != "bt", name))
-    return {name: [cell for cell in cells if cell["method"] == name] for name in names}
+def _of_agents(cells: Cells) -> dict[str, Cells]:
+    names = sorted({cell["agent"] for cell in cells}, key=lambda name: (name != "bt", name))
+    return {name: [cell for cell in cells if cell["agent"] == name] for name in names}
 
 
 def _weighted(cells: Cells) -> str:
@@ -198,9 +198,9 @@ def _is_corner(cell: Document) -> bool:
 def caution(root: Path) -> str:
     """The tree from fast to careful, over the paper's moderate conditions."""
     cells, lines = _moderate(_cells(root, "caution")), []
-    for value in dict.fromkeys(cell["teacher.caution"] for cell in cells):
-        own = [cell for cell in cells if cell["teacher.caution"] == value]
-        (row,) = _by_method(own, "", True)
+    for value in dict.fromkeys(cell["behavior.caution"] for cell in cells):
+        own = [cell for cell in cells if cell["behavior.caution"] == value]
+        (row,) = _by_agent(own, "", True)
         arrived = sum(cell["outcomes"]["success"] for cell in own)
         total_s = sum(cell["outcomes"]["success"] * (cell["time_to_success_mean_s"] or 0.0) for cell in own)
         named = f"{value}" + (" (default)" if value == 1.0 else "")
@@ -220,7 +220,7 @@ def one_at_a_time(root: Path) -> str:
                 str(cell["outcomes"]["timeout"]),
                 seconds(cell["time_to_success_mean_s"]),
             ]
-            lines.setdefault(", ".join(changes) or "nothing", {})[cell["method"]] = shown
+            lines.setdefault(", ".join(changes) or "nothing", {})[cell["agent"]] = shown
     columns = ["success [95 %]", "collision [95 %]", "timeouts", "time"]
     head = ["changed", *(f"`{m}`: {c}" if c == columns[0] else c for m in ("bt", "best") for c in columns)]
     return text_table(head, [[name, *row["bt"], *row["best"]] for name, row in lines.items()])
@@ -321,10 +321,10 @@ def keep_row(name: str, run: Path, root: Path = ROOT) -> None:
     if row is None:
         raise ValueError(f"no row {name!r}; there are {', '.join(row['name'] for row in document['rows'])}")
     how = {"commit": record["git_sha"], "date": record["started"], "machine": record["hardware"]}
-    agents = {method["name"]: _kept(method) | how for method in result["methods"]}
+    agents = {agent["name"]: _kept(agent) | how for agent in result["agents"]}
     if wrong := [agent for agent, kept in agents.items() if kept["episodes"] != document["episodes"]]:
         raise ValueError(f"{', '.join(wrong)}: not {document['episodes']} episodes")
-    row["methods"] |= agents
+    row["agents"] |= agents
     row["paired"] = [pair for pair in row["paired"] if agents.keys().isdisjoint({pair["a"], pair["b"]})]
     row["paired"] += result["paired"]
     _write(root / EVALUATIONS, document)
@@ -338,7 +338,7 @@ def keep_reproduction(run: Path, root: Path = ROOT) -> None:
     small["table_main"] = {
         name: [_kept(entry) for entry in entries] for name, entries in document["table_main"].items()
     }
-    small["ceilings"] = {"methods": [_kept(entry) for entry in document["ceilings"]["methods"]]}
+    small["ceilings"] = {"agents": [_kept(entry) for entry in document["ceilings"]["agents"]]}
     small["sweeps"] = {name: _small_sweep(sweep) for name, sweep in document["sweeps"].items()}
     small["profile"] = {
         "paper_latency": document["profile"]["paper_latency"],
@@ -362,7 +362,7 @@ def _kept(entry: Document) -> Document:
 
 
 def _small_sweep(sweep: Document) -> Document:
-    names = {cell_name(axis) for axis in sweep["axes"]} | {"S", "D", "v_m_s", "method", *_KEPT}
+    names = {cell_name(axis) for axis in sweep["axes"]} | {"S", "D", "v_m_s", "agent", *_KEPT}
     rest = {name: sweep[name] for name in ("axes", "one_at_a_time", "unchanged") if name in sweep}
     return rest | {
         "cells": [{k: cell[k] for k in cell if k in names} | _ends(cell) for cell in sweep["cells"]]
@@ -375,7 +375,7 @@ def _ends(cell: Document) -> dict[str, str]:
     return {"ends": "".join(LETTERS[end] for end in ends.values())} if ends else {}
 
 
-_COUNTS = dict(zip(("success", "contact", "ttc_stop", "out_of_tank", "timeout"), ENDINGS, strict=True))
+_COUNTS = dict(zip(("success", "contact", "ttc_stop", "out_of_tank", "timeout"), FINAL_OUTCOMES, strict=True))
 """columns of a kept sweep"""
 
 
@@ -392,13 +392,13 @@ def keep_sweep(name: str, run: Path, root: Path = ROOT) -> None:
     last = "time_to_success_mean_s"
     with (root / f"docs/data/sweep_{name}.csv").open("w", newline="", encoding="utf-8") as stream:
         rows = csv.writer(stream, lineterminator="\n")
-        rows.writerow([*axes, "method", "episodes", *_COUNTS, last, "ends"])
+        rows.writerow([*axes, "agent", "episodes", *_COUNTS, last, "ends"])
         for cell in sweep["cells"]:
             values = ["" if cell.get(axis) is None else cell[axis] for axis in axes]
             counts = [cell["outcomes"][end] for end in _COUNTS.values()]
             mean_s = cell[last] if cell[last] is None else round(cell[last], 2)
             rows.writerow(
-                [*values, cell["method"], cell["episodes"], *counts, mean_s, _ends(cell).get("ends")]
+                [*values, cell["agent"], cell["episodes"], *counts, mean_s, _ends(cell).get("ends")]
             )
     _write(root / SWEEPS, known)
 
@@ -411,7 +411,7 @@ def _cells(root: Path, name: str) -> Cells:
 
 def _cell(row: dict[str, str]) -> Document:
     outcomes = {end: int(row.pop(column)) for column, end in _COUNTS.items()}
-    ends = {name: row.pop(name, "") for name in ("method", "ends")}
+    ends = {name: row.pop(name, "") for name in ("agent", "ends")}
     ends = {name: text for name, text in ends.items() if text}
     return {name: _value(text) for name, text in row.items()} | ends | {"outcomes": outcomes}
 

@@ -1,4 +1,4 @@
-"""Your own behaviour tree: ``patient.xml`` beside the shipped ones on the same episodes: a table.
+"""Your own behaviour tree: ``patient.xml`` beside the built-in ones on the same episodes: a table.
 
 ``python examples/custom_tree.py``, which is ``uuv eval --agent examples/patient.xml`` from Python
 """
@@ -21,7 +21,7 @@ def main(sim: Sim | None = None, episodes: int = 128) -> str:
     sim = sim or uuvtai.make("pool", num_envs=64).sim
     lines = [f"{'tree':10} {'success':>24} {'collision':>10} {'time s':>7}"]
     for name in TREES:
-        sim.use_tree(read_tree(name, sim.config.teacher.max_node))
+        sim.use_tree(read_tree(name, sim.config.behavior.max_node))
         results, env_steps = run_episodes(sim, jobs_of([0], episodes))
         found = summary(Path(name).stem, results, env_steps, wall_s=0.0)
         won, (low, high) = found["outcomes"]["success"], found["success_ci95"]

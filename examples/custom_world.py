@@ -17,7 +17,7 @@ WORLD = Path(__file__).with_name("harbour.yaml")
 
 
 def main(picture: Path, sim: Sim | None = None, most_steps: int = 3000) -> str:
-    """Plays episode 0 of seed 7 and writes the picture; tells how it ended."""
+    """Runs episode 0 of seed 7 and writes the picture; tells how it ended."""
     env = UuvEnv(world=str(WORLD), render_mode="rgb_array", sim=sim)
     _obs, info = env.reset(seed=7)
     for _ in range(most_steps):

@@ -1,5 +1,5 @@
-"""A potential field: pulled along the route, pushed off by what the sonar hears and by bodies that will come
-near: ``uuv eval --agent bt,examples/own_field.py``."""
+"""A potential field: pulled along the route, pushed off by what the sonar hears and by obstacles that will
+come near: ``uuv eval --agent bt,examples/own_field.py``."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ def act(view):
     near = np.where(view.scan.hit, np.clip(0.9 - view.scan.range_m, 0, None), 0.0)
     push = -3.0 * np.stack([near * np.cos(angle), near * np.sin(angle)], -1).mean(1)
 
-    body = view.tracks.forecast[:, :, ::5] - view.ego.position[:, None, None, :2]  # (n, bodies, times, 2)
+    body = view.tracks.forecast[:, :, ::5] - view.ego.position[:, None, None, :2]  # (n, obstacles, times, 2)
     gap = np.maximum(np.linalg.norm(body, axis=-1) - view.tracks.forecast_radius[:, :, ::5], 0.1)
     close = view.tracks.moving[:, :, None] * np.clip(1 / gap - 1, 0, 4)
     away = -(close[..., None] * body / np.linalg.norm(body, axis=-1, keepdims=True).clip(0.1)).mean(2).sum(1)

@@ -9,10 +9,10 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from train_rsl_rl import CONFIG
 
-from uuvtai.plugins import About, piece
+from uuvtai.plugins import About, plugin
 
 
-@piece(arrays="torch", hold_steps=HOLD_STEPS)
+@plugin(arrays="torch", hold_steps=HOLD_STEPS)
 def load(about: About):
     """The actor alone, which scales its observations itself."""
     saved = torch.load(Path(about.argument or "runs/rsl_rl") / "model.pt", weights_only=False)

@@ -7,10 +7,10 @@ from pathlib import Path
 from judge import HOLD_STEPS
 from stable_baselines3 import PPO
 
-from uuvtai.plugins import About, piece
+from uuvtai.plugins import About, plugin
 
 
-@piece(hold_steps=HOLD_STEPS)
+@plugin(hold_steps=HOLD_STEPS)
 def load(about: About):
     """Scaled as in training, without exploration."""
     folder = Path(about.argument or "runs/sb3")

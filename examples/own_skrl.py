@@ -10,10 +10,10 @@ from judge import HOLD_STEPS
 from skrl.resources.preprocessors.torch import RunningStandardScaler
 from train_skrl import Policy
 
-from uuvtai.plugins import About, piece
+from uuvtai.plugins import About, plugin
 
 
-@piece(arrays="torch", hold_steps=HOLD_STEPS)
+@plugin(arrays="torch", hold_steps=HOLD_STEPS)
 def load(about: About):
     """The policy and the scales of its observations."""
     saved = torch.load(Path(about.argument or "runs/skrl") / "agent.pt", weights_only=False)

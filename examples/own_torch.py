@@ -2,10 +2,10 @@
 
 import torch
 
-from uuvtai.plugins import View, piece
+from uuvtai.plugins import View, plugin
 
 
-@piece(arrays="torch")
+@plugin(arrays="torch")
 class Pilot:
     """Follows the route, slower where something is near ahead, and backs off from what closes in fast."""
 

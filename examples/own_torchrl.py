@@ -7,10 +7,10 @@ import torch
 from judge import HOLD_STEPS
 from train_torchrl import policy
 
-from uuvtai.plugins import About, piece
+from uuvtai.plugins import About, plugin
 
 
-@piece(arrays="torch", hold_steps=HOLD_STEPS)
+@plugin(arrays="torch", hold_steps=HOLD_STEPS)
 def load(about: About):
     """Scaled as in training; the mean of the actions."""
     saved = torch.load(Path(about.argument or "runs/torchrl") / "policy.pt", weights_only=True)

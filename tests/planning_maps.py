@@ -33,10 +33,10 @@ def box(occ, x, y, half_x, half_y, yaw=0.0):
     occ |= (np.abs(u) <= half_x) & (np.abs(v) <= half_y)
 
 
-def scene(rng, n_body=12):
+def scene(rng, n_obstacle=12):
     """Discs and turned boxes, some only seen as a shell, and some false cells."""
     occ = np.zeros(SHAPE, bool)
-    for _ in range(n_body):
+    for _ in range(n_obstacle):
         x, y = rng.uniform(0.5, 19.5), rng.uniform(0.2, 5.8)
         if rng.random() < 0.5:
             radius = rng.uniform(0.2, 0.5)

@@ -57,12 +57,12 @@ def stage():
 
 
 def clean():
-    """Empty water, nothing seen, every env awake at step 0, no route; start and goal on the centre line."""
+    """Empty water, nothing seen, every env active at step 0, no route; start and goal on the centre line."""
     from uuvtai.kernels.planning.route import reset_route
 
     s = stage()
-    s.clock.awake.fill(1)
     s.clock.active.fill(1)
+    s.clock.running.fill(1)
     s.clock.step.fill(0)
     for field in (
         s.grid_map.static_occ,

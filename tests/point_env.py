@@ -102,10 +102,10 @@ class PointEnv:
 
     def _tell(self, outcome, terms):
         distance = self._pos.norm(dim=1, keepdim=True)
-        teacher = torch.cat([-self._pos / distance.clamp(min=0.1), torch.zeros(self.num_envs, 2)], 1)
+        behavior = torch.cat([-self._pos / distance.clamp(min=0.1), torch.zeros(self.num_envs, 2)], 1)
         leaf = torch.where(distance[:, 0] > 1.0, 1, 2).to(torch.int32)
         return self.info | {
-            "teacher_action": teacher,
+            "teacher_action": behavior,
             "leaf": leaf,
             "outcome": outcome,
             "reward_terms": terms,

@@ -21,7 +21,7 @@ def rates(k_success, k_collision, n=N):
     }  # fmt: skip
 
 
-def sweep_document(method="bt", axes=None):
+def sweep_document(agent="bt", axes=None):
     """A sweep of the paper's grid; D = 0 has no speed."""
     axes = axes or {"S": [4, 8, 12], "D": [0, 3, 6, 9, 15], "v_m_s": list(SPEEDS)}
     cells = []
@@ -29,15 +29,15 @@ def sweep_document(method="bt", axes=None):
         for d in axes["D"]:
             for v in axes["v_m_s"] if d else [None]:
                 lost = min(N, round(d * (v or 0) / 3))
-                cells.append({"S": s, "D": d, "v_m_s": v, "method": method, **rates(N - lost, lost // 2)})
+                cells.append({"S": s, "D": d, "v_m_s": v, "agent": agent, **rates(N - lost, lost // 2)})
     return {"schema": 1, "world": "pool", "axes": axes, "cells": cells}
 
 
 def noise_sweep():
-    """A sweep over one axis of names, two methods."""
+    """A sweep over one axis of names, two agents."""
     cells = [
-        {"sensors": name, "method": method, **rates(16 - i - j, i)}
-        for j, method in enumerate(("bt", "best"))
+        {"sensors": name, "agent": agent, **rates(16 - i - j, i)}
+        for j, agent in enumerate(("bt", "best"))
         for i, name in enumerate(("clean", "paper", "nominal", "harsh"))
     ]
     return {
@@ -49,7 +49,7 @@ def noise_sweep():
 
 
 def robustness_sweep():
-    """One axis at a time around a condition, two methods; one axis has lists for values, one is of the
+    """One axis at a time around a condition, two agents; one axis has lists for values, one is of the
     scene."""
     scene = {"S": 8, "D": 6, "v_m_s": 0.6}
     places = [
@@ -60,7 +60,7 @@ def robustness_sweep():
         {"sensors": "harsh"},
     ]
     cells = [
-        {**scene, **place, "method": name, **rates(N - i - j, i)}
+        {**scene, **place, "agent": name, **rates(N - i - j, i)}
         for j, name in enumerate(("bt", "best"))
         for i, place in enumerate(places)
     ]
@@ -71,7 +71,7 @@ def robustness_sweep():
     }  # fmt: skip
 
 
-def method(name, k_success=6, k_collision=2, n=8, **more):
+def agent(name, k_success=6, k_collision=2, n=8, **more):
     """One entry of an evaluation."""
     detail = [
         {
@@ -93,8 +93,8 @@ def method(name, k_success=6, k_collision=2, n=8, **more):
     return {"name": name, **rates(k_success, k_collision, n), **found, "episodes_detail": detail, **more}
 
 
-def evaluation_document(*methods):
-    """An evaluation of these methods."""
+def evaluation_document(*agents):
+    """An evaluation of these agents."""
     scene = {
         "world": "pool",
         "S": 8,
@@ -104,11 +104,11 @@ def evaluation_document(*methods):
         "seeds": [0],
         "episodes_per_seed": 8,
     }
-    return {"schema": 1, **scene, "methods": list(methods or (method("straight", 3, 5), method("bt")))}
+    return {"schema": 1, **scene, "agents": list(agents or (agent("straight", 3, 5), agent("bt")))}
 
 
 CAUSE = {
-    "label": "unseen_above", "count": 2, "share": 1.0, "knew_share": 0.5, "unseen_median_s": 1.7,
+    "label": "undetected_above", "count": 2, "share": 1.0, "knew_share": 0.5, "undetected_median_s": 1.7,
     "evading_median_s": None,
     "last_chance_median_s": 0.2, "meaning": "killer above the sonar's fan all through the last 0.3 "
                                             "s", "remarks": {},
@@ -122,7 +122,7 @@ STAGES = (
     "clearance",
     "planning",
     "features",
-    "teacher",
+    "behavior",
     "reward",
     "export",
 )

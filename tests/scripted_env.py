@@ -17,7 +17,7 @@ class Moment(NamedTuple):
     """One control step of all envs, (N, ...)."""
 
     obs: torch.Tensor
-    teacher: torch.Tensor
+    behavior: torch.Tensor
     action: torch.Tensor
     """as it was handed to ``step``"""
     final_obs: torch.Tensor
@@ -64,7 +64,7 @@ class ScriptedEnv:
         }
 
     def step(self, action):
-        obs, teacher = self._obs(), self._info()["teacher_action"]
+        obs, behavior = self._obs(), self._info()["teacher_action"]
         self._targets = self._targets + 0.1 * action.clamp(-1, 1).repeat(1, N_TARGET // 4)
         self._age += 1
         self._t += 1
@@ -73,7 +73,7 @@ class ScriptedEnv:
         reward = torch.cos(3.0 * self._t + torch.arange(self.num_envs)) + 2.0 * (
             outcome == self.outcomes.index("success")
         )
-        self.log.append(Moment(obs, teacher, action.clone(), self._obs(), reward, ended & ~truncated, ended))
+        self.log.append(Moment(obs, behavior, action.clone(), self._obs(), reward, ended & ~truncated, ended))
         final = {"final_obs": self._obs(), "episode_return": reward, "episode_steps": self._age.clone()}
         self._episode += ended
         self._age[ended] = 0
@@ -97,6 +97,6 @@ class ScriptedEnv:
         return torch.cat([self._targets, moment[:, None]], 1)
 
     def _info(self):
-        teacher = torch.sin(self._obs()[:, -1:] + torch.arange(4.0))
+        behavior = torch.sin(self._obs()[:, -1:] + torch.arange(4.0))
         zeros = torch.zeros(self.num_envs, dtype=torch.int32)
-        return {"teacher_action": teacher, "leaf": zeros, "seed": zeros, "episode": self._episode.clone()}
+        return {"teacher_action": behavior, "leaf": zeros, "seed": zeros, "episode": self._episode.clone()}

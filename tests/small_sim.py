@@ -28,7 +28,7 @@ class SmallSim:
         "--set",
         "episode.horizon_steps=400",
         "--set",
-        "distill.batch=32",
+        "distillation.batch=32",
         "--set",
         "world_model.batch=32",
     )
@@ -57,7 +57,7 @@ class SmallSim:
         self.sim.reset(mask, seeds, numbers)
 
     def scenario_bank(self):
-        """The scenarios of episodes 0 .. N - 1 of seed 5, for the twin."""
+        """The scenarios of episodes 0 .. N - 1 of seed 5, for the surrogate."""
         from uuvtai.surrogate.world import ScenarioBank, scenario_rows
 
         self.begin(range(self.N), seed=5)

@@ -51,7 +51,7 @@ def make(
     checked_seed(seed)
     config = load_config(world, sensors, vehicle, overrides)
     return VectorEnv(
-        Sim(config, num_envs, read_tree(teacher, config.teacher.max_node), device),
+        Sim(config, num_envs, read_tree(teacher, config.behavior.max_node), device),
         seed,
         check_actions,
         owns_sim=True,

@@ -108,20 +108,20 @@ def sweep(
 
     Finished cells are kept when it is interrupted; --resume continues."""
     from uuvtai.console.views import show_sweep
-    from uuvtai.evaluation import sweep as play
+    from uuvtai.evaluation import sweep as sweeps
     from uuvtai.evaluation.grid import SweepRequest, grid_of
 
     parsing.refuse_less("--episodes", episodes, 1)
     engine, progress = place.made(), Progress("cells")
     if resume is not None:
         parsing.refuse_beside_resume(ctx, parsing.OF_A_SWEEP_RESUMED)
-        result, folder = play.resume(resume, engine, progress, allow_code)
+        result, folder = sweeps.resume(resume, engine, progress, allow_code)
     else:
         request = SweepRequest.typed(
             scene, agents.named(), grid=grid_of(grid or []), episodes=episodes,
             seeds=tuple(parsing.seeds("--seeds", seeds)), num_envs=num_envs, device=device,
         )  # fmt: skip
-        result, folder = play.sweep(request, engine, run_dir, progress)
+        result, folder = sweeps.sweep(request, engine, run_dir, progress)
     _report_if(with_report, folder)
     output.show(result, lambda screen: show_sweep(screen, result), folder)
 
@@ -421,7 +421,7 @@ def log_repair(file: opt.LogFile, out: opt.RepairOut = None, force: opt.LogForce
 @groups.grouped
 def reproduce(
     ctx: typer.Context,
-    own: groups.PiecesGroup,
+    own: groups.PluginsGroup,
     output: groups.PlainOutputGroup,
     budget: opt.BudgetName = "quick",
     allow_code: opt.AllowCode = False,
@@ -484,7 +484,7 @@ def pilot_vehicle(
     from uuvtai.vehicle.control_loop import fly
 
     config = scene.config()
-    found, failure = fly(config, read_tree(agent, config.teacher.max_node), flight.plan(config), say)
+    found, failure = fly(config, read_tree(agent, config.behavior.max_node), flight.plan(config), say)
     output.show(found, lambda screen: show_flight(screen, found))
     if failure is not None:
         raise failure
@@ -510,7 +510,7 @@ def serve_sitl(
     from uuvtai.vehicle.sitl import serve_water
 
     plan, config = served.plan(), scene.config()
-    found = serve_water(config, read_tree("straight", config.teacher.max_node), plan, say)
+    found = serve_water(config, read_tree("straight", config.behavior.max_node), plan, say)
     output.show(found, lambda screen: show_sitl(screen, found))
 
 
@@ -574,7 +574,7 @@ def replay_log(
 @groups.grouped
 def simulate(
     motion: groups.MotionGroup,
-    driver: groups.AgentGroup,
+    agent: groups.AgentGroup,
     output: groups.PlainOutputGroup,
     vehicle: opt.BaseVehicle = "bluerov2",
     overrides: opt.Set = None,
@@ -586,7 +586,7 @@ def simulate(
     from uuvtai.console.views import show_simulation
     from uuvtai.evaluation.simulate import simulate as run
 
-    trial, driven = motion.trial(), driver.one
+    trial, driven = motion.trial(), agent.one
     if driven is None:
         result = run(config, trial)
     else:

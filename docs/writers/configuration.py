@@ -211,7 +211,7 @@ def _set_by(name: str) -> dict[tuple[str, str], list[str]]:
 
 @functools.cache
 def _presets() -> list[tuple[str, dict[str, Any]]]:
-    """Every shipped preset of ``KINDS``: 'kind name', and what it says."""
+    """Every built-in preset of ``KINDS``: 'kind name', and what it says."""
     return [
         (f"{kind} `{name}`", loader.read_preset(kind, name))
         for kind in KINDS

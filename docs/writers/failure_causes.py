@@ -12,7 +12,8 @@ def page() -> str:
     parts = [
         "# Causes of failure",
         "`uuv eval --explain` runs every failed episode again and gives it one cause, the first of these "
-        "that holds. *Killer* is what the referee stopped the episode for. Forecasts, and whether there was "
+        "that holds. *Killer* is what the termination check stopped the episode for. Forecasts, and whether "
+        "there was "
         "a way out, are judged 1 s before the end.",
         text_table(["cause", "meaning"], causes),
         "Remarks say what may have contributed, where the killer moves; any number of them may hold: "

@@ -1,4 +1,4 @@
-"""Groot's palette of the shipped trees, from the table of leaves: ``python -m docs.writers.palettes``."""
+"""Groot's palette of the built-in trees, from the table of leaves: ``python -m docs.writers.palettes``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def with_palette(tree: str) -> str:
 
 
 def main() -> None:
-    """Write the palette of every shipped tree anew."""
+    """Write the palette of every built-in tree anew."""
     for path in sorted(TREES.glob("*.xml")):
         path.write_text(with_palette(path.read_text(encoding="utf-8")), encoding="utf-8")
 

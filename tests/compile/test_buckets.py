@@ -23,7 +23,7 @@ STEPS = 12
 
 
 def played(n_env, seed, **world):
-    """Positions after some steps of ``n_env`` episodes of a world; rows beyond them must stay asleep."""
+    """Positions after some steps of ``n_env`` episodes of a world; rows beyond them must stay inactive."""
     overrides = {"world.dynamic_capacity": 9} | {f"world.{key}": value for key, value in world.items()}
     sim = Sim(load_config("pool", "paper", overrides=overrides), n_env, read_tree("bt"))
     observation, action = sim.observe(), sim.action
@@ -34,8 +34,8 @@ def played(n_env, seed, **world):
         sim.step()
     pos_w = sim.rows(sim.s.vehicle.pos_w)
     assert pos_w.shape == (n_env, 3)
-    awake = sim.s.clock.awake.to_numpy()
-    assert awake[:n_env].all() and not awake[n_env:].any()
+    active = sim.s.clock.active.to_numpy()
+    assert active[:n_env].all() and not active[n_env:].any()
     return pos_w
 
 
@@ -46,7 +46,7 @@ def played(n_env, seed, **world):
         ("harsh", {}),
         ("multibeam_image", {}),
         ("ping360", {}),
-        ("nominal", {"forecast.learned": "shipped"}),
+        ("nominal", {"forecast.learned": "built-in"}),
         ("nominal", {"baselines.mppi.horizon_s": 1.0}),
     ],
 )
@@ -83,7 +83,7 @@ def test_kernels_do_not_see_how_many_obstacles_a_scene_has():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="own machine code is for Linux")
-def test_other_batches_bodies_and_speeds_compile_nothing_and_change_nothing():
+def test_other_batches_obstacles_and_speeds_compile_nothing_and_change_nothing():
     """The first batch may compile; the others find its code, and an episode is the same in every batch."""
     whole = played(6, 4, n_dynamic=6)
     made = native[0].made

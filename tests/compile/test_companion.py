@@ -41,7 +41,7 @@ def test_rows_that_fill_up_a_size_sleep(another, monkeypatch):
     """Kernels would write beyond the ends of the batch's tensors."""
     monkeypatch.setattr(another, "num_envs", another.num_envs - 2)
     wake(another)
-    for clock in (another.s.clock.awake, another.s.clock.active):
+    for clock in (another.s.clock.active, another.s.clock.running):
         assert clock.to_numpy().tolist() == [1] * another.num_envs + [0] * 2
 
 
@@ -58,7 +58,7 @@ def test_its_keys_are_those_that_the_first_process_looks_for(small, another):
     small.begin([0, 1])
     small.sim.step()
     store = native[0].store
-    looked_for = {"generate_scenarios", "update_map", "follow_bodies", "plan_evasion", "compute_reward"}
+    looked_for = {"generate_scenarios", "update_map", "follow_obstacles", "plan_evasion", "compute_reward"}
     for kernel, arguments in calls_of(another):
         if kernel.func.__name__ in looked_for:
             key = key_of(kernel, arguments, another.memory().tree, native[0].surroundings)

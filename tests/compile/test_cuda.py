@@ -21,7 +21,7 @@ class DevicesMemory(Memory):
 
     def __init__(self, sim):
         plain = sim.memory()
-        super().__init__(sim.s, sim.s.clock.active, 0, torch.device("cuda"))
+        super().__init__(sim.s, sim.s.clock.running, 0, torch.device("cuda"))
         self.address, self._bytes = plain.address, torch.from_numpy(plain.read())
 
     def _on_device(self):
@@ -31,21 +31,26 @@ class DevicesMemory(Memory):
 def test_a_gpus_numbers_are_told_at_once(small):
     sim = small.sim
     memory = DevicesMemory(sim)
-    for field in (sim.s.route.n_failed, sim.s.referee.outcome, sim.s.route.failed):
+    for field in (sim.s.route.n_failed, sim.s.termination.outcome, sim.s.route.failed):
         assert memory.tensor(field).numpy().tolist() == sim._memory.live(field).tolist()
-    outcome, kept = sim._memory.live(sim.s.referee.outcome), sim._memory.live(sim.s.referee.outcome).copy()
+    outcome, kept = (
+        sim._memory.live(sim.s.termination.outcome),
+        sim._memory.live(sim.s.termination.outcome).copy(),
+    )
     failed = sim._memory.live(sim.s.route.n_failed)
-    counts = HostCounts(memory, sim.s.referee.outcome, SmallSim.N)
+    counts = HostCounts(memory, sim.s.termination.outcome, SmallSim.N)
     try:
         outcome[...], failed[...] = RUNNING, 3
         assert (counts.number(sim.s.route.n_failed), counts.any_ended) == (3, 0)
         outcome[SmallSim.N - 1] = TIMEOUT
         assert (counts.number(sim.s.route.n_failed), counts.any_ended) == (3, 1)
         mask = torch.zeros(SmallSim.N, dtype=torch.int32)
-        assert not counts.has_any(sim.s.referee.outcome, mask)
+        assert not counts.has_any(sim.s.termination.outcome, mask)
         mask[-1] = 1
-        assert counts.has_any(sim.s.referee.outcome, mask)
-        assert HostCounts(sim._memory, sim.s.referee.outcome, SmallSim.N).has_any(sim.s.referee.outcome, mask)
+        assert counts.has_any(sim.s.termination.outcome, mask)
+        assert HostCounts(sim._memory, sim.s.termination.outcome, SmallSim.N).has_any(
+            sim.s.termination.outcome, mask
+        )
     finally:
         outcome[...], failed[...] = kept, 0
 

@@ -77,11 +77,11 @@ def changed(small, patch, change):
     elif change == "planner":
         patch.setattr(sim, "planner", Straight())
     elif change == "observation":
-        width = features.observation_width(config.features)
+        width = features.observation_width(config.observation)
         patch.setattr(sim, "observation", torch.full((small.N, width), 7.0))
     else:
-        camera = config.elevation.model_copy(update={"use_camera": not config.elevation.use_camera})
-        configure(patch, sim, config.model_copy(update={"elevation": camera}))
+        camera = config.height.model_copy(update={"use_camera": not config.height.use_camera})
+        configure(patch, sim, config.model_copy(update={"height": camera}))
 
 
 @pytest.mark.parametrize("change", ["tree", "privileged", "planner", "observation", "config"])
@@ -173,4 +173,4 @@ def test_timed_stages_are_not_launched_in_a_row(small, monkeypatch):
     monkeypatch.setattr(small.sim, "stage_s", {})
     small.begin(range(small.N))
     small.sim.step()
-    assert small.sim.stage_s.keys() >= {"dynamics", "tracking", "teacher"} and not rows_of(small.sim)
+    assert small.sim.stage_s.keys() >= {"dynamics", "tracking", "behavior"} and not rows_of(small.sim)

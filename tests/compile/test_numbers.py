@@ -16,7 +16,7 @@ from tests.compile.test_native import N, Scene, Source, Sums, place, started  # 
 from uuvtai.compile import launch as module
 from uuvtai.compile.cache import ALL, key_of, noted, sections_in, value_of, values_of
 from uuvtai.compile.launch import Number, Numbers, native, quick_launch, worked_out
-from uuvtai.config import Config, EpisodeConfig, SonarConfig, TeacherConfig
+from uuvtai.config import BehaviorConfig, Config, EpisodeConfig, SonarConfig
 from uuvtai.envs.warm_up import calls_of
 from uuvtai.kernels.core.stage import Bundle, Const, In, Out
 from uuvtai.sim.sim import Sim
@@ -172,46 +172,46 @@ def test_what_is_no_number_cannot_be_reckoned_with(wrong):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PartsIO:
-    teacher_cfg: "Const[TeacherConfig]"
+    behavior_cfg: "Const[BehaviorConfig]"
     sonar_cfg: "Const[SonarConfig]"
     all_cfg: "Const[Config]"
 
 
 def parts():
     config = Config()
-    return PartsIO(config.teacher, config.sensors.sonar, config)
+    return PartsIO(config.behavior, config.sensors.sonar, config)
 
 
 def test_every_section_has_its_places():
     places = dict(sections_in(parts()))
     assert {
-        "teacher_cfg",
+        "behavior_cfg",
         "sonar_cfg",
         "all_cfg",
-        "all_cfg.teacher",
+        "all_cfg.behavior",
         "all_cfg.sensors.sonar",
     } <= places.keys()
-    assert places["teacher_cfg"] is places["all_cfg.teacher"]
+    assert places["behavior_cfg"] is places["all_cfg.behavior"]
 
 
 def test_what_is_read_is_noted_in_all_its_places_and_by_code_of_the_section_too():
     io = parts()
     with noted(io) as (names, _):
-        assert io.teacher_cfg.n_heading == 24
+        assert io.behavior_cfg.n_heading == 24
         assert io.sonar_cfg.is_ring
-        assert not hasattr(io.teacher_cfg, "nothing_of_that_name")
+        assert not hasattr(io.behavior_cfg, "nothing_of_that_name")
     assert names == {
-        "teacher_cfg.n_heading",
-        "all_cfg.teacher.n_heading",
+        "behavior_cfg.n_heading",
+        "all_cfg.behavior.n_heading",
         '["==", "sonar_cfg.horizontal_aperture_deg", 360.0]',
     }
     with noted(io) as (names, _):
-        io.teacher_cfg.model_dump()
-    assert f"teacher_cfg.{ALL}" in names
-    assert values_of([f"teacher_cfg.{ALL}"], io) == [(f"teacher_cfg.{ALL}", repr(io.teacher_cfg))]
+        io.behavior_cfg.model_dump()
+    assert f"behavior_cfg.{ALL}" in names
+    assert values_of([f"behavior_cfg.{ALL}"], io) == [(f"behavior_cfg.{ALL}", repr(io.behavior_cfg))]
     with noted(io) as (names, _):
         pass
-    assert io.teacher_cfg.n_heading == 24 and names == set(), "nothing is noted any more"
+    assert io.behavior_cfg.n_heading == 24 and names == set(), "nothing is noted any more"
 
 
 def test_what_another_config_lacks_is_told_apart():
@@ -221,16 +221,16 @@ def test_what_another_config_lacks_is_told_apart():
         ('["/", 1.0, ["-", "sonar_cfg.max_range_m", 12.0]]', ""),
         ('["<", "no.such", 1]', ""),
     ]
-    assert values_of(["all_cfg.teacher"], io) == [("all_cfg.teacher", "TeacherConfig")]
+    assert values_of(["all_cfg.behavior"], io) == [("all_cfg.behavior", "BehaviorConfig")]
 
 
 # ------------------------------------------------------------------------------------- the whole simulator
 
 SHAPES = {"depth_cfg.fov_deg", "sonar_cfg.horizontal_aperture_deg"}
 """numbers among these that are no argument: what is seen is shaped by them"""
-LIMITED = {"teacher_cfg.cruise_m_s", "teacher_cfg.back_off_m_s"}
+LIMITED = {"behavior_cfg.cruise_m_s", "behavior_cfg.back_off_m_s"}
 """numbers of which the smaller of two is taken that are equal by default: 1 % more decides otherwise"""
-OFTEN = ("teacher_cfg", "reward_cfg", "forecast_cfg", "sonar_cfg", "depth_cfg", "sensors_cfg.dvl",
+OFTEN = ("behavior_cfg", "reward_cfg", "forecast_cfg", "sonar_cfg", "depth_cfg", "sensors_cfg.dvl",
          "sensors_cfg.imu", "sensors_cfg.pressure")  # fmt: skip
 """sections whose numbers people change"""
 
@@ -255,7 +255,7 @@ def test_another_number_of_the_tree_the_reward_the_forecast_or_the_noise_compile
                     told = [json.loads(text) for text in kept[0] if leaf in text and text.startswith("[")]
                     if any(comes_to(each, io, leaf, 1.0) != comes_to(each, io, leaf, 1.01) for each in told):
                         wrong.add(leaf)
-    assert len(tried) > 100 and {leaf.partition(".")[0] for leaf in tried} >= {"teacher_cfg", "reward_cfg"}
+    assert len(tried) > 100 and {leaf.partition(".")[0] for leaf in tried} >= {"behavior_cfg", "reward_cfg"}
     assert wrong == SHAPES | LIMITED
 
 
@@ -265,11 +265,11 @@ def comes_to(told, io, leaf, factor):
 
 
 def test_another_threshold_is_as_warm_as_before(small):
-    """What ``uuv eval --set teacher.caution=1.3`` builds: every kernel is found."""
+    """What ``uuv eval --set behavior.caution=1.3`` builds: every kernel is found."""
     small.begin([0, 1])
     small.sim.step()
     changed = {
-        "teacher": small.config.teacher.model_copy(update={"caution": 1.3, "emergency_ttc_s": 0.9}),
+        "behavior": small.config.behavior.model_copy(update={"caution": 1.3, "emergency_ttc_s": 0.9}),
         "reward": small.config.reward.model_copy(update={"progress": 2.0}),
     }
     other, before = Sim(small.config.model_copy(update=changed), small.N, small.trees["bt"]), native[0].made

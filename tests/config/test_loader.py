@@ -147,7 +147,7 @@ def test_paper_is_the_table_to_the_letter():
         1.5,
         1.0,
     )
-    assert (c.distill.batch, c.distill.steps, c.distill.learning_rate) == (1024, 2, 1.5e-4)
+    assert (c.distillation.batch, c.distillation.steps, c.distillation.learning_rate) == (1024, 2, 1.5e-4)
     assert (c.world_model.latent, c.world_model.hidden, c.world_model.batch, c.world_model.steps) == (
         64,
         (128, 128),
@@ -173,7 +173,13 @@ def test_paper_is_the_table_to_the_letter():
     )
     assert not any(
         c.forecast.model_dump()[switch]
-        for switch in ("use_turn_rate", "use_habits", "use_reflection", "use_coasting", "use_turning_back")
+        for switch in (
+            "use_turn_rate",
+            "use_turn_history",
+            "use_reflection",
+            "use_coasting",
+            "use_turning_back",
+        )
     )
 
 
@@ -182,7 +188,7 @@ def test_the_paper_schedule_meets_the_equation():
     schedule)."""
     from uuvtai.learning.distillation import piecewise_linear
 
-    points = load_training("paper").distill.schedule
+    points = load_training("paper").distillation.schedule
     for t in (0, 400, 800, 801, 1000, 1199, 1500, 1600, 2000):
         expected = 1.0 if t <= 800 else 0.2 * (1 - (t - 800) / 800) if t <= 1600 else 0.0
         assert piecewise_linear(points, t / 1200) == pytest.approx(expected, abs=1e-6)
@@ -232,7 +238,7 @@ def test_a_users_own_stack_extends_one(tmp_path):
     ("text", "says"),
     [
         ("world: {n_static: 0}\n", "mine.yaml:1: a stack cannot set 'world'"),
-        ("features: {n_track: 4}\n", "a stack cannot set 'features'"),
+        ("observation: {n_track: 4}\n", "a stack cannot set 'observation'"),
         ("voronoi: {usee: fused}\n", "mine.yaml:1: unknown key 'voronoi.usee'; did you mean 'use'?"),
         ("extends: papr\n", "did you mean 'paper'"),
     ],
@@ -269,8 +275,8 @@ def differing(config, base):
 @pytest.mark.parametrize(
     ("row", "keys"),
     [
-        ("ppo", {"distill.schedule", "distill.steps"}),
-        ("distill_20", {"distill.schedule"}),
+        ("ppo", {"distillation.schedule", "distillation.steps"}),
+        ("distill_20", {"distillation.schedule"}),
         ("no_risk_scaling", {"uncertainty.gain"}),
         ("no_world_model", {"world_model.as_features"}),
     ],
@@ -300,7 +306,7 @@ def test_a_training_preset_names_presets_and_changes_them(tmp_path):
             "mine.yaml:2: world.preset must be the name or path of a world preset, got 3",
         ),
         ("ppo:\n  gama: 1\n", "mine.yaml:2: unknown key 'ppo.gama'; did you mean 'gamma'?"),
-        ("distill: {schedule: [[1, 0], [0, 1]]}\n", "shares not falling"),
+        ("distillation: {schedule: [[1, 0], [0, 1]]}\n", "shares not falling"),
         ("train: {seed: 500000}\n", "must differ from train.seed"),
         ("extends: curiculum\n", "did you mean 'curriculum'"),
     ],
@@ -362,7 +368,7 @@ def test_a_world_file_is_no_vehicle(tmp_path):
 
 
 def test_explicit_obstacles_count():
-    assert load_config("maze").world.bodies == {"S": 11, "D": 6, "fixed_static": 3, "fixed_moving": 0}
+    assert load_config("maze").world.obstacles == {"S": 11, "D": 6, "fixed_static": 3, "fixed_moving": 0}
 
 
 # ------------------------------------------------------------------------------------------ light vehicles

@@ -186,13 +186,13 @@ def test_a_command_refuses_a_nonsense_thread_count(tmp_path):
 
 
 def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluation):
-    """A run folder, a vehicle and a method whose names look like markup: in titles, cells and lines of every
+    """A run folder, a vehicle and an agent whose names look like markup: in titles, cells and lines of every
     table."""
     folder, document, _ = evaluation
     odd = json.loads(json.dumps(document))
     odd["world"] = odd["sensors"] = "[/x]"
-    for method in odd["methods"]:
-        method["name"] = "[/x]" + method["name"]
+    for agent in odd["agents"]:
+        agent["name"] = "[/x]" + agent["name"]
     show_evaluation(Screen(), odd, Path("[/x]"))
     monkeypatch.chdir(tmp_path)
     Path("a[/x]").mkdir(parents=True)
@@ -423,22 +423,22 @@ def evaluation(tmp_path_factory):
 
 def test_eval_prints_one_document_with_every_documented_key(evaluation):
     _, document, _ = evaluation
-    assert {"schema", "world", "S", "D", "v_m_s", "sensors", "seeds", "episodes_per_seed", "methods"} <= set(
+    assert {"schema", "world", "S", "D", "v_m_s", "sensors", "seeds", "episodes_per_seed", "agents"} <= set(
         document
     )
-    assert [m["name"] for m in document["methods"]] == ["straight", "bt"]
-    for method in document["methods"]:
+    assert [m["name"] for m in document["agents"]] == ["straight", "bt"]
+    for agent in document["agents"]:
         assert {
             "name", "episodes", "outcomes", "success_rate", "success_ci95", "collision_rate",
             "collision_ci95", "return_mean",
             "time_mean_s", "tts_s", "time_to_success_mean_s", "min_clearance_mean_m", "path_length_mean_m",
             "replans_per_episode", "replans_by_trigger",
             "planned_by", "env_steps", "wall_s", "env_steps_per_s", "episodes_detail",
-        } <= set(method)  # fmt: skip
-        assert sum(method["outcomes"].values()) == method["episodes"] == 4
-        assert set(method["outcomes"]) == {"success", "collision", "ttc", "out_of_tank", "timeout"}
-        assert [d["episode"] for d in method["episodes_detail"]] == [0, 1, 2, 3]
-        assert method["env_steps"] == sum(round(d["time_s"] / 0.02) for d in method["episodes_detail"])
+        } <= set(agent)  # fmt: skip
+        assert sum(agent["outcomes"].values()) == agent["episodes"] == 4
+        assert set(agent["outcomes"]) == {"success", "collision", "ttc", "out_of_tank", "timeout"}
+        assert [d["episode"] for d in agent["episodes_detail"]] == [0, 1, 2, 3]
+        assert agent["env_steps"] == sum(round(d["time_s"] / 0.02) for d in agent["episodes_detail"])
 
 
 def messages_of(log):
@@ -462,9 +462,7 @@ def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, tmp_pa
     done = subprocess.run(
         command, capture_output=True, text=True, check=True, env={**os.environ, "UUV_NUM_THREADS": "1"}
     )
-    assert (
-        json.loads(done.stdout)["methods"][0]["episodes_detail"] == document["methods"][1]["episodes_detail"]
-    )
+    assert json.loads(done.stdout)["agents"][0]["episodes_detail"] == document["agents"][1]["episodes_detail"]
     alone, together = (messages_of(run / "logs/bt_seed3_episode0.mcap") for run in (tmp_path / "run", folder))
     assert {topic for topic, _, _ in alone} >= {"/sonar/scan", "/map/static", "/map/dynamic"}
     assert alone == together
@@ -477,7 +475,7 @@ def test_eval_leaves_a_complete_run_folder(evaluation):
         "config.yaml", "run.json", "eval/result.json", "eval/tree.json", "eval/trees/bt.xml",
         "logs/bt_seed3_episode0.mcap",
         "logs/straight_seed3_episode0.mcap", "pictures/seed3_episode0.png", "videos/bt_seed3_episode0.webm",
-        "report.html", "figures/methods.png",
+        "report.html", "figures/agents.png",
     } <= names  # fmt: skip
     assert not [n for n in names if n.endswith((".tmp", ".part"))]
     run = json.loads((folder / "run.json").read_text())
@@ -491,7 +489,7 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     assert code == 0
     nodes = json.loads(out)["nodes"]
     assert nodes[0]["share"] == 1.0
-    bt = document["methods"][1]
+    bt = document["agents"][1]
     # the tree is ticked once when the episode begins and after every step
     assert nodes[0]["ticks"] == bt["env_steps"] + bt["episodes"]
     assert sum(n["acted"] for n in nodes) <= nodes[0]["ticks"]

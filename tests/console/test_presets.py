@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from tests.command import uuv
-from uuvtai.common.presets import KINDS, preset_names, shipped_file
+from uuvtai.common.presets import KINDS, built_in_file, preset_names
 from uuvtai.console.views import near, sentences
 
 
@@ -29,7 +29,7 @@ def test_show_prints_what_a_preset_states_with_units_and_sources(kind, capfd):
             capfd, "presets", "show", f"{kind}/{name}", *(["--all"] if kind == "tree" else [])
         )
         assert code == 0, err
-        assert out == shipped_file(kind, name).read_text().rstrip("\n") + "\n"
+        assert out == built_in_file(kind, name).read_text().rstrip("\n") + "\n"
         extends = "extends:" in out and kind != "tree"
         assert ("it changes these keys of" in err) == extends
 
@@ -38,7 +38,7 @@ def test_show_prints_what_a_preset_states_with_units_and_sources(kind, capfd):
 def test_json_of_show_holds_what_the_file_states(kind, capfd):
     name = preset_names(kind)[0]
     _, out, _ = uuv(capfd, "presets", "show", f"{kind}/{name}", "--json")
-    assert json.loads(out) == yaml.safe_load(shipped_file(kind, name).read_text())
+    assert json.loads(out) == yaml.safe_load(built_in_file(kind, name).read_text())
 
 
 def test_all_prints_every_key_with_defaults_and_what_it_builds_on(capfd):

@@ -13,10 +13,10 @@ from uuvtai.console.doctor import show_checks
 from uuvtai.console.screen import Screen
 from uuvtai.console.views import (
     sentences,
+    show_agents,
     show_causes,
     show_export,
     show_log,
-    show_methods,
     show_pairs,
     show_presets,
     show_profile,
@@ -38,21 +38,21 @@ def shown(show, width, wide=False):
 
 
 def evaluation():
-    """Four methods with the longest figures that there are, one of them privileged."""
+    """Four agents with the longest figures that there are, one of them privileged."""
     names = {"straight": 281, "planner": 290, "bt+truth": 500, "20261122-154501_curriculum": 0}
-    methods = [
-        samples.method(name, k, 500 - k, 500, privileged=name == "bt+truth", env_steps_per_s=25123.4)
+    agents = [
+        samples.agent(name, k, 500 - k, 500, privileged=name == "bt+truth", env_steps_per_s=25123.4)
         for name, k in names.items()
     ]
-    return samples.evaluation_document(*methods) | {
+    return samples.evaluation_document(*agents) | {
         "remainder": [],
-        "paired": paired(methods),
+        "paired": paired(agents),
     }
 
 
 def explained():
     cause = samples.CAUSE | {"examples": [[90001, 499]], "label": "unseen_above_or_below"}
-    return {"methods": [{"name": "bt", "episodes": 500, "explain": [{}, {}], "causes": [cause]}]}
+    return {"agents": [{"name": "bt", "episodes": 500, "explain": [{}, {}], "causes": [cause]}]}
 
 
 def simulated():
@@ -89,13 +89,13 @@ CLAIMS = {
     "claims": [{"text": "word " * 30, "theirs": "82.8 %", "ours": "96.5 % [95.1, 97.5]", "verdict": "holds"}],
 }
 SHOWS = {
-    "eval": (lambda s: show_methods(s, evaluation()), ["method", "success [95 %]", "collision [95 %]"]),
+    "eval": (lambda s: show_agents(s, evaluation()), ["agent", "success [95 %]", "collision [95 %]"]),
     "pairs": (lambda s: show_pairs(s, evaluation()["paired"]), ["a : b", "only a", "only b", "(McNemar)"]),
     "causes": (lambda s: show_causes(s, explained()), ["cause", "n"]),
     "simulate": (lambda s: show_simulation(s, simulated(), "bluerov2"), ["t s", "x m", "y m", "z m"]),
     "sweep": (
         lambda s: show_sweep(s, samples.robustness_sweep()),
-        ["changed", "method", "success [95 %]", "collision [95 %]"],
+        ["changed", "agent", "success [95 %]", "collision [95 %]"],
     ),
     "profile": (lambda s: show_profile(s, PROFILE), ["us per env-step", "65536 env"]),
     "export": (lambda s: show_export(s, Exported), ["engine"]),
@@ -132,8 +132,8 @@ def test_no_cell_is_cut_and_the_essential_columns_are_there(name, width):
 @pytest.mark.parametrize("width", WIDTHS)
 def test_rates_of_an_evaluation_stand_whole_in_one_line(width):
     result = evaluation()
-    lines = shown(lambda s: show_methods(s, result), width).splitlines()
-    for m in result["methods"]:
+    lines = shown(lambda s: show_agents(s, result), width).splitlines()
+    for m in result["agents"]:
         o = m["outcomes"]
         (row,) = [
             line for line in lines if re.search(rf"\b{o['success']}/500 = .*\b{o['collision']}/500 = ", line)
@@ -143,7 +143,7 @@ def test_rates_of_an_evaluation_stand_whole_in_one_line(width):
 
 def test_a_wider_terminal_shows_more_and_what_is_left_out_is_said():
     result = evaluation()
-    found = {width: shown(lambda s: show_methods(s, result), width) for width in (*WIDTHS, 200)}
+    found = {width: shown(lambda s: show_agents(s, result), width) for width in (*WIDTHS, 200)}
     assert "steps/s" in found[200].split("left out")[0] and "left out" not in found[200]
     for width in WIDTHS:
         before, _, after = found[width].partition("left out, for want of room: ")
@@ -169,7 +169,7 @@ def test_wide_shows_every_column(name):
 
 
 def test_a_file_is_wide(capsys):
-    show_methods(Screen(), evaluation())
+    show_agents(Screen(), evaluation())
     out = capsys.readouterr().out
     assert "steps/s" in out and "left out" not in out
 
@@ -210,7 +210,7 @@ def test_heat_maps_come_in_pieces_where_they_are_wider_than_the_terminal():
 def test_long_values_of_an_axis_are_not_cut():
     axes = {"S": [4, 8], "sensors.localization": ["truth", "dead_reckoning_with_drift"]}
     cells = [
-        {"S": s, "sensors.localization": v, "method": "bt", **samples.rates(9, 3)}
+        {"S": s, "sensors.localization": v, "agent": "bt", **samples.rates(9, 3)}
         for s in axes["S"]
         for v in axes["sensors.localization"]
     ]

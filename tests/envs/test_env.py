@@ -209,7 +209,7 @@ def test_teacher_action_drives_as_the_tree_does(env):
     assert (info["teacher_action"].abs().amax(dim=1) > 0).all()
     *_rest, info = env.step(full([-0.123, 0, 0, 0]))
     assert not (info["teacher_action"] == -0.123).any()
-    np.testing.assert_allclose(info["teacher_action"], env.sim.s.teacher.action.to_numpy())
+    np.testing.assert_allclose(info["teacher_action"], env.sim.s.behavior.action.to_numpy())
 
 
 def test_nothing_is_copied(env):
@@ -272,7 +272,7 @@ def test_leaf_is_the_node_whose_action_is_told(env):
     seen = set()
     for _ in range(30):
         *_rest, info = env.step(info["teacher_action"].clone())
-        np.testing.assert_array_equal(info["leaf"], env.sim.s.teacher.leaf.to_numpy())
+        np.testing.assert_array_equal(info["leaf"], env.sim.s.behavior.leaf.to_numpy())
         seen |= set(info["leaf"].tolist())
     actions = {
         i
@@ -287,36 +287,38 @@ def test_columns_find_every_group(env):
     assert list(env.columns) == [row.name for row in env.observation_table]
     assert env.columns["goal"] == slice(0, 3) and env.columns["sector_range"] == slice(12, 24)
     np.testing.assert_allclose(
-        obs[:, env.columns["sector_range"]], env.sim.s.features.sector_range_m.to_numpy()
+        obs[:, env.columns["sector_range"]], env.sim.s.observation.sector_range_m.to_numpy()
     )
 
 
-def test_bodies_and_advice_stand_behind_the_paper_observation(small, env, monkeypatch):
+def test_obstacles_and_advice_stand_behind_the_paper_observation(small, env, monkeypatch):
     """Switched on by the config alone: what was there stays as it was, the tree's action is the one that is
     told."""
     plain = VectorEnv(small.sim, seed=SEED)
     wanted = [plain.reset()[0].clone(), *(plain.step(full([0.6, 0, 0, 0.05]))[0].clone() for _ in range(80))]
-    more = small.config.features.model_copy(update={"n_track": 2, "teacher": True})
-    configure(monkeypatch, small.sim, small.config.model_copy(update={"features": more}))
+    more = small.config.observation.model_copy(update={"n_track": 2, "behavior": True})
+    configure(monkeypatch, small.sim, small.config.model_copy(update={"observation": more}))
     with VectorEnv(small.sim, seed=SEED) as shown:
         assert shown.observation_sha256 != plain.observation_sha256
         assert list(shown.columns)[-4:] == [
             "teacher_action",
-            "teacher_conflict",
-            "teacher_evade_cost",
-            "teacher_class",
+            "behavior_conflict",
+            "behavior_evade_cost",
+            "behavior_class",
         ]
         obs, info = shown.reset()
         seen = 0
         for step, paper in enumerate(wanted):
             assert torch.equal(obs[:, : plain.num_obs], paper), f"step {step}"
             assert torch.equal(obs[:, shown.columns["teacher_action"]], info["teacher_action"])
-            assert (obs[:, shown.columns["teacher_class"]].sum(dim=1) == (info["leaf"] >= 0)).all()
+            assert (obs[:, shown.columns["behavior_class"]].sum(dim=1) == (info["leaf"] >= 0)).all()
             moving = (small.sim.s.tracks.alive.to_numpy() * small.sim.s.tracks.moving.to_numpy()).sum(axis=1)
-            np.testing.assert_array_equal(obs[:, shown.columns["body_valid"]].sum(dim=1), moving.clip(max=2))
+            np.testing.assert_array_equal(
+                obs[:, shown.columns["obstacle_valid"]].sum(dim=1), moving.clip(max=2)
+            )
             seen += int(moving.sum())
             obs, *_rest, info = shown.step(full([0.6, 0, 0, 0.05]))
-        assert seen > 0, "no body was ever tracked"
+        assert seen > 0, "no obstacle was ever tracked"
         obs = obs.clone()
         arrays = shown.capture()
         assert torch.equal(shown.restore(arrays)[0], obs)
@@ -424,7 +426,7 @@ def test_a_closed_environment_stays_closed(small, env):
     [
         ({"world": "pol"}, ConfigError, "pool"),
         ({"sensors": "perfect"}, ConfigError, "paper"),
-        ({"teacher": "oracle"}, ConfigError, "planner"),
+        ({"behavior": "oracle"}, ConfigError, "planner"),
         ({"overrides": {"world.n_dynamics": 3}}, ConfigError, "n_dynamic"),
         ({"num_envs": 0}, ValueError, "at least 1 env"),
         ({"num_envs": 2.0}, TypeError, "num_envs must be an int"),

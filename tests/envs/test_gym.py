@@ -134,7 +134,7 @@ def test_spaces_hold_what_comes(make):
 
 
 def test_every_bound_is_of_a_column(small):
-    everything = small.config.features.model_copy(update={"n_track": 2, "teacher": True})
+    everything = small.config.observation.model_copy(update={"n_track": 2, "behavior": True})
     assert set(bounds(small.config)) <= {column.name for column, _first, _width in placed_columns(everything)}
     table = VectorEnv(small.sim).observation_table
     space, places = observation_space(table, small.config), {column.name: column.slice for column in table}
@@ -144,8 +144,8 @@ def test_every_bound_is_of_a_column(small):
 
 
 def test_the_docs_list_the_columns(small):
-    features = small.config.features.model_copy(update={"n_track": 1, "teacher": True})
-    per = {"": "", "sector": " a sector", "body": " a body"}
+    features = small.config.observation.model_copy(update={"n_track": 1, "behavior": True})
+    per = {"": "", "sector": " a sector", "body": " an obstacle"}
     rows = [
         f"| `{column.name}` | {column.width}{per[column.per]} | {column.unit} | {column.frame} | "
         f"{column.meaning} |"

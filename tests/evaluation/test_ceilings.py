@@ -32,11 +32,11 @@ def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
     )
     assert code == 0, err
     document = json.loads(out)
-    bt, truth, oracle = document["methods"]
-    assert [m["name"] for m in document["methods"]] == ["bt", "bt+truth", "oracle"]
-    assert [m["privileged"] for m in document["methods"]] == [False, True, True]
+    bt, truth, oracle = document["agents"]
+    assert [m["name"] for m in document["agents"]] == ["bt", "bt+truth", "oracle"]
+    assert [m["privileged"] for m in document["agents"]] == [False, True, True]
     assert all(set(m) >= set(bt) for m in (truth, oracle))
-    paired = [[(d["seed"], d["episode"]) for d in m["episodes_detail"]] for m in document["methods"]]
+    paired = [[(d["seed"], d["episode"]) for d in m["episodes_detail"]] for m in document["agents"]]
     assert paired[0] == paired[1] == paired[2] == [(SEED, 0), (SEED, 1), (SEED, 2)]
     for driven in (bt, truth):
         for ours, best in zip(driven["episodes_detail"], oracle["episodes_detail"], strict=True):
@@ -46,7 +46,7 @@ def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
     assert oracle["return_mean"] is None and oracle["env_steps"] == 0
     assert json.loads((tmp_path / "run/eval/result.json").read_text()) == document
     (remainder,) = document["remainder"]
-    assert remainder == remainder_of(document["methods"])[0]
+    assert remainder == remainder_of(document["agents"])[0]
     assert (
         remainder["missed"]
         == 3 - bt["outcomes"]["success"]
@@ -68,11 +68,9 @@ def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, capfd, tmp_path)
     assert code == 0, err
     code, alone, err = uuv(capfd, *COMMAND, "--agent", "bt", "--run-dir", str(tmp_path / "b"), "--json")
     assert code == 0, err
-    truth, bt = json.loads(out)["methods"]
+    truth, bt = json.loads(out)["agents"]
     assert (
-        bt["episodes_detail"]
-        == json.loads(alone)["methods"][0]["episodes_detail"]
-        != truth["episodes_detail"]
+        bt["episodes_detail"] == json.loads(alone)["agents"][0]["episodes_detail"] != truth["episodes_detail"]
     )
 
 
@@ -81,10 +79,10 @@ def test_failures_of_a_privileged_tree_are_replayed_with_the_truth(borrowed, cap
     options = ["--agent", "straight+truth,oracle", "--explain", "--explain-record", "0", "--json"]
     code, out, err = uuv(capfd, *COMMAND, *options, "--run-dir", str(tmp_path / "run"))
     assert code == 0, err
-    straight, oracle = json.loads(out)["methods"]
+    straight, oracle = json.loads(out)["agents"]
     assert len(straight["explain"]) == 3 - straight["outcomes"]["success"] > 0
     assert "explain" not in oracle
-    assert [m["name"] for m in json.loads((tmp_path / "run/eval/explain.json").read_text())["methods"]] == [
+    assert [m["name"] for m in json.loads((tmp_path / "run/eval/explain.json").read_text())["agents"]] == [
         "straight+truth"
     ]
 
@@ -101,7 +99,7 @@ def test_what_is_missing_is_split_by_hand():
         entry("oracle", *range(9)),
     ]
     parts = {"sensing": 2, "forecast_decision": 3, "physics": 1, "lost_with_truth": 1}
-    assert remainder_of(entries) == [{"method": "bt", "episodes": 10, "missed": 6, **parts}]
+    assert remainder_of(entries) == [{"agent": "bt", "episodes": 10, "missed": 6, **parts}]
     assert remainder_of(entries[:3]) == []
 
 
@@ -109,14 +107,14 @@ def test_scenarios_are_those_that_are_played_in_any_batch(small):
     """More jobs than rows, in another order."""
     jobs = [Job(SEED, episode) for episode in (9, 2, 5, 1, 7, 8, 3, 0, 4, 6)]
     found = dict(zip(jobs, scenarios_of(small.sim, jobs), strict=True))
-    assert not small.sim.rows(small.sim.s.clock.active).any()
+    assert not small.sim.rows(small.sim.s.clock.running).any()
     small.begin([4, 2], seed=SEED)
     starts = small.sim.rows(small.sim.s.mission.start_w)
     assert (
         found[Job(SEED, 4)]["start"] == starts[0].tolist()
         and found[Job(SEED, 2)]["start"] == starts[1].tolist()
     )
-    assert len(found[Job(SEED, 4)]["bodies"]) == 14
+    assert len(found[Job(SEED, 4)]["obstacles"]) == 14
 
 
 def test_a_tree_of_the_users_own_may_have_a_plus_in_its_name(tmp_path):

@@ -28,9 +28,9 @@ from uuvtai.evaluation.failure_causes import (
 )
 from uuvtai.evaluation.failure_facts import (
     WINDOW_S,
-    Bodies,
     CoarseHistory,
     History,
+    Obstacles,
     candidates,
     escapes,
     motion,
@@ -64,9 +64,9 @@ class Story:
         self.size = np.array([[radius] * 3, [0.2] * 3, [0.3, 0.3, 0.8]])
         self.speed = np.array([speed, 0.0, 0.0])
         self.circle = np.zeros(3)
-        self.body = np.tile(np.array([2.0, 1.0, -0.8]), (self.n, 3, 1))
+        self.obstacle = np.tile(np.array([2.0, 1.0, -0.8]), (self.n, 3, 1))
         touching = at(NOSE_M + gap + radius, 0.0, rise)
-        self.body[:, KILLER] = touching + self.ago[:, None] * [speed, 0.0, 0.0]
+        self.obstacle[:, KILLER] = touching + self.ago[:, None] * [speed, 0.0, 0.0]
         self.vel = np.zeros((self.n, 3, 3))
         self.vel[:, KILLER, 0] = -speed
         self.hull_vel = np.zeros((self.n, 3))
@@ -85,34 +85,34 @@ class Story:
     def turn(self, ago_s, before=(0.0, -1.0)):
         """The killer moved along ``before`` until ``ago_s`` before the end; forecasts went on straight."""
         early = self.ago > ago_s + 1e-6
-        corner = self.body[~early, KILLER][0]
+        corner = self.obstacle[~early, KILLER][0]
         self.vel[early, KILLER] = [before[0], before[1], 0.0]
-        self.body[early, KILLER] = corner - (self.ago[early, None] - ago_s) * self.vel[early, KILLER]
+        self.obstacle[early, KILLER] = corner - (self.ago[early, None] - ago_s) * self.vel[early, KILLER]
         self.foreseen_vel[early] = before
         return self
 
     def put(self, slot, kind, pos, size, speed=0.0):
         self.kind[slot], self.size[slot], self.speed[slot] = kind, size, speed
-        self.body[:, slot] = pos
+        self.obstacle[:, slot] = pos
         return self
 
-    def bodies(self):
-        return Bodies(
+    def obstacles(self):
+        return Obstacles(
             self.kind, self.size, np.zeros(3), self.speed, self.circle, np.where(self.speed > 0, 8.0, np.inf)
         )
 
     def scan(self):
         """Beam 0 looks at the killer, wherever it is: the tests turn the vehicle's yaw with the bearing."""
-        away = np.linalg.norm((self.body[:, KILLER] - self.pos)[:, :2], axis=1) - self.size[KILLER, 0]
+        away = np.linalg.norm((self.obstacle[:, KILLER] - self.pos)[:, :2], axis=1) - self.size[KILLER, 0]
         scan = np.full((self.n, CONFIG.sensors.sonar.n_ray), 12.0)
         scan[self.sees, 0] = away[self.sees]
         return scan
 
     def history(self):
-        toward = self.body[:, KILLER] - self.pos
+        toward = self.obstacle[:, KILLER] - self.pos
         yaw = np.arctan2(toward[:, 1], toward[:, 0]) + self.look
         lead = 0.1 * np.arange(26)
-        forecast = self.body[:, KILLER, None, :2] + lead[:, None] * self.foreseen_vel[:, None]
+        forecast = self.obstacle[:, KILLER, None, :2] + lead[:, None] * self.foreseen_vel[:, None]
         return History(
             t_s=self.t,
             pos_w=self.pos,
@@ -121,12 +121,12 @@ class Story:
             quat_wb=np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1),
             vel_b=self.hull_vel,
             rate_b=np.zeros((self.n, 3)),
-            body_w=self.body,
-            body_vel_w=self.vel,
+            obstacle_w=self.obstacle,
+            obstacle_vel_w=self.vel,
             ping_age_s=np.zeros(self.n),
             range_m=self.scan(),
             track_moving=np.where(self.believes, 1, 0)[:, None],
-            track_w=self.body[:, KILLER, None, :2],
+            track_w=self.obstacle[:, KILLER, None, :2],
             forecast_w=forecast[:, None],
             forecast_m=np.where(self.believes, 0.2, -1.0)[:, None],
             forecast_above_w=self.pos[:, 2:] + self.believed_gap,
@@ -142,7 +142,7 @@ class Story:
         )
 
     def explained(self, outcome="collision"):
-        return explain(outcome, self.history(), self.bodies(), self.config)
+        return explain(outcome, self.history(), self.obstacles(), self.config)
 
 
 def corridor(story, half_gap=0.32):
@@ -161,7 +161,7 @@ def with_second(story, y=0.7):
 
 def hit_static(evading=False, moving_m=None):
     story = Story(speed=1.0).put(STATIC, CYLINDER, at(NOSE_M + 0.3 + 0.05, 0.0, 0.0), [0.3, 0.3, 0.8])
-    story.body[:, KILLER] = at(0.0, 2.5 if moving_m is None else NOSE_M + 0.2 + moving_m, 0.0)
+    story.obstacle[:, KILLER] = at(0.0, 2.5 if moving_m is None else NOSE_M + 0.2 + moving_m, 0.0)
     story.leaf = ["Evade" if evading else "FollowRoute"] * story.n
     return story
 
@@ -219,43 +219,43 @@ def from_behind():
 def above_the_floor():
     """In a corridor, too near to the floor to dive below what comes over the whole width at its height."""
     story = corridor(Story(speed=2.0, rise=0.25, gap=-0.05))
-    for places in (story.pos, *np.moveaxis(story.body, 1, 0)):
+    for places in (story.pos, *np.moveaxis(story.obstacle, 1, 0)):
         places[:, 2] -= 0.5
     return story
 
 
 STORIES = {
     "out_of_tank": (lambda: change(at_wall(Story()), pos=np.tile([-0.1, 3.0, -0.8], (41, 1))), "out_of_tank"),
-    "depth_misjudged": (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, 0.06])), "collision"),
-    "lost_place": (lambda: change(hit_static(), place_error=np.array([0.08, 0.08, 0])), "collision"),
+    "depth_error": (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, 0.06])), "collision"),
+    "localization_error": (lambda: change(hit_static(), place_error=np.array([0.08, 0.08, 0])), "collision"),
     "velocity_lost": (lambda: change(hit_static(), vel_valid=np.full(41, 2)), "collision"),
-    "depth_change": (diving_into_it, "collision"),
-    "turned_back": (lambda: Story().turn(1.1, before=(1.0, 0.1)), "collision"),
-    "depth_edge": (above_the_floor, "collision"),
+    "undetected_depth_change": (diving_into_it, "collision"),
+    "obstacle_reversed": (lambda: Story().turn(1.1, before=(1.0, 0.1)), "collision"),
+    "no_depth_left": (above_the_floor, "collision"),
     "hit_floor": (lambda: at_depth(-1.5), "collision"),
     "hit_surface": (lambda: at_depth(-0.1), "collision"),
     "hit_static": (hit_static, "collision"),
     "hit_wall": (lambda: at_wall(Story()), "collision"),
-    "pushed_into_static": (lambda: hit_static(evading=True), "collision"),
-    "start_in_danger": (lambda: Story(end_s=1.5), "collision"),
-    "unseen_beside": (from_behind, "collision"),
-    "unseen_above": (lambda: below(0.35), "collision"),
-    "unseen_below": (lambda: below(-0.35), "collision"),
-    "unannounced_turn": (lambda: Story().turn(1.1), "collision"),
-    "seen_late": (late_into_the_fan, "collision"),
-    "hidden": (lambda: lately(lately(Story(), 0.3, "sees", False), 0.4, "believes", False), "collision"),
+    "evaded_into_static": (lambda: hit_static(evading=True), "collision"),
+    "no_escape_at_start": (lambda: Story(end_s=1.5), "collision"),
+    "undetected_beside": (from_behind, "collision"),
+    "undetected_above": (lambda: below(0.35), "collision"),
+    "undetected_below": (lambda: below(-0.35), "collision"),
+    "obstacle_turned": (lambda: Story().turn(1.1), "collision"),
+    "late_detection": (late_into_the_fan, "collision"),
+    "occluded": (lambda: lately(lately(Story(), 0.3, "sees", False), 0.4, "believes", False), "collision"),
     "untracked": (lambda: lately(Story(), 0.9, "believes", False), "collision"),
-    "curving": (
+    "obstacle_on_curve": (
         lambda: change(Story(), circle=np.array([2.0, 0, 0]), foreseen_vel=np.tile([-1.0, 0.5], (41, 1))),
         "collision",
     ),
-    "forecast_missed": (lambda: change(Story(), foreseen_vel=np.tile([-1.0, 0.5], (41, 1))), "collision"),
-    "late": (lambda: lately(Story(), 0.4, "leaf", "FollowRoute"), "collision"),
-    "wrong_evasion": (Story, "collision"),
-    "needs_heave": (lambda: corridor(Story(speed=2.0, rise=0.25, gap=-0.05)), "collision"),
-    "squeezed_by_static": (lambda: corridor(Story(speed=5.0)), "collision"),
-    "crowded": (lambda: with_second(Story(speed=5.0)), "collision"),
-    "fast_crossing": (lambda: Story(speed=5.0), "collision"),
+    "prediction_error": (lambda: change(Story(), foreseen_vel=np.tile([-1.0, 0.5], (41, 1))), "collision"),
+    "late_reaction": (lambda: lately(Story(), 0.4, "leaf", "FollowRoute"), "collision"),
+    "failed_evasion": (Story, "collision"),
+    "depth_change_needed": (lambda: corridor(Story(speed=2.0, rise=0.25, gap=-0.05)), "collision"),
+    "blocked_by_static": (lambda: corridor(Story(speed=5.0)), "collision"),
+    "second_obstacle_near": (lambda: with_second(Story(speed=5.0)), "collision"),
+    "obstacle_too_fast": (lambda: Story(speed=5.0), "collision"),
 }
 
 
@@ -263,9 +263,9 @@ TIMEOUTS = {
     "no_route": {"no_route_share": 0.6},
     "too_slow": {"progress_m": 1.5},
     "waiting": {"waiting_share": 0.6},
-    "kept_away": {"evading_share": 0.6},
+    "blocked_by_traffic": {"evading_share": 0.6},
     "stuck": {"driven_m": 0.3},
-    "circling": {},
+    "no_progress": {},
 }
 QUIET = {
     "no_route_share": 0.0,
@@ -296,28 +296,28 @@ def test_a_timeout_gets_its_label(label):
 @pytest.mark.parametrize(
     ("make", "label"),
     [
-        (lambda: below(0.25), "wrong_evasion"),  # the fan still holds its edge at the end
-        (lambda: Story().turn(1.3), "wrong_evasion"),  # long ago, and the forecasts since were right
+        (lambda: below(0.25), "failed_evasion"),  # the fan still holds its edge at the end
+        (lambda: Story().turn(1.3), "failed_evasion"),  # long ago, and the forecasts since were right
         (
             lambda: change(Story().turn(1.1), foreseen_vel=_learnt_turn(1.1)),
-            "wrong_evasion",
+            "failed_evasion",
         ),  # the forecast knew of the turn
-        (lambda: Story(end_s=2.1), "wrong_evasion"),  # old enough not to have started in danger
+        (lambda: Story(end_s=2.1), "failed_evasion"),  # old enough not to have started in danger
         (lambda: change(at_depth(-1.5), vel_valid=np.zeros(41)), "velocity_lost"),
         (lambda: change(at_depth(-1.5), vel_valid=np.full(41, 2)), "hit_floor"),  # heave is known
         (lambda: change(hit_static(), vel_valid=np.where(np.arange(41) < 35, 0, 1)), "hit_static"),  # again
-        (lambda: hit_static(moving_m=0.9), "pushed_into_static"),
+        (lambda: hit_static(moving_m=0.9), "evaded_into_static"),
         (lambda: hit_static(moving_m=1.1), "hit_static"),
         (
             lambda: lately(Story(), 0.6, "leaf", "FollowRoute"),
-            "wrong_evasion",
+            "failed_evasion",
         ),  # the last chance was 0.5 s before the end
-        (lambda: with_second(Story(speed=5.0), y=1.5), "fast_crossing"),
+        (lambda: with_second(Story(speed=5.0), y=1.5), "obstacle_too_fast"),
         (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, 0.04])), "hit_floor"),
         (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, -0.06])), "hit_floor"),  # the safe way
-        (lambda: change(at_depth(-0.1), place_error=np.array([0, 0, -0.06])), "depth_misjudged"),
+        (lambda: change(at_depth(-0.1), place_error=np.array([0, 0, -0.06])), "depth_error"),
         (lambda: change(hit_static(), place_error=np.array([0.06, 0.07, 0])), "hit_static"),
-        (lambda: Story().turn(1.1, before=(0.5, -0.9)), "unannounced_turn"),  # by less than 120 degrees
+        (lambda: Story().turn(1.1, before=(0.5, -0.9)), "obstacle_turned"),  # by less than 120 degrees
     ],
 )
 def test_just_past_a_threshold_the_label_changes(make, label):
@@ -329,7 +329,7 @@ def _learnt_turn(ago_s):
     """Constant velocities that lead from every place before the turn to where the killer ends."""
     story = Story().turn(ago_s)
     left = np.maximum(story.ago, 0.1)[:, None]
-    return (story.body[-1, KILLER, :2] - story.body[:, KILLER, :2]) / left
+    return (story.obstacle[-1, KILLER, :2] - story.obstacle[:, KILLER, :2]) / left
 
 
 def test_facts_of_a_plain_story():
@@ -347,7 +347,7 @@ def test_facts_of_a_plain_story():
 
 
 REMARKABLE = {
-    "second body near": lambda: with_second(Story()),
+    "second obstacle near": lambda: with_second(Story()),
     "static near": lambda: corridor(Story()),
     "turned lately": lambda: Story().turn(2.4),
     "corner passed in reach before": lambda: Story().turn(1.1),
@@ -357,7 +357,7 @@ REMARKABLE = {
     "taken as static": lambda: lately(Story(), 2.0, "believes", False),
     "backed off before the last chance": lambda: change(Story(), leaf=["BackOff"] * 41),
     "only heave escaped": lambda: change(
-        STORIES["needs_heave"][0](), foreseen_vel=np.tile([-2.0, 0.5], (41, 1))
+        STORIES["depth_change_needed"][0](), foreseen_vel=np.tile([-2.0, 0.5], (41, 1))
     ),
 }
 
@@ -371,13 +371,13 @@ def test_every_remark_has_its_story_and_a_plain_one_has_none():
 
 
 def test_a_start_in_danger_says_what_it_would_be_otherwise():
-    assert Story(end_s=1.5).explained().remarks[0] == "else wrong_evasion"
+    assert Story(end_s=1.5).explained().remarks[0] == "else failed_evasion"
     assert (
-        Story(end_s=0.2).explained().label == "start_in_danger"
+        Story(end_s=0.2).explained().label == "no_escape_at_start"
     )  # too short for every interval that is looked at
 
 
-def test_a_forgotten_body_and_a_seen_corner_are_told():
+def test_a_forgotten_obstacle_and_a_seen_corner_are_told():
     story = Story().turn(1.1)
     story.believes[story.ago < 0.45] = False
     story.sees[story.ago < 0.25] = False
@@ -407,13 +407,13 @@ def test_the_gap_that_was_believed_is_told(rise):
     assert change(below(rise), believes=np.zeros(41, bool)).explained().facts["believed_gap_m"] is None
 
 
-def test_a_ttc_stop_names_the_body_that_closes_in_and_not_the_nearest():
+def test_a_ttc_stop_names_the_obstacle_that_closes_in_and_not_the_nearest():
     story = Story(speed=3.0, gap=0.4).put(STATIC, CYLINDER, at(0.0, 0.17 + 0.3 + 0.15, 0.0), [0.3, 0.3, 0.8])
     assert story.explained("ttc").killer.slot == KILLER
     assert story.explained("collision").killer.slot == STATIC
 
 
-def test_a_ttc_stop_never_names_a_body_that_moves_away():
+def test_a_ttc_stop_never_names_a_obstacle_that_moves_away():
     story = with_second(Story(speed=3.0, gap=0.4), y=0.5)
     story.vel[:, SECOND] = [0.0, 2.0, 0.0]
     found = story.explained("ttc")
@@ -421,9 +421,9 @@ def test_a_ttc_stop_never_names_a_body_that_moves_away():
     assert found.killer.slot == KILLER
 
 
-def test_a_second_body_that_passed_earlier_is_not_near():
+def test_a_second_obstacle_that_passed_earlier_is_not_near():
     story = with_second(Story())
-    story.body[story.ago < 1.0, SECOND] += [0.0, 2.0, 0.0]
+    story.obstacle[story.ago < 1.0, SECOND] += [0.0, 2.0, 0.0]
     assert story.explained().facts["second_body_m"] > 2.0
 
 
@@ -433,9 +433,9 @@ def test_a_scan_is_compared_with_the_moment_of_its_ping():
     late = replace(
         story.history(), ping_age_s=np.full(story.n, 0.2), range_m=story.scan() + 0.2 * (np.arange(256) == 0)
     )
-    assert explain("collision", late, story.bodies(), CONFIG).facts["seen_ago_s"] == 0.0
+    assert explain("collision", late, story.obstacles(), CONFIG).facts["seen_ago_s"] == 0.0
     unchanged = replace(late, ping_age_s=np.zeros(story.n))
-    assert explain("collision", unchanged, story.bodies(), CONFIG).facts["seen_ago_s"] is None
+    assert explain("collision", unchanged, story.obstacles(), CONFIG).facts["seen_ago_s"] is None
 
 
 def test_timeout_facts_from_the_coarse_history():
@@ -456,7 +456,7 @@ HULL_TOLERANCE_M = 1e-3
 """The axis is sampled every 25 mm (hindsight._AXIS_SAMPLES)."""
 
 
-def random_bodies(rng, n):
+def random_obstacles(rng, n):
     kind = rng.integers(1, 4, n)
     size = rng.uniform(0.15, 0.5, (n, 3))
     size[kind != BOX, 1] = size[kind != BOX, 0]
@@ -466,22 +466,25 @@ def random_bodies(rng, n):
 
 def test_hull_gaps_equal_the_reference():
     rng = np.random.default_rng(5)
-    kind, size, yaw = random_bodies(rng, 12)
+    kind, size, yaw = random_obstacles(rng, 12)
     pos = rng.uniform(-0.3, 0.3, (20, 3))
     axis = rng.normal(size=(20, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    body = rng.uniform(-1, 1, (20, 12, 3)) + 1.2 * np.sign(rng.normal(size=(20, 12, 3)))
-    gap, normal, along = failure_facts.hull_gaps(pos, axis, kind, body, size, yaw, 0.17, 0.10)
+    obstacle = rng.uniform(-1, 1, (20, 12, 3)) + 1.2 * np.sign(rng.normal(size=(20, 12, 3)))
+    gap, normal, along = failure_facts.hull_gaps(pos, axis, kind, obstacle, size, yaw, 0.17, 0.10)
     expected = [
-        [hull_reference.clearance(pos[i], axis[i], kind[j], body[i, j], size[j], yaw[j]) for j in range(12)]
+        [
+            hull_reference.clearance(pos[i], axis[i], kind[j], obstacle[i, j], size[j], yaw[j])
+            for j in range(12)
+        ]
         for i in range(len(pos))
     ]
     np.testing.assert_allclose(gap, expected, atol=HULL_TOLERANCE_M)
     step = 1e-4
-    pushed, _, _ = failure_facts.hull_gaps(pos, axis, kind, body + step * normal, size, yaw, 0.17, 0.10)
+    pushed, _, _ = failure_facts.hull_gaps(pos, axis, kind, obstacle + step * normal, size, yaw, 0.17, 0.10)
     np.testing.assert_allclose(
         (pushed - gap) / step, 1.0, atol=0.02
-    )  # moving a body along the normal opens the gap
+    )  # moving an obstacle along the normal opens the gap
     assert np.abs(along).max() <= 0.10 + 1e-9
 
 
@@ -508,26 +511,26 @@ def test_floor_and_surface_gaps_of_a_tilted_hull():
 
 def test_beam_entries_equal_the_reference():
     rng = np.random.default_rng(7)
-    kind, size, yaw = random_bodies(rng, 30)
+    kind, size, yaw = random_obstacles(rng, 30)
     sonar = CONFIG.sensors.sonar
     met = 0
     for j in range(30):
         pos, heading = rng.uniform(-1, 1, 3), rng.uniform(-3, 3)
-        body = pos + rng.uniform([1.0, 1.0, -1.5], [4.0, 4.0, 1.5])
+        obstacle = pos + rng.uniform([1.0, 1.0, -1.5], [4.0, 4.0, 1.5])
         quat = [np.cos(heading / 2), 0, 0, np.sin(heading / 2)]
         scene = {
             "kind": kind[j : j + 1][None],
             "size": size[j][None, None],
             "yaw": yaw[j : j + 1][None],
-            "body_pos": body[None, None],
+            "obstacle_pos": obstacle[None, None],
         }
         bearing = sonar_reference.beam_headings(np.array(quat), sonar.n_ray)
         u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-        expected, _ = sonar_reference.body_hits(
+        expected, _ = sonar_reference.obstacle_hits(
             scene, 0, 0, pos, u, np.tan(np.radians(sonar.vertical_half_aperture_deg))
         )
         found = failure_facts.beam_entries(
-            pos[None], np.array([heading]), kind[j], body[None], size[j], yaw[j], sonar
+            pos[None], np.array([heading]), kind[j], obstacle[None], size[j], yaw[j], sonar
         )[0]
         np.testing.assert_allclose(found, expected, atol=1e-9)
         met += np.isfinite(found).any()
@@ -550,11 +553,11 @@ def test_a_held_velocity_is_approached_with_the_lag():
 def test_everything_escapes_in_free_water_and_nothing_from_a_box():
     free = Story()
     free.kind[KILLER] = NONE
-    level, heaving = escapes(free.history(), free.bodies(), CONFIG, 1.0)
+    level, heaving = escapes(free.history(), free.obstacles(), CONFIG, 1.0)
     assert level == int((candidates(CONFIG, 0.0)[:, 2] == 0).sum()) == 33
     assert heaving == 66  # 0.4 m/s for 1.5 s reaches neither floor nor surface from mid-water
     story = corridor(Story(speed=2.0))
-    assert escapes(story.history(), story.bodies(), CONFIG, 1.0)[0] == 0
+    assert escapes(story.history(), story.obstacles(), CONFIG, 1.0)[0] == 0
 
 
 def test_candidates_respect_the_limits_of_the_body_axes():
@@ -569,10 +572,10 @@ def test_candidates_respect_the_limits_of_the_body_axes():
     assert set(np.round(command[:, 2], 6)) == {0.0, 0.4, -0.4}
 
 
-def test_bodies_go_straight_on_after_the_end():
+def test_obstacles_go_straight_on_after_the_end():
     story = Story(speed=1.0)
     then, vel = motion(story.history(), np.array([END_S - 0.25, END_S + 0.4]))
-    np.testing.assert_allclose(then[:, KILLER, 0] - story.body[-1, KILLER, 0], [0.25, -0.4], atol=1e-6)
+    np.testing.assert_allclose(then[:, KILLER, 0] - story.obstacle[-1, KILLER, 0], [0.25, -0.4], atol=1e-6)
     np.testing.assert_allclose(vel[:, KILLER], [[-1.0, 0.0, 0.0]] * 2)
 
 
@@ -586,43 +589,49 @@ def row(label, episode, closing=None, **facts):
 
 def test_the_table_counts_sorts_and_names_the_worst():
     rows = [
-        row("late", 0, 0.2),
-        row("late", 1, 0.9),
-        row("unseen_above", 2),
-        row("late", 3, 0.5),
+        row("late_reaction", 0, 0.2),
+        row("late_reaction", 1, 0.9),
+        row("undetected_above", 2),
+        row("late_reaction", 3, 0.5),
         row("hit_wall", 4),
-        row("late", 5, 0.1),
+        row("late_reaction", 5, 0.1),
     ]
     table = table_of(rows)
     assert [(entry["label"], entry["count"]) for entry in table] == [
-        ("late", 4),
+        ("late_reaction", 4),
         ("hit_wall", 1),
-        ("unseen_above", 1),
+        ("undetected_above", 1),
     ]
     assert table[0]["examples"] == [[1, 1], [1, 3], [1, 0]]
     assert sum(entry["share"] for entry in table) == pytest.approx(1.0)
-    assert table[0]["meaning"] == CAUSES["late"]
+    assert table[0]["meaning"] == CAUSES["late_reaction"]
     assert table_of([]) == []
 
 
 def test_what_is_typical_of_a_label():
     unknown = {"seen_ago_s": None, "evading_s": 1.0, "last_chance_s": 0.5, "forecast_error_m": None}
     known = {"seen_ago_s": 0.1, "evading_s": 3.0, "last_chance_s": None, "forecast_error_m": 0.1}
-    rows = [row("late", 0, **unknown), row("late", 1, **known), row("stuck", 2, goal_m=2.0)]
+    rows = [row("late_reaction", 0, **unknown), row("late_reaction", 1, **known), row("stuck", 2, goal_m=2.0)]
     rows[0].explanation.remarks.extend(["static near", "turned lately"])
     rows[1].explanation.remarks.append("turned lately")
     late, stuck = table_of(rows)
     assert (late["knew_share"], late["evading_median_s"], late["last_chance_median_s"]) == (0.5, 2.0, 1.25)
-    assert late["unseen_median_s"] == pytest.approx((WINDOW_S + 0.1) / 2)
+    assert late["undetected_median_s"] == pytest.approx((WINDOW_S + 0.1) / 2)
     assert late["remarks"] == {"turned lately": 2, "static near": 1}
     assert {
-        stuck[name] for name in ("knew_share", "unseen_median_s", "evading_median_s", "last_chance_median_s")
+        stuck[name]
+        for name in ("knew_share", "undetected_median_s", "evading_median_s", "last_chance_median_s")
     } == {None}
     assert stuck["remarks"] == {}
 
 
 def test_recordings_go_round_the_labels():
-    rows = [row("late", 0, 0.2), row("late", 1, 0.9), row("unseen_above", 2), row("late", 3, 0.5)]
+    rows = [
+        row("late_reaction", 0, 0.2),
+        row("late_reaction", 1, 0.9),
+        row("undetected_above", 2),
+        row("late_reaction", 3, 0.5),
+    ]
     assert [r.result.episode for r in chosen_for_recording(rows, 3)] == [1, 2, 3]
     assert [r.result.episode for r in chosen_for_recording(rows, 99)] == [1, 2, 3, 0]
     assert chosen_for_recording(rows, 0) == [] == chosen_for_recording([], 3)
@@ -630,7 +639,7 @@ def test_recordings_go_round_the_labels():
 
 @pytest.fixture(scope="module")
 def played(small):
-    """Blind driving among fast bodies: most episodes fail within seconds."""
+    """Blind driving among fast obstacles: most episodes fail within seconds."""
     small.sim.use_tree(small.trees["straight"])
     small.sim.set_scenes([(8, 9, 1.5)])
     results, _ = run_episodes(small.sim, jobs_of([7], 12))
@@ -719,26 +728,24 @@ def test_a_comparison_carries_its_causes(request_of):
     from uuvtai.evaluation.evaluate import compare
 
     result, folder = compare(request_of(explain_record=1), Quiet())
-    method = result["methods"][0]
-    failed = [d for d in method["episodes_detail"] if d["outcome"] != "success"]
+    agent = result["agents"][0]
+    failed = [d for d in agent["episodes_detail"] if d["outcome"] != "success"]
     assert failed
-    assert [(e["seed"], e["episode"], e["outcome"]) for e in method["explain"]] == [
+    assert [(e["seed"], e["episode"], e["outcome"]) for e in agent["explain"]] == [
         (d["seed"], d["episode"], d["outcome"]) for d in failed
     ]
-    assert sum(cause["count"] for cause in method["causes"]) == len(failed)
-    assert [(folder / e["log"]).is_file() for e in method["explain"] if e["log"]] == [True]
+    assert sum(cause["count"] for cause in agent["causes"]) == len(failed)
+    assert [(folder / e["log"]).is_file() for e in agent["explain"] if e["log"]] == [True]
     assert json.loads((folder / "eval/result.json").read_text()) == result
     written = json.loads((folder / "eval/explain.json").read_text())
-    assert written["methods"] == [
-        {"name": "straight", "causes": method["causes"], "explain": method["explain"]}
-    ]
+    assert written["agents"] == [{"name": "straight", "causes": agent["causes"], "explain": agent["explain"]}]
 
 
 def test_without_explain_the_document_has_no_causes(request_of):
     from uuvtai.evaluation.evaluate import compare
 
     result, folder = compare(request_of(explain=False), Quiet())
-    assert not {"causes", "explain"} & set(result["methods"][0])
+    assert not {"causes", "explain"} & set(result["agents"][0])
     assert not (folder / "eval/explain.json").exists()
 
 
@@ -752,7 +759,7 @@ def test_an_interrupted_explanation_leaves_the_results(request_of, monkeypatch):
     request = request_of()
     with pytest.raises(KeyboardInterrupt):
         compare(request, Quiet())
-    assert json.loads((request.run_dir / "eval/result.json").read_text())["methods"][0]["episodes"] == 6
+    assert json.loads((request.run_dir / "eval/result.json").read_text())["agents"][0]["episodes"] == 6
     assert json.loads((request.run_dir / "run.json").read_text())["status"] == "interrupted"
 
 
@@ -777,13 +784,13 @@ def test_the_table_is_printed_and_no_failure_is_said(capfd):
     from uuvtai.console.views import show_causes
 
     causes_found = table_of(
-        [row("late", 0, 0.2, forecast_error_m=0.1, seen_ago_s=0.0, evading_s=0.4, last_chance_s=0.5)]
+        [row("late_reaction", 0, 0.2, forecast_error_m=0.1, seen_ago_s=0.0, evading_s=0.4, last_chance_s=0.5)]
     )
-    method = {"name": "bt", "episodes": 9, "explain": [{}], "causes": causes_found}
-    show_causes(Screen(), {"methods": [method, {"name": "calm", "episodes": 9, "explain": [], "causes": []}]})
+    agent = {"name": "bt", "episodes": 9, "explain": [{}], "causes": causes_found}
+    show_causes(Screen(), {"agents": [agent, {"name": "calm", "episodes": 9, "explain": [], "causes": []}]})
     out = capfd.readouterr().out
     assert "bt: why 1 of 9 episodes failed" in out
-    assert "late" in out and "1:0" in out and "100 %" in out
+    assert "late_reaction" in out and "1:0" in out and "100 %" in out
     assert "calm: no episode failed, nothing to explain" in out
 
 

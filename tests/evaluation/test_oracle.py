@@ -1,4 +1,4 @@
-"""The oracle on hand-made scenarios: distances, what the referee forbids, earliest arrivals."""
+"""The oracle on hand-made scenarios: distances, what the termination check forbids, earliest arrivals."""
 
 import math
 
@@ -13,7 +13,7 @@ from uuvtai.evaluation.oracle import (
     CELL_M,
     MOVES,
     Obstacle,
-    Referee,
+    Termination,
     earliest_arrival,
     lattice_of,
     level_excess,
@@ -30,7 +30,7 @@ GOAL_M = 1.0
 
 
 def line(a, b, speed, phase=0.0):
-    """Path document of a body that goes back and forth."""
+    """Path document of an obstacle that goes back and forth."""
     return {
         "shape": "polyline",
         "corners": [list(a), list(b)],
@@ -40,20 +40,20 @@ def line(a, b, speed, phase=0.0):
     }
 
 
-def body(kind, position, size, path=None, yaw=0.0):
+def obstacle(kind, position, size, path=None, yaw=0.0):
     return {"slot": 0, "kind": kind, "position": list(position), "size": list(size), "yaw": yaw, "path": path}
 
 
 def column(x, y, radius=0.25, path=None):
-    return body("cylinder", (x, y, -0.8), (radius, radius, 0.8), path)
+    return obstacle("cylinder", (x, y, -0.8), (radius, radius, 0.8), path)
 
 
-def scenario(start, goal, *bodies):
-    return {"start": list(start), "goal": list(goal), "bodies": list(bodies)}
+def scenario(start, goal, *obstacles):
+    return {"start": list(start), "goal": list(goal), "obstacles": list(obstacles)}
 
 
-def arrival(start, goal, *bodies, config=CONFIG):
-    return earliest_arrival(scenario(start, goal, *bodies), config).time_s
+def arrival(start, goal, *obstacles, config=CONFIG):
+    return earliest_arrival(scenario(start, goal, *obstacles), config).time_s
 
 
 # -------------------------------------------------------------------------------------------------- obstacles
@@ -85,7 +85,7 @@ def test_many_positions_of_a_path_are_those_of_one_by_one(path):
     assert path_positions(path, t) == pytest.approx(np.array([path_position(path, s) for s in t]), abs=1e-9)
 
 
-def test_bodies_move_with_the_speed_of_their_path():
+def test_obstacles_move_with_the_speed_of_their_path():
     moving, still = obstacles_of(
         scenario((2, 2, -0.8), (9, 2, -0.8), column(5, 1, path=line((5, 1), (5, 5), 0.5)), column(7, 2)),
         np.arange(0.1, 12.0, 0.5),
@@ -132,7 +132,7 @@ def test_the_referee_forbids_what_closes_too_fast_and_lets_flee():
             np.array([[6.0 + 0.42 + gap, 3.0, -0.8]]),
             np.array([[-1.5, 0.0]]),
         )
-        blocked = Referee(grid, [], CONFIG).blocked([coming], 0, np.ones_like(grid.inside))[
+        blocked = Termination(grid, [], CONFIG).blocked([coming], 0, np.ones_like(grid.inside))[
             (slice(None), *grid.start)
         ]
         found = [not blocked[moves[move]] for move in ((0, 0), (-1, 0), (1, 0))]
@@ -164,23 +164,32 @@ def test_height_takes_time_and_a_current_carries():
 
 def test_a_wall_without_a_gap_cannot_be_passed_and_a_door_can():
     left, right = ((2.0, 3.0, -0.8), (14.0, 3.0, -0.8))
-    assert arrival(left, right, body("box", (8, 3, -0.8), (0.1, 3.0, 0.8))) is None
-    door = (body("box", (8, 1.2, -0.8), (0.1, 1.2, 0.8)), body("box", (8, 4.8, -0.8), (0.1, 1.2, 0.8)))
+    assert arrival(left, right, obstacle("box", (8, 3, -0.8), (0.1, 3.0, 0.8))) is None
+    door = (
+        obstacle("box", (8, 1.2, -0.8), (0.1, 1.2, 0.8)),
+        obstacle("box", (8, 4.8, -0.8), (0.1, 1.2, 0.8)),
+    )
     assert arrival(left, right, *door) == pytest.approx(11.0 / TOP_SPEED, abs=2 * STEP_S)
-    slit = (body("box", (8, 1.5, -0.8), (0.1, 1.25, 0.8)), body("box", (8, 4.5, -0.8), (0.1, 1.25, 0.8)))
+    slit = (
+        obstacle("box", (8, 1.5, -0.8), (0.1, 1.25, 0.8)),
+        obstacle("box", (8, 4.5, -0.8), (0.1, 1.25, 0.8)),
+    )
     assert arrival(left, right, *slit) is None, "0.5 m is less than the hull and its clearances"
 
 
 def test_a_low_wall_is_passed_above():
-    low = body("box", (8, 3, -1.35), (0.1, 3.0, 0.25))
+    low = obstacle("box", (8, 3, -1.35), (0.1, 3.0, 0.25))
     assert arrival((2.0, 3.0, -1.2), (14.0, 3.0, -0.8), low) is not None
 
 
-def test_the_oracle_waits_for_a_door_that_a_body_blocks():
+def test_the_oracle_waits_for_a_door_that_a_obstacle_blocks():
     """The door is 1.2 m wide; a column creeps out of its middle at 2 cm/s and leaves room at its side from
     9.5 to 11 s on (by hand)."""
     start, goal = (6.0, 3.0, -0.8), (12.0, 3.0, -0.8)
-    door = (body("box", (8, 1.2, -0.8), (0.1, 1.2, 0.8)), body("box", (8, 4.8, -0.8), (0.1, 1.2, 0.8)))
+    door = (
+        obstacle("box", (8, 1.2, -0.8), (0.1, 1.2, 0.8)),
+        obstacle("box", (8, 4.8, -0.8), (0.1, 1.2, 0.8)),
+    )
     free = arrival(start, goal, *door)
     assert free == pytest.approx(5.0 / TOP_SPEED, abs=2 * STEP_S)
     rest_s = 3.0 / TOP_SPEED

@@ -169,14 +169,14 @@ def test_episodes_that_were_not_kept_allow_neither_interval_nor_test():
     assert found == [claims.Finding(OPEN, None)] * 5
 
 
-def cell(n_static, n_dynamic, speed, method="best", **more):
+def cell(n_static, n_dynamic, speed, agent="best", **more):
     """Cells of one sweep, whose episodes do not go together."""
     found = entry(**more)
     ends = ["success"] * found["outcomes"]["success"] + ["collision"] * found["outcomes"]["collision"]
     ends += ["timeout"] * found["outcomes"]["timeout"]
     shuffled = random.Random(f"{n_static} {n_dynamic} {speed}").sample(ends, len(ends))
     return found | {
-        "S": n_static, "D": n_dynamic, "v_m_s": speed, "method": method, "episode_outcomes": shuffled
+        "S": n_static, "D": n_dynamic, "v_m_s": speed, "agent": agent, "episode_outcomes": shuffled
     }  # fmt: skip
 
 
@@ -187,7 +187,7 @@ def test_claims_of_the_sweep_take_the_papers_conditions():
         cell(8, 9, 3.0, success=0, collision=100),  # too fast for the mean
         cell(12, 9, 1.5, success=0, collision=100),  # too many
         cell(12, 15, 3.0, success=5, collision=95),
-        cell(8, 9, 1.5, method="bt", success=0, collision=100),
+        cell(8, 9, 1.5, agent="bt", success=0, collision=100),
     ]
     found = claims.judged(claims.of_sweep(cells, "best"))
     assert found[0].ours.startswith("190/200")
@@ -224,7 +224,7 @@ def test_time_to_success_is_the_papers_and_stands_beside_the_papers():
     document = minimal() | {
         "table_main": {"curriculum": [entry(50, time_s=10.0) | {"time_to_success_mean_s": 7.0}]}
     }
-    (head,) = [line for line in results_page(document).splitlines() if line.startswith("| method | training")]
+    (head,) = [line for line in results_page(document).splitlines() if line.startswith("| agent | training")]
     (row,) = [line for line in results_page(document).splitlines() if line.startswith("| `curriculum`")]
     cells = dict(zip([c.strip() for c in head.split("|")], [c.strip() for c in row.split("|")], strict=True))
     assert (cells["TTS"], cells["the paper: TTS"]) == ("20.0 s", "15.8 s")
@@ -247,7 +247,7 @@ def minimal():
         "commands": {"eval/main": "uuv eval", "eval/ceilings": "uuv eval", "profile": "uuv profile"},
         "claims": [vars(claim) for claim in found],
         "table_main": {},
-        "ceilings": {"methods": []},
+        "ceilings": {"agents": []},
         "sweeps": {},
         "profile": profile,
         "inconsistencies": [],
@@ -323,9 +323,9 @@ def printed(arguments):
         details = [
             {"seed": 1, "episode": i, "outcome": "success" if i < 50 else "timeout"} for i in range(100)
         ]
-        return {"methods": [entry(50) | {"name": name, "episodes_detail": details} for name in names]}
+        return {"agents": [entry(50) | {"name": name, "episodes_detail": details} for name in names]}
     if arguments[0] == "sweep":
-        cells = [cell(8, 6, 0.6, method=name, success=90) for name in names]
+        cells = [cell(8, 6, 0.6, agent=name, success=90) for name in names]
         return {"axes": {"S": [8], "D": [6], "v": [0.6]}, "cells": cells}
     if arguments[0] == "profile":
         row = {"num_envs": 1, "env_steps_per_s": {"step": 1.0, "step_inference": 1.0, "train": 1.0}}

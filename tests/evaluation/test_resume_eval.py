@@ -19,10 +19,10 @@ EPISODES = 4
 
 
 class Watch:
-    """Interrupts at the ``after``-th finished episode of a method."""
+    """Interrupts at the ``after``-th finished episode of a agent."""
 
-    def __init__(self, method=None, after=0):
-        self.method, self.after, self.notes, self.begun = method, after, [], {}
+    def __init__(self, agent=None, after=0):
+        self.agent, self.after, self.notes, self.begun = agent, after, [], {}
 
     def start(self, name, total):
         self.name = name
@@ -34,7 +34,7 @@ class Watch:
     def update(self, done, total, env_steps, left=None):
         if self.begun[self.name] is None:
             self.begun[self.name] = done
-        if self.name == self.method and done >= self.after:
+        if self.name == self.agent and done >= self.after:
             raise KeyboardInterrupt
 
     def stop(self):
@@ -43,7 +43,7 @@ class Watch:
 
 @pytest.fixture(scope="module")
 def ask(small, tmp_path_factory):
-    """Requests of the session's simulator: nothing is compiled. The blind yardstick drives, twice: its
+    """Requests of the session's simulator: nothing is compiled. The blind oracle drives, twice: its
     episodes are short."""
     second = tmp_path_factory.mktemp("trees") / "second.xml"
     second.write_text(preset_path("tree", "straight").read_text())
@@ -71,9 +71,7 @@ def ask(small, tmp_path_factory):
 def outcome(result):
     """A document without the machine's times."""
     return result | {
-        "methods": [
-            {name: value for name, value in m.items() if name not in TIMES} for m in result["methods"]
-        ]
+        "agents": [{name: value for name, value in m.items() if name not in TIMES} for m in result["agents"]]
     }
 
 
@@ -82,16 +80,16 @@ def whole(ask, tmp_path_factory):
     return compare(ask(tmp_path_factory.mktemp("whole") / "run"), Watch())
 
 
-@pytest.mark.parametrize(("method", "after"), [("straight", 1), ("second", 2)])
-def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_path, method, after):
-    run, watch = tmp_path / "run", Watch(method, after)
+@pytest.mark.parametrize(("agent", "after"), [("straight", 1), ("second", 2)])
+def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_path, agent, after):
+    run, watch = tmp_path / "run", Watch(agent, after)
     with pytest.raises(KeyboardInterrupt):
         compare(ask(run), watch)
     assert f"finished episodes are kept; go on with: uuv eval --resume {run}" in watch.notes
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
     assert not (run / "eval/result.json").exists()
     kept = (run / results.JOURNAL_FILE).read_bytes()
-    finished = sum(json.loads(line)["method"] == method for line in kept.splitlines())
+    finished = sum(json.loads(line)["agent"] == agent for line in kept.splitlines())
     assert after <= finished <= EPISODES
     old = {log.name: log.stat().st_mtime_ns for log in (run / "logs").glob("*.mcap")}
     watch = Watch()
@@ -99,8 +97,8 @@ def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_pa
     assert outcome(result) == outcome(whole[0])
     assert json.loads((run / "eval/result.json").read_text()) == result
     assert (run / "eval/tree.json").read_bytes() == (whole[1] / "eval/tree.json").read_bytes()
-    assert (run / results.JOURNAL_FILE).read_bytes().startswith(kept), "nothing that is over is played again"
-    assert watch.begun[method] is None or watch.begun[method] >= finished
+    assert (run / results.JOURNAL_FILE).read_bytes().startswith(kept), "nothing that is over is run again"
+    assert watch.begun[agent] is None or watch.begun[agent] >= finished
     logs = sorted((run / "logs").iterdir())
     assert [log.name for log in logs] == sorted(log.name for log in (whole[1] / "logs").iterdir()), (
         "every log whole, no part left"
@@ -149,7 +147,7 @@ def test_another_tree_under_the_same_name_is_refused(ask, tmp_path):
         (REQUEST, b"[1]", "is no request"),
         (REQUEST, b'{"schema": 1, "controllers": ["bt"]}', "is no request of this version of 'uuv eval'"),
         (REQUEST, None, "cannot be read"),
-        (results.JOURNAL_FILE, b'{"method": "straight"}\n', "line 1: is no finished episode"),
+        (results.JOURNAL_FILE, b'{"agent": "straight"}\n', "line 1: is no finished episode"),
         (results.JOURNAL_FILE, b"\xff\xfe\n", "line 1: is no finished episode"),
     ],
 )
@@ -181,7 +179,7 @@ def test_paths_of_the_request_are_found_from_another_folder(ask, tmp_path, monke
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     result, _ = resume(tmp_path / "run", Watch())
-    assert [method["name"] for method in result["methods"]] == ["mine"]
+    assert [agent["name"] for agent in result["agents"]] == ["mine"]
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):

@@ -35,10 +35,10 @@ def test_the_papers_grid_shares_what_does_not_move():
 
 def test_axes_are_read_as_typed():
     grid = grid_of(
-        ["S=4,8", "teacher.caution=0.5,1", "disturbance.current_m_s=[0.1,0,0]", "sensors=paper,harsh"]
+        ["S=4,8", "behavior.caution=0.5,1", "disturbance.current_m_s=[0.1,0,0]", "sensors=paper,harsh"]
     )
     assert grid.axes == {
-        "S": (4, 8), "teacher.caution": (0.5, 1), "disturbance.current_m_s": ([0.1, 0, 0],),
+        "S": (4, 8), "behavior.caution": (0.5, 1), "disturbance.current_m_s": ([0.1, 0, 0],),
         "sensors": ("paper", "harsh"),
     }  # fmt: skip
     assert len(grid.cells()) == 8
@@ -126,12 +126,12 @@ def test_one_simulator_serves_every_scene():
 
 
 def test_other_axes_make_configs_of_their_own():
-    request = asked(grid_of(["teacher.caution=0.5,2", "D=0,6"]))
+    request = asked(grid_of(["behavior.caution=0.5,2", "D=0,6"]))
     tasks = tasks_of(request, [("bt", "bt")], set())
-    assert [task.config.teacher.caution for task in tasks] == [0.5, 2.0]
+    assert [task.config.behavior.caution for task in tasks] == [0.5, 2.0]
     assert tasks[1].labels == (
-        {"S": 8, "D": 0, "v_m_s": None, "teacher.caution": 2},
-        {"S": 8, "D": 6, "v_m_s": 0.6, "teacher.caution": 2},
+        {"S": 8, "D": 0, "v_m_s": None, "behavior.caution": 2},
+        {"S": 8, "D": 6, "v_m_s": 0.6, "behavior.caution": 2},
     )
 
 
@@ -157,7 +157,7 @@ def test_what_is_printed_of_one_axis_at_a_time_names_what_changes(capsys):
 
 def test_a_request_survives_its_json():
     request = asked(
-        grid_of(["S=4,8", "teacher.caution=0.5,1"]),
+        grid_of(["S=4,8", "behavior.caution=0.5,1"]),
         overrides=("world.n_dynamic=3", ("features", {"n_track": 4})),
     )
     assert request_of(json.loads(json.dumps(request.document()))) == request
@@ -166,7 +166,7 @@ def test_a_request_survives_its_json():
 def test_wrong_keys_are_refused_before_anything_is_written(tmp_path):
     place = tmp_path / "run"
     with pytest.raises(ConfigError, match="did you mean 'caution'"):
-        sweep(asked(Grid({"teacher.cautoin": (1, 2)})), Canned(), place, Quiet())
+        sweep(asked(Grid({"behavior.cautoin": (1, 2)})), Canned(), place, Quiet())
     with pytest.raises(ConfigError, match="same cell twice"):
         sweep(asked(Grid({"D": (6,)}, one_at_a_time=True)), Canned(), place, Quiet())
     assert not place.exists()
@@ -175,8 +175,8 @@ def test_wrong_keys_are_refused_before_anything_is_written(tmp_path):
 # ----------------------------------------------------------------------------------------------------- folder
 
 
-def row(label, method):
-    return {**label, "method": method, "success_rate": 0.5, "told": label["S"] + label["D"]}
+def row(label, agent):
+    return {**label, "agent": agent, "success_rate": 0.5, "told": label["S"] + label["D"]}
 
 
 class Canned:

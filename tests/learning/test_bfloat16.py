@@ -53,7 +53,7 @@ def test_a_torch_that_cannot_tell_counts_as_without(cpu, monkeypatch):
 @pytest.mark.parametrize("has", [False, True])
 def test_a_training_says_so(cpu, has, tmp_path, capfd):
     cpu(avx512_bf16=has)
-    small = ["train.num_envs=8", "ppo.minibatches=1", "twin.scenarios=8", "train.evaluate_episodes=8"]
+    small = ["train.num_envs=8", "ppo.minibatches=1", "surrogate.scenarios=8", "train.evaluate_episodes=8"]
     words = [word for change in small for word in ("--set", change)]
     code, _, told = uuv(capfd, "train", "quick", "--iterations", "1", "--run-dir", tmp_path / "run", *words)
     assert code == 0, told

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from uuvtai.config.learning import DistillConfig
+from uuvtai.config.learning import DistillationConfig
 from uuvtai.learning.distillation import (
     MAX_WEIGHT_RATIO,
     LeafErrors,
@@ -47,9 +47,9 @@ def lesson():
 
 def test_the_error_is_the_squared_norm_over_the_four_actions():
     mean = torch.tensor([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5]])
-    teacher = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -0.5]])
-    assert imitation_error(mean, teacher).tolist() == [5.0, 1.0]
-    assert float(distillation_loss(mean, teacher, torch.tensor([0.5, 1.5]))) == pytest.approx(
+    behavior = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -0.5]])
+    assert imitation_error(mean, behavior).tolist() == [5.0, 1.0]
+    assert float(distillation_loss(mean, behavior, torch.tensor([0.5, 1.5]))) == pytest.approx(
         (0.5 * 5 + 1.5 * 1) / 2
     )
 
@@ -84,25 +84,25 @@ def test_a_weighting_needs_its_signal():
 
 
 def test_teacher_batches_teach_the_mean_and_leave_the_critic(lesson):
-    x, teacher, weight, generator = lesson
+    x, behavior, weight, generator = lesson
     policy = LinearPolicy()
     critic = policy.critic.weight.clone()
     policy.critic(x).sum().backward()  # a gradient that PPO left behind
-    batches = TeacherBatches(policy, DistillConfig(batch=64, steps=300, learning_rate=1e-2))
-    before = imitation_error(policy.distribution(x)[0], teacher).mean()
-    batches.update(x, teacher, weight, 1.0, generator)
-    after = imitation_error(policy.distribution(x)[0], teacher).mean()
+    batches = TeacherBatches(policy, DistillationConfig(batch=64, steps=300, learning_rate=1e-2))
+    before = imitation_error(policy.distribution(x)[0], behavior).mean()
+    batches.update(x, behavior, weight, 1.0, generator)
+    after = imitation_error(policy.distribution(x)[0], behavior).mean()
     assert after < 0.01 * before
     assert torch.equal(policy.critic.weight, critic)
 
 
 def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
-    x, teacher, weight, generator = lesson
+    x, behavior, weight, generator = lesson
 
     def moved(strength):
         policy = LinearPolicy()
-        TeacherBatches(policy, DistillConfig(batch=64, steps=1)).update(
-            x, teacher, weight, strength, torch.Generator().manual_seed(0)
+        TeacherBatches(policy, DistillationConfig(batch=64, steps=1)).update(
+            x, behavior, weight, strength, torch.Generator().manual_seed(0)
         )
         return (policy.actor.weight - 0.1).detach()
 
@@ -110,7 +110,7 @@ def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
     assert torch.allclose(moved(0.2), 0.2 * moved(1.0), rtol=1e-2, atol=1e-9)
     state = generator.get_state()
     policy = LinearPolicy()
-    TeacherBatches(policy, DistillConfig()).update(x, teacher, weight, 0.0, generator)
+    TeacherBatches(policy, DistillationConfig()).update(x, behavior, weight, 0.0, generator)
     assert torch.equal(generator.get_state(), state)
     assert torch.equal(policy.actor.weight, torch.full((4, 2), 0.1))
 
@@ -118,23 +118,23 @@ def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
 def test_a_batch_that_is_not_finite_changes_nothing_and_is_counted(lesson):
     x, _teacher, weight, generator = lesson
     policy = LinearPolicy()
-    batches = TeacherBatches(policy, DistillConfig(batch=64, steps=2))
+    batches = TeacherBatches(policy, DistillationConfig(batch=64, steps=2))
     batches.update(x, torch.full((500, 4), math.nan), weight, 1.0, generator)
     assert batches.skipped == 2
     assert torch.equal(policy.actor.weight, torch.full((4, 2), 0.1))
 
 
 def test_teacher_batches_go_on_from_their_state(lesson):
-    x, teacher, weight, _generator = lesson
+    x, behavior, weight, _generator = lesson
 
     def run(parts):
         policy, generator = LinearPolicy(), torch.Generator().manual_seed(7)
         state = None
         for _ in range(parts):
-            batches = TeacherBatches(policy, DistillConfig(batch=32, steps=4 // parts))
+            batches = TeacherBatches(policy, DistillationConfig(batch=32, steps=4 // parts))
             if state is not None:
                 batches.load_state_dict(state)
-            batches.update(x, teacher, weight, 0.7, generator)
+            batches.update(x, behavior, weight, 0.7, generator)
             state = batches.state_dict()
         return policy.actor.weight
 
@@ -146,5 +146,9 @@ def test_errors_by_leaf():
     errors.add(torch.tensor([1.0, 2.0, 3.0, 6.0]), torch.tensor([1, 2, 3, -1], dtype=torch.int32))
     errors.add(torch.tensor([4.0, math.nan]), torch.tensor([2, 2], dtype=torch.int32))
     found = errors.take()
-    assert found == {"distill/leaf/Evade": 2.0, "distill/leaf/Follow": 3.0, "distill/loss": 16.0 / 5}
+    assert found == {
+        "distillation/leaf/Evade": 2.0,
+        "distillation/leaf/Follow": 3.0,
+        "distillation/loss": 16.0 / 5,
+    }
     assert errors.take() == {}

@@ -9,7 +9,7 @@ import torch
 from tests.learning.test_pilot import N_OBS, networks
 from tests.learning.test_train import config_of, same
 from uuvtai.learning.networks import NUM_ACTIONS
-from uuvtai.learning.policy_agent import Pilot
+from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.rollout import Hold
 from uuvtai.learning.trainer import Trainer
 
@@ -98,7 +98,7 @@ def test_a_training_counts_control_steps_and_goes_on_bit_for_bit():
 @pytest.mark.parametrize("hold", [1, 4])
 def test_the_pilot_asks_its_networks_when_a_decision_is_due_and_after_a_reset(hold):
     policy, model = networks(hold_steps=hold)
-    pilot, rng = Pilot(policy, model, 2), torch.Generator().manual_seed(3)
+    pilot, rng = PolicyAgent(policy, model, 2), torch.Generator().manual_seed(3)
     actions = []
     for step in range(9):
         if step == 6:

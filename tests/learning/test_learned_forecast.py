@@ -1,5 +1,5 @@
-"""Learning what bodies will do: what is learnt from, likelihood and scores, resuming; and the forecast in the
-whole simulator."""
+"""Learning what obstacles will do: what is learnt from, likelihood and scores, resuming; and the forecast in
+the whole simulator."""
 
 import copy
 import math
@@ -21,7 +21,7 @@ from uuvtai.learning import forecast as forecast_trainer
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.forecast import ForecastTrainer, TrackMoments, column_row, path_places, scores_of, watch
 from uuvtai.learning.networks import TIMES_S, Mixture, MixtureNet, negative_log_likelihood
-from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.runner import TrainRequest, train
 from uuvtai.sim.forecast_weights import packed_weights, read_weights
 from uuvtai.surrogate.world import scenario_rows
@@ -29,14 +29,14 @@ from uuvtai.surrogate.world import scenario_rows
 SMALL = {
     "train.num_envs": 8,
     "train.iterations": 4,
-    "forecaster.memory": 1024,
-    "forecaster.minibatches": 20,
-    "forecaster.minibatch": 64,
+    "forecast_training.memory": 1024,
+    "forecast_training.minibatches": 20,
+    "forecast_training.minibatch": 64,
 }
 
 
 def made_up(seed, n=400):
-    """Moments of bodies that go on or turn back at once, each half of the time; column 5 tells nothing."""
+    """Moments of obstacles that go on or turn back at once, each half of the time; column 5 tells nothing."""
     generator = torch.Generator().manual_seed(seed)
     columns = torch.zeros(n, N_COLUMN)
     columns[:, 0] = 0.5 + torch.rand(n, generator=generator)
@@ -125,7 +125,7 @@ def test_scores():
 
 def test_it_learns_two_futures_and_how_probable_they_are(config, made):
     config = config.model_copy(
-        update={"forecaster": config.forecaster.model_copy(update={"minibatches": 150})}
+        update={"forecast_training": config.forecast_training.model_copy(update={"minibatches": 150})}
     )
     trainer = ForecastTrainer(config)
     first = trainer.evaluate()
@@ -166,11 +166,11 @@ def test_a_run_leaves_the_file_that_a_stack_forecasts_with(config, made, tmp_pat
     assert all(np.array_equal(whole[name], values) for name, values in net.weights().items())
     assert any(not np.array_equal(whole[name], values) for name, values in halfway.items())
     with pytest.raises(CheckpointError, match="forecasts and does not drive"):
-        load_pilot(found, 1)
+        load_agent(found, 1)
 
 
 def test_what_cannot_be_learnt_is_refused(config, tmp_path):
-    forecast = config.forecast.model_copy(update={"learned": "shipped"})
+    forecast = config.forecast.model_copy(update={"learned": "built-in"})
     with pytest.raises(UserError, match="leave it empty"):
         ForecastTrainer(config.model_copy(update={"forecast": forecast}))
     with pytest.raises(ConfigError, match="it learns on the CPU"):
@@ -180,21 +180,21 @@ def test_what_cannot_be_learnt_is_refused(config, tmp_path):
 # ---------------------------------------------------------------------------------------------- the simulator
 
 
-def test_bodies_are_where_the_closed_form_has_them(small):
+def test_obstacles_are_where_the_closed_form_has_them(small):
     small.begin(range(small.N), seed=5)
     path = scenario_rows(small.sim)[1]
     times = np.random.default_rng(1).uniform(0, 30, (small.N, 7))
-    found, compared_bodies = path_places(path, times), 0
+    found, compared_obstacles = path_places(path, times), 0
     for row in range(small.N):
         s = small.sim.s
         scenario = describe_scenario(lambda name: small.sim.rows(attrgetter(name)(s), [row])[0])  # noqa: B023
-        moving = [body for body in scenario["bodies"] if body["path"]]
+        moving = [body for body in scenario["obstacles"] if body["path"]]
         first = min(body["slot"] for body in moving)
         for body in moving:
             own = path_positions(body["path"], times[row])
             np.testing.assert_allclose(found[row, body["slot"] - first], own, atol=1e-4)
-            compared_bodies += 1
-    assert compared_bodies == 8 * 6
+            compared_obstacles += 1
+    assert compared_obstacles == 8 * 6
     assert np.isnan(found).any(), "empty slots are nowhere"
 
 
@@ -206,9 +206,9 @@ def test_what_is_watched_is_what_came(learned):
     assert moments.columns[:, :COLUMNS].isfinite().all() and (moments.columns[:, COLUMNS:] == 0).all()
     assert torch.equal(moments.columns[:, 0], moments.frame[:, 4])
     far = moments.truth[:, -1].norm(dim=-1)
-    assert far.max() < 2.5 * 0.6 + 0.5 + 1e-3, "no body is faster than its scene says"
+    assert far.max() < 2.5 * 0.6 + 0.5 + 1e-3, "no obstacle is faster than its scene says"
     ahead = (moments.truth[:, 0] - torch.stack([0.5 * moments.frame[:, 4], 0 * far], -1)).norm(dim=-1)
-    assert ahead.median() < 0.1, "most bodies go on as they are tracked"
+    assert ahead.median() < 0.1, "most obstacles go on as they are tracked"
     sim, s = learned.sim, learned.sim.s
     there = sim.rows(s.forecast.radius_m)[..., 0] >= 0
     columns, frame, share = (

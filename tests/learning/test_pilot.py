@@ -1,4 +1,4 @@
-"""A policy at the wheel: the same decisions in any batch, memory per row, and checkpoints that do not fit are
+"""A policy driving: the same decisions in any batch, memory per row, and checkpoints that do not fit are
 refused."""
 
 import itertools
@@ -9,12 +9,12 @@ import torch
 
 from uuvtai.config.loader import load_training
 from uuvtai.envs.vector_env import VectorEnv
-from uuvtai.evaluation.agents import Method, features_of, find_policy, load_agents
+from uuvtai.evaluation.agents import AgentSpec, find_policy, load_agents, observation_of
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
 from uuvtai.learning import checkpoint
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.networks import ActorCritic
-from uuvtai.learning.policy_agent import CHUNK, Pilot, load_pilot
+from uuvtai.learning.policy_agent import CHUNK, PolicyAgent, load_agent
 from uuvtai.learning.world_model import WorldModel
 from uuvtai.logs.writer import EpisodeRecorder
 
@@ -50,7 +50,7 @@ def flown(policy, model, rows, steps=4):
     """Decisions of a pilot over some steps for the given rows of one fixed stream of observations."""
     rng = torch.Generator().manual_seed(1)
     stream = 3.0 * torch.randn(steps, 300, N_OBS, generator=rng)
-    pilot, out = Pilot(policy, model, len(rows)), []
+    pilot, out = PolicyAgent(policy, model, len(rows)), []
     for obs in stream:
         decision = pilot.decide(obs[rows])
         columns = (decision.value, decision.residual, decision.uncertainty)
@@ -78,7 +78,7 @@ def test_a_row_does_not_depend_on_its_batch_to_the_last_bit(threads):
 
 def test_memory_is_reset_by_row_and_deciding_again_changes_nothing():
     policy, model = networks()
-    pilot = Pilot(policy, model, 3)
+    pilot = PolicyAgent(policy, model, 3)
     obs = torch.randn(3, N_OBS, generator=torch.Generator().manual_seed(2))
     pilot.act(torch.zeros(3, N_OBS))
     first = pilot.decide(obs)
@@ -97,7 +97,7 @@ def test_what_it_thinks_of_the_world_model_is_about_its_own_last_action():
     with torch.no_grad():
         model.decoder[-1].weight.mul_(100.0)  # or an untrained prediction would hardly depend on the action
     first, second = 3.0 * torch.randn(2, 3, N_OBS, generator=torch.Generator().manual_seed(4))
-    pilot = Pilot(policy, model, 3)
+    pilot = PolicyAgent(policy, model, 3)
     pilot.act(first)
     own = policy.distribution(torch.cat([first, torch.zeros(3, 2)], 1))[0].detach()
     assert own.abs().mean() > 0.1
@@ -111,7 +111,7 @@ def test_what_it_thinks_of_the_world_model_is_about_its_own_last_action():
 
 def test_actions_are_means_within_the_limits_and_nan_does_not_spread():
     policy, model = networks()
-    pilot = Pilot(policy, model, 2)
+    pilot = PolicyAgent(policy, model, 2)
     obs = torch.randn(2, N_OBS)
     clean = pilot.decide(obs).action
     obs[1, 5] = float("nan")
@@ -139,26 +139,26 @@ def trained(small, tmp_path_factory):
         policy.actor[-1].bias[2] = 3.0  # down or up until something stops it: short episodes
     state = state_of(policy, model, env.num_obs)
     checkpoint.save(
-        folder / "checkpoints", 5, state, config, env.observation_table, metrics={"distill/lambda": 0.25}
+        folder / "checkpoints", 5, state, config, env.observation_table, metrics={"distillation/lambda": 0.25}
     )
     return folder, config
 
 
-def pilot_of(folder, small):
-    (method,) = load_agents([str(folder)], 64, print)
-    note = method.driver_for(small.sim)
-    small.sim.use_tree(method.tree)
-    return method, note
+def agent_of(folder, small):
+    (agent,) = load_agents([str(folder)], 64, print)
+    note = agent.agent_for(small.sim)
+    small.sim.use_tree(agent.tree)
+    return agent, note
 
 
 def test_episodes_do_not_depend_on_order_or_neighbours(small, trained, monkeypatch):
     monkeypatch.setattr(small.sim, "observation", None)  # others may have asked for it before
-    method, note = pilot_of(trained[0], small)
-    assert method.name == "mine"
+    agent, note = agent_of(trained[0], small)
+    assert agent.name == "mine"
     jobs = jobs_of([21], 10)
-    results, _ = run_episodes(small.sim, jobs, driver=note.pilot)
-    backwards, _ = run_episodes(small.sim, jobs[::-1], driver=load_pilot(method.checkpoint, small.N))
-    alone, _ = run_episodes(small.sim, jobs[4:5], driver=note.pilot)
+    results, _ = run_episodes(small.sim, jobs, agent=note.agent)
+    backwards, _ = run_episodes(small.sim, jobs[::-1], agent=load_agent(agent.checkpoint, small.N))
+    alone, _ = run_episodes(small.sim, jobs[4:5], agent=note.agent)
     answer = [vars(r) | {"ticks": r.ticks.tolist(), "acted": r.acted.tolist()} for r in results]
     assert [
         vars(r) | {"ticks": r.ticks.tolist(), "acted": r.acted.tolist()} for r in backwards[::-1]
@@ -171,13 +171,13 @@ def test_episodes_do_not_depend_on_order_or_neighbours(small, trained, monkeypat
 def test_the_log_tells_what_the_policy_thought(small, trained, tmp_path):
     from uuvtai.logs.reader import read_head, read_messages
 
-    method, note = pilot_of(trained[0], small)
+    agent, note = agent_of(trained[0], small)
     jobs = jobs_of([21], 1)
-    recorder = EpisodeRecorder(tmp_path, "pool", method.name, jobs, policy=note)
-    run_episodes(small.sim, jobs, recorder, driver=note.pilot)
+    recorder = EpisodeRecorder(tmp_path, "pool", agent.name, jobs, policy=note)
+    run_episodes(small.sim, jobs, recorder, agent=note.agent)
     log = recorder.paths[jobs[0]]
     run = read_head(log).metadata["uuv.run"]
-    assert (run["controller"], run["checkpoint_sha256"]) == ("mine", method.checkpoint.sha256)
+    assert (run["controller"], run["checkpoint_sha256"]) == ("mine", agent.checkpoint.sha256)
     messages = list(read_messages(log, ("/policy", "/action")))
     outputs = [m.data for m in messages if m.topic == "/policy"]
     actions = [m.data for m in messages if m.topic == "/action"]
@@ -188,17 +188,17 @@ def test_the_log_tells_what_the_policy_thought(small, trained, tmp_path):
     assert all(b["applied"] == a["policy"] for a, b in itertools.pairwise(actions)), (
         "what it chose is what was done next"
     )
-    assert any(a["policy"] != a["teacher"] for a in actions)
+    assert any(a["policy"] != a["behavior"] for a in actions)
 
 
 def test_another_observation_is_refused_before_driving(small, trained):
-    method, _ = pilot_of(trained[0], small)
-    changed = method.checkpoint.manifest.model_copy(
-        update={"observation_table": method.checkpoint.manifest.observation_table[:-1]}
+    agent, _ = agent_of(trained[0], small)
+    changed = agent.checkpoint.manifest.model_copy(
+        update={"observation_table": agent.checkpoint.manifest.observation_table[:-1]}
     )
-    other = checkpoint.Checkpoint(method.checkpoint.path, changed, method.checkpoint.config, "")
+    other = checkpoint.Checkpoint(agent.checkpoint.path, changed, agent.checkpoint.config, "")
     with pytest.raises(CheckpointError, match="another observation table"):
-        Method("other", method.tree, other).driver_for(small.sim)
+        AgentSpec("other", agent.tree, other).agent_for(small.sim)
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_networks_that_cannot_drive_are_refused(small, trained, tmp_path, change
     change(state)
     path = checkpoint.save(tmp_path / "checkpoints", 1, state, trained[1], env.observation_table)
     with pytest.raises(CheckpointError, match=says):
-        load_pilot(checkpoint.open_checkpoint(path), 4)
+        load_agent(checkpoint.open_checkpoint(path), 4)
 
 
 # ------------------------------------------------------------------------------------------------------ names
@@ -238,7 +238,7 @@ def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
         == checkpoint.sha256_of(folder / "checkpoints" / "step_000005" / "manifest.json")
     )
     assert load_agents([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
-    assert features_of([str(folder)]) == [("features", config.features.model_dump(mode="json"))]
+    assert observation_of([str(folder)]) == [("features", config.observation.model_dump(mode="json"))]
 
 
 def test_names_that_are_no_policy(trained, tmp_path):
@@ -250,9 +250,9 @@ def test_names_that_are_no_policy(trained, tmp_path):
 
 def test_policies_with_other_columns_are_not_evaluated_together(trained, tmp_path):
     folder, config = trained
-    wider = config.model_copy(update={"features": config.features.model_copy(update={"n_sector": 16})})
+    wider = config.model_copy(update={"observation": config.observation.model_copy(update={"n_sector": 16})})
     table = json.loads((folder / "checkpoints/step_000005/manifest.json").read_text())["observation_table"]
     columns = [type("Column", (), row | {"slice": slice(row["first"], row["stop"])}) for row in table]
     checkpoint.save(tmp_path / "other" / "checkpoints", 1, {"policy": {}, "env": {}}, wider, columns)
     with pytest.raises(ValueError, match="evaluate them one by one"):
-        features_of([str(folder), str(tmp_path / "other")])
+        observation_of([str(folder), str(tmp_path / "other")])

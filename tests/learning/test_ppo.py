@@ -238,7 +238,7 @@ def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
     rollout.teacher_action.normal_(generator=torch.Generator().manual_seed(1))
     rollout.weight.uniform_(0.5, 1.5, generator=torch.Generator().manual_seed(2))
-    metrics = ppo.update(rollout, distill_weight=0.3)
+    metrics = ppo.update(rollout, distillation_weight=0.3)
 
     advantage, target = gae(
         rollout.reward, rollout.value, rollout.next_value, rollout.terminated, rollout.ended, 0.99, 0.95
@@ -314,7 +314,7 @@ def test_without_the_surrogate_the_actor_rests_unless_the_teacher_moves_it():
     ppo.update(rollout, surrogate=False)
     assert torch.equal(ppo.policy.actor[0].weight, actor)
     assert not torch.equal(ppo.policy.critic[0].weight, critic)
-    ppo.update(fill(rollout, ppo.policy), distill_weight=1.0, surrogate=False)
+    ppo.update(fill(rollout, ppo.policy), distillation_weight=1.0, surrogate=False)
     assert not torch.equal(ppo.policy.actor[0].weight, actor)
     assert torch.equal(ppo.policy.log_std, make_policy().log_std)
 
@@ -327,7 +327,7 @@ def test_distillation_draws_the_mean_to_the_teacher_where_the_weight_is():
     rollout.weight[:, 0] = 3.0
     x = rollout.x.clone()
     for _ in range(4):
-        ppo.update(rollout, distill_weight=10.0, surrogate=False)
+        ppo.update(rollout, distillation_weight=10.0, surrogate=False)
     error = (ppo.policy.distribution(x)[0] - 0.5).detach().abs().mean(-1)
     assert float(error[:, 0].mean()) < 0.05
     before = (make_policy().distribution(x)[0] - 0.5).detach().abs().mean()
@@ -346,7 +346,7 @@ def test_equal_generators_give_equal_bits_and_a_saved_state_goes_on(shuffle):
             generator.set_state(generator_state)
         rollout = Rollout(T, N, N_IN)
         for number in range(first, first + updates):
-            ppo.update(fill(rollout, ppo.policy, seed=number), distill_weight=0.1, generator=generator)
+            ppo.update(fill(rollout, ppo.policy, seed=number), distillation_weight=0.1, generator=generator)
         return ppo, generator
 
     whole, _ = run(4)
@@ -379,7 +379,7 @@ def test_samples_that_are_not_finite_have_no_part_and_are_counted(name, bad):
     ppo = make_ppo()
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
     getattr(rollout, name)[3, 2] = bad
-    metrics = ppo.update(rollout, distill_weight=0.5)
+    metrics = ppo.update(rollout, distillation_weight=0.5)
     assert metrics["train/invalid_samples"] == 1
     assert metrics["train/skipped_updates"] == 0
     assert all(math.isfinite(value) for value in metrics.values())
@@ -433,7 +433,7 @@ def test_a_loss_that_is_not_finite_changes_nothing():
     ppo = make_ppo(normalise_values=False)
     before = weights(ppo.policy)
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
-    metrics = ppo.update(rollout, distill_weight=math.nan)
+    metrics = ppo.update(rollout, distillation_weight=math.nan)
     assert metrics["train/skipped_updates"] == 8
     assert torch.equal(weights(ppo.policy), before)
 

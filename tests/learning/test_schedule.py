@@ -2,7 +2,7 @@
 
 import pytest
 
-from uuvtai.config.learning import DistillConfig
+from uuvtai.config.learning import DistillationConfig
 from uuvtai.learning.distillation import piecewise_linear
 
 
@@ -30,7 +30,9 @@ def test_one_point_is_a_constant():
 def test_the_paper_s_schedule(iteration, value):
     """Equation of lambda_t: 1 until 800, then from 0.2 down to 0 at 1600 of 1200 iterations, which a run
     never reaches."""
-    assert piecewise_linear(DistillConfig().schedule, iteration / 1200) == pytest.approx(value, abs=1e-12)
+    assert piecewise_linear(DistillationConfig().schedule, iteration / 1200) == pytest.approx(
+        value, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("points", [[], [(1.0, 0.0), (0.5, 1.0)]])

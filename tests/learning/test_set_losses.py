@@ -1,4 +1,4 @@
-"""Losses of a policy over a set of bodies, by pieces on several threads: gradients of the whole minibatch,
+"""Losses of a policy over a set of obstacles, by pieces on several threads: gradients of the whole minibatch,
 whatever the number of threads."""
 
 import pytest
@@ -11,15 +11,17 @@ from uuvtai.learning.ppo import surrogate_loss
 from uuvtai.learning.set_networks import MaxAndSum, SetActor, SetCritic
 from uuvtai.learning.surrogate_trainer import CACHE_ROWS, SetLosses, by_part, side_by_side
 
-ROWS, LANES, N_BODY, N_OWN, N_TRUTH = CACHE_ROWS + 77, 3, 5, 7, 4
+ROWS, LANES, N_OBSTACLE, N_OWN, N_TRUTH = CACHE_ROWS + 77, 3, 5, 7, 4
 
 
 @pytest.fixture
 def nets():
-    config = LearningConfig.model_validate({"twin": {"body_hidden": 8, "head_hidden": 8}, "policy": {}})
+    config = LearningConfig.model_validate(
+        {"surrogate": {"obstacle_hidden": 8, "head_hidden": 8}, "policy": {}}
+    )
     generator = torch.Generator().manual_seed(0)
-    actor = SetActor(N_BODY, N_OWN, config, generator)
-    return config, actor, SetCritic(N_BODY, N_OWN, N_TRUTH, config, generator)
+    actor = SetActor(N_OBSTACLE, N_OWN, config, generator)
+    return config, actor, SetCritic(N_OBSTACLE, N_OWN, N_TRUTH, config, generator)
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +31,9 @@ def batch():
     def drawn(*shape):
         return torch.randn(ROWS, *shape, generator=generator)
 
-    bodies = drawn(LANES, N_BODY)
-    bodies[..., 0] = (bodies[..., 0] > 0).float()
-    return [bodies, drawn(N_OWN), drawn(LANES, N_TRUTH), drawn(3), drawn() - 3.0, drawn(), drawn()]
+    obstacles = drawn(LANES, N_OBSTACLE)
+    obstacles[..., 0] = (obstacles[..., 0] > 0).float()
+    return [obstacles, drawn(N_OWN), drawn(LANES, N_TRUTH), drawn(3), drawn() - 3.0, drawn(), drawn()]
 
 
 def gradients(config, actor, critic, batch):
@@ -44,8 +46,8 @@ def gradients(config, actor, critic, batch):
 def test_pieces_add_up_to_the_gradient_of_the_whole(nets, batch):
     config, actor, critic = nets
     of_actor, of_critic, sums = gradients(config, actor, critic, batch)
-    bodies, own, truth, action, before, advantage, target = batch
-    mean, value = actor(bodies, own), critic(bodies, own, truth)
+    obstacles, own, truth, action, before, advantage, target = batch
+    mean, value = actor(obstacles, own), critic(obstacles, own, truth)
     surrogate = surrogate_loss(
         log_prob(action, mean, actor.log_std) - before, advantage, config.ppo.clip
     ).mean()
@@ -71,10 +73,10 @@ def test_a_minibatch_is_the_rows_that_were_chosen(nets, batch):
 def test_maximum_and_sum_have_the_gradient_of_torch(kind):
     generator = torch.Generator().manual_seed(4)
     said = torch.randn(5, 64, 8, generator=generator).to(kind)
-    said[1, :9] = said[3, :9]  # equally high bodies share
+    said[1, :9] = said[3, :9]  # equally high obstacles share
     said.requires_grad_()
     mask = (torch.rand(5, 64, generator=generator) < 0.6).float()
-    mask[:, 20:25] = 0.0  # rows without a body
+    mask[:, 20:25] = 0.0  # rows without an obstacle
     back = [torch.randn(64, 8, generator=generator).to(kind) for _ in range(2)]
     each = torch.relu(said) * mask.to(kind).unsqueeze(-1)
     wanted = each.amax(dim=0), each.sum(dim=0)

@@ -25,7 +25,7 @@ def config_of(**sections):
     small = {
         "policy": {"hidden": [16, 16]},
         "ppo": {"rollout_steps": 16, "epochs": 2, "minibatches": 2, "learning_rate": 1e-3},
-        "distill": {"batch": 64, "schedule": [[0, 1], [1, 0.2]]},
+        "distillation": {"batch": 64, "schedule": [[0, 1], [1, 0.2]]},
         "world_model": {"hidden": [16], "latent": 8, "batch": 64},
         "train": {"iterations": 8},
     }
@@ -56,11 +56,16 @@ def test_it_learns_the_task_from_its_teacher_and_says_so():
     first = trainer.iterate()
     for _ in range(11):
         last = trainer.iterate()
-    assert last["distill/loss"] < 0.5 * first["distill/loss"]
+    assert last["distillation/loss"] < 0.5 * first["distillation/loss"]
     assert last["rollout/success_rate"] > 0.9
-    assert last["distill/leaf/Far"] > 0 and last["distill/leaf/Near"] > 0
-    assert (first["distill/lambda"], last["distill/lambda"]) == (1.0, pytest.approx(1 - 0.8 * 11 / 12))
-    assert last["distill/lambda_risk"] == pytest.approx(last["distill/lambda"] * last["distill/scale"])
+    assert last["distillation/leaf/Far"] > 0 and last["distillation/leaf/Near"] > 0
+    assert (first["distillation/lambda"], last["distillation/lambda"]) == (
+        1.0,
+        pytest.approx(1 - 0.8 * 11 / 12),
+    )
+    assert last["distillation/lambda_risk"] == pytest.approx(
+        last["distillation/lambda"] * last["distillation/scale"]
+    )
     assert last["time/env_steps"] == 16 * 16 * 13, "the rollout that the tree drove counts too"
     assert last["reward/progress"] > first["reward/progress"]
     assert set(WALL_TIMES) < set(last)

@@ -9,25 +9,42 @@ import torch
 
 from uuvtai.common.errors import UserError
 from uuvtai.config import FastConfig, SlowConfig
-from uuvtai.config.behavior import CALM, DEVIATION, FAST, GAZE, HORIZON, RANGE, SLOW, TTC, TUNED, log_bounds
+from uuvtai.config.behavior import (
+    DEVIATION,
+    FAST,
+    HEADING_RANGE,
+    HORIZON,
+    HYSTERESIS,
+    RANGE,
+    SLOW,
+    TTC,
+    TUNED,
+    log_bounds,
+)
 from uuvtai.config.loader import load_config, load_training, with_stack
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
 from uuvtai.kernels.behavior.rollout import tuned
 from uuvtai.kernels.core.stage import AnyTensor, In
 from uuvtai.learning import checkpoint
-from uuvtai.learning.agents import TunedPilot, load_tuned, tuned_sections
+from uuvtai.learning.agents import TunedAgent, load_tuned, tuned_sections
 from uuvtai.learning.checkpoint import CheckpointError
-from uuvtai.learning.parameter_search import BEND_MEAN, NumberSearch, TunerTrainer, best_near, fitted
-from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.parameter_search import (
+    BEND_MEAN,
+    NumberSearch,
+    ParameterSearchTrainer,
+    best_near,
+    fitted,
+)
+from uuvtai.learning.policy_agent import load_agent
 from uuvtai.sim.setup import fill_constants
-from uuvtai.state import TeacherState, allocate
+from uuvtai.state import BehaviorState, allocate
 
 SMALL = {
     "train.num_envs": 8,
     "train.iterations": 4,
     "train.evaluate_episodes": 4,
-    "tuner.scenes": [["pool", 8, 6, 0.6], ["pool", 8, 6, 1.5]],
-    "tuner.warm_up": 0.5,
+    "parameter_search.scenes": [["pool", 8, 6, 0.6], ["pool", 8, 6, 1.5]],
+    "parameter_search.warm_up": 0.5,
 }
 
 
@@ -38,8 +55,8 @@ def config():
 
 @pytest.fixture(scope="module")
 def trainer(config, small):
-    """After three iterations: slow bodies, fast ones, slow ones."""
-    made = TunerTrainer(config, {"pool": small.sim})
+    """After three iterations: slow obstacles, fast ones, slow ones."""
+    made = ParameterSearchTrainer(config, {"pool": small.sim})
     for _ in range(3):
         made.iterate()
     return made
@@ -82,15 +99,15 @@ def test_few_trials_are_not_believed():
 
 def test_every_number_is_one_of_the_config(config):
     for number in TUNED:
-        assert getattr(config.teacher, number.name) > 0
+        assert getattr(config.behavior, number.name) > 0
         assert getattr(config.slow, number.name) == getattr(config.fast, number.name) == 1.0
         assert 0 < number.least < 1 <= number.most
-    assert [TUNED[i].name for i in (DEVIATION, HORIZON, TTC, RANGE, GAZE)] == [
+    assert [TUNED[i].name for i in (DEVIATION, HORIZON, TTC, RANGE, HEADING_RANGE)] == [
         "weight_deviation",
         "horizon_s",
         "emergency_ttc_s",
         "emergency_range_m",
-        "gaze_m",
+        "heading_range_m",
     ]
     low, high = log_bounds()
     assert low[TTC] == pytest.approx(math.log(0.15)) and high[HORIZON] == 0.0
@@ -98,44 +115,44 @@ def test_every_number_is_one_of_the_config(config):
 
 def ends(sim, log_factor=None):
     """(outcome, time) of eight episodes, by the tree or with factors on its numbers."""
-    driver = None if log_factor is None else TunedPilot(log_factor, sim)
-    results, _ = run_episodes(sim, jobs_of([77], 8), driver=driver)
+    agent = None if log_factor is None else TunedAgent(log_factor, sim)
+    results, _ = run_episodes(sim, jobs_of([77], 8), agent=agent)
     return [(result.outcome, result.time_s, result.path_length_m) for result in results]
 
 
 @ti.kernel
-def _factors_of_calm(out: AnyTensor, teacher: In[TeacherState]):
+def _factors_of_calm(out: AnyTensor, behavior: In[BehaviorState]):
     for env in out:
-        out[env] = tuned(env, CALM, teacher)
+        out[env] = tuned(env, HYSTERESIS, behavior)
 
 
-def test_what_holds_follows_from_the_speed_of_the_bodies():
+def test_what_holds_follows_from_the_speed_of_the_obstacles():
     sizes = {"n_env": 4, "n_node": 1, "n_candidate": 16, "n_tuned": len(TUNED)}
-    teacher, out = allocate(TeacherState, sizes), np.zeros(4, np.float32)
+    behavior, out = allocate(BehaviorState, sizes), np.zeros(4, np.float32)
     factors = np.zeros((4, len(TUNED), 2), np.float32)
-    factors[:, CALM] = np.log([4.0, 0.25])
-    teacher.tuned.from_numpy(factors)
-    teacher.alert.from_numpy(np.array([-1.0, 0.0, 0.5, 1.0], np.float32))
-    _factors_of_calm(out, teacher)
+    factors[:, HYSTERESIS] = np.log([4.0, 0.25])
+    behavior.tuned.from_numpy(factors)
+    behavior.alert.from_numpy(np.array([-1.0, 0.0, 0.5, 1.0], np.float32))
+    _factors_of_calm(out, behavior)
     assert out == pytest.approx([4.0, 4.0, 1.0, 0.25]), "nothing tracked, slow, between, fast"
 
 
-def test_factors_hold_among_the_bodies_that_they_are_for(small):
+def test_factors_hold_among_the_obstacles_that_they_are_for(small):
     sim, alike = small.sim, {}
-    for bodies, speed in ((SLOW, 0.6), (FAST, 1.5)):
+    for obstacles, speed in ((SLOW, 0.6), (FAST, 1.5)):
         sim.set_scenes([(8, 6, speed)])
         usual = ends(sim)
         for part in (SLOW, FAST):
             other = torch.zeros(len(TUNED), 2)
             other[DEVIATION, part] = math.log(TUNED[DEVIATION].least)
             found = zip(ends(sim, other), usual, strict=True)
-            alike[part, bodies] = sum(a[:2] == b[:2] for a, b in found)
-        if bodies == SLOW:
+            alike[part, obstacles] = sum(a[:2] == b[:2] for a, b in found)
+        if obstacles == SLOW:
             assert ends(sim) == usual, "a reset sets the numbers back"
         else:
             assert ends(sim, torch.zeros(len(TUNED), 2)) == usual, "factors of one change nothing"
     assert alike[SLOW, SLOW] <= 2 and alike[FAST, FAST] <= 2, f"{alike} of 8"
-    assert alike[FAST, SLOW] >= 4, f"{alike} of 8: a slow body is now and then thought to be fast"
+    assert alike[FAST, SLOW] >= 4, f"{alike} of 8: a slow obstacle is now and then thought to be fast"
     sim.set_scenes()
 
 
@@ -144,10 +161,10 @@ def test_every_row_has_its_own_numbers(small):
     rows = torch.arange(sim.num_envs, dtype=torch.int32)
     sim.sleep()
     sim.reset(torch.ones_like(rows), torch.full_like(rows, 77), rows)
-    pilot = TunedPilot(torch.zeros(len(TUNED), 2), sim)
+    pilot = TunedAgent(torch.zeros(len(TUNED), 2), sim)
     pilot.log_factor[1, TTC, FAST] = -1.0
     pilot.reset(torch.ones_like(rows))
-    held = sim.rows(sim.s.teacher.tuned)
+    held = sim.rows(sim.s.behavior.tuned)
     assert held[1, TTC, FAST] == -1.0 and np.count_nonzero(held) == 1
     assert torch.equal(pilot.decide(sim.action).action, sim.action)
     sim.sleep()
@@ -175,8 +192,8 @@ def test_trials_come_in_mirrored_pairs():
     assert bool((drawn.abs() <= search.spread + 1e-6).all())
 
 
-def test_trials_of_one_kind_of_bodies_leave_the_other_s_numbers_alone(config, small):
-    made = TunerTrainer(config, {"pool": small.sim})
+def test_trials_of_one_kind_of_obstacles_leave_the_other_s_numbers_alone(config, small):
+    made = ParameterSearchTrainer(config, {"pool": small.sim})
     began = made.centre
     made.iterate()
     first = made.centre
@@ -187,15 +204,15 @@ def test_trials_of_one_kind_of_bodies_leave_the_other_s_numbers_alone(config, sm
 
 
 def test_a_search_goes_on_from_the_config_s_numbers(small):
-    config = load_training("best", overrides=SMALL | {"slow.calm_s": 2.0, "fast.calm_s": 0.5})
-    made = TunerTrainer(config, {"pool": small.sim})
-    assert made.centre[CALM].tolist() == pytest.approx([math.log(2.0), math.log(0.5)])
+    config = load_training("best", overrides=SMALL | {"slow.hysteresis_s": 2.0, "fast.hysteresis_s": 0.5})
+    made = ParameterSearchTrainer(config, {"pool": small.sim})
+    assert made.centre[HYSTERESIS].tolist() == pytest.approx([math.log(2.0), math.log(0.5)])
 
 
 def test_a_scene_that_is_neither_slow_nor_fast_is_refused():
-    config = load_training("best", overrides=SMALL | {"tuner.scenes": [["pool", 8, 6, 1.0]]})
+    config = load_training("best", overrides=SMALL | {"parameter_search.scenes": [["pool", 8, 6, 1.0]]})
     with pytest.raises(UserError, match=r"1 m/s, in pool, are neither slow \(fast\.from_m_s, 0\.8"):
-        TunerTrainer(config)
+        ParameterSearchTrainer(config)
 
 
 def test_arrivals_count_and_early_ones_more(trainer):
@@ -219,9 +236,9 @@ def test_an_evaluation_changes_nothing(trainer):
 def test_a_resumed_training_has_the_same_bits(trainer, config, small, tmp_path):
     path = checkpoint.save(tmp_path / "checkpoints", 3, trainer.state(), config, trainer.observation_table)
     found = checkpoint.open_checkpoint(path)
-    other = TunerTrainer(config, {"pool": small.sim})
+    other = ParameterSearchTrainer(config, {"pool": small.sim})
     other.load_state(found.state(like=other.state()))
-    first = TunerTrainer(config, {"pool": small.sim})
+    first = ParameterSearchTrainer(config, {"pool": small.sim})
     first.load_state(trainer.state())
     assert first.iterate()["rollout/success_rate"] == other.iterate()["rollout/success_rate"]
     assert torch.equal(first.centre, other.centre)
@@ -272,7 +289,7 @@ def test_numbers_that_no_training_leaves_are_refused(saved, small, wrong):
 
 def test_an_export_says_what_to_do_instead(saved, trainer):
     with pytest.raises(UserError, match=r"stack\.yaml"):
-        load_pilot(saved(trainer.centre), 1)
+        load_agent(saved(trainer.centre), 1)
 
 
 def test_a_stack_holds_the_factors():
@@ -280,17 +297,20 @@ def test_a_stack_holds_the_factors():
     log_factor[:, FAST] = math.log(2.0)
     sections = tuned_sections(log_factor)
     assert sections["slow"] == {number.name: 0.5123 for number in TUNED}
-    assert SlowConfig(**sections["slow"]).softness == 0.5123
-    assert FastConfig(**sections["fast"]).softness == 2.0
+    assert SlowConfig(**sections["slow"]).temperature == 0.5123
+    assert FastConfig(**sections["fast"]).temperature == 2.0
 
 
 def test_the_config_s_factors_are_what_a_reset_sets(small):
     """As a run with them would be, without another simulator: what they are in the arrays."""
-    sim, config = small.sim, load_config("pool", overrides=[("fast.calm_s", 2.0), ("slow.calm_s", 3.0)])
+    sim, config = (
+        small.sim,
+        load_config("pool", overrides=[("fast.hysteresis_s", 2.0), ("slow.hysteresis_s", 3.0)]),
+    )
     put, factor = {}, sim.s.table.factor
     assert not factor.to_numpy().any()
     fill_constants(sim.s, config, lambda field, values: put.setdefault(id(field), values))
-    assert put[id(factor)][CALM] == pytest.approx(np.log([3.0, 2.0]))
+    assert put[id(factor)][HYSTERESIS] == pytest.approx(np.log([3.0, 2.0]))
     assert np.count_nonzero(put[id(factor)]) == 2
 
 
@@ -300,12 +320,12 @@ def test_the_shipped_stack_holds_factors_that_a_training_can_find():
     for number in TUNED:
         for section in (ours.slow, ours.fast):
             assert number.least <= getattr(section, number.name) <= number.most, number.name
-    changed = ("slow", "fast", "tracking", "forecast", "quiet", "route", "teacher")
+    changed = ("slow", "fast", "tracking", "forecast", "quiet", "route", "behavior")
     own = {name: getattr(usual, name) for name in changed}
     assert ours.model_copy(update=own) == usual
-    brisk = {"gaze_clearance_m": 0.48, "slow_fraction": 1.0, "patience_s": 0.0}
-    assert ours.teacher == usual.teacher.model_copy(update=brisk)
+    brisk = {"heading_clearance_m": 0.48, "slow_fraction": 1.0, "patience_s": 0.0}
+    assert ours.behavior == usual.behavior.model_copy(update=brisk)
     assert ours.route == usual.route.model_copy(update={"lookahead_m": 0.8})
     assert ours.quiet == usual.quiet.model_copy(update={"room_m": 0.8})
     assert ours.tracking == usual.tracking.model_copy(update={"partial_sigmas": 2.0})
-    assert ours.forecast == usual.forecast.model_copy(update={"learned": "shipped"})
+    assert ours.forecast == usual.forecast.model_copy(update={"learned": "built-in"})

@@ -25,7 +25,7 @@ from tests.command import read_by_viewer
 from tests.oracles import logs as episode
 from tests.oracles.world import path_position
 from uuvtai.common.files import FileError
-from uuvtai.common.obstacle_motion import KIND_NAMES, body_positions
+from uuvtai.common.obstacle_motion import KIND_NAMES, obstacle_positions
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.core import geometry, grid
 from uuvtai.logs.container import McapFile
@@ -136,7 +136,7 @@ def test_a_track_says_how_sure_it_is(log_path):
 def test_an_evasion_is_told_where_one_is_looked_for(log_path, snaps):
     """Only in the decisions that look for one; null = no conflict."""
     found = by_topic(log_path, "/evasion")
-    assert len(found) == sum(int(snap["teacher.want_evade"]) for snap in snaps) > 0
+    assert len(found) == sum(int(snap["behavior.want_evade"]) for snap in snaps) > 0
     assert all(message["hold_conflict_s"] is None for message in found)
     assert {message["candidate"] for message in found} == {-1, 17}
     assert {message["conflict_s"] is None for message in found} == {True, False}
@@ -388,8 +388,8 @@ def _matrix(q):
 def test_the_scenario_gives_every_obstacle_at_any_time(log_path):
     scenario = read_head(log_path).scenario
     for message in read_messages(log_path, ["/obstacles/truth"]):
-        for body, seen in zip(scenario["bodies"], message.data["obstacles"], strict=True):
-            at = body_positions(body, np.array([message.time_s]))[0]
+        for body, seen in zip(scenario["obstacles"], message.data["obstacles"], strict=True):
+            at = obstacle_positions(body, np.array([message.time_s]))[0]
             np.testing.assert_allclose([seen["x"], seen["y"], seen["z"]], at, atol=CLOSED_FORM_M)
             assert seen["kind"] == body["kind"]
             if body["path"]:
@@ -404,13 +404,13 @@ def test_null_stands_only_where_something_does_not_exist(log_path):
     assert safety[0]["ttc_s"] == pytest.approx(2.3) and safety[1]["ttc_s"] is None
     assert policy[0]["value"] is None and policy[0]["alive"] == pytest.approx(0.01)
     assert policy[0]["reward"] == pytest.approx(sum(policy[0][name] for name in episode.TERMS))
-    assert action[0]["policy"] is None and action[0]["teacher"] == pytest.approx([0.8, 0.0, 0.1, -0.2])
+    assert action[0]["policy"] is None and action[0]["behavior"] == pytest.approx([0.8, 0.0, 0.1, -0.2])
     assert action[75]["leaf"] == "Evade"
 
 
 def test_far_time_to_collision_is_null(tmp_path, snaps):
     with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
-        log.write(snaps[0] | {"referee.ttc_s": 1e6})
+        log.write(snaps[0] | {"termination.ttc_s": 1e6})
         log.close(episode.result(0))
     assert by_topic(tmp_path / "a.mcap", "/safety")[0]["ttc_s"] is None
 
@@ -448,7 +448,7 @@ def test_kinds_are_those_of_the_simulator():
         "vehicle.rpm",
         "world.pos_w",
         "tracks.state",
-        "referee.clearance_m",
+        "termination.clearance_m",
     ],
 )
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
@@ -482,7 +482,7 @@ def test_due_asks_for_maps_at_2_hz_on_replans_and_at_the_end(tmp_path, snaps):
         assert asked == [0, 25, 50]
         assert "/map/static" not in due(log, 60)
         assert "/map/static" in due(log, 60, **{"route.plan_step": 60})
-        assert {"/map/static", "/obstacles", "/log"} <= due(log, 60, **{"referee.outcome": 1})
+        assert {"/map/static", "/obstacles", "/log"} <= due(log, 60, **{"termination.outcome": 1})
         assert "/camera/depth" in due(log, 75) and "/camera/depth" not in due(log, 74)
         assert "/camera/depth" not in due(log, 75, **{"image.fresh": 0})
     with McapEpisodeLog(tmp_path / "b.mcap", episode.header()) as log:
@@ -492,7 +492,7 @@ def test_due_asks_for_maps_at_2_hz_on_replans_and_at_the_end(tmp_path, snaps):
 def test_every_topic_reads_what_the_state_has():
     """A name that is wrong would leave its topic out of logs written by hand; here it is found."""
     structs = typing.get_type_hints(SimState)
-    outputs = {"driver.applied", *NO_POLICY}
+    outputs = {"agent.applied", *NO_POLICY}
     for topic in TOPICS:
         for name in {*topic.reads, *topic.when.reads} - outputs:
             struct, field = name.split(".")

@@ -8,7 +8,7 @@ from PIL import Image
 
 from tests.oracles import logs as episode
 from uuvtai.cli import main
-from uuvtai.common.colours import PALETTE, contrast, method_colours
+from uuvtai.common.colours import PALETTE, agent_colours, contrast
 from uuvtai.common.errors import UserError
 from uuvtai.logs import drawing
 from uuvtai.logs import video as film
@@ -98,7 +98,7 @@ def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
             seen |= set(map(tuple, np.array(image.convert("RGB")).reshape(-1, 3)))
         assert image.info["loop"] == 0 and image.size[0] == 800
     assert sum(durations) == pytest.approx(1000 * (image.n_frames / 15), abs=40)
-    assert {color[::-1] for color in (drawing.GOAL, drawing.ROUTE, drawing.method_inks(["bt"])["bt"])} <= seen
+    assert {color[::-1] for color in (drawing.GOAL, drawing.ROUTE, drawing.agent_inks(["bt"])["bt"])} <= seen
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path):
@@ -134,7 +134,7 @@ def test_a_cut_file_is_seen(tmp_path, logs):
     frames = [np.full((64, 64, 3), 20 * i, np.uint8) for i in range(10)]
     for suffix in (".webm", ".mp4", ".gif"):
         path = tmp_path / f"a{suffix}"
-        assert film.write_film(path, frames, 10.0, frames, []) == 10
+        assert film.write_video(path, frames, 10.0, frames, []) == 10
         film.check_whole(path, 10, path)
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
         with pytest.raises(UserError, match="disk full"):
@@ -169,24 +169,24 @@ METHODS += ["dwa", "potential_field", "velocity_obstacle", "mppi"]
 
 
 def test_a_method_has_one_colour_wherever_it_is_shown():
-    known = method_colours(METHODS)
+    known = agent_colours(METHODS)
     assert len(set(known.values())) == len(known)
     for name, colour in known.items():
-        assert method_colours([name]) == {name: colour} and method_colours(["mine", name])[name] == colour
+        assert agent_colours([name]) == {name: colour} and agent_colours(["mine", name])[name] == colour
 
 
 def test_other_methods_take_what_is_free_in_their_order():
     names = ["bt", "a", "b", "c"]
-    found = method_colours(names)
-    assert len(set(found.values())) == 4 and method_colours(["bt", "a"]) == {
+    found = agent_colours(names)
+    assert len(set(found.values())) == 4 and agent_colours(["bt", "a"]) == {
         name: found[name] for name in ("bt", "a")
     }
-    many = method_colours([f"m{i}" for i in range(20)])
+    many = agent_colours([f"m{i}" for i in range(20)])
     assert set(many.values()) <= set(PALETTE) and len(set(many.values())) == 7
 
 
 def test_every_method_stands_out_from_what_a_map_shows():
-    for colour in method_colours(METHODS).values():
+    for colour in agent_colours(METHODS).values():
         assert contrast(colour, "#ffffff") > 1.9
         for meaning in (drawing.DYNAMIC, drawing.MOVER):
             assert np.abs(np.array(drawing.bgr(colour)) - meaning).max() > 60
@@ -194,7 +194,7 @@ def test_every_method_stands_out_from_what_a_map_shows():
 
 def test_a_video_draws_its_method_in_its_colour(folder, logs):
     recording = load_recording(logs[1])
-    own, other = drawing.method_inks(["straight"])["straight"], drawing.method_inks(["bt"])["bt"]
+    own, other = drawing.agent_inks(["straight"])["straight"], drawing.agent_inks(["bt"])["bt"]
     pixels = set(map(tuple, FrameArtist(recording).frame(1.0).reshape(-1, 3)))
     assert tuple(own) in pixels and tuple(other) not in pixels
 
@@ -202,10 +202,10 @@ def test_a_video_draws_its_method_in_its_colour(folder, logs):
 def test_methods_of_a_user_keep_the_colour_that_they_have_beside_each_other(tmp_path):
     path = episode.record(tmp_path / "b.mcap", N_STEP, episode.header("second"))
     names = ["bt", "first", "second"]
-    pixels = set(map(tuple, FrameArtist(load_recording(path), methods=names).frame(1.0).reshape(-1, 3)))
-    assert tuple(drawing.method_inks(names)["second"]) in pixels
-    image = paint_picture([load_recording(path, PICTURE_TOPICS)], methods=names).image
-    assert tuple(drawing.method_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))
+    pixels = set(map(tuple, FrameArtist(load_recording(path), agents=names).frame(1.0).reshape(-1, 3)))
+    assert tuple(drawing.agent_inks(names)["second"]) in pixels
+    image = paint_picture([load_recording(path, PICTURE_TOPICS)], agents=names).image
+    assert tuple(drawing.agent_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))
 
 
 def test_maps_of_a_harbour_are_kept_packed():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.oracles import logs as episode
-from uuvtai.common.obstacle_motion import body_positions
+from uuvtai.common.obstacle_motion import obstacle_positions
 from uuvtai.logs import drawing as ink
 from uuvtai.logs.drawing import (
     PICTURE_TOPICS,
@@ -21,7 +21,7 @@ from uuvtai.logs.picture import paint_picture, picture
 from uuvtai.logs.video import FrameArtist, video
 from uuvtai.logs.writer import McapEpisodeLog
 
-INKS = ink.method_inks(["bt", "straight", "planner"])
+INKS = ink.agent_inks(["bt", "straight", "planner"])
 N_STEP = 110
 CODEC_ERROR = 40
 """VP9 keeps colours of small details only so well (0 to 255)"""
@@ -104,23 +104,25 @@ def test_the_end_shows_the_outcome(bt, straight):
 
 
 def test_where_methods_go_the_same_way_both_are_seen(folder, bt):
-    twin = episode.record(folder / "twin.mcap", N_STEP, episode.header("twin"))
-    loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, twin)]
+    surrogate = episode.record(folder / "surrogate.mcap", N_STEP, episode.header("surrogate"))
+    loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, surrogate)]
     image = paint_picture(loaded, obstacles=False).image
     path = loaded[0].positions
     assert has(around(image, place(path[len(path) // 4]), 2), INKS["bt"])
     assert has(
-        around(image, place(path[len(path) // 4]), 5), ink.method_inks(["bt", "twin"])["twin"], 60
+        around(image, place(path[len(path) // 4]), 5), ink.agent_inks(["bt", "surrogate"])["surrogate"], 60
     )  # its edge, a pixel and a half wide
 
 
-def test_true_bodies_are_as_old_as_the_map(folder, bt):
-    """The first method's map is drawn; another method that took longer does not move the bodies on."""
+def test_true_obstacles_are_as_old_as_the_map(folder, bt):
+    """The first agent's map is drawn; another agent that took longer does not move the obstacles on."""
     longer = folder / "longer.mcap"
     episode.record(longer, 2 * N_STEP, episode.header("straight"), sway=-0.9)
     first, second = (load_recording(path, PICTURE_TOPICS) for path in (bt, longer))
-    body = episode.BODIES[4]
-    then, later = (body_positions(body, np.array([recording.duration_s]))[0] for recording in (first, second))
+    body = episode.OBSTACLES[4]
+    then, later = (
+        obstacle_positions(body, np.array([recording.duration_s]))[0] for recording in (first, second)
+    )
     assert np.linalg.norm(then - later) > 1.0
     alone, both = paint_picture([first]).image, paint_picture([first, second]).image
     for center, there in ((then, True), (later, False)):
@@ -139,10 +141,10 @@ def test_remarks_stand_in_red_beside_the_title(bt):
         assert has(marked[: rows.max() + 1, cols.min() :].reshape(-1, 3).astype(int), ink.FAILED, 60)
 
 
-def test_bodies_above_and_below_the_vehicle_are_dashed():
+def test_obstacles_above_and_below_the_vehicle_are_dashed():
     def ink_used(own_z_m):
         canvas = map_canvas(episode.scenario()["tank"], 1280, (52, 28, 84, 212))
-        paint_truth(canvas, {"bodies": [episode.BODIES[0] | {"size": [0.35, 0.35, 0.2]}]}, 0.0, own_z_m)
+        paint_truth(canvas, {"obstacles": [episode.OBSTACLES[0] | {"size": [0.35, 0.35, 0.2]}]}, 0.0, own_z_m)
         return int((255 - canvas.image.astype(int)).sum())
 
     level, reaching_up, below, above = (ink_used(z) for z in (-0.8, -1.1, -1.3, -0.3))

@@ -35,7 +35,7 @@ def decisions(log):
 
 def band(log, z_variance, lost):
     """(lowest, highest) z that is steered for; ``lost``: with a dead vertical thruster."""
-    t, (floor, surface) = log.config["teacher"], log.scenario["tank"]["z_m"]
+    t, (floor, surface) = log.config["behavior"], log.scenario["tank"]["z_m"]
     edge = max(t["edge_gap_m"], t["lost_edge_gap_m"] if lost else 0)
     gap = min(edge + t["edge_sigmas"] * math.sqrt(z_variance), (surface - floor) / 2)
     return floor + gap, surface - gap
@@ -43,7 +43,7 @@ def band(log, z_variance, lost):
 
 def candidates(log, own):
     """(velocities (n, 3), how long each is commanded (n,))."""
-    t, vehicle = log.config["teacher"], log.config["vehicle"]
+    t, vehicle = log.config["behavior"], log.config["vehicle"]
     z, h0 = own.position[2], math.atan2(own.follow[1], own.follow[0])
 
     def held(heave):
@@ -77,7 +77,7 @@ def candidates(log, own):
 
 def mean_of_the_best(log, own, velocities):
     """(3,) mean of the candidates by their logged costs."""
-    above = (own.costs - own.costs.min()) / log.config["teacher"]["softness"]
+    above = (own.costs - own.costs.min()) / log.config["behavior"]["temperature"]
     weight = np.where(above < 12, np.exp(-above), 0.0)
     return weight @ velocities / weight.sum()
 
@@ -85,7 +85,7 @@ def mean_of_the_best(log, own, velocities):
 def costs(log, own, velocities, lasts):
     """(n,) costs of velocities from the logged tracks, and from the clearance of the decision's own step
     where that is logged; elsewhere without what stands still."""
-    t = log.config["teacher"]
+    t = log.config["behavior"]
     peak, mean, contact = moving_depths(log, own, velocities, lasts)
     static_mean, static_contact = static_depths(log, own, velocities, lasts)
     off, change = (np.linalg.norm(velocities - other, axis=1) for other in (own.follow, own.asked))
@@ -115,7 +115,7 @@ def driven(own, velocities, lasts, times, lag_s):
 
 def moving_depths(log, own, velocities, lasts):
     """(peak, mean, contact), each (n,)."""
-    t, dt = log.config["teacher"], log.config["tracking"]["forecast_dt_s"]
+    t, dt = log.config["behavior"], log.config["tracking"]["forecast_dt_s"]
     n = round(t["horizon_s"] / dt)
     times = dt * np.arange(1, n + 1)
     at, moving = driven(own, velocities, lasts, times, t["lag_s"])
@@ -161,7 +161,7 @@ def free_m(rel, closing, gap, radius, t, patience):
 
 def static_depths(log, own, velocities, lasts):
     """(mean depth, largest contact), each (n,), on the clearance grid of the decision's own step."""
-    t, grid = log.config["teacher"], own.grid
+    t, grid = log.config["behavior"], own.grid
     if grid is None:
         return np.zeros((2, len(velocities)))
     n = max(1, round(t["static_horizon_s"] / t["static_dt_s"]))

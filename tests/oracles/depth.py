@@ -1,5 +1,5 @@
-"""NumPy float64 oracle of the clean depth camera: every surface of every body on its own, nearest one seen
-from outside."""
+"""NumPy float64 oracle of the clean depth camera: every surface of every obstacle on its own, nearest one
+seen from outside."""
 
 import numpy as np
 
@@ -19,13 +19,13 @@ def camera_position(scene, env, depth):
 
 
 def z_depths(scene, env, tank, rays, eye):
-    """z-depth [n] along rays from ``eye``, without the limit of range; the eye is outside every body and
+    """z-depth [n] along rays from ``eye``, without the limit of range; the eye is outside every obstacle and
     inside the walls."""
     best = walls(eye, rays, tank)
     for body in np.flatnonzero(scene["kind"][env]):
         kind, size, yaw = scene["kind"][env, body], scene["size"][env, body], scene["yaw"][env, body]
         turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-        start, d = turn @ (eye - scene["body_pos"][env, body]), rays @ turn.T
+        start, d = turn @ (eye - scene["obstacle_pos"][env, body]), rays @ turn.T
         if kind == SPHERE:
             found = [round_surface(start, d, size[0])]
         elif kind == BOX:

@@ -67,7 +67,7 @@ class Body:
         return self.rigid_mass_matrix + np.diag(self.added)
 
     def neutral(self):
-        """The same body with buoyancy equal to weight."""
+        """The same obstacle with buoyancy equal to weight."""
         return Body(**{**self.__dict__, "buoyancy": self.mass * self.gravity})
 
 

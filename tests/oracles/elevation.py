@@ -1,14 +1,14 @@
-"""NumPy float64 oracle of the height hypotheses: one body and one hypothesis at a time.
+"""NumPy float64 oracle of the height hypotheses: one obstacle and one hypothesis at a time.
 
-Hypotheses 0 .. 14 are centres in the middle of fifteen equal slices of the water, 15 is a body through the
-full water column.
+Hypotheses 0 .. 14 are centres in the middle of fifteen equal slices of the water, 15 is an obstacle through
+the full water column.
 """
 
 import numpy as np
 
 N_SLICE = 15
 CERTAIN = 0.95
-"""probability of a body that was just matched to be where it is expected"""
+"""probability of an obstacle that was just matched to be where it is expected"""
 LEAST = 0.01
 LEAST_SHARE = 1e-3
 """likelihood of what cannot be"""
@@ -24,8 +24,8 @@ def prior(cfg):
 
 
 def hit_probability(own_z, away_m, radius_m, half_m, cfg, sonar, tank):
-    """Per hypothesis: 1 where a body of this half height reaches ``edge_m`` into the fan, 0 where as much is
-    missing, linear between."""
+    """Per hypothesis: 1 where an obstacle of this half height reaches ``edge_m`` into the fan, 0 where as
+    much is missing, linear between."""
     fan = np.tan(np.radians(sonar.vertical_half_aperture_deg)) * max(away_m - radius_m / 2, 0)
     overlap = np.array([fan + half_m - abs(z - own_z) for z in heights(tank)])
     return np.append(np.interp(overlap, [-cfg.edge_m, cfg.edge_m], [0, 1]), 1.0)
@@ -64,7 +64,7 @@ def seen_not(share, present, likely):
 
 
 def free_water(share, own_z, radius_m, cfg, tank):
-    """(lowest edge above, highest edge below) [m] of the bodies that may be there, no farther than the own
+    """(lowest edge above, highest edge below) [m] of the obstacles that may be there, no farther than the own
     height; infinite = none."""
     half = max(radius_m, cfg.half_height_m)
     above, below = np.inf, -np.inf

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.oracles.forecast import turned
-from tests.oracles.habits import expected_turn_rate
+from tests.oracles.turn_history import expected_turn_rate
 
 
 def sectors(range_m, doppler_m_s, hit, turned, n_sector, max_range_m, ttc_cap_s):
@@ -70,9 +70,9 @@ def closest_approach(pos, radius, own, vel, dt):
     return gap[best], t[best] + share[best] * dt
 
 
-def bodies(v, n_body, forecast_cfg, tracking, tank, rules):
-    """Columns of the moving bodies of one env, closest approach first, as arrays (n_body, width); ``v`` by
-    'struct.array'."""
+def obstacles(v, n_obstacle, forecast_cfg, tracking, tank, rules):
+    """Columns of the moving obstacles of one env, closest approach first, as arrays (n_obstacle, width);
+    ``v`` by 'struct.array'."""
     yaw, own = v["ego.rpy"][2], v["ego.pos_w"]
     vel = (rotation_wb(*v["ego.rpy"]) @ v["ego.vel_b"])[:2]
     rows = []
@@ -87,19 +87,19 @@ def bodies(v, n_body, forecast_cfg, tracking, tank, rules):
         water = np.array([v["forecast.above_w"][track] - own[2], own[2] - v["forecast.below_w"][track]])
         rows.append(
             {
-                "body_valid": [1.0],
-                "body_position": turned(pos[0] - own[:2], -yaw),
-                "body_velocity": turned(state[2:] - vel, -yaw),
-                "body_turn_rate": [expected_turn_rate(rate, rate_var, forecast_cfg, tracking)],
-                "body_radius": [radius[0]],
-                "body_free_water": np.minimum(water, tank.z_m[1] - tank.z_m[0]),
-                "body_age": [(v["clock.step"] - v["tracks.seen_step"][track]) * rules.control_dt_s],
-                "body_closest": [gap],
-                "body_closest_time": [time],
+                "obstacle_valid": [1.0],
+                "obstacle_position": turned(pos[0] - own[:2], -yaw),
+                "obstacle_velocity": turned(state[2:] - vel, -yaw),
+                "obstacle_turn_rate": [expected_turn_rate(rate, rate_var, forecast_cfg, tracking)],
+                "obstacle_radius": [radius[0]],
+                "obstacle_free_water": np.minimum(water, tank.z_m[1] - tank.z_m[0]),
+                "obstacle_age": [(v["clock.step"] - v["tracks.seen_step"][track]) * rules.control_dt_s],
+                "obstacle_closest": [gap],
+                "obstacle_closest_time": [time],
             }
         )
-    rows = sorted(rows, key=lambda row: row["body_closest"][0])[:n_body]
-    widths = {"body_position": 2, "body_velocity": 2, "body_free_water": 2}
+    rows = sorted(rows, key=lambda row: row["obstacle_closest"][0])[:n_obstacle]
+    widths = {"obstacle_position": 2, "obstacle_velocity": 2, "obstacle_free_water": 2}
     names = (
         "valid",
         "position",
@@ -111,7 +111,7 @@ def bodies(v, n_body, forecast_cfg, tracking, tank, rules):
         "closest",
         "closest_time",
     )
-    out = {f"body_{name}": np.zeros((n_body, widths.get(f"body_{name}", 1))) for name in names}
+    out = {f"obstacle_{name}": np.zeros((n_obstacle, widths.get(f"obstacle_{name}", 1))) for name in names}
     for slot, row in enumerate(rows):
         for name, value in row.items():
             out[name][slot] = value

@@ -1,4 +1,4 @@
-"""NumPy float64 oracle of the habits: a list of turns per env, one track at a time. Written from the
+"""NumPy float64 oracle of the turn history: a list of turns per env, one track at a time. Written from the
 description of the method."""
 
 from dataclasses import dataclass
@@ -111,7 +111,7 @@ def wall_ahead(pos, course, radius, tank):
 def next_event(turns, pos, course, radius, cfg, tank):
     """(way to the next turn, course after it)."""
     best, out = 1e6, course
-    for turn in turns if cfg.use_habits else []:
+    for turn in turns if cfg.use_turn_history else []:
         along, across = offset(turn, pos, course)
         if -cfg.overdue_m < along < best and across < cfg.across_m + cfg.across_slope * along:
             best, out = along, turn.went
@@ -139,15 +139,15 @@ def walk(turns, x, radius, times, cfg, tank, most_legs):
 
 
 TURN_ROWS = ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")
-"""rows of ``HabitState.turn``"""
+"""rows of ``TurnHistory.turn``"""
 
 
 def turn_rows(turn):
-    """Rows (n_env, n_turn) of ``HabitState.turn``, by their names."""
+    """Rows (n_env, n_turn) of ``TurnHistory.turn``, by their names."""
     return {name: turn[:, row].reshape(len(turn), -1).copy() for row, name in enumerate(TURN_ROWS)}
 
 
 def packed_turns(rows):
-    """``HabitState.turn`` of rows (n_env, n_turn) by their names."""
+    """``TurnHistory.turn`` of rows (n_env, n_turn) by their names."""
     table = np.stack([rows[name] for name in TURN_ROWS], 1)
     return table.reshape(*table.shape[:2], -1, 16).astype(np.float32)

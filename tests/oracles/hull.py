@@ -23,11 +23,13 @@ def point_distances(
     return np.linalg.norm(np.maximum(excess, 0.0), axis=1)
 
 
-def clearance(pos, axis, kind, body_pos, size, yaw, radius=0.17, half_length=0.10, samples=4001) -> float:
+def clearance(pos, axis, kind, obstacle_pos, size, yaw, radius=0.17, half_length=0.10, samples=4001) -> float:
     """Hull to solid [m]."""
     along = np.linspace(-half_length, half_length, samples)
     points = np.asarray(pos) + along[:, None] * np.asarray(axis)
-    return float(point_distances(points, kind, np.asarray(body_pos), np.asarray(size), yaw).min() - radius)
+    return float(
+        point_distances(points, kind, np.asarray(obstacle_pos), np.asarray(size), yaw).min() - radius
+    )
 
 
 def wall_clearance(pos, axis, shape, x_m, y_m, radius=0.17, half_length=0.10, samples=2001) -> float:

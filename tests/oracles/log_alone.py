@@ -78,8 +78,8 @@ def vehicle(log):
     return SimpleNamespace(pos=log.column("/state", "position"), R=R, vel=vel, rates=rates)
 
 
-def body_motion(body, times):
-    """(positions, velocities), each (n, 3), of a body at these times."""
+def obstacle_motion(body, times):
+    """(positions, velocities), each (n, 3), of an obstacle at these times."""
     pos, vel = np.tile(np.array(body["position"], float), (len(times), 1)), np.zeros((len(times), 3))
     path = body["path"]
     if path is None:
@@ -120,8 +120,8 @@ def wall_ranges(tank, x, y, ux, uy):
 
 
 def outline_ranges(body, yaw, rel, slope, ux, uy):
-    """[m] to the horizontal outline of a body whose centre lies at ``rel`` (n, 3) from the sonar; inf where a
-    beam misses it."""
+    """[m] to the horizontal outline of an obstacle whose centre lies at ``rel`` (n, 3) from the sonar; inf
+    where a beam misses it."""
     size, far = body["size"], np.hypot(rel[:, 0], rel[:, 1])
     if body["kind"] == "box":
         c, s = math.cos(yaw), math.sin(yaw)
@@ -159,13 +159,13 @@ def recast(log):
     slope = math.tan(math.radians(sonar["vertical_half_aperture_deg"]))
     best, away = wall_ranges(scenario["tank"], pos[:, :1], pos[:, 1:2], ux, uy), np.zeros_like(ux)
     moves = np.zeros(ux.shape, bool)
-    for body in scenario["bodies"]:
-        body_pos, body_vel = body_motion(body, steps * log.dt)
-        found = outline_ranges(body, body["yaw"], body_pos - pos, slope, ux, uy)
+    for body in scenario["obstacles"]:
+        obstacle_pos, obstacle_vel = obstacle_motion(body, steps * log.dt)
+        found = outline_ranges(body, body["yaw"], obstacle_pos - pos, slope, ux, uy)
         nearer = found < best
         best = np.where(nearer, found, best)
         moves = np.where(nearer, body["path"] is not None, moves)
-        away = np.where(nearer, body_vel[:, :1] * ux + body_vel[:, 1:2] * uy, away)
+        away = np.where(nearer, obstacle_vel[:, :1] * ux + obstacle_vel[:, 1:2] * uy, away)
     return best, away - vel[:, :1] * ux - vel[:, 1:2] * uy, moves
 
 
@@ -193,7 +193,7 @@ def sonar_figures(log, gate_m):
         "doppler_mean_m_s": float(slip.mean()),
         "doppler_sigma_m_s": float(slip.std()),
         "doppler_within_1e_3": float(np.mean(np.abs(slip) <= 1e-3)),
-        "returns_of_moving_bodies": int(moves[used].sum()),
+        "returns_of_moving_obstacles": int(moves[used].sum()),
     }
 
 
@@ -505,15 +505,16 @@ def camera_figures(log, same_m):
 
 
 def marched(log, start, unit, time):
-    """[m] along unit vectors to the nearest body or side wall: as far as nothing can be, again and again."""
-    along, bodies = (
+    """[m] along unit vectors to the nearest obstacle or side wall: as far as nothing can be, again and
+    again."""
+    along, obstacles = (
         np.zeros(len(unit)),
-        [(body, body_motion(body, np.array([time]))[0][0]) for body in log.scenario["bodies"]],
+        [(body, obstacle_motion(body, np.array([time]))[0][0]) for body in log.scenario["obstacles"]],
     )
     for _ in range(100):
         point = start + along[:, None] * unit
         room = wall_gap(log.scenario["tank"], point[:, 0], point[:, 1])
-        for body, pos in bodies:
+        for body, pos in obstacles:
             room = np.minimum(room, core_distance(body, (point - pos) @ own_axes(body).T))
         along = along + room
     return along
@@ -541,8 +542,8 @@ def core_distance(body, q):
 
 
 def hull_distance(hull, body, rel, axis):
-    """[m] from the hull's surface to a body; rel (n, 3) = hull's centre seen from the body's. Ternary search
-    along the hull's axis."""
+    """[m] from the hull's surface to an obstacle; rel (n, 3) = hull's centre seen from the body's. Ternary
+    search along the hull's axis."""
     rel, axis = rel @ own_axes(body).T, axis @ own_axes(body).T
     low, high = np.full(len(rel), -hull["hull_half_length_m"]), np.full(len(rel), hull["hull_half_length_m"])
     for _ in range(40):
@@ -553,8 +554,8 @@ def hull_distance(hull, body, rel, axis):
 
 
 def threats(log):
-    """(clearance [m] to bodies and side walls, time to collision [s] with inf = none, whether a closing speed
-    is at its threshold)."""
+    """(clearance [m] to obstacles and side walls, time to collision [s] with inf = none, whether a closing
+    speed is at its threshold)."""
     truth, hull, rules = vehicle(log), log.config["vehicle"], log.config["episode"]
     times = np.arange(len(truth.pos)) * log.dt
     axis, spin = truth.R[:, :, 0], np.cross(truth.rates, truth.R[:, :, 0])
@@ -562,8 +563,8 @@ def threats(log):
     ends = np.stack([wall_gap(log.scenario["tank"], *(truth.pos + side * half).T[:2]) for side in (-1, 1)])
     clearance = ends.min(axis=0) - hull["hull_radius_m"]
     ttc, doubtful = np.full(len(times), np.inf), np.zeros(len(times), bool)
-    for body in log.scenario["bodies"]:
-        pos, vel = body_motion(body, times)
+    for body in log.scenario["obstacles"]:
+        pos, vel = obstacle_motion(body, times)
         rel, drift = truth.pos - pos, truth.vel - vel
         gap = hull_distance(hull, body, rel, axis)
         # a little later and a little earlier along the present motion: no formula for nearest points or
@@ -631,8 +632,8 @@ def obstacle_error(log):
     """[m] and [m/s]: largest difference between /obstacles/truth and the closed form."""
     place, speed = 0.0, 0.0
     times = np.array(log.steps("/obstacles/truth")) * log.dt
-    for i, body in enumerate(log.scenario["bodies"]):
-        pos, vel = body_motion(body, times)
+    for i, body in enumerate(log.scenario["obstacles"]):
+        pos, vel = obstacle_motion(body, times)
         answer = np.array(
             [
                 [data["obstacles"][i][key] for key in ("x", "y", "z", "vx", "vy", "vz")]

@@ -1,5 +1,5 @@
-"""A synthetic episode for the tests of logs and pictures: plain NumPy, no simulator. A vehicle passes resting
-and moving bodies."""
+"""A synthetic episode for the tests of logs and pictures: plain NumPy, no simulator. A vehicle passes static
+and moving obstacles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from uuvtai.common.enums import (
     TRIGGER_NONE,
     TRIGGER_STUCK,
 )
-from uuvtai.common.obstacle_motion import body_positions
+from uuvtai.common.obstacle_motion import obstacle_positions
 from uuvtai.config import Config, SensorsConfig, SonarConfig
 from uuvtai.logs.encode import EpisodeHeader
 from uuvtai.logs.scenario import scenario_document
@@ -35,7 +35,7 @@ TERMS = ("alive", "progress", "clearance", "ttc")
 NODES = ("Root", "Emergency", "Back off", "Evade", "Follow", "Follow")
 START, GOAL = (2.0, 1.5, -0.8), (17.0, 4.5, -0.8)
 
-BODIES = [
+OBSTACLES = [
     {
         "slot": 0,
         "kind": "cylinder",
@@ -106,7 +106,7 @@ def scenario(episode: int = 3) -> dict:
         "goal": list(GOAL),
         "layout_draws": 1,
         "faults": 0,
-        "bodies": BODIES,
+        "obstacles": OBSTACLES,
     }
     return scenario_document(config(), described, world="pool", seed=7, episode=episode)
 
@@ -133,18 +133,18 @@ def snapshots(
     for step in range(n_step + 1):
         share = step / max(n_step, 1)
         pos, yaw = _pose(share, sway)
-        bodies = np.array([body_positions(body, np.array([step * DT]))[0] for body in BODIES])
-        ranges, hit, which = cast(pos, yaw, bodies)
+        obstacles = np.array([obstacle_positions(body, np.array([step * DT]))[0] for body in OBSTACLES])
+        ranges, hit, which = cast(pos, yaw, obstacles)
         ranges = np.where(hit, ranges + rng.normal(0, 0.02, N_RAY), ranges).astype(np.float32)
         dynamic *= 0.99
         _mark(static, dynamic, pos, yaw, ranges, hit, which)
         due = maps and (step % 25 == 0 or step == n_step)
         yield {
             "clock.step": np.int32(step),
-            "referee.outcome": np.int32(OUTCOMES.index(outcome if step == n_step else "running")),
-            **_truth(step, pos, yaw, bodies, ranges.min(), rng),
+            "termination.outcome": np.int32(OUTCOMES.index(outcome if step == n_step else "running")),
+            **_truth(step, pos, yaw, obstacles, ranges.min(), rng),
             **_sensed(step, pos, yaw, ranges, hit, rng),
-            **_tracked(bodies, which),
+            **_tracked(obstacles, which),
             **_planned(step, pos, _pose(min(share + 0.06, 1.0), sway)[0]),
             **_driven(step),
             **(layers(static, dynamic) if due else {}),
@@ -155,13 +155,13 @@ def _truth(
     step: int,
     pos: np.ndarray,
     yaw: float,
-    bodies: np.ndarray,
+    obstacles: np.ndarray,
     nearest_m: np.floating,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """Slot 3 is empty."""
-    later = np.array([body_positions(body, np.array([step * DT + 1e-3]))[0] for body in BODIES])
-    sizes = np.array([body["size"] for body in BODIES])
+    later = np.array([obstacle_positions(body, np.array([step * DT + 1e-3]))[0] for body in OBSTACLES])
+    sizes = np.array([body["size"] for body in OBSTACLES])
     return {
         "vehicle.pos_w": pos.astype(np.float32),
         "vehicle.quat_wb": _quaternion(0.02, -0.03, yaw),
@@ -171,11 +171,11 @@ def _truth(
         "current.vel_w": np.zeros(3, np.float32),
         "vehicle.rpm": rng.normal(500, 20, 6).astype(np.float32),
         "actuation.thrust_n": rng.normal(2, 0.1, 6).astype(np.float32),
-        "referee.clearance_m": np.float32(max(nearest_m - 0.17, 0.01)),
-        "referee.ttc_s": np.float32(1e6 if step % 3 else 2.3),
+        "termination.clearance_m": np.float32(max(nearest_m - 0.17, 0.01)),
+        "termination.ttc_s": np.float32(1e6 if step % 3 else 2.3),
         "world.kind": np.array([2, 3, 2, 0, 1, 2], np.int32),
-        "world.pos_w": np.insert(bodies, 3, 0.0, axis=0).astype(np.float32),
-        "world.vel_w": np.insert((later - bodies) / 1e-3, 3, 0.0, axis=0).astype(np.float32),
+        "world.pos_w": np.insert(obstacles, 3, 0.0, axis=0).astype(np.float32),
+        "world.vel_w": np.insert((later - obstacles) / 1e-3, 3, 0.0, axis=0).astype(np.float32),
         "world.size": np.insert(sizes, 3, 0.0, axis=0).astype(np.float32),
         "world.yaw": np.array([0, 0.6, 0, 0, 0, 0], np.float32),
     }
@@ -214,15 +214,15 @@ def _sensed(
     }
 
 
-def _tracked(bodies: np.ndarray, which: np.ndarray) -> dict[str, Any]:
+def _tracked(obstacles: np.ndarray, which: np.ndarray) -> dict[str, Any]:
     """The two that move, in slots 0 and 2; slot 1 is dead, slot 3 rests."""
     state = np.zeros((4, 4), np.float32)
-    state[[0, 2], :2] = bodies[3:, :2]
+    state[[0, 2], :2] = obstacles[3:, :2]
     return {
         "tracks.alive": np.array([1, 0, 1, 1], np.int32),
         "tracks.moving": np.array([1, 1, 1, 0], np.int32),
         "tracks.state": state,
-        "tracks.z_m": np.array([bodies[3, 2], 0, bodies[4, 2], 0], np.float32),
+        "tracks.z_m": np.array([obstacles[3, 2], 0, obstacles[4, 2], 0], np.float32),
         "tracks.radius_m": np.array([0.22, 0, 0.2, 0.5], np.float32),
         "tracks.cov": np.outer([1.0, 0.0, 2.0, 1.0], np.arange(1, 11) * 1e-3).astype(np.float32),
         "tracks.turn_rate": np.array([0.3, 0, 0, 0], np.float32),
@@ -257,27 +257,27 @@ def _planned(step: int, pos: np.ndarray, ahead: np.ndarray) -> dict[str, Any]:
 def _driven(step: int) -> dict[str, Any]:
     """By a tree, which evades in the last 30 of every 100 steps."""
     follows = step % 100 < 70
-    outputs = ("action", "value", "std", "distill_lambda", "residual", "uncertainty")
+    outputs = ("action", "value", "std", "distillation_lambda", "residual", "uncertainty")
     return {
-        "teacher.action": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-        "teacher.status": np.array(
+        "behavior.action": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
+        "behavior.status": np.array(
             [2, 3, 0, 3, 2, 0, 9, 9] if follows else [1, 3, 0, 1, 0, 0, 9, 9], np.int32
         ),
-        "teacher.leaf": np.int32(4 if follows else 3),
-        "teacher.want_evade": np.int32(not follows and step % 5 == 0),
-        "teacher.conflict_s": np.float32(1e6 if step % 2 else 0.9),
-        "teacher.hold_conflict_s": np.float32(1e6),
-        "teacher.follow_vel_w": np.array([0.6, 0.1, 0.0], np.float32),
-        "teacher.cruise_z_m": np.float32(-0.2),
-        "teacher.evade_vel_w": np.array([0.1, 0.6, 0.2], np.float32),
-        "teacher.patience": np.float32(1.0),
-        "teacher.evade_cost": np.float32(2.5),
-        "teacher.evade_candidate": np.int32(-1 if step % 2 else 17),
-        "teacher.candidate_cost": np.arange(160, dtype=np.float32),
-        "teacher.last_vel_w": np.array([0.2, 0.5, -0.1], np.float32),
+        "behavior.leaf": np.int32(4 if follows else 3),
+        "behavior.want_evade": np.int32(not follows and step % 5 == 0),
+        "behavior.conflict_s": np.float32(1e6 if step % 2 else 0.9),
+        "behavior.hold_conflict_s": np.float32(1e6),
+        "behavior.follow_vel_w": np.array([0.6, 0.1, 0.0], np.float32),
+        "behavior.cruise_z_m": np.float32(-0.2),
+        "behavior.evade_vel_w": np.array([0.1, 0.6, 0.2], np.float32),
+        "behavior.patience": np.float32(1.0),
+        "behavior.evade_cost": np.float32(2.5),
+        "behavior.evade_candidate": np.int32(-1 if step % 2 else 17),
+        "behavior.candidate_cost": np.arange(160, dtype=np.float32),
+        "behavior.last_vel_w": np.array([0.2, 0.5, -0.1], np.float32),
         "reward.term": np.array([0.01, 0.02, -0.001, 0.0], np.float32),
-        "driver.applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-        **{f"driver.{name}": None for name in outputs},
+        "agent.applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
+        **{f"agent.{name}": None for name in outputs},
     }
 
 
@@ -310,7 +310,7 @@ def layers(static: np.ndarray, dynamic: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def cast(pos: np.ndarray, yaw: float, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def cast(pos: np.ndarray, yaw: float, obstacles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(range, hit, index of the body or -1) of every beam against circles and the walls of the pool."""
     angle = yaw + 2 * np.pi * np.arange(N_RAY) / N_RAY
     ux, uy = np.cos(angle), np.sin(angle)
@@ -319,7 +319,7 @@ def cast(pos: np.ndarray, yaw: float, bodies: np.ndarray) -> tuple[np.ndarray, n
             np.where(ux > 0, 20 - pos[0], -pos[0]) / ux, np.where(uy > 0, 6 - pos[1], -pos[1]) / uy
         )
     best, which = wall, np.full(N_RAY, -1)
-    for i, (body, at) in enumerate(zip(BODIES, bodies, strict=True)):
+    for i, (body, at) in enumerate(zip(OBSTACLES, obstacles, strict=True)):
         dx, dy = at[0] - pos[0], at[1] - pos[1]
         along, across = ux * dx + uy * dy, ux * dy - uy * dx
         radius = body["size"][0]

@@ -1,5 +1,5 @@
-"""NumPy float64 oracle of what a depth image says about the height of one tracked body, pixel by pixel and
-hypothesis by hypothesis."""
+"""NumPy float64 oracle of what a depth image says about the height of one tracked obstacle, pixel by pixel
+and hypothesis by hypothesis."""
 
 import numpy as np
 
@@ -60,7 +60,7 @@ def look(share, present, image, pos, rpy, at, radius, cfg, depth, tank):
 
 
 def shown(heights_m, body, hides, z, tank):
-    """(likelihood per hypothesis, doubt) of a body whose pixels lie at these heights."""
+    """(likelihood per hypothesis, doubt) of an obstacle whose pixels lie at these heights."""
     low, high = heights_m.min(), heights_m.max()
     covered = np.concatenate([[True], hides, [True]])  # beyond the image nothing is seen
     on_top = any(covered[row] for row in body)

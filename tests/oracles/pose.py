@@ -214,7 +214,7 @@ class Filter:
         wild = sonar.doppler_outlier * cfg.gate_sigmas * np.sqrt(still_var) / sonar.doppler_outlier_m_s
         deep = width / 2 / np.sqrt(2 * SIDE + 1)
         var *= gated(clutter, cfg.gate_sigmas)
-        unseen = cfg.body_returns_per_m * deep**2 / (sonar.max_range_m / 2)
+        unseen = cfg.obstacle_returns_per_m * deep**2 / (sonar.max_range_m / 2)
         var *= 1 + unseen * short / max(short + good.sum(), 1)
         still_var *= gated(wild, cfg.gate_sigmas)
         noise = np.diag(np.concatenate([var[good], np.full(still.sum(), still_var)]))
@@ -229,8 +229,8 @@ class Voyage:
     """Truth and readings of ``n`` vehicles that steer for another velocity now and then; what the newest
     reading tells of a step's mean acceleration is as unsure as the filter supposes."""
 
-    def __init__(self, n, steps, sensors, cfg, tank, dt, rng, bodies=None):
-        self.sensors, self.tank, self.rng, self.bodies = sensors, tank, rng, bodies
+    def __init__(self, n, steps, sensors, cfg, tank, dt, rng, obstacles=None):
+        self.sensors, self.tank, self.rng, self.obstacles = sensors, tank, rng, obstacles
         t = np.arange(steps)[:, None] * dt
         mid = np.array([sum(tank.x_m), sum(tank.y_m)]) / 2
         turn = rng.uniform(0.5, 1.5, n), rng.uniform(0, 6.28, n)
@@ -286,7 +286,7 @@ class Voyage:
         at = np.broadcast_to(self.pos[k][:, None, :2], u.shape)
         r, normal = wall(self.tank, at, u)
         r = np.where(-np.sum(normal * u, -1) < sonar.grazing_cosine, np.inf, r)
-        for x, y, radius in () if self.bodies is None else self.bodies:
+        for x, y, radius in () if self.obstacles is None else self.obstacles:
             along, across = (
                 np.sum((np.array([x, y]) - at) * u, -1),
                 u[..., 0] * (y - at[..., 1]) - u[..., 1] * (x - at[..., 0]),

@@ -7,12 +7,12 @@ SPHERE, CYLINDER, BOX = 1, 2, 3
 NOTHING_M = 1.0e6
 
 
-def random_scenes(rng, n_env, n_body, tank, tilt=0.5):
-    """Scenes as float64 arrays that float32 holds exactly, vehicle outside every body.
+def random_scenes(rng, n_env, n_obstacle, tank, tilt=0.5):
+    """Scenes as float64 arrays that float32 holds exactly, vehicle outside every obstacle.
 
-    pos, vel_b [n_env, 3], quat [n_env, 4]; kind, yaw [n_env, n_body]; body_pos, body_vel, size [n_env,
-    n_body, 3]. A third of the bodies spans the water column; kind 0 = empty slot. Bodies may overlap each
-    other, the walls, and the vehicle's column above or below it.
+    pos, vel_b [n_env, 3], quat [n_env, 4]; kind, yaw [n_env, n_obstacle]; obstacle_pos, obstacle_vel, size
+    [n_env, n_obstacle, 3]. A third of the obstacles spans the water column; kind 0 = empty slot. Obstacles
+    may overlap each other, the walls, and the vehicle's column above or below it.
     """
     (x0, x1), (y0, y1), (z0, z1) = tank.x_m, tank.y_m, tank.z_m
     pos = rng.uniform(
@@ -21,14 +21,14 @@ def random_scenes(rng, n_env, n_body, tank, tilt=0.5):
         (n_env, 3),
     )
     rpy = rng.uniform((-tilt, -tilt, -np.pi), (tilt, tilt, np.pi), (n_env, 3))
-    kind = rng.choice([0, SPHERE, CYLINDER, BOX], (n_env, n_body), p=[0.1, 0.3, 0.3, 0.3])
-    size = rng.uniform(0.15, 0.5, (n_env, n_body, 3))
+    kind = rng.choice([0, SPHERE, CYLINDER, BOX], (n_env, n_obstacle), p=[0.1, 0.3, 0.3, 0.3])
+    size = rng.uniform(0.15, 0.5, (n_env, n_obstacle, 3))
     size[..., 1] = np.where(kind == BOX, size[..., 1], size[..., 0])
-    body_pos = rng.uniform((x0, y0, z0 + 0.2), (x1, y1, z1 - 0.2), (n_env, n_body, 3))
-    full = (rng.random((n_env, n_body)) < 1 / 3) & (kind != SPHERE)
+    obstacle_pos = rng.uniform((x0, y0, z0 + 0.2), (x1, y1, z1 - 0.2), (n_env, n_obstacle, 3))
+    full = (rng.random((n_env, n_obstacle)) < 1 / 3) & (kind != SPHERE)
     size[..., 2] = np.where(kind == SPHERE, size[..., 0], np.where(full, 0.5 * (z1 - z0), size[..., 2]))
-    body_pos[..., 2] = np.where(full, 0.5 * (z0 + z1), body_pos[..., 2])
-    offset = np.abs(body_pos - pos[:, None])
+    obstacle_pos[..., 2] = np.where(full, 0.5 * (z0 + z1), obstacle_pos[..., 2])
+    offset = np.abs(obstacle_pos - pos[:, None])
     reach = np.hypot(size[..., 0], np.where(kind == BOX, size[..., 1], 0.0)) + 0.3
     touching = (np.hypot(offset[..., 0], offset[..., 1]) < reach) & (offset[..., 2] < size[..., 2] + 0.3)
     kind[touching] = 0
@@ -36,10 +36,10 @@ def random_scenes(rng, n_env, n_body, tank, tilt=0.5):
         "pos": pos,
         "quat": quaternions(rpy),
         "vel_b": rng.normal(0.0, 0.6, (n_env, 3)),
-        "body_pos": body_pos,
-        "body_vel": rng.normal(0.0, 0.8, (n_env, n_body, 3)) * (1.0, 1.0, 0.0),
+        "obstacle_pos": obstacle_pos,
+        "obstacle_vel": rng.normal(0.0, 0.8, (n_env, n_obstacle, 3)) * (1.0, 1.0, 0.0),
         "size": size,
-        "yaw": rng.uniform(-np.pi, np.pi, (n_env, n_body)),
+        "yaw": rng.uniform(-np.pi, np.pi, (n_env, n_obstacle)),
     }
     return {
         "kind": kind,
@@ -91,7 +91,7 @@ class Caster:
             kind, size, yaw = scene["kind"][env, body], scene["size"][env, body], scene["yaw"][env, body]
             spec.worldbody.add_geom(
                 type=shapes[kind],
-                pos=scene["body_pos"][env, body],
+                pos=scene["obstacle_pos"][env, body],
                 size=[size[0], size[2], 0] if kind == CYLINDER else size,
                 quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)],
             )
@@ -132,25 +132,25 @@ def load(scene, vehicle, world):
     vehicle.vel_b.from_numpy(single["vel_b"])
     world.kind.from_numpy(scene["kind"].astype(np.int32))
     for field, name in (
-        (world.pos_w, "body_pos"),
-        (world.vel_w, "body_vel"),
+        (world.pos_w, "obstacle_pos"),
+        (world.vel_w, "obstacle_vel"),
         (world.size, "size"),
         (world.yaw, "yaw"),
     ):
         field.from_numpy(single[name])
 
 
-def one_body_scene(n_env, n_body, pos, **body):
-    """The same level vehicle at ``pos`` with heading 0 and at most one body in every env."""
+def one_obstacle_scene(n_env, n_obstacle, pos, **body):
+    """The same level vehicle at ``pos`` with heading 0 and at most one obstacle in every env."""
     scene = {
         "pos": np.tile(np.asarray(pos, float), (n_env, 1)),
         "quat": np.tile([1.0, 0.0, 0.0, 0.0], (n_env, 1)),
         "vel_b": np.zeros((n_env, 3)),
-        "kind": np.zeros((n_env, n_body), int),
-        "body_pos": np.zeros((n_env, n_body, 3)),
-        "body_vel": np.zeros((n_env, n_body, 3)),
-        "size": np.ones((n_env, n_body, 3)),
-        "yaw": np.zeros((n_env, n_body)),
+        "kind": np.zeros((n_env, n_obstacle), int),
+        "obstacle_pos": np.zeros((n_env, n_obstacle, 3)),
+        "obstacle_vel": np.zeros((n_env, n_obstacle, 3)),
+        "size": np.ones((n_env, n_obstacle, 3)),
+        "yaw": np.zeros((n_env, n_obstacle)),
     }
     for name, value in body.items():
         scene[name][:, 0] = value

@@ -1,7 +1,7 @@
 """A small NumPy sonar for scenes of the tracking tests: horizontal plane only, circles, yawed boxes and the
 walls of a rectangular tank.
 
-Written apart from the product's sonar. All arrays lead with the env: positions (E, 2), bodies (E, B, ...).
+Written apart from the product's sonar. All arrays lead with the env: positions (E, 2), obstacles (E, B, ...).
 Radius 0 = box.
 """
 
@@ -11,24 +11,28 @@ N_RAY = 256
 MAX_RANGE_M = 12.0
 
 
-def cast(pos, yaw, vel_w, centre, body_vel, radius, half, body_yaw, tank):
+def cast(pos, yaw, vel_w, centre, obstacle_vel, radius, half, obstacle_yaw, tank):
     """Ranges, Doppler (receding positive, own motion included), hit flags and body hit (-1 = wall or
     nothing), each (E, 256)."""
     bearing = yaw[:, None] + np.arange(N_RAY) * (2 * np.pi / N_RAY)
     u = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-    to_body = np.stack([_circle(pos, u, centre, radius), _box(pos, u, centre, half, body_yaw)])
+    to_body = np.stack([_circle(pos, u, centre, radius), _box(pos, u, centre, half, obstacle_yaw)])
     to_body = np.where(radius[:, None, :] > 0, to_body[0], to_body[1])
-    none = np.full((*to_body.shape[:2], 1), np.inf)  # a body that is never hit, so that there may be none
-    to_body, body_vel = (
+    none = np.full(
+        (*to_body.shape[:2], 1), np.inf
+    )  # an obstacle that is never hit, so that there may be none
+    to_body, obstacle_vel = (
         np.concatenate([to_body, none], -1),
-        np.concatenate([body_vel, np.zeros((len(pos), 1, 2))], 1),
+        np.concatenate([obstacle_vel, np.zeros((len(pos), 1, 2))], 1),
     )
     nearest = to_body.argmin(axis=-1)
     to_nearest = np.take_along_axis(to_body, nearest[..., None], -1)[..., 0]
     to_wall = _walls(pos, u, tank)
     body = np.where(to_nearest < to_wall, nearest, -1)
     reach = np.minimum(to_nearest, to_wall)
-    surface_vel = np.where((body >= 0)[..., None], np.take_along_axis(body_vel, nearest[..., None], 1), 0.0)
+    surface_vel = np.where(
+        (body >= 0)[..., None], np.take_along_axis(obstacle_vel, nearest[..., None], 1), 0.0
+    )
     doppler = ((surface_vel - vel_w[:, None, :]) * u).sum(-1)
     hit = reach < MAX_RANGE_M
     return (
@@ -73,8 +77,8 @@ def _circle(pos, u, centre, radius):
     return np.where((chord > 0) & (out > 0), out, np.inf)
 
 
-def _box(pos, u, centre, half, body_yaw):
-    c, s = np.cos(body_yaw), np.sin(body_yaw)
+def _box(pos, u, centre, half, obstacle_yaw):
+    c, s = np.cos(obstacle_yaw), np.sin(obstacle_yaw)
     axes = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
     origin = np.einsum("ebkl,ebl->ebk", axes, pos[:, None, :] - centre)[:, None]
     way = np.einsum("ebkl,erl->erbk", axes, u)

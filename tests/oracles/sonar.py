@@ -24,7 +24,7 @@ def sonar_scan(scene, env, tank, n_ray, aperture_deg, turn=0.0):
     who = np.full(n_ray, WALL)
     slope = np.tan(np.radians(aperture_deg))
     for body in np.flatnonzero(scene["kind"][env]):
-        r, c = body_hits(scene, env, body, pos, u, slope)
+        r, c = obstacle_hits(scene, env, body, pos, u, slope)
         nearer = r < best
         best, cosine, who = (
             np.where(nearer, r, best),
@@ -47,11 +47,11 @@ def wall_hits(start, u, tank):
     return np.minimum(tx, ty), np.where(tx < ty, np.abs(u[:, 0]), np.abs(u[:, 1]))
 
 
-def body_hits(scene, env, body, pos, u, slope):
-    """(range, cosine) where beams enter one body's horizontal outline and the vertical gap allows it, else
-    inf."""
+def obstacle_hits(scene, env, body, pos, u, slope):
+    """(range, cosine) where beams enter one obstacle's horizontal outline and the vertical gap allows it,
+    else inf."""
     kind, size = scene["kind"][env, body], scene["size"][env, body]
-    rel = scene["body_pos"][env, body] - pos
+    rel = scene["obstacle_pos"][env, body] - pos
     if kind == BOX:
         r, cosine = box_entry(rel[:2], size[:2], scene["yaw"][env, body], u)
     else:
@@ -97,7 +97,7 @@ def box_entry(centre, half, yaw, u):
 def doppler_by_differences(scene, env, u, range_m, who, dt=1.0e-4):
     """[m/s] central difference of the distance to the material point that each beam hit; u [n, 2]."""
     sensor_vel = rotation(scene["quat"][env]) @ scene["vel_b"][env]
-    moving = np.where((who == WALL)[:, None], 0.0, scene["body_vel"][env][who])
+    moving = np.where((who == WALL)[:, None], 0.0, scene["obstacle_vel"][env][who])
     point = np.column_stack([range_m[:, None] * u, np.zeros(len(u))])
     ahead = np.linalg.norm(point + (moving - sensor_vel) * dt, axis=1)
     behind = np.linalg.norm(point - (moving - sensor_vel) * dt, axis=1)

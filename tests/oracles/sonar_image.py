@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from uuvtai.common.obstacle_motion import body_positions
+from uuvtai.common.obstacle_motion import obstacle_positions
 from uuvtai.config import SonarConfig
 from uuvtai.config.multibeam import ABSORPTION_NP_M, elevation_pattern, elevations, heard_bearings, ray_sr
 
@@ -21,7 +21,8 @@ _WALL, _FLOOR, _SURFACE = -1, -2, -3
 
 
 class Seen:
-    """What rays meet: range [m], cosine of incidence, and which surface (a body's number, or below 0)."""
+    """What rays meet: range [m], cosine of incidence, and which surface (an obstacle's number, or below
+    0)."""
 
     def __init__(self, n: int) -> None:
         self.range_m, self.cosine, self.surface = np.full(n, np.inf), np.zeros(n), np.full(n, -9)
@@ -35,12 +36,12 @@ class Seen:
 
 
 def cast_rays(scenario: dict[str, Any], time_s: float, start: np.ndarray, unit: np.ndarray) -> Seen:
-    """What rays (n, 3) from a place (3,) [m] within the tank meet at a time: bodies, side walls, floor and
+    """What rays (n, 3) from a place (3,) [m] within the tank meet at a time: obstacles, side walls, floor and
     surface of ``scenario.json``."""
     seen = Seen(len(unit))
     _meet_tank(seen, scenario["tank"], start, unit)
-    for number, body in enumerate(scenario["bodies"]):
-        centre = body_positions(body, np.array([time_s]))[0]
+    for number, body in enumerate(scenario["obstacles"]):
+        centre = obstacle_positions(body, np.array([time_s]))[0]
         size, yaw = np.array(body["size"], float), float(body["yaw"])
         if body["kind"] == "sphere":
             _meet_sphere(seen, number, start - centre, unit, size[0])

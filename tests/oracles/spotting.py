@@ -1,5 +1,5 @@
-"""NumPy float64 oracle of bodies followed by the camera: image to columns pixel by pixel, columns to spots as
-lists, spots to tracks.
+"""NumPy float64 oracle of obstacles followed by the camera: image to columns pixel by pixel, columns to spots
+as lists, spots to tracks.
 
 Written from the description of the method, with the product's constants passed in or restated here. A track's
 correction takes both numbers of a spot at once, in matrices and Joseph's form.

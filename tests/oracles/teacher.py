@@ -1,4 +1,4 @@
-"""NumPy float64 oracle of the evasion's roll-outs and costs: one candidate, one body and one sample at a
+"""NumPy float64 oracle of the evasion's roll-outs and costs: one candidate, one obstacle and one sample at a
 time."""
 
 import numpy as np
@@ -48,7 +48,7 @@ def distance_to(body, radius, above, below, at, cfg):
     return np.hypot(beside, upright), beside / np.hypot(beside, upright), doubt
 
 
-def body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
+def obstacle_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
     """(peak, mean, contact, first, doubt) of one command [m/s, 3].
 
     ``forecast`` = (places [track, k, 2], radii [track, k], negative = nothing, above [track], below [track],
@@ -78,7 +78,7 @@ def body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
                 deepest, nearest = max(deepest, depth), max(nearest, cfg.contact_m - free)
                 mean += share * depth / n
                 doubt = min(doubt, unsure)
-                if depth > 0 and share >= cfg.heed_share:
+                if depth > 0 and share >= cfg.evade_probability:
                     first = min(first, k * dt_s)
             expected += share * np.array([deepest, nearest])
         peak, contact = max(peak, expected[0]), max(contact, expected[1])
@@ -141,7 +141,7 @@ def candidates(follow, last, yaw, own_z, cfg, vehicle, tank):
 def cost(pos, vel, command, burst_s, follow, last, forecast, clearance, origin, cell_m, cfg, tank, dt_s):
     """(cost of one command, how near any of its samples is to a case or cell that float32 may decide
     otherwise [m])."""
-    peak, mean, contact, _, doubt = body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s)
+    peak, mean, contact, _, doubt = obstacle_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s)
     static_mean, static_contact, border = static_depths(
         pos, vel, command, clearance, origin, cell_m, cfg, burst_s
     )
@@ -151,9 +151,9 @@ def cost(pos, vel, command, burst_s, follow, last, forecast, clearance, origin, 
     return total + cfg.weight_change * np.linalg.norm(command - last) / cfg.cruise_m_s, min(doubt, border)
 
 
-def mean_velocity(velocities, costs, softness):
-    """Mean of the velocities weighted by exp(-cost / softness); what weighs less than exp(-12) is left
+def mean_velocity(velocities, costs, temperature):
+    """Mean of the velocities weighted by exp(-cost / temperature); what weighs less than exp(-12) is left
     out."""
-    excess = (costs - costs.min()) / softness
+    excess = (costs - costs.min()) / temperature
     weight = np.where(excess < 12, np.exp(-excess), 0.0)
     return weight @ velocities / weight.sum()

@@ -160,7 +160,7 @@ def edge_open(scan, edge, way, sonar):
 
 
 def cluster_from(beams, steps, scan, still, slip, cfg, sonar):
-    """A run as a cluster, or None where it cannot be a body."""
+    """A run as a cluster, or None where it cannot be a obstacle."""
     n, spacing = len(beams), 2 * np.pi / sonar.n_ray
     ra, rb = scan.range_m[beams[0]], scan.range_m[beams[-1]]
     mean = scan.range_m[beams].mean() - sonar.range_jitter_m

@@ -12,7 +12,7 @@ GRID_M = 0.05
 
 
 def outline(kind, pos, size, yaw, spacing=0.005):
-    """Points on the outline of a body's plan view (n, 2), corners included."""
+    """Points on the outline of an obstacle's plan view (n, 2), corners included."""
     if kind != BOX:
         angle = np.linspace(0, 2 * np.pi, max(8, int(2 * np.pi * size[0] / spacing)), endpoint=False)
         return np.asarray(pos[:2]) + size[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -23,7 +23,7 @@ def outline(kind, pos, size, yaw, spacing=0.005):
 
 
 def plan_distances(points, kind, pos, size, yaw):
-    """Distances [m] of points (..., 2) to a body's plan view; 0 inside a box, negative inside a disc."""
+    """Distances [m] of points (..., 2) to an obstacle's plan view; 0 inside a box, negative inside a disc."""
     q = np.asarray(points, float) - np.asarray(pos[:2])
     if kind != BOX:
         return np.linalg.norm(q, axis=-1) - size[0]
@@ -33,14 +33,14 @@ def plan_distances(points, kind, pos, size, yaw):
 
 
 def gap(a, b):
-    """Smallest distance between the plan views of two bodies (kind, pos, size, yaw) [m], within 1 mm above
+    """Smallest distance between the plan views of two obstacles (kind, pos, size, yaw) [m], within 1 mm above
     the exact one."""
     return float(min(plan_distances(outline(*a), *b).min(), plan_distances(outline(*b), *a).min()))
 
 
 def keeps_gap(a, b, least):
-    """Whether two bodies' plan views lie this far apart [m]; outlines are drawn only where circles around the
-    bodies do not."""
+    """Whether two obstacles' plan views lie this far apart [m]; outlines are drawn only where circles around
+    the obstacles do not."""
     reach = sum(math.hypot(*size[:2]) if kind == BOX else size[0] for kind, _, size, _ in (a, b))
     return math.dist(a[1][:2], b[1][:2]) - reach >= least or gap(a, b) >= least
 
@@ -53,14 +53,14 @@ def wall_distances(points, tank):
     return np.min([x - tank.x_m[0], tank.x_m[1] - x, y - tank.y_m[0], tank.y_m[1] - y], axis=0)
 
 
-def is_joined(start, goal, bodies, tank, clearance):
+def is_joined(start, goal, obstacles, tank, clearance):
     """Whether start and goal lie in one region of cells (8 neighbours) whose centre has the clearance, less
     half a cell's diagonal."""
     cols = np.arange(tank.x_m[0] + GRID_M / 2, tank.x_m[1], GRID_M)
     rows = np.arange(tank.y_m[0] + GRID_M / 2, tank.y_m[1], GRID_M)
     points = np.stack(np.meshgrid(cols, rows), axis=-1)
     free = wall_distances(points, tank)
-    for body in bodies:
+    for body in obstacles:
         free = np.minimum(free, plan_distances(points, *body))
     label, _ = ndimage.label(free >= clearance - GRID_M * np.sqrt(0.5), np.ones((3, 3)))
     cells = [
@@ -80,7 +80,7 @@ def path_points(n_way, way, radius, length, spacing=0.02):
 
 
 def path_position(path, time_s):
-    """(x, y) [m] of a moving body at a time, from its path in scenario.json."""
+    """(x, y) [m] of a moving obstacle at a time, from its path in scenario.json."""
     arc = (path["phase_m"] + path["speed_m_s"] * time_s) % path["length_m"]
     if path["shape"] == "circle":
         angle = arc / path["radius_m"]

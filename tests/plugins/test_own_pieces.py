@@ -1,4 +1,4 @@
-"""Pieces that the user brings: found, called once per decision, checked, and refused by file and line."""
+"""Plugins that the user brings: found, called once per decision, checked, and refused by file and line."""
 
 import json
 import threading
@@ -13,7 +13,7 @@ from tests.command import uuv
 from tests.evaluation.test_resume_eval import Watch
 from tests.sim.test_observation_only import KNOWN, Poison
 from uuvtai.common.errors import SettingError, UserError
-from uuvtai.config import Config, FeaturesConfig
+from uuvtai.config import Config, ObservationConfig
 from uuvtai.config.loader import ConfigError
 from uuvtai.console import parsing
 from uuvtai.evaluation.agents import load_agents
@@ -23,14 +23,14 @@ from uuvtai.evaluation.failure_causes import FailureRecorder
 from uuvtai.evaluation.reproduce_steps import BUDGETS, steps_of
 from uuvtai.kernels.planning.observation import observation_width
 from uuvtai.logs.run_folder import RunFolderError
-from uuvtai.plugins import adapters, loading, piece
+from uuvtai.plugins import adapters, loading, plugin
 from uuvtai.plugins.adapters import CallMeter
-from uuvtai.plugins.api import COMMAND, PieceError, PieceSpec, is_piece, piece_spec
-from uuvtai.report.evaluation import methods_table
+from uuvtai.plugins.api import COMMAND, PluginError, PluginSpec, is_plugin, plugin_spec
+from uuvtai.report.evaluation import agents_table
 from uuvtai.report.tables import TERMINAL
 
 AWAY = "import numpy as np\n\ndef act(view):\n    return np.tile([0.6, 0.0, 0.0, 0.0], (len(view.rows), 1))\n"
-N_OBS = observation_width(FeaturesConfig())
+N_OBS = observation_width(ObservationConfig())
 AHEAD = "def plan(clearance, cell_m, start, goal, forecast):\n    return [start, goal]\n"
 
 
@@ -57,18 +57,18 @@ def sim(small):
 
 
 def found(text, kind="controller"):
-    return loading.own_piece(piece_spec(text, kind))
+    return loading.load_plugin(plugin_spec(text, kind))
 
 
 def stepped(sim, text, steps=3, kind="controller", rows=None):
-    """The driver after a few steps of all rows."""
-    driver = found(text, kind).driver(sim)
-    stepper = Stepper(sim, driver)
+    """The agent after a few steps of all rows."""
+    agent = found(text, kind).agent(sim)
+    stepper = Stepper(sim, agent)
     mask = torch.ones(sim.num_envs, dtype=torch.int32)
     stepper.reset(mask, torch.full_like(mask, 77), torch.arange(sim.num_envs, dtype=torch.int32))
     for _ in range(steps):
         stepper.step()
-    return driver
+    return agent
 
 
 # ------------------------------------------------------------------------------------------------------ names
@@ -85,28 +85,28 @@ def stepped(sim, text, steps=3, kind="controller", rows=None):
     ],
 )
 def test_a_piece_has_a_name_that_finds_it_again(text, kind, answer):
-    spec = piece_spec(text, kind)
+    spec = plugin_spec(text, kind)
     assert (spec.text, spec.label, spec.is_code) == answer
-    assert piece_spec(spec.text) == spec and is_piece(spec.text)
+    assert plugin_spec(spec.text) == spec and is_plugin(spec.text)
 
 
 @pytest.mark.parametrize("text", ["bt", "mine.xml", "best", "runs/first", "bt+truth", "ours.yaml"])
 def test_what_is_no_piece_stays_what_it_was(text):
-    assert not is_piece(text)
+    assert not is_plugin(text)
 
 
 @pytest.mark.parametrize(
     ("text", "kind", "says"),
     [
-        ("mine", "planner", "--planner 'mine': names no piece; for example --planner mine.py:plan"),
+        ("mine", "planner", "--planner 'mine': names no plugin; for example --planner mine.py:plan"),
         ("mine.py:1x", "controller", "'1x' is no name of Python"),
-        ("model.onnx", "controller", "names no piece; for example --agent mine.py:act"),
-        ("policy:model.pt", "controller", "--agent 'model.pt': names no piece"),
+        ("model.onnx", "controller", "names no plugin; for example --agent mine.py:act"),
+        ("policy:model.pt", "controller", "--agent 'model.pt': names no plugin"),
     ],
 )
 def test_a_name_that_names_nothing_is_refused(text, kind, says):
     with pytest.raises(SettingError, match=says.replace("(", r"\(")):
-        piece_spec(text, kind)
+        plugin_spec(text, kind)
 
 
 def test_options_become_names_of_agents():
@@ -118,14 +118,14 @@ def test_options_become_names_of_agents():
     assert parsing.agents(["policy:q.py:net"], None, []) == ["policy:q.py:net"]
     assert parsing.agents(None, ["p.py"], ["bt"]) == ["planner:p.py:plan"]
     assert parsing.agents(None, None, ["straight", "bt"]) == ["straight", "bt"]
-    assert parsing.own_pieces(None, ["p.py"]) == ["planner:p.py:plan"]
-    assert parsing.own_pieces(None, None) == [] and parsing.one_agent(None, None) is None
+    assert parsing.named_plugins(None, ["p.py"]) == ["planner:p.py:plan"]
+    assert parsing.named_plugins(None, None) == [] and parsing.one_agent(None, None) is None
     assert parsing.one_agent("mine.py", None) == "controller:mine.py:act"
     for given in (("bt", ["p.py"]), (None, ["p.py", "q.py"]), ("bt,best", None)):
         with pytest.raises(parsing.UsageError, match="give one of them"):
             parsing.one_agent(*given)
-    with pytest.raises(parsing.UsageError, match="bt: is no piece of yours"):
-        parsing.own_pieces(["bt"], None)
+    with pytest.raises(parsing.UsageError, match="bt: is no plugin of yours"):
+        parsing.named_plugins(["bt"], None)
     with pytest.raises(parsing.UsageError, match="name who drives"):
         parsing.agents([","], None, ["bt"])
 
@@ -180,8 +180,8 @@ def test_two_rows_never_share_a_name(write):
 def test_what_cannot_be_used_is_refused_by_its_line(sim, write, text, name, says):
     if text is not None:
         write(text)
-    with pytest.raises(PieceError) as refused:
-        found(name).driver(sim)
+    with pytest.raises(PluginError) as refused:
+        found(name).agent(sim)
     assert says in str(refused.value) and "\n" not in str(refused.value)
 
 
@@ -204,10 +204,10 @@ def test_a_class_and_load_are_made_once_and_told_what_is_known(sim, write):
         "    return Pilot(about)\n"
     )
     for name in ("Pilot", "load=text"):
-        driver = stepped(sim, f"mine.py:{name}", steps=1)
-        about = driver.code.act.__self__.about
+        agent = stepped(sim, f"mine.py:{name}", steps=1)
+        about = agent.code.act.__self__.about
         assert (about.num_envs, about.n_obs, about.argument) == (8, N_OBS, "text" if "=" in name else "")
-        assert torch.equal(driver.decision.action, torch.ones(8, 4)), "the limits are full speed"
+        assert torch.equal(agent.decision.action, torch.ones(8, 4)), "the limits are full speed"
 
 
 def test_what_lies_beside_the_file_can_be_imported_and_no_bytecode_is_left(sim, write):
@@ -221,9 +221,9 @@ def test_what_lies_beside_the_file_can_be_imported_and_no_bytecode_is_left(sim, 
 
 COUNTING = """
 import numpy as np
-from uuvtai.plugins import piece
+from uuvtai.plugins import plugin
 asked, begun = [], []
-@piece(rows={rows!r}, arrays={arrays!r}, hold_steps={hold})
+@plugin(rows={rows!r}, arrays={arrays!r}, hold_steps={hold})
 def act(view):
     asked.append((np.atleast_1d(view.rows).tolist(), float(np.max(np.asarray(view.time_s)))))
     {assertion}
@@ -246,8 +246,8 @@ def counting(write, **changes):
 
 def test_each_running_row_is_asked_once_per_decision_and_told_of_its_episodes(sim, write):
     own = counting(write)
-    driver = own.driver(sim)
-    results, _steps = run_episodes(sim, jobs_of([77], 9), driver=driver)
+    agent = own.agent(sim)
+    results, _steps = run_episodes(sim, jobs_of([77], 9), agent=agent)
     module = own.found.__globals__
     assert [len(rows) for rows, _t in module["asked"]][:3] == [8, 8, 8]
     calls = sum(len(rows) for rows, _t in module["asked"])
@@ -257,12 +257,12 @@ def test_each_running_row_is_asked_once_per_decision_and_told_of_its_episodes(si
     assert sorted(row for rows in module["begun"] for row in rows) == sorted(
         [*range(8), module["begun"][1][0]]
     )
-    assert driver.code.meter.document()["calls"] == len(module["asked"])
+    assert agent.code.meter.document()["calls"] == len(module["asked"])
 
 
 def test_a_decision_is_held(sim, write):
     own = counting(write, hold=10)
-    stepper = Stepper(sim, own.driver(sim))
+    stepper = Stepper(sim, own.agent(sim))
     mask = torch.ones(8, dtype=torch.int32)
     stepper.reset(mask, mask, torch.arange(8, dtype=torch.int32))
     for _ in range(25):
@@ -274,11 +274,11 @@ def test_one_by_one_and_torch_give_what_the_batch_gives(sim, write):
     parts = "v.obs[..., 0] * 0 + 0.3, v.goal[..., 0] * 0, v.ego.depth * 0 + 0.1, v.ego.rpy[..., 2] * 0.1"
     rule = f"np.stack([{parts}], -1)"
     write(
-        "import numpy as np\nimport torch\nfrom uuvtai.plugins import piece\n"
+        "import numpy as np\nimport torch\nfrom uuvtai.plugins import plugin\n"
         f"def batch(v):\n    return {rule}\n"
-        "@piece(rows='one')\ndef one(v):\n    assert v.scan.range_m.ndim == 1 and isinstance(v.rows, int)\n"
+        "@plugin(rows='one')\ndef one(v):\n    assert v.scan.range_m.ndim == 1 and isinstance(v.rows, int)\n"
         f"    return {rule}\n"
-        "@piece(arrays='torch')\ndef tensors(v):\n"
+        "@plugin(arrays='torch')\ndef tensors(v):\n"
         "    assert all(isinstance(x, torch.Tensor) for x in (v.obs, v.goal, v.map.static, v.limits))\n"
         f"    return {rule.replace('np', 'torch')}\n"
     )
@@ -303,13 +303,13 @@ def test_a_policy_sees_chunks_of_one_size_and_acts_in_parts_of_the_limits(sim, w
         "def load():\n    return Net()\n"
     )
     own = found("mine.py:load", "policy")
-    driver = own.driver(sim)
-    assert driver.code.marks.arrays == "torch"
-    stepper = Stepper(sim, driver)
+    agent = own.agent(sim)
+    assert agent.code.marks.arrays == "torch"
+    stepper = Stepper(sim, agent)
     mask = torch.ones(8, dtype=torch.int32)
     stepper.reset(mask, mask, mask)
     assert own.found.__globals__["shapes"] == [(64, N_OBS)]
-    assert torch.equal(driver.decision.action, torch.ones(8, 4)), "cut off at full speed"
+    assert torch.equal(agent.decision.action, torch.ones(8, 4)), "cut off at full speed"
     theirs = stepped(sim, "mine.py:Theirs", kind="policy")
     assert torch.equal(theirs.decision.action, torch.full((8, 4), 0.25))
 
@@ -333,7 +333,7 @@ def test_a_policy_sees_chunks_of_one_size_and_acts_in_parts_of_the_limits(sim, w
 )
 def test_a_wrong_answer_is_told_by_shape_and_kind(sim, write, answer, says):
     write(f"import numpy as np, torch\nnp.seterr(all='ignore')\n\ndef act(view):\n    return {answer}\n")
-    with pytest.raises(PieceError) as refused:
+    with pytest.raises(PluginError) as refused:
         stepped(sim, "mine.py:act")
     assert str(refused.value).startswith("mine.py:4: act: ") and says in str(refused.value)
 
@@ -343,7 +343,7 @@ def test_an_exception_names_the_line_where_her_code_was(sim, write):
         "import numpy as np\n\ndef helper(view):\n    return view['gaol']\n\n"
         "def act(view):\n    return helper(view)\n"
     )
-    with pytest.raises(PieceError) as refused:
+    with pytest.raises(PluginError) as refused:
         stepped(sim, "mine.py:act")
     told = str(refused.value)
     assert (
@@ -351,7 +351,7 @@ def test_an_exception_names_the_line_where_her_code_was(sim, write):
     )
     assert told.endswith("(--agent mine.py:act)") and isinstance(refused.value.__cause__, KeyError)
     write("def act(view): ...\ndef reset(rows):\n    raise ValueError('no')\n", "other.py")
-    with pytest.raises(PieceError, match=r"other.py:3: ValueError: no \(in reset of --agent other.py:act\)"):
+    with pytest.raises(PluginError, match=r"other.py:3: ValueError: no \(in reset of --agent other.py:act\)"):
         stepped(sim, "other.py:act")
 
 
@@ -368,7 +368,7 @@ def test_an_exception_names_the_line_where_her_code_was(sim, write):
 def test_a_wrong_route_is_told(sim, write, answer, says):
     write(f"import numpy as np\ndef plan(clearance, cell_m, start, goal, forecast):\n    return {answer}\n")
     sim.planner = found("mine.py", "planner").planner(sim)
-    with pytest.raises(PieceError) as refused:
+    with pytest.raises(PluginError) as refused:
         begin(sim)
     assert str(refused.value).startswith("mine.py:2: plan: ") and says in str(refused.value)
 
@@ -418,7 +418,7 @@ def test_a_planner_plans_every_route_from_what_the_map_says(sim, write):
     way = sim.rows(sim.s.route.way_w)[0][: sim.rows(sim.s.route.n_way)[0]]
     middle = (start + goal) / 2 + [0, 0.1] + sim.fallback.origin
     assert np.linalg.norm(way - middle, axis=1).min() < 0.01
-    assert own.driver(sim) is None and own.document()["calls"] == 8
+    assert own.agent(sim) is None and own.document()["calls"] == 8
 
 
 # --------------------------------------------------------------------------------------------------- the view
@@ -442,7 +442,7 @@ def test_a_view_is_the_same_where_the_truth_is_spoilt(sim):
 
     def seen():
         return values_of(
-            adapters.PieceView(adapters.Readings(sim, [0, 2, 5], sim.observation[[0, 2, 5]]), fixed)
+            adapters.PluginView(adapters.Readings(sim, [0, 2, 5], sim.observation[[0, 2, 5]]), fixed)
         )
 
     poison, before = Poison(sim), seen()
@@ -472,9 +472,9 @@ def test_vectors_are_turned_into_the_body(sim, write):
 
 def test_marks_refuse_other_values():
     with pytest.raises(ValueError, match="rows is 'batch' or 'one'"):
-        piece(rows="some")
+        plugin(rows="some")
     with pytest.raises(ValueError, match="hold_steps is a number"):
-        piece(hold_steps=True)
+        plugin(hold_steps=True)
 
 
 # ------------------------------------------------------------------------------------------------------- time
@@ -507,18 +507,18 @@ def test_a_call_that_does_not_come_back_is_told_by_its_line(sim, write):
         told.set()
 
     own.note = note
-    driver = own.driver(sim)
-    driver.code.meter._stall_s = 0.01
-    Stepper(sim, driver).reset(*(torch.ones(8, dtype=torch.int32) for _ in range(3)))
+    agent = own.agent(sim)
+    agent.code.meter._stall_s = 0.01
+    Stepper(sim, agent).reset(*(torch.ones(8, dtype=torch.int32) for _ in range(3)))
     own.close()
     assert notes[0].startswith("mine.py:2: a call of --agent mine.py:act has not come back for")
 
 
 def test_the_table_has_a_column_for_the_time_of_own_code():
     row = {"name": "x", "episodes": 1, "replans_per_episode": 1.0, "env_steps_per_s": 1.0}
-    assert "own code ms\n(slowest)" not in [c.short for c in methods_table([row], "").columns]
+    assert "own code ms\n(slowest)" not in [c.short for c in agents_table([row], "").columns]
     own = row | {"own": {"decision_ms": 0.4, "slowest_ms": 12.0}}
-    columns, cells = methods_table([own, row], "").on(TERMINAL)
+    columns, cells = agents_table([own, row], "").on(TERMINAL)
     assert columns[-1].short == "own code ms\n(slowest)"
     assert [str(line[-1]) for line in cells] == ["0.4 (slowest 12)", "-"]
 
@@ -554,17 +554,17 @@ def ask(small, monkeypatch, write):
 
 def test_pieces_are_rows_beside_the_tree_with_logs_and_pictures(ask, write, tmp_path):
     write(AWAY + AHEAD)
-    pieces = ["controller:mine.py:act", "planner:mine.py:plan"]
-    result, folder = compare(ask(tmp_path / "run", "straight", *pieces, record=1), Watch())
-    assert [m["name"] for m in result["methods"]] == ["straight", "mine-act", "mine-plan"]
-    away, planned = result["methods"][1:]
+    plugins = ["controller:mine.py:act", "planner:mine.py:plan"]
+    result, folder = compare(ask(tmp_path / "run", "straight", *plugins, record=1), Watch())
+    assert [m["name"] for m in result["agents"]] == ["straight", "mine-act", "mine-plan"]
+    away, planned = result["agents"][1:]
     assert away["own"]["kind"] == "controller" and away["own"]["calls"] > 10 and away["success_rate"] == 0
     assert planned["planned_by"]["voronoi"] == 0 and planned["planned_by"]["own"] >= 2
     assert len(result["paired"]) == 3
     assert {path.name for path in (folder / "logs").iterdir()} >= {"mine-act_seed77_episode0.mcap"}
     assert (folder / "pictures/seed77_episode0.png").stat().st_size > 1000
     kept = json.loads((folder / "eval/request.json").read_text())
-    assert kept["agents"] == ["straight", *pieces] and len(kept["drivers"]["mine-act"]) == 64
+    assert kept["agents"] == ["straight", *plugins] and len(kept["digests"]["mine-act"]) == 64
 
 
 def test_going_on_runs_code_of_a_folder_only_where_the_user_says_so(ask, write, tmp_path):
@@ -583,7 +583,7 @@ def test_going_on_runs_code_of_a_folder_only_where_the_user_says_so(ask, write, 
         resume(tmp_path / "run", Watch(), allow_code=True)
     write(Path("mine.py").read_text().removesuffix("# changed\n"))
     result, _folder = resume(tmp_path / "run", Watch(), allow_code=True)
-    assert result["methods"][0]["episodes"] == 2
+    assert result["agents"][0]["episodes"] == 2
 
 
 def test_failures_that_are_played_otherwise_are_told_and_left_out():
@@ -613,9 +613,9 @@ def test_the_command_line_tells_in_one_line_and_keeps_the_traceback(write, capfd
     ("arguments", "says"),
     [
         (["eval", "--planner", "none.py"], "none.py cannot be read"),
-        (["eval", "--planner", "bt"], "--planner 'bt': names no piece; for example --planner mine.py:plan"),
+        (["eval", "--planner", "bt"], "--planner 'bt': names no plugin; for example --planner mine.py:plan"),
         (["sweep", "--agent", "none.onnx", "--grid", "D=0"], "none.onnx cannot be read"),
-        (["reproduce", "--agent", "bt"], "bt: is no piece of yours"),
+        (["reproduce", "--agent", "bt"], "bt: is no plugin of yours"),
         (["reproduce", "--planner", "none.py"], "none.py cannot be read"),
         (["simulate", "--seconds", "1", "--agent", "none.py"], "none.py cannot be read"),
         (
@@ -669,10 +669,10 @@ def graph_of(
 def test_a_graph_drives(sim, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("model.onnx").write_bytes(graph_of(hold="5"))
-    driver = stepped(sim, "model.onnx", steps=0, kind="policy")
+    agent = stepped(sim, "model.onnx", steps=0, kind="policy")
     expected = (1e-3 * sim.observation.sum(1, keepdim=True)).clamp(-1, 1).expand(-1, 4)
-    torch.testing.assert_close(driver.decision.action, expected, rtol=1e-4, atol=1e-5)
-    assert driver.code.marks.hold_steps == 5
+    torch.testing.assert_close(agent.decision.action, expected, rtol=1e-4, atol=1e-5)
+    assert agent.code.marks.hold_steps == 5
 
 
 def expected_of(sim):
@@ -687,8 +687,8 @@ def expected_of(sim):
 def test_a_graph_of_another_trainer_drives(sim, tmp_path, monkeypatch, changes):
     monkeypatch.chdir(tmp_path)
     Path("model.onnx").write_bytes(graph_of(**changes))
-    driver = stepped(sim, "model.onnx", steps=0, kind="policy")
-    torch.testing.assert_close(driver.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
+    agent = stepped(sim, "model.onnx", steps=0, kind="policy")
+    torch.testing.assert_close(agent.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
 
 
 def test_other_outputs_are_left_out(sim, tmp_path, monkeypatch):
@@ -696,8 +696,8 @@ def test_other_outputs_are_left_out(sim, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     nodes = [*GEMM, ("Atan", ["obs"], ["value"])]
     Path("model.onnx").write_bytes(graph_of(nodes=nodes, outputs=("value", "action")))
-    driver = stepped(sim, "model.onnx", steps=0, kind="policy")
-    torch.testing.assert_close(driver.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
+    agent = stepped(sim, "model.onnx", steps=0, kind="policy")
+    torch.testing.assert_close(agent.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
 
 
 def split(graph, location="model.onnx.data", length=None):
@@ -719,11 +719,11 @@ def test_weights_beside_a_graph_are_read(sim, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     graph, weights = split(graph_of())
     Path("model.onnx").write_bytes(graph)
-    with pytest.raises(PieceError, match=r"its weights are in model\.onnx\.data, .*copy that file too"):
+    with pytest.raises(PluginError, match=r"its weights are in model\.onnx\.data, .*copy that file too"):
         found("model.onnx", "policy")
     Path("model.onnx.data").write_bytes(weights)
-    driver = stepped(sim, "model.onnx", steps=0, kind="policy")
-    torch.testing.assert_close(driver.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
+    agent = stepped(sim, "model.onnx", steps=0, kind="policy")
+    torch.testing.assert_close(agent.decision.action, expected_of(sim), rtol=1e-4, atol=1e-5)
     before = found("model.onnx", "policy").sha256
     Path("model.onnx.data").write_bytes(weights[:-1] + b"!")
     assert found("model.onnx", "policy").sha256 != before, "other weights drive otherwise"
@@ -767,8 +767,8 @@ def test_a_strange_graph_never_reaches_onnx_runtime(sim, tmp_path, monkeypatch, 
         monkeypatch.setattr(
             "uuvtai.learning.export.graph.session", lambda _graph: pytest.fail("ONNX Runtime saw it")
         )
-    with pytest.raises(PieceError) as refused:
-        found("model.onnx", "policy").driver(sim)
+    with pytest.raises(PluginError) as refused:
+        found("model.onnx", "policy").agent(sim)
     assert str(refused.value).startswith("model.onnx: ") and says in str(refused.value)
 
 
@@ -776,8 +776,8 @@ def test_what_is_no_graph_or_too_large_is_refused(sim, tmp_path, monkeypatch):
     pytest.importorskip("onnx", reason="needs the extra uuvtai[export]")
     monkeypatch.chdir(tmp_path)
     Path("model.onnx").write_bytes(b"nonsense")
-    with pytest.raises(PieceError, match=r"model.onnx: is no ONNX graph"):
-        found("model.onnx", "policy").driver(sim)
+    with pytest.raises(PluginError, match=r"model.onnx: is no ONNX graph"):
+        found("model.onnx", "policy").agent(sim)
     with Path("model.onnx").open("wb") as file:
         file.truncate((64 << 20) + 1)
     with pytest.raises(UserError, match="more than the 67,108,864"):
@@ -787,7 +787,7 @@ def test_what_is_no_graph_or_too_large_is_refused(sim, tmp_path, monkeypatch):
 def test_a_graph_with_too_few_outputs_is_told(sim, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("model.onnx").write_bytes(graph_of(n_out=3))
-    with pytest.raises(PieceError, match=r"model.onnx: gave 3 columns; wanted is shape"):
+    with pytest.raises(PluginError, match=r"model.onnx: gave 3 columns; wanted is shape"):
         stepped(sim, "model.onnx", kind="policy")
 
 
@@ -798,5 +798,5 @@ def test_the_spec_of_a_command_is_what_a_request_keeps():
         ("policy", "m.py", "net", "--agent policy:m.py:net"),
         ("planner", "m.py", "plan", "--planner m.py:plan"),
     ):
-        assert PieceSpec(kind, Path(file), name).option == option
+        assert PluginSpec(kind, Path(file), name).option == option
     assert "m/s" in COMMAND

@@ -30,10 +30,10 @@ POINTS = 72.0
 """of an inch"""
 
 
-def evaluated(folder, *methods, **more):
+def evaluated(folder, *agents, **more):
     """A run folder of an evaluation."""
-    document = samples.evaluation_document(*methods)
-    document["paired"] = paired(document["methods"])
+    document = samples.evaluation_document(*agents)
+    document["paired"] = paired(document["agents"])
     return samples.write_run(folder, ("uuv", "eval", "--set", EVIL), eval__result=document, **more)
 
 
@@ -43,10 +43,10 @@ def text_of(path):
 
 @pytest.fixture(scope="module")
 def kit(tmp_path_factory):
-    """The kit of an evaluation, a sweep and two trainings of one method."""
+    """The kit of an evaluation, a sweep and two trainings of one agent."""
     place = tmp_path_factory.mktemp("runs")
     runs = [
-        evaluated(place / "first", samples.method("straight", 3, 5), samples.method(EVIL, 7, 1)),
+        evaluated(place / "first", samples.agent("straight", 3, 5), samples.agent(EVIL, 7, 1)),
         samples.write_run(place / "grid", ("uuv", "sweep"), sweep=small_sweep()),
         *(
             samples.write_run(
@@ -67,8 +67,8 @@ def few_metrics():
     return [{key: row[key] for key in kept} for row in samples.metrics()]
 
 
-def small_sweep(method="bt"):
-    return samples.sweep_document(method, {"S": [8], "D": [0, 6], "v_m_s": [0.4, 0.6]})
+def small_sweep(agent="bt"):
+    return samples.sweep_document(agent, {"S": [8], "D": [0, 6], "v_m_s": [0.4, 0.6]})
 
 
 # ------------------------------------------------------------ figures
@@ -117,7 +117,7 @@ def test_the_table_of_methods_has_n_and_intervals(kit):
 
 def test_the_paired_test_is_adjusted(tmp_path):
     run = evaluated(
-        tmp_path / "run", samples.method("a", 1, 7), samples.method("b", 8, 0), samples.method("c", 7, 1)
+        tmp_path / "run", samples.agent("a", 1, 7), samples.agent("b", 8, 0), samples.agent("c", 7, 1)
     )
     kit = paper([run], tmp_path / "kit")
     rows = list(csv.DictReader(text_of(kit.folder / "tables/paired.csv").splitlines()))
@@ -134,7 +134,7 @@ def test_a_grid_says_where_a_row_does_not_depend_on_the_column(kit):
 
 
 def test_causes_of_failures_are_a_table(tmp_path):
-    run = evaluated(tmp_path / "run", samples.method("bt", causes=[samples.CAUSE], explain=[{}, {}]))
+    run = evaluated(tmp_path / "run", samples.agent("bt", causes=[samples.CAUSE], explain=[{}, {}]))
     (item,) = [item for item in items_of(run) if item.name == "causes_bt"]
     assert "n = 2 failures of 8 episodes" in item.caption
     assert "unseen above & 2 & 100" in latex.tabular(item.table, "")
@@ -250,7 +250,7 @@ def test_only_a_new_or_empty_folder_is_written(tmp_path, capfd):
 
 def test_runs_without_anything_to_show_are_refused_and_nothing_is_written(tmp_path):
     bare = samples.write_run(tmp_path / "bare")
-    damaged = samples.write_run(tmp_path / "damaged", eval__result={"schema": 1, "methods": [{"name": 1}]})
+    damaged = samples.write_run(tmp_path / "damaged", eval__result={"schema": 1, "agents": [{"name": 1}]})
     whole = samples.write_run(tmp_path / "whole", reproduce={"title": "x"})
     for run, says in (
         (bare, "has nothing to report"),

@@ -261,13 +261,13 @@ def test_methods_are_shown_with_counts_intervals_and_both_times():
         "3.0",
         "0.30",
     ]
-    assert first.data.columns[:3] == ["method", "episodes", "success"]
+    assert first.data.columns[:3] == ["agent", "episodes", "success"]
     assert first.data.rows[1][:3] == ["bt", 8, 6]
 
 
 def test_a_method_without_episodes_is_dashes():
     nobody = (
-        samples.method("bt")
+        samples.agent("bt")
         | samples.rates(0, 0, 1)
         | {"episodes": 0, "success_rate": None, "success_ci95": None}
     )
@@ -278,7 +278,7 @@ def test_a_method_without_episodes_is_dashes():
 
 def test_causes_are_shown_where_there_are_any():
     blocks = evaluation(
-        samples.evaluation_document(samples.method("best", causes=[samples.CAUSE], explain=[1, 2]))
+        samples.evaluation_document(samples.agent("best", causes=[samples.CAUSE], explain=[1, 2]))
     )
     assert rows(tables(blocks)[-1]) == [
         ["unseen above", "2", "100 %", "50 %", "1.7", "-", "0.2", samples.CAUSE["meaning"]]
@@ -403,7 +403,7 @@ def recorded(tmp_path):
     for name, size in sizes.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"x" * size)
-    return tmp_path, samples.evaluation_document(samples.method("bt"))
+    return tmp_path, samples.evaluation_document(samples.agent("bt"))
 
 
 def test_the_worst_episodes_come_first_and_once(recorded):
@@ -456,9 +456,9 @@ EVIL = "</title><script>alert(1)</script>$x$\"'&"
 def evil(tmp_path_factory):
     """Page of an evaluation whose every name wants to be more than a name."""
     name = EVIL.replace("/", ":")
-    method = samples.method(EVIL, causes=[samples.CAUSE | {"label": EVIL, "meaning": EVIL}], explain=[1])
+    agent = samples.agent(EVIL, causes=[samples.CAUSE | {"label": EVIL, "meaning": EVIL}], explain=[1])
     folder = tmp_path_factory.mktemp("evil") / name
-    document = samples.evaluation_document(method) | {"world": EVIL}
+    document = samples.evaluation_document(agent) | {"world": EVIL}
     samples.write_run(folder, ("uuv", "eval", EVIL), EVIL, eval__result=document)
     return folder, report([folder])
 
@@ -470,7 +470,7 @@ def test_everything_from_files_is_escaped(evil):
     assert not [key for _, attributes in page.tags for key in attributes if key.startswith("on")]
     text = "".join(page.words)
     assert text.count("alert(1)") > 5, "as words they are there"
-    assert [path.name for path in written.figures] == ["methods.png"]
+    assert [path.name for path in written.figures] == ["agents.png"]
 
 
 def test_a_page_needs_nothing_but_itself(evil):
@@ -570,7 +570,7 @@ def test_a_training_and_its_evaluations_are_one_page(tmp_path):
     shas = {"first_eval": hashlib.sha256(manifest.read_bytes()).hexdigest(), "other_eval": "0" * 64}
     for name, sha in shas.items():
         document = samples.evaluation_document(
-            samples.method("bt"), samples.method("mine", checkpoint={"sha256": sha})
+            samples.agent("bt"), samples.agent("mine", checkpoint={"sha256": sha})
         )
         samples.write_run(tmp_path / name, eval__result=document)
     written = report([trained, *(tmp_path / name for name in shas)], tmp_path / "page.html")
@@ -590,10 +590,10 @@ def test_a_training_and_its_evaluations_are_one_page(tmp_path):
 
 
 def test_pairs_of_methods_are_told_with_p_and_interval():
-    methods = [samples.method("straight", 3, 5), samples.method("bt", 8, 0)]
+    agents = [samples.agent("straight", 3, 5), samples.agent("bt", 8, 0)]
     (pairs,) = [
         table
-        for table in tables(evaluation(samples.evaluation_document(*methods) | {"paired": paired(methods)}))
+        for table in tables(evaluation(samples.evaluation_document(*agents) | {"paired": paired(agents)}))
         if table.title.startswith("Pairs")
     ]
     assert rows(pairs) == [
@@ -603,17 +603,17 @@ def test_pairs_of_methods_are_told_with_p_and_interval():
     assert not any(
         table.title.startswith("Pairs") for table in tables(evaluation(samples.evaluation_document()))
     )
-    nobody = [samples.method(name, 0, 8) for name in "ab"]
+    nobody = [samples.agent(name, 0, 8) for name in "ab"]
     assert rows(paired_table(paired(nobody), "")) == [["a", "b", "8", "0", "0", "0", "1", "-", "-", "-"]]
-    assert rows(paired_table([paired(methods)[0] | {"mcnemar_p": 1e-9}], ""))[0][6] == "< 0.0001"
+    assert rows(paired_table([paired(agents)[0] | {"mcnemar_p": 1e-9}], ""))[0][6] == "< 0.0001"
 
 
 def test_a_method_has_its_colour_in_charts_and_tables(tmp_path):
-    from uuvtai.common.colours import method_colours
+    from uuvtai.common.colours import agent_colours
 
     names = ["straight", "planner", "bt", "mine"]
-    colours = method_colours(names)
-    document = samples.evaluation_document(*map(samples.method, names))
+    colours = agent_colours(names)
+    document = samples.evaluation_document(*map(samples.agent, names))
     blocks = evaluation(document)
     assert tables(blocks)[0].swatches == [colours[name] for name in names]
     (figure,) = [block for block in blocks if isinstance(block, Figure)]
@@ -654,7 +654,7 @@ def test_a_page_of_many_videos_stays_below_ten_megabytes(tmp_path):
     runs = []
     for i in range(2):
         run = samples.write_run(
-            tmp_path / f"run_{i}", eval__result=samples.evaluation_document(samples.method("bt"))
+            tmp_path / f"run_{i}", eval__result=samples.evaluation_document(samples.agent("bt"))
         )
         for place, name, n_files, size in (
             ("pictures", "seed0_episode{}.png", 8, 300_000),
@@ -746,7 +746,7 @@ def test_a_reproduction_that_cannot_be_shown_says_why(tmp_path, block, says):
     [
         ("eval/result.json", "{", "is not valid JSON"),
         ("eval/result.json", "[1]", "is no JSON object"),
-        ("eval/result.json", '{"schema": 1}', "KeyError: 'methods'"),
+        ("eval/result.json", '{"schema": 1}', "KeyError: 'agents'"),
         ("sweep.json", '{"cells": [{}], "axes": {"S": [4, 8], "D": [0, 3]}}', "KeyError: 'episodes'"),
         ("metrics.jsonl", '{"iteration": 1}\nnothing\n{"iteration": 2}', "line 2: is no JSON object"),
     ],
@@ -833,8 +833,8 @@ def test_a_page_of_several_trainings_is_none_of_theirs(tmp_path):
     [
         (
             "eval/result.json",
-            samples.evaluation_document() | {"methods": [samples.method("bt")] * 201},
-            "methods has 201 entries",
+            samples.evaluation_document() | {"agents": [samples.agent("bt")] * 201},
+            "agents has 201 entries",
         ),
         ("sweep.json", samples.noise_sweep() | {"cells": [{}] * 20_001}, "cells has 20,001 entries"),
         ("sweep.json", {"cells": [], "axes": {"S": [1] * 10_001}}, "axes.S has 10,001 entries"),

@@ -8,7 +8,7 @@ import pytest
 from tests import report_samples as samples
 from tests.browser import VIEWS, brightness, look
 from uuvtai.evaluation.results import paired
-from uuvtai.logs.video import write_film
+from uuvtai.logs.video import write_video
 from uuvtai.report.build import report
 
 BAD = """<!DOCTYPE html><title>bad</title><div id="a" style="width: 3000px">wide</div><p id="a"></p>
@@ -24,7 +24,7 @@ def picture(path):
 def video(path):
     path.parent.mkdir(exist_ok=True)
     frames = [np.full((240, 640, 3), 25 * i, np.uint8) for i in range(10)]
-    write_film(path, frames, 10.0, frames[:1], [])
+    write_video(path, frames, 10.0, frames[:1], [])
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +32,9 @@ def page(tmp_path_factory):
     """A page with everything that a report can hold, with long names."""
     folder = tmp_path_factory.mktemp("browser") / "run"
     long = "a_method_with_a_name_that_is_far_longer_than_any_column_would_like_it_to_be"
-    methods = [
-        samples.method(long, causes=[samples.CAUSE], explain=[1, 2]),
-        samples.method("bt"),
+    agents = [
+        samples.agent(long, causes=[samples.CAUSE], explain=[1, 2]),
+        samples.agent("bt"),
     ]
     verdict = {"claim": "it swims " * 30, "verdict": "holds", "numbers": "3 of 3"}
     blocks = [
@@ -43,7 +43,7 @@ def page(tmp_path_factory):
         {"kind": "run", "path": "noise"},
     ]
     document = {"schema": 1, "title": "Everything", "sections": [{"title": "First", "blocks": blocks}]}
-    result = samples.evaluation_document(*methods) | {"paired": paired(methods)}
+    result = samples.evaluation_document(*agents) | {"paired": paired(agents)}
     samples.write_run(
         folder, ("uuv", "eval", "x" * 300), "key: " + "y" * 500, reproduce=document, eval__result=result,
         sweep=samples.sweep_document(), profile=samples.PROFILE,

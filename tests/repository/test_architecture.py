@@ -87,7 +87,7 @@ def test_the_stack_never_names_the_truth(path):
 
 
 def test_what_knows_the_truth_writes_nothing_that_the_stack_reads_but_readings():
-    """Simulated instruments, the clock and the mission are what the vehicle may know; the yardsticks say what
+    """Simulated instruments, the clock and the mission are what the vehicle may know; the oracles say what
     they are."""
     known = {
         kind

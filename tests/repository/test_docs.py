@@ -80,7 +80,7 @@ def test_the_page_of_the_python_api_has_what_programs_use(site):
         "uuvtai.envs.vector_env.VectorEnv.step",
         "uuvtai.envs.gymnasium.UuvVectorEnv.step",
         "uuvtai.envs.gymnasium.UuvEnv.step",
-        "uuvtai.learning.policy_agent.Pilot.act",
+        "uuvtai.learning.policy_agent.PolicyAgent.act",
         "uuvtai.learning.export.run_policy.Policy.act",
         "uuvtai.logs.reader.read_messages",
     ):
@@ -170,7 +170,7 @@ def test_every_topic_of_a_log_is_on_its_page():
     assert len(TOPICS) >= 24
     for topic in TOPICS:
         assert f"| `{topic.name}` |" in page and topic.when.text + topic.note in page
-    assert "| `/tracks` | uuv.Tracks | every new scan |" in page and "`/tracks`. Moving bodies" in page
+    assert "| `/tracks` | uuv.Tracks | every new scan |" in page and "`/tracks`. Moving obstacles" in page
 
 
 # ------------------------------------------------------------------------------------------------------ lines

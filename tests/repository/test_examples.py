@@ -224,15 +224,15 @@ OWN = {"own_astar.py": "planner", "own_field.py:act": "controller", "own_torch.p
 
 @pytest.mark.parametrize("name", OWN)
 def test_an_own_piece_drives(short, name):
-    """It plays its episodes without an error, and gets nearer to the goal."""
-    method = load_agents([f"{OWN[name]}:{EXAMPLES / name}"], 64)[0]
-    observed, short.planner = short.observation, method.planner_for(short)
+    """It runs its episodes without an error, and gets nearer to the goal."""
+    agent = load_agents([f"{OWN[name]}:{EXAMPLES / name}"], 64)[0]
+    observed, short.planner = short.observation, agent.planner_for(short)
     try:
-        note = method.driver_for(short)
-        results, _steps = run_episodes(short, jobs_of([77], N), driver=note.pilot if note else None)
+        note = agent.agent_for(short)
+        results, _steps = run_episodes(short, jobs_of([77], N), agent=note.agent if note else None)
     finally:
         short.planner, short.observation = None, observed
-        method.own.close()
+        agent.own.close()
     assert [r.outcome for r in results] == ["timeout"] * N and max(r.path_length_m for r in results) > 0.1
     assert (sum(r.planned_by["own"] for r in results) >= N) == (OWN[name] == "planner")
 
@@ -263,7 +263,7 @@ def test_what_a_trainer_saved_drives_as_an_own_policy(short, example, tmp_path, 
     with torch.no_grad():
         expected = example(name).play(short, tmp_path)(obs)
     obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
-    driver = load_agents([spec], 64)[0].driver_for(short).pilot
-    found = driver.decide(torch.from_numpy(obs)).action.numpy()
+    agent = load_agents([spec], 64)[0].agent_for(short).pilot
+    found = agent.decide(torch.from_numpy(obs)).action.numpy()
     np.testing.assert_allclose(found, np.clip(expected, -1, 1), rtol=1e-4, atol=1e-5)
-    assert driver.code.marks.hold_steps == example("judge").HOLD_STEPS
+    assert agent.code.marks.hold_steps == example("judge").HOLD_STEPS

@@ -47,7 +47,7 @@ def outcomes(device, folder):
         "--run-dir", str(folder / f"run_{device}"), "--json",
     ]  # fmt: skip
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return [d["outcome"] for d in json.loads(done.stdout)["methods"][0]["episodes_detail"]]
+    return [d["outcome"] for d in json.loads(done.stdout)["agents"][0]["episodes_detail"]]
 
 
 def test_states_agree_after_200_steps(tmp_path):

@@ -43,7 +43,7 @@ DISTANCE_M = 1e-5
 SAFETY_M, TTC_SHARE = 1e-3, 1e-2
 VELOCITY_M_S, COST_SHARE = 1e-5, 1e-3
 """float32 of headings and of roll-outs; a cost may differ by more where a place falls within float32 of a
-cell's edge or a body's height"""
+cell's edge or an obstacle's height"""
 CLOSED_FORM = 1e-5
 """[m] and [m/s], float32 of arcs of tens of metres"""
 
@@ -168,7 +168,7 @@ def test_clean_scans_are_recast_from_the_true_obstacles(recordings, figures):
         found = figures[path]["sonar"]
         assert (
             found["beams"] > 40_000
-            and found["returns_of_moving_bodies"] > 500
+            and found["returns_of_moving_obstacles"] > 500
             and found["no_return_is_max_range"]
         )
         assert found["fitting_share"] >= FIT_SHARE
@@ -260,9 +260,9 @@ def test_the_outcome_follows_from_the_rules(recordings, logs, figures):
             and found["time_error_s"] < 1e-6
         )
     printed = {
-        (method["name"], str(entry["seed"]), str(entry["episode"])): entry["outcome"]
-        for method in recordings["printed"]["methods"]
-        for entry in method["episodes_detail"]
+        (agent["name"], str(entry["seed"]), str(entry["episode"])): entry["outcome"]
+        for agent in recordings["printed"]["agents"]
+        for entry in agent["episodes_detail"]
     }
     outcomes = set()
     for path in recordings["paper"]:
@@ -276,13 +276,13 @@ def test_the_choice_among_evasions_is_redone(logs):
     """From the logged costs: the least candidate or the mean of the best ones, by its velocity."""
     means = least = 0
     for log in logs.values():
-        softness = log.config["teacher"]["softness"]
+        temperature = log.config["behavior"]["temperature"]
         for own in decision_alone.decisions(log):
             velocities, _ = decision_alone.candidates(log, own)
             assert len(velocities) == len(own.costs)
             if own.candidate < 0:
                 chosen = decision_alone.mean_of_the_best(log, own, velocities)
-                assert own.cost <= own.costs.min() + softness + 1e-6
+                assert own.cost <= own.costs.min() + temperature + 1e-6
                 means += 1
             else:
                 assert own.candidate == own.costs.argmin() and own.cost == own.costs.min()

@@ -14,7 +14,7 @@ from uuvtai.kernels.vehicle.dynamics import KGF, thrust_limits
 from uuvtai.learning.world_model import LOG_VAR_BOUNDS
 
 PAGE = (Path(__file__).parents[2] / "docs/paper.md").read_text()
-SAME = {"distill.schedule", "sensors.sonar"}
+SAME = {"distillation.schedule", "sensors.sonar"}
 """keys that differ in writing only (shares of a run with eight digits), or by the sensor preset that every
 command takes"""
 

@@ -63,7 +63,7 @@ def test_a_cell_that_was_changed_by_hand_is_caught(copy, page, cell, changed):
 
 def test_results_that_move_on_leave_the_pages_behind(copy):
     document = json.loads((copy / EVALUATIONS).read_text())
-    document["rows"][0]["methods"]["bt"]["outcomes"] |= {"success": 999, "collision": 1}
+    document["rows"][0]["agents"]["bt"]["outcomes"] |= {"success": 999, "collision": 1}
     (copy / EVALUATIONS).write_text(json.dumps(document))
     assert "+| `pool` (0) | 999/1000 = 99.9 %" in "\n".join(render_results.differences(copy))
     document = json.loads((copy / REPRODUCTION).read_text())
@@ -93,7 +93,7 @@ def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
     kept.write_text("\n".join(line.rpartition(",")[0] for line in kept.read_text().splitlines()))
     assert "`bt` | 503/512 = 98.2 % |" in render_results.grid(copy), "without: none"
     cells = [
-        {"S": 8, "D": d, "v_m_s": v, "method": "bt", "episodes": 40, "time_to_success_mean_s": 9.0,
+        {"S": 8, "D": d, "v_m_s": v, "agent": "bt", "episodes": 40, "time_to_success_mean_s": 9.0,
          "outcomes": {"success": 39, "collision": 0, "ttc": 1, "out_of_tank": 0, "timeout": 0},
          "episode_outcomes": ["ttc", *["success"] * 39]}
         for d, v in ((0, None), (9, 0.6), (9, 1.5))
@@ -122,9 +122,9 @@ def evaluation(folder, n=1000):
     """A run folder as ``uuv eval`` leaves it."""
     ends = {"success": n - 3, "collision": 1, "ttc": 1, "out_of_tank": 0, "timeout": 1}
     agent = {"name": "bt", "episodes": n, "outcomes": ends, "time_mean_s": 9.0, "time_to_success_mean_s": 9.0}
-    agent |= {"causes": [{"label": "late", "count": 3, "share": 1.0}], "episodes_detail": [{}] * n}
+    agent |= {"causes": [{"label": "late_reaction", "count": 3, "share": 1.0}], "episodes_detail": [{}] * n}
     (folder / "eval").mkdir(parents=True)
-    (folder / "eval/result.json").write_text(json.dumps({"methods": [agent], "paired": []}))
+    (folder / "eval/result.json").write_text(json.dumps({"agents": [agent], "paired": []}))
     (folder / "run.json").write_text(json.dumps({"git_sha": "abc", "started": "today", "hardware": {}}))
     return folder
 
@@ -134,9 +134,9 @@ def test_an_evaluation_is_kept_in_its_row_alone(copy, tmp_path):
     render_results.keep_row("pool_0", evaluation(tmp_path / "run"), copy)
     after = json.loads((copy / EVALUATIONS).read_text())
     assert after["rows"][1:] == before["rows"][1:]
-    agents = after["rows"][0]["methods"]
+    agents = after["rows"][0]["agents"]
     assert agents["bt"]["commit"] == "abc" and "episodes_detail" not in agents["bt"]
-    assert agents["best"] == before["rows"][0]["methods"]["best"]
+    assert agents["best"] == before["rows"][0]["agents"]["best"]
     assert all("bt" not in (pair["a"], pair["b"]) for pair in after["rows"][0]["paired"])
     assert (
         "| `pool` (0) | 997/1000 = 99.7 % [99.1, 99.9] | 0.2 % [0.1, 0.7] | 1 / 1 / 0 / 1 |"

@@ -41,7 +41,7 @@ from uuvtai.learning import checkpoint
 from uuvtai.learning.checkpoint import CheckpointError, config_sha256, sha256_of
 from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.folder import of_onnx
-from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.runner import MetricsRecorder, TrainRequest, train
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.drawing import load_recording
@@ -405,7 +405,7 @@ def test_a_checkpoint(here, name, told):
     with pytest.raises(CheckpointError, match=says) as error:
         found = checkpoint.open_checkpoint(path)
         assert name in USED
-        load_pilot(found, 1)
+        load_agent(found, 1)
     assert str(path) in str(error.value), "the message says where"
     answer = told("export", path) + told("eval", path)
     if "pickle" in name:
@@ -418,7 +418,7 @@ WRITTEN = """
 .lock run.json config.yaml metrics.jsonl cells.jsonl sweep.json sweep_request.json reproduce.json report.html
 profile.json checkpoints checkpoints/step_000002 checkpoints/step_000002/model.safetensors
 checkpoints/.partial-step_000003.1 eval eval/result.json eval/tree.json eval/trees eval/trees/bt.xml figures
-figures/methods.png pictures pictures/x.png videos videos/x.webm explain explain/x.png logs logs/x.mcap
+figures/agents.png pictures pictures/x.png videos videos/x.webm explain explain/x.png logs logs/x.mcap
 tensorboard tensorboard/events.out.tfevents.1 anything/else
 """
 """what a run folder may hold, and what a resumed run, a report or an evaluation writes or deletes there"""
@@ -442,7 +442,7 @@ def run(here):
 @pytest.fixture
 def outside(here):
     """A folder elsewhere that nobody may touch."""
-    for name in ("file", "methods.png", "result.json", "manifest.json", "step_000001/manifest.json",
+    for name in ("file", "agents.png", "result.json", "manifest.json", "step_000001/manifest.json",
                  ".partial-x/model.safetensors"):  # fmt: skip
         file = here / "outside" / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -859,10 +859,12 @@ DRAWN = {
     ),
     "no tank": changed(tank={}),
     "a tank of words": changed(tank={"shape": "rectangle", "x_m": ["a", "b"], "y_m": [0, 6]}),
-    "bodies at the end of the world": changed(bodies=[episode.BODIES[0] | {"position": [1e300, 0, 0]}]),
-    "endless bodies": changed(bodies=[episode.BODIES[0]] * 100_000),
+    "obstacles at the end of the world": changed(
+        obstacles=[episode.OBSTACLES[0] | {"position": [1e300, 0, 0]}]
+    ),
+    "endless obstacles": changed(obstacles=[episode.OBSTACLES[0]] * 100_000),
     "no goal": {key: value for key, value in episode.scenario().items() if key != "goal"},
-    "bodies without shape": changed(bodies=[{"position": [1, 2, 3]}]),
+    "obstacles without shape": changed(obstacles=[{"position": [1, 2, 3]}]),
     "a list": [],
 }
 

@@ -227,4 +227,4 @@ def test_an_evaluation_asks_no_server(uuv):
     result = json.loads(
         uuv("eval", "--agent", "bt", "--episodes", "2", "--seeds", "3", *SmallSim.OPTIONS, "--json")
     )
-    assert sum(result["methods"][0]["outcomes"].values()) == 2
+    assert sum(result["agents"][0]["outcomes"].values()) == 2

@@ -16,10 +16,11 @@ from uuvtai.sim.snapshot import capture
 from uuvtai.sim.stages import SimState
 
 KNOWN = {
-    "clock", "mission", "ego", "scan", "echoes", "image", "pose", "tracks", "clusters", "spots", "habits",
+    "clock", "mission", "ego", "scan", "echoes", "image", "pose", "tracks", "clusters", "spots",
+    "turn_history",
     "forecast",
     "futures", "past", "mixture", "mask", "grid_map", "map_scratch",
-    "clearance", "clearance_memory", "voronoi", "route", "features", "teacher", "table", "baselines",
+    "clearance", "clearance_memory", "voronoi", "route", "features", "behavior", "table", "baselines",
 }  # fmt: skip
 """Structs of what the vehicle is told, senses, remembers and decides. Every other struct, a new one too,
 counts as truth."""
@@ -93,15 +94,15 @@ def watched(small, monkeypatch):
     """The session's simulator, writing observations with all the columns there are: only their kernels are
     compiled for it."""
     launch_one_by_one(monkeypatch, small.sim)
-    columns = small.config.features.model_copy(update={"n_track": 4, "teacher": True})
-    configure(monkeypatch, small.sim, small.config.model_copy(update={"features": columns}))
+    columns = small.config.observation.model_copy(update={"n_track": 4, "behavior": True})
+    configure(monkeypatch, small.sim, small.config.model_copy(update={"observation": columns}))
     monkeypatch.setattr(
         small.sim, "observation", torch.zeros(small.N, observation.observation_width(columns))
     )
     memory = small.sim.memory()
     before = memory.read().copy()
     yield small
-    memory.read()[:] = before  # scratch too: other tests never write that of the columns of bodies
+    memory.read()[:] = before  # scratch too: other tests never write that of the columns of obstacles
 
 
 def driven(small, poison=None):
@@ -152,7 +153,7 @@ def test_every_struct_is_known_or_truth():
         "current",
         "path",
         "episode",
-        "referee",
+        "termination",
         "reward",
         "ego_memory",
         "sonar_memory",
@@ -174,7 +175,7 @@ def test_nor_with_an_estimated_pose_and_harsh_readings(watched, monkeypatch):
     assert not torch.equal(actions, exact), "the readings are others"
     apart = np.abs(watched.sim.s.ego.pos_w.to_numpy() - watched.sim.s.vehicle.pos_w.to_numpy())
     assert apart.max() > 0.005
-    assert (watched.sim.s.ego.z_var.to_numpy() > 0).all() and watched.sim.s.pose.mean.to_numpy().any()
+    assert (watched.sim.s.ego.z_var.to_numpy() > 0).all() and watched.sim.s.localization.mean.to_numpy().any()
 
 
 # ----------------------------------------------------------------------------------- the tests above can fail
@@ -185,7 +186,7 @@ def test_the_poison_reaches_whoever_reads_the_truth(watched):
     watched.begin(range(watched.N))
     poison, s = Poison(sim), sim.s
     assert {name.partition(".")[0] for name in poison.arrays} == TRUTH
-    s.clock.awake.fill(1)
+    s.clock.active.fill(1)
     before = s.ego.pos_w.to_numpy()
     poison.on()
     proprioception.sense_proprioception(sim.io.proprioception)

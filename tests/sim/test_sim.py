@@ -22,13 +22,13 @@ SENSED = (
     "scan",
     "image",
     "tracks",
-    "habits",
+    "turn_history",
     "forecast",
     "grid_map",
     "clearance",
     "route",
     "features",
-    "teacher",
+    "behavior",
 )
 """Structs of what the vehicle senses, remembers and decides (clusters are scratch of one scan: slots beyond
 their count are stale)."""
@@ -53,7 +53,7 @@ def test_an_episode_is_the_same_in_any_row_and_company(small, monkeypatch, estim
     """Where the vehicle is told its place nothing writes the pose filter's memory."""
     if estimated:
         estimate_pose(monkeypatch, small)
-    looked_at = (*SENSED, "vehicle", "world", "referee", *["pose"] * estimated)
+    looked_at = (*SENSED, "vehicle", "world", "termination", *["pose"] * estimated)
     small.begin([0, 1, 2, 3])
     for _ in range(120):
         small.sim.step()
@@ -62,7 +62,7 @@ def test_an_episode_is_the_same_in_any_row_and_company(small, monkeypatch, estim
     for _ in range(120):
         small.sim.step()
     again = small.arrays(*looked_at)
-    assert ("pose.mean" in first) == estimated
+    assert ("localization.mean" in first) == estimated
     assert equal(first, again, [0, 1, 2, 3], [6, 4, 5, 1]) == []
     assert equal(first, again, [0], [0]) != [], "another episode must differ"
 
@@ -71,7 +71,7 @@ def test_an_episode_is_the_same_in_any_row_and_company(small, monkeypatch, estim
 def test_a_reset_touches_only_its_rows(small, monkeypatch, estimated):
     if estimated:
         estimate_pose(monkeypatch, small)
-    looked_at = (*SENSED, "vehicle", "world", "referee", "episode", *["pose"] * estimated)
+    looked_at = (*SENSED, "vehicle", "world", "termination", "episode", *["pose"] * estimated)
     small.begin(list(range(8)))
     for _ in range(40):
         small.sim.step()
@@ -89,12 +89,12 @@ def test_the_camera_is_asked_about_heights_only_if_the_config_says_so(small, mon
     asked, sim = [], small.sim
     launch_one_by_one(monkeypatch, sim)
     small.begin([0])
-    monkeypatch.setattr("uuvtai.sim.stack.tracking.track_bodies", lambda *_: None)
+    monkeypatch.setattr("uuvtai.sim.stack.tracking.track_obstacles", lambda *_: None)
     monkeypatch.setattr("uuvtai.sim.stack.height.bound_heights", lambda *_: None)
-    monkeypatch.setattr("uuvtai.sim.stack.camera_tracking.look_at_bodies", lambda *_: asked.append(1))
+    monkeypatch.setattr("uuvtai.sim.stack.camera_tracking.look_at_obstacles", lambda *_: asked.append(1))
     for use, calls in ((True, 3), (False, 0)):
-        changed = small.config.elevation.model_copy(update={"use_camera": use})
-        monkeypatch.setattr(sim, "config", small.config.model_copy(update={"elevation": changed}))
+        changed = small.config.height.model_copy(update={"use_camera": use})
+        monkeypatch.setattr(sim, "config", small.config.model_copy(update={"height": changed}))
         for _ in range(3):
             sim.step()
         assert len(asked) == calls
@@ -141,9 +141,9 @@ def test_scene_is_data(small):
     np.testing.assert_allclose(moving, 1.5, rtol=1e-4)
     sim.set_scenes([(8, 6, 0.6), (2, 0, 0.6), (5, 7, 0.3)])
     small.begin([0, 1, 2, 3])
-    bodies = sim.s.world.kind.to_numpy()[:4] != 0
-    assert bodies[:, :slots].sum(axis=1).tolist() == [8, 2, 5, 8], "dealt out in turn"
-    assert bodies[:, slots:].sum(axis=1).tolist() == [6, 0, 7, 6]
+    obstacles = sim.s.world.kind.to_numpy()[:4] != 0
+    assert obstacles[:, :slots].sum(axis=1).tolist() == [8, 2, 5, 8], "dealt out in turn"
+    assert obstacles[:, slots:].sum(axis=1).tolist() == [6, 0, 7, 6]
     with pytest.raises(ValueError, match="dynamic_capacity"):
         sim.set_scenes([(3, 10, 1.5)])
     sim.set_scenes()

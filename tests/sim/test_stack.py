@@ -37,8 +37,8 @@ def test_an_agent_that_is_neither_preset_nor_file_is_refused():
 
 
 def test_a_stack_touches_nothing_that_makes_an_episode():
-    """World, vehicle, sensors, referee, reward and columns are the request's: rows are paired."""
-    config = load_config("gauntlet", "harsh", overrides={"features.n_track": 2})
+    """World, vehicle, sensors, termination check, reward and columns are the request's: rows are paired."""
+    config = load_config("gauntlet", "harsh", overrides={"observation.n_track": 2})
     other = with_stack(config, "paper")
     same = set(type(config).model_fields) - set(STACK_SECTIONS)
     assert {
@@ -85,7 +85,7 @@ def compared(small, tmp_path_factory):
 
 def test_bt_and_paper_are_two_rows_of_one_table(compared):
     result, folder = compared
-    bt, paper = result["methods"]
+    bt, paper = result["agents"]
     assert (bt["name"], paper["name"], paper["stack"]["tree"]) == ("bt", "paper", tree_of_stack("paper"))
     assert [(d["seed"], d["episode"]) for d in bt["episodes_detail"]] == [
         (d["seed"], d["episode"]) for d in paper["episodes_detail"]
@@ -102,4 +102,4 @@ def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
         "bt_seed5_episode0.mcap",
         "paper_seed5_episode0.mcap",
     ]
-    assert json.loads((folder / "eval/result.json").read_text())["methods"][1]["stack"]["preset"] == "paper"
+    assert json.loads((folder / "eval/result.json").read_text())["agents"][1]["stack"]["preset"] == "paper"

@@ -14,12 +14,12 @@ from tests.bundles import io_for
 from uuvtai import state
 from uuvtai.common import tree_codes as codes
 from uuvtai.common.presets import preset_names
-from uuvtai.config import TeacherConfig
+from uuvtai.config import BehaviorConfig
 from uuvtai.config.behavior import TUNED
 from uuvtai.config.loader import ConfigError, preset_path
 from uuvtai.console.screen import Screen
 from uuvtai.console.views import show_tree
-from uuvtai.kernels.behavior.io import TeacherIO
+from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.tree import tick_with_given_statuses
 from uuvtai.sim.behavior_tree import (
     CONTROLS,
@@ -165,7 +165,7 @@ def test_presets_open_in_groot(name):
     assert with_palette(text) == text
     used = {node.tag for tree in root.findall("BehaviorTree") for node in tree.iter()} - {"BehaviorTree"}
     assert used <= {*LEAVES, *CONTROLS, *DECORATORS}
-    assert len(read_tree(name, TeacherConfig().max_node).kind) <= TeacherConfig().max_node
+    assert len(read_tree(name, BehaviorConfig().max_node).kind) <= BehaviorConfig().max_node
 
 
 @pytest.mark.parametrize("width", [80, 100, 120])
@@ -210,21 +210,21 @@ def test_text_and_dot_name_every_node_and_its_use():
 @pytest.fixture(scope="module")
 def engine():
     sizes = {"n_env": N_BOARD, "n_node": MAX_NODE, "n_candidate": 16, "n_tuned": len(TUNED)}
-    return state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
+    return state.allocate(state.BehaviorState, sizes), state.allocate(state.TreeTable, sizes)
 
 
 def begin(engine, flat):
-    teacher, table = engine
+    behavior, table = engine
     load_tree(table, flat)
-    for array in (teacher.status, teacher.running_child, teacher.ticks):
+    for array in (behavior.status, behavior.running_child, behavior.ticks):
         array.fill(0)
 
 
 def tick(engine, answers):
     """Statuses [env, node] after a tick with the given leaf answers, and the acting node."""
-    teacher, table = engine
-    tick_with_given_statuses(io_for(TeacherIO, teacher, table), np.ascontiguousarray(answers, np.int32))
-    return teacher.status.to_numpy(), teacher.leaf.to_numpy()
+    behavior, table = engine
+    tick_with_given_statuses(io_for(BehaviorIO, behavior, table), np.ascontiguousarray(answers, np.int32))
+    return behavior.status.to_numpy(), behavior.leaf.to_numpy()
 
 
 def random_tree(rng) -> FlatTree:

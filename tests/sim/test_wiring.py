@@ -48,7 +48,7 @@ def trainer_of(script=SCRIPT, **sections):
             "normalise_values": False,
             "entropy_weight": 0.01,
         },
-        "distill": {"steps": 0, "schedule": [[0, 1], [1, 0.2]]},
+        "distillation": {"steps": 0, "schedule": [[0, 1], [1, 0.2]]},
         "uncertainty": {"ema": 1.0, "max_scale": 50.0},
         "train": {"iterations": ITERATIONS},
     }
@@ -163,15 +163,15 @@ def test_the_scale_is_capped_and_follows_the_running_mean():
 
 def first_features(trainer, env):
     """Residual and uncertainty (T, N) that the first iteration of an equal trainer meets."""
-    twin, env = trainer_of(uncertainty={"ema": 1.0, "max_scale": 50.0})
-    collect, models = twin.collector.collect, []
+    surrogate, env = trainer_of(uncertainty={"ema": 1.0, "max_scale": 50.0})
+    collect, models = surrogate.collector.collect, []
 
     def note():
-        models.append(copy.deepcopy(twin.world_model))
+        models.append(copy.deepcopy(surrogate.world_model))
         return collect()
 
-    twin.collector.collect = note
-    twin.iterate()
+    surrogate.collector.collect = note
+    surrogate.iterate()
     return residual_and_uncertainty(
         models[0], *(joined(env.log[-STEPS:], name) for name in ("obs", "action", "final_obs"))
     )
@@ -205,7 +205,7 @@ def test_the_rollout_is_what_happened():
     policy, model, moments = learned_once(trainer, env)
     rollout = trainer.rollout
     for name, of_log in (
-        ("teacher_action", "teacher"),
+        ("teacher_action", "behavior"),
         *((n, n) for n in ("action", "reward", "terminated", "ended")),
     ):
         assert torch.equal(getattr(rollout, name), joined(moments, of_log)), name
@@ -227,8 +227,8 @@ def test_the_rollout_is_what_happened():
 def test_the_world_models_columns_come_from_the_policys_own_action():
     trainer, env = trainer_of()
     _, model, moments = learned_once(trainer, env)
-    obs, action, teacher, final = (
-        joined(moments, name) for name in ("obs", "action", "teacher", "final_obs")
+    obs, action, behavior, final = (
+        joined(moments, name) for name in ("obs", "action", "behavior", "final_obs")
     )
     found, on = trainer.rollout.x[1:, :, -2:], ~trainer.rollout.ended[:-1]
 
@@ -236,7 +236,7 @@ def test_the_world_models_columns_come_from_the_policys_own_action():
         return torch.stack(residual_and_uncertainty(model, obs, by, final), -1)[:-1]
 
     assert torch.allclose(found[on], columns(action)[on], rtol=1e-3)
-    assert not torch.allclose(found[on], columns(teacher)[on], rtol=1e-3)
+    assert not torch.allclose(found[on], columns(behavior)[on], rtol=1e-3)
     assert not found[~on].any() and (~on).any(), "an episode begins with no prediction behind it"
 
 

@@ -1,4 +1,4 @@
-"""The kinematic twin against the simulator and against oracles, and the policy that learns in it."""
+"""The kinematic surrogate against the simulator and against oracles, and the policy that learns in it."""
 
 import copy
 
@@ -9,7 +9,7 @@ import torch
 
 from tests.oracles import hull_rule as reference
 from tests.repository.test_architecture import TRUTH
-from uuvtai.common.enums import BODY_WIDTH, COLLISION, EGO_COLUMNS, N_RAY, RUNNING, SUCCESS, TIMEOUT
+from uuvtai.common.enums import COLLISION, EGO_COLUMNS, N_RAY, OBSTACLE_WIDTH, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.common.errors import UserError
 from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config import TankConfig, VehicleConfig
@@ -20,35 +20,35 @@ from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
 from uuvtai.kernels.core.noise import episode_key
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
 from uuvtai.learning import checkpoint, surrogate_trainer
-from uuvtai.learning.agents import load_set_pilot
+from uuvtai.learning.agents import load_set_agent
 from uuvtai.learning.checkpoint import CheckpointError
-from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.runner import TrainRequest, train
 from uuvtai.learning.set_networks import SetActor
-from uuvtai.learning.surrogate_trainer import Student, TwinTrainer, imitate, wish_of_command
+from uuvtai.learning.surrogate_trainer import Student, SurrogateTrainer, imitate, wish_of_command
 from uuvtai.sim.stages import bind, members_of
 from uuvtai.surrogate import motion, observation, sensing
-from uuvtai.surrogate.arrays import TRACK_WIDTH, ObserverIO, TwinRules
+from uuvtai.surrogate.arrays import TRACK_WIDTH, ObserverIO, SurrogateRules
 from uuvtai.surrogate.world import draw_bank
 
 CLEARANCE_TOL_M = 0.01
-"""the simulator's hull leans by a few degrees, the twin's does not"""
+"""the simulator's hull leans by a few degrees, the surrogate's does not"""
 TTC_TOL_S = 0.1
 """the same, at closing speeds of 0.1 m/s and more"""
 SOON_S = 0.6
-"""bodies that hit within it are near enough for the twin to look at"""
+"""obstacles that hit within it are near enough for the surrogate to look at"""
 FLOAT_TOL = 2e-5
 SMALL = {
     "train.num_envs": 16,
     "ppo.rollout_steps": 8,
     "ppo.minibatches": 2,
-    "twin.body_hidden": 8,
-    "twin.head_hidden": 8,
+    "surrogate.obstacle_hidden": 8,
+    "surrogate.head_hidden": 8,
     "train.evaluate_episodes": 8,
     "train.scenes": [[8, 6, 0.6]],
-    "twin.worlds": ["pool"],
+    "surrogate.worlds": ["pool"],
     "train.iterations": 4,
-    "twin.warm_start_waves": 0,
+    "surrogate.warm_start_waves": 0,
 }
 
 
@@ -70,7 +70,7 @@ def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
 
 
 @ti.kernel
-def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[TwinRules], ray: FloatMatrix):
+def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[SurrogateRules], ray: FloatMatrix):
     for i in range(place.shape[0]):
         sensing.write_rays(i, i, body.shape[1], place[i, 0], place[i, 1], body, ray, io)
 
@@ -80,13 +80,13 @@ def threats(
     near_only: int,
     pose: FloatMatrix,
     moved: FloatMatrix,
-    io: Bundle[TwinRules],
+    io: Bundle[SurrogateRules],
     body: AnyTensor,
     path: AnyTensor,
     out: FloatMatrix,
 ):
-    """Clearance and time to collision after hulls (x, y, z, t) have moved by (x, y, z, t), of the bodies that
-    were found near before, or of all."""
+    """Clearance and time to collision after hulls (x, y, z, t) have moved by (x, y, z, t), of the obstacles
+    that were found near before, or of all."""
     for i in range(pose.shape[0]):
         before = ti.Vector([pose[i, k] for k in ti.static(range(3))])
         after = before + ti.Vector([moved[i, k] for k in ti.static(range(3))])
@@ -101,7 +101,7 @@ def threats(
 
 @ti.kernel
 def watch(at: FloatMatrix, is_seen: int, steps: int, bend_m: float, track: AnyTensor):
-    """Bodies that stay at (x, y) with a velocity, each a row, for so many decisions, seen from (0, 0)."""
+    """Obstacles that stay at (x, y) with a velocity, each a row, for so many decisions, seen from (0, 0)."""
     for i in range(at.shape[0]):
         place = ti.Vector([at[i, 0], at[i, 1], at[i, 2], at[i, 3]])
         for step in range(steps):
@@ -131,7 +131,7 @@ def velocities(wish: FloatMatrix, flip: FloatMatrix, vehicle: Const[VehicleConfi
 
 @ti.kernel
 def earn(
-    nearer: FloatVector, nearest: FloatVector, ended: IntVector, io: Bundle[TwinRules], out: FloatVector
+    nearer: FloatVector, nearest: FloatVector, ended: IntVector, io: Bundle[SurrogateRules], out: FloatVector
 ):
     for i in range(out.shape[0]):
         out[i] = motion.earned(nearer[i], nearest[i], ended[i], io)
@@ -139,7 +139,7 @@ def earn(
 
 @pytest.fixture(scope="module")
 def config():
-    return load_training("twin", overrides=SMALL)
+    return load_training("surrogate", overrides=SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def bank(small):
 @pytest.fixture(scope="module")
 def trainer(config, bank):
     """After two iterations."""
-    made = TwinTrainer(config, bank)
+    made = SurrogateTrainer(config, bank)
     made.iterate()
     made.iterate()
     return made
@@ -171,7 +171,8 @@ def saved(trainer, config, tmp_path):
     return save
 
 
-# ------------------------------------------------------------------------------------------------- the twin
+# ------------------------------------------------------------------------------------------------- the
+# surrogate
 
 
 def test_the_hull_rule_is_that_of_the_oracle():
@@ -190,7 +191,7 @@ def test_the_hull_rule_is_that_of_the_oracle():
     np.testing.assert_allclose(out.numpy(), expected, atol=1e-5)
 
 
-def test_bodies_move_as_in_closed_form(small, bank):
+def test_obstacles_move_as_in_closed_form(small, bank):
     small.begin(range(small.N), seed=5)
     times = torch.linspace(0.0, 50.0, small.N)
     out = torch.zeros(*bank.path.shape[:2], 4)
@@ -199,7 +200,7 @@ def test_bodies_move_as_in_closed_form(small, bank):
     for row in range(small.N):
         arrays = {k: v[row] for k, v in small.arrays("world", "path", "mission").items()}
         first = bank.body.shape[1] - bank.path.shape[1]
-        for body in describe_scenario(lambda name, arrays=arrays: arrays[name])["bodies"]:
+        for body in describe_scenario(lambda name, arrays=arrays: arrays[name])["obstacles"]:
             if body["path"]:
                 near = np.array([times[row] - 1e-3, times[row], times[row] + 1e-3])
                 way = path_positions(body["path"], near)
@@ -211,7 +212,7 @@ def test_bodies_move_as_in_closed_form(small, bank):
 
 
 def states_of(sim):
-    """(n, 12) rows for ``judge_states``."""
+    """(n, 12) rows for ``check_states``."""
     rows, s = sim.rows, sim.s
     w, x, y, z = rows(s.vehicle.quat_wb).T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -228,15 +229,19 @@ def test_the_referee_is_the_simulators(small, bank, config):
     through whatever is in the way."""
     small.sim.use_tree(small.trees["straight"])
     small.begin(range(small.N), seed=5)
-    rules, compared, verdicts = bind(TwinRules, config), 0, set()
+    rules, compared, verdicts = bind(SurrogateRules, config), 0, set()
     for step in range(500):
         small.sim.step()
         if step % 5:
             continue
-        rows, referee = small.sim.rows, small.sim.s.referee
+        rows, termination = small.sim.rows, small.sim.s.termination
         seen, outcome = torch.zeros(small.N, 2), torch.zeros(small.N, dtype=torch.int32)
-        motion.judge_states(rules, states_of(small.sim), bank.body, bank.path, seen, outcome)
-        clearance, ttc, ended = rows(referee.clearance_m), rows(referee.ttc_s), rows(referee.outcome)
+        motion.check_states(rules, states_of(small.sim), bank.body, bank.path, seen, outcome)
+        clearance, ttc, ended = (
+            rows(termination.clearance_m),
+            rows(termination.ttc_s),
+            rows(termination.outcome),
+        )
         near, soon = clearance < motion.NEAR_M, (ttc < SOON_S) & (ttc > 0.0)
         np.testing.assert_allclose(seen[near, 0], clearance[near], atol=CLEARANCE_TOL_M)
         np.testing.assert_allclose(seen[soon, 1], ttc[soon], atol=TTC_TOL_S)
@@ -247,22 +252,22 @@ def test_the_referee_is_the_simulators(small, bank, config):
     assert compared > 5 and len(verdicts) >= 3
 
 
-def test_far_bodies_are_left_out(config):
-    rules, far = bind(TwinRules, config), torch.zeros(1, 1, 8)
+def test_far_obstacles_are_left_out(config):
+    rules, far = bind(SurrogateRules, config), torch.zeros(1, 1, 8)
     far[0, 0] = torch.tensor([1.0, 15.0, 3.0, -0.8, 0.2, 0.2, 0.2, 0.0])
     pose = torch.tensor([[5.0, 3.0, -0.8, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 18.0, 3.0, -0.8]])
     seen, outcome = torch.zeros(1, 2), torch.zeros(1, dtype=torch.int32)
-    motion.judge_states(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
+    motion.check_states(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
     assert seen[0, 1] == FAR_M and outcome[0] == 0
     assert seen[0, 0] == pytest.approx(3.0 - 0.17, abs=FLOAT_TOL)  # the side walls
 
 
 @pytest.mark.parametrize("slots", [0, 30])
-def test_no_body_that_can_come_near_is_left_out(bank, config, slots):
+def test_no_obstacle_that_can_come_near_is_left_out(bank, config, slots):
     """Nothing changes where those alone are looked at that were near when the decision began, however the
     hull has moved since; nor where there are more slots than an integer has bits."""
     rng, count = np.random.default_rng(3), len(bank.body)
-    rules, changed = bind(TwinRules, config), 0
+    rules, changed = bind(SurrogateRules, config), 0
     body = torch.cat([torch.zeros(count, slots, 8), bank.body], dim=1).contiguous()
     for _ in range(200):
         pose, moved = rng.uniform(0, 1, (count, 4)), rng.uniform(-1, 1, (count, 4))
@@ -275,18 +280,19 @@ def test_no_body_that_can_come_near_is_left_out(bank, config, slots):
         threats(1, pose, moved, rules, body, bank.path, near)
         assert torch.equal(near, all_of_them)
         changed += int((near[:, 1] < FAR_M).sum())
-    assert changed > 100, "bodies come closer"
+    assert changed > 100, "obstacles come closer"
 
 
-def free_m(x, y, bodies, tank):
-    """Along 24 rays, in float64, each ray against each body: what the twin looks up by directions."""
+def free_m(x, y, obstacles, tank):
+    """Along 24 rays, in float64, each ray against each obstacle: what the surrogate looks up by
+    directions."""
     angle = np.arange(N_RAY) * 2 * np.pi / N_RAY
     u = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     with np.errstate(divide="ignore"):
         ends = [np.where(u[:, a] > 0, (bound[1] - at) / u[:, a], (bound[0] - at) / u[:, a])
                 for a, (at, bound) in enumerate(((x, tank.x_m), (y, tank.y_m)))]  # fmt: skip
         out = np.minimum(*[np.where(abs(u[:, a]) < 1e-6, 99.0, end) for a, end in enumerate(ends)])
-    for kind, bx, by, _, wide, deep, _, yaw in bodies:
+    for kind, bx, by, _, wide, deep, _, yaw in obstacles:
         d = np.array([bx - x, by - y])
         if kind == BOX:
             c, s = np.cos(yaw), np.sin(yaw)
@@ -315,28 +321,29 @@ def test_rays_meet_what_stands_in_their_way(config):
     body[..., 4:6], body[..., 7] = rng.uniform(0.1, 0.8, (count, 5, 2)), rng.uniform(-7, 7, (count, 5))
     ray = torch.zeros(count, N_RAY)
     place, body = (torch.from_numpy(a.astype(np.float32)) for a in (place, body))
-    look_along(place, body, bind(TwinRules, config), ray)
+    look_along(place, body, bind(SurrogateRules, config), ray)
     wanted = [
         free_m(*at, row, tank) for at, row in zip(place.double().numpy(), body.double().numpy(), strict=True)
     ]
     off = abs(ray.numpy() - wanted) > 1e-3
     assert off.mean() < 1e-3, "but for rays that touch an edge"
     bare = [free_m(*at, [], tank) for at in place.double().numpy()]
-    assert (np.array(bare) > np.array(wanted) + 0.1).mean() > 0.1, "bodies are in the way"
+    assert (np.array(bare) > np.array(wanted) + 0.1).mean() > 0.1, "obstacles are in the way"
 
 
 def test_rewards_by_hand(config):
     nearer, nearest = torch.tensor([0.08, 0.0, -0.02, 0.1]), torch.tensor([9.0, 0.25, 0.05, 2.0])
     ended = torch.tensor([RUNNING, TIMEOUT, COLLISION, SUCCESS], dtype=torch.int32)
-    reward, twin = torch.zeros(4), config.twin
-    earn(nearer, nearest, ended, bind(TwinRules, config), reward)
-    close = (1.0 - nearest / twin.soft_clearance_m).clamp(0.0, 1.0)
-    expected = twin.progress * nearer - 0.1 * (twin.time_cost + twin.closeness_cost * close)
+    reward, surrogate = torch.zeros(4), config.surrogate
+    earn(nearer, nearest, ended, bind(SurrogateRules, config), reward)
+    close = (1.0 - nearest / surrogate.soft_clearance_m).clamp(0.0, 1.0)
+    expected = surrogate.progress * nearer - 0.1 * (surrogate.time_cost + surrogate.closeness_cost * close)
     assert torch.allclose(reward, expected + torch.tensor([0.0, 0.0, -1.0, 1.0]), atol=1e-6)
 
 
 def watched(far_m, steps, is_seen=1, count=4000, radius_m=None, track=None):
-    """Tracks (count, 9) of bodies so far ahead that go across at 1 m/s, on a circle where it has a radius."""
+    """Tracks (count, 9) of obstacles so far ahead that go across at 1 m/s, on a circle where it has a
+    radius."""
     at = torch.tensor([[far_m, 0.0, 0.0, 1.0]]).repeat(count, 1)
     track = torch.zeros(count, 1, TRACK_WIDTH) if track is None else track
     watch(at, is_seen, steps, radius_m or 0.0, track)
@@ -385,35 +392,35 @@ def born_of(track):
 
 
 def test_neither_order_nor_empty_rows_matter(config):
-    actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
     for parameter in actor.parameters():  # biases too: an empty row must not count for what it gives
         torch.nn.init.normal_(parameter, std=0.3, generator=torch.Generator().manual_seed(2))
-    bodies, own = torch.randn(5, 4, BODY_WIDTH), torch.randn(5, EGO_COLUMNS)
-    bodies[..., 0] = 1.0
-    said = actor(bodies, own)
-    assert torch.allclose(actor(bodies[:, [2, 0, 3, 1]], own), said, atol=1e-5)
-    padded = torch.cat([bodies, torch.zeros(5, 5, BODY_WIDTH)], dim=1)
+    obstacles, own = torch.randn(5, 4, OBSTACLE_WIDTH), torch.randn(5, EGO_COLUMNS)
+    obstacles[..., 0] = 1.0
+    said = actor(obstacles, own)
+    assert torch.allclose(actor(obstacles[:, [2, 0, 3, 1]], own), said, atol=1e-5)
+    padded = torch.cat([obstacles, torch.zeros(5, 5, OBSTACLE_WIDTH)], dim=1)
     assert torch.allclose(actor(padded, own), said, atol=1e-5)
-    assert not torch.allclose(actor(bodies[:, :3], own), said, atol=1e-3)
+    assert not torch.allclose(actor(obstacles[:, :3], own), said, atol=1e-3)
 
 
 def test_what_drives_knows_nothing_that_only_the_simulator_knows(saved):
     assert not set(members_of(ObserverIO).values()) & TRUTH
     found = saved()
     assert list(found.model()) == ["policy"]
-    own = SetActor(BODY_WIDTH, EGO_COLUMNS, found.config, torch.Generator()).state_dict()
+    own = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, found.config, torch.Generator()).state_dict()
     assert {n: t.shape for n, t in found.model()["policy"].items()} == {n: t.shape for n, t in own.items()}
-    assert max(row["stop"] for row in found.manifest.observation_table) == EGO_COLUMNS + 9 * BODY_WIDTH
+    assert max(row["stop"] for row in found.manifest.observation_table) == EGO_COLUMNS + 9 * OBSTACLE_WIDTH
 
 
 def test_the_critic_alone_feels_the_truth(trainer):
-    view = trainer.twin.look()
+    view = trainer.surrogate.look()
     other = view.truth + torch.randn(view.truth.shape) * (view.truth[..., 2:3] > 0)
-    assert not torch.equal(trainer.critic(view.bodies, view.own, other), trainer.critic(*view))
+    assert not torch.equal(trainer.critic(view.obstacles, view.own, other), trainer.critic(*view))
 
 
 def test_learning_goes_on_from_a_state_bit_for_bit(trainer, config, bank):
-    other = TwinTrainer(config, bank)
+    other = SurrogateTrainer(config, bank)
     other.load_state(copy.deepcopy(trainer.state()))
     kept = copy.deepcopy(trainer.state())
     ours, theirs = trainer.iterate(), other.iterate()
@@ -445,10 +452,12 @@ def test_a_command_becomes_the_wish_with_its_velocity():
 def test_it_learns_what_the_tree_says(small, monkeypatch):
     monkeypatch.setattr(surrogate_trainer, "PASSES", 1)
     losses, decisions = [], []
-    config = load_training("twin", overrides=SMALL | {"train.num_envs": small.N, "twin.warm_start_waves": 2})
+    config = load_training(
+        "surrogate", overrides=SMALL | {"train.num_envs": small.N, "surrogate.warm_start_waves": 2}
+    )
     for passes in (1, 20):
         monkeypatch.setattr(surrogate_trainer, "LAST_PASSES", passes)
-        actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+        actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
         std = actor.log_std.detach().clone()
         found = imitate(actor, config, ((8, 6, 0.6),), {"pool": small.sim})
         losses.append(found["warm_start/loss"])
@@ -458,22 +467,22 @@ def test_it_learns_what_the_tree_says(small, monkeypatch):
 
 
 def test_the_tree_alone_drives_as_without_a_student(small):
-    config = load_training("twin", overrides=SMALL)
-    actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    config = load_training("surrogate", overrides=SMALL)
+    actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
     student = Student(actor, small.sim, config, torch.Generator().manual_seed(0))
     small.begin(range(small.N), seed=9)
     student.reset(torch.ones(small.N))
-    for share, driver in ((1.0, small.sim.action), (0.0, None)):
+    for share, agent in ((1.0, small.sim.action), (0.0, None)):
         student.tree_share = share
         said = student.decide(small.sim.action).action
-        expected = student.decision.action if driver is None else driver
+        expected = student.decision.action if agent is None else agent
         assert torch.equal(said, expected)
     assert len(student.samples) == 2 and len(student.samples[0].wish) == small.N
 
 
 def test_what_clearly_pays_is_the_presets():
-    twin, quick = load_training("twin").twin, load_training("quick").twin
-    assert twin.warm_start_waves > 0
+    surrogate, quick = load_training("surrogate").surrogate, load_training("quick").surrogate
+    assert surrogate.warm_start_waves > 0
     assert quick.warm_start_waves == 0, "it learns from nothing"
 
 
@@ -481,10 +490,10 @@ def test_what_clearly_pays_is_the_presets():
 
 
 def test_it_drives_whatever_the_order_of_the_episodes(small, saved):
-    pilot = load_set_pilot(saved(), small.sim)
+    pilot = load_set_agent(saved(), small.sim)
     jobs = jobs_of([3], 5)
-    forth, _ = run_episodes(small.sim, jobs, driver=pilot)
-    back, _ = run_episodes(small.sim, jobs[::-1], driver=pilot)
+    forth, _ = run_episodes(small.sim, jobs, agent=pilot)
+    back, _ = run_episodes(small.sim, jobs[::-1], agent=pilot)
     assert [(r.outcome, r.time_s, r.path_length_m) for r in forth] == [
         (r.outcome, r.time_s, r.path_length_m) for r in back[::-1]
     ]
@@ -492,7 +501,7 @@ def test_it_drives_whatever_the_order_of_the_episodes(small, saved):
 
 
 def test_asking_again_changes_nothing(small, saved):
-    pilot = load_set_pilot(saved(), small.sim)
+    pilot = load_set_agent(saved(), small.sim)
     small.begin(range(small.N), seed=9)
     pilot.reset(torch.ones(small.N))
     first = pilot.decide(torch.zeros(0)).action
@@ -503,7 +512,7 @@ def test_rays_end_at_the_walls(small):
     small.begin(range(small.N), seed=5)
     io = bind(ObserverIO, small.sim.s, small.sim.config)
     ego, raw, ray = torch.zeros(small.N, 21), torch.zeros(small.N, 9, 14), torch.zeros(small.N, 24)
-    observation.observe_bodies(io, torch.ones(small.N, dtype=torch.int32), ego, raw, ray)
+    observation.observe_obstacles(io, torch.ones(small.N, dtype=torch.int32), ego, raw, ray)
     y = small.sim.rows(small.sim.s.ego.pos_w)[:, 1]
     assert (ray[:, 6].numpy() <= 6.0 - y + 0.2).all() and (ray[:, 18].numpy() <= y + 0.2).all()
     assert bool((ray > 0.3).all())
@@ -516,43 +525,43 @@ def test_rays_end_at_the_walls(small):
     ("change", "says"),
     [
         (lambda part: part.pop("log_std"), "not those of its config"),
-        (lambda part: part.update({"net.body.0.weight": torch.zeros(9, BODY_WIDTH)}), "instead of"),
+        (lambda part: part.update({"net.body.0.weight": torch.zeros(9, OBSTACLE_WIDTH)}), "instead of"),
         (lambda part: part.update(log_std=torch.full((3,), float("nan"))), "log_std is not finite"),
     ],
 )
 def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
     with pytest.raises(CheckpointError, match=says):
-        load_set_pilot(saved(change), small.sim)
+        load_set_agent(saved(change), small.sim)
 
 
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
-        ("policy.residual", True, "the twin has none"),
-        ("world_model.enabled", True, "the twin has none"),
+        ("policy.residual", True, "the surrogate has none"),
+        ("world_model.enabled", True, "the surrogate has none"),
         ("policy.hold_steps", 4, "decides every 0.1 s"),
         ("episode.control_dt_s", 0.01, "decides every 0.1 s"),
         ("ppo.minibatches", 200, "only 128 samples"),
     ],
 )
-def test_what_the_twin_lacks_is_refused(bank, key, value, says):
+def test_what_the_surrogate_lacks_is_refused(bank, key, value, says):
     with pytest.raises(UserError, match=says):
-        TwinTrainer(load_training("twin", overrides=SMALL | {key: value}), bank)
+        SurrogateTrainer(load_training("surrogate", overrides=SMALL | {key: value}), bank)
 
 
-def test_the_trainer_knows_how_long_the_twin_holds_a_decision():
+def test_the_trainer_knows_how_long_the_surrogate_holds_a_decision():
     assert surrogate_trainer.HOLD_STEPS == motion.STEPS
     assert surrogate_trainer.DECISION_S == sensing.DT_S
 
 
 def test_it_is_no_policy_of_one_observation(saved):
     with pytest.raises(CheckpointError, match="looks at the simulator itself"):
-        load_pilot(saved(), 1)
+        load_agent(saved(), 1)
 
 
 @pytest.mark.parametrize("world", ["netpen", "transfer"])
 def test_worlds_of_another_tank_are_refused(world):
-    other = load_training("twin", overrides=SMALL | {"twin.worlds": [world]})
+    other = load_training("surrogate", overrides=SMALL | {"surrogate.worlds": [world]})
     with pytest.raises(ConfigError, match=f"{world} has another tank"):
         draw_bank(other, ((8, 6, 0.6),), 0, 1)
 
@@ -566,4 +575,4 @@ def test_a_gpu_is_refused_before_anything_is_written(config, tmp_path):
 
 
 def test_the_defaults_are_off():
-    assert not LearningConfig().twin.enabled
+    assert not LearningConfig().surrogate.enabled

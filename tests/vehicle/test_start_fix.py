@@ -10,16 +10,16 @@ from uuvtai.vehicle.onboard import DvlReading, ImuReading, SonarPing
 from uuvtai.vehicle.start_fix import LONGEST_S, MISFIT, StartFix, WallWatch, expected
 from uuvtai.vehicle.telemetry import ping_of, sectors_of
 
-BODIES = ((9.0, 4.4, 0.35), (12.0, 1.2, 0.3), (6.0, 5.0, 0.25), (15.5, 3.2, 0.4), (3.6, 1.4, 0.3))
+OBSTACLES = ((9.0, 4.4, 0.35), (12.0, 1.2, 0.3), (6.0, 5.0, 0.25), (15.5, 3.2, 0.4), (3.6, 1.4, 0.3))
 """(x, y, radius) [m] of what stands in the tank, unknown to the fix"""
 
 
-def ranges(config, pose, rng, bodies=BODIES):
+def ranges(config, pose, rng, obstacles=OBSTACLES):
     """(range, hit) of a scan from ``pose`` (x, y, yaw), with the sonar's noise."""
     sonar = config.sensors.sonar
     bearing = pose[2] + sonar.first_beam_rad + sonar.beam_step_rad * np.arange(sonar.n_ray)
     r = expected(config.world.tank, np.tile(pose[:2], (sonar.n_ray, 1)), bearing)[0]
-    for x, y, radius in bodies:
+    for x, y, radius in obstacles:
         along = (x - pose[0]) * np.cos(bearing) + (y - pose[1]) * np.sin(bearing)
         room = radius**2 - (x - pose[0]) ** 2 - (y - pose[1]) ** 2 + along**2
         near = along - np.sqrt(np.maximum(room, 0.0))
@@ -29,7 +29,7 @@ def ranges(config, pose, rng, bodies=BODIES):
     return r + noise + sonar.range_jitter_m * rng.exponential(size=sonar.n_ray), hit
 
 
-def played(config, true, typed, turn, seed=0, rate=0.35, bodies=BODIES, coarse=False, dt=0.1):
+def played(config, true, typed, turn, seed=0, rate=0.35, obstacles=OBSTACLES, coarse=False, dt=0.1):
     """(fix, pose at its end) of a vehicle at ``true`` (x, y, yaw) that takes its yaw for larger by ``turn``
     and its place for ``typed``; after 3 s it is turned around at ``rate`` [rad/s]. ``coarse``: by sectors, as
     MAVLink tells it."""
@@ -40,7 +40,7 @@ def played(config, true, typed, turn, seed=0, rate=0.35, bodies=BODIES, coarse=F
         rpy = np.array([0.0, 0.0, math.remainder(pose[2] + turn, math.tau)])
         fix.feed(ImuReading(dt * k, rpy, np.zeros(3), np.zeros(3)))
         fix.feed(DvlReading(dt * k, np.zeros(3)))
-        r, hit = ranges(config, pose, rng, bodies)
+        r, hit = ranges(config, pose, rng, obstacles)
         ping = SonarPing(dt * k, r, hit, np.zeros(0))
         if coarse:
             distances, increment, offset = sectors_of(sonar, r, hit)
@@ -92,7 +92,7 @@ def test_what_cannot_be_checked_is_refused(true, typed, rate, why):
     assert why in fix.result.refusal and "--start" in fix.result.refusal
 
 
-def watched(config, true, believed, bodies=BODIES):
+def watched(config, true, believed, obstacles=OBSTACLES):
     """What the watch says after 4 s at ``true`` (x, y, yaw), which is taken for ``believed``."""
     watch, rng, n = WallWatch(config), np.random.default_rng(3), config.sensors.sonar.n_ray
     views = {
@@ -103,7 +103,7 @@ def watched(config, true, believed, bodies=BODIES):
     views["scan.ping_pos_w"], views["scan.new_count"] = np.array([[*believed[:2], -0.8]]), np.array([n])
     views["scan.new_from"] = np.zeros(1, int)
     for views["clock.step"][0] in range(0, 200, 10):
-        r, hit = ranges(config, true, rng, bodies)
+        r, hit = ranges(config, true, rng, obstacles)
         views["scan.range_m"], views["scan.hit"] = r[None], hit[None].astype(int)
         found = watch.look(views)
     return found

@@ -14,7 +14,7 @@ PALETTE = (*SERIES, "#8d5524", "#6a3d9a", "#999933", "#882255", "#332288", "#117
 """Every colour that a line or a swatch can have; the page has a lighter one for each on a dark screen."""
 
 _BLUE, _VERMILLION, _GREEN, _PURPLE, _ORANGE, _SKY, _BROWN, _VIOLET, _OLIVE, _WINE, _INDIGO, _FOREST = PALETTE
-_METHODS = {
+_AGENTS = {
     "bt": _BLUE,
     "planner": _ORANGE,
     "straight": _GREEN,
@@ -28,7 +28,7 @@ _METHODS = {
 }
 _TRUTH = "+truth"
 _SPARE = (_PURPLE, _BROWN, _VIOLET, _SKY, _GREEN, _ORANGE, _BLUE)
-"""For methods without a colour, in this order. Vermillion is for moving bodies in pictures."""
+"""For agents without a colour, in this order. Vermillion is for moving obstacles in pictures."""
 
 DARK, LIGHT = "#000000", "#ffffff"
 
@@ -43,8 +43,8 @@ def shade(share: float) -> str:
     )
 
 
-def method_colours(names: Sequence[str]) -> dict[str, str]:
-    """Name -> '#rrggbb'. A known method has one colour everywhere; others take what is free, in order."""
+def agent_colours(names: Sequence[str]) -> dict[str, str]:
+    """Name -> '#rrggbb'. A known agent has one colour everywhere; others take what is free, in order."""
     known = {name: colour for name in names if (colour := _known(name)) is not None}
     free = [colour for colour in _SPARE if colour not in known.values()] or list(_SPARE)
     others = list(dict.fromkeys(name for name in names if name not in known))
@@ -57,7 +57,7 @@ def on_page(colour: str) -> str:
 
 
 def _known(name: str) -> str | None:
-    return _SKY if name.endswith(_TRUTH) else _METHODS.get(name)
+    return _SKY if name.endswith(_TRUTH) else _AGENTS.get(name)
 
 
 def ink_on(background: str) -> str:

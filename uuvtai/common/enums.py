@@ -3,10 +3,10 @@
 OUTCOMES = ("running", "success", "collision", "ttc", "out_of_tank", "timeout")  # names by code
 RUNNING, SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT = range(len(OUTCOMES))
 
-ENDINGS = OUTCOMES[1:]  # exclusive; every finished episode has one
+FINAL_OUTCOMES = OUTCOMES[1:]  # exclusive; every finished episode has one
 COLLIDED = ("collision", "ttc", "out_of_tank")
 """what counts as a collision in every rate: contact, a stop by time to collision, leaving the tank"""
-LETTERS: dict[str, str] = dict(zip(ENDINGS, "scxot", strict=True))
+LETTERS: dict[str, str] = dict(zip(FINAL_OUTCOMES, "scxot", strict=True))
 """of the endings, for a row of episodes as one word"""
 
 
@@ -71,11 +71,11 @@ class Truth:
     ``tests/repository/test_architecture.py`` reads it."""
 
 
-# ---- A policy over a set of bodies in numbers: widths of what it is told, and of the rule that lays its wish
-# on the hull. Read by kernels, by what learns, and by what is exported without them.
+# ---- A policy over a set of obstacles in numbers: widths of what it is told, and of the rule that lays its
+# wish on the hull. Read by kernels, by what learns, and by what is exported without them.
 
-N_BODY = 9  # moving bodies that the policy sees, the nearest ones
-BODY_WIDTH = 22  # columns of a body
+N_OBSTACLE = 9  # moving obstacles that the policy sees, the nearest ones
+OBSTACLE_WIDTH = 22  # columns of an obstacle
 OWN_WIDTH = 17  # columns of the vehicle and its goal
 N_RAY = 24  # rays of free distance around the vehicle
 EGO_COLUMNS = OWN_WIDTH + N_RAY  # columns of the vehicle's own, rays included

@@ -24,7 +24,7 @@ class DeviceError(UserError, RuntimeError):
 
 
 class OwnCodeError(UserError, RuntimeError):
-    """A piece that the user brought has failed; its ``__cause__`` is what was raised in her code."""
+    """A plugin that the user brought has failed; its ``__cause__`` is what was raised in her code."""
 
 
 ODD = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)

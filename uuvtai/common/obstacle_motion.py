@@ -1,7 +1,7 @@
-"""One scenario in closed form: what is in it, and where its bodies are at any time.
+"""One scenario in closed form: what is in it, and where its obstacles are at any time.
 
-Plain Python and NumPy in float64. The simulator moves its bodies by the same formula in float32
-(``kernels/world/motion.py``); logs, pictures and the privileged yardsticks take it from here.
+Plain Python and NumPy in float64. The simulator moves its obstacles by the same formula in float32
+(``kernels/world/motion.py``); logs, pictures and the oracles take it from here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ Read = Callable[[str], np.ndarray]  # One env's row of a field of the state, by 
 
 
 def describe_scenario(read: Read) -> dict[str, Any]:
-    """One scenario as a document: where every body is at any time follows from this (``body_positions``).
+    """One scenario as a document: where every obstacle is at any time follows from this
+    (``obstacle_positions``).
 
     Positions [m] in the world frame, angles [rad], times from the episode's start.
     """
@@ -27,7 +28,7 @@ def describe_scenario(read: Read) -> dict[str, Any]:
         for name in ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s")
     }
     first_moving = len(kind) - len(path["n_way"])
-    bodies = []
+    obstacles = []
     for slot in range(len(kind)):
         if kind[slot] in KIND_NAMES:
             lane = slot - first_moving
@@ -39,7 +40,7 @@ def describe_scenario(read: Read) -> dict[str, Any]:
                 "yaw": float(yaw[slot]),
                 "path": None if lane < 0 else _path({name: rows[lane] for name, rows in path.items()}),
             }
-            bodies.append(body)
+            obstacles.append(body)
     return {
         "start": read("mission.start_w").tolist(),
         "start_yaw": float(read("mission.start_yaw")),
@@ -47,7 +48,7 @@ def describe_scenario(read: Read) -> dict[str, Any]:
         "layout_draws": int(read("world.draws")),
         "unclear_paths": int(read("world.unclear_paths")),
         "faults": int(read("world.faults")),
-        "bodies": bodies,
+        "obstacles": obstacles,
     }
 
 
@@ -75,7 +76,7 @@ def path_positions(path: dict[str, Any], times_s: np.ndarray) -> np.ndarray:
     return corners[leg] + share[:, None] * legs[leg]
 
 
-def body_positions(body: dict[str, Any], times_s: np.ndarray) -> np.ndarray:
+def obstacle_positions(body: dict[str, Any], times_s: np.ndarray) -> np.ndarray:
     """Centres (n, 3) [m] of a document's body at these times (n,) [s]."""
     if body["path"] is None:
         return np.tile(np.array(body["position"], float), (len(times_s), 1))

@@ -1,4 +1,4 @@
-"""Names of the presets that are shipped: what the help, the completion and the loader all read, quickly."""
+"""Names of the presets that are built in: what the help, the completion and the loader all read, quickly."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ TRAINING_TREE = "bt"
 
 
 def preset_names(kind: str) -> list[str]:
-    """Names of what is shipped of a kind (``KINDS``)."""
+    """Names of what is built in of a kind (``KINDS``)."""
     folder = PRESET_DIR / KINDS[kind]
     return sorted(path.stem for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
 
 
-def shipped_file(kind: str, name: str) -> Path:
-    """File of a shipped preset."""
+def built_in_file(kind: str, name: str) -> Path:
+    """File of a built-in preset."""
     return PRESET_DIR / KINDS[kind] / f"{name}{'.xml' if kind == 'tree' else '.yaml'}"

@@ -1,4 +1,4 @@
-"""Intervals for rates and means, paired comparison of methods, and the two time figures. Hand-checked in
+"""Intervals for rates and means, paired comparison of agents, and the two time figures. Hand-checked in
 tests/common/test_statistics.py."""
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def bootstrap_interval(values: Sequence[float], resamples: int = _RESAMPLES) -> 
 
 
 def mcnemar_p(only_a: int, only_b: int) -> float:
-    """Two-sided exact p value of McNemar's test (1947): pairs in which only one of two methods succeeded,
+    """Two-sided exact p value of McNemar's test (1947): pairs in which only one of two agents succeeded,
     binomial with p = 1/2.
 
     1 where there is no such pair. Raises ValueError for negative counts.

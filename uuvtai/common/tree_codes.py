@@ -68,7 +68,9 @@ LEAVES = {
         EMERGENCY_TTC, "ttc_s range_m", "sonar: contact sooner than ttc_s, or closing in within range_m"
     ),
     "PredictedConflict": _condition(
-        PREDICTED_CONFLICT, "within_s calm_s", "a forecast body comes too close; holds calm_s longer"
+        PREDICTED_CONFLICT,
+        "within_s hysteresis_s",
+        "a forecast obstacle comes too close; holds hysteresis_s longer",
     ),
     "RouteBlocked": _condition(
         ROUTE_BLOCKED, "clearance_m", "mapped clearance on the way to the look-ahead point is too small"
@@ -77,7 +79,7 @@ LEAVES = {
     "HasRoute": _condition(HAS_ROUTE, "", "a route exists"),
     "GoalNear": _condition(GOAL_NEAR, "distance_m", "the goal is closer than distance_m"),
     "SafeHere": _condition(
-        SAFE_HERE, "within_s", "stopping here conflicts with no forecast body within within_s, or at all"
+        SAFE_HERE, "within_s", "stopping here conflicts with no forecast obstacle within within_s, or at all"
     ),
     "BackOff": _action(BACK_OFF, "speed_m_s", "retreat from the sensed threat"),
     "Evade": _action(EVADE, "", "drive the evasive velocity of least cost"),

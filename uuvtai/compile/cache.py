@@ -29,7 +29,7 @@ from uuvtai.config import Section
 
 # ------------------------------------------------------------------------------------------------------------
 # What of the config a kernel's code depends on: what was read and decided while Taichi compiled it, and
-# nothing else. So another horizon compiles the referee anew, and not the sonar.
+# nothing else. So another horizon compiles the termination check anew, and not the sonar.
 
 
 ALL = "*"
@@ -39,7 +39,7 @@ ALL = "*"
 @contextlib.contextmanager
 def noted(bundle: Any, spare: int = 0) -> Iterator[tuple[set[str], Numbers]]:
     """Names of the values of this bundle's sections that code depends on which Taichi compiles meanwhile
-    ('teacher_cfg.n_heading'), and the numbers that are its arguments."""
+    ('behavior_cfg.n_heading'), and the numbers that are its arguments."""
     names: set[str] = set()
     numbers = Numbers(names.add, spare)
     places: dict[int, list[str]] = {}

@@ -16,16 +16,16 @@ from uuvtai.config.baselines import (
     PotentialFieldConfig,
     VelocityObstacleConfig,
 )
-from uuvtai.config.behavior import FastConfig, SlowConfig, TeacherConfig
+from uuvtai.config.behavior import BehaviorConfig, FastConfig, SlowConfig
 from uuvtai.config.perception import (
-    ElevationConfig,
+    CameraTrackingConfig,
     ForecastConfig,
+    HeightConfig,
+    LocalizationConfig,
     MappingConfig,
-    PoseConfig,
-    SpottingConfig,
     TrackingConfig,
 )
-from uuvtai.config.planning import ClearanceConfig, FeaturesConfig, QuietConfig, RouteConfig, VoronoiConfig
+from uuvtai.config.planning import ClearanceConfig, ObservationConfig, QuietConfig, RouteConfig, VoronoiConfig
 from uuvtai.config.sensors import (
     DepthConfig,
     DvlConfig,
@@ -67,18 +67,18 @@ class Config(Section):
     disturbance: DisturbanceConfig = DisturbanceConfig()
     sensors: SensorsConfig = SensorsConfig()
     traffic: TrafficConfig = TrafficConfig()
-    pose: PoseConfig = PoseConfig()
+    localization: LocalizationConfig = LocalizationConfig()
     tracking: TrackingConfig = TrackingConfig()
     forecast: ForecastConfig = ForecastConfig()
-    elevation: ElevationConfig = ElevationConfig()
-    spotting: SpottingConfig = SpottingConfig()
+    height: HeightConfig = HeightConfig()
+    camera_tracking: CameraTrackingConfig = CameraTrackingConfig()
     mapping: MappingConfig = MappingConfig()
     clearance: ClearanceConfig = ClearanceConfig()
     voronoi: VoronoiConfig = VoronoiConfig()
     quiet: QuietConfig = QuietConfig()
     route: RouteConfig = RouteConfig()
-    features: FeaturesConfig = FeaturesConfig()
-    teacher: TeacherConfig = TeacherConfig()
+    observation: ObservationConfig = ObservationConfig()
+    behavior: BehaviorConfig = BehaviorConfig()
     slow: SlowConfig = SlowConfig()
     fast: FastConfig = FastConfig()
     baselines: BaselinesConfig = BaselinesConfig()
@@ -104,6 +104,8 @@ class Config(Section):
 __all__ = [
     "ActuationConfig",
     "BaselinesConfig",
+    "BehaviorConfig",
+    "CameraTrackingConfig",
     "ClearanceConfig",
     "Config",
     "DepthConfig",
@@ -111,16 +113,16 @@ __all__ = [
     "DvlConfig",
     "DynamicObstacles",
     "DynamicWindowConfig",
-    "ElevationConfig",
     "EpisodeConfig",
     "FastConfig",
-    "FeaturesConfig",
     "FixedObstacle",
     "ForecastConfig",
+    "HeightConfig",
     "ImuConfig",
+    "LocalizationConfig",
     "MappingConfig",
+    "ObservationConfig",
     "PathIntegralConfig",
-    "PoseConfig",
     "PotentialFieldConfig",
     "PressureConfig",
     "QuietConfig",
@@ -131,10 +133,8 @@ __all__ = [
     "SensorsConfig",
     "SlowConfig",
     "SonarConfig",
-    "SpottingConfig",
     "StaticObstacles",
     "TankConfig",
-    "TeacherConfig",
     "Thruster",
     "TrackingConfig",
     "TrafficConfig",

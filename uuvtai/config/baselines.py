@@ -13,7 +13,7 @@ class DynamicWindowConfig(Section):
     horizon_s: Positive = 2.5
     """of the roll-out of a velocity"""
     margin_m: NonNegative = 0.15
-    """wanted clearance beyond contact from moving bodies; closer counts as a collision"""
+    """wanted clearance beyond contact from moving obstacles; closer counts as a collision"""
     clear_m: Positive = 0.6
     """clearance beyond the margin from which on more is worth nothing"""
     weight_heading: NonNegative = 2.0
@@ -28,9 +28,9 @@ class PotentialFieldConfig(Section):
     """Artificial potential field (Khatib 1986)."""
 
     reach_m: Positive = 1.5
-    """moving bodies farther away push nobody"""
+    """moving obstacles farther away push nobody"""
     gain: NonNegative = 0.1
-    """[m^4/s] of the push of a moving body"""
+    """[m^4/s] of the push of a moving obstacle"""
     static_reach_m: Positive = 0.3
     """mapped obstacles and walls farther away push nobody"""
     static_gain: NonNegative = 0.002
@@ -47,7 +47,7 @@ class VelocityObstacleConfig(Section):
     horizon_s: Positive = 3.0
     """collisions later than this are none"""
     margin_m: NonNegative = 0.4
-    """wanted clearance beyond contact from moving bodies"""
+    """wanted clearance beyond contact from moving obstacles"""
     static_horizon_s: Positive = 1.5
     """the same for mapped obstacles and walls"""
 
@@ -69,13 +69,13 @@ class PathIntegralConfig(Section):
     exploration: Fraction = 0.98
     """alpha: how much of the control cost is left out; 1 = all of it"""
     margin_m: NonNegative = 0.25
-    """wanted clearance beyond contact from moving bodies"""
+    """wanted clearance beyond contact from moving obstacles"""
     margin_growth_m_s: NonNegative = 0.1
     """the margin grows with prediction time"""
     weight_track: NonNegative = 1.0
     """[1/m] mean distance from where the wanted velocity would lead"""
-    weight_body: NonNegative = 40.0
-    """[1/m] mean depth of violation of the wanted clearance from moving bodies"""
+    weight_obstacle: NonNegative = 40.0
+    """[1/m] mean depth of violation of the wanted clearance from moving obstacles"""
     weight_static: NonNegative = 40.0
     """[1/m] mean depth of violation of the wanted clearance from mapped obstacles and walls"""
     weight_contact: NonNegative = 10.0
@@ -83,8 +83,8 @@ class PathIntegralConfig(Section):
 
 
 class BaselinesConfig(Section):
-    """What the local planners of the literature share. Limits of speed, hull and lag are the teacher's and
-    the vehicle's: the same for everybody."""
+    """What the local planners of the literature share. Limits of speed, hull and lag are the behaviour tree's
+    and the vehicle's: the same for everybody."""
 
     period_steps: PositiveCount = 5
     """control steps between decisions"""
@@ -96,7 +96,7 @@ class BaselinesConfig(Section):
     """vertical speed of those that climb or dive; 0 = depth is not used to evade (also in the potential
     field)"""
     vertical_weight: Positive = 1.5
-    """free water above or below a body counts this many times: the hull is slimmer upwards"""
+    """free water above or below an obstacle counts this many times: the hull is slimmer upwards"""
     edge_gap_m: NonNegative = 0.26
     """hull centre to surface or floor, at least"""
     static_margin_m: NonNegative = 0.1

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-class TeacherConfig(Section):
+class BehaviorConfig(Section):
     """Behaviour tree's leaves: assessment of threats, evasion and driving. Ports of a tree override the
     numbers that are a leaf's own."""
 
@@ -41,31 +41,32 @@ class TeacherConfig(Section):
     hull_reach_m: NonNegative = 0.22
     """hull centre to surface: between 0.17 abeam and 0.27 ahead"""
     contact_m: NonNegative = 0.1
-    """clearance that the referee calls a collision"""
+    """clearance that the termination check calls a collision"""
     margin_m: NonNegative = 0.275
-    """wanted clearance beyond contact from a forecast body"""
+    """wanted clearance beyond contact from a forecast obstacle"""
     margin_growth_m_s: NonNegative = 0.085
     """the margin grows with prediction time"""
     closing_s: NonNegative = 0.2
-    """effective clearance is reduced by this times the closing speed (the referee stops at 0.18 s)"""
+    """effective clearance is reduced by this times the closing speed (the termination check stops at 0.18
+    s)"""
     vertical_weight: Positive = 2.0
-    """free water above or below a body counts this many times: the hull is slimmer upwards (0.17 m) and
+    """free water above or below an obstacle counts this many times: the hull is slimmer upwards (0.17 m) and
     heights carry their own margin"""
     least_share: Fraction = 0.02
     """futures that are less probable are left out,"""
-    heed_share: Fraction = 0.2
+    evade_probability: Fraction = 0.2
     """and those that are less probable than this cost, but are no reason to evade"""
     future_margin: Fraction = 1.0
-    """margin kept from a body that does something else than is forecast, as a share of the usual one"""
+    """margin kept from an obstacle that does something else than is forecast, as a share of the usual one"""
     caution: Positive = 1.0
-    """factor of both margins from moving bodies: more trades time and success for fewer collisions"""
+    """factor of both margins from moving obstacles: more trades time and success for fewer collisions"""
     patience_s: NonNegative = 3.0
     """a vehicle that has waited longer, before crossing traffic say, is less cautious: by this over the time
     that it has waited; 0 = it waits for ever"""
     waiting_m_s: Positive = 0.2
     """as long as it comes on along its way more slowly than this it waits; faster, it forgets that it did"""
-    body_doubt: Positive = 1.0
-    """factor of what a body's radius grows by in its forecast, as that is less and less sure"""
+    obstacle_growth: Positive = 1.0
+    """factor of what an obstacle's radius grows by in its forecast, as that is less and less sure"""
     static_margin_m: NonNegative = 0.1
     """wanted clearance beyond contact from mapped obstacles and walls"""
     place_sigmas: NonNegative = 3.0
@@ -76,7 +77,7 @@ class TeacherConfig(Section):
     weight_peak: NonNegative = 6.0
     """[1/m] largest depth of violation of the wanted clearance"""
     weight_mean: NonNegative = 5.0
-    """[1/m] depth of violation averaged over the horizon, summed over bodies"""
+    """[1/m] depth of violation averaged over the horizon, summed over obstacles"""
     weight_contact: NonNegative = 12.0
     """[1/m] largest depth below contact"""
     weight_static: NonNegative = 12.0
@@ -87,10 +88,10 @@ class TeacherConfig(Section):
     """per cruise speed of difference from the follow velocity"""
     weight_change: NonNegative = 0.3
     """per cruise speed of difference from the last command"""
-    softness: Positive = 0.05
+    temperature: Positive = 0.05
     """temperature of the cost-softmax mean over candidates"""
 
-    calm_s: NonNegative = 0.3
+    hysteresis_s: NonNegative = 0.3
     """evasion goes on for this long after the last predicted conflict"""
     conflict_within_s: NonNegative = 2.5
     emergency_ttc_s: NonNegative = 0.15
@@ -116,12 +117,12 @@ class TeacherConfig(Section):
     edge_sigmas: NonNegative = 3.0
     """and so many standard deviations of the own depth"""
     free_depth: bool = True
-    """cruise at the depth where the fewest bodies are to be met, as far as the goal's depth can still be
+    """cruise at the depth where the fewest obstacles are to be met, as far as the goal's depth can still be
     reached in time; false = at the goal's depth"""
     depth_choices: PositiveCount = 8
     """depths to choose among, from edge to edge"""
     weight_traffic: NonNegative = 1.0
-    """of the bodies that are expected but not seen (``traffic``), by the share of them that is level"""
+    """of the obstacles that are expected but not seen (``traffic``), by the share of them that is level"""
     weight_goal_depth: NonNegative = 0.05
     """[1/m] of the way to the goal's depth"""
     weight_depth_change: NonNegative = 0.1
@@ -133,17 +134,17 @@ class TeacherConfig(Section):
     level way"""
     depth_gain: Positive = 1.0
     """[1/s] heave per metre of depth error"""
-    gaze_m: NonNegative = 3.0
-    """the nose, and with it the camera, turns to the nearest moving body this close: near ones leave the
+    heading_range_m: NonNegative = 3.0
+    """the nose, and with it the camera, turns to the nearest moving obstacle this close: near ones leave the
     sonar's fan; 0 = along the way"""
-    gaze_level_m: NonNegative = 3.0
-    """bodies level with the vehicle count as so much farther: the sonar sees them; as much as ``gaze_m`` or
-    more: the nose is not turned to them at all"""
-    gaze_clearance_m: NonNegative = 0.6
+    heading_level_m: NonNegative = 3.0
+    """obstacles level with the vehicle count as so much farther: the sonar sees them; as much as
+    ``heading_range_m`` or more: the nose is not turned to them at all"""
+    heading_clearance_m: NonNegative = 0.6
     """mapped clearance below which the nose stays along the way: the hull is longer than wide"""
-    askew_clearance_m: NonNegative = 0.5
+    sideslip_clearance_m: NonNegative = 0.5
     """where the way is narrower the vehicle slows down until its nose lies along it"""
-    gaze_off_deg: NonNegative = 25.0
+    heading_off_deg: NonNegative = 25.0
     """the nose may be so far off the body that is looked at, towards a diagonal of the body along the way"""
     sight_margin_deg: NonNegative = 20.0
     """where the sonar is a fan ahead, the way is kept so far within its edge: the nose turns, and beyond that
@@ -173,11 +174,11 @@ class TeacherConfig(Section):
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Factors on the behaviour tree's numbers: among slow bodies and among fast ones.
+# Factors on the behaviour tree's numbers: among slow obstacles and among fast ones.
 
 
 class TunedConfig(Section):
-    """Factors on numbers of ``teacher``. ``uuv train best`` learns them (``docs/learning.md``)."""
+    """Factors on numbers of ``behavior``. ``uuv train best`` learns them (``docs/learning.md``)."""
 
     caution: Positive = 1.0
     margin_growth_m_s: Positive = 1.0
@@ -187,14 +188,14 @@ class TunedConfig(Section):
     weight_deviation: Positive = 1.0
     emergency_ttc_s: Positive = 1.0
     emergency_range_m: Positive = 1.0
-    calm_s: Positive = 1.0
-    gaze_m: Positive = 1.0
+    hysteresis_s: Positive = 1.0
+    heading_range_m: Positive = 1.0
     vertical_weight: Positive = 1.0
     weight_peak: Positive = 1.0
     weight_mean: Positive = 1.0
     weight_contact: Positive = 1.0
     weight_change: Positive = 1.0
-    softness: Positive = 1.0
+    temperature: Positive = 1.0
     static_margin_m: Positive = 1.0
     weight_static: Positive = 1.0
     heave_m_s: Positive = 1.0
@@ -203,20 +204,20 @@ class TunedConfig(Section):
     return_slope: Positive = 1.0
     weight_goal_depth: Positive = 1.0
     weight_depth_change: Positive = 1.0
-    body_doubt: Positive = 1.0
+    obstacle_growth: Positive = 1.0
     arrival_depth_share: Positive = 1.0
 
 
 class SlowConfig(TunedConfig):
-    """Factors on numbers of ``teacher`` that hold where no fast body was lately tracked."""
+    """Factors on numbers of ``behavior`` that hold where no fast obstacle was lately tracked."""
 
 
 class FastConfig(TunedConfig):
-    """Factors on numbers of ``teacher`` that hold, instead of those of ``slow``, where fast bodies were
+    """Factors on numbers of ``behavior`` that hold, instead of those of ``slow``, where fast obstacles were
     lately tracked, and by a share of their logarithms where these are a little fast."""
 
     from_m_s: NonNegative = 0.8
-    """speed of the fastest tracked body, less its standard deviation, up to which ``slow`` holds alone"""
+    """speed of the fastest tracked obstacle, less its standard deviation, up to which ``slow`` holds alone"""
     full_m_s: NonNegative = 1.2
     """speed from which on these factors hold alone"""
     settle_s: Positive = 1.0
@@ -225,19 +226,19 @@ class FastConfig(TunedConfig):
 
 # ------------------------------------------------------------------------------------------------------------
 # Numbers of the behaviour tree that ``uuv train best`` changes, row by row: the order of
-# ``TeacherState.tuned``.
+# ``BehaviorState.tuned``.
 
 
 SLOW, FAST = 0, 1
-"""last axis of ``TeacherState.tuned``: which bodies the factors are for"""
+"""last axis of ``BehaviorState.tuned``: which obstacles the factors are for"""
 
-CAUTION, GROWTH, CLOSING, HORIZON, LAG, DEVIATION, TTC, RANGE, CALM, GAZE = range(10)
-VERTICAL, PEAK, MEAN, CONTACT, CHANGE, SOFTNESS, STATIC_MARGIN, STATIC, HEAVE, BURST = range(10, 20)
+CAUTION, GROWTH, CLOSING, HORIZON, LAG, DEVIATION, TTC, RANGE, HYSTERESIS, HEADING_RANGE = range(10)
+VERTICAL, PEAK, MEAN, CONTACT, CHANGE, TEMPERATURE, STATIC_MARGIN, STATIC, HEAVE, BURST = range(10, 20)
 WITHIN, SLOPE, GOAL_DEPTH, DEPTH_CHANGE, DOUBT, ARRIVAL = range(20, 26)
 
 
 class TunedNumber(NamedTuple):
-    """A number of the config's section ``teacher``; the sections ``slow`` and ``fast`` have a factor of the
+    """A number of the config's section ``behavior``; the sections ``slow`` and ``fast`` have a factor of the
     same name."""
 
     name: str
@@ -256,14 +257,14 @@ TUNED = (
     TunedNumber("weight_deviation", 0.4, 2.5),
     TunedNumber("emergency_ttc_s", 0.15, 2.0),
     TunedNumber("emergency_range_m", 0.15, 2.5),
-    TunedNumber("calm_s", 0.3, 4.0),
-    TunedNumber("gaze_m", 0.1, 1.6),
+    TunedNumber("hysteresis_s", 0.3, 4.0),
+    TunedNumber("heading_range_m", 0.1, 1.6),
     TunedNumber("vertical_weight", 0.5, 1.6),
     TunedNumber("weight_peak", 0.4, 5.0),
     TunedNumber("weight_mean", 0.4, 5.0),
     TunedNumber("weight_contact", 0.4, 4.0),
     TunedNumber("weight_change", 0.3, 2.5),
-    TunedNumber("softness", 0.2, 3.0),
+    TunedNumber("temperature", 0.2, 3.0),
     TunedNumber("static_margin_m", 0.25, 2.5),
     TunedNumber("weight_static", 0.4, 4.0),
     TunedNumber("heave_m_s", 0.5, 1.1),
@@ -272,7 +273,7 @@ TUNED = (
     TunedNumber("return_slope", 0.4, 4.0),
     TunedNumber("weight_goal_depth", 0.3, 3.0),
     TunedNumber("weight_depth_change", 0.3, 3.0),
-    TunedNumber("body_doubt", 0.1, 2.0),
+    TunedNumber("obstacle_growth", 0.1, 2.0),
     TunedNumber("arrival_depth_share", 0.1, 1.4),
 )
 """by their numbers above, new ones last: a checkpoint without them drives by factors of one; roll-outs are no

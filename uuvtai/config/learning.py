@@ -17,7 +17,7 @@ from uuvtai.config.base import Count, Fraction, NonNegative, Positive, PositiveC
 
 Points = tuple[tuple[NonNegative, NonNegative], ...]
 """(share of the run, value): linear in between, constant outside; two points at the same share are a jump"""
-TunerScene = tuple[Annotated[str, Field(min_length=1, max_length=200)], Count, Count, NonNegative]
+SearchScene = tuple[Annotated[str, Field(min_length=1, max_length=200)], Count, Count, NonNegative]
 """world preset, S, D, v [m/s]"""
 
 
@@ -32,7 +32,7 @@ class PolicyConfig(Section):
     min_std: Positive = 0.05
     """floor: the policy never stops exploring altogether (EC)"""
     residual: bool = False
-    """the mean is the tree's action plus what the network adds; needs ``features.teacher``"""
+    """the mean is the tree's action plus what the network adds; needs ``observation.behavior``"""
     residual_limit: Positive = 0.5
     """largest addition, in parts of the vehicle's limits"""
     hold_steps: PositiveCount = 1
@@ -69,7 +69,7 @@ class PpoConfig(Section):
     normalise_values: bool = True
 
 
-class DistillConfig(Section):
+class DistillationConfig(Section):
     """Supervision by the behaviour tree."""
 
     schedule: Points = ((0.0, 1.0), (2 / 3, 1.0), (2 / 3, 0.2), (4 / 3, 0.0))
@@ -144,7 +144,7 @@ class TrainConfig(Section):
     seed: Seed = 0
     scenes: tuple[tuple[Count, Count, NonNegative], ...] = ()
     """(S, D, v [m/s]) dealt out to the envs in turn, slots permitting; none = the world's own, which
-    evaluations play in any case"""
+    evaluations use in any case"""
     checkpoint_every: PositiveCount = 50
     """iterations between checkpoints"""
     keep_checkpoints: PositiveCount = 3
@@ -167,18 +167,18 @@ class TrainConfig(Section):
         return value
 
 
-class TwinConfig(Section):
-    """A kinematic twin of the simulator to train in, and the policy over a set of bodies that learns there
-    (``docs/learning.md``)."""
+class SurrogateConfig(Section):
+    """A kinematic surrogate of the simulator to train in, and the policy over a set of obstacles that learns
+    there (``docs/learning.md``)."""
 
     enabled: bool = False
-    """train in the twin; false = in the simulator"""
+    """train in the surrogate; false = in the simulator"""
     worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("pool", "gauntlet")
     """world presets whose scenarios are dealt out, each with all of ``train.scenes``"""
     scenarios: Annotated[int, Field(ge=1, le=2**20)] = 4096
     """drawn by the simulator for every pair of world and scene"""
-    body_hidden: PositiveCount = 64
-    """width of the encoder that every body goes through"""
+    obstacle_hidden: PositiveCount = 64
+    """width of the encoder that every obstacle goes through"""
     head_hidden: PositiveCount = 128
     """width of the layers behind it"""
     goal_gain: NonNegative = 0.7
@@ -197,12 +197,12 @@ class TwinConfig(Section):
     (DAgger), world by world and scene by scene; 0 = none"""
 
 
-class TunerConfig(Section):
+class ParameterSearchConfig(Section):
     """A search for better numbers of the behaviour tree (``tuned_numbers``; ``docs/learning.md``)."""
 
     enabled: bool = False
     """learn the tree's numbers"""
-    scenes: tuple[TunerScene, ...] = (
+    scenes: tuple[SearchScene, ...] = (
         ("gauntlet", 8, 9, 1.5),
         ("pool", 8, 6, 0.6),
         ("pool", 8, 9, 1.5),
@@ -210,26 +210,26 @@ class TunerConfig(Section):
         ("gauntlet", 8, 9, 1.5),
         ("pool", 8, 6, 0.6),
     )
-    """world preset, S, D and v [m/s] of what is played, an iteration each, in turn. By its speed a scene is
-    one of slow bodies (``fast.from_m_s`` or less) or of fast ones (``fast.full_m_s`` or more), and moves the
-    numbers for these alone"""
+    """world preset, S, D and v [m/s] of what is run, an iteration each, in turn. By its speed a scene is
+    one of slow obstacles (``fast.from_m_s`` or less) or of fast ones (``fast.full_m_s`` or more), and moves
+    the numbers for these alone"""
     spread: Fraction = 0.3
     """numbers are tried so far from the best ones, in parts of the way between their bounds"""
     warm_up: Fraction = 0.25
     """part of the run before the numbers are moved for the first time"""
     time_cost: NonNegative = 0.005
-    """[1/s] an arrival among fast bodies is worth so much less per second"""
+    """[1/s] an arrival among fast obstacles is worth so much less per second"""
     slow_time_cost: NonNegative = 0.01
     """[1/s] the same among slow ones, where nearly all arrive"""
 
 
-class ForecasterConfig(Section):
-    """A network that says what moving bodies may do in the next 2.5 s (``docs/learning.md``)."""
+class ForecastTrainingConfig(Section):
+    """A network that says what moving obstacles may do in the next 2.5 s (``docs/learning.md``)."""
 
     enabled: bool = False
     """learn a forecast"""
     worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("pool", "gauntlet", "maze")
-    """world presets whose episodes are played in turn, ``train.scenes`` dealt out to the envs"""
+    """world presets whose episodes are run in turn, ``train.scenes`` dealt out to the envs"""
     episode_steps: PositiveCount = 1500
     """control steps after which an episode is left"""
     memory: Annotated[int, Field(ge=1024, le=2**23)] = 2**21
@@ -247,16 +247,21 @@ class LearningConfig(Config):
 
     policy: PolicyConfig = PolicyConfig()
     ppo: PpoConfig = PpoConfig()
-    distill: DistillConfig = DistillConfig()
+    distillation: DistillationConfig = DistillationConfig()
     uncertainty: UncertaintyConfig = UncertaintyConfig()
     world_model: WorldModelConfig = WorldModelConfig()
-    twin: TwinConfig = TwinConfig()
-    tuner: TunerConfig = TunerConfig()
-    forecaster: ForecasterConfig = ForecasterConfig()
+    surrogate: SurrogateConfig = SurrogateConfig()
+    parameter_search: ParameterSearchConfig = ParameterSearchConfig()
+    forecast_training: ForecastTrainingConfig = ForecastTrainingConfig()
     train: TrainConfig = TrainConfig()
 
     @property
     def learner(self) -> str:
-        """Section that says what is learned: forecaster, tuner or twin; else policy, in the simulator."""
-        sections = {"forecaster": self.forecaster, "tuner": self.tuner, "twin": self.twin}
+        """Section that says what is learned: forecast network, parameter_search or surrogate; else policy, in
+        the simulator."""
+        sections = {
+            "forecast_training": self.forecast_training,
+            "parameter_search": self.parameter_search,
+            "surrogate": self.surrogate,
+        }
         return next((name for name, section in sections.items() if section.enabled), "policy")

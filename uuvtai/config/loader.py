@@ -23,30 +23,30 @@ from pydantic import BaseModel, ValidationError
 
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import FileError, read_text
-from uuvtai.common.presets import preset_names, shipped_file
+from uuvtai.common.presets import built_in_file, preset_names
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 
 DEFAULT_WORLD, DEFAULT_SENSORS, DEFAULT_VEHICLE = "pool", "paper", "bluerov2"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 STACK_SECTIONS = (
-    "pose",
+    "localization",
     "tracking",
     "forecast",
-    "elevation",
-    "spotting",
+    "height",
+    "camera_tracking",
     "mapping",
     "clearance",
     "voronoi",
     "quiet",
     "route",
-    "teacher",
+    "behavior",
     "slow",
     "fast",
     "baselines",
 )
-"""what a stack preset may set: nothing that a scenario, a sensor, the referee or the observation's columns
-depend on"""
+"""what a stack preset may set: nothing that a scenario, a sensor, the termination check or the observation's
+columns depend on"""
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
 MAX_BYTES = 1 << 20
 """of a YAML file"""
@@ -166,7 +166,8 @@ def _read_stack(name: str) -> _Layer:
     layer.tree.pop("tree", None)
     for key in layer.tree.keys() - set(STACK_SECTIONS):
         raise ConfigError(
-            f"{layer.origin[key]}: a stack cannot set '{key}'; it has {', '.join(STACK_SECTIONS)} and tree"
+            f"{layer.origin[key]}: a stack cannot set '{key}'{renamed(key)}; it has "
+            f"{', '.join(STACK_SECTIONS)} and tree"
         )
     return layer
 
@@ -258,7 +259,7 @@ def preset_path(kind: str, name: str) -> Path:
             f"{kind} {name!r} is no preset{nearest(name, preset_names(kind))}; there are: "
             f"{', '.join(preset_names(kind))} (see 'uuv presets'), or give the path of a {suffix} file"
         )
-    return shipped_file(kind, name)
+    return built_in_file(kind, name)
 
 
 def read_preset(kind: str, name: str) -> dict[str, Any]:
@@ -447,6 +448,25 @@ def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
 # --------------------------------------------------------------------------------------------------- messages
 
 
+RENAMED = {
+    "askew_clearance_m": "sideslip_clearance_m", "body_doubt": "obstacle_growth",
+    "body_hidden": "obstacle_hidden", "body_returns_per_m": "obstacle_returns_per_m",
+    "calm_s": "hysteresis_s", "distill": "distillation", "elevation": "height", "features": "observation",
+    "forecaster": "forecast_training", "gaze_clearance_m": "heading_clearance_m",
+    "gaze_level_m": "heading_level_m", "gaze_m": "heading_range_m", "gaze_off_deg": "heading_off_deg",
+    "heed_share": "evade_probability", "pose": "localization", "softness": "temperature",
+    "spotting": "camera_tracking", "teacher": "behavior", "tuner": "parameter_search", "twin": "surrogate",
+    "use_habits": "use_turn_history", "weight_body": "weight_obstacle",
+}  # fmt: skip
+"""old name of a section or key -> its name"""
+
+
+def renamed(dotted: str) -> str:
+    """What to add to the refusal of an old key: "; renamed to 'behavior.temperature'"."""
+    found = ".".join(RENAMED.get(part, part) for part in dotted.split("."))
+    return f"; renamed to '{found}'" if found != dotted else ""
+
+
 _WITHIN = re.compile(r"Value error, ([a-z_]+(?:\.[a-z_0-9]+)*): (.+)", re.DOTALL)
 _MOST_GOT = 200
 """characters of a value that are shown"""
@@ -458,10 +478,10 @@ def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseM
         dotted = ".".join(str(part) for part in problem["loc"])
         where = _origin_of(dotted, origin)
         if problem["type"] == "extra_forbidden":
-            lines.append(
-                f"{where}unknown key "
-                f"'{dotted}'{nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc'], model))}"
-            )
+            if isinstance(given := problem["input"], dict) and given and renamed(dotted):
+                dotted = f"{dotted}.{next(iter(given))}"
+            like = renamed(dotted) or nearest(str(problem["loc"][-1]), _siblings(problem["loc"], model))
+            lines.append(f"{where}unknown key '{dotted}'{like}")
         elif found := _WITHIN.match(problem["msg"]):  # a check of the whole names the part itself
             dotted = f"{dotted}.{found[1]}".lstrip(".")
             lines.append(f"{_origin_of(dotted, origin)}{dotted}: {found[2]}")

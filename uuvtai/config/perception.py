@@ -1,4 +1,4 @@
-"""The own pose, moving bodies, their forecast and height, and the map."""
+"""The own pose, moving obstacles, their forecast and height, and the map."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from uuvtai.config.base import Fraction, NonNegative, Packets, Positive, PositiveCount, Section
 
 
-class PoseConfig(Section):
+class LocalizationConfig(Section):
     """Filter of the own pose, where ``sensors.localization`` is ``estimated`` (values EC, tuned). What the
     sensors do wrong it takes from their own sections."""
 
@@ -34,15 +34,15 @@ class PoseConfig(Section):
     """error of the known place of a wall"""
     bearing_sigma_rad: NonNegative = 0.001
     """error of a beam's direction"""
-    body_returns_per_m: NonNegative = 240.0
-    """[1/m] returns of neighbouring beams and scans in a row that err together where a body stands so close
-    before a wall that it is not told from it, per metre of that. How often one does follows from how many
-    returns of the scan fall short of the walls"""
+    obstacle_returns_per_m: NonNegative = 240.0
+    """[1/m] returns of neighbouring beams and scans in a row that err together where an obstacle stands so
+    close before a wall that it is not told from it, per metre of that. How often one does follows from how
+    many returns of the scan fall short of the walls"""
 
 
 class TrackingConfig(Section):
-    """Clusters of beams to tracks of moving bodies, and their forecast. Every constant is in seconds, not in
-    scans (values EC, tuned)."""
+    """Clusters of beams to tracks of moving obstacles, and their forecast. Every constant is in seconds, not
+    in scans (values EC, tuned)."""
 
     n_track: PositiveCount = 24
     n_cluster: PositiveCount = 48
@@ -51,7 +51,7 @@ class TrackingConfig(Section):
     split_m: NonNegative = 0.18
     split_slope: NonNegative = 0.03
     split_doppler_m_s: Positive = 0.3
-    """neighbouring beams whose Doppler differs by more (plus 6 sigma) belong to different bodies"""
+    """neighbouring beams whose Doppler differs by more (plus 6 sigma) belong to different obstacles"""
     wall_margin_m: NonNegative = 0.15
     """returns this close (plus 2 sigma of range) to a known wall are dropped"""
     max_width_m: Positive = 0.75
@@ -61,16 +61,16 @@ class TrackingConfig(Section):
     birth_speed_sigma_m_s: Positive = 1.0
     """across the bearing, where the first Doppler says nothing"""
     accel_density: NonNegative = 0.03
-    """[m^2/s^3] spectral density of a body's acceleration"""
+    """[m^2/s^3] spectral density of an obstacle's acceleration"""
     turn_rate_sigma_rad_s: NonNegative = 1.0
-    """prior of a moving body's turn rate around 0; 0 = bodies are taken to go straight"""
+    """prior of a moving obstacle's turn rate around 0; 0 = obstacles are taken to go straight"""
     turn_density: NonNegative = 0.005
     """[rad^2/s^3] spectral density of the turn rate's changes"""
     gate_m: Positive = 0.3
     """a cluster this close to a prediction (plus one scan of its speed) may always match, however sure the
     filter is"""
     turn_gate: Positive = 20.0
-    """squared normalised innovation (3 values) beyond which a body is taken to have turned"""
+    """squared normalised innovation (3 values) beyond which an obstacle is taken to have turned"""
     partial_sigmas: NonNegative = 0.0
     """a cluster with free edges that is narrower than its track by more standard deviations than this is a
     part of the body, which leaves the sonar's fan by its nearest side first; 0 = it is all of it
@@ -78,7 +78,7 @@ class TrackingConfig(Section):
     moving_speed_m_s: NonNegative = 0.08
     moving_doppler_m_s: NonNegative = 0.03
     sight_doppler_m_s: Positive = 0.2
-    """a body moves from its first scan on where its Doppler is larger"""
+    """an obstacle moves from its first scan on where its Doppler is larger"""
     moving_shift_m: NonNegative = 0.12
     """displacement (forgotten over shift_memory_s) that shows motion across the beams"""
     shift_memory_s: Positive = 2.0
@@ -99,15 +99,16 @@ class TrackingConfig(Section):
 
 
 class ForecastConfig(Section):
-    """What forecasts of moving bodies know of how bodies move. Each switch is one row of an ablation."""
+    """What forecasts of moving obstacles know of how obstacles move. Each switch is one row of an
+    ablation."""
 
     use_turn_rate: bool = True
-    """bodies keep their turn rate; off: straight ahead"""
+    """obstacles keep their turn rate; off: straight ahead"""
     straight_odds: Positive = 4.0
-    """prior odds that a body goes straight: a turn rate is used where its evidence against 0 outweighs
+    """prior odds that an obstacle goes straight: a turn rate is used where its evidence against 0 outweighs
     them"""
-    use_habits: bool = True
-    """bodies turn where one was seen to turn"""
+    use_turn_history: bool = True
+    """obstacles turn where one was seen to turn"""
     n_turn: Packets = 48
     """turns remembered"""
     across_m: Positive = 0.25
@@ -119,60 +120,61 @@ class ForecastConfig(Section):
     passed_m: Positive = 0.5
     """a turn this far behind did not come"""
     use_reflection: bool = True
-    """bodies turn back at the tank's walls"""
+    """obstacles turn back at the tank's walls"""
     use_coasting: bool = True
-    """unseen bodies go on by their habits; off: straight on, or along their arc"""
+    """unseen obstacles go on by their turn history; off: straight on, or along their arc"""
     use_turning_back: bool = True
-    """bodies above or below the fan whose next turn is not known may have turned back: the expected velocity
-    fades, and the uncertainty grows both ways along their course (``traffic.leg_m``); off: they go on for
-    sure"""
+    """obstacles above or below the fan whose next turn is not known may have turned back: the expected
+    velocity fades, and the uncertainty grows both ways along their course (``traffic.leg_m``); off: they go
+    on for sure"""
     learned: Annotated[str, Field(max_length=1000)] = ""
-    """network that says what bodies may do: ``shipped``, or the run folder of ``uuv train forecast``; empty =
-    none (``docs/learning.md``)"""
+    """network that says what obstacles may do: ``built-in``, or the run folder of ``uuv train forecast``;
+    empty = none (``docs/learning.md``)"""
     keep_columns: bool = False
     """keep what such a network is told of each track, to train one"""
 
 
-class ElevationConfig(Section):
-    """Memory in 3-D of bodies that left the sonar's fan (values EC, tuned)."""
+class HeightConfig(Section):
+    """Memory in 3-D of obstacles that left the sonar's fan (values EC, tuned)."""
 
     memory_s: NonNegative = 8.0
-    """time constant with which an unseen body is forgotten; 0 = a body that beams see through is forgotten at
-    once"""
+    """time constant with which an unseen obstacle is forgotten; 0 = an obstacle that beams see through is
+    forgotten at once"""
     half_height_m: NonNegative = 0.2
-    """half height assumed of a body that is no wider"""
+    """half height assumed of an obstacle that is no wider"""
     least_half_height_m: NonNegative = 0.1
-    """half height assumed where a body is not seen: the flattest one that would hide so"""
+    """half height assumed where an obstacle is not seen: the flattest one that would hide so"""
     column_share: Fraction = 0.05
-    """share of moving bodies expected to go through the full water column"""
+    """share of moving obstacles expected to go through the full water column"""
     edge_m: Positive = 0.06
     """half width of the soft edge of the fan"""
     evidence_s: Positive = 0.15
     """scans closer together than this are not independent evidence"""
     hit_share: Fraction = 0.9
-    """probability that a body in the fan is hit, where its place is known exactly"""
+    """probability that an obstacle in the fan is hit, where its place is known exactly"""
     use_camera: bool = True
     """let the camera's image tell heights too"""
     camera_hit_share: Annotated[float, Field(ge=0, lt=1)] = 0.5
-    """probability that a body in the image and at a free distance shows in the column through its middle"""
+    """probability that an obstacle in the image and at a free distance shows in the column through its
+    middle"""
     gone_share: Fraction = 0.25
-    """below this probability of being where it is expected, a body is forgotten"""
+    """below this probability of being where it is expected, an obstacle is forgotten"""
     tail_share: Fraction = 0.02
     """heights that are less likely than this are taken to be free"""
     column_tail_share: Fraction = 0.15
 
     @model_validator(mode="after")
-    def _is_somewhere(self) -> ElevationConfig:
+    def _is_somewhere(self) -> HeightConfig:
         if 15 * self.tail_share + self.column_tail_share >= 1:
             raise ValueError(
                 f"tail_share {self.tail_share} of 15 heights and column_tail_share {self.column_tail_share} "
-                "must sum to less than 1: else a body could be taken to be nowhere"
+                "must sum to less than 1: else an obstacle could be taken to be nowhere"
             )
         return self
 
 
-class SpottingConfig(Section):
-    """Tracked bodies followed by the camera where the sonar's fan misses them (values EC, tuned)."""
+class CameraTrackingConfig(Section):
+    """Tracked obstacles followed by the camera where the sonar's fan misses them (values EC, tuned)."""
 
     use_camera: bool = True
     """off: the image tells heights only"""
@@ -188,11 +190,11 @@ class SpottingConfig(Section):
     gate_m: Positive = 0.3
     """a spot this close to where a track is expected may match it,"""
     max_gate_m: Positive = 1.2
-    """and farther for bodies that were not seen for long, up to this"""
+    """and farther for obstacles that were not seen for long, up to this"""
     apart_m: Positive = 0.35
-    """a spot farther than this from every track is a body of its own"""
+    """a spot farther than this from every track is an obstacle of its own"""
     turn_gate: Positive = 12.0
-    """squared normalised innovation (2 values) beyond which a body is taken to have turned"""
+    """squared normalised innovation (2 values) beyond which an obstacle is taken to have turned"""
 
 
 class MappingConfig(Section):

@@ -63,7 +63,7 @@ class RouteConfig(Section):
     forecast_clearance_m: NonNegative = 0.35
     """a forecast closer than this to the look-ahead path is an intersection"""
     reach_speed_m_s: NonNegative = 0.6
-    """the vehicle can be anywhere up to this times t along the path when a forecast body is there"""
+    """the vehicle can be anywhere up to this times t along the path when a forecast obstacle is there"""
     progress_window_m: Positive = 1.5
     """how far ahead of the last foot the new one is looked for"""
     min_replan_s: NonNegative = 0.4
@@ -75,13 +75,13 @@ class RouteConfig(Section):
     rrt_range_m: Positive = 1.0
 
 
-class FeaturesConfig(Section):
+class ObservationConfig(Section):
     """What the observation holds: the sonar by sectors, and what may be added to the paper's phi."""
 
     n_sector: PositiveCount = 12
     ttc_cap_s: Positive = 10.0
     """times to collision or conflict are cut off here"""
     n_track: Count = 0
-    """moving bodies with columns of their own, those that come closest; 0 = none (the paper's phi)"""
-    teacher: bool = False
+    """moving obstacles with columns of their own, those that come closest; 0 = none (the paper's phi)"""
+    behavior: bool = False
     """the behaviour tree's action, and why it takes it, as columns; false = the paper's phi"""

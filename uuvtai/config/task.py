@@ -1,4 +1,4 @@
-"""Reward, clock and the rules of the referee."""
+"""Reward, clock and the rules of the termination."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class RewardConfig(Section):
 
 
 class EpisodeConfig(Section):
-    """Clock and the referee's rules."""
+    """Clock and the termination check's rules."""
 
     control_dt_s: Positive = 0.02
     substeps: PositiveCount = 2

@@ -85,10 +85,10 @@ class DynamicObstacles(Section):
     cylinder_fraction: Fraction = 0.5
     """the others are spheres"""
     full_column_fraction: Fraction = 0.0
-    """share of the moving bodies that are cylinders through the full water column (counted within
+    """share of the moving obstacles that are cylinders through the full water column (counted within
     cylinder_fraction)"""
     motion: Literal["line_circle", "waypoints", "mixed"] = "line_circle"
-    """mixed: each body by a throw of a coin"""
+    """mixed: each obstacle by a throw of a coin"""
     circle_fraction: Fraction = 0.5
     """the others go back and forth on a line"""
     line_length_m: PositiveInterval = (2.0, 6.0)
@@ -238,8 +238,8 @@ class WorldConfig(Section, Truth):
         )  # fmt: skip
 
     @property
-    def bodies(self) -> dict[str, int]:
-        """Numbers of all its obstacles, S resting and D moving, and how many of each are explicit."""
+    def obstacles(self) -> dict[str, int]:
+        """Numbers of all its obstacles, S static and D moving, and how many of each are explicit."""
         fixed_static, fixed_moving = self.n_fixed_static, self.n_fixed_moving
         all_of = {"S": self.n_static + fixed_static, "D": self.n_dynamic + fixed_moving}
         return all_of | {"fixed_static": fixed_static, "fixed_moving": fixed_moving}
@@ -256,10 +256,11 @@ class WorldConfig(Section, Truth):
 
 
 class TrafficConfig(Section):
-    """A prior, as an operator can give it who knows the water: where moving bodies swim and how they turn.
+    """A prior, as an operator can give it who knows the water: where moving obstacles swim and how they turn.
 
-    It says nothing of any single episode. Worlds whose bodies are others state their own (``worlds/*.yaml``),
-    with the share that fills the whole water (``elevation.column_share``); what is seen counts beside it.
+    It says nothing of any single episode. Worlds whose obstacles are others state their own
+    (``worlds/*.yaml``), with the share that fills the whole water (``height.column_share``); what is seen
+    counts beside it.
     """
 
     z_m: OrderedInterval = (-1.2, -0.4)

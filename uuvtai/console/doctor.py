@@ -92,13 +92,13 @@ def _video() -> str:
     import av
     import numpy as np
 
-    from uuvtai.logs.video import check_whole, write_film
+    from uuvtai.logs.video import check_whole, write_video
 
     frames = [np.full((64, 64, 3), 80 * i, np.uint8) for i in range(3)]
     with tempfile.TemporaryDirectory() as folder:
         for suffix in (".webm", ".mp4", ".gif"):
             target = Path(folder) / f"test{suffix}"
-            check_whole(target, write_film(target, frames, 10.0, frames, []), target)
+            check_whole(target, write_video(target, frames, 10.0, frames, []), target)
     return f"PyAV {av.__version__}, WebM, MP4 and GIF can be written"
 
 

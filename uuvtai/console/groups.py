@@ -149,15 +149,15 @@ class AgentGroup:
 
 
 @dataclass(frozen=True)
-class PiecesGroup:
-    """The user's own pieces, and nothing else."""
+class PluginsGroup:
+    """The user's own plugins, and nothing else."""
 
     agent: opt.OwnAgents = None
     planner: opt.Planners = None
 
     def named(self) -> list[str]:
-        """UsageError for what is no piece of hers."""
-        return parsing.own_pieces(self.agent, self.planner)
+        """UsageError for what is no plugin of hers."""
+        return parsing.named_plugins(self.agent, self.planner)
 
 
 @dataclass(frozen=True)

@@ -73,11 +73,11 @@ def refuse_no_duration(option: str, seconds: float) -> None:
 def agents(given: list[str] | None, planner: list[str] | None, default: Sequence[str]) -> list[str]:
     """Names of --agent, each alone or several with commas between; of --planner a row each. ``default``:
     where neither is typed."""
-    from uuvtai.plugins.api import PLANNER, is_piece, piece_spec
+    from uuvtai.plugins.api import PLANNER, is_plugin, plugin_spec
 
     whole = (part for item in given or (default if not planner else []) for part in _parted(item))
-    names = [piece_spec(name).text if is_piece(name) else name for name in whole]
-    names += [piece_spec(name, PLANNER).text for name in planner or []]
+    names = [plugin_spec(name).text if is_plugin(name) else name for name in whole]
+    names += [plugin_spec(name, PLANNER).text for name in planner or []]
     if not names:
         raise UsageError("--agent: name who drives, for example --agent bt")
     return list(dict.fromkeys(names))
@@ -89,15 +89,15 @@ def _parted(item: str) -> list[str]:
     return [item] if is_one else [name for name in item.split(",") if name]
 
 
-def own_pieces(given: list[str] | None, planner: list[str] | None) -> list[str]:
-    """The user's own pieces where nothing else may be named."""
-    from uuvtai.plugins.api import is_piece
+def named_plugins(given: list[str] | None, planner: list[str] | None) -> list[str]:
+    """The user's own plugins where nothing else may be named."""
+    from uuvtai.plugins.api import is_plugin
 
     if not (given or planner):
         return []
     found = agents(given, planner, [])
-    if strange := [name for name in found if not is_piece(name)]:
-        raise UsageError(f"{strange[0]}: is no piece of yours, for example --agent mine.py:act")
+    if strange := [name for name in found if not is_plugin(name)]:
+        raise UsageError(f"{strange[0]}: is no plugin of yours, for example --agent mine.py:act")
     return found
 
 

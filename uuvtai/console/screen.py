@@ -28,8 +28,8 @@ from uuvtai.report.tables import (
     HeatMap,
     Table,
     axis_name,
-    bodies,
     number,
+    obstacles,
     percent,
     pivot,
 )
@@ -248,7 +248,7 @@ class Progress:
         )
 
     def _left_s(self, done: int, env_steps: int, left: int | None) -> float | None:
-        """Time left [s]. Of episodes, from their steps: played together they end together, and their count
+        """Time left [s]. Of episodes, from their steps: run together they end together, and their count
         tells nothing until then."""
         assert self._pace is not None
         if not env_steps:
@@ -328,7 +328,7 @@ class TrainingProgress:
         self._folder, self._total, self._pace = folder, total, None
         world = config.world
         self._title = (
-            f"{config.train.num_envs} envs, {bodies(world.bodies)}, v = {world.dynamic_speed_m_s} m/s"
+            f"{config.train.num_envs} envs, {obstacles(world.obstacles)}, v = {world.dynamic_speed_m_s} m/s"
         )
         if sys.stderr.isatty():
             from rich.live import Live
@@ -399,7 +399,7 @@ def training_rows(
         if is_first
         else f"{of('time/env_steps_per_s', 0.0):,.0f} ({split})",
         "env-steps": f"{of('time/env_steps', 0.0):,.0f}",
-        "lambda": number(of("distill/lambda_risk"), 3),
+        "lambda": number(of("distillation/lambda_risk"), 3),
     }
     if left_s is not None:
         rows["ETA"] = time_left(left_s).removeprefix("ETA ")
@@ -425,21 +425,21 @@ _WIDTH = 7
 
 
 def print_heat_maps(document: dict[str, Any], console: Console, is_whole: bool = False) -> None:
-    """Print both heat maps of every method of a ``uuv sweep --json`` document. Raises ValueError like
+    """Print both heat maps of every agent of a ``uuv sweep --json`` document. Raises ValueError like
     ``heatmap.pivot``.
 
     A map that is wider than the console comes in pieces, one below the other, unless it shall be
     ``is_whole``.
     """
     cells = document["cells"]
-    for method in dict.fromkeys(cell.get("method", "") for cell in cells):
-        chosen = pivot([cell for cell in cells if cell.get("method", "") == method], document["axes"])
+    for agent in dict.fromkeys(cell.get("agent", "") for cell in cells):
+        chosen = pivot([cell for cell in cells if cell.get("agent", "") == agent], document["axes"])
         n = len(chosen.column_names)
         step = n if is_whole else max(1, (console.width - _row_width(chosen)) // _cell_width(chosen))
         for first in range(0, n, step):
             piece = range(first, min(n, first + step))
             tables = [
-                heat_table(chosen, key, f"{method}: {key.removesuffix('_rate')}", piece)
+                heat_table(chosen, key, f"{agent}: {key.removesuffix('_rate')}", piece)
                 for key in ("collision_rate", "success_rate")
             ]
             if is_whole:

@@ -15,12 +15,12 @@ from rich.text import Text
 
 from uuvtai.common.exits import UsageError, plain, say
 from uuvtai.common.files import read_text
-from uuvtai.common.presets import KINDS, preset_names, shipped_file
+from uuvtai.common.presets import KINDS, built_in_file, preset_names
 from uuvtai.common.tree_codes import ACTION, LEAVES
 from uuvtai.console.screen import Screen, print_heat_maps
-from uuvtai.report.evaluation import DAGGER, causes_table, methods_table, paired_table
+from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, paired_table
 from uuvtai.report.sweep import cell_table
-from uuvtai.report.tables import Column, Table, bodies, number, sensing, varies_alone, varying, vehicle
+from uuvtai.report.tables import Column, Table, number, obstacles, sensing, varies_alone, varying, vehicle
 from uuvtai.report.timing import density_table, latency_table
 
 if TYPE_CHECKING:
@@ -28,43 +28,44 @@ if TYPE_CHECKING:
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
-    """All of a ``uuv eval --json`` document: methods, pairs, and why episodes failed."""
-    show_methods(screen, result)
+    """All of a ``uuv eval --json`` document: agents, pairs, and why episodes failed."""
+    show_agents(screen, result)
     show_pairs(screen, result["paired"])
-    if any("causes" in method for method in result["methods"]):
+    if any("causes" in agent for agent in result["agents"]):
         show_causes(screen, result)
         say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
 
 
-def show_methods(screen: Screen, result: dict[str, Any]) -> None:
-    """Table of methods of a ``uuv eval --json`` document, and what belongs below it."""
+def show_agents(screen: Screen, result: dict[str, Any]) -> None:
+    """Table of agents of a ``uuv eval --json`` document, and what belongs below it."""
     speed = f"v = {result['v_m_s']} m/s, " if result["D"] else ""
     title = (
-        f"{result['world']}: {bodies(result)}, {speed}{vehicle(result)}{sensing(result)}, "
+        f"{result['world']}: {obstacles(result)}, {speed}{vehicle(result)}{sensing(result)}, "
         f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x "
         f"{result['episodes_per_seed']} episodes"
     )
-    screen.table(methods_table(result["methods"], title))
+    screen.table(agents_table(result["agents"], title))
     for part in result["remainder"]:
         _show_remainder(screen, part)
-    for m in result["methods"]:
+    for m in result["agents"]:
         if m["privileged"]:
             screen.line(f"{DAGGER} {m['name']} is privileged: {_privilege(m['name'])}", "dim")
 
 
 def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
-    """Every two methods on the episodes that both played (``evaluation.results``); nothing where one
-    method played alone."""
+    """Every two agents on the episodes that both played (``evaluation.results``); nothing where one
+    agent run alone."""
     if not pairs:
         return
     screen.line("")
-    screen.table(paired_table(pairs, f"the same {pairs[0]['episodes']} episodes, two methods at a time"))
+    screen.table(paired_table(pairs, f"the same {pairs[0]['episodes']} episodes, two agents at a time"))
 
 
 def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
     screen.line(
-        f"{part['method']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told "
-        f"of the moving bodies it arrives), {part['forecast_decision']} by forecast, decision and inertia (a "
+        f"{part['agent']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told "
+        f"of the moving obstacles it arrives), {part['forecast_decision']} by forecast, decision and inertia "
+        f"(a "
         f"point had a way), {part['physics']} by physics (the oracle finds none)"
     )
 
@@ -74,7 +75,7 @@ def _privilege(name: str) -> str:
         return (
             "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
         )
-    return "it is told where every moving body is and how it moves; what stands still it senses"
+    return "it is told where every moving obstacle is and how it moves; what stands still it senses"
 
 
 _REMARKABLE_SHARE = 0.2
@@ -88,15 +89,15 @@ _LEGEND = (
 
 
 def show_causes(screen: Screen, result: dict[str, Any]) -> None:
-    """Causes of every method of a ``uuv eval --explain --json`` document."""
-    for m in result["methods"]:
+    """Causes of every agent of a ``uuv eval --explain --json`` document."""
+    for m in result["agents"]:
         if "explain" in m:
-            _show_method(screen, m)
-    if any(m.get("explain") for m in result["methods"]):
+            _show_agent(screen, m)
+    if any(m.get("explain") for m in result["agents"]):
         screen.line(_LEGEND, "dim")
 
 
-def _show_method(screen: Screen, m: dict[str, Any]) -> None:
+def _show_agent(screen: Screen, m: dict[str, Any]) -> None:
     failed = len(m["explain"])
     screen.line("")
     if not failed:
@@ -203,7 +204,7 @@ def _show_latency(screen: Screen, result: dict[str, Any]) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# The shipped presets in the terminal: a sentence for each, and what one of them states, with its comments,
+# The built-in presets in the terminal: a sentence for each, and what one of them states, with its comments,
 # units and sources.
 
 
@@ -213,8 +214,8 @@ _SENTENCE = re.compile(r"(.+?[.])(?:\s+(?=[A-Z0-9])|$)", re.S)
 
 
 def sentence(kind: str, name: str) -> str:
-    """What a shipped preset says of itself first: its first comment's first sentence."""
-    text = read_text(shipped_file(kind, name), _MAX_BYTES)
+    """What a built-in preset says of itself first: its first comment's first sentence."""
+    text = read_text(built_in_file(kind, name), _MAX_BYTES)
     if kind == "tree":
         said = text.partition("<!--")[2].partition("-->")[0]
     else:
@@ -227,7 +228,7 @@ def sentence(kind: str, name: str) -> str:
 
 
 def sentences() -> dict[str, dict[str, str]]:
-    """Kind -> name -> sentence, of everything that is shipped."""
+    """Kind -> name -> sentence, of everything that is built in."""
     return {kind: {name: sentence(kind, name) for name in preset_names(kind)} for kind in KINDS}
 
 
@@ -261,7 +262,7 @@ def show_stated(kind: str, name: str, as_json: bool) -> None:
     typer.echo(text)
     if kind == "world":
         with contextlib.suppress(loader.ConfigError):  # a file is shown although it cannot be used
-            told = bodies(loader.load_config(name).world.bodies)
+            told = obstacles(loader.load_config(name).world.obstacles)
             vehicle, sensors = (loader.preset_of(other, name, None) for other in ("vehicle", "sensors"))
             say(f"{told}, vehicle {vehicle}, sensors {sensors}")
     if (base := loader.base_of(path)) is not None:
@@ -471,7 +472,7 @@ def _errors(values: Sequence[float | None]) -> list[str]:
 
 
 _COLUMNS = (
-    Column("method"),
+    Column("agent"),
     Column("seed"),
     Column("episode"),
     Column("outcome"),
@@ -485,7 +486,7 @@ def show_watched(screen: Screen, watched: list[dict[str, Any]]) -> None:
     """A row per episode of ``uuv watch --json``."""
     rows = [
         [
-            entry["method"],
+            entry["agent"],
             str(entry["seed"]),
             str(entry["episode"]),
             entry["outcome"],

@@ -23,8 +23,8 @@ from uuvtai.envs.vector_env import NUM_ACTIONS, ObservationColumn, VectorEnv, ch
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.logs.drawing import (
     ROUTE,
+    agent_inks,
     map_canvas,
-    method_inks,
     paint_layers,
     paint_truth,
     paint_walls,
@@ -71,17 +71,17 @@ def observation_space(table: tuple[ObservationColumn, ...], config: Config) -> s
 
 def bounds(config: Config) -> dict[str, tuple[float, float]]:
     """(low, high) of the columns that cannot leave them, by name."""
-    ttc_s = config.features.ttc_cap_s
+    ttc_s = config.observation.ttc_cap_s
     return {
         "heading_error": (-1.0, 1.0),
         "sector_range": (0.0, config.sensors.sonar.max_range_m),
         "sector_ttc": (0.0, ttc_s),
         "path_risk": (0.0, np.inf),
-        "body_valid": (0.0, 1.0),
-        "body_age": (0.0, np.inf),
-        "body_closest_time": (0.0, np.inf),
-        "teacher_conflict": (0.0, ttc_s),
-        "teacher_class": (0.0, 1.0),
+        "obstacle_valid": (0.0, 1.0),
+        "obstacle_age": (0.0, np.inf),
+        "obstacle_closest_time": (0.0, np.inf),
+        "behavior_conflict": (0.0, ttc_s),
+        "behavior_class": (0.0, 1.0),
     }
 
 
@@ -97,7 +97,7 @@ def episode_seed(env: gymnasium.Env | gymnasium.vector.VectorEnv, seed: Any) -> 
 
     An int is that seed, folded as ``uuvtai.make`` does. None goes on where the env has been seeded, and draws
     a seed where it has not. The env's generator is seeded along. Raises TypeError or ValueError for what is
-    no seed; lists are refused, since env i plays episode i of one seed.
+    no seed; lists are refused, since env i runs episode i of one seed.
     """
     if seed is not None:
         given = _integer(seed)
@@ -137,7 +137,7 @@ def simulator(
     if type(num_envs) is not int:
         raise TypeError(f"num_envs must be an int, got {num_envs!r}")
     config = load_config(world, sensors, vehicle, overrides)
-    return Sim(config, num_envs, read_tree(teacher, config.teacher.max_node), device)
+    return Sim(config, num_envs, read_tree(teacher, config.behavior.max_node), device)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -196,7 +196,7 @@ BACKENDS = ("numpy", "torch")
 
 
 class UuvVectorEnv(gymnasium.vector.VectorEnv):
-    """``num_envs`` vehicles in their worlds; env i plays the episodes i, i + num_envs, i + 2 num_envs, ... of
+    """``num_envs`` vehicles in their worlds; env i runs the episodes i, i + num_envs, i + 2 num_envs, ... of
     the seed.
 
     Observations are float32 (num_envs, n_obs) in raw SI units (``native.observation_table`` names the
@@ -360,7 +360,7 @@ _MARGINS = (12, 12, 12, 12)
 
 def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     """(height, width, 3) uint8, red green blue: what the vehicle of this row has mapped, its route and goal,
-    and the true bodies."""
+    and the true obstacles."""
     config = sim.config
 
     def read(name: str) -> np.ndarray:
@@ -380,7 +380,7 @@ def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     paint_walls(canvas, scenario["tank"])
     canvas.line(read("route.way_w")[: int(read("route.n_way"))], ROUTE, 2)
     canvas.star(scenario["goal"], 12)
-    canvas.vehicle([*pos_w, _yaw(read("vehicle.quat_wb"))], method_inks(["bt"])["bt"])
+    canvas.vehicle([*pos_w, _yaw(read("vehicle.quat_wb"))], agent_inks(["bt"])["bt"])
     return canvas.image[:, :, ::-1].copy()
 
 
@@ -395,7 +395,7 @@ def _yaw(quat_wb: np.ndarray) -> float:
 
 
 class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One vehicle that plays the episodes 0, 1, 2, ... of its seed (of a simulator with n envs: 0, n, 2n,
+    """One vehicle that runs the episodes 0, 1, 2, ... of its seed (of a simulator with n envs: 0, n, 2n,
     ..., in its first row).
 
     Observation float32 (n_obs,) in raw SI units (``native.observation_table`` names the columns), action
@@ -466,7 +466,7 @@ class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._row(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """The tank from above: map, true bodies, route, goal and vehicle, (height, width, 3) uint8; None
+        """The tank from above: map, true obstacles, route, goal and vehicle, (height, width, 3) uint8; None
         without a render mode."""
         if self.render_mode is None:
             return None

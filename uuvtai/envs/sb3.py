@@ -78,6 +78,6 @@ class Sb3VecEnv(VecEnv):
         """There are no single envs."""
         raise NotImplementedError("Sb3VecEnv has no attributes or methods of single envs")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, agent_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
         """There are no single envs."""
         raise NotImplementedError("Sb3VecEnv has no attributes or methods of single envs")

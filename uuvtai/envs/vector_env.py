@@ -62,7 +62,7 @@ class VectorEnv:
     """``num_envs`` episodes side by side; an env whose episode ends begins its next one in the same step
     (``autoreset``).
 
-    Env i plays the episodes i, i + num_envs, i + 2 num_envs, ... of its seed, the same scenarios whatever is
+    Env i runs the episodes i, i + num_envs, i + 2 num_envs, ... of its seed, the same scenarios whatever is
     done in them. Actions are float32 (num_envs, 4): surge, sway, heave, yaw rate in parts of the vehicle's
     limits, body frame; beyond [-1, 1] they are clamped. Observations are float32 (num_envs, num_obs) in raw
     SI units, as ``observation_table`` says: scaling is the policy's business.
@@ -98,7 +98,7 @@ class VectorEnv:
             ObservationColumn(
                 column.name, slice(first, first + width), column.unit, column.frame, column.meaning
             )
-            for column, first, width in placed_columns(sim.config.features)
+            for column, first, width in placed_columns(sim.config.observation)
         )
         self.columns = {column.name: column.slice for column in self.observation_table}
         self.observation_sha256 = observation_sha256(self.observation_table)
@@ -147,7 +147,7 @@ class VectorEnv:
             self._number += self.num_envs * rows
         self.sim.observation = self._obs
         self._begin(rows)
-        write_leaf(self.sim.io.teacher, self._info["leaf"])
+        write_leaf(self.sim.io.behavior, self._info["leaf"])
         self._begun = True
         for name in ("outcome", "episode_return", "episode_steps"):
             self._info[name].masked_fill_(rows, 0)
@@ -161,7 +161,7 @@ class VectorEnv:
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         """Apply ``action`` for one control step: (obs, reward, terminated, truncated, info).
 
-        terminated: success, or a stop by the referee; truncated: the horizon was reached; both bool
+        terminated: success, or a stop by the termination check; truncated: the horizon was reached; both bool
         (num_envs,). Envs that ended have already begun their next episode: obs, ``info["teacher_action"]``
         (what the behaviour tree would do now), ``info["leaf"]`` (which of its nodes says so, an index into
         ``node_names``, -1 = none), ``info["seed"]`` and ``info["episode"]`` belong to it. To the step itself
@@ -185,7 +185,7 @@ class VectorEnv:
         told = sim.counts.any_ended
         if sim.counts.number(sim.s.reward.n_ended) if told is None else told:
             self._go_on(self._terminated | self._truncated)
-        write_leaf(sim.io.teacher, info["leaf"])
+        write_leaf(sim.io.behavior, info["leaf"])
         return self._obs, sim.reward, self._terminated, self._truncated, dict(info)
 
     @property
@@ -270,7 +270,7 @@ class VectorEnv:
     def _go_on(self, ended: torch.Tensor) -> None:
         """The next episodes of the rows that ended, or rest."""
         if not self.autoreset:
-            self.sim.sleep_ended()
+            self.sim.deactivate_ended()
             return
         self._number += self.num_envs * ended
         self._begin(ended)

@@ -112,7 +112,7 @@ def understood(recipe: bytes) -> tuple[Config, int]:
 def compile_backwards(config: Config, num_envs: int) -> int:
     """Compile the kernels of a reset and a step from the last to the first, each run once on empty arrays;
     how many there are."""
-    sim = Sim(config, num_envs, read_tree("bt", config.teacher.max_node))  # kernels know no tree
+    sim = Sim(config, num_envs, read_tree("bt", config.behavior.max_node))  # kernels know no tree
     calls = calls_of(sim)
     wake(sim)
     for kernel, arguments in reversed(calls):
@@ -124,7 +124,7 @@ def compile_backwards(config: Config, num_envs: int) -> int:
 def wake(sim: Sim) -> None:
     """Have every row work, for a kernel that does nothing compares nothing; but not the rows that fill up a
     size: the tensors that kernels write to have none for them."""
-    for clock in (sim.s.clock.awake, sim.s.clock.active):
+    for clock in (sim.s.clock.active, sim.s.clock.running):
         rows = clock.to_numpy()
         rows[:] = np.arange(len(rows)) < sim.num_envs
         clock.from_numpy(rows)

@@ -1,5 +1,5 @@
 """What drives an evaluation: behaviour trees and stacks by name, trained policies by run folder, checkpoint
-folder, and pieces that the user brings."""
+folder, and plugins that the user brings."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from uuvtai.common.presets import TRAINING_TREE, preset_names
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
 from uuvtai.learning.export.folder import Export, export
-from uuvtai.plugins.api import is_piece, piece_spec
+from uuvtai.plugins.api import is_plugin, plugin_spec
 from uuvtai.sim.behavior_tree import FlatTree, read_tree
 
 if TYPE_CHECKING:
     from uuvtai.learning.checkpoint import Checkpoint
     from uuvtai.logs.writer import PolicyNote
-    from uuvtai.plugins.loading import OwnPiece
+    from uuvtai.plugins.loading import LoadedPlugin
     from uuvtai.sim.rrt import RoutePlanner
     from uuvtai.sim.sim import Sim
 
 
 TRUTH = "truth"
-"""suffix of a tree's name: a privileged yardstick whose tracks of moving bodies are the truth"""
+"""suffix of a tree's name: an oracle whose tracks of moving obstacles are the truth"""
 
 _STACK = (
     "tracking",
     "forecast",
-    "elevation",
+    "height",
     "mapping",
     "clearance",
     "voronoi",
     "quiet",
     "route",
-    "teacher",
+    "behavior",
     "fast",
     "actuation",
     "episode",
@@ -46,48 +46,48 @@ _STACK = (
 
 
 @dataclass(frozen=True)
-class Method:
-    """One row of the table of methods."""
+class AgentSpec:
+    """One row of the table of agents."""
 
     name: str
     tree: FlatTree
     checkpoint: Checkpoint | None = None
     """None = the tree drives"""
     privileged: bool = False
-    """its tracks of moving bodies are the truth"""
+    """its tracks of moving obstacles are the truth"""
     stack: str | None = None
     """stack preset (name or path) that this row alone drives with; None = the request's own"""
-    own: OwnPiece | None = None
+    own: LoadedPlugin | None = None
     """what the user brought: it drives, or plans the routes of the tree"""
 
     def config_of(self, config: Config) -> Config:
-        """What this method's simulator runs on; scenarios, sensors and referee are those of ``config``.
-        Raises ConfigError."""
+        """What this agent's simulator runs on; scenarios, sensors and termination check are those of
+        ``config``. Raises ConfigError."""
         return config if self.stack is None else with_stack(config, self.stack)
 
-    def driver_for(self, sim: Sim) -> PolicyNote | None:
+    def agent_for(self, sim: Sim) -> PolicyNote | None:
         """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError or
-        PieceError for one that does not fit."""
+        PluginError for one that does not fit."""
         if self.own is not None:
             from uuvtai.logs.writer import PolicyNote
 
-            driver = self.own.driver(sim)
-            return None if driver is None else PolicyNote(driver, self.own.sha256, None)
+            agent = self.own.agent(sim)
+            return None if agent is None else PolicyNote(agent, self.own.sha256, None)
         if self.checkpoint is None:
             return None
         from uuvtai.learning.agents import load_driver
         from uuvtai.logs.writer import PolicyNote
 
-        pilot = load_driver(self.checkpoint, sim)
-        weight = self.checkpoint.manifest.metrics.get("distill/lambda")
-        return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
+        agent = load_driver(self.checkpoint, sim)
+        weight = self.checkpoint.manifest.metrics.get("distillation/lambda")
+        return PolicyNote(agent, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
 
     def planner_for(self, sim: Sim) -> RoutePlanner | None:
-        """Who plans this simulator's routes in place of its own planners; None = they do. PieceError."""
+        """Who plans this simulator's routes in place of its own planners; None = they do. PluginError."""
         return None if self.own is None else self.own.planner(sim)
 
     def document(self) -> dict[str, Any]:
-        """What ``uuv eval --json`` says of a policy, a stack or a piece of the user's beside its results."""
+        """What ``uuv eval --json`` says of a policy, a stack or a plugin of the user's beside its results."""
         if self.own is not None:
             return {"own": self.own.document()}
         if self.checkpoint is None:
@@ -109,11 +109,11 @@ class Method:
 
 def load_agents(
     names: Sequence[str], max_node: int, note: Callable[[str], None] = lambda _text: None
-) -> list[Method]:
+) -> list[AgentSpec]:
     """Every kind of agent by the name that ``--agent`` takes: trees and stacks, each perhaps with ``+truth``,
-    the user's own pieces, trained policies. ``note`` is told of checkpoints that were left out. Raises
-    ConfigError, CheckpointError, PieceError."""
-    found: dict[str, Method] = {}
+    the user's own plugins, trained policies. ``note`` is told of checkpoints that were left out. Raises
+    ConfigError, CheckpointError, PluginError."""
+    found: dict[str, AgentSpec] = {}
     for name in dict.fromkeys(names):
         agent = _load(name, max_node, note)
         if agent.name in found:
@@ -125,28 +125,28 @@ def load_agents(
     return list(found.values())
 
 
-def _load(name: str, max_node: int, note: Callable[[str], None]) -> Method:
-    if is_piece(name):
-        return _own_method(name, max_node)
+def _load(name: str, max_node: int, note: Callable[[str], None]) -> AgentSpec:
+    if is_plugin(name):
+        return _plugin_agent(name, max_node)
     if is_trained(name):
         checkpoint = find_policy(name, note)
-        return Method(policy_name(name, checkpoint), read_tree(TRAINING_TREE, max_node), checkpoint)
-    driver, privileged = _parted(name)
-    label = f"{_label(driver)}+{TRUTH}" if privileged else _label(driver)
-    stack = driver if _is_stack(driver) else None
-    tree = tree_of_stack(driver) if stack else driver
-    return Method(label, read_tree(tree, max_node), privileged=privileged, stack=stack)
+        return AgentSpec(policy_name(name, checkpoint), read_tree(TRAINING_TREE, max_node), checkpoint)
+    base, privileged = _parted(name)
+    label = f"{_label(base)}+{TRUTH}" if privileged else _label(base)
+    stack = base if _is_stack(base) else None
+    tree = tree_of_stack(base) if stack else base
+    return AgentSpec(label, read_tree(tree, max_node), privileged=privileged, stack=stack)
 
 
-def _own_method(name: str, max_node: int) -> Method:
-    """A piece of the user's: what it leaves to the stack, the training tree's does."""
-    from uuvtai.plugins.loading import own_piece
+def _plugin_agent(name: str, max_node: int) -> AgentSpec:
+    """A plugin of the user's: what it leaves to the stack, the training tree's does."""
+    from uuvtai.plugins.loading import load_plugin
 
     try:
-        found = own_piece(piece_spec(name))
+        found = load_plugin(plugin_spec(name))
     except SettingError as error:
         raise ConfigError(str(error)) from None
-    return Method(found.label, read_tree(TRAINING_TREE, max_node), own=found)
+    return AgentSpec(found.label, read_tree(TRAINING_TREE, max_node), own=found)
 
 
 def is_trained(name: str) -> bool:
@@ -190,32 +190,32 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
     )
 
 
-def features_of(names: Sequence[str]) -> list[tuple[str, Any]]:
+def observation_of(names: Sequence[str]) -> list[tuple[str, Any]]:
     """Overrides that give the observation the columns that the trained policies among these agents know.
     ConfigError where they differ among themselves."""
-    trained = [name for name in names if not is_piece(name) and is_trained(name)]
-    sections = {name: find_policy(name).config.features.model_dump(mode="json") for name in trained}
+    trained = [name for name in names if not is_plugin(name) and is_trained(name)]
+    sections = {name: find_policy(name).config.observation.model_dump(mode="json") for name in trained}
     for name, section in sections.items():
         if section != next(iter(sections.values())):
             raise ConfigError(
                 f"{trained[0]} and {name} see other columns ({sections[trained[0]]} and {section}); "
                 "evaluate them one by one: with the same seeds they meet the same episodes"
             )
-    return [("features", section) for section in list(sections.values())[:1]]
+    return [("observation", section) for section in list(sections.values())[:1]]
 
 
-def differences(method: Method, config: Config) -> str:
+def differences(agent: AgentSpec, config: Config) -> str:
     """Keys of the stack that differ from the policy's training, in words; empty = none."""
-    if method.checkpoint is None:
+    if agent.checkpoint is None:
         return ""
-    ours, trained = config.model_dump(mode="json"), method.checkpoint.config.model_dump(mode="json")
+    ours, trained = config.model_dump(mode="json"), agent.checkpoint.config.model_dump(mode="json")
     parts = [
         f"{section}.{key} = {value} (trained with {trained[section].get(key)})"
         for section in _STACK
         for key, value in ours[section].items()
         if value != trained[section].get(key)
     ]
-    return f"{method.name}: {', '.join(parts)}" if parts else ""
+    return f"{agent.name}: {', '.join(parts)}" if parts else ""
 
 
 def policy_name(name: str, checkpoint: Checkpoint) -> str:

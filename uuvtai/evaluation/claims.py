@@ -54,7 +54,7 @@ LOOP_MS, BUDGET_MS = 28.63, 20.0
 INCONSISTENCIES = (
     "Table main: success 0.87 and collision 0.15 of the curriculum add up to more than 1, though every "
     "episode ends in one way.",
-    "Table main: 25 episodes a method (5 seeds x 5 trials) cannot give 0.46, 0.87 or 0.15: k/25 is 0.44 or "
+    "Table main: 25 episodes an agent (5 seeds x 5 trials) cannot give 0.46, 0.87 or 0.15: k/25 is 0.44 or "
     "0.48, 0.84 or 0.88, 0.12 or 0.16.",
     "Table main: TTS is defined as mean time over success rate; 22.84 / 0.20 = 114.2 holds, but 13.44 / 0.46 "
     "= 29.2 is printed as 67.2, 11.41 / 0.87 = 13.1 as 15.8, and 14.50 / 0.80 = 18.1 as 32.5.",
@@ -146,18 +146,18 @@ class Share:
         )
 
 
-def pooled(methods: Sequence[dict[str, Any]], *outcomes: str) -> Share:
+def pooled(agents: Sequence[dict[str, Any]], *outcomes: str) -> Share:
     """Share of the episodes of these entries (of ``uuv eval`` or a sweep) that ended in ``outcomes``."""
-    k, n = sum(m["outcomes"][o] for m in methods for o in outcomes), sum(m["episodes"] for m in methods)
-    return Share(k, n, _design(methods, outcomes) if len(methods) > 1 else 1.0)
+    k, n = sum(m["outcomes"][o] for m in agents for o in outcomes), sum(m["episodes"] for m in agents)
+    return Share(k, n, _design(agents, outcomes) if len(agents) > 1 else 1.0)
 
 
-def _design(methods: Sequence[dict[str, Any]], outcomes: Sequence[str]) -> float | None:
+def _design(agents: Sequence[dict[str, Any]], outcomes: Sequence[str]) -> float | None:
     """Of entries that share episodes by their numbers."""
     won, played = Counter[Hashable](), Counter[Hashable]()
-    for method in methods:
-        ends = ends_of(method)
-        if len(ends) != method["episodes"]:
+    for agent in agents:
+        ends = ends_of(agent)
+        if len(ends) != agent["episodes"]:
             return None
         played.update(ends.keys())
         won.update(key for key, end in ends.items() if end in outcomes)
@@ -240,7 +240,7 @@ def times_as_large(a: Share, b: Share, factor: float) -> Finding:
 
 
 def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
-    """Claims about the methods and ablations; entries of ``uuv eval`` by preset, one per training seed."""
+    """Claims about the agents and ablations; entries of ``uuv eval`` by preset, one per training seed."""
     success = {name: pooled(entries, "success") for name, entries in by_preset.items()}
     collision = {name: pooled(entries, *COLLIDED) for name, entries in by_preset.items()}
     ours, plain = success["curriculum"], success["ppo"]
@@ -350,9 +350,9 @@ def of_training(metrics: Sequence[dict[str, Any]]) -> list[Claim]:
 # ------------------------------------------------------------------------------------------------------ sweep
 
 
-def of_sweep(cells: Sequence[dict[str, Any]], method: str) -> list[Claim]:
-    """Claims about the grid of conditions, for one method of a sweep."""
-    own = [cell for cell in cells if cell["method"] == method]
+def of_sweep(cells: Sequence[dict[str, Any]], agent: str) -> list[Claim]:
+    """Claims about the grid of conditions, for one agent of a sweep."""
+    own = [cell for cell in cells if cell["agent"] == agent]
     moderate = [cell for cell in own if all((cell[name] or 0) <= most for name, most in MODERATE.items())]
     few = [cell for cell in own if cell["D"] <= FEW_MOVERS]
     corner = [cell for cell in own if all(cell[name] == value for name, value in CORNER.items())]
@@ -360,32 +360,32 @@ def of_sweep(cells: Sequence[dict[str, Any]], method: str) -> list[Claim]:
     spotless = sum(not any(cell["outcomes"][o] for o in COLLIDED) for cell in moderate)
     return [
         claim(
-            f"{method}: mean success over S <= 8, D <= 9, v <= 1.5 m/s",
+            f"{agent}: mean success over S <= 8, D <= 9, v <= 1.5 m/s",
             f"{MODERATE_SUCCESS}",
             str(success),
             at_least(success, MODERATE_SUCCESS),
         ),
         claim(
-            f"{method}: mean collision there",
+            f"{agent}: mean collision there",
             f"{MODERATE_COLLISION}",
             str(collision),
             at_most(collision, MODERATE_COLLISION),
         ),
         claim(
-            f"{method}: conditions without any collision there",
+            f"{agent}: conditions without any collision there",
             f"{WITHOUT_COLLISION} of {MODERATE_CONDITIONS}",
             f"{spotless} of {len(moderate)} (D = 0 once per S), {moderate[0]['episodes'] if moderate else 0} "
             "episodes each",
             Finding(OPEN, None),  # more episodes a cell leave fewer such cells, and theirs are not printed
         ),
         claim(
-            f"{method}: collision for D <= 3 over all S and v",
+            f"{agent}: collision for D <= 3 over all S and v",
             f"below {FEW_MOVERS_COLLISION}",
             str(pooled(few, *COLLIDED)),
             at_most(pooled(few, *COLLIDED), FEW_MOVERS_COLLISION),
         ),
         claim(
-            f"{method}: degrades in the corner S = 12, D = 15, v = 3.0 m/s",
+            f"{agent}: degrades in the corner S = 12, D = 15, v = 3.0 m/s",
             "as told",
             f"{pooled(corner, 'success')} against {success}",
             larger(success, pooled(corner, "success")),

@@ -1,4 +1,4 @@
-"""Play episodes side by side: every driver meets exactly the same ones, whatever the batch size or order."""
+"""Run episodes side by side: every agent meets exactly the same ones, whatever the batch size or order."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from uuvtai.sim.setup import Scene
 from uuvtai.sim.sim import Sim
 
 if TYPE_CHECKING:
-    from uuvtai.learning.policy_agent import PilotDecision
+    from uuvtai.learning.policy_agent import AgentDecision
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -85,7 +85,7 @@ _PROGRESS_EVERY = 50
 
 @dataclass(frozen=True)
 class Job:
-    """One episode to play."""
+    """One episode to run."""
 
     seed: int
     episode: int
@@ -148,13 +148,13 @@ class Recorders:
             part.end(sim, row, result)
 
 
-class Driver(Protocol):
-    """Chooses the actions of all rows from their observations (``learn.pilot.Pilot``)."""
+class Agent(Protocol):
+    """Chooses the actions of all rows from their observations (``learn.agent.PolicyAgent``)."""
 
     def reset(self, rows: torch.Tensor) -> None:
         """New episodes have begun in the rows (n_env,) where this is not 0."""
 
-    def decide(self, obs: torch.Tensor) -> PilotDecision:
+    def decide(self, obs: torch.Tensor) -> AgentDecision:
         """What to do now; asking again changes nothing."""
         ...
 
@@ -177,18 +177,18 @@ def run_episodes(
     jobs: list[Job],
     recorder: EpisodeObserver | None = None,
     progress: Progress | None = None,
-    driver: Driver | None = None,
+    agent: Agent | None = None,
     clock: StepClock | None = None,
 ) -> tuple[list[EpisodeResult], int]:
-    """Play every job; results in the order of ``jobs``, and the env steps it took. Without a driver the
+    """Run every job; results in the order of ``jobs``, and the env steps it took. Without an agent the
     simulator's tree drives.
 
     ``clock`` is told the time of simulating, without what the recorder takes.
     """
     observed = sim.observation
-    stepper = Stepper(sim, driver)
+    stepper = Stepper(sim, agent)
     waiting = list(enumerate(jobs))[::-1]
-    playing: dict[int, int] = {}
+    running: dict[int, int] = {}
     results: dict[int, EpisodeResult] = {}
     free = list(range(sim.num_envs))[::-1]
     begun: dict[int, int] = {}
@@ -197,37 +197,37 @@ def run_episodes(
 
     def left() -> int | None:
         over = (round(r.time_s / sim.config.episode.control_dt_s) for r in results.values())
-        return env_steps_left(over, (passes - begun[row] for row in playing), len(waiting))
+        return env_steps_left(over, (passes - begun[row] for row in running), len(waiting))
 
     if progress:
         progress(0, len(jobs), 0, None)
-    while waiting or playing:
-        if waiting and free and (len(free) * _REFILL_SHARE >= sim.num_envs or not playing):
+    while waiting or running:
+        if waiting and free and (len(free) * _REFILL_SHARE >= sim.num_envs or not running):
             with clock.counting("reset"):
-                rows = _refill(sim, stepper, jobs, waiting, free, playing)
+                rows = _refill(sim, stepper, jobs, waiting, free, running)
             begun |= dict.fromkeys(rows, passes)
             if recorder:
                 for row in rows:
-                    recorder.begin(sim, row, jobs[playing[row]])
-        passes, env_steps = passes + 1, env_steps + len(playing)
-        with clock.counting("step", len(playing)):
+                    recorder.begin(sim, row, jobs[running[row]])
+        passes, env_steps = passes + 1, env_steps + len(running)
+        with clock.counting("step", len(running)):
             stepper.step()
-            outcome = sim.rows(sim.s.referee.outcome)
+            outcome = sim.rows(sim.s.termination.outcome)
         if recorder:
             recorder.step(sim)
         if progress and passes % _PROGRESS_EVERY == 1:
             progress(len(results), len(jobs), env_steps, left())
-        ended = [row for row in sorted(playing) if outcome[row] != RUNNING]
+        ended = [row for row in sorted(running) if outcome[row] != RUNNING]
         if not ended:
             continue
         for row, result in zip(
-            ended, _results(sim, ended, [jobs[playing[row]] for row in ended]), strict=True
+            ended, _results(sim, ended, [jobs[running[row]] for row in ended]), strict=True
         ):
-            results[playing.pop(row)] = result
+            results[running.pop(row)] = result
             free.append(row)
             if recorder:
                 recorder.end(sim, row, result)
-        sim.sleep_ended()
+        sim.deactivate_ended()
         if progress:
             progress(len(results), len(jobs), env_steps, left())
     sim.observation = observed
@@ -235,34 +235,34 @@ def run_episodes(
 
 
 class Stepper:
-    """Steps the simulator by a driver, or by its tree where there is none."""
+    """Steps the simulator by an agent, or by its tree where there is none."""
 
-    def __init__(self, sim: Sim, driver: Driver | None) -> None:
-        self._sim, self._driver = sim, driver
-        self._obs = sim.observe() if driver else None
+    def __init__(self, sim: Sim, agent: Agent | None) -> None:
+        self._sim, self._agent = sim, agent
+        self._obs = sim.observe() if agent else None
         self._action: torch.Tensor | None = None
 
     def step(self) -> None:
         """One control step, and what to do in the next."""
         self._sim.step(self._action)
-        if self._driver:
-            self._driver.advance()
-            self._decide(self._driver)
+        if self._agent:
+            self._agent.advance()
+            self._decide(self._agent)
 
     def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
         """Begin episodes as ``Sim.reset`` does."""
         self._sim.reset(mask, seed, number)
-        if self._driver:
-            self._driver.reset(mask)
-            self._decide(self._driver)
+        if self._agent:
+            self._agent.reset(mask)
+            self._decide(self._agent)
 
-    def _decide(self, driver: Driver) -> None:
+    def _decide(self, agent: Agent) -> None:
         assert self._obs is not None  # observed since the beginning
-        self._action = driver.decide(self._obs).action
+        self._action = agent.decide(self._obs).action
 
 
 def _refill(
-    sim: Sim, stepper: Stepper, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int]
+    sim: Sim, stepper: Stepper, jobs: list[Job], waiting: list, free: list[int], running: dict[int, int]
 ) -> list[int]:
     """Begin as many jobs as there are free rows; the rows."""
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
@@ -270,7 +270,7 @@ def _refill(
     while waiting and free:
         index, job = waiting.pop()
         row = free.pop()
-        playing[row] = index
+        running[row] = index
         mask[row], seed[row], number[row] = 1, job.seed, job.episode
         begun.append((row, job))
     _set_scenes(sim, begun)
@@ -292,16 +292,16 @@ def _results(sim: Sim, rows: list[int], jobs: list[Job]) -> list[EpisodeResult]:
     read = {
         name: sim.rows(field, rows)
         for name, field in {
-            "outcome": s.referee.outcome,
+            "outcome": s.termination.outcome,
             "step": s.clock.step,
             "return": s.reward.episode_return,
-            "clearance": s.referee.min_clearance_m,
-            "length": s.referee.path_length_m,
+            "clearance": s.termination.min_clearance_m,
+            "length": s.termination.path_length_m,
             "replans": s.route.replans,
             "planned_by": s.route.planned_by,
             "fallbacks": s.route.fallbacks,
-            "ticks": s.teacher.ticks,
-            "acted": s.teacher.acted,
+            "ticks": s.behavior.ticks,
+            "acted": s.behavior.acted,
         }.items()
     }
     return [

@@ -23,7 +23,7 @@ from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError
 from uuvtai.evaluation import failure_causes
-from uuvtai.evaluation.agents import TRUTH, Method, differences, load_agents
+from uuvtai.evaluation.agents import TRUTH, AgentSpec, differences, load_agents
 from uuvtai.evaluation.episodes import (
     EpisodeResult,
     Job,
@@ -36,12 +36,12 @@ from uuvtai.evaluation.episodes import (
 from uuvtai.evaluation.oracle import earliest_arrival
 from uuvtai.evaluation.results import (
     ORACLE,
-    Ledger,
-    LedgerWriter,
+    JournalWriter,
     Request,
+    ResultsJournal,
+    digests_of,
     document,
     document_of,
-    drivers_of,
     read_request,
     refuse_others,
     summary,
@@ -60,12 +60,12 @@ if TYPE_CHECKING:
 
 
 _BATCH = 256
-"""Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost
+"""Episodes run together by default: enough to fill the cores, few enough that the last stragglers cost
 little."""
 
 
 def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
-    """Play every method's episodes; the ``uuv eval --json`` document and the run folder.
+    """Play every agent's episodes; the ``uuv eval --json`` document and the run folder.
 
     Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError,
     MemoryError, RunFolderError, CheckpointError.
@@ -80,13 +80,13 @@ def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], P
             "same"
         )
     refuse_place(request.run_dir)
-    methods = agents_of(request, watch)
+    agents = agents_of(request, watch)
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
-    comparison = comparison_of(request, num_envs, methods, watch)
+    comparison = comparison_of(request, num_envs, agents, watch)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     with _going_on(folder, watch):
         device = comparison.any_simulator().device.type
-        folder.write_json(REQUEST, document_of(request, num_envs, device, drivers_of(methods)))
+        folder.write_json(REQUEST, document_of(request, num_envs, device, digests_of(agents)))
         runs = run_agents(comparison, folder)
         return write_results(comparison, folder, runs), folder.path
 
@@ -100,17 +100,17 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
     """
     folder = RunFolder.held(place, "uuv eval")
     try:
-        request, drivers = read_request(place)
+        request, digests = read_request(place)
         refuse_code(place, request.agents, allow_code)
-        methods = agents_of(request, watch)
-        refuse_others(place, drivers, drivers_of(methods))
+        agents = agents_of(request, watch)
+        refuse_others(place, digests, digests_of(agents))
         folder.go_on({"what": "eval"})
     except BaseException:
         folder.release()
         raise
     with _going_on(folder, watch):
         assert request.num_envs is not None  # the file states it
-        comparison = comparison_of(request, request.num_envs, methods, watch)
+        comparison = comparison_of(request, request.num_envs, agents, watch)
         return write_results(comparison, folder, run_agents(comparison, folder)), place
 
 
@@ -133,22 +133,22 @@ def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
         watch.stop()
 
 
-def agents_of(request: Request, watch: EvaluationWatch) -> list[Method]:
-    """The request's agents but the oracle. Raises ConfigError, CheckpointError, PieceError."""
+def agents_of(request: Request, watch: EvaluationWatch) -> list[AgentSpec]:
+    """The request's agents but the oracle. Raises ConfigError, CheckpointError, PluginError."""
     names = [name for name in request.agents if name != ORACLE]
-    methods = load_agents(names, request.config.teacher.max_node, watch.note)
-    if not methods and (request.record or request.explain):
+    agents = load_agents(names, request.config.behavior.max_node, watch.note)
+    if not agents and (request.record or request.explain):
         raise ConfigError(
             "--record, --explain: the oracle drives no vehicle; add who does, for example --agent bt,oracle"
         )
-    for method in methods:
-        if changes := differences(method, request.config):
+    for agent in agents:
+        if changes := differences(agent, request.config):
             watch.note(f"note: {changes}")
-    return methods
+    return agents
 
 
 def comparison_of(
-    request: Request, num_envs: int, methods: list[Method], watch: EvaluationWatch
+    request: Request, num_envs: int, agents: list[AgentSpec], watch: EvaluationWatch
 ) -> Comparison:
     """A simulator for the request's own config and one for every stack that drives a row: the episodes are
     the same in all. And the policies, ready for them."""
@@ -157,15 +157,15 @@ def comparison_of(
     watch.note(
         f"starting {num_envs} envs (sizes not used before compile their kernels first, about half a minute)"
     )
-    configs = {method.stack: method.config_of(request.config) for method in methods} or {None: request.config}
-    tree = methods[0].tree if methods else _any_tree()
+    configs = {agent.stack: agent.config_of(request.config) for agent in agents} or {None: request.config}
+    tree = agents[0].tree if agents else _any_tree()
     sims = {stack: Sim(config, num_envs, tree, request.device) for stack, config in configs.items()}
-    for method in methods:
-        if method.own:
-            method.own.note = watch.note
-    policies = {method.name: method.driver_for(sims[method.stack]) for method in methods}
-    planners = {method.name: method.planner_for(sims[method.stack]) for method in methods}
-    return Comparison(request, methods, sims, policies, planners, watch)
+    for agent in agents:
+        if agent.own:
+            agent.own.note = watch.note
+    policies = {agent.name: agent.agent_for(sims[agent.stack]) for agent in agents}
+    planners = {agent.name: agent.planner_for(sims[agent.stack]) for agent in agents}
+    return Comparison(request, agents, sims, policies, planners, watch)
 
 
 def _any_tree() -> FlatTree:
@@ -176,21 +176,21 @@ def _any_tree() -> FlatTree:
     return read_tree(TRAINING_TREE)
 
 
-def run_agents(comparison: Comparison, folder: RunFolder) -> list[MethodRun]:
+def run_agents(comparison: Comparison, folder: RunFolder) -> list[AgentRun]:
     """Run every agent's episodes that are not over yet."""
     jobs = jobs_of(comparison.request.seeds, comparison.request.episodes)
-    ledger = Ledger(folder.path)
+    journal = ResultsJournal(folder.path)
     try:
-        return [play(comparison, method, jobs, ledger, folder.path) for method in comparison.methods]
+        return [run_agent(comparison, agent, jobs, journal, folder.path) for agent in comparison.agents]
     finally:
-        ledger.close()
+        journal.close()
 
 
-def write_results(comparison: Comparison, folder: RunFolder, runs: list[MethodRun]) -> dict[str, Any]:
+def write_results(comparison: Comparison, folder: RunFolder, runs: list[AgentRun]) -> dict[str, Any]:
     """The whole document of what was run, with the oracle's row, and all that is written and drawn of it."""
     request = comparison.request
     jobs = jobs_of(request.seeds, request.episodes)
-    entries = [method_run.entry for method_run in runs]
+    entries = [agent_run.entry for agent_run in runs]
     scenarios = scenarios_of(comparison.any_simulator(), jobs)
     if ORACLE in request.agents:
         entries.append(_ask_oracle(comparison, jobs, scenarios))
@@ -200,7 +200,7 @@ def write_results(comparison: Comparison, folder: RunFolder, runs: list[MethodRu
     _write_results(folder, result, runs)
     if request.explain:
         explain(comparison, runs, result, folder)
-    _draw(comparison, folder.path, [method_run.logs for method_run in runs if method_run.logs])
+    _draw(comparison, folder.path, [agent_run.logs for agent_run in runs if agent_run.logs])
     return result
 
 
@@ -213,19 +213,19 @@ def _ask_oracle(comparison: Comparison, jobs: list[Job], scenarios: list[dict[st
         comparison.watch.stop()
 
 
-def _write_results(folder: RunFolder, result: dict[str, Any], runs: list[MethodRun]) -> None:
+def _write_results(folder: RunFolder, result: dict[str, Any], runs: list[AgentRun]) -> None:
     """The document, and the trees that drove with the use of their nodes."""
     folder.write_json("eval/result.json", result)
-    driving = [method_run for method_run in runs if method_run.policy is None]
-    for method_run in driving:
-        method = method_run.method
-        folder.write_bytes(f"eval/trees/{method.name}.xml", method.tree.xml)
-    use = {method_run.method.name: method_run.use for method_run in driving}
+    driving = [agent_run for agent_run in runs if agent_run.policy is None]
+    for agent_run in driving:
+        agent = agent_run.agent
+        folder.write_bytes(f"eval/trees/{agent.name}.xml", agent.tree.xml)
+    use = {agent_run.agent.name: agent_run.use for agent_run in driving}
     folder.write_json("eval/tree.json", {"schema": 1, "use": use})
 
 
 def _draw(comparison: Comparison, folder: Path, logs: list[dict[Job, Path]]) -> None:
-    """One picture per recorded episode with every method's trajectory, and the videos."""
+    """One picture per recorded episode with every agent's trajectory, and the videos."""
     if not logs:
         return
     from uuvtai.logs.picture import picture
@@ -233,15 +233,15 @@ def _draw(comparison: Comparison, folder: Path, logs: list[dict[Job, Path]]) -> 
 
     for job in logs[0]:
         end = f"seed{job.seed}_episode{job.episode}"
-        files = [paths[job] for paths in reversed(logs)]  # the map drawn is that of the last method
+        files = [paths[job] for paths in reversed(logs)]  # the map drawn is that of the last agent
         names = [file.stem.removesuffix(f"_{end}") for file in reversed(files)]
-        picture(files, folder / "pictures" / f"{end}.png", methods=names)
-        picture(files, folder / "pictures" / f"{end}_clearance.png", clearance=True, methods=names)
+        picture(files, folder / "pictures" / f"{end}.png", agents=names)
+        picture(files, folder / "pictures" / f"{end}_clearance.png", clearance=True, agents=names)
         for file in files if comparison.request.video else []:
             target = folder / "videos" / f"{file.stem}.webm"
             if not target.exists():  # an evaluation that goes on may have drawn it before
                 comparison.watch.note(f"drawing {target.name}")
-                video(file, target, methods=names, **SMALL)
+                video(file, target, agents=names, **SMALL)
 
 
 _DIGITS = 3
@@ -264,7 +264,7 @@ def _rounded(value: Any) -> Any:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# One method of an evaluation plays its episodes on its simulator, as far as they are not over.
+# One agent of an evaluation runs its episodes on its simulator, as far as they are not over.
 
 
 class EvaluationWatch(Protocol):
@@ -281,33 +281,33 @@ class Comparison:
     """What is compared, and on what."""
 
     request: Request
-    methods: list[Method]
+    agents: list[AgentSpec]
     sims: dict[str | None, Sim]
     """by the stack that drives; None = the request's own"""
     policies: dict[str, PolicyNote | None]
-    """by method, ready for its simulator; None where a tree drives"""
+    """by agent, ready for its simulator; None where a tree drives"""
     planners: dict[str, RoutePlanner | None]
-    """by method: who plans routes in place of the simulator's planners; None = they do"""
+    """by agent: who plans routes in place of the simulator's planners; None = they do"""
     watch: EvaluationWatch
 
     def any_simulator(self) -> Sim:
         """For what is the same in all of them."""
         return next(iter(self.sims.values()))
 
-    def simulator_for(self, method: Method) -> Sim:
-        """The method's simulator, with its tree, its planner and, where it is a yardstick, with the truth."""
-        sim = self.sims[method.stack]
-        sim.use_tree(method.tree)
-        sim.privileged = method.privileged
-        sim.planner = self.planners[method.name]
+    def simulator_for(self, agent: AgentSpec) -> Sim:
+        """The agent's simulator, with its tree, its planner and, where it is an oracle, with the truth."""
+        sim = self.sims[agent.stack]
+        sim.use_tree(agent.tree)
+        sim.privileged = agent.privileged
+        sim.planner = self.planners[agent.name]
         return sim
 
 
 @dataclass(frozen=True)
-class MethodRun:
-    """What a method has done."""
+class AgentRun:
+    """What an agent has done."""
 
-    method: Method
+    agent: AgentSpec
     policy: PolicyNote | None
     results: list[EpisodeResult]
     entry: dict[str, Any]
@@ -317,18 +317,20 @@ class MethodRun:
     logs: dict[Job, Path]
 
 
-def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger, folder: Path) -> MethodRun:
-    """Play one method's episodes, as far as they are not over; ``folder`` is the run's."""
-    policy, watch = comparison.policies[method.name], comparison.watch
+def run_agent(
+    comparison: Comparison, agent: AgentSpec, jobs: list[Job], journal: ResultsJournal, folder: Path
+) -> AgentRun:
+    """Play one agent's episodes, as far as they are not over; ``folder`` is the run's."""
+    policy, watch = comparison.policies[agent.name], comparison.watch
     dt = comparison.request.config.episode.control_dt_s
-    sim = comparison.simulator_for(method)
-    recorder = _recorder(comparison.request, folder, method.name, jobs, policy)
+    sim = comparison.simulator_for(agent)
+    recorder = _recorder(comparison.request, folder, agent.name, jobs, policy)
     logs = recorder.paths if recorder else {}
-    over = ledger.finished(method.name)
+    over = journal.finished(agent.name)
     left = [job for job in jobs if job not in over or (job in logs and not logs[job].exists())]
     before = len(jobs) - len(left)
-    watch.start(method.name, len(jobs))
-    writer, clock = LedgerWriter(ledger, method.name), StepClock()
+    watch.start(agent.name, len(jobs))
+    writer, clock = JournalWriter(journal, agent.name), StepClock()
     try:
         run_episodes(
             sim,
@@ -337,31 +339,31 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
             lambda done, _total, env_steps, to_come: watch.update(
                 before + done, len(jobs), env_steps, to_come
             ),
-            policy.pilot if policy else None,
+            policy.agent if policy else None,
             clock,
         )
     finally:
         watch.stop()
-        if method.own:
-            method.own.close()
+        if agent.own:
+            agent.own.close()
         if recorder:
             recorder.abort()
-    if method.own and (slow := method.own.told()):
+    if agent.own and (slow := agent.own.told()):
         watch.note(slow)
     results = [over[job].result for job in jobs]
     env_steps, wall_s = sum(round(r.time_s / dt) for r in results), writer.wall_s if left else writer.before_s
-    entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)
-    entry |= {"privileged": method.privileged} | method.document()
-    return MethodRun(method, policy, results, entry, tree_use(sim, results), logs)
+    entry = summary(agent.name, results, env_steps, wall_s, clock.env_steps_per_s)
+    entry |= {"privileged": agent.privileged} | agent.document()
+    return AgentRun(agent, policy, results, entry, tree_use(sim, results), logs)
 
 
 def _recorder(
-    request: Request, folder: Path, method: str, jobs: list[Job], policy: PolicyNote | None
+    request: Request, folder: Path, agent: str, jobs: list[Job], policy: PolicyNote | None
 ) -> EpisodeRecorder | None:
     if not request.record:
         return None
     world, chosen = Path(request.world).stem, jobs[: request.record]
-    return EpisodeRecorder(folder / "logs", world, method, chosen, request.depth_images, policy)
+    return EpisodeRecorder(folder / "logs", world, agent, chosen, request.depth_images, policy)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -371,20 +373,20 @@ def _recorder(
 def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been."""
-    from uuvtai.learning.policy_agent import Pilot
+    from uuvtai.learning.policy_agent import PolicyAgent
     from uuvtai.learning.trainer import Trainer
 
     if not isinstance(trainer, Trainer):  # the others run episodes by themselves
         return trainer.evaluate()
     env = trainer.env
     model = trainer.world_model if config.world_model.as_features else None
-    pilot = Pilot(trainer.policy, model, env.num_envs, env.device)
+    agent = PolicyAgent(trainer.policy, model, env.num_envs, env.device)
     held = env.capture()
     try:
         env.sim.sleep()
         env.sim.set_scenes()
         jobs = jobs_of([config.train.evaluate_seed], config.train.evaluate_episodes)
-        results, env_steps = run_episodes(env.sim, jobs, driver=pilot)
+        results, env_steps = run_episodes(env.sim, jobs, agent=agent)
     finally:
         env.sim.set_scenes(config.train.scenes)
         env.restore(held)
@@ -397,23 +399,23 @@ def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
 # ``uuv eval --explain``: the causes of failures in the document, and logs of the worst.
 
 
-def explain(comparison: Comparison, runs: list[MethodRun], result: dict[str, Any], folder: RunFolder) -> None:
+def explain(comparison: Comparison, runs: list[AgentRun], result: dict[str, Any], folder: RunFolder) -> None:
     """Replay what failed, add the causes to the document, record the worst. What is known is written before
     the next long step begins."""
-    rows = {method_run.method.name: _explained(comparison, method_run) for method_run in runs}
+    rows = {agent_run.agent.name: _explained(comparison, agent_run) for agent_run in runs}
     _write_causes(folder, result)
-    for method_run in runs:
-        method, entry = method_run.method, method_run.entry
-        found = rows[method.name]
+    for agent_run in runs:
+        agent, entry = agent_run.agent, agent_run.entry
+        found = rows[agent.name]
         chosen = failure_causes.chosen_for_recording(found, comparison.request.explain_record)
         paths = failure_causes.record_worst(
-            comparison.simulator_for(method),
+            comparison.simulator_for(agent),
             chosen,
             folder.path / "explain",
             comparison.request.world,
-            method.name,
+            agent.name,
             comparison.watch.note,
-            method_run.policy,
+            agent_run.policy,
             list(rows),
         )
         for row, path in zip(chosen, paths, strict=True):
@@ -421,40 +423,40 @@ def explain(comparison: Comparison, runs: list[MethodRun], result: dict[str, Any
     _write_causes(folder, result)
 
 
-def _explained(comparison: Comparison, method_run: MethodRun) -> list[failure_causes.Row]:
-    """A method's failures with their explanations, which its entry then holds too."""
-    policy, watch, name = method_run.policy, comparison.watch, method_run.method.name
-    watch.start(f"{name}: replaying failures", len(failure_causes.failures(method_run.results)))
+def _explained(comparison: Comparison, agent_run: AgentRun) -> list[failure_causes.Row]:
+    """An agent's failures with their explanations, which its entry then holds too."""
+    policy, watch, name = agent_run.policy, comparison.watch, agent_run.agent.name
+    watch.start(f"{name}: replaying failures", len(failure_causes.failures(agent_run.results)))
     rows = failure_causes.explain_failures(
-        comparison.simulator_for(method_run.method),
-        method_run.results,
+        comparison.simulator_for(agent_run.agent),
+        agent_run.results,
         watch.update,
-        policy.pilot if policy else None,
-        method_run.method.own is not None,
+        policy.agent if policy else None,
+        agent_run.agent.own is not None,
     )
     watch.stop()
-    if lost := len(failure_causes.failures(method_run.results)) - len(rows):
+    if lost := len(failure_causes.failures(agent_run.results)) - len(rows):
         watch.note(
-            f"{name}: {lost} failures ended otherwise when they were played again and are not explained: "
+            f"{name}: {lost} failures ended otherwise when they were run again and are not explained: "
             "your code depends on more than it is shown (random numbers, the clock, older episodes)"
         )
-    method_run.entry["causes"] = failure_causes.table_of(rows)
-    method_run.entry["explain"] = [row.document() for row in rows]
+    agent_run.entry["causes"] = failure_causes.table_of(rows)
+    agent_run.entry["explain"] = [row.document() for row in rows]
     return rows
 
 
 def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
     folder.write_json("eval/result.json", result)
-    methods = [
+    agents = [
         {"name": entry["name"], "causes": entry["causes"], "explain": entry["explain"]}
-        for entry in result["methods"]
+        for entry in result["agents"]
         if "explain" in entry
     ]
-    folder.write_json("eval/explain.json", {"schema": 1, "methods": methods})
+    folder.write_json("eval/explain.json", {"schema": 1, "agents": agents})
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Privileged yardsticks beside the methods: the oracle's row of the table, and what a method lacks of it.
+# Privileged oracles beside the agents: the oracle's row of the table, and what an agent lacks of it.
 
 
 _UNKNOWN = (
@@ -530,13 +532,13 @@ def _result(job: Job, time_s: float | None, config: Config) -> EpisodeResult:
 
 
 def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What each method lacks of 100 %, split: ``remainder`` of ``uuv eval --json``, for methods whose
+    """What each agent lacks of 100 %, split: ``remainder`` of ``uuv eval --json``, for agents whose
     ``+truth`` and the oracle are there.
 
     Episodes, as differences of successes that add up to ``missed``: sensing = with the true tracks less
     without, forecast_decision = the oracle's less that (with the vehicle's inertia, which the oracle has
     not), physics = what the oracle cannot reach either. A part may be negative where knowing more did not
-    help; ``lost_with_truth`` counts the episodes that the method won and its ``+truth`` did not.
+    help; ``lost_with_truth`` counts the episodes that the agent won and its ``+truth`` did not.
     """
     won = {entry["name"]: _won(entry) for entry in entries}
     if ORACLE not in won:
@@ -544,7 +546,7 @@ def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ceiling = won[ORACLE]
     return [
         {
-            "method": name,
+            "agent": name,
             "episodes": entries[0]["episodes"],
             "missed": entries[0]["episodes"] - len(own),
             "sensing": len(with_truth) - len(own),

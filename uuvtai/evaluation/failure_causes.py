@@ -3,7 +3,7 @@ here.
 
 Every failed episode gets exactly one label, the first of ``CAUSES`` whose condition holds. The order asks
 what a developer would ask: was there a chance at all, did the vehicle *know* of what killed it (sensing,
-tracking, forecast: the first half), and if it did, what did the pilot make of it (the second half). Remarks
+tracking, forecast: the first half), and if it did, what did the agent make of it (the second half). Remarks
 add what may have contributed; any number of them may hold.
 """
 
@@ -21,46 +21,47 @@ import numpy as np
 from uuvtai.common.statistics import mean
 from uuvtai.config import Config
 from uuvtai.evaluation import failure_facts
-from uuvtai.evaluation.episodes import Driver, EpisodeResult, Job, Progress, run_episodes
+from uuvtai.evaluation.episodes import Agent, EpisodeResult, Job, Progress, run_episodes
 from uuvtai.evaluation.failure_facts import (
     BACK_RAD,
     BLIND_S,
     CLIMB_S,
     LAST_S,
     LEAD_S,
-    Bodies,
     CoarseHistory,
     History,
     Killer,
+    Obstacles,
     Scene,
     killer_facts,
     timeout_facts,
 )
 from uuvtai.sim.behavior_tree import FlatTree
-from uuvtai.sim.setup import body_slots
+from uuvtai.sim.setup import obstacle_slots
 from uuvtai.sim.sim import Sim
 
 if TYPE_CHECKING:
     from uuvtai.logs.writer import PolicyNote
 
 
-START_S = 2.0  # a younger episode starts in danger: evading takes a second, bodies start 1.5 m away
-UNSEEN_S = 0.3  # out of the sonar's fan all this time before the end (no track 0.3 s before)
+START_S = 2.0  # a younger episode starts in danger: evading takes a second, obstacles start 1.5 m away
+UNDETECTED_S = 0.3  # out of the sonar's fan all this time before the end (no track 0.3 s before)
 TURN_S = 1.2
 """An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it
 was off by more than MISS_M at the end, or there was none."""
 CLEAR_M = 0.1
-"""A body remembered farther above or below counts as clear of the own depth (the referee's contact)."""
+"""An obstacle remembered farther above or below counts as clear of the own depth (the termination check's
+contact)."""
 LATELY_S = 2.5  # Remarks look back this far.
-MISS_M = 0.35  # a forecast missed when farther off than the pilot's margin at a second (0.25 m + 0.1 m/s)
+MISS_M = 0.35  # a forecast missed when farther off than the agent's margin at a second (0.25 m + 0.1 m/s)
 REACH_M = 0.4  # squeezed: something static this near to the hull leaves no room (0.17 + 0.1 m + margin)
-CROWD_M = 0.6  # Crowded: a second moving body came nearer to the hull in the last CROWD_S.
+CROWD_M = 0.6  # Crowded: a second moving obstacle came nearer to the hull in the last CROWD_S.
 NEAR_M = 1.0
 """Contact with something static is no accident of its own with a mover this near in the last NEAR_S."""
 PLACE_M = 0.1
-"""Lost its place: the own position was off by more than the margin (``teacher.static_margin_m``)."""
+"""Lost its place: the own position was off by more than the margin (``behavior.static_margin_m``)."""
 DEPTH_M = 0.05
-"""Took floor or surface for farther than it was: the own depth was off by more, towards it; the pilot keeps
+"""Took floor or surface for farther than it was: the own depth was off by more, towards it; the agent keeps
 the hull 0.03 m off and three standard deviations of the depth."""
 CLIMB_M = 0.15  # Changed its depth: moved by more, upwards or downwards, in the last second.
 PROGRESS_M = 1.0  # A timeout that came this much nearer to the goal in that time was only slow.
@@ -68,43 +69,45 @@ STUCK_M = 0.5  # A vehicle that drove less in that time did not move.
 
 CAUSES: dict[str, str] = {
     "out_of_tank": "left the tank",
-    "depth_misjudged": f"touched floor or surface, the own depth off by > {DEPTH_M:g} m towards it",
-    "lost_place": f"touched a static or wall, the own position off by > {PLACE_M:g} m",
+    "depth_error": f"touched floor or surface, the own depth off by > {DEPTH_M:g} m towards it",
+    "localization_error": f"touched a static or wall, the own position off by > {PLACE_M:g} m",
     "velocity_lost": "touched floor, surface, a static or wall, the own velocity unknown in most of the last "
     f"{BLIND_S:g} s",
     "hit_floor": "touched the floor",
     "hit_surface": "touched the surface",
-    "pushed_into_static": f"touched a static or wall while evading, or with a moving body within {NEAR_M:g} "
+    "evaded_into_static": f"touched a static or wall while evading, or with a moving obstacle within "
+    f"{NEAR_M:g} "
     "m",
-    "hit_static": "touched a static obstacle, no moving body near",
-    "hit_wall": "touched a side wall, no moving body near",
-    "start_in_danger": f"killed in the first {START_S:g} s",
-    "unseen_beside": f"killer beside or behind the sonar's fan all through the last {UNSEEN_S:g} s",
-    "depth_change": f"killer above or below the sonar's fan all through the last {UNSEEN_S:g} s, and the own "
+    "hit_static": "touched a static obstacle, no moving obstacle near",
+    "hit_wall": "touched a side wall, no moving obstacle near",
+    "no_escape_at_start": f"killed in the first {START_S:g} s",
+    "undetected_beside": f"killer beside or behind the sonar's fan all through the last {UNDETECTED_S:g} s",
+    "undetected_depth_change": f"killer above or below the sonar's fan all through the last {UNDETECTED_S:g} "
+    f"s, and the own "
     f"depth changed towards it by > {CLIMB_M:g} m in the last {CLIMB_S:g} s",
-    "unseen_above": f"killer above the sonar's fan all through the last {UNSEEN_S:g} s",
-    "unseen_below": f"killer below the sonar's fan all through the last {UNSEEN_S:g} s",
-    "turned_back": f"killer turned back in the last {TURN_S:g} s and the forecast before it was wrong",
-    "unannounced_turn": f"killer turned a corner in the last {TURN_S:g} s and the forecast before it was "
+    "undetected_above": f"killer above the sonar's fan all through the last {UNDETECTED_S:g} s",
+    "undetected_below": f"killer below the sonar's fan all through the last {UNDETECTED_S:g} s",
+    "obstacle_reversed": f"killer turned back in the last {TURN_S:g} s and the forecast before it was wrong",
+    "obstacle_turned": f"killer turned a corner in the last {TURN_S:g} s and the forecast before it was "
     "wrong",
-    "seen_late": f"killer came into the sonar's fan less than {LEAD_S:g} s before the end",
-    "hidden": f"killer was behind something else until {LEAD_S:g} s before the end",
+    "late_detection": f"killer came into the sonar's fan less than {LEAD_S:g} s before the end",
+    "occluded": f"killer was behind something else until {LEAD_S:g} s before the end",
     "untracked": f"killer seen, but no forecast of it {LEAD_S:g} s before the end",
-    "curving": f"killer on a circle, forecast off by > {MISS_M:g} m",
-    "forecast_missed": f"killer on a straight course, forecast off by > {MISS_M:g} m",
-    "late": "forecast right, but evasion began after the last chance to escape, or never",
-    "wrong_evasion": "forecast right and evading before the last chance to escape: it chose the wrong way",
-    "needs_heave": "forecast right, but only a change of depth would have escaped",
-    "depth_edge": "forecast right, only below the floor or above the surface was there a way out",
-    "squeezed_by_static": f"forecast right, no way out: static or wall within {REACH_M:g} m",
-    "crowded": f"forecast right, no way out: a second moving body within {CROWD_M:g} m",
-    "fast_crossing": "forecast right, no way out: the killer is too fast to give way to",
+    "obstacle_on_curve": f"killer on a circle, forecast off by > {MISS_M:g} m",
+    "prediction_error": f"killer on a straight course, forecast off by > {MISS_M:g} m",
+    "late_reaction": "forecast right, but evasion began after the last chance to escape, or never",
+    "failed_evasion": "forecast right and evading before the last chance to escape: it chose the wrong way",
+    "depth_change_needed": "forecast right, but only a change of depth would have escaped",
+    "no_depth_left": "forecast right, only below the floor or above the surface was there a way out",
+    "blocked_by_static": f"forecast right, no way out: static or wall within {REACH_M:g} m",
+    "second_obstacle_near": f"forecast right, no way out: a second moving obstacle within {CROWD_M:g} m",
+    "obstacle_too_fast": "forecast right, no way out: the killer is too fast to give way to",
     "no_route": f"timeout: no route in most of the last {LAST_S:g} s",
     "too_slow": f"timeout: still came > {PROGRESS_M:g} m nearer to the goal in the last {LAST_S:g} s",
     "waiting": f"timeout: waited on purpose in most of the last {LAST_S:g} s",
-    "kept_away": f"timeout: evaded in most of the last {LAST_S:g} s",
+    "blocked_by_traffic": f"timeout: evaded in most of the last {LAST_S:g} s",
     "stuck": f"timeout: drove < {STUCK_M:g} m in the last {LAST_S:g} s",
-    "circling": f"timeout: drove on without coming nearer in the last {LAST_S:g} s",
+    "no_progress": f"timeout: drove on without coming nearer in the last {LAST_S:g} s",
 }
 """Every label with its meaning, in order of precedence (forecasts: LEAD_S before the end, escapes too)."""
 
@@ -112,15 +115,17 @@ CAUSES: dict[str, str] = {
 Fact = dict[str, Any]
 
 REMARKS: dict[str, Callable[[Fact], bool]] = {
-    "second body near": lambda f: _within(f["second_body_m"], CROWD_M),
+    "second obstacle near": lambda f: _within(f["second_body_m"], CROWD_M),
     "static near": lambda f: f["static_near_m"] < REACH_M,
     "turned lately": lambda f: _within(f["turned_ago_s"], LATELY_S),
     "corner passed in reach before": lambda f: (
         _within(f["turned_ago_s"], TURN_S) and bool(f["turns_in_reach_before"])
     ),
     "changed its depth": lambda f: abs(f["climbed_m"]) > CLIMB_M,
-    "remembered to the end": lambda f: _is_unseen(f) and f["belief_error_m"] is not None,
-    "remembered clear of the own depth": lambda f: _is_unseen(f) and (f["believed_gap_m"] or 0.0) > CLEAR_M,
+    "remembered to the end": lambda f: _is_undetected(f) and f["belief_error_m"] is not None,
+    "remembered clear of the own depth": lambda f: (
+        _is_undetected(f) and (f["believed_gap_m"] or 0.0) > CLEAR_M
+    ),
     "taken as static": lambda f: _within(f["taken_as_static_ago_s"], LATELY_S),
     "backed off before the last chance": lambda f: (
         f["leaf"] == "BackOff" and f["leaf_s"] > (f["last_chance_s"] or 0.0)
@@ -130,12 +135,12 @@ REMARKS: dict[str, Callable[[Fact], bool]] = {
 """What may have contributed, where the killer moves. "Corner passed in reach before": was learnable."""
 
 _IMPLIED = {
-    ("unannounced_turn", "turned lately"),
-    ("turned_back", "turned lately"),
-    ("depth_change", "changed its depth"),
-    ("needs_heave", "only heave escaped"),
-    ("squeezed_by_static", "static near"),
-    ("crowded", "second body near"),
+    ("obstacle_turned", "turned lately"),
+    ("obstacle_reversed", "turned lately"),
+    ("undetected_depth_change", "changed its depth"),
+    ("depth_change_needed", "only heave escaped"),
+    ("blocked_by_static", "static near"),
+    ("second_obstacle_near", "second obstacle near"),
 }
 """Remarks that a label says already."""
 
@@ -150,20 +155,20 @@ class Explanation:
     remarks: list[str] = field(default_factory=list)
 
 
-def explain(outcome: str, history: History, bodies: Bodies, config: Config) -> Explanation:
+def explain(outcome: str, history: History, obstacles: Obstacles, config: Config) -> Explanation:
     """Label and facts of an episode that ended with ``outcome`` (collision, ttc, out_of_tank or timeout)."""
     if outcome == "timeout":
         facts = timeout_facts(history.coarse)
         return Explanation(timeout_label(facts), Killer(""), facts)
-    scene = Scene(history, bodies, config)
+    scene = Scene(history, obstacles, config)
     killer = scene.killer(outcome)
     facts, remarks = scene.facts(killer), []
     if killer.moving and killer.slot is not None:
-        facts |= killer_facts(history, bodies, killer.slot, config)
+        facts |= killer_facts(history, obstacles, killer.slot, config)
     label = label_of(outcome, killer, facts)
     if killer.moving:
         remarks = [name for name, holds in REMARKS.items() if holds(facts) and (label, name) not in _IMPLIED]
-    if label == "start_in_danger":
+    if label == "no_escape_at_start":
         remarks.insert(0, f"else {label_of(outcome, killer, facts | {'age_s': START_S})}")
     return Explanation(label, killer, facts, remarks)
 
@@ -178,55 +183,55 @@ def label_of(outcome: str, killer: Killer, facts: Fact) -> str:
     if killer.name in ("floor", "surface"):
         towards = facts["depth_error_m"] * (1 if killer.name == "floor" else -1)
         if towards > DEPTH_M:
-            return "depth_misjudged"
+            return "depth_error"
         return "velocity_lost" if facts["blind_share"] > 0.5 else f"hit_{killer.name}"
     if not killer.moving:
         if facts["place_error_m"] > PLACE_M:
-            return "lost_place"
+            return "localization_error"
         if facts["blind_share"] > 0.5:
             return "velocity_lost"
         pushed = facts["evading_s"] > 0 or _within(facts["moving_near_m"], NEAR_M)
-        return "pushed_into_static" if pushed else "hit_wall" if killer.name == "wall" else "hit_static"
-    return _knowledge_label(facts) or _pilot_label(facts)
+        return "evaded_into_static" if pushed else "hit_wall" if killer.name == "wall" else "hit_static"
+    return _knowledge_label(facts) or _decision_label(facts)
 
 
 def _knowledge_label(facts: Fact) -> str | None:
     """What kept the vehicle from knowing where the killer would be; None = it knew."""
     if facts["age_s"] < START_S:
-        return "start_in_danger"
-    if _is_unseen(facts):
-        if facts["width_ago_s"] is None or facts["width_ago_s"] >= UNSEEN_S:
-            return "unseen_beside"
+        return "no_escape_at_start"
+    if _is_undetected(facts):
+        if facts["width_ago_s"] is None or facts["width_ago_s"] >= UNDETECTED_S:
+            return "undetected_beside"
         above = facts["vertical_gap_m"] > 0
         if facts["climbed_m"] * (1 if above else -1) > CLIMB_M:
-            return "depth_change"
-        return "unseen_above" if above else "unseen_below"
+            return "undetected_depth_change"
+        return "undetected_above" if above else "undetected_below"
     if _within(facts["turned_ago_s"], TURN_S) and not _within(facts["turn_error_m"], MISS_M):
-        return "turned_back" if facts["turned_deg"] > math.degrees(BACK_RAD) else "unannounced_turn"
+        return "obstacle_reversed" if facts["turned_deg"] > math.degrees(BACK_RAD) else "obstacle_turned"
     if facts["forecast_error_m"] is None:
         return (
-            "seen_late"
+            "late_detection"
             if facts["fan_share"] < 0.5
-            else "hidden"
+            else "occluded"
             if facts["seen_share"] < 0.5
             else "untracked"
         )
     if facts["forecast_error_m"] > MISS_M:
-        return "curving" if facts["circle_m"] else "forecast_missed"
+        return "obstacle_on_curve" if facts["circle_m"] else "prediction_error"
     return None
 
 
-def _pilot_label(facts: Fact) -> str:
-    """What the pilot made of what it knew; where nothing could be made of it, what stood in the way."""
+def _decision_label(facts: Fact) -> str:
+    """What the agent made of what it knew; where nothing could be made of it, what stood in the way."""
     if facts["escapes"]:
-        return "late" if facts["evading_s"] < facts["last_chance_s"] else "wrong_evasion"
+        return "late_reaction" if facts["evading_s"] < facts["last_chance_s"] else "failed_evasion"
     if facts["escapes_by_heave"]:
-        return "needs_heave"
+        return "depth_change_needed"
     if facts["escapes_beyond_edge"]:
-        return "depth_edge"
+        return "no_depth_left"
     if facts["static_near_m"] < REACH_M:
-        return "squeezed_by_static"
-    return "crowded" if _within(facts["second_body_m"], CROWD_M) else "fast_crossing"
+        return "blocked_by_static"
+    return "second_obstacle_near" if _within(facts["second_body_m"], CROWD_M) else "obstacle_too_fast"
 
 
 def timeout_label(facts: Fact) -> str:
@@ -237,19 +242,19 @@ def timeout_label(facts: Fact) -> str:
     if facts["waiting_share"] > 0.5:
         return "waiting"
     if facts["evading_share"] > 0.5:
-        return "kept_away"
-    return "stuck" if facts["driven_m"] < STUCK_M else "circling"
+        return "blocked_by_traffic"
+    return "stuck" if facts["driven_m"] < STUCK_M else "no_progress"
 
 
-def _is_unseen(facts: Fact) -> bool:
-    return facts["fan_ago_s"] is None or facts["fan_ago_s"] >= UNSEEN_S
+def _is_undetected(facts: Fact) -> bool:
+    return facts["fan_ago_s"] is None or facts["fan_ago_s"] >= UNDETECTED_S
 
 
 def _within(value: float | None, limit: float) -> bool:
     return value is not None and value <= limit
 
 
-# ---- Watch failed episodes as they are played again: keep the truth and the vehicle's beliefs of their last
+# ---- Watch failed episodes as they are run again: keep the truth and the vehicle's beliefs of their last
 # seconds. An episode is the same in any batch, so only the failed ones are replayed, and their ends are known
 # beforehand: nothing is kept of the time before the last ``facts.WINDOW_S`` but a coarse diary.
 
@@ -263,10 +268,10 @@ _WINDOW_FIELDS = {
     "scan": ("ping_step", "range_m"),
     "tracks": ("alive", "moving", "state"),
     "forecast": ("pos_w", "radius_m", "above_w", "below_w"),
-    "teacher": ("leaf", "conflict_s", "action", "clearance_m"),
+    "behavior": ("leaf", "conflict_s", "action", "clearance_m"),
 }
-_COARSE_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
-_BODY_FIELDS = {"world": ("kind", "size", "yaw"), "path": ("n_way", "radius_m", "length_m", "speed_m_s")}
+_COARSE_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "behavior": ("leaf",)}
+_OBSTACLE_FIELDS = {"world": ("kind", "size", "yaw"), "path": ("n_way", "radius_m", "length_m", "speed_m_s")}
 
 _FORESEEN_S = 1.0e3  # A predicted conflict; beyond = none (geometry.FAR_M).
 
@@ -277,7 +282,7 @@ class _Watched:
 
     end_step: int
     step: int = 0
-    bodies: Bodies | None = None
+    obstacles: Obstacles | None = None
     window: list[dict[str, np.ndarray]] = field(default_factory=list)
     coarse: list[dict[str, np.ndarray]] = field(default_factory=list)
 
@@ -296,7 +301,7 @@ class FailureRecorder:
         self.found: dict[Job, Explanation] = {}
         self._own_code = own_code
         self.differed: list[Job] = []
-        """episodes that the user's code did not play as before: they are not explained"""
+        """episodes that the user's code did not run as before: they are not explained"""
 
     def begin(self, sim: Sim, row: int, job: Job) -> None:
         self._rows[row] = _Watched(round(self._expected[job].time_s / self._dt))
@@ -306,8 +311,8 @@ class FailureRecorder:
         for watched in self._rows.values():
             watched.step += 1
         new = [row for row, watched in self._rows.items() if watched.step == 1]
-        for row, read in _read_rows(sim, _BODY_FIELDS, new).items():
-            self._rows[row].bodies = _bodies(sim.config, read)
+        for row, read in _read_rows(sim, _OBSTACLE_FIELDS, new).items():
+            self._rows[row].obstacles = _obstacles(sim.config, read)
         for row, read in _read_rows(sim, _WINDOW_FIELDS, self._due(self._is_in_window)).items():
             self._rows[row].window.append(read | {"step": np.array(self._rows[row].step)})
         for row, read in _read_rows(sim, _COARSE_FIELDS, self._due(self._is_coarse_due)).items():
@@ -326,8 +331,8 @@ class FailureRecorder:
                 f"{result.time_s} s instead of {expected.outcome} at {expected.time_s} s: episodes must be "
                 "the same in any batch, please report this"
             )
-        assert watched.bodies is not None  # read after the first step
-        self.found[job] = explain(result.outcome, self._history(watched), watched.bodies, self._config)
+        assert watched.obstacles is not None  # read after the first step
+        self.found[job] = explain(result.outcome, self._history(watched), watched.obstacles, self._config)
 
     def _due(self, is_due: Callable[[_Watched], bool]) -> list[int]:
         return [row for row, watched in self._rows.items() if is_due(watched)]
@@ -355,8 +360,8 @@ class FailureRecorder:
             quat_wb=w["vehicle.quat_wb"].astype(float),
             vel_b=w["vehicle.vel_b"].astype(float),
             rate_b=w["vehicle.rate_b"].astype(float),
-            body_w=w["world.pos_w"].astype(float),
-            body_vel_w=w["world.vel_w"].astype(float),
+            obstacle_w=w["world.pos_w"].astype(float),
+            obstacle_vel_w=w["world.vel_w"].astype(float),
             ping_age_s=(w["step"] - w["scan.ping_step"]) * self._dt,
             range_m=w["scan.range_m"].astype(float),
             track_moving=np.where(w["tracks.alive"] == 1, w["tracks.moving"], -1),
@@ -365,16 +370,16 @@ class FailureRecorder:
             forecast_m=w["forecast.radius_m"][:, :, 0].astype(float),
             forecast_above_w=w["forecast.above_w"].astype(float),
             forecast_below_w=w["forecast.below_w"].astype(float),
-            conflict=w["teacher.conflict_s"] < _FORESEEN_S,
-            leaf=self._leaves(w["teacher.leaf"]),
-            action=w["teacher.action"].astype(float),
-            map_clearance_m=w["teacher.clearance_m"].astype(float),
+            conflict=w["behavior.conflict_s"] < _FORESEEN_S,
+            leaf=self._leaves(w["behavior.leaf"]),
+            action=w["behavior.action"].astype(float),
+            map_clearance_m=w["behavior.clearance_m"].astype(float),
             coarse=CoarseHistory(
                 t_s=d["step"] * self._dt,
                 pos_w=d["vehicle.pos_w"].astype(float),
                 goal_m=np.linalg.norm(d["mission.goal_w"] - d["vehicle.pos_w"], axis=1),
                 has_route=d["route.n_way"] > 0,
-                leaf=self._leaves(d["teacher.leaf"]),
+                leaf=self._leaves(d["behavior.leaf"]),
             ),
         )
 
@@ -400,19 +405,21 @@ def _stacked(samples: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
 
 
-def _bodies(config: Config, read: dict[str, np.ndarray]) -> Bodies:
-    """Path facts are per moving slot; bodies at rest get zeros."""
-    kind, first = read["world.kind"], body_slots(config.world).first_dynamic
+def _obstacles(config: Config, read: dict[str, np.ndarray]) -> Obstacles:
+    """Path facts are per moving slot; static obstacles get zeros."""
+    kind, first = read["world.kind"], obstacle_slots(config.world).first_dynamic
     used, path_speed = kind[first:] > 0, read["path.speed_m_s"].astype(float)
     speed, circle, lap = np.zeros(len(kind)), np.zeros(len(kind)), np.full(len(kind), np.inf)
     speed[first:] = np.where(used, path_speed, 0.0)
     circle[first:] = np.where(used & (read["path.n_way"] == 0), read["path.radius_m"], 0.0)
     moves = used & (path_speed > 0)
     lap[first:][moves] = read["path.length_m"][moves] / path_speed[moves]
-    return Bodies(kind, read["world.size"].astype(float), read["world.yaw"].astype(float), speed, circle, lap)
+    return Obstacles(
+        kind, read["world.size"].astype(float), read["world.yaw"].astype(float), speed, circle, lap
+    )
 
 
-# ---- Explain failed episodes: play them again, label each, and record the worst.
+# ---- Explain failed episodes: run them again, label each, and record the worst.
 
 EXAMPLES = 3  # Episodes named per label in the table.
 
@@ -439,20 +446,20 @@ def explain_failures(
     sim: Sim,
     results: list[EpisodeResult],
     progress: Progress | None = None,
-    driver: Driver | None = None,
+    agent: Agent | None = None,
     own_code: bool = False,
 ) -> list[Row]:
-    """Replay the failed episodes of one method and explain them; in the order of ``results``. Raises
+    """Replay the failed episodes of one agent and explain them; in the order of ``results``. Raises
     RuntimeError (see ``FailureRecorder.end``). With ``own_code``, the user's, episodes that it plays
     otherwise this time are left out.
 
-    Where a ``driver`` drives, the facts about leaves and actions are those of the tree beside it.
+    Where a ``agent`` drives, the facts about leaves and actions are those of the tree beside it.
     """
     failed = failures(results)
     if not failed:
         return []
     recorder = FailureRecorder(sim.config, sim.tree, failed, own_code)
-    run_episodes(sim, [Job(r.seed, r.episode) for r in failed], recorder, progress, driver)
+    run_episodes(sim, [Job(r.seed, r.episode) for r in failed], recorder, progress, agent)
     jobs = [Job(r.seed, r.episode) for r in failed]
     found = recorder.found
     return [Row(r, found[job]) for r, job in zip(failed, jobs, strict=True) if job in found]
@@ -485,7 +492,7 @@ def _typical(found: list[Explanation]) -> dict[str, Any]:
     return {
         "remarks": dict(Counter(remark for e in found for remark in e.remarks).most_common()),
         "knew_share": mean([float(error is not None and error <= MISS_M) for error in errors]),
-        "unseen_median_s": _median(found, "seen_ago_s", failure_facts.WINDOW_S),
+        "undetected_median_s": _median(found, "seen_ago_s", failure_facts.WINDOW_S),
         "evading_median_s": _median(found, "evading_s", 0.0),
         "last_chance_median_s": _median(found, "last_chance_s", failure_facts.CHANCES_S[-1]),
     }
@@ -518,15 +525,15 @@ def record_worst(
     rows: list[Row],
     folder: Path,
     world: str,
-    method: str,
+    agent: str,
     note: Callable[[str], None],
     policy: PolicyNote | None = None,
-    methods: Sequence[str] = (),
+    agents: Sequence[str] = (),
 ) -> list[Path]:
-    """Play these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture
+    """Run these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture
     and a video beside it.
 
-    ``methods``: all that are compared, in order, so that each keeps its colour.
+    ``agents``: all that are compared, in order, so that each keeps its colour.
     """
     from uuvtai.logs.picture import picture
     from uuvtai.logs.video import SMALL, video
@@ -535,9 +542,9 @@ def record_worst(
     if not rows:
         return []
     jobs = [Job(row.result.seed, row.result.episode) for row in rows]
-    recorder = EpisodeRecorder(folder, Path(world).stem, method, jobs, policy=policy)
+    recorder = EpisodeRecorder(folder, Path(world).stem, agent, jobs, policy=policy)
     try:
-        run_episodes(sim, jobs, recorder, driver=policy.pilot if policy else None)
+        run_episodes(sim, jobs, recorder, agent=policy.agent if policy else None)
     finally:
         recorder.abort()
     paths = [
@@ -548,6 +555,6 @@ def record_worst(
         note(f"drawing {path.stem}")
         label = row.explanation.label
         cause = label.replace("_", " ")
-        picture(path, path.with_suffix(".png"), remark=f"{cause}: {CAUSES[label]}", methods=methods)
-        video(path, path.with_suffix(".webm"), remark=cause, methods=methods, **SMALL)
+        picture(path, path.with_suffix(".png"), remark=f"{cause}: {CAUSES[label]}", agents=agents)
+        video(path, path.with_suffix(".webm"), remark=cause, agents=agents, **SMALL)
     return paths

@@ -1,10 +1,10 @@
 """What was true in the last seconds of a failed episode, as numbers with names. Pure NumPy;
 ``failure_causes.py`` makes labels of them.
 
-The killer is what the referee stopped the episode for: the body with the least time to collision of a ``ttc``
-stop, otherwise what the hull touches. "Seen" means that a beam of a delivered scan met the body, "believed"
-that a forecast lies within ``BELIEF_M`` of it. Facts that end in ``_ago_s`` count back from the end; None =
-not within ``WINDOW_S``.
+The killer is what the termination check stopped the episode for: the obstacle with the least time to
+collision of a ``ttc`` stop, otherwise what the hull touches. "Seen" means that a beam of a delivered scan met
+the obstacle, "believed" that a forecast lies within ``BELIEF_M`` of it. Facts that end in ``_ago_s`` count
+back from the end; None = not within ``WINDOW_S``.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.config import Config, SonarConfig, TankConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 
-# ---- What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach,
-# what its beams met. For explanations after the fact only; nothing that drives a vehicle may import it. Same
-# geometry as ``kernels/core/geometry.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode have the
-# samples first, shape (n, ...); bodies are on the next axis.
+# ---- What the truth looked like, in NumPy: distances of the hull to every obstacle, what the sonar could
+# reach, what its beams met. For explanations after the fact only; nothing that drives a vehicle may import
+# it. Same geometry as ``kernels/core/geometry.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode
+# have the samples first, shape (n, ...); obstacles are on the next axis.
 
 Array = np.ndarray
 
@@ -45,21 +45,21 @@ def hull_gaps(
     pos_w: Array,
     axis_w: Array,
     kind: Array,
-    body_w: Array,
+    obstacle_w: Array,
     size: Array,
     yaw: Array,
     radius_m: float,
     half_m: float,
 ):
-    """(gap [m], unit vector hull to body, place on the axis [m]) of the capsule to every body: (n, nb), (n,
-    nb, 3), (n, nb).
+    """(gap [m], unit vector hull to body, place on the axis [m]) of the capsule to every obstacle: (n, nb),
+    (n, nb, 3), (n, nb).
 
-    ``pos_w``, ``axis_w`` (n, 3); ``body_w`` (n, nb, 3); ``kind``, ``yaw`` (nb,), ``size`` (nb, 3). Empty
+    ``pos_w``, ``axis_w`` (n, 3); ``obstacle_w`` (n, nb, 3); ``kind``, ``yaw`` (nb,), ``size`` (nb, 3). Empty
     slots are infinitely far.
     """
     along = np.linspace(-half_m, half_m, _AXIS_SAMPLES)
     point = pos_w[:, None, :] + along[:, None] * axis_w[:, None, :]
-    away = point[:, None, :, :] - np.asarray(body_w, float)[:, :, None, :]
+    away = point[:, None, :, :] - np.asarray(obstacle_w, float)[:, :, None, :]
     c, s = (
         turn[None, :, None]
         for turn in (np.cos(np.where(kind == BOX, yaw, 0.0)), np.sin(np.where(kind == BOX, yaw, 0.0)))
@@ -87,7 +87,8 @@ def hull_gaps(
 
 
 def _core_point(q: Array, kind: Array, size: Array) -> Array:
-    """Point of a body's core nearest to q: a sphere's core is its centre, other bodies are their own."""
+    """Point of an obstacle's core nearest to q: a sphere's core is its centre, other obstacles are their
+    own."""
     rho = np.hypot(q[..., 0], q[..., 1])
     scale = np.minimum(1.0, size[..., 0] / np.maximum(rho, 1e-9))
     z = np.clip(q[..., 2], -size[..., 2], size[..., 2])
@@ -115,25 +116,32 @@ def floor_and_surface_gaps(
     return pos_w[:, 2] - low - reach, high - pos_w[:, 2] - reach
 
 
-def vertical_gap(pos_w: Array, kind: int, body_w: Array, size: Array) -> Array:
-    """(n,) signed gap [m] from the sonar's plane to a body: positive = it is above, 0 = it crosses."""
-    rise = body_w[:, 2] - pos_w[:, 2]
+def vertical_gap(pos_w: Array, kind: int, obstacle_w: Array, size: Array) -> Array:
+    """(n,) signed gap [m] from the sonar's plane to an obstacle: positive = it is above, 0 = it crosses."""
+    rise = obstacle_w[:, 2] - pos_w[:, 2]
     half = size[0] if kind == SPHERE else size[2]
     return np.where(np.abs(rise) > half, rise - np.sign(rise) * half, 0.0)
 
 
 def beam_entries(
-    pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array, body_yaw: float, sonar_cfg: SonarConfig
+    pos_w: Array,
+    yaw: Array,
+    kind: int,
+    obstacle_w: Array,
+    size: Array,
+    obstacle_yaw: float,
+    sonar_cfg: SonarConfig,
 ) -> Array:
-    """(n, n_ray) range at which each beam enters a body's outline within the vertical fan; inf = none."""
+    """(n, n_ray) range at which each beam enters an obstacle's outline within the vertical fan; inf =
+    none."""
     slope = math.tan(math.radians(sonar_cfg.vertical_half_aperture_deg))
     beams = np.arange(sonar_cfg.n_ray)
     bearing = yaw[:, None] + sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * beams
     ux, uy = np.cos(bearing), np.sin(bearing)
-    start = pos_w - body_w
+    start = pos_w - obstacle_w
     sx, sy, rise = start[:, 0:1], start[:, 1:2], np.abs(start[:, 2:3])
     if kind == BOX:
-        c, s = math.cos(body_yaw), math.sin(body_yaw)
+        c, s = math.cos(obstacle_yaw), math.sin(obstacle_yaw)
         enter = _box_entry(sx * c + sy * s, sy * c - sx * s, ux * c + uy * s, uy * c - ux * s, size)
     else:
         lost = np.maximum(rise - np.hypot(sx, sy) * slope, 0.0) if kind == SPHERE else 0.0
@@ -152,12 +160,12 @@ def _box_entry(x: Array, y: Array, dx: Array, dy: Array, size: Array) -> Array:
     return np.where(into <= out, into, np.inf)
 
 
-# ---- What is kept of a failed episode: its bodies, its last seconds sample by sample, all of it coarsely.
+# ---- What is kept of a failed episode: its obstacles, its last seconds sample by sample, all of it coarsely.
 
 
 @dataclass(frozen=True)
-class Bodies:
-    """What stays the same over an episode: its bodies. Arrays have one entry per slot."""
+class Obstacles:
+    """What stays the same over an episode: its obstacles. Arrays have one entry per slot."""
 
     kind: Array
     size: Array
@@ -193,8 +201,8 @@ class History:
     quat_wb: Array
     vel_b: Array
     rate_b: Array
-    body_w: Array  # (n, nb, 3)
-    body_vel_w: Array
+    obstacle_w: Array  # (n, nb, 3)
+    obstacle_vel_w: Array
     ping_age_s: Array  # (n,) age of the newest delivered scan
     range_m: Array  # (n, n_ray) that scan; no return = maximum range
     track_moving: Array  # (n, n_track) 1 = confirmed, 0 = taken to be static, -1 = empty slot
@@ -204,7 +212,7 @@ class History:
     forecast_above_w: Array
     """(n, n_track) z of the lowest edge it may have above the vehicle; the own z where it may be level"""
     forecast_below_w: Array  # (n, n_track) z of the highest edge of what it may hold below
-    conflict: Array  # (n,) bool: the pilot foresees a conflict
+    conflict: Array  # (n,) bool: the agent foresees a conflict
     leaf: list[str]  # type of the leaf in charge, "" = none
     action: Array  # (n, 4)
     map_clearance_m: Array  # (n,) what the vehicle's own map says
@@ -220,31 +228,33 @@ _DEEP_M = 1e3
 AFTER_S = 0.5  # An escape keeps clear up to this after the end.
 
 
-def escapes(history: History, bodies: Bodies, config: Config, lead_s: float) -> tuple[int, int]:
+def escapes(history: History, obstacles: Obstacles, config: Config, lead_s: float) -> tuple[int, int]:
     """How many velocities, chosen ``lead_s`` before the end and held, keep clear of everything: (at constant
     depth, with heave).
 
     Candidates are ``N_HEADING`` headings x ``SPEEDS`` and stopping, each at constant depth and with full
-    heave up and down, within the limits of the body axes; the vehicle follows them with the pilot's lag and
-    keeps its yaw. Bodies move as they did, after the end straight on. Clear means the referee's rules:
-    clearance, time to collision, tank.
+    heave up and down, within the limits of the body axes; the vehicle follows them with the agent's lag and
+    keeps its yaw. Obstacles move as they did, after the end straight on. Clear means the termination check's
+    rules: clearance, time to collision, tank.
     """
     end = float(history.t_s[-1])
     start = int(np.abs(history.t_s - (end - lead_s)).argmin())
     t = np.arange(0.0, end - history.t_s[start] + AFTER_S + 1e-6, STEP_S)
     R_wb = rotation(history.quat_wb[start])
     command = candidates(config, float(np.arctan2(R_wb[1, 0], R_wb[0, 0])))
-    pos, vel = rolled_out(history.pos_w[start], R_wb @ history.vel_b[start], command, t, config.teacher.lag_s)
-    clear = is_clear(pos, vel, R_wb[:, 0], *motion(history, history.t_s[start] + t), bodies, config)
+    pos, vel = rolled_out(
+        history.pos_w[start], R_wb @ history.vel_b[start], command, t, config.behavior.lag_s
+    )
+    clear = is_clear(pos, vel, R_wb[:, 0], *motion(history, history.t_s[start] + t), obstacles, config)
     level = command[:, 2] == 0
     return int(clear[level].sum()), int(clear[~level].sum())
 
 
-def escapes_beyond_the_edge(history: History, bodies: Bodies, config: Config, lead_s: float) -> int:
+def escapes_beyond_the_edge(history: History, obstacles: Obstacles, config: Config, lead_s: float) -> int:
     """How many of them would keep clear with heave if the water went on beyond floor and surface."""
     tank = config.world.tank.model_copy(update={"z_m": (-_DEEP_M, _DEEP_M)})
     world = config.world.model_copy(update={"tank": tank})
-    return escapes(history, bodies, config.model_copy(update={"world": world}), lead_s)[1]
+    return escapes(history, obstacles, config.model_copy(update={"world": world}), lead_s)[1]
 
 
 def candidates(config: Config, yaw: float) -> Array:
@@ -253,7 +263,7 @@ def candidates(config: Config, yaw: float) -> Array:
     limits = np.abs(
         [np.cos(heading) / config.vehicle.max_surge_m_s, np.sin(heading) / config.vehicle.max_sway_m_s]
     )
-    top = np.minimum(config.teacher.evade_m_s, 1.0 / limits.max(0))
+    top = np.minimum(config.behavior.evade_m_s, 1.0 / limits.max(0))
     ring = np.stack([np.cos(heading + yaw), np.sin(heading + yaw)], -1) * top[:, None]
     level = np.concatenate([np.zeros((1, 2)), *(ring * share for share in SPEEDS)])
     heave = config.vehicle.max_heave_m_s
@@ -268,19 +278,25 @@ def rolled_out(pos: Array, vel: Array, command: Array, t: Array, lag_s: float) -
 
 
 def motion(history: History, at_s: Array) -> tuple[Array, Array]:
-    """(n_t, nb, 3) true positions and velocities of the bodies; straight on after the last sample."""
-    flat = history.body_w.reshape(len(history.t_s), -1)
+    """(n_t, nb, 3) true positions and velocities of the obstacles; straight on after the last sample."""
+    flat = history.obstacle_w.reshape(len(history.t_s), -1)
     inside = np.stack([np.interp(at_s, history.t_s, column) for column in flat.T], -1).reshape(
         len(at_s), -1, 3
     )
-    vel = history.body_vel_w[np.clip(np.searchsorted(history.t_s, at_s), 0, len(history.t_s) - 1)]
-    return inside + np.maximum(at_s - history.t_s[-1], 0.0)[:, None, None] * history.body_vel_w[-1], vel
+    vel = history.obstacle_vel_w[np.clip(np.searchsorted(history.t_s, at_s), 0, len(history.t_s) - 1)]
+    return inside + np.maximum(at_s - history.t_s[-1], 0.0)[:, None, None] * history.obstacle_vel_w[-1], vel
 
 
 def is_clear(
-    pos: Array, vel: Array, axis_w: Array, body_w: Array, body_vel_w: Array, bodies: Bodies, config: Config
+    pos: Array,
+    vel: Array,
+    axis_w: Array,
+    obstacle_w: Array,
+    obstacle_vel_w: Array,
+    obstacles: Obstacles,
+    config: Config,
 ) -> Array:
-    """(n,) bool: paths (n, n_t, 3) along which the referee would stop nothing."""
+    """(n,) bool: paths (n, n_t, 3) along which the termination check would stop nothing."""
     rules, hull = config.episode, (config.vehicle.hull_radius_m, config.vehicle.hull_half_length_m)
     n, n_t = pos.shape[:2]
     flat, axis = pos.reshape(-1, 3), np.broadcast_to(axis_w, (n * n_t, 3))
@@ -290,26 +306,28 @@ def is_clear(
         & (floor >= 0)
         & (surface >= 0)
     )
-    for body in np.flatnonzero((bodies.kind > 0) & (_nearest(pos, body_w) < _reach(pos, bodies))):
-        there = np.broadcast_to(body_w[:, body], pos.shape).reshape(-1, 1, 3)
-        one = slice(body, body + 1)
+    for obstacle in np.flatnonzero(
+        (obstacles.kind > 0) & (_nearest(pos, obstacle_w) < _reach(pos, obstacles))
+    ):
+        there = np.broadcast_to(obstacle_w[:, obstacle], pos.shape).reshape(-1, 1, 3)
+        one = slice(obstacle, obstacle + 1)
         gap, normal, _ = hull_gaps(
-            flat, axis, bodies.kind[one], there, bodies.size[one], bodies.yaw[one], *hull
+            flat, axis, obstacles.kind[one], there, obstacles.size[one], obstacles.yaw[one], *hull
         )
-        closing = ((vel - body_vel_w[:, body]).reshape(-1, 3) * normal[:, 0]).sum(-1)
+        closing = ((vel - obstacle_vel_w[:, obstacle]).reshape(-1, 3) * normal[:, 0]).sum(-1)
         clear &= gap[:, 0] >= np.maximum(rules.collision_clearance_m, rules.ttc_s * closing)
     return np.asarray(clear.reshape(n, n_t).all(1))
 
 
-def _nearest(pos: Array, body_w: Array) -> Array:
-    """(nb,) least distance of each body from the mean of all paths."""
-    return np.linalg.norm(body_w[..., :2] - pos.mean(0)[:, None, :2], axis=-1).min(0)
+def _nearest(pos: Array, obstacle_w: Array) -> Array:
+    """(nb,) least distance of each obstacle from the mean of all paths."""
+    return np.linalg.norm(obstacle_w[..., :2] - pos.mean(0)[:, None, :2], axis=-1).min(0)
 
 
-def _reach(pos: Array, bodies: Bodies) -> Array:
-    """(nb,) distance from that mean beyond which a body troubles none of the paths."""
+def _reach(pos: Array, obstacles: Obstacles) -> Array:
+    """(nb,) distance from that mean beyond which an obstacle troubles none of the paths."""
     spread = np.linalg.norm(pos[..., :2] - pos[..., :2].mean(0), axis=-1).max()
-    return spread + np.linalg.norm(bodies.size[:, :2], axis=1) + 1.0
+    return spread + np.linalg.norm(obstacles.size[:, :2], axis=1) + 1.0
 
 
 WINDOW_S = 4.0  # How far back the facts look; a time "ago" that is None lies farther back or never was.
@@ -317,14 +335,16 @@ LEAD_S = 1.0
 """Forecasts are judged by what they said this long before the end: to react, and to get away."""
 SIGHT_S = (1.5, 0.5)
 """Without a forecast LEAD_S before the end, why in this interval: out of the fan, hidden, not tracked."""
-TURN_RAD = math.radians(30.0)  # A corner: the body's course changes by more between two samples.
+TURN_RAD = math.radians(30.0)  # A corner: the obstacle's course changes by more between two samples.
 BACK_RAD = math.radians(120.0)  # A turn back: a corner with more than this.
 BEFORE_TURN_S = 0.1  # The forecast that a turn is judged by was made this long before it.
-BELIEF_M = 0.5  # a forecast or track belongs to a body when its place is this close to the truth, in plan
+BELIEF_M = (
+    0.5  # a forecast or track belongs to an obstacle when its place is this close to the truth, in plan
+)
 CLIMB_S = 1.0  # Changes of the own depth are counted over this time before the end.
-BEAM_M = 0.1  # A beam met the body when its range agrees with the truth within this plus four sigma.
-CROWD_S = 0.5  # A second moving body counts when it came near in this time before the end.
-NEAR_S = 1.5  # Any moving body counts as near when it was so in this time before the end.
+BEAM_M = 0.1  # A beam met the obstacle when its range agrees with the truth within this plus four sigma.
+CROWD_S = 0.5  # A second moving obstacle counts when it came near in this time before the end.
+NEAR_S = 1.5  # Any moving obstacle counts as near when it was so in this time before the end.
 CHANCES_S = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 """The last chance: the latest of these times before the end from which some velocity escaped."""
 BLIND_S = 1.0
@@ -352,13 +372,20 @@ def is_waiting(leaf: str) -> bool:
 class Scene:
     """Distances of the hull to everything over the window."""
 
-    def __init__(self, history: History, bodies: Bodies, config: Config) -> None:
-        self.h, self.bodies, self.config = history, bodies, config
+    def __init__(self, history: History, obstacles: Obstacles, config: Config) -> None:
+        self.h, self.obstacles, self.config = history, obstacles, config
         radius, half = config.vehicle.hull_radius_m, config.vehicle.hull_half_length_m
         R_wb = rotation(history.quat_wb)
         self.axis_w = R_wb[:, :, 0]
         self.gap, self.normal, self.along = hull_gaps(
-            history.pos_w, self.axis_w, bodies.kind, history.body_w, bodies.size, bodies.yaw, radius, half
+            history.pos_w,
+            self.axis_w,
+            obstacles.kind,
+            history.obstacle_w,
+            obstacles.size,
+            obstacles.yaw,
+            radius,
+            half,
         )
         self.wall = wall_gaps(history.pos_w, self.axis_w, config.world.tank, radius, half)
         self.floor, self.surface = floor_and_surface_gaps(
@@ -367,7 +394,7 @@ class Scene:
         vel_w = np.einsum("nij,nj->ni", R_wb, history.vel_b)
         swing_w = np.cross(np.einsum("nij,nj->ni", R_wb, history.rate_b), self.axis_w)
         point_vel = vel_w[:, None, :] + self.along[..., None] * swing_w[:, None, :]
-        self.closing = ((point_vel - history.body_vel_w) * self.normal).sum(-1)
+        self.closing = ((point_vel - history.obstacle_vel_w) * self.normal).sum(-1)
         self.vel_w = vel_w
 
     def killer(self, outcome: str) -> Killer:
@@ -391,18 +418,18 @@ class Scene:
 
     def _body(self, slot: int) -> Killer:
         return Killer(
-            name=KIND_NAMES[int(self.bodies.kind[slot])],
+            name=KIND_NAMES[int(self.obstacles.kind[slot])],
             slot=slot,
-            moving=bool(self.bodies.moving[slot]),
+            moving=bool(self.obstacles.moving[slot]),
             gap_m=_round(self.gap[-1, slot]),
             closing_m_s=_round(self.closing[-1, slot]),
         )
 
     def facts(self, killer: Killer) -> dict[str, Any]:
         """What holds for every failure that has a killer."""
-        h, moving = self.h, self.bodies.moving
+        h, moving = self.h, self.obstacles.moving
         others = moving & (np.arange(len(moving)) != (-1 if killer.slot is None else killer.slot))
-        still = (self.bodies.kind != NONE) & ~moving
+        still = (self.obstacles.kind != NONE) & ~moving
         ago = h.t_s[-1] - h.t_s
         off = h.believed_pos_w[-1] - h.pos_w[-1]
         blind = h.vel_valid == 0 if killer.name in ("floor", "surface") else h.vel_valid != 1
@@ -425,16 +452,16 @@ class Scene:
         }
 
 
-def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
+def _sight_facts(history: History, obstacles: Obstacles, slot: int, config: Config) -> dict[str, Any]:
     """When the sonar could reach the killer, when it saw it, and what else it is."""
-    sonar, kind, size = config.sensors.sonar, int(bodies.kind[slot]), bodies.size[slot]
+    sonar, kind, size = config.sensors.sonar, int(obstacles.kind[slot]), obstacles.size[slot]
     ago = history.t_s[-1] - history.t_s
     R_wb = rotation(history.quat_wb)
     late = history.ping_age_s[:, None]
     then_w = history.pos_w - np.einsum("nij,nj->ni", R_wb, history.vel_b) * late
-    body_then_w = history.body_w[:, slot] - history.body_vel_w[:, slot] * late
+    obstacle_then_w = history.obstacle_w[:, slot] - history.obstacle_vel_w[:, slot] * late
     yaw = np.arctan2(R_wb[:, 1, 0], R_wb[:, 0, 0]) - history.rate_b[:, 2] * history.ping_age_s
-    entry = beam_entries(then_w, yaw, kind, body_then_w, size, float(bodies.yaw[slot]), sonar)
+    entry = beam_entries(then_w, yaw, kind, obstacle_then_w, size, float(obstacles.yaw[slot]), sonar)
     reached = np.isfinite(entry)
     tolerance = (
         BEAM_M
@@ -442,7 +469,7 @@ def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) ->
         + sonar.range_jitter_m
     )
     met = reached & (np.abs(history.range_m - np.where(reached, entry, 0.0)) < tolerance)
-    off_w = body_then_w[:, :2] - then_w[:, :2]
+    off_w = obstacle_then_w[:, :2] - then_w[:, :2]
     off = np.angle(np.exp(1j * (np.arctan2(off_w[:, 1], off_w[:, 0]) - yaw)))
     in_width = np.degrees(np.abs(off)) <= 0.5 * sonar.horizontal_aperture_deg
     in_fan, seen = np.asarray(reached.any(1)), np.asarray(met.any(1))
@@ -453,19 +480,21 @@ def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) ->
         "seen_ago_s": _last_ago(ago, seen),
         "fan_share": _round(in_fan[before].mean()) if before.any() else 0.0,
         "seen_share": _round(seen[before].sum() / max(1, in_fan[before].sum())),
-        "vertical_gap_m": _round(vertical_gap(history.pos_w[-1:], kind, history.body_w[-1:, slot], size)[0]),
-        "killer_speed_m_s": _round(np.linalg.norm(history.body_vel_w[-1, slot])),
+        "vertical_gap_m": _round(
+            vertical_gap(history.pos_w[-1:], kind, history.obstacle_w[-1:, slot], size)[0]
+        ),
+        "killer_speed_m_s": _round(np.linalg.norm(history.obstacle_vel_w[-1, slot])),
         "killer_radius_m": _round(size[0]),
         "full_height": bool(
             kind != BOX and size[2] > 0.49 * (config.world.tank.z_m[1] - config.world.tank.z_m[0])
         ),
-        "circle_m": _round(abs(bodies.circle_m[slot])) if bodies.circle_m[slot] else None,
+        "circle_m": _round(abs(obstacles.circle_m[slot])) if obstacles.circle_m[slot] else None,
     }
 
 
 def _belief_facts(history: History, slot: int, turned_ago_s: float | None, config: Config) -> dict[str, Any]:
     ago = history.t_s[-1] - history.t_s
-    truth = history.body_w[:, slot, :2]
+    truth = history.obstacle_w[:, slot, :2]
     away = np.where(
         history.forecast_m >= 0, np.linalg.norm(history.forecast_w[:, :, 0] - truth[:, None], axis=-1), np.inf
     )
@@ -496,7 +525,7 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
 
 def _believed_gap(history: History, slot: int, track: int) -> float:
     """Vertical gap [m] that the vehicle believed in at the end, towards the killer; 0 = may be level."""
-    own, above = history.pos_w[-1, 2], history.body_w[-1, slot, 2] > history.pos_w[-1, 2]
+    own, above = history.pos_w[-1, 2], history.obstacle_w[-1, slot, 2] > history.pos_w[-1, 2]
     return _round(
         max(
             0.0,
@@ -511,29 +540,33 @@ def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
     return np.array([np.interp(lead_s, steps, forecast_w[:, axis]) for axis in range(2)])
 
 
-def _course_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
+def _course_facts(history: History, obstacles: Obstacles, slot: int, config: Config) -> dict[str, Any]:
     """When the killer last turned a corner (circles have none), and how often there before in reach."""
-    vel = history.body_vel_w[:, slot, :2]
+    vel = history.obstacle_vel_w[:, slot, :2]
     turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(vel[:, 1], vel[:, 0])))))
-    corner = (turn > TURN_RAD) & (bodies.circle_m[slot] == 0)
+    corner = (turn > TURN_RAD) & (obstacles.circle_m[slot] == 0)
     ago = _last_ago(history.t_s[-1] - history.t_s[1:], corner)
     return {
         "turned_ago_s": ago,
         "turned_deg": None if ago is None else _round(np.degrees(turn[corner][-1])),
-        "turns_in_reach_before": None if ago is None else _turns_in_reach(history, bodies, slot, ago, config),
+        "turns_in_reach_before": None
+        if ago is None
+        else _turns_in_reach(history, obstacles, slot, ago, config),
     }
 
 
-def _turns_in_reach(history: History, bodies: Bodies, slot: int, ago_s: float, config: Config) -> int:
+def _turns_in_reach(history: History, obstacles: Obstacles, slot: int, ago_s: float, config: Config) -> int:
     """Earlier passes, in the sonar's fan, of the corner turned ``ago_s`` before the end: was it to learn?"""
     turned_s = float(history.t_s[-1]) - ago_s
-    place = history.body_w[int(np.abs(history.t_s - turned_s).argmin()), slot]
-    passes = np.arange(turned_s - bodies.lap_s[slot], 0.0, -bodies.lap_s[slot])
+    place = history.obstacle_w[int(np.abs(history.t_s - turned_s).argmin()), slot]
+    passes = np.arange(turned_s - obstacles.lap_s[slot], 0.0, -obstacles.lap_s[slot])
     here = np.stack(
         [np.interp(passes, history.coarse.t_s, history.coarse.pos_w[:, axis]) for axis in range(3)], -1
     )
     gap = np.abs(
-        vertical_gap(here, int(bodies.kind[slot]), np.broadcast_to(place, here.shape), bodies.size[slot])
+        vertical_gap(
+            here, int(obstacles.kind[slot]), np.broadcast_to(place, here.shape), obstacles.size[slot]
+        )
     )
     away = np.linalg.norm(here[:, :2] - place[:2], axis=1)
     sonar = config.sensors.sonar
@@ -545,23 +578,23 @@ def _turns_in_reach(history: History, bodies: Bodies, slot: int, ago_s: float, c
     )
 
 
-def killer_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
-    """What holds where a moving body in this slot was the killer."""
-    course = _course_facts(history, bodies, slot, config)
+def killer_facts(history: History, obstacles: Obstacles, slot: int, config: Config) -> dict[str, Any]:
+    """What holds where a moving obstacle in this slot was the killer."""
+    course = _course_facts(history, obstacles, slot, config)
     beliefs = _belief_facts(history, slot, course["turned_ago_s"], config)
     return (
-        _sight_facts(history, bodies, slot, config)
+        _sight_facts(history, obstacles, slot, config)
         | course
         | beliefs
-        | _escape_facts(history, bodies, config)
+        | _escape_facts(history, obstacles, config)
     )
 
 
-def _escape_facts(history: History, bodies: Bodies, config: Config) -> dict[str, Any]:
+def _escape_facts(history: History, obstacles: Obstacles, config: Config) -> dict[str, Any]:
     """Velocities that would have escaped from LEAD_S before the end, and when the last one was gone."""
-    level, heaving = escapes(history, bodies, config, LEAD_S)
-    chances = (back for back in CHANCES_S if any(escapes(history, bodies, config, back)))
-    beyond = 0 if level or heaving else escapes_beyond_the_edge(history, bodies, config, LEAD_S)
+    level, heaving = escapes(history, obstacles, config, LEAD_S)
+    chances = (back for back in CHANCES_S if any(escapes(history, obstacles, config, back)))
+    beyond = 0 if level or heaving else escapes_beyond_the_edge(history, obstacles, config, LEAD_S)
     return {
         "escapes": level,
         "escapes_by_heave": heaving,

@@ -103,7 +103,7 @@ def _axis(text: str) -> tuple[str, tuple[Value, ...]]:
     if not isinstance(parsed, list):
         raise ConfigError(
             f"--grid {text!r}: write AXIS=value,value,.. for example --grid S=4,8 --grid "
-            "teacher.caution=0.5,1,2"
+            "behavior.caution=0.5,1,2"
         )
     return name.strip(), tuple(parsed)
 
@@ -116,7 +116,7 @@ def checked(grid: Grid) -> Grid:
         if name not in SCENE_AXES and name not in PRESET_AXES and not _KEY.fullmatch(name):
             raise ConfigError(
                 f"--grid {name}: no such axis; it is S, D, v, {', '.join(PRESET_AXES)} or a dotted config "
-                "key such as teacher.caution"
+                "key such as behavior.caution"
             )
         if not values:
             raise ConfigError(f"--grid {name}: has no values; for example --grid {name}=1,2")
@@ -154,12 +154,12 @@ def _check_values(name: str, values: Sequence[Value]) -> None:
 
 # ---- What a worker of a sweep is given and what it gives back: plain data, for any process on any machine.
 
-Row = dict[str, Any]  # one method in one cell, an entry of ``cells`` in ``uuv sweep --json``
+Row = dict[str, Any]  # one agent in one cell, an entry of ``cells`` in ``uuv sweep --json``
 
 
 @dataclass(frozen=True)
 class Task:
-    """Cells of one config, which one simulator serves, and one method that plays them."""
+    """Cells of one config, which one simulator serves, and one agent that runs them."""
 
     config: Config
     """with room for the largest scene"""
@@ -186,28 +186,28 @@ class _Kept:
 _kept = _Kept()
 
 
-def play(task: Task) -> list[Row]:
-    """Play all episodes of the task's cells; one row per cell, in their order."""
+def run_task(task: Task) -> list[Row]:
+    """Run all episodes of the task's cells; one row per cell, in their order."""
     from uuvtai.evaluation.agents import load_agents
     from uuvtai.evaluation.episodes import Job, run_episodes
 
-    (method,) = load_agents([task.agent], task.config.teacher.max_node)
-    sim = _sim_of(task, method.config_of(task.config))
-    sim.use_tree(method.tree)
-    sim.planner = method.planner_for(sim)
+    (agent,) = load_agents([task.agent], task.config.behavior.max_node)
+    sim = _sim_of(task, agent.config_of(task.config))
+    sim.use_tree(agent.tree)
+    sim.planner = agent.planner_for(sim)
     jobs = [
         Job(seed, episode, scene)
         for scene in task.scenes
         for seed in task.seeds
         for episode in range(task.episodes)
     ]
-    note = method.driver_for(sim)
-    results, _env_steps = run_episodes(sim, jobs, driver=note.pilot if note else None)
-    if method.own:
-        method.own.close()
+    note = agent.agent_for(sim)
+    results, _env_steps = run_episodes(sim, jobs, agent=note.agent if note else None)
+    if agent.own:
+        agent.own.close()
     each = len(task.seeds) * task.episodes
     return [
-        row_of(method.name, label, results[i * each : (i + 1) * each]) for i, label in enumerate(task.labels)
+        row_of(agent.name, label, results[i * each : (i + 1) * each]) for i, label in enumerate(task.labels)
     ]
 
 
@@ -219,16 +219,18 @@ def _sim_of(task: Task, config: Config) -> Sim:
     key = (config.model_dump_json(), task.num_envs, task.device)
     if _kept.key != key:
         _kept.key, _kept.sim = None, None
-        _kept.sim = Sim(config, task.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node), task.device)
+        _kept.sim = Sim(
+            config, task.num_envs, read_tree(TRAINING_TREE, config.behavior.max_node), task.device
+        )
         _kept.key = key
     return _kept.sim
 
 
-def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> Row:
-    """One method in one cell: as in ``uuv eval``, without what a clock measured, and how episodes end."""
+def row_of(agent: str, label: dict[str, Any], results: list[EpisodeResult]) -> Row:
+    """One agent in one cell: as in ``uuv eval``, without what a clock measured, and how episodes end."""
     from uuvtai.evaluation.results import summary
 
-    found = summary(method, results, 0, 0.0)
+    found = summary(agent, results, 0, 0.0)
     for name in (
         "name",
         "env_steps",
@@ -242,7 +244,7 @@ def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> 
     details = found.pop("episodes_detail")
     return {
         **label,
-        "method": method,
+        "agent": agent,
         **found,
         "episode_outcomes": [entry["outcome"] for entry in details],
         "episode_times_s": [entry["time_s"] for entry in details],
@@ -267,7 +269,7 @@ class SweepRequest:
     """of the config, for every cell: ``key=value`` texts and (key, value) pairs"""
     agents: tuple[str, ...]
     seeds: tuple[int, ...]
-    episodes: int  # per seed, cell and method
+    episodes: int  # per seed, cell and agent
     num_envs: int | None = None
     device: str = "auto"
 
@@ -359,18 +361,18 @@ def unchanged(request: SweepRequest) -> dict[str, Any]:
     return json.loads(json.dumps(own))
 
 
-def row_key(label: dict[str, Any], method: str) -> str:
+def row_key(label: dict[str, Any], agent: str) -> str:
     """What tells a row from every other one of the same sweep."""
-    return hashlib.sha256(json.dumps([sorted(label.items(), key=str), method]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([sorted(label.items(), key=str), agent]).encode()).hexdigest()
 
 
-def tasks_of(request: SweepRequest, methods: Sequence[tuple[str, str]], done: set[str]) -> list[Task]:
-    """Tasks for the rows that are not ``done`` (keys). ``methods``: (name, agent). ConfigError."""
+def tasks_of(request: SweepRequest, agents: Sequence[tuple[str, str]], done: set[str]) -> list[Task]:
+    """Tasks for the rows that are not ``done`` (keys). ``agents``: (name, agent). ConfigError."""
     each = len(request.seeds) * request.episodes
     per_task = max(1, TASK_EPISODES // each)
     found = []
     for config, cells in _by_config(request):
-        for name, agent in methods:
+        for name, agent in agents:
             labels = [label for cell in cells if row_key(label := label_of(cell, config), name) not in done]
             for first in range(0, len(labels), per_task):
                 part = labels[first : first + per_task]
@@ -400,13 +402,13 @@ def _by_config(request: SweepRequest) -> list[tuple[Config, list[Cell]]]:
     return list(groups.values())
 
 
-def check_rows(request: SweepRequest, methods: Sequence[str]) -> list[str]:
+def check_rows(request: SweepRequest, agents: Sequence[str]) -> list[str]:
     """Keys of all rows in the document's order. Raises ConfigError for cells that cannot be told apart."""
     keys = [
         row_key(label_of(cell, config), name)
         for config, cells in _by_config(request)
         for cell in cells
-        for name in methods
+        for name in agents
     ]
     if len(set(keys)) != len(keys):
         raise ConfigError(

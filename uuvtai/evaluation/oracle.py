@@ -6,13 +6,13 @@ be reached alive is followed through time, step by step, until one lies within t
 found is the earliest arrival of a kinematic point:
 
 - Optimistic: no inertia (any velocity at once); the hull is a ball of its smallest radius; the level speed is
-  that of the body's diagonal in any direction, between the eight directions of the lattice up to 8 % more;
-  bodies are looked at once a time step (0.12 s).
+  that of the obstacle's diagonal in any direction, between the eight directions of the lattice up to 8 %
+  more; obstacles are looked at once a time step (0.12 s).
 - Pessimistic: positions are nodes (level 0.1 m apart) at whole time steps; moves along the lattice count as
   full speed for the time to collision, also in a slow approach; climbing and diving count as standing still
   for it.
 
-So it bounds success from above but for the rounding to nodes; research/LOG.md says how often a pilot arrived
+So it bounds success from above but for the rounding to nodes; research/LOG.md says how often an agent arrived
 where the oracle saw no way.
 """
 
@@ -24,10 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from uuvtai.common.obstacle_motion import body_positions, path_positions
+from uuvtai.common.obstacle_motion import obstacle_positions, path_positions
 from uuvtai.config import Config
 
-# ---- Where the bodies of a scenario are at given times, and how far points are from them.
+# ---- Where the obstacles of a scenario are at given times, and how far points are from them.
 
 _BEFORE_S = 1e-4  # Velocities are differences over this time: exact but for the moment of a sharp turn.
 
@@ -37,7 +37,7 @@ class Obstacle:
     kind: str  # sphere, cylinder or box
     size: Array  # (3,) [m] as in ``WorldState``
     yaw: float
-    pos_w: Array  # (n_t, 3) [m]; n_t = 1 for a body at rest
+    pos_w: Array  # (n_t, 3) [m]; n_t = 1 for an obstacle at rest
     vel_w: Array  # (n_t, 2) [m/s] horizontal
 
     @property
@@ -51,44 +51,47 @@ class Obstacle:
 
 
 def obstacles_of(scenario: dict[str, Any], t_s: Array) -> list[Obstacle]:
-    """Bodies of a ``describe_scenario`` document at the times ``t_s`` (n_t,) [s] since the start."""
-    return [_obstacle(body, t_s) for body in scenario["bodies"]]
+    """Obstacles of a ``describe_scenario`` document at the times ``t_s`` (n_t,) [s] since the start."""
+    return [_obstacle(obstacle, t_s) for obstacle in scenario["obstacles"]]
 
 
-def _obstacle(body: dict[str, Any], t_s: Array) -> Obstacle:
-    pos, vel = np.array([body["position"]], float), np.zeros((1, 2))
-    path = body["path"]
+def _obstacle(obstacle: dict[str, Any], t_s: Array) -> Obstacle:
+    pos, vel = np.array([obstacle["position"]], float), np.zeros((1, 2))
+    path = obstacle["path"]
     if path is not None and path["speed_m_s"] > 0:
-        pos = body_positions(body, t_s)
+        pos = obstacle_positions(obstacle, t_s)
         vel = (pos[:, :2] - path_positions(path, t_s - _BEFORE_S)) / _BEFORE_S
-    return Obstacle(body["kind"], np.array(body["size"], float), float(body["yaw"]), pos, vel)
+    return Obstacle(obstacle["kind"], np.array(obstacle["size"], float), float(obstacle["yaw"]), pos, vel)
 
 
-def level_excess(body: Obstacle, dx: Array, dy: Array) -> tuple[Array, Array]:
-    """(x, y) parts [m] of the way from the body's core (a sphere's centre) to points at (dx, dy)."""
-    if body.kind == "sphere":
+def level_excess(obstacle: Obstacle, dx: Array, dy: Array) -> tuple[Array, Array]:
+    """(x, y) parts [m] of the way from the obstacle's core (a sphere's centre) to points at (dx, dy)."""
+    if obstacle.kind == "sphere":
         return dx, dy
-    if body.kind == "cylinder":
-        share = np.maximum(1.0 - body.size[0] / np.maximum(np.hypot(dx, dy), 1e-9), 0.0)
+    if obstacle.kind == "cylinder":
+        share = np.maximum(1.0 - obstacle.size[0] / np.maximum(np.hypot(dx, dy), 1e-9), 0.0)
         return dx * share, dy * share
-    c, s = np.cos(body.yaw), np.sin(body.yaw)
+    c, s = np.cos(obstacle.yaw), np.sin(obstacle.yaw)
     x, y = c * dx + s * dy, c * dy - s * dx
-    x, y = x - np.clip(x, -body.size[0], body.size[0]), y - np.clip(y, -body.size[1], body.size[1])
+    x, y = (
+        x - np.clip(x, -obstacle.size[0], obstacle.size[0]),
+        y - np.clip(y, -obstacle.size[1], obstacle.size[1]),
+    )
     return c * x - s * y, s * x + c * y
 
 
-def upright_excess(body: Obstacle, dz: Array) -> Array:
+def upright_excess(obstacle: Obstacle, dz: Array) -> Array:
     """z part [m] of that way."""
-    return dz if body.kind == "sphere" else dz - np.clip(dz, -body.size[2], body.size[2])
+    return dz if obstacle.kind == "sphere" else dz - np.clip(dz, -obstacle.size[2], obstacle.size[2])
 
 
-def rounding_m(body: Obstacle) -> float:
+def rounding_m(obstacle: Obstacle) -> float:
     """[m] from the core to the surface."""
-    return float(body.size[0]) if body.kind == "sphere" else 0.0
+    return float(obstacle.size[0]) if obstacle.kind == "sphere" else 0.0
 
 
-# ---- Nodes at which a kinematic point may be, and which of them the referee's rules forbid at a time. The
-# hull is a ball of its own radius: the slimmest that the capsule can look, whatever its heading.
+# ---- Nodes at which a kinematic point may be, and which of them the termination check's rules forbid at a
+# time. The hull is a ball of its own radius: the slimmest that the capsule can look, whatever its heading.
 
 CELL_M = 0.1  # Level distance of neighbouring nodes.
 
@@ -153,41 +156,41 @@ def _axis(start: float, bounds: tuple[float, float], step: float, margin: float)
     return start + step * np.arange(-below, above + 1), below
 
 
-class Referee:
+class Termination:
     """Which nodes a hull may not be at, per move: ``blocked`` (n_move, n_z, n_y, n_x) bool.
 
     A node is forbidden to who leaves or reaches it by a move if the clearance there is below the collision
     clearance, or lasts for less than the time to collision at the speed with which that move at full speed,
-    and the body, close it.
+    and the obstacle, close it.
     """
 
     def __init__(self, lattice: Lattice, still: list[Obstacle], config: Config) -> None:
-        """``still``: the bodies at rest."""
+        """``still``: the static obstacles."""
         self._grid, self._rules, self._hull_m = lattice, config.episode, config.vehicle.hull_radius_m
         length = np.maximum(np.linalg.norm(MOVES, axis=1), 1.0)[:, None]
         self._velocity = lattice.speed_m_s * MOVES / length
         self._base = np.repeat(~lattice.inside[None], len(MOVES), axis=0)
-        for body in still:
-            self._forbid(self._base, body, 0, None)
+        for obstacle in still:
+            self._forbid(self._base, obstacle, 0, None)
 
     def blocked(self, moving: list[Obstacle], step: int, near: Array) -> Array:
         """Masks at a time step, right wherever ``near`` (n_z, n_y, n_x) and its neighbours are."""
         out = self._base.copy()
-        for body in moving:
-            self._forbid(out, body, step, near)
+        for obstacle in moving:
+            self._forbid(out, obstacle, step, near)
         return out
 
-    def _forbid(self, out: Array, body: Obstacle, step: int, near: Array | None) -> None:
-        box = self._box(body, step)
+    def _forbid(self, out: Array, obstacle: Obstacle, step: int, near: Array | None) -> None:
+        box = self._box(obstacle, step)
         if any(part.start >= part.stop for part in box) or (
             near is not None and not near[_widened(box)].any()
         ):
             return
-        grid, at, vel = self._grid, body.pos_w[step], body.vel_w[step]
-        ox, oy = level_excess(body, grid.x_m[box[2]] - at[0], (grid.y_m[box[1]] - at[1])[:, None])
-        oz = upright_excess(body, grid.z_m[box[0]] - at[2])[:, None, None]
+        grid, at, vel = self._grid, obstacle.pos_w[step], obstacle.vel_w[step]
+        ox, oy = level_excess(obstacle, grid.x_m[box[2]] - at[0], (grid.y_m[box[1]] - at[1])[:, None])
+        oz = upright_excess(obstacle, grid.z_m[box[0]] - at[2])[:, None, None]
         away = np.sqrt(ox**2 + oy**2 + oz**2)
-        gap = away - rounding_m(body) - self._hull_m
+        gap = away - rounding_m(obstacle) - self._hull_m
         # closing speed = -(move - body) . (ox, oy) / away; both sides times ``away``
         fastest = (
             np.maximum(gap / self._rules.ttc_s, self._rules.ttc_closing_m_s)
@@ -200,13 +203,13 @@ class Referee:
         for move, velocity in enumerate(self._velocity):
             out[(move, *box)] |= -(velocity[0] * ox + velocity[1] * oy) > allowed
 
-    def _box(self, body: Obstacle, step: int) -> tuple[slice, slice, slice]:
-        """(z, y, x) ranges of the nodes that the body may forbid."""
-        fastest = self._grid.speed_m_s + float(np.hypot(*body.vel_w[step]))
+    def _box(self, obstacle: Obstacle, step: int) -> tuple[slice, slice, slice]:
+        """(z, y, x) ranges of the nodes that the obstacle may forbid."""
+        fastest = self._grid.speed_m_s + float(np.hypot(*obstacle.vel_w[step]))
         reach = self._hull_m + max(self._rules.collision_clearance_m, self._rules.ttc_s * fastest)
-        spans = (body.size[2] + reach, body.radius_m + reach, body.radius_m + reach)
+        spans = (obstacle.size[2] + reach, obstacle.radius_m + reach, obstacle.radius_m + reach)
         axes = (self._grid.z_m, self._grid.y_m, self._grid.x_m)
-        low_high = zip(axes, body.pos_w[step][::-1], spans, strict=True)
+        low_high = zip(axes, obstacle.pos_w[step][::-1], spans, strict=True)
         z, y, x = (
             slice(int(np.searchsorted(axis, at - span)), int(np.searchsorted(axis, at + span)))
             for axis, at, span in low_high
@@ -238,27 +241,28 @@ def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
     rules = config.episode
     grid = lattice_of(np.array(scenario["start"]), config)
     n_step = int(rules.horizon_steps * rules.control_dt_s / grid.dt_s)
-    bodies = obstacles_of(scenario, grid.dt_s * np.arange(n_step + 1))
-    referee = Referee(grid, [body for body in bodies if not body.moves], config)
-    moving = [body for body in bodies if body.moves]
+    obstacles = obstacles_of(scenario, grid.dt_s * np.arange(n_step + 1))
+    termination = Termination(grid, [obstacle for obstacle in obstacles if not obstacle.moves], config)
+    moving = [obstacle for obstacle in obstacles if obstacle.moves]
     goal = grid.near(np.array(scenario["goal"]), rules.goal_radius_m)
     reached = np.zeros_like(grid.inside)
     reached[grid.start] = True
-    blocked = referee.blocked(moving, 0, reached)
+    blocked = termination.blocked(moving, 0, reached)
     reached &= ~blocked[0]
     for step in range(n_step + 1):
         if (reached & goal).any():
             return Arrival(step * grid.dt_s)
         if step == n_step or not reached.any():
             break
-        after = referee.blocked(moving, step + 1, reached)
+        after = termination.blocked(moving, step + 1, reached)
         reached = _moved(reached, blocked, after, step)
         blocked = after
     return Arrival(None)
 
 
 def _moved(reached: Array, blocked: Array, after: Array, step: int) -> Array:
-    """Nodes in reach a step later; ``blocked`` and ``after``: the referee's masks at both its ends."""
+    """Nodes in reach a step later; ``blocked`` and ``after``: the termination check's masks at both its
+    ends."""
     out = np.zeros_like(reached)
     for move in _moves_of(step):
         here, there = _shifted(MOVES[move])

@@ -155,7 +155,7 @@ def _networks(config: LearningConfig) -> dict[str, Callable[[], Any]]:
     from uuvtai.learning.networks import ActorCritic
     from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
-    generator, n_obs = torch.Generator().manual_seed(0), observation_width(config.features)
+    generator, n_obs = torch.Generator().manual_seed(0), observation_width(config.observation)
     model = WorldModel(n_obs, config.world_model, generator)
     policy = ActorCritic(
         n_obs + N_FEATURES, config.policy.model_copy(update={"residual": False}), None, generator
@@ -246,7 +246,7 @@ def profile(
     before anything runs."""
     from uuvtai.sim.behavior_tree import read_tree
 
-    tree = read_tree(controller, config.teacher.max_node)
+    tree = read_tree(controller, config.behavior.max_node)
     for n in sizes:
         check_size(config, n, device)
     rows, latency, real_time, device_used = [], [], None, device
@@ -301,7 +301,7 @@ def _rate_row(
     return {
         "num_envs": sim.num_envs,
         "controller": controller,
-        **config.world.bodies,
+        **config.world.obstacles,
         "depth_every": config.sensors.depth.period_steps,
         "env_steps_per_s": {"step": step, "tree": driven},
         "compile_s": compile_s,

@@ -29,7 +29,7 @@ from uuvtai.evaluation.reproduce_steps import (
     steps_of,
 )
 from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
-from uuvtai.plugins.api import is_piece, piece_spec, refuse_code
+from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code
 from uuvtai.report.build import report
 from uuvtai.report.reproduction import claim_table
 from uuvtai.report.tables import Table, change_name, markdown, seconds, text_table, varies_alone
@@ -61,13 +61,11 @@ def sections_of(document: dict[str, Any], budget: Budget) -> list[Described]:
         _section("Trajectories: scenario A", {"kind": "run", "path": "eval/scenario_a"}),
         _section("Trajectories: scenario B", {"kind": "run", "path": "eval/scenario_b"}),
         _section("Time", {"kind": "run", "path": "profile"}),
-        _section("Every method in full", {"kind": "run", "path": "eval/main"}),
+        _section("Every agent in full", {"kind": "run", "path": "eval/main"}),
     ]
 
 
-_CEILINGS = (
-    "bt+truth is told where every moving body is, oracle knows the future: privileged yardsticks, no methods."
-)
+_CEILINGS = "bt+truth is told where every moving obstacle is, oracle knows the future: oracles, no agents."
 
 
 def _section(title: str, *blocks: Described) -> Described:
@@ -94,7 +92,7 @@ def _main_table(document: dict[str, Any]) -> Described:
         rates = [str(pooled(entries, "success")), str(pooled(entries, *COLLIDED))]
         rows.append([name, str(len(entries)), *rates, "-" if own is None else f"{own:.1f}", *theirs])
     measured = ["success", "collision", "TTS s"]
-    columns = ["method", "training seeds", *measured, *(f"paper: {name}" for name in measured)]
+    columns = ["agent", "training seeds", *measured, *(f"paper: {name}" for name in measured)]
     caption = f"Table main, ours beside the paper's as printed; {document['commands']['eval/main']}"
     return {"kind": "table", "columns": columns, "rows": rows, "caption": caption, "n_left": 1}
 
@@ -109,11 +107,11 @@ def _trade_off(document: dict[str, Any]) -> list[Described]:
     sweep = document["sweeps"].get("caution")
     if sweep is None:
         return []
-    points = [_point(sweep["cells"], caution) for caution in sweep["axes"]["teacher.caution"]]
+    points = [_point(sweep["cells"], caution) for caution in sweep["axes"]["behavior.caution"]]
     rates = {"collision_rate": claims.MODERATE_COLLISION, "success_rate": claims.MODERATE_SUCCESS}
     block = {
         "kind": "trade_off",
-        "series": [{"name": "bt, teacher.caution from fast to careful", "points": points}],
+        "series": [{"name": "bt, behavior.caution from fast to careful", "points": points}],
         "marks": [{"name": "paper", **rates}],
         "caption": "Mean over S <= 8, D <= 9, v <= 1.5 m/s (D = 0 once per S)",
         "command": document["commands"]["sweep/caution"],
@@ -122,7 +120,7 @@ def _trade_off(document: dict[str, Any]) -> list[Described]:
 
 
 def _point(cells: Sequence[dict[str, Any]], caution: float) -> Described:
-    own = [cell for cell in cells if cell["teacher.caution"] == caution]
+    own = [cell for cell in cells if cell["behavior.caution"] == caution]
     return {"collision_rate": pooled(own, *COLLIDED).rate, "success_rate": pooled(own, "success").rate}
 
 
@@ -184,7 +182,7 @@ def _main(document: dict[str, Any]) -> str:
         "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the "
         "episodes that arrive, has no peer in the paper."
     )
-    columns = ["method", "training seeds", "success", "collision", "the paper: success / collision"]
+    columns = ["agent", "training seeds", "success", "collision", "the paper: success / collision"]
     columns += ["TTS", "the paper: TTS", "mean time", "the paper: mean time", "mean time of successes"]
     return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n{note}\n\n" + text_table(
         columns, rows
@@ -193,10 +191,10 @@ def _main(document: dict[str, Any]) -> str:
 
 def _ceilings(document: dict[str, Any]) -> str:
     rows = []
-    for m in document["ceilings"]["methods"]:
+    for m in document["ceilings"]["agents"]:
         rates = [str(pooled([m], "success")), str(pooled([m], *COLLIDED))]
         rows.append([f"`{m['name']}`", *rates, seconds(m["time_to_success_mean_s"])])
-    note = "`bt+truth` is told the true bodies, `oracle` knows the future: privileged, no methods."
+    note = "`bt+truth` is told the true obstacles, `oracle` knows the future: privileged, no agents."
     return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + text_table(
         ["", "success", "collision", "mean time of successes"], rows
     )
@@ -210,7 +208,7 @@ def _sweeps(document: dict[str, Any]) -> str:
 
 
 def _sweep_lines(sweep: dict[str, Any]) -> str:
-    """Rows: method and every axis but the speed; columns: speeds; cells: success / collision in %."""
+    """Rows: agent and every axis but the speed; columns: speeds; cells: success / collision in %."""
     if varies_alone(sweep):
         return _alone(sweep)
     axes = [("v_m_s" if name == "v" else name) for name in sweep["axes"]]
@@ -219,23 +217,23 @@ def _sweep_lines(sweep: dict[str, Any]) -> str:
     values = list(dict.fromkeys(cell.get(across) for cell in sweep["cells"]))
     lines: dict[tuple[Any, ...], dict[Any, str]] = {}
     for cell in sweep["cells"]:
-        key = (cell["method"], *(str(cell.get(name, "")) for name in down))
+        key = (cell["agent"], *(str(cell.get(name, "")) for name in down))
         lines.setdefault(key, {})[str(cell.get(across))] = _both(cell)
     speeds = ["nothing moves" if value is None else f"{across} = {value}" for value in values]
     rows = [
         [*map(str, key), *(found.get(str(value), "") for value in values)] for key, found in lines.items()
     ]
-    return "success / collision in %\n\n" + text_table(["method", *down, *speeds], rows)
+    return "success / collision in %\n\n" + text_table(["agent", *down, *speeds], rows)
 
 
 def _alone(sweep: dict[str, Any]) -> str:
-    """Rows: what is changed; columns: methods; cells: success / collision in %."""
-    methods = list(dict.fromkeys(cell["method"] for cell in sweep["cells"]))
+    """Rows: what is changed; columns: agents; cells: success / collision in %."""
+    agents = list(dict.fromkeys(cell["agent"] for cell in sweep["cells"]))
     lines: dict[str, dict[str, str]] = {}
     for cell in sweep["cells"]:
-        lines.setdefault(change_name(cell, sweep), {})[cell["method"]] = _both(cell)
-    rows = [[name, *(found.get(method, "") for method in methods)] for name, found in lines.items()]
-    return "success / collision in %, one axis at a time\n\n" + text_table(["changed", *methods], rows)
+        lines.setdefault(change_name(cell, sweep), {})[cell["agent"]] = _both(cell)
+    rows = [[name, *(found.get(agent, "") for agent in agents)] for name, found in lines.items()]
+    return "success / collision in %, one axis at a time\n\n" + text_table(["changed", *agents], rows)
 
 
 def _both(cell: dict[str, Any]) -> str:
@@ -274,16 +272,16 @@ class ReproductionWatch(Protocol):
 def reproduce(
     budget: str, run_dir: Path | None, watch: ReproductionWatch, own: Sequence[str] = ()
 ) -> tuple[dict[str, Any], Path]:
-    """Begin a reproduction: its document and its folder. ``own``: pieces of the user's, compared with ours.
-    Raises ValueError for an unknown budget, RunFolderError, PieceError."""
+    """Begin a reproduction: its document and its folder. ``own``: plugins of the user's, compared with ours.
+    Raises ValueError for an unknown budget, RunFolderError, PluginError."""
     if budget not in BUDGETS:
         raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
     refuse_place(run_dir)
-    config, pieces = load_config("pool"), [piece_spec(name).absolute().text for name in own]
-    load_agents(pieces, config.teacher.max_node)  # refuses what cannot be loaded before hours have passed
+    config, plugins = load_config("pool"), [plugin_spec(name).absolute().text for name in own]
+    load_agents(plugins, config.behavior.max_node)  # refuses what cannot be loaded before hours have passed
     root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
     folder = RunFolder(root, config, [EVALUATION_SEED])
-    request: dict[str, Any] = {"schema": 1, "budget": budget, "own": pieces}
+    request: dict[str, Any] = {"schema": 1, "budget": budget, "own": plugins}
     folder.write_json(REQUEST, request)
     return _run(folder, request, watch), root
 
@@ -308,7 +306,7 @@ def _request(root: Path) -> dict[str, Any]:
     try:
         request = read_json(file, folder=root)
         known = request["budget"] in BUDGETS
-        known = known and all(isinstance(name, str) and is_piece(name) for name in request.get("own", []))
+        known = known and all(isinstance(name, str) and is_plugin(name) for name in request.get("own", []))
     except (FileError, OSError, KeyError, TypeError) as error:
         raise RunFolderError(
             f"{file}: cannot be read ({error}); give the folder that 'uuv reproduce' printed"
@@ -352,7 +350,7 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
     results = {step.folder: read_json(result_file(step, root), folder=root) for step in steps}
     record = read_json(root / "run.json", folder=root)
     budget = BUDGETS[request["budget"]]
-    own = [piece_spec(name).label for name in request["own"]]
+    own = [plugin_spec(name).label for name in request["own"]]
     by_preset = _by_preset(results["eval/main"], budget, own)
     document = {
         "schema": 1,
@@ -388,11 +386,11 @@ def _shown(part: str, root: Path) -> str:
 
 
 def _by_preset(main: dict[str, Any], budget: Budget, own: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """Entries of the methods' table by preset; of their single episodes how each ended."""
+    """Entries of the agents' table by preset; of their single episodes how each ended."""
     entries = {
         entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"}
         | {"ends": "".join(LETTERS[e["outcome"]] for e in entry["episodes_detail"])}
-        for entry in main["methods"]
+        for entry in main["agents"]
     }
     trained = {
         preset: [entries[f"{preset}-{seed}"] for seed in range(budget.training_seeds)] for preset in TRAINED
@@ -407,13 +405,13 @@ def _claims(
     own: Sequence[str],
 ) -> list[claims.Claim]:
     cells = results["sweep/pool"]["cells"]
-    names = list(dict.fromkeys(cell["method"] for cell in cells))
-    pilot = next(name for name in names if name not in ("bt", *own))
-    there = next(entry for entry in results["eval/transfer"]["methods"] if entry["name"] not in ("bt", *own))
+    names = list(dict.fromkeys(cell["agent"] for cell in cells))
+    agent = next(name for name in names if name not in ("bt", *own))
+    there = next(entry for entry in results["eval/transfer"]["agents"] if entry["name"] not in ("bt", *own))
     found = [
         *claims.of_table_main(by_preset),
         *claims.of_training(_metrics(root / "train" / "curriculum-0")),
-        *(claim for name in (pilot, "bt") for claim in claims.of_sweep(cells, name)),
+        *(claim for name in (agent, "bt") for claim in claims.of_sweep(cells, name)),
         *claims.of_timing(results["profile"]),
         *(claims.of_transfer(by_preset["curriculum"][0], there)),
     ]

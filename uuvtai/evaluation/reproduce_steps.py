@@ -27,7 +27,7 @@ class Budget:
     iterations: int
     """of 256 envs x 64 steps; 38 are 622,592 env-steps, the paper's budget, and 380 ten times as many"""
     training_seeds: int
-    episodes: int  # per method in Table main
+    episodes: int  # per agent in Table main
     ceiling_episodes: int
     sweep_episodes: int  # per cell
     profile_seconds: float
@@ -60,7 +60,7 @@ class Step:
 
 
 def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
-    """All steps in their order; ``own``: pieces of the user's, beside ours wherever methods are compared."""
+    """All steps in their order; ``own``: plugins of the user's, beside ours wherever agents are compared."""
     seeds = range(budget.training_seeds)
     runs = {preset: [f"train/{preset}-{seed}" for seed in seeds] for preset in TRAINED}
     trainings = [
@@ -75,10 +75,10 @@ def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
     ]
     at = ("--seeds", str(EVALUATION_SEED), "--episodes")
     places = [str(root / place) for of_preset in runs.values() for place in of_preset]
-    pilot = str(root / runs["curriculum"][0])
+    agent = str(root / runs["curriculum"][0])
     judged = ("eval", *_agents("straight", "planner", "bt", *own, *places), *at, str(budget.episodes))
     recorded = ("--record", "1", *at, "1")
-    methods = [str(root / runs[name][0]) for name in ("ppo", "distill_20", "curriculum")]
+    agents = [str(root / runs[name][0]) for name in ("ppo", "distill_20", "curriculum")]
     steps = [
         *trainings,
         Step("Table main and ablations", judged, "eval/main"),
@@ -89,20 +89,20 @@ def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
         ),
         Step(
             "transfer",
-            ("eval", *_agents("bt", *own, pilot), "--world", "transfer", *at, str(budget.episodes)),
+            ("eval", *_agents("bt", *own, agent), "--world", "transfer", *at, str(budget.episodes)),
             "eval/transfer",
         ),
         Step(
             "scenario A",
-            ("eval", *_agents("bt", *own, *methods), *recorded, "--video"),
+            ("eval", *_agents("bt", *own, *agents), *recorded, "--video"),
             "eval/scenario_a",
         ),
         Step(
             "scenario B",
-            ("eval", *_agents("bt", *own, *methods), "-S", "12", "-D", "9", *recorded, "--video"),
+            ("eval", *_agents("bt", *own, *agents), "-S", "12", "-D", "9", *recorded, "--video"),
             "eval/scenario_b",
         ),
-        Step("sweep", _sweep(pilot, "paper", budget.sweep_episodes, own=own), "sweep/pool", resumes=True),
+        Step("sweep", _sweep(agent, "paper", budget.sweep_episodes, own=own), "sweep/pool", resumes=True),
         Step(
             "profile",
             ("profile", "--num-envs", "1,64,1024", "--seconds", str(budget.profile_seconds), "--density"),
@@ -110,18 +110,18 @@ def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
             to_file=True,
         ),
     ]
-    return steps + (_beyond(pilot, budget, own) if budget.beyond else [])
+    return steps + (_beyond(agent, budget, own) if budget.beyond else [])
 
 
 def _train(preset: str, seed: int, budget: Budget) -> tuple[str, ...]:
     return ("train", preset, "--seed", str(seed), "--set", f"train.iterations={budget.iterations}")
 
 
-def _sweep(pilot: str, grid: str, episodes: int, *more: str, own: Sequence[str] = ()) -> tuple[str, ...]:
+def _sweep(agent: str, grid: str, episodes: int, *more: str, own: Sequence[str] = ()) -> tuple[str, ...]:
     seed = ("--seeds", str(EVALUATION_SEED))
     return (
         "sweep",
-        *_agents("bt", *own, pilot),
+        *_agents("bt", *own, agent),
         "--grid",
         grid,
         "--episodes",
@@ -131,12 +131,12 @@ def _sweep(pilot: str, grid: str, episodes: int, *more: str, own: Sequence[str] 
     )
 
 
-def _beyond(pilot: str, budget: Budget, own: Sequence[str]) -> list[Step]:
+def _beyond(agent: str, budget: Budget, own: Sequence[str]) -> list[Step]:
     few = max(1, budget.sweep_episodes // 2)
     return [
         Step(
             "gauntlet",
-            _sweep(pilot, "paper", few, "--world", "gauntlet", own=own),
+            _sweep(agent, "paper", few, "--world", "gauntlet", own=own),
             "sweep/gauntlet",
             resumes=True,
         ),
@@ -148,13 +148,13 @@ def _beyond(pilot: str, budget: Budget, own: Sequence[str]) -> list[Step]:
         ),
         Step(
             "robustness",
-            _sweep(pilot, "robustness", 4 * budget.sweep_episodes, own=own),
+            _sweep(agent, "robustness", 4 * budget.sweep_episodes, own=own),
             "sweep/robustness",
             resumes=True,
         ),
         Step(
             "dead reckoning",
-            _sweep(pilot, "dead_reckoning", 4 * budget.sweep_episodes, own=own),
+            _sweep(agent, "dead_reckoning", 4 * budget.sweep_episodes, own=own),
             "sweep/dead_reckoning",
             resumes=True,
         ),

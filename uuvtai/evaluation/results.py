@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from uuvtai.common.enums import COLLIDED, ENDINGS, PLANNERS, REASONS, TRIGGERS
+from uuvtai.common.enums import COLLIDED, FINAL_OUTCOMES, PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.files import (
     open_to_append,
     read_bytes,
@@ -38,12 +38,12 @@ from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError, preset_of, read_preset, validated
 from uuvtai.evaluation.episodes import EpisodeObserver, EpisodeResult, Job
 from uuvtai.logs.run_folder import RunFolderError
-from uuvtai.plugins.api import is_piece, piece_spec
+from uuvtai.plugins.api import is_plugin, plugin_spec
 from uuvtai.sim.behavior_tree import node_use
 from uuvtai.sim.sim import Sim
 
 if TYPE_CHECKING:
-    from uuvtai.evaluation.agents import Method
+    from uuvtai.evaluation.agents import AgentSpec
     from uuvtai.sim.scene import SceneOptions
 
 
@@ -71,7 +71,7 @@ class Finished(NamedTuple):
 
     result: EpisodeResult
     wall_s: float
-    """time that its method had taken by then"""
+    """time that its agent had taken by then"""
 
 
 class _Line(BaseModel):
@@ -79,7 +79,7 @@ class _Line(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-    method: str
+    agent: str
     seed: int
     episode: int = Field(ge=0)
     outcome: Literal["success", "collision", "ttc", "out_of_tank", "timeout"]
@@ -102,7 +102,7 @@ class _Line(BaseModel):
         return Finished(EpisodeResult(**plain, **counts), self.wall_s)
 
 
-class Ledger:
+class ResultsJournal:
     """The file ``eval/episodes.jsonl`` of a run folder that this process holds. Raises RunFolderError,
     FileError."""
 
@@ -116,14 +116,14 @@ class Ledger:
             truncate(self._path, self._read(folder), folder)
         self._file = open_to_append(self._path, folder)
 
-    def finished(self, method: str) -> dict[Job, Finished]:
-        """A method's episodes that are over."""
-        return self._found.setdefault(method, {})
+    def finished(self, agent: str) -> dict[Job, Finished]:
+        """An agent's episodes that are over."""
+        return self._found.setdefault(agent, {})
 
-    def add(self, method: str, finished: Finished) -> None:
+    def add(self, agent: str, finished: Finished) -> None:
         """Write an episode down."""
         result = finished.result
-        row: dict[str, Any] = {"method": method} | {name: getattr(result, name) for name in _PLAIN}
+        row: dict[str, Any] = {"agent": agent} | {name: getattr(result, name) for name in _PLAIN}
         row |= {name: getattr(result, name).tolist() for name in ("ticks", "acted")}
         row |= {"wall_s": round(finished.wall_s, 3)}
         self._file.write(json.dumps(row, allow_nan=False, separators=(",", ":")).encode() + b"\n")
@@ -131,7 +131,7 @@ class Ledger:
         if time.monotonic() - self._synced >= _SYNC_S:
             os.fsync(self._file.fileno())
             self._synced = time.monotonic()
-        self.finished(method)[Job(result.seed, result.episode)] = finished
+        self.finished(agent)[Job(result.seed, result.episode)] = finished
 
     def close(self) -> None:
         """See all of it on the disk."""
@@ -153,32 +153,32 @@ class Ledger:
                 raise RunFolderError(
                     f"{self._path}, line {number}: is no finished episode ({reason}); take that line out"
                 ) from None
-            self.finished(found.method)[Job(found.seed, found.episode)] = found.finished()
+            self.finished(found.agent)[Job(found.seed, found.episode)] = found.finished()
             kept += len(line)
         return kept
 
 
-class LedgerWriter(EpisodeObserver):
-    """Recorder that writes a method's episodes into the ledger as they end; behind those whose work an
+class JournalWriter(EpisodeObserver):
+    """Recorder that writes an agent's episodes into the journal as they end; behind those whose work an
     episode needs to be whole."""
 
-    def __init__(self, ledger: Ledger, method: str) -> None:
-        self._ledger, self._method = ledger, method
-        self.before_s = max((found.wall_s for found in ledger.finished(method).values()), default=0.0)
+    def __init__(self, journal: ResultsJournal, agent: str) -> None:
+        self._journal, self._method = journal, agent
+        self.before_s = max((found.wall_s for found in journal.finished(agent).values()), default=0.0)
         self._begun = time.perf_counter()
 
     @property
     def wall_s(self) -> float:
-        """Time that the method has taken, that of earlier processes included."""
+        """Time that the agent has taken, that of earlier processes included."""
         return self.before_s + time.perf_counter() - self._begun
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
         """Keep the episode."""
-        self._ledger.add(self._method, Finished(result, self.wall_s))
+        self._journal.add(self._method, Finished(result, self.wall_s))
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Methods compared on the same episodes: who alone arrives, how sure that is, and the difference in time
+# Agents compared on the same episodes: who alone arrives, how sure that is, and the difference in time
 # where both do.
 
 
@@ -186,13 +186,13 @@ Episode = dict[str, Any]
 """an entry of ``episodes_detail``: seed, episode, outcome, time_s at least"""
 
 
-def paired(methods: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Every pair of methods (entries of ``uuv eval --json``): only_a and only_b arrive, McNemar's exact p,
+def paired(agents: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Every pair of agents (entries of ``uuv eval --json``): only_a and only_b arrive, McNemar's exact p,
     times where both arrive.
 
     ``time_difference_mean_s`` is a's time minus b's, with a bootstrap interval over episodes.
     """
-    return [_compared(a, b) for a, b in itertools.combinations(methods, 2)]
+    return [_compared(a, b) for a, b in itertools.combinations(agents, 2)]
 
 
 def _compared(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def _pairs(a: list[Episode], b: list[Episode]) -> list[tuple[Episode, Episode]]:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What ``uuv eval --json`` says of played episodes: one entry per method, and the whole document.
+# What ``uuv eval --json`` says of ran episodes: one entry per agent, and the whole document.
 
 
 def summary(
@@ -238,14 +238,14 @@ def summary(
     wall_s: float,
     env_steps_per_s: float | None = None,
 ) -> dict[str, Any]:
-    """One method's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never
+    """One agent's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never
     NaN.
 
     ``env_steps_per_s`` is a ``StepClock``'s: of simulating alone, where ``wall_s`` is all the time that the
-    method took.
+    agent took.
     """
     n = len(results)
-    outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in ENDINGS}
+    outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in FINAL_OUTCOMES}
     collided = sum(outcomes[o] for o in COLLIDED)
     time_mean, to_goal = (
         mean([r.time_s for r in results]),
@@ -306,21 +306,21 @@ def document(
     vehicle: str,
     seeds: list[int],
     episodes: int,
-    methods: list[dict[str, Any]],
+    agents: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """The whole ``uuv eval --json`` document."""
     return {
         "schema": 1,
         "world": world,
-        **config.world.bodies,
+        **config.world.obstacles,
         "v_m_s": config.world.dynamic_speed_m_s,
         "sensors": sensors,
         "vehicle": vehicle,
         "localization": config.sensors.localization,
         "seeds": seeds,
         "episodes_per_seed": episodes,
-        "methods": methods,
-        "paired": paired(methods),
+        "agents": agents,
+        "paired": paired(agents),
     }
 
 
@@ -371,9 +371,9 @@ class Request:
     def typed(cls, scene: SceneOptions, agents: list[str], **rest: Any) -> Request:
         """What a command line asks for: the scene as it was typed, observed as the policies were trained.
         Raises ConfigError, CheckpointError."""
-        from uuvtai.evaluation.agents import features_of
+        from uuvtai.evaluation.agents import observation_of
 
-        config, world = scene.config(features_of(agents)), scene.world_name
+        config, world = scene.config(observation_of(agents)), scene.world_name
         named = {kind: preset_of(kind, world, getattr(scene, kind)) for kind in ("sensors", "vehicle")}
         return cls(config=config, world=world, **named, agents=agents, **rest)
 
@@ -399,11 +399,11 @@ class _Document(BaseModel):
     explain_record: int = Field(ge=0)
     device: str
     cwd: str
-    drivers: dict[str, str]
+    digests: dict[str, str]
 
 
-def document_of(request: Request, num_envs: int, device: str, drivers: dict[str, str]) -> dict[str, Any]:
-    """The request with what was chosen for it, as JSON; ``drivers``: sha256 of what drives, by method."""
+def document_of(request: Request, num_envs: int, device: str, digests: dict[str, str]) -> dict[str, Any]:
+    """The request with what was chosen for it, as JSON; ``digests``: sha256 of what drives, by agent."""
     document = {
         field.name: getattr(request, field.name)
         for field in dataclasses.fields(request)
@@ -415,12 +415,12 @@ def document_of(request: Request, num_envs: int, device: str, drivers: dict[str,
         **document,
         "config": request.config.model_dump(mode="json"),
         "cwd": os.getcwd(),
-        "drivers": drivers,
+        "digests": digests,
     }
 
 
 def read_request(place: Path) -> tuple[Request, dict[str, str]]:
-    """The request of a run folder, and the sha256 of what drove by method. Raises RunFolderError,
+    """The request of a run folder, and the sha256 of what drove by agent. Raises RunFolderError,
     FileError."""
     file = place / REQUEST_FILE
     try:
@@ -436,16 +436,16 @@ def read_request(place: Path) -> tuple[Request, dict[str, str]]:
         raise RunFolderError(
             f"{file}: is no request of this version of 'uuv eval' ({reason}); {_GIVE}"
         ) from None
-    given = found.model_dump(exclude={"schema_", "config", "cwd", "drivers"})
-    return _found_again(Request(config=config, **given), Path(found.cwd)), found.drivers
+    given = found.model_dump(exclude={"schema_", "config", "cwd", "digests"})
+    return _found_again(Request(config=config, **given), Path(found.cwd)), found.digests
 
 
 def _found_again(request: Request, cwd: Path) -> Request:
-    """Paths that were typed in another folder, seen from this one; names of what is shipped stay names."""
+    """Paths that were typed in another folder, seen from this one; names of what is built in stay names."""
 
     def seen(name: str) -> str:
-        if is_piece(name):
-            return piece_spec(name).located(cwd).text
+        if is_plugin(name):
+            return plugin_spec(name).located(cwd).text
         file = name.removesuffix("+truth")
         is_shipped = file in (ORACLE, *preset_names("tree"), *preset_names("stack"))
         return name if is_shipped or Path(file).exists() else str(cwd / name)
@@ -453,21 +453,21 @@ def _found_again(request: Request, cwd: Path) -> Request:
     return replace(request, agents=list(map(seen, request.agents)))
 
 
-def drivers_of(methods: list[Method]) -> dict[str, str]:
-    """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played, with its stack,
-    of the file of a piece of the user's."""
+def digests_of(agents: list[AgentSpec]) -> dict[str, str]:
+    """sha256 of what drives, by agent: of a policy's checkpoint, of a tree as it is run, with its stack,
+    of the file of a plugin of the user's."""
     return {
-        method.name: method.own.sha256
-        if method.own
-        else method.checkpoint.sha256
-        if method.checkpoint
-        else _tree_sha256(method)
-        for method in methods
+        agent.name: agent.own.sha256
+        if agent.own
+        else agent.checkpoint.sha256
+        if agent.checkpoint
+        else _tree_sha256(agent)
+        for agent in agents
     }
 
 
 def refuse_others(place: Path, before: dict[str, str], now: dict[str, str]) -> None:
-    """RunFolderError where another tree or policy has a method's name by now: episodes of both under one name
+    """RunFolderError where another tree or policy has an agent's name by now: episodes of both under one name
     would prove nothing."""
     changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     if changed:
@@ -477,8 +477,8 @@ def refuse_others(place: Path, before: dict[str, str], now: dict[str, str]) -> N
         )
 
 
-def _tree_sha256(method: Method) -> str:
-    tree = dataclasses.asdict(method.tree)
+def _tree_sha256(agent: AgentSpec) -> str:
+    tree = dataclasses.asdict(agent.tree)
     del tree["source"], tree["xml"]
-    stack = [] if method.stack is None else [read_preset("stack", method.stack)]
-    return hashlib.sha256(json.dumps([tree, method.privileged, *stack]).encode()).hexdigest()
+    stack = [] if agent.stack is None else [read_preset("stack", agent.stack)]
+    return hashlib.sha256(json.dumps([tree, agent.privileged, *stack]).encode()).hexdigest()

@@ -18,7 +18,7 @@ from uuvtai.common.presets import PRESET_DIR
 from uuvtai.compile.runtime import Runtime, start_taichi
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError
-from uuvtai.evaluation.agents import Method, load_agents
+from uuvtai.evaluation.agents import AgentSpec, load_agents
 from uuvtai.evaluation.episodes import Job, Recorders, Stepper, run_episodes
 from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, agents_of, comparison_of
 from uuvtai.evaluation.results import ORACLE, Request
@@ -225,22 +225,22 @@ _NOT_BESIDE = ("wrench", "command", "initial_rpy_deg", "initial_velocity")
 def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     """As ``simulate.simulate``, positions [m] from the start, with "goal" [m] from there. It ends early where
     the goal is reached or the tank is left. ``name``: any agent. Raises SettingError,
-    ConfigError, PieceError."""
+    ConfigError, PluginError."""
     for given in _NOT_BESIDE:
         if getattr(trial, given) is not None:
             option = "--" + given.replace("_", "-")
             raise SettingError(f"{option}: not beside --agent, which drives from rest; leave one of them out")
     substeps, control_dt = control_step(trial.dt)
     n_step = checked_steps(trial.seconds, control_dt, substeps)
-    (method,) = load_agents([name], config.teacher.max_node)
-    config = method.config_of(experiment(config, trial))
+    (agent,) = load_agents([name], config.behavior.max_node)
+    config = agent.config_of(experiment(config, trial))
     config = config.model_copy(
         update={"episode": config.episode.model_copy(update={"horizon_steps": n_step + 1})}
     )
-    sim = Sim(config, 1, method.tree, "cpu")
-    sim.planner, sim.privileged = method.planner_for(sim), method.privileged
-    note = method.driver_for(sim)
-    stepper = Stepper(sim, note.pilot if note else None)
+    sim = Sim(config, 1, agent.tree, "cpu")
+    sim.planner, sim.privileged = agent.planner_for(sim), agent.privileged
+    note = agent.agent_for(sim)
+    stepper = Stepper(sim, note.agent if note else None)
     one, zero = torch.ones(1, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
     stepper.reset(one, zero, zero)
     start, goal = (sim.rows(field)[0].astype(float) for field in (sim.s.vehicle.pos_w, sim.s.mission.goal_w))
@@ -248,10 +248,10 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     for k in range(1, n_step + 1):
         stepper.step()
         samples.append(_drive_sample(sim, start, k * control_dt))
-        if sim.rows(sim.s.referee.outcome)[0] != RUNNING:
+        if sim.rows(sim.s.termination.outcome)[0] != RUNNING:
             break
-    if method.own:
-        method.own.close()
+    if agent.own:
+        agent.own.close()
     return {key: [s[key] for s in samples] for key in samples[0]} | {"goal": (goal - start).tolist()}
 
 
@@ -290,26 +290,26 @@ class LiveOptions:
 
 
 def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) -> list[dict[str, Any]]:
-    """Play the request's episodes, each by every method in turn, and serve them; ``episodes`` 0 = on and on,
-    until it is interrupted. How each ended. Raises LiveError, ConfigError, CheckpointError, PieceError."""
+    """Run the request's episodes, each by every agent in turn, and serve them; ``episodes`` 0 = on and on,
+    until it is interrupted. How each ended. Raises LiveError, ConfigError, CheckpointError, PluginError."""
     if ORACLE in request.agents:
         raise ConfigError("--agent oracle: it drives no vehicle; name who does, for example bt")
-    methods = agents_of(request, watch)
+    agents = agents_of(request, watch)
     with ViewerServer(live.host, live.port, live.origins) as server:
         shown = "localhost" if live.host in ("127.0.0.1", "0.0.0.0", "::") else live.host
         watch.note(f"serving ws://{shown}:{server.port}; in Foxglove or Lichtblick: open a connection,")
         watch.note(f"Foxglove WebSocket, to that address, and import the layout {LAYOUT}")
-        comparison = comparison_of(request, 1, methods, watch)
+        comparison = comparison_of(request, 1, agents, watch)
         try:
             return [
-                _watched(comparison, method, job, server, live.rate)
+                _watched(comparison, agent, job, server, live.rate)
                 for job in _jobs(request)
-                for method in methods
+                for agent in agents
             ]
         finally:
-            for method in methods:
-                if method.own:
-                    method.own.close()
+            for agent in agents:
+                if agent.own:
+                    agent.own.close()
 
 
 def _jobs(request: Request) -> Iterable[Job]:
@@ -318,17 +318,17 @@ def _jobs(request: Request) -> Iterable[Job]:
 
 
 def _watched(
-    comparison: Comparison, method: Method, job: Job, server: ViewerServer, rate: float
+    comparison: Comparison, agent: AgentSpec, job: Job, server: ViewerServer, rate: float
 ) -> dict[str, Any]:
-    """Play one episode for all to see; how it ended."""
-    request, policy = comparison.request, comparison.policies[method.name]
-    sim = comparison.simulator_for(method)
+    """Run one episode for all to see; how it ended."""
+    request, policy = comparison.request, comparison.policies[agent.name]
+    sim = comparison.simulator_for(agent)
     clock = RealTime(request.config.episode.control_dt_s, rate)
-    shown = Broadcast(server, Path(request.world).stem, method.name, request.depth_images, policy)
-    driver = policy.pilot if policy else None
-    (result,), _ = run_episodes(sim, [job], Recorders([shown, clock]), driver=driver)
+    shown = Broadcast(server, Path(request.world).stem, agent.name, request.depth_images, policy)
+    acting = policy.agent if policy else None
+    (result,), _ = run_episodes(sim, [job], Recorders([shown, clock]), agent=acting)
     entry = {
-        "method": method.name,
+        "agent": agent.name,
         "seed": job.seed,
         "episode": job.episode,
         "outcome": result.outcome,
@@ -337,7 +337,7 @@ def _watched(
         "real_time_factor": round(clock.real_time_factor, 2),
     }
     comparison.watch.note(
-        f"{method.name}, seed {job.seed}, episode {job.episode}: {result.outcome} after "
+        f"{agent.name}, seed {job.seed}, episode {job.episode}: {result.outcome} after "
         f"{result.time_s:.1f} s ({entry['real_time_factor']:.2f} of real time)"
     )
     return entry

@@ -20,17 +20,17 @@ from uuvtai.evaluation.grid import (
     base_config,
     check_rows,
     ordered,
-    play,
     request_of,
     row_key,
+    run_task,
     tasks_of,
     unchanged,
 )
 from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
-from uuvtai.plugins.api import is_piece, piece_spec, refuse_code
+from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code
 
 if TYPE_CHECKING:
-    from uuvtai.evaluation.agents import Method
+    from uuvtai.evaluation.agents import AgentSpec
 
 
 # ---- Who does the work: processes on this machine, or a Ray cluster. A lost worker's task is done once more.
@@ -101,7 +101,7 @@ def engine_of(name: str, workers: int, address: str) -> Engine:
 
 ROWS, REQUEST, RESULT = "cells.jsonl", "sweep_request.json", "sweep.json"
 
-MethodKey = tuple[str, str]
+AgentKey = tuple[str, str]
 """(name in the table, agent)"""
 
 
@@ -123,14 +123,14 @@ def sweep(
     Raises ConfigError, CheckpointError, RunFolderError, EngineError.
     """
     refuse_place(run_dir)
-    request, methods, checkpoints = resolved(request, watch)
-    keys = check_rows(request, [name for name, _agent in methods])
+    request, agents, checkpoints = resolved(request, watch)
+    keys = check_rows(request, [name for name, _agent in agents])
     place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
     folder = RunFolder(place, base_config(request), list(request.seeds))
     folder.write_json(
-        REQUEST, {"schema": 1, **request.document(), "methods": methods, "checkpoints": checkpoints}
+        REQUEST, {"schema": 1, **request.document(), "agents": agents, "checkpoints": checkpoints}
     )
-    return _play(request, methods, keys, engine, folder, watch), folder.path
+    return _run_cells(request, agents, keys, engine, folder, watch), folder.path
 
 
 def resume(
@@ -144,23 +144,23 @@ def resume(
             document = read_json(place / REQUEST, folder=place)
             if "agents" not in document:
                 raise TypeError("an older version of uuv wrote it; begin the sweep again")
-            request, methods = request_of(document), [_method_key(method) for method in document["methods"]]
+            request, agents = request_of(document), [_agent_key(agent) for agent in document["agents"]]
             checkpoints = dict(document["checkpoints"])
         except (FileError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise RunFolderError(
                 f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed"
             ) from None
-        agents = [agent for _name, agent in methods]
+        agents = [agent for _name, agent in agents]
         refuse_code(place, [*request.agents, *agents], allow_code)
         _refuse_other_policies(place, request, agents, checkpoints, watch)
-        keys = check_rows(request, [name for name, _agent in methods])
+        keys = check_rows(request, [name for name, _agent in agents])
         folder.go_on({"rows": len(read_rows(place))})
-        return _play(request, methods, keys, engine, folder, watch), place
+        return _run_cells(request, agents, keys, engine, folder, watch), place
     finally:
         folder.release()
 
 
-def _method_key(given: Any) -> MethodKey:
+def _agent_key(given: Any) -> AgentKey:
     """Of a request on disk. Raises TypeError, ValueError."""
     name, agent = given
     if not (isinstance(name, str) and isinstance(agent, str)):
@@ -179,7 +179,7 @@ def _refuse_other_policies(
     nothing."""
     from uuvtai.evaluation.agents import load_agents
 
-    now = _sha256_of(load_agents(agents, base_config(request).teacher.max_node, watch.note))
+    now = _sha256_of(load_agents(agents, base_config(request).behavior.max_node, watch.note))
     changed = [name for name, sha256 in checkpoints.items() if now.get(name) != sha256]
     if changed:
         raise RunFolderError(
@@ -188,56 +188,54 @@ def _refuse_other_policies(
         )
 
 
-def resolved(
-    request: SweepRequest, watch: SweepWatch
-) -> tuple[SweepRequest, list[MethodKey], dict[str, str]]:
-    """The request with the columns that its policies see, its methods by their names in the table, and the
+def resolved(request: SweepRequest, watch: SweepWatch) -> tuple[SweepRequest, list[AgentKey], dict[str, str]]:
+    """The request with the columns that its policies see, its agents by their names in the table, and the
     sha256 of every policy.
 
     Paths are made absolute. Raises ConfigError, CheckpointError.
     """
-    from uuvtai.evaluation.agents import features_of, load_agents
+    from uuvtai.evaluation.agents import load_agents, observation_of
 
     agents = tuple(map(_located, request.agents))
-    loaded = load_agents(agents, base_config(request).teacher.max_node, watch.note)
-    methods = [(method.name, name) for method, name in zip(loaded, agents, strict=True)]
-    overrides = (*features_of(agents), *request.overrides)
-    return replace(request, overrides=overrides, agents=agents), methods, _sha256_of(loaded)
+    loaded = load_agents(agents, base_config(request).behavior.max_node, watch.note)
+    agents = [(agent.name, name) for agent, name in zip(loaded, agents, strict=True)]
+    overrides = (*observation_of(agents), *request.overrides)
+    return replace(request, overrides=overrides, agents=agents), agents, _sha256_of(loaded)
 
 
 def _located(name: str) -> str:
     """An agent's name as a worker in any folder finds it."""
     from uuvtai.evaluation.agents import is_trained
 
-    if is_piece(name):
-        return piece_spec(name).absolute().text
+    if is_plugin(name):
+        return plugin_spec(name).absolute().text
     is_file = name.endswith((".xml", ".yaml", ".yml")) or is_trained(name)
     return str(Path(name).resolve()) if is_file else name
 
 
-def _sha256_of(methods: Sequence[Method]) -> dict[str, str]:
-    """Of the checkpoints and of the user's own pieces, by the method's name."""
-    found = {method.name: method.own or method.checkpoint for method in methods}
-    return {name: driver.sha256 for name, driver in found.items() if driver}
+def _sha256_of(agents: Sequence[AgentSpec]) -> dict[str, str]:
+    """Of the checkpoints and of the user's own plugins, by the agent's name."""
+    found = {agent.name: agent.own or agent.checkpoint for agent in agents}
+    return {name: agent.sha256 for name, agent in found.items() if agent}
 
 
-def _play(
+def _run_cells(
     request: SweepRequest,
-    methods: Sequence[MethodKey],
+    agents: Sequence[AgentKey],
     keys: list[str],
     engine: Engine,
     folder: RunFolder,
     watch: SweepWatch,
 ) -> dict[str, Any]:
     rows = _by_key(folder.path, request.grid)
-    tasks = tasks_of(request, methods, set(rows))
+    tasks = tasks_of(request, agents, set(rows))
     watch.start(f"{len(keys)} cells", len(keys), len(rows))
     try:
         with folder.recorded():
-            for number, played in engine.run(play, tasks):
+            for number, played in engine.run(run_task, tasks):
                 for row in played:
                     append_row(folder.path, row)
-                    rows[row_key(_label(row, request.grid), row["method"])] = row
+                    rows[row_key(_label(row, request.grid), row["agent"])] = row
                 watch.note(f"{_words(tasks[number].labels[0])} .. {_words(tasks[number].labels[-1])}: done")
                 watch.update(len(rows), len(keys), 0)
             document = _document(request, ordered(rows, keys))
@@ -253,7 +251,7 @@ def _play(
 def _by_key(place: Path, grid: Grid) -> dict[str, Row]:
     """Rows that are finished. Raises RunFolderError for rows of another grid."""
     try:
-        return {row_key(_label(row, grid), row["method"]): row for row in read_rows(place)}
+        return {row_key(_label(row, grid), row["agent"]): row for row in read_rows(place)}
     except (KeyError, TypeError) as error:
         raise RunFolderError(
             f"{place / ROWS}: holds a row that is not of this sweep ({error!r}); take it out to go on"

@@ -9,7 +9,7 @@ import torch
 
 from uuvtai.config.behavior import FAST, SLOW, TUNED
 from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
-from uuvtai.learning.policy_agent import Pilot, PilotDecision, by_chunk, load_pilot
+from uuvtai.learning.policy_agent import AgentDecision, PolicyAgent, by_chunk, load_agent
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetActor, actor_of
 
 if TYPE_CHECKING:
@@ -21,30 +21,30 @@ _FEWEST = 25
 """numbers that a checkpoint holds; those that came later are not changed where it lacks them"""
 
 
-class TunedPilot:
+class TunedAgent:
     """Lets the simulator's tree drive, with other numbers from the first decision after a reset on; used as
-    ``Pilot`` is."""
+    ``PolicyAgent`` is."""
 
     world_model = None
 
     def __init__(self, log_factor: torch.Tensor, sim: Sim) -> None:
         """``log_factor`` (n_tuned, 2) natural logarithms of the factors, in the order of ``TUNED``, for slow
-        bodies and for fast ones."""
+        obstacles and for fast ones."""
         self.simulator = sim
-        rows = sim.s.teacher.tuned.shape[0]
+        rows = sim.s.behavior.tuned.shape[0]
         self.log_factor = log_factor.float().cpu().numpy()[None].repeat(rows, axis=0)
         """(rows, n_tuned, 2) of every row that is allocated"""
         nothing = torch.zeros(sim.num_envs, device=sim.device)
         std = torch.zeros(4, device=sim.device)
-        self.decision = PilotDecision(sim.action, nothing, std, nothing, nothing)
+        self.decision = AgentDecision(sim.action, nothing, std, nothing, nothing)
         """value, residual and uncertainty are 0: nobody says them"""
 
     def reset(self, rows: torch.Tensor) -> None:
         """New episodes have begun in the rows (num_envs,) where this is not 0: a reset has set their numbers
         back."""
-        self.simulator.put(self.simulator.s.teacher.tuned, self.log_factor)
+        self.simulator.put(self.simulator.s.behavior.tuned, self.log_factor)
 
-    def decide(self, obs: torch.Tensor) -> PilotDecision:
+    def decide(self, obs: torch.Tensor) -> AgentDecision:
         """What the tree has chosen; changes nothing."""
         self.decision = self.decision._replace(action=self.simulator.action.clone())
         return self.decision
@@ -53,9 +53,9 @@ class TunedPilot:
         """The last decision has been carried out."""
 
 
-def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedPilot:
-    """Pilot of a checkpoint that holds numbers of the tree. Raises CheckpointError for others."""
-    return TunedPilot(checkpoint_factors(checkpoint), sim)
+def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
+    """PolicyAgent of a checkpoint that holds numbers of the tree. Raises CheckpointError for others."""
+    return TunedAgent(checkpoint_factors(checkpoint), sim)
 
 
 def checkpoint_factors(checkpoint: Checkpoint) -> torch.Tensor:
@@ -91,26 +91,26 @@ def tuned_sections(log_factor: torch.Tensor) -> dict[str, dict[str, float]]:
 
 
 def tree_row() -> ObservationColumn:
-    """The observation of such a pilot, for a checkpoint's manifest."""
+    """The observation of such an agent, for a checkpoint's manifest."""
     from uuvtai.envs.vector_env import ObservationColumn
 
     return ObservationColumn("tree", slice(0, 4), "1", "body", "what the behaviour tree asks for")
 
 
 # ------------------------------------------------------------------------------------------------------------
-# A policy over a set of bodies at the wheel of the simulator: a wish for a velocity ten times a second,
+# A policy over a set of obstacles driving the simulator: a wish for a velocity ten times a second,
 # laid on the hull by the fixed rule in every control step.
 
 
-class SetPilot:
-    """Drives the rows of a simulator; used as ``Pilot`` is, but it looks at tracks, map and pose itself, as
-    the vehicle has them."""
+class SetAgent:
+    """Drives the rows of a simulator; used as ``PolicyAgent`` is, but it looks at tracks, map and pose
+    itself, as the vehicle has them."""
 
     world_model = None
 
     def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
         """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
-        from uuvtai.common.enums import BODY_WIDTH, EGO_COLUMNS, N_BODY, N_RAY
+        from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
         from uuvtai.sim.stages import bind
         from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO
 
@@ -120,15 +120,15 @@ class SetPilot:
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(sim.num_envs, *shape, device=sim.device)
 
-        self._ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_BODY, RAW_WIDTH), zeros(N_RAY)
-        self.bodies, self.own = zeros(N_BODY, BODY_WIDTH), zeros(EGO_COLUMNS)
+        self._ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_OBSTACLE, RAW_WIDTH), zeros(N_RAY)
+        self.obstacles, self.own = zeros(N_OBSTACLE, OBSTACLE_WIDTH), zeros(EGO_COLUMNS)
         """columns that the last decision was made from"""
         self.wish, self._last, self._command = zeros(NUM_WISHES), zeros(NUM_WISHES), zeros(4)
         """what is wished now, and what the vehicle is told of its last decision; (rows, NUM_WISHES)"""
         self._age = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
         std = torch.cat([actor.log_std.detach().exp(), torch.zeros(1, device=sim.device)])
         nothing = zeros()
-        self.decision = PilotDecision(self._command, nothing, std, nothing, nothing)
+        self.decision = AgentDecision(self._command, nothing, std, nothing, nothing)
         """value, residual and uncertainty are 0: what drives has no critic and no world model"""
 
     def reset(self, rows: torch.Tensor) -> None:
@@ -138,7 +138,7 @@ class SetPilot:
         self._last *= kept[:, None]
 
     @torch.no_grad()
-    def decide(self, _obs: torch.Tensor) -> PilotDecision:
+    def decide(self, _obs: torch.Tensor) -> AgentDecision:
         """Command for all rows; changes nothing that the next one depends on."""
         from uuvtai.surrogate.observation import command_hull
 
@@ -146,7 +146,7 @@ class SetPilot:
         if bool(due.any()):
             self._look(due)
             rows = due.nonzero().flatten()
-            wish = by_chunk(self.actor, self.bodies[rows], self.own[rows]).clamp(-MOST_WISH, MOST_WISH)
+            wish = by_chunk(self.actor, self.obstacles[rows], self.own[rows]).clamp(-MOST_WISH, MOST_WISH)
             self.wish[rows] = wish
         command_hull(self._io, self._gap_m, self.wish, self._command)
         self.decision = self.decision._replace(action=self._command.clone())
@@ -162,39 +162,39 @@ class SetPilot:
     def _look(self, due: torch.Tensor) -> None:
         """Columns of the rows (num_envs,) bool where ``due``, as they are now."""
         from uuvtai.surrogate.arrays import AT_LAST
-        from uuvtai.surrogate.observation import observe_bodies, write_set_columns
+        from uuvtai.surrogate.observation import observe_obstacles, write_set_columns
 
         self._ego[:, AT_LAST : AT_LAST + NUM_WISHES] = self._last
-        observe_bodies(self._io, due.int(), self._ego, self._raw, self._ray)
-        write_set_columns(self._ego, self._raw, self._ray, self.bodies, self.own)
+        observe_obstacles(self._io, due.int(), self._ego, self._raw, self._ray)
+        write_set_columns(self._ego, self._raw, self._ray, self.obstacles, self.own)
 
     def _due(self) -> torch.Tensor:
         """(num_envs,) rows whose decision is not held any more."""
         return self._age % self._hold == 0
 
 
-def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
-    """Pilot of a policy that learnt in the twin. Raises CheckpointError where its networks are not those of
-    its config."""
+def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:
+    """PolicyAgent of a policy that learnt in the surrogate. Raises CheckpointError where its networks are not
+    those of its config."""
     from uuvtai.surrogate.observation import SET_TABLE
 
     checkpoint.check_table(SET_TABLE, sim.config)
     config, actor = checkpoint.config, actor_of(checkpoint)
-    return SetPilot(actor.to(sim.device), sim, config.policy.hold_steps, config.twin.vertical_gap_m)
+    return SetAgent(actor.to(sim.device), sim, config.policy.hold_steps, config.surrogate.vertical_gap_m)
 
 
 # ------------------------------------------------------------------------------------------------------------
 
 
-def load_driver(checkpoint: Checkpoint, sim: Sim) -> Pilot | TunedPilot | SetPilot:
+def load_driver(checkpoint: Checkpoint, sim: Sim) -> PolicyAgent | TunedAgent | SetAgent:
     """Who drives by a checkpoint, whatever learnt it. Raises CheckpointError for one that does not fit."""
     from uuvtai.envs.vector_env import VectorEnv
 
     learner = checkpoint.config.learner
-    if learner == "tuner":
+    if learner == "parameter_search":
         return load_tuned(checkpoint, sim)
-    if learner == "twin":
-        return load_set_pilot(checkpoint, sim)
+    if learner == "surrogate":
+        return load_set_agent(checkpoint, sim)
     if learner == "policy":
         checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
-    return load_pilot(checkpoint, sim.num_envs, sim.device)
+    return load_agent(checkpoint, sim.num_envs, sim.device)

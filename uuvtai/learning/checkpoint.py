@@ -42,6 +42,7 @@ from uuvtai.common.files import (
 )
 from uuvtai.common.version import __version__
 from uuvtai.config.learning import LearningConfig
+from uuvtai.config.loader import renamed
 
 # ------------------------------------------------------------------------------------------------------------
 # Nested state as named tensors and plain JSON, and back to the last bit; big arrays as one compressed stream
@@ -324,7 +325,7 @@ def refused(file: Path) -> Iterator[None]:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise CheckpointError(
-            f"{file}: {where}: {first['msg']}; it was not written by this version of uuvtai"
+            f"{file}: {where}: {first['msg']}{renamed(where)}; it was not written by this version of uuvtai"
         ) from None
     except (PackingError, FileError) as error:
         raise CheckpointError(f"{file}: {str(error).removeprefix(f'{file}: ')}") from None

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from uuvtai.common.errors import SettingError
-from uuvtai.config.learning import DistillConfig, UncertaintyConfig
+from uuvtai.config.learning import DistillationConfig, UncertaintyConfig
 from uuvtai.learning.networks import PlainAdam
 
 MAX_WEIGHT_RATIO = 4.0
@@ -55,23 +55,23 @@ Weighting = Literal["none", "uncertainty"]
 
 
 def check_weighting(kind: Weighting, has_world_model: bool) -> None:
-    """Raise ValueError for a ``distill.weighting`` whose signal this run does not have."""
+    """Raise ValueError for a ``distillation.weighting`` whose signal this run does not have."""
     if kind == "uncertainty" and not has_world_model:
         raise SettingError(
-            "distill.weighting=uncertainty needs the world model: set world_model.enabled=true, or "
-            "distill.weighting=none"
+            "distillation.weighting=uncertainty needs the world model: set world_model.enabled=true, or "
+            "distillation.weighting=none"
         )
 
 
 def weights_of(kind: Weighting, uncertainty: torch.Tensor) -> torch.Tensor:
-    """Weights by ``distill.weighting``, of the shape of the uncertainties."""
+    """Weights by ``distillation.weighting``, of the shape of the uncertainties."""
     return sample_weight(uncertainty) if kind == "uncertainty" else torch.ones_like(uncertainty)
 
 
 class TeacherBatches:
     """Gradient steps on batches of (input, teacher action) beside those of PPO."""
 
-    def __init__(self, policy: nn.Module, config: DistillConfig) -> None:
+    def __init__(self, policy: nn.Module, config: DistillationConfig) -> None:
         """``policy.distribution(x)`` gives the means."""
         self.policy, self.config = policy, config
         self.optimiser = PlainAdam(policy.parameters(), lr=config.learning_rate)
@@ -143,17 +143,17 @@ class LeafErrors:
         self._count.index_add_(0, node, finite.double())
 
     def take(self) -> dict[str, float]:
-        """``distill/loss`` (over all samples) and ``distill/leaf/<name>`` of the leaves that acted; the sums
-        begin anew."""
+        """``distillation/loss`` (over all samples) and ``distillation/leaf/<name>`` of the leaves that acted;
+        the sums begin anew."""
         error, count = self._error.tolist(), self._count.tolist()
         found: dict[str, list[float]] = {}
         for name, of_node, n in zip(self.names, error, count[:-1], strict=False):
             if n:
                 entry = found.setdefault(name, [0.0, 0.0])
                 entry[0], entry[1] = entry[0] + of_node, entry[1] + n
-        metrics = {f"distill/leaf/{name}": total / n for name, (total, n) in sorted(found.items())}
+        metrics = {f"distillation/leaf/{name}": total / n for name, (total, n) in sorted(found.items())}
         if sum(count):
-            metrics["distill/loss"] = sum(error) / sum(count)
+            metrics["distillation/loss"] = sum(error) / sum(count)
         self._error.zero_()
         self._count.zero_()
         return metrics

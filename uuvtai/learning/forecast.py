@@ -1,7 +1,8 @@
-"""Learn what moving bodies will do: what ``learning/runner.py`` drives where ``forecaster.enabled``.
+"""Learn what moving obstacles will do: what ``learning/runner.py`` drives where
+``forecast_training.enabled``.
 
-Every iteration plays episodes of one world in the simulator, driven by the tree, and fits a mixture density
-network to what the bodies behind the tracks then did, by likelihood.
+Every iteration runs episodes of one world in the simulator, driven by the tree, and fits a mixture density
+network to what the obstacles behind the tracks then did, by likelihood.
 """
 
 from __future__ import annotations
@@ -63,21 +64,21 @@ def nearest_way(mixture: Mixture, truth: torch.Tensor) -> torch.Tensor:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Tracks as the tracker delivers them in the simulator, with what their bodies then did: to learn a forecast
-# from, and to judge one. The truth serves learning alone; what drives sees columns of tracks.
+# Tracks as the tracker delivers them in the simulator, with what their obstacles then did: to learn a
+# forecast from, and to judge one. The truth serves learning alone; what drives sees columns of tracks.
 
 
 EVERY_STEPS = 25
 """a track is looked at so often, in control steps"""
-_BODY_M = 0.5
-"""a track belongs to a moving body this close to where it is forecast now,"""
+_OBSTACLE_M = 0.5
+"""a track belongs to a moving obstacle this close to where it is forecast now,"""
 _SPEED_S = 0.3
 """the nearest of them, a m/s of difference in velocity counting as so many metres"""
 _STEP_S = 0.02
 
 
 class TrackMoments(NamedTuple):
-    """n moments of tracks that a body is behind."""
+    """n moments of tracks that an obstacle is behind."""
 
     columns: torch.Tensor
     """(n, N_COLUMN) what a network is told"""
@@ -88,8 +89,8 @@ class TrackMoments(NamedTuple):
 
 
 def path_places(path: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """(n, n_lane, t, 2) [m] of the bodies of n scenarios, ``path`` (n, n_lane, 16) as in a bank of the
-    twin's, at times (n, t) [s]; NaN where there is no body."""
+    """(n, n_lane, t, 2) [m] of the obstacles of n scenarios, ``path`` (n, n_lane, 16) as in a bank of the
+    surrogate's, at times (n, t) [s]; NaN where there is no obstacle."""
     n_way = path[..., 0].astype(int)[..., None]
     radius, length, phase, speed = (path[..., i, None].astype(float) for i in range(1, 5))
     way = path[..., 5:15].reshape(*path.shape[:2], 5, 2).astype(float)
@@ -124,10 +125,10 @@ def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int
     for step in range(1, steps + 1):
         done += int(running.sum())
         sim.step()
-        running &= sim.rows(sim.s.referee.outcome) == RUNNING
+        running &= sim.rows(sim.s.termination.outcome) == RUNNING
         if not running.any():
             break
-        sim.sleep_ended()
+        sim.deactivate_ended()
         if step % EVERY_STEPS == 0:
             found.append(_moments(sim, np.flatnonzero(running), path, step * _STEP_S))
     return joined(found), done
@@ -139,19 +140,19 @@ def joined(parts: list[TrackMoments]) -> TrackMoments:
 
 
 def _moments(sim: Sim, rows: np.ndarray, path: np.ndarray, now_s: float) -> TrackMoments:
-    """Of the tracks of these rows that have a forecast and a body."""
+    """Of the tracks of these rows that have a forecast and a obstacle."""
     s, envs = sim.s, [int(row) for row in rows]
     there = sim.rows(s.forecast.radius_m, envs)[..., 0] >= 0
     frame = sim.rows(s.mixture.frame, envs)
     times = np.broadcast_to(
         now_s + np.array([-0.05, 0.0, 0.05, *TIMES_S.tolist()]), (len(rows), 3 + len(TIMES_S))
     )
-    bodies = path_places(path[rows], times)
-    velocity = (bodies[:, :, 2] - bodies[:, :, 0]) / 0.1
+    obstacles = path_places(path[rows], times)
+    velocity = (obstacles[:, :, 2] - obstacles[:, :, 0]) / 0.1
     own_velocity = frame[..., 2:4] * frame[..., 4:]
-    away = np.linalg.norm(bodies[:, None, :, 1] - frame[:, :, None, :2], axis=-1)
+    away = np.linalg.norm(obstacles[:, None, :, 1] - frame[:, :, None, :2], axis=-1)
     cost = away + _SPEED_S * np.linalg.norm(velocity[:, None] - own_velocity[:, :, None], axis=-1)
-    cost = np.where(away < _BODY_M, cost, np.inf)
+    cost = np.where(away < _OBSTACLE_M, cost, np.inf)
     body = np.argmin(np.nan_to_num(cost, nan=np.inf, posinf=np.inf), -1)
     env, track = np.nonzero(there & np.isfinite(np.min(cost, -1)))
     chosen = frame[env, track]
@@ -159,7 +160,7 @@ def _moments(sim: Sim, rows: np.ndarray, path: np.ndarray, now_s: float) -> Trac
     parts = (
         column,
         chosen,
-        _in_frame(bodies[env, body[env, track], 3:], chosen),
+        _in_frame(obstacles[env, body[env, track], 3:], chosen),
     )
     return TrackMoments(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in parts))
 
@@ -188,15 +189,18 @@ class ForecastTrainer:
         forecasts by a network."""
         if config.forecast.learned:
             raise SettingError(
-                "forecast.learned: a forecast is learnt beside the one by arcs and habits; leave it empty"
+                "forecast.learned: a forecast is learnt beside the one by arcs and turn history; leave it "
+                "empty"
             )
         self.config = config
         self.observation_table = (column_row(),)
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.net = MixtureNet(self.generator)
-        self.optimiser = PlainAdam(self.net.parameters(), lr=config.forecaster.learning_rate, eps=ADAM_EPS)
-        size = config.forecaster.memory
+        self.optimiser = PlainAdam(
+            self.net.parameters(), lr=config.forecast_training.learning_rate, eps=ADAM_EPS
+        )
+        size = config.forecast_training.memory
         self._columns = torch.zeros(size, N_COLUMN, dtype=torch.float16)
         self._truth = torch.zeros(size, len(TIMES_S), 2)
         self.recent = Recent(OUTCOMES, ())
@@ -205,16 +209,16 @@ class ForecastTrainer:
         self._sims: dict[str, Sim] = dict(sims or {})
 
     def iterate(self) -> dict[str, float]:
-        """Play episodes of one world, learn from all that is kept; metrics by their names in
+        """Run episodes of one world, learn from all that is kept; metrics by their names in
         metrics.jsonl."""
         began, config = time.perf_counter(), self.config
-        worlds = config.forecaster.worlds
+        worlds = config.forecast_training.worlds
         found, steps = self._watched(
             worlds[self.iteration % len(worlds)], config.train.seed, self.iteration * config.train.num_envs
         )
         self._keep(found)
         between = time.perf_counter()
-        losses = [self._fit() for _ in range(config.forecaster.minibatches)]
+        losses = [self._fit() for _ in range(config.forecast_training.minibatches)]
         learn_s = time.perf_counter() - between
         self.iteration += 1
         self.env_steps += steps
@@ -233,7 +237,7 @@ class ForecastTrainer:
     def evaluate(self) -> dict[str, float]:
         """``eval/*`` of the forecast as it is, on episodes that it never learnt from, world by world."""
         train, metrics = self.config.train, {}
-        for world in self.config.forecaster.worlds:
+        for world in self.config.forecast_training.worlds:
             found, _ = self._watched(world, train.evaluate_seed, 0)
             scores = scores_of(self.net(found.columns, found.frame[:, 4]), found.truth)
             metrics |= {f"eval/{name}_{world}": value for name, value in scores.items()}
@@ -246,7 +250,9 @@ class ForecastTrainer:
     def _watched(self, world: str, seed: int, first: int) -> tuple[TrackMoments, int]:
         if world not in self._sims:
             self._sims[world] = _simulator_of(self.config, world, self._scenes)
-        return watch(self._sims[world], self._scenes, seed, first, self.config.forecaster.episode_steps)
+        return watch(
+            self._sims[world], self._scenes, seed, first, self.config.forecast_training.episode_steps
+        )
 
     def _keep(self, seen: TrackMoments) -> None:
         """Remember moments, the newest in the place of the oldest."""
@@ -258,7 +264,7 @@ class ForecastTrainer:
 
     def _fit(self) -> float:
         """One step of the network towards what came; the loss in nats."""
-        config, share = self.config.forecaster, self.iteration / self.config.train.iterations
+        config, share = self.config.forecast_training, self.iteration / self.config.train.iterations
         self.optimiser.param_groups[0]["lr"] = config.learning_rate * max(_LEAST_RATE, 1.0 - share)
         at = torch.randint(self.kept, (config.minibatch,), generator=self.generator)
         columns, truth = self._columns[at].float(), self._truth[at]

@@ -229,7 +229,7 @@ class ActorCritic(nn.Module):
         if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != NUM_ACTIONS):
             raise SettingError(
                 f"policy.residual adds to the teacher's {NUM_ACTIONS} commands, but the observation has no "
-                f"such columns (got {teacher_slice}): set features.teacher=true or policy.residual=false"
+                f"such columns (got {teacher_slice}): set observation.behavior=true or policy.residual=false"
             )
         if config.initial_std < config.min_std:
             raise SettingError(
@@ -368,7 +368,7 @@ def _spare_compiler() -> None:
 TIMES_S = torch.arange(1, ANCHORS + 1) * ANCHOR_S
 """[s] ahead, of the places that it tells"""
 _LEAST_M, _MOST = 0.03, 4.0
-"""[m] smallest deviation; largest, as a part of the way that a body can go"""
+"""[m] smallest deviation; largest, as a part of the way that an obstacle can go"""
 _HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -513,7 +513,7 @@ class Guard:
             counter.zero_()
         return {f"{PREFIX}{name}": float(count) for name, count in found.items() if count}
 
-    def judge(
+    def check(
         self, iteration: int, complaints: Sequence[str], seed: torch.Tensor, episode: torch.Tensor
     ) -> None:
         """Count an iteration with or without complaints; TrainingError after ``patience`` in a row with some.

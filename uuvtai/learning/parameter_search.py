@@ -1,7 +1,7 @@
-"""Learn the behaviour tree's numbers: what ``learning/runner.py`` drives where ``tuner.enabled``.
+"""Learn the behaviour tree's numbers: what ``learning/runner.py`` drives where ``parameter_search.enabled``.
 
-Every iteration plays episodes of one scene in the simulator, each with numbers of its own, and moves the best
-numbers so far: those for slow bodies or those for fast ones (``number_search``).
+Every iteration runs episodes of one scene in the simulator, each with numbers of its own, and moves the best
+numbers so far: those for slow obstacles or those for fast ones (``number_search``).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import torch
 from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS
 from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.config.behavior import FAST, SLOW, TUNED, configured_factors, log_bounds
-from uuvtai.config.learning import LearningConfig, TunerScene
+from uuvtai.config.learning import LearningConfig, SearchScene
 from uuvtai.config.loader import ConfigError
-from uuvtai.learning.agents import TunedPilot, tree_row, tuned_sections
+from uuvtai.learning.agents import TunedAgent, tree_row, tuned_sections
 from uuvtai.learning.rollout import Recent, RolloutSums
 
 if TYPE_CHECKING:
-    from uuvtai.learning.policy_agent import PilotDecision
+    from uuvtai.learning.policy_agent import AgentDecision
     from uuvtai.sim.setup import Scene
     from uuvtai.sim.sim import Sim
 
@@ -153,7 +153,7 @@ def best_near(
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Simulators of the worlds that a trainer plays in.
+# Simulators of the worlds that a trainer runs.
 
 
 def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
@@ -166,14 +166,14 @@ def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) 
 
     most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
     config = config.model_copy(update={"world": load_config(world, overrides=[*most]).world})
-    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node))
+    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.behavior.max_node))
 
 
 # ------------------------------------------------------------------------------------------------------------
 # Episodes of one scene in a trainer's simulator, so many at once as there are rows.
 
 
-class WavePilot(Protocol):
+class WaveAgent(Protocol):
     """Who drives."""
 
     @property
@@ -185,44 +185,44 @@ class WavePilot(Protocol):
     """(num_envs,) episode of every row"""
 
     def reset(self, rows: torch.Tensor) -> None: ...
-    def decide(self, obs: torch.Tensor, /) -> PilotDecision: ...
+    def decide(self, obs: torch.Tensor, /) -> AgentDecision: ...
     def advance(self) -> None: ...
 
 
-def play_episodes(
-    pilot: WavePilot, scene: Scene, seed: int, first: int, count: int, times: int = 1
+def run_search_episodes(
+    agent: WaveAgent, scene: Scene, seed: int, first: int, count: int, times: int = 1
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(outcome code, control steps), both (count,), of episodes from ``first`` on of a seed, each played
+    """(outcome code, control steps), both (count,), of episodes from ``first`` on of a seed, each run
     ``times`` times in a row."""
-    sim = pilot.simulator
+    sim = agent.simulator
     outcome, steps = (torch.zeros(count, dtype=torch.int64) for _ in range(2))
     sim.set_scenes([scene])
     for begin in range(0, count, sim.num_envs):
         rows = torch.arange(sim.num_envs)
         mask = (rows < count - begin).int()
-        pilot.running, pilot.number = mask == 1, begin + rows
+        agent.running, agent.number = mask == 1, begin + rows
         sim.sleep()
         sim.reset(mask, torch.full_like(mask, seed), (first + (begin + rows) // times).int())
-        pilot.reset(mask)
-        action = pilot.decide(sim.action).action
-        while bool(pilot.running.any()):
-            steps[pilot.number[pilot.running]] += 1
+        agent.reset(mask)
+        action = agent.decide(sim.action).action
+        while bool(agent.running.any()):
+            steps[agent.number[agent.running]] += 1
             sim.step(action)
-            pilot.advance()
-            now = torch.from_numpy(sim.rows(sim.s.referee.outcome).astype("int64"))
-            ended = pilot.running & (now != RUNNING)
+            agent.advance()
+            now = torch.from_numpy(sim.rows(sim.s.termination.outcome).astype("int64"))
+            ended = agent.running & (now != RUNNING)
             if bool(ended.any()):
-                outcome[pilot.number[ended]] = now[ended]
-                pilot.running &= ~ended
-                sim.sleep_ended()
-            action = pilot.decide(sim.action).action
+                outcome[agent.number[ended]] = now[ended]
+                agent.running &= ~ended
+                sim.deactivate_ended()
+            action = agent.decide(sim.action).action
     return outcome, steps
 
 
 # ------------------------------------------------------------------------------------------------------------
 
 
-class TunerTrainer:
+class ParameterSearchTrainer:
     """Everything that the search carries from one iteration to the next. Episodes begin and end within an
     iteration: the simulators carry nothing."""
 
@@ -230,19 +230,20 @@ class TunerTrainer:
         """``sims``: simulators of worlds that are there already. Raises ConfigError."""
         self.config = config
         self.observation_table = (tree_row(),)
-        self._scenes = config.tuner.scenes
+        self._scenes = config.parameter_search.scenes
         self._part = [self._part_of(scene) for scene in self._scenes]
         self.searches = tuple(self._search(part) for part in (SLOW, FAST))
         self.recent = Recent(OUTCOMES, ())
         self.iteration = self.env_steps = 0
         self._sims = dict(sims or {})
 
-    def _part_of(self, scene: TunerScene) -> int:
+    def _part_of(self, scene: SearchScene) -> int:
         """``SLOW`` or ``FAST``."""
         fast = self.config.fast
         if fast.from_m_s < scene[3] < fast.full_m_s:
             raise ConfigError(
-                f"tuner.scenes: bodies at {scene[3]:g} m/s, in {scene[0]}, are neither slow (fast.from_m_s, "
+                f"parameter_search.scenes: obstacles at {scene[3]:g} m/s, in {scene[0]}, are neither slow "
+                f"(fast.from_m_s, "
                 f"{fast.from_m_s:g} m/s or less) nor fast (fast.full_m_s, {fast.full_m_s:g} m/s or more); "
                 "choose another speed"
             )
@@ -254,7 +255,7 @@ class TunerTrainer:
         return NumberSearch(
             torch.from_numpy(configured_factors(config.slow, config.fast)[:, part]),
             torch.tensor(log_bounds()),
-            config.tuner.spread,
+            config.parameter_search.spread,
             rounds * config.train.num_envs,
             config.train.seed,
         )
@@ -272,7 +273,7 @@ class TunerTrainer:
         return torch.stack([search.centre for search in self.searches], 1)
 
     def iterate(self) -> dict[str, float]:
-        """Play episodes, move towards the better ones; metrics by their names in metrics.jsonl."""
+        """Run episodes, move towards the better ones; metrics by their names in metrics.jsonl."""
         began = time.perf_counter()
         nth = self.iteration % len(self._scenes)
         scene, part = self._scenes[nth], self._part[nth]
@@ -282,7 +283,7 @@ class TunerTrainer:
         outcome, steps = self._played(scene, place, self.config.train.seed, search.trials // 2, 2)
         between = time.perf_counter()
         search.take(place[:, :, part], self._scored(outcome, steps, part), nth)
-        if search.trials >= self.config.tuner.warm_up * search.size:
+        if search.trials >= self.config.parameter_search.warm_up * search.size:
             search.move()
         learn_s = time.perf_counter() - between
         self.iteration += 1
@@ -309,19 +310,19 @@ class TunerTrainer:
         }
 
     def _played(
-        self, scene: TunerScene, place: torch.Tensor, seed: int, first: int, times: int = 1
+        self, scene: SearchScene, place: torch.Tensor, seed: int, first: int, times: int = 1
     ) -> tuple[torch.Tensor, torch.Tensor]:
         world, s, d, v = scene
         if world not in self._sims:
             here = tuple(other[1:] for other in self._scenes if other[0] == world)
             self._sims[world] = simulator_of(self.config, world, here)
-        pilot = _TrialPilot(place, self._sims[world])
-        return play_episodes(pilot, (s, d, v), seed, first, len(place), times)
+        agent = _TrialAgent(place, self._sims[world])
+        return run_search_episodes(agent, (s, d, v), seed, first, len(place), times)
 
     def _scored(self, outcome: torch.Tensor, steps: torch.Tensor, part: int) -> torch.Tensor:
         """1 for an arrival at once, less for a late one, 0 for none."""
-        tuner = self.config.tuner
-        cost = tuner.slow_time_cost if part == SLOW else tuner.time_cost
+        parameter_search = self.config.parameter_search
+        cost = parameter_search.slow_time_cost if part == SLOW else parameter_search.time_cost
         late = steps * self.config.episode.control_dt_s * cost
         return (outcome == SUCCESS).float() * (1.0 - late)
 
@@ -370,7 +371,7 @@ class TunerTrainer:
             search.load_state(own, memory)
 
 
-class _TrialPilot(TunedPilot):
+class _TrialAgent(TunedAgent):
     """Drives every episode with numbers of its own."""
 
     def __init__(self, place: torch.Tensor, sim: Sim) -> None:
@@ -381,7 +382,7 @@ class _TrialPilot(TunedPilot):
         self.number = torch.zeros(sim.num_envs, dtype=torch.int64)
 
     def reset(self, rows: torch.Tensor) -> None:
-        """As ``TunedPilot.reset``."""
+        """As ``TunedAgent.reset``."""
         of_row = np.minimum(self.number.numpy(), len(self._place) - 1)
         self.log_factor[: len(of_row)] = self._place[of_row]
         super().reset(rows)

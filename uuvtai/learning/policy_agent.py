@@ -1,4 +1,4 @@
-"""A trained policy at the wheel: the mean action without exploration noise, with the world model's memory of
+"""A trained policy driving: the mean action without exploration noise, with the world model's memory of
 every row.
 
 What a row does must not depend on its neighbours, the batch's size or the number of threads. The networks
@@ -25,7 +25,7 @@ TEACHER_COLUMN = "teacher_action"
 """column of the observation that a residual policy adds to"""
 
 
-class PilotDecision(NamedTuple):
+class AgentDecision(NamedTuple):
     """What the policy chooses for N rows, and what it thinks of their state."""
 
     action: torch.Tensor
@@ -40,7 +40,7 @@ class PilotDecision(NamedTuple):
     """(N,) of that prediction"""
 
 
-class Pilot:
+class PolicyAgent:
     """Drives ``num_envs`` rows. ``decide`` looks, ``advance`` goes on to the next step; ``reset`` when a row
     begins another episode."""
 
@@ -63,7 +63,7 @@ class Pilot:
         self._has_last = torch.zeros(rows, dtype=torch.bool, device=device)
         self._hold, self._age = policy.config.hold_steps, torch.zeros(rows, dtype=torch.int64, device=device)
         self._offset, self._said = (torch.zeros(rows, width, device=device) for width in (NUM_ACTIONS, 3))
-        self.decision = PilotDecision(*(torch.zeros(0) for _ in PilotDecision._fields))
+        self.decision = AgentDecision(*(torch.zeros(0) for _ in AgentDecision._fields))
         """the last one; where an older one is held, what the networks said then"""
 
     @property
@@ -79,7 +79,7 @@ class Pilot:
         self._age *= kept
 
     @torch.no_grad()
-    def decide(self, obs: torch.Tensor) -> PilotDecision:
+    def decide(self, obs: torch.Tensor) -> AgentDecision:
         """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on."""
         x = self._x
         fill = self.policy.observation_norm.mean[: self._n_obs].float()
@@ -90,7 +90,7 @@ class Pilot:
         teacher = self.policy.teacher_action(x)
         self._action = self._offset if teacher is None else teacher + self._offset
         value, residual, uncertainty = self._said.clone().T
-        self.decision = PilotDecision(
+        self.decision = AgentDecision(
             self._action.clamp(-1.0, 1.0),
             value,
             self.policy.log_std.exp(),
@@ -177,18 +177,21 @@ def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> N
 
 
 _NO_NETWORK = {
-    "forecaster": "forecasts and does not drive; give it to a pilot that does: --set forecast.learned=RUN",
-    "tuner": "numbers for the behaviour tree, no network that could be exported; they drive as --agent best, "
+    "forecast_training": "forecasts and does not drive; give it to an agent that does: --set "
+    "forecast.learned=RUN",
+    "parameter_search": "numbers for the behaviour tree, no network that could be exported; they drive as "
+    "--agent best, "
     "or as stack.yaml of the run",
-    "twin": "a policy over a set of bodies, which looks at the simulator itself; it drives in 'uuv eval' and "
+    "surrogate": "a policy over a set of obstacles, which looks at the simulator itself; it drives in 'uuv "
+    "eval' and "
     "'uuv sweep', and is exported by 'uuv export'",
 }
-"""what cannot be a ``Pilot``, by ``LearningConfig.learner``"""
+"""what cannot be a ``PolicyAgent``, by ``LearningConfig.learner``"""
 
 
-def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> Pilot:
-    """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config
-    says."""
+def load_agent(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> PolicyAgent:
+    """PolicyAgent with the networks of a checkpoint. Raises CheckpointError where they do not fit what its
+    config says."""
     config, rows = checkpoint.config, checkpoint.manifest.observation_table
     if config.learner in _NO_NETWORK:
         raise CheckpointError(f"{checkpoint.path}: {_NO_NETWORK[config.learner]}")
@@ -218,4 +221,4 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
                     "checkpoint"
                 )
         module.to(device).eval()
-    return Pilot(policy, world_model, num_envs, device)
+    return PolicyAgent(policy, world_model, num_envs, device)

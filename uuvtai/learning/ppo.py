@@ -113,7 +113,7 @@ class Minibatch:
         return Minibatch(**{name: value[index] for name, value in vars(self).items()})
 
 
-_SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distill", "count")
+_SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distillation", "count")
 
 
 class Ppo:
@@ -133,15 +133,16 @@ class Ppo:
     def update(
         self,
         rollout: Rollout,
-        distill_weight: float = 0.0,
+        distillation_weight: float = 0.0,
         surrogate: bool = True,
         generator: torch.Generator | None = None,
     ) -> dict[str, float]:
         """Learn from a closed rollout; metrics by their names in metrics.jsonl, means over all minibatches of
         the update.
 
-        ``distill_weight`` is lambda_t s_t of weight ||mean - teacher_action||^2; without ``surrogate`` only
-        the critic and the distillation learn (critic warm-up). ``generator`` (CPU) draws the minibatches of
+        ``distillation_weight`` is lambda_t s_t of weight ||mean - teacher_action||^2; without ``surrogate``
+        only the critic and the distillation learn (critic warm-up). ``generator`` (CPU) draws the minibatches
+        of
         ``config.shuffle``. Samples that are not finite have no part in any of it and are counted. ValueError
         for more minibatches than samples.
         """
@@ -154,7 +155,7 @@ class Ppo:
         skipped, sums = self.skipped, torch.zeros(len(_SUMS), dtype=torch.float64, device=batch.valid.device)
         for _ in range(self.config.epochs):
             for minibatch in self._minibatches(batch, generator):
-                self._learn(minibatch, distill_weight, surrogate, sums)
+                self._learn(minibatch, distillation_weight, surrogate, sums)
         if self.config.normalise_observations:
             self.observe(rollout.x)
         return metrics | self._metrics(sums, skipped)
@@ -243,7 +244,9 @@ class Ppo:
 
     # ------------------------------------------------------------------------------------------ one minibatch
 
-    def _learn(self, batch: Minibatch, distill_weight: float, surrogate: bool, sums: torch.Tensor) -> None:
+    def _learn(
+        self, batch: Minibatch, distillation_weight: float, surrogate: bool, sums: torch.Tensor
+    ) -> None:
         self.optimiser.zero_grad(set_to_none=True)
         count = batch.valid.sum().clamp(min=1.0)
         kl_before = sums[_SUMS.index("approx_kl")].clone()
@@ -251,23 +254,23 @@ class Ppo:
         rows = CACHE_ROWS * (1 + in_bfloat16(self.config, device)) if device == "cpu" else len(batch.valid)
         for first in range(0, len(batch.valid), rows):
             block = batch.rows(slice(first, first + rows))
-            self._add_gradients(block, count, distill_weight, surrogate, sums)
+            self._add_gradients(block, count, distillation_weight, surrogate, sums)
         self._step((sums[_SUMS.index("approx_kl")] - kl_before).float() / count, surrogate)
 
     def _add_gradients(
         self,
         batch: Minibatch,
         count: torch.Tensor,
-        distill_weight: float,
+        distillation_weight: float,
         surrogate: bool,
         sums: torch.Tensor,
     ) -> None:
         x = batch.normalised
         bfloat16 = in_bfloat16(self.config, x.device.type)
         value = _output(self.policy.critic, x, bfloat16)
-        acting = surrogate or distill_weight != 0.0
+        acting = surrogate or distillation_weight != 0.0
         out = _output(self.policy.actor, x, bfloat16) if acting else batch.action
-        self._loss(batch, value, out, count, distill_weight, surrogate, sums).backward()
+        self._loss(batch, value, out, count, distillation_weight, surrogate, sums).backward()
 
     def _loss(
         self,
@@ -275,7 +278,7 @@ class Ppo:
         value_out: torch.Tensor,
         actor_out: torch.Tensor,
         count: torch.Tensor,
-        distill_weight: float,
+        distillation_weight: float,
         surrogate: bool,
         sums: torch.Tensor,
     ) -> torch.Tensor:
@@ -298,9 +301,9 @@ class Ppo:
             )
             with torch.no_grad():
                 kl, clipped = approximate_kl(log_ratio), (log_ratio.expm1().abs() > config.clip).float()
-        if distill_weight:
+        if distillation_weight:
             distill = batch.weight * imitation_error(mean, batch.teacher_action)
-            loss = loss + distill_weight * (share * distill).sum()
+            loss = loss + distillation_weight * (share * distill).sum()
         with torch.no_grad():
             terms = torch.stack([policy_loss, value_error, kl, clipped, distill, torch.ones_like(zero)])
             sums += (terms @ batch.valid).double()
@@ -333,7 +336,7 @@ class Ppo:
             "train/learning_rate": float(self.rate),
             "train/std": float(log_std.exp().mean()),
             "train/skipped_updates": float(self.skipped - skipped_before),
-            "train/distill_loss": means["distill"],
+            "train/distill_loss": means["distillation"],
         }
 
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from uuvtai.envs.vector_env import VectorEnv
     from uuvtai.learning.checkpoint import Checkpoint
     from uuvtai.learning.forecast import ForecastTrainer
-    from uuvtai.learning.parameter_search import TunerTrainer
-    from uuvtai.learning.surrogate_trainer import TwinTrainer
+    from uuvtai.learning.parameter_search import ParameterSearchTrainer
+    from uuvtai.learning.surrogate_trainer import SurrogateTrainer
     from uuvtai.learning.trainer import Trainer
     from uuvtai.sim.scene import SceneOptions
 
@@ -74,7 +74,7 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-AnyTrainer = Union["Trainer", "TwinTrainer", "TunerTrainer", "ForecastTrainer"]
+AnyTrainer = Union["Trainer", "SurrogateTrainer", "ParameterSearchTrainer", "ForecastTrainer"]
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``evaluation.evaluate.evaluate_now``, which knows what learning does not)"""
@@ -122,9 +122,10 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    if config.learner == "twin" and config.twin.warm_start_waves and not found:
+    if config.learner == "surrogate" and config.surrogate.warm_start_waves and not found:
         watch.note(
-            f"first {config.twin.warm_start_waves} waves of episodes in the simulator, in which the policy "
+            f"first {config.surrogate.warm_start_waves} waves of episodes in the simulator, in which the "
+            f"policy "
             "imitates the tree: about a minute each"
         )
     trainer = _continued(_TRAINERS[config.learner](config, request.device), config, found)
@@ -175,7 +176,7 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim
 
-    sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node), device)
+    sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.behavior.max_node), device)
     sim.set_scenes(config.train.scenes)
     return VectorEnv(sim, config.train.seed)
 
@@ -187,15 +188,15 @@ def _policy(config: LearningConfig, device: str) -> AnyTrainer:
 
 
 def _surrogate() -> Callable[[LearningConfig], AnyTrainer]:
-    from uuvtai.learning.surrogate_trainer import TwinTrainer
+    from uuvtai.learning.surrogate_trainer import SurrogateTrainer
 
-    return TwinTrainer
+    return SurrogateTrainer
 
 
 def _numbers() -> Callable[[LearningConfig], AnyTrainer]:
-    from uuvtai.learning.parameter_search import TunerTrainer
+    from uuvtai.learning.parameter_search import ParameterSearchTrainer
 
-    return TunerTrainer
+    return ParameterSearchTrainer
 
 
 def _forecast() -> Callable[[LearningConfig], AnyTrainer]:
@@ -219,9 +220,9 @@ def _on_the_cpu(
 
 _TRAINERS: dict[str, Callable[[LearningConfig, str], AnyTrainer]] = {
     "policy": _policy,
-    "twin": _on_the_cpu(_surrogate),
-    "tuner": _on_the_cpu(_numbers),
-    "forecaster": _on_the_cpu(_forecast),
+    "surrogate": _on_the_cpu(_surrogate),
+    "parameter_search": _on_the_cpu(_numbers),
+    "forecast_training": _on_the_cpu(_forecast),
 }
 """by ``LearningConfig.learner``"""
 

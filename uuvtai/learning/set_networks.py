@@ -1,4 +1,4 @@
-"""The networks of a checkpoint that learnt in the twin or to forecast: made, filled, checked."""
+"""The networks of a checkpoint that learnt in the surrogate or to forecast: made, filled, checked."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any, TypeVar
 import torch
 from torch import nn
 
-from uuvtai.common.enums import BODY_WIDTH, EGO_COLUMNS
+from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
 from uuvtai.learning.networks import MixtureNet, mlp
 
 # ------------------------------------------------------------------------------------------------------------
-# Policy over a set of bodies: every body goes through one encoder, and what comes out is pooled by maximum
-# and sum, so that neither their order nor their number matters. The critic has an encoder of its own, which
-# also sees the bodies' true future: it serves training alone, and no file that drives holds it.
+# Policy over a set of obstacles: every obstacle goes through one encoder, and what comes out is pooled by
+# maximum and sum, so that neither their order nor their number matters. The critic has an encoder of its own,
+# which also sees the obstacles' true future: it serves training alone, and no file that drives holds it.
 
 
 NUM_WISHES = 3
@@ -28,16 +28,16 @@ MOST_WISH = 2.0
 AT_DIRECTION = slice(3, 5)
 """columns of ``own`` with the unit vector to the goal"""
 _SUM_SCALE = 0.3
-"""sums over the bodies are a few times as large as a maximum"""
+"""sums over the obstacles are a few times as large as a maximum"""
 
 
 class SetEncoder(nn.Module):
-    """Bodies (..., n, n_body) of which ``mask`` (..., n, 1) are there, and the vehicle's own columns (...,
-    n_own), to ``n_out`` numbers."""
+    """Obstacles (..., n, n_obstacle) of which ``mask`` (..., n, 1) are there, and the vehicle's own columns
+    (..., n_own), to ``n_out`` numbers."""
 
     def __init__(
         self,
-        n_body: int,
+        n_obstacle: int,
         n_own: int,
         n_out: int,
         config: LearningConfig,
@@ -45,16 +45,20 @@ class SetEncoder(nn.Module):
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        wide, head = config.twin.body_hidden, config.twin.head_hidden
-        self.body = mlp((n_body, wide, wide), "relu", generator, math.sqrt(2.0))
+        wide, head = config.surrogate.obstacle_hidden, config.surrogate.head_hidden
+        self.obstacle = mlp((n_obstacle, wide, wide), "relu", generator, math.sqrt(2.0))
         self.own = nn.Sequential(*mlp((n_own, wide), "relu", generator, math.sqrt(2.0)), nn.ReLU())
         self.head = mlp((3 * wide, head, head, n_out), "relu", generator, gain)
 
-    def forward(self, bodies: torch.Tensor, own: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    def forward(self, obstacles: torch.Tensor, own: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """(..., n_out)."""
-        n, rows = bodies.shape[-2], bodies.shape[:-2]
-        each = bodies.reshape(-1, n, bodies.shape[-1]).transpose(0, 1)  # bodies first, as pooling wants them
-        said = self.body(each.flatten(0, 1)).unflatten(0, each.shape[:2])  # rows: ReLU in place costs none
+        n, rows = obstacles.shape[-2], obstacles.shape[:-2]
+        each = obstacles.reshape(-1, n, obstacles.shape[-1]).transpose(
+            0, 1
+        )  # obstacles first, as pooling wants them
+        said = self.obstacle(each.flatten(0, 1)).unflatten(
+            0, each.shape[:2]
+        )  # rows: ReLU in place costs none
         highest, total = MaxAndSum.apply(said, mask.reshape(-1, n).t())
         pooled = torch.cat((highest, _SUM_SCALE * total), dim=-1)
         return self.head(torch.cat((pooled.reshape(*rows, -1), self.own(own)), dim=-1))
@@ -63,42 +67,45 @@ class SetEncoder(nn.Module):
 class SetActor(nn.Module):
     """What drives: a diagonal Gaussian over the wish for a velocity. Its input is what the vehicle knows."""
 
-    def __init__(self, n_body: int, n_own: int, config: LearningConfig, generator: torch.Generator) -> None:
+    def __init__(
+        self, n_obstacle: int, n_own: int, config: LearningConfig, generator: torch.Generator
+    ) -> None:
         super().__init__()
-        self.n_body, self.n_own = n_body, n_own
-        self.goal_gain = config.twin.goal_gain
-        self.net = SetEncoder(n_body, n_own, NUM_WISHES, config, 0.01, generator)
+        self.n_obstacle, self.n_own = n_obstacle, n_own
+        self.goal_gain = config.surrogate.goal_gain
+        self.net = SetEncoder(n_obstacle, n_own, NUM_WISHES, config, 0.01, generator)
         self.log_std = nn.Parameter(torch.full((NUM_WISHES,), math.log(config.policy.initial_std)))
 
-    def forward(self, bodies: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
+    def forward(self, obstacles: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
         """(..., 3) mean wish; straight to the goal at birth."""
         ahead = self.goal_gain * own[..., AT_DIRECTION]
-        said = self.net(bodies, own, bodies[..., :1])
+        said = self.net(obstacles, own, obstacles[..., :1])
         return torch.cat([ahead + said[..., :2], said[..., 2:]], dim=-1)
 
 
 class SetCritic(nn.Module):
-    """Expected return, from what the vehicle knows and from the bodies' true places, now and later."""
+    """Expected return, from what the vehicle knows and from the obstacles' true places, now and later."""
 
     def __init__(
-        self, n_body: int, n_own: int, n_truth: int, config: LearningConfig, generator: torch.Generator
+        self, n_obstacle: int, n_own: int, n_truth: int, config: LearningConfig, generator: torch.Generator
     ) -> None:
         super().__init__()
-        self.net = SetEncoder(n_body + n_truth, n_own, 1, config, 1.0, generator)
+        self.net = SetEncoder(n_obstacle + n_truth, n_own, 1, config, 1.0, generator)
 
-    def forward(self, bodies: torch.Tensor, own: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    def forward(self, obstacles: torch.Tensor, own: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         """(...,)."""
-        there = torch.maximum(bodies[..., :1], truth[..., 2:3])
-        return self.net(torch.cat([bodies, truth], dim=-1), own, there).squeeze(-1)
+        there = torch.maximum(obstacles[..., :1], truth[..., 2:3])
+        return self.net(torch.cat([obstacles, truth], dim=-1), own, there).squeeze(-1)
 
 
 class MaxAndSum(torch.autograd.Function):
-    """(highest, sum), both (rows, wide), over the bodies of relu(said) where ``mask`` is 1; 0 where no body
-    is there. Its gradient is its own: torch's, by the pieces, takes as long as all products of the policy.
+    """(highest, sum), both (rows, wide), over the obstacles of relu(said) where ``mask`` is 1; 0 where no
+    obstacle is there. Its gradient is its own: torch's, by the pieces, takes as long as all products of the
+    policy.
 
-    ``said`` (bodies, rows, wide) is what an encoder says of each body, ``mask`` (bodies, rows) is 1 or 0 and
-    has no gradient. Bodies come first: what is next to each other in memory is then reduced together. Bodies
-    that are equally high share the gradient of the highest, as in ``torch.amax``.
+    ``said`` (obstacles, rows, wide) is what an encoder says of each obstacle, ``mask`` (obstacles, rows) is 1
+    or 0 and has no gradient. Obstacles come first: what is next to each other in memory is then reduced
+    together. Obstacles that are equally high share the gradient of the highest, as in ``torch.amax``.
     """
 
     @staticmethod
@@ -121,7 +128,7 @@ class MaxAndSum(torch.autograd.Function):
 
 
 def _sum(each: torch.Tensor) -> torch.Tensor:
-    """Over the bodies. Torch adds up in float32 in any case, and twice as fast where it is told."""
+    """Over the obstacles. Torch adds up in float32 in any case, and twice as fast where it is told."""
     return each.sum(dim=0, dtype=torch.float32).to(each.dtype)
 
 
@@ -132,19 +139,19 @@ Net = TypeVar("Net", bound=nn.Module)
 
 
 def actor_of(checkpoint: Checkpoint) -> SetActor:
-    """The policy over a set of bodies. Raises CheckpointError where its networks are not those of its
+    """The policy over a set of obstacles. Raises CheckpointError where its networks are not those of its
     config."""
     config = checkpoint.config
-    wide, head = config.twin.body_hidden, config.twin.head_hidden
+    wide, head = config.surrogate.obstacle_hidden, config.surrogate.head_hidden
     with _refused(checkpoint):
         part = checkpoint.model()["policy"]
         for name, shape in (
-            ("net.body.0.weight", (wide, BODY_WIDTH)),
+            ("net.body.0.weight", (wide, OBSTACLE_WIDTH)),
             ("net.head.0.weight", (head, 3 * wide)),
         ):
             if tuple(part[name].shape) != shape:
                 raise ValueError(f"{name} is {tuple(part[name].shape)} instead of {shape}")
-        actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator())
+        actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator())
         actor.load_state_dict(part)
     return _finite(actor, checkpoint)
 

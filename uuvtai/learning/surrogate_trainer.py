@@ -1,4 +1,4 @@
-"""PPO in the kinematic surrogate: what ``learning/runner.py`` drives where ``twin.enabled``."""
+"""PPO in the kinematic surrogate: what ``learning/runner.py`` drives where ``surrogate.enabled``."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import torch
 from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.agents import SetPilot
+from uuvtai.learning.agents import SetAgent
 from uuvtai.learning.networks import PlainAdam, in_bfloat16, log_prob
-from uuvtai.learning.parameter_search import play_episodes, simulator_of
-from uuvtai.learning.policy_agent import PilotDecision
+from uuvtai.learning.parameter_search import run_search_episodes, simulator_of
+from uuvtai.learning.policy_agent import AgentDecision
 from uuvtai.learning.ppo import ADAM_EPS, adapted_rate, approximate_kl, gae, surrogate_loss
 from uuvtai.learning.rollout import Recent, RolloutSums
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetActor, SetCritic
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from uuvtai.config import VehicleConfig
     from uuvtai.sim.setup import Scene
     from uuvtai.sim.sim import Sim
-    from uuvtai.surrogate.world import ScenarioBank, Twin
+    from uuvtai.surrogate.world import ScenarioBank, Surrogate
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Warm start of a policy over a set of bodies: imitation of the behaviour tree in the simulator.
+# Warm start of a policy over a set of obstacles: imitation of the behaviour tree in the simulator.
 #
 # DAgger (Ross, Gordon & Bagnell 2011, AISTATS): whoever drives, the tree says what it would do, and the
 # actor's
@@ -51,8 +51,8 @@ SEED = 7_000_003
 class Sample(NamedTuple):
     """Decisions to imitate."""
 
-    bodies: torch.Tensor
-    """(n, lanes, BODY_WIDTH)"""
+    obstacles: torch.Tensor
+    """(n, lanes, OBSTACLE_WIDTH)"""
     own: torch.Tensor
     """(n, EGO_COLUMNS)"""
     wish: torch.Tensor
@@ -71,11 +71,11 @@ def wish_of_command(
     return torch.cat([flip * level / fastest, command[:, 2:3]], dim=1)
 
 
-class Student(SetPilot):
+class Student(SetAgent):
     """Drives with the tree, drawn anew for every decision, and keeps what the tree says of each."""
 
     def __init__(self, actor: SetActor, sim: Sim, config: LearningConfig, generator: torch.Generator) -> None:
-        super().__init__(actor, sim, config.policy.hold_steps, config.twin.vertical_gap_m)
+        super().__init__(actor, sim, config.policy.hold_steps, config.surrogate.vertical_gap_m)
         self.simulator, self._generator = sim, generator
         self.tree_share = 1.0
         """chance that the tree drives, beta of DAgger"""
@@ -87,7 +87,7 @@ class Student(SetPilot):
         self._with_tree = torch.ones(sim.num_envs, dtype=torch.bool)
 
     @torch.no_grad()
-    def decide(self, obs: torch.Tensor) -> PilotDecision:
+    def decide(self, obs: torch.Tensor) -> AgentDecision:
         """Command for all rows, the tree's or the student's."""
         due = self._due()
         said = super().decide(obs)
@@ -105,21 +105,21 @@ class Student(SetPilot):
         wish = wish_of_command(
             tree[kept], ego[:, AT_YAW], ego[:, AT_FLIP : AT_FLIP + 2], self.simulator.config.vehicle
         )
-        self.samples.append(Sample(self.bodies[kept], self.own[kept], wish))
+        self.samples.append(Sample(self.obstacles[kept], self.own[kept], wish))
 
 
 def imitate(
     actor: SetActor, config: LearningConfig, scenes: tuple[Scene, ...], sims: dict[str, Sim] | None = None
 ) -> dict[str, float]:
-    """``twin.warm_start_waves`` waves of DAgger; the actor's mean is then close to the tree. What was spent,
-    as metrics. ``sims``: simulators of worlds that are there already."""
+    """``surrogate.warm_start_waves`` waves of DAgger; the actor's mean is then close to the tree. What was
+    spent, as metrics. ``sims``: simulators of worlds that are there already."""
     began, sims = time.perf_counter(), dict(sims or {})
-    waves, rows = config.twin.warm_start_waves, min(WAVE_EPISODES, config.train.num_envs)
+    waves, rows = config.surrogate.warm_start_waves, min(WAVE_EPISODES, config.train.num_envs)
     few = config.model_copy(update={"train": config.train.model_copy(update={"num_envs": rows})})
     seed = config.train.seed + SEED
     generator = torch.Generator().manual_seed(seed)
     optimiser = PlainAdam(list(actor.net.parameters()), lr=RATE)
-    places = [(world, scene) for scene in scenes for world in config.twin.worlds]
+    places = [(world, scene) for scene in scenes for world in config.surrogate.worlds]
     samples, won, loss = [], 0.0, 0.0
     for wave in range(waves):
         world, scene = places[wave % len(places)]
@@ -127,7 +127,7 @@ def imitate(
             sims[world] = simulator_of(few, world, scenes)
         student = Student(actor, sims[world], config, generator)
         student.tree_share = 1.0 - wave / max(1, waves - 1)
-        outcome, _ = play_episodes(student, scene, seed, wave * rows, rows)
+        outcome, _ = run_search_episodes(student, scene, seed, wave * rows, rows)
         samples += student.samples
         won = float((outcome == SUCCESS).float().mean())
         joined = Sample(*(torch.cat(parts) for parts in zip(*samples, strict=True)))
@@ -150,7 +150,7 @@ def regress(
     for _ in range(passes):
         errors = []
         for index in torch.randperm(len(sample.wish), generator=generator).split(MINIBATCH):
-            mean = actor(sample.bodies[index], sample.own[index])
+            mean = actor(sample.obstacles[index], sample.own[index])
             loss = (mean - sample.wish[index]).square().sum(dim=-1).mean()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -205,11 +205,11 @@ def _begin() -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Gradients of PPO's losses for a policy over a set of bodies, by pieces that several cores can take.
+# Gradients of PPO's losses for a policy over a set of obstacles, by pieces that several cores can take.
 
 
 CACHE_ROWS = 2048
-"""rows in one pass through the networks: nine bodies each"""
+"""rows in one pass through the networks: nine obstacles each"""
 
 
 class Piece(NamedTuple):
@@ -229,8 +229,8 @@ class SetLosses:
     def backward(self, rows: list[torch.Tensor], index: torch.Tensor) -> torch.Tensor:
         """Fill the parameters' gradients; (4,) sums as in ``Piece``.
 
-        ``rows``: bodies, own, truth, action, log probability, advantage, target; ``index`` (M,) chooses the
-        minibatch. Pieces are added up in their order, so that the number of threads changes no bit.
+        ``rows``: obstacles, own, truth, action, log probability, advantage, target; ``index`` (M,) chooses
+        the minibatch. Pieces are added up in their order, so that the number of threads changes no bit.
         """
         count = len(index)
         some = side_by_side(*(functools.partial(_chosen, rows, part) for part in index.split(CACHE_ROWS)))
@@ -248,10 +248,10 @@ class SetLosses:
         return sums
 
     def _of_actor(self, samples: list[torch.Tensor], count: int) -> Piece:
-        bodies, own, _, action, before, advantage, _ = samples
+        obstacles, own, _, action, before, advantage, _ = samples
         clip = self._config.ppo.clip
         with coarse(self._config):
-            mean = self._actor(bodies, own)
+            mean = self._actor(obstacles, own)
         log_ratio = log_prob(action, mean.float(), self._actor.log_std) - before
         policy_loss = surrogate_loss(log_ratio, advantage, clip).sum() / count
         gradients = torch.autograd.grad(policy_loss, list(self._actor.parameters()))
@@ -261,9 +261,9 @@ class SetLosses:
             return Piece(gradients, torch.stack([policy_loss, torch.zeros(()), kl, clipped]))
 
     def _of_critic(self, samples: list[torch.Tensor], count: int) -> Piece:
-        bodies, own, truth, *_, target = samples
+        obstacles, own, truth, *_, target = samples
         with coarse(self._config):
-            value = self._critic(bodies, own, truth)
+            value = self._critic(obstacles, own, truth)
         value_loss = (value.float() - target).square().sum() / count
         loss = self._config.ppo.value_weight * value_loss
         gradients = torch.autograd.grad(loss, list(self._critic.parameters()))
@@ -306,30 +306,30 @@ CRITIC_RATE = 1e-3
 DECAY_FROM = 0.5
 """share of the run from which the learning rate falls to a tenth"""
 HOLD_STEPS, DECISION_S = 5, 0.1
-"""of the twin (``uuvtai/surrogate/motion.py``), which this file does not import"""
+"""of the surrogate (``uuvtai/surrogate/motion.py``), which this file does not import"""
 
 
-class TwinTrainer:
-    """Everything that training in the twin carries from one iteration to the next."""
+class SurrogateTrainer:
+    """Everything that training in the surrogate carries from one iteration to the next."""
 
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
         """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
         another tank."""
-        from uuvtai.common.enums import BODY_WIDTH, EGO_COLUMNS
+        from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
         from uuvtai.surrogate.arrays import TRUTH_WIDTH
         from uuvtai.surrogate.observation import SET_TABLE
-        from uuvtai.surrogate.world import Twin, draw_bank
+        from uuvtai.surrogate.world import Surrogate, draw_bank
 
-        _refuse_what_the_twin_lacks(config)
+        _refuse_what_the_surrogate_lacks(config)
         self.config = config
         self.observation_table = SET_TABLE
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self._scenes = scenes = config.train.scenes or (config.world.own_scene,)
-        bank = bank or draw_bank(config, scenes, BANK_SEED, config.twin.scenarios)
-        self.twin = Twin(config, bank, config.train.num_envs, config.train.seed)
-        self.actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, self.generator)
-        self.critic = SetCritic(BODY_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, self.generator)
+        bank = bank or draw_bank(config, scenes, BANK_SEED, config.surrogate.scenarios)
+        self.surrogate = Surrogate(config, bank, config.train.num_envs, config.train.seed)
+        self.actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, self.generator)
+        self.critic = SetCritic(OBSTACLE_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, self.generator)
         self.rate = torch.tensor(config.ppo.learning_rate)
         self.optimiser = PlainAdam(
             [
@@ -346,18 +346,18 @@ class TwinTrainer:
         self._allocate(
             config.ppo.rollout_steps,
             config.train.num_envs,
-            self.twin.view.bodies.shape[1],
-            BODY_WIDTH,
+            self.surrogate.view.obstacles.shape[1],
+            OBSTACLE_WIDTH,
             EGO_COLUMNS,
         )
-        self.twin.begin(torch.ones(config.train.num_envs, dtype=torch.bool), self._next_scenarios())
-        self.twin.look()
+        self.surrogate.begin(torch.ones(config.train.num_envs, dtype=torch.bool), self._next_scenarios())
+        self.surrogate.look()
 
-    def _allocate(self, steps: int, envs: int, lanes: int, n_body: int, n_own: int) -> None:
+    def _allocate(self, steps: int, envs: int, lanes: int, n_obstacle: int, n_own: int) -> None:
         kind = torch.bfloat16 if in_bfloat16(self.config.ppo, "cpu") else torch.float32
-        n_truth = self.twin.view.truth.shape[2]
-        self._bodies, self._truth = (
-            torch.zeros(steps, envs, lanes, width, dtype=kind) for width in (n_body, n_truth)
+        n_truth = self.surrogate.view.truth.shape[2]
+        self._obstacles, self._truth = (
+            torch.zeros(steps, envs, lanes, width, dtype=kind) for width in (n_obstacle, n_truth)
         )
         self._own, self._action = (torch.zeros(steps, envs, width) for width in (n_own, NUM_WISHES))
         self._log_prob, self._value, self._reward = (torch.zeros(steps, envs) for _ in range(3))
@@ -365,8 +365,8 @@ class TwinTrainer:
         self._terminated, self._ended = (torch.zeros(steps, envs, dtype=torch.bool) for _ in range(2))
 
     def _imitate(self) -> dict[str, float]:
-        """Learn from the tree first, where ``twin.warm_start_waves`` says so; metrics."""
-        if self.iteration > 0 or not self.config.twin.warm_start_waves:
+        """Learn from the tree first, where ``surrogate.warm_start_waves`` says so; metrics."""
+        if self.iteration > 0 or not self.config.surrogate.warm_start_waves:
             return {}
         return imitate(self.actor, self.config, self._scenes)
 
@@ -398,22 +398,24 @@ class TwinTrainer:
 
     def _next_scenarios(self) -> torch.Tensor:
         """(N,) numbers of scenarios, any."""
-        return torch.randint(self.twin.num_scenarios, (self.twin.num_envs,), generator=self.generator)
+        return torch.randint(
+            self.surrogate.num_scenarios, (self.surrogate.num_envs,), generator=self.generator
+        )
 
     @torch.no_grad()
     def _collect(self) -> RolloutSums:
-        twin, view = self.twin, self.twin.view
+        surrogate, view = self.surrogate, self.surrogate.view
         sums = RolloutSums.zeros(len(OUTCOMES), 0, torch.device("cpu"))
         for t in range(len(self._reward)):
-            self._bodies[t], self._own[t], self._truth[t] = view
+            self._obstacles[t], self._own[t], self._truth[t] = view
             mean, self._value[t] = side_by_side(
-                functools.partial(by_part, self.actor, view.bodies, view.own, config=self.config),
+                functools.partial(by_part, self.actor, view.obstacles, view.own, config=self.config),
                 functools.partial(by_part, self.critic, *view, config=self.config),
             )
             noise = torch.randn(mean.shape, generator=self.generator)
             action = torch.addcmul(mean, noise, self.actor.log_std.exp())
             self._action[t], self._log_prob[t] = action, log_prob(action, mean, self.actor.log_std)
-            reward, outcome = twin.step(action)
+            reward, outcome = surrogate.step(action)
             ended = outcome != RUNNING
             self._reward[t], self._ended[t] = reward, ended
             self._terminated[t] = ended & (outcome != TIMEOUT)
@@ -425,13 +427,13 @@ class TwinTrainer:
                 late = outcome == TIMEOUT
                 after = None
                 if bool(late.any()):
-                    twin.look()
-                    after = self.critic(view.bodies[late], view.own[late], view.truth[late])
-                twin.begin(ended, self._next_scenarios())
+                    surrogate.look()
+                    after = self.critic(view.obstacles[late], view.own[late], view.truth[late])
+                surrogate.begin(ended, self._next_scenarios())
             else:
                 late, after = ended, None
             self._late = (late.clone(), after)
-            twin.look()
+            surrogate.look()
             self._bootstrap(t)
         last = by_part(self.critic, *view, config=self.config)
         self._next_value[-1] = torch.where(self._ended[-1], self._next_value[-1], last)
@@ -449,7 +451,7 @@ class TwinTrainer:
     def _count_ended(self, sums: RolloutSums, outcome: torch.Tensor, ended: torch.Tensor) -> None:
         sums.outcomes += torch.bincount(outcome[ended], minlength=len(OUTCOMES)).double()
         sums.episode_return += self._returns[ended].double().sum()
-        sums.episode_steps += (self.twin.time_s[ended] / DECISION_S).round().double().sum()
+        sums.episode_steps += (self.surrogate.time_s[ended] / DECISION_S).round().double().sum()
         self._returns[ended] = 0.0
 
     # ------------------------------------------------------------------------------------------- an iteration
@@ -465,7 +467,7 @@ class TwinTrainer:
             config.gamma,
             config.gae_lambda,
         )
-        rows = [part.flatten(0, 1) for part in (self._bodies, self._own, self._truth, self._action)]
+        rows = [part.flatten(0, 1) for part in (self._obstacles, self._own, self._truth, self._action)]
         flat = [
             part.flatten()
             for part in (self._log_prob, (advantage - advantage.mean()) / (advantage.std() + 1e-6), target)
@@ -510,15 +512,17 @@ class TwinTrainer:
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
         """``eval/*`` of the policy as it is, without exploration, on scenarios that it never learnt from, the
-        same number of each world and scene, in the twin."""
-        from uuvtai.surrogate.world import Twin, draw_bank
+        same number of each world and scene, in the surrogate."""
+        from uuvtai.surrogate.world import Surrogate, draw_bank
 
         train = self.config.train
-        each = -(-train.evaluate_episodes // (len(self.config.twin.worlds) * len(self._scenes)))
+        each = -(-train.evaluate_episodes // (len(self.config.surrogate.worlds) * len(self._scenes)))
         if self._held_out is None:
             self._held_out = draw_bank(self.config, self._scenes, train.evaluate_seed, each)
         bank = self._held_out
-        outcome, time_s = play_once(Twin(self.config, bank, len(bank.body), train.evaluate_seed), self.actor)
+        outcome, time_s = run_once(
+            Surrogate(self.config, bank, len(bank.obstacle), train.evaluate_seed), self.actor
+        )
         metrics = _rates("eval", outcome, time_s)
         for number, name in enumerate(bank.names):
             rows = bank.origin == number
@@ -538,7 +542,7 @@ class TwinTrainer:
             "recent": list(self.recent.rows),
             "returns": self._returns.clone(),
             "counters": {"iteration": self.iteration, "env_steps": self.env_steps},
-            "env": self.twin.capture(),
+            "env": self.surrogate.capture(),
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -551,25 +555,29 @@ class TwinTrainer:
         self.recent.rows = [list(row) for row in state["recent"]]
         self._returns.copy_(state["returns"])
         self.iteration, self.env_steps = (int(state["counters"][n]) for n in ("iteration", "env_steps"))
-        self.twin.restore(state["env"])
+        self.surrogate.restore(state["env"])
 
 
 def _copied(net: torch.nn.Module) -> dict[str, torch.Tensor]:
     return {name: tensor.clone() for name, tensor in net.state_dict().items()}
 
 
-def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
-    """Raise SettingError for parts of a training that the twin does not have, and sizes that do not fit."""
+def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
+    """Raise SettingError for parts of a training that the surrogate does not have, and sizes that do not
+    fit."""
     for name, is_on in (
         ("policy.residual", config.policy.residual),
         ("world_model.enabled", config.world_model.enabled),
     ):
         if is_on:
-            raise SettingError(f"{name}: the twin has none; set {name}=false, or twin.enabled=false")
+            raise SettingError(
+                f"{name}: the surrogate has none; set {name}=false, or surrogate.enabled=false"
+            )
     held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
         raise SettingError(
-            f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: the twin decides every {DECISION_S} s, "
+            f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: the surrogate decides every "
+            f"{DECISION_S} s, "
             f"after {HOLD_STEPS} control steps"
         )
     samples = config.ppo.rollout_steps * config.train.num_envs
@@ -581,16 +589,16 @@ def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
 
 
 @torch.no_grad()
-def play_once(twin: Twin, actor: SetActor) -> tuple[torch.Tensor, torch.Tensor]:
+def run_once(surrogate: Surrogate, actor: SetActor) -> tuple[torch.Tensor, torch.Tensor]:
     """(outcome code, time [s]), both (N,), of scenario i in env i, driven by the mean."""
-    every = torch.ones(twin.num_envs, dtype=torch.bool)
-    twin.begin(every, torch.arange(twin.num_envs))
-    outcome, time_s = torch.zeros(twin.num_envs, dtype=torch.int32), torch.zeros(twin.num_envs)
+    every = torch.ones(surrogate.num_envs, dtype=torch.bool)
+    surrogate.begin(every, torch.arange(surrogate.num_envs))
+    outcome, time_s = torch.zeros(surrogate.num_envs, dtype=torch.int32), torch.zeros(surrogate.num_envs)
     while bool((outcome == RUNNING).any()):
-        view = twin.look()
-        _, now = twin.step(by_part(actor, view.bodies, view.own).clamp(-MOST_WISH, MOST_WISH))
+        view = surrogate.look()
+        _, now = surrogate.step(by_part(actor, view.obstacles, view.own).clamp(-MOST_WISH, MOST_WISH))
         new = (outcome == RUNNING) & (now != RUNNING)
-        outcome, time_s = torch.where(new, now, outcome), torch.where(new, twin.time_s, time_s)
+        outcome, time_s = torch.where(new, now, outcome), torch.where(new, surrogate.time_s, time_s)
     return outcome, time_s
 
 

@@ -38,7 +38,7 @@ class Trainer:
 
     def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
         """Resets ``env``. ValueError for settings that do not fit each other."""
-        check_weighting(config.distill.weighting, config.world_model.enabled)
+        check_weighting(config.distillation.weighting, config.world_model.enabled)
         self.env, self.config, self.observation_table = env, config, env.observation_table
         self.generator = torch.Generator().manual_seed(config.train.seed)
         n_in, device = env.num_obs + N_FEATURES, env.device
@@ -51,7 +51,7 @@ class Trainer:
             [(c.name, c.slice) for c in env.observation_table], env.num_envs, config.train.patience, device
         )
         self.ppo = Ppo(self.policy, config.ppo)
-        self.teacher_batches = TeacherBatches(self.policy, config.distill)
+        self.teacher_batches = TeacherBatches(self.policy, config.distillation)
         world = config.world_model
         self.world_model = (
             WorldModel(env.num_obs, world, self.generator).to(device) if world.enabled else None
@@ -131,7 +131,7 @@ class Trainer:
     def _learn(self, share: float) -> dict[str, float]:
         """Everything that learns from the rollout; ``share`` of the run is over."""
         strength, metrics = self._strength(share)
-        rollout, config = self.rollout, self.config.distill
+        rollout, config = self.rollout, self.config.distillation
         rollout.weight.copy_(weights_of(config.weighting, self.collector.uncertainty))
         surrogate = self.iteration >= config.critic_warmup_iterations
         metrics |= self.ppo.update(rollout, strength, surrogate, self.generator)
@@ -162,11 +162,11 @@ class Trainer:
         """lambda_t s_t, and both for the log."""
         mean = self.collector.uncertainty.nanmean().nan_to_num()[None]
         self.uncertainty.update(mean)
-        weight, scale = piecewise_linear(self.config.distill.schedule, share), self.uncertainty.scale
+        weight, scale = piecewise_linear(self.config.distillation.schedule, share), self.uncertainty.scale
         return weight * scale, {
-            "distill/lambda": weight,
-            "distill/scale": scale,
-            "distill/lambda_risk": weight * scale,
+            "distillation/lambda": weight,
+            "distillation/scale": scale,
+            "distillation/lambda_risk": weight * scale,
         }
 
     def _times(self, learn_s: float) -> dict[str, float]:
@@ -189,7 +189,7 @@ class Trainer:
         skipped = metrics["train/skipped_updates"]
         if skipped:
             complaints.append(f"{int(skipped)} updates left out because loss or gradient was not finite")
-        self.guard.judge(
+        self.guard.check(
             self.iteration, complaints, self.collector.info["seed"], self.collector.info["episode"]
         )
 

@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from uuvtai.common.colours import method_colours
-from uuvtai.common.obstacle_motion import body_positions
+from uuvtai.common.colours import agent_colours
+from uuvtai.common.obstacle_motion import obstacle_positions
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import LogHead, read_head, read_messages
 from uuvtai.logs.topics import TOPICS
@@ -37,9 +37,9 @@ STATIC, DYNAMIC, GOAL, ROUTE, MOVER = map(bgr, ("#262c38", "#e53946", "#f7b801",
 FAILED = bgr("#c92a2a")
 
 
-def method_inks(names: Sequence[str]) -> dict[str, Color]:
-    """Colour of every method, the same as in the charts."""
-    return {name: bgr(code) for name, code in method_colours(names).items()}
+def agent_inks(names: Sequence[str]) -> dict[str, Color]:
+    """Colour of every agent, the same as in the charts."""
+    return {name: bgr(code) for name, code in agent_colours(names).items()}
 
 
 class Canvas:
@@ -237,7 +237,7 @@ def _fixed(pixels: np.ndarray) -> np.ndarray:
     return np.round((np.asarray(pixels) - 0.5) * (1 << _SHIFT)).astype(np.int32)
 
 
-# ---- What pictures and videos have in common: the tank, maps, true bodies, ruler, in world coordinates.
+# ---- What pictures and videos have in common: the tank, maps, true obstacles, ruler, in world coordinates.
 
 _MAX_MAP = 1000  # [px] greatest height of the map
 _HULL_RADIUS_M = 0.17  # half the height of the hull that ``Canvas.vehicle`` draws
@@ -290,35 +290,35 @@ def paint_layers(canvas: Canvas, static: Layer, dynamic: Layer, faint: np.ndarra
 def paint_truth(
     canvas: Canvas, scenario: dict[str, Any], time_s: float, own_z_m: float | None = None
 ) -> None:
-    """True bodies as thin outlines where they are at this time, and the paths of those that move.
+    """True obstacles as thin outlines where they are at this time, and the paths of those that move.
 
-    With the vehicle's height, bodies that pass wholly above or below its hull are dashed: from above they
+    With the vehicle's height, obstacles that pass wholly above or below its hull are dashed: from above they
     seem to be in its way.
     """
-    for body in scenario["bodies"]:
-        at = body_positions(body, np.array([time_s]))[0]
+    for obstacle in scenario["obstacles"]:
+        at = obstacle_positions(obstacle, np.array([time_s]))[0]
         color = GREY
-        if body["path"] is not None:
+        if obstacle["path"] is not None:
             color = MOVER
-            period = body["path"]["length_m"] / max(body["path"]["speed_m_s"], 1e-6)
+            period = obstacle["path"]["length_m"] / max(obstacle["path"]["speed_m_s"], 1e-6)
             canvas.dashes(
-                body_positions(body, np.linspace(0, period, 181))[:, :2], mixed(MOVER, WATER, 0.45), 1
+                obstacle_positions(obstacle, np.linspace(0, period, 181))[:, :2], mixed(MOVER, WATER, 0.45), 1
             )
-        outline = body_outline(body, at)
-        if own_z_m is not None and abs(at[2] - own_z_m) > body["size"][2] + _HULL_RADIUS_M:
+        outline = obstacle_outline(obstacle, at)
+        if own_z_m is not None and abs(at[2] - own_z_m) > obstacle["size"][2] + _HULL_RADIUS_M:
             canvas.dashes(np.vstack([outline, outline[:1]]), color, 1)
         else:
             canvas.line(outline, color, 1, closed=True)
 
 
-def body_outline(body: dict[str, Any], at: np.ndarray) -> np.ndarray:
-    """(n, 2) horizontal outline of a body at a place."""
-    if body["kind"] == "box":
-        a, b, _ = body["size"]
-        c, s = math.cos(body["yaw"]), math.sin(body["yaw"])
+def obstacle_outline(obstacle: dict[str, Any], at: np.ndarray) -> np.ndarray:
+    """(n, 2) horizontal outline of an obstacle at a place."""
+    if obstacle["kind"] == "box":
+        a, b, _ = obstacle["size"]
+        c, s = math.cos(obstacle["yaw"]), math.sin(obstacle["yaw"])
         return np.array([(a, b), (-a, b), (-a, -b), (a, -b)]) @ np.array([[c, s], [-s, c]]) + at[:2]
     angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    return at[:2] + body["size"][0] * np.column_stack([np.cos(angles), np.sin(angles)])
+    return at[:2] + obstacle["size"][0] * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 def mixed(color: Color, other: Color, share: float) -> Color:
@@ -386,7 +386,7 @@ class Recording:
         return self.series[topic]
 
     @property
-    def method(self) -> str:
+    def agent(self) -> str:
         return self.head.metadata.get("uuv.run", {}).get("controller", "?")
 
     @property
@@ -394,8 +394,8 @@ class Recording:
         return self.head.metadata.get("uuv.result", {}).get("outcome", "cut off")
 
     @property
-    def ending(self) -> str:
-        return _ENDINGS.get(self.outcome, self.outcome.replace("_", " "))
+    def outcome_text(self) -> str:
+        return _OUTCOME_NAMES.get(self.outcome, self.outcome.replace("_", " "))
 
     @property
     def duration_s(self) -> float:
@@ -411,8 +411,8 @@ class Recording:
         return min((value[0] for value in self["/safety"].values), default=None)
 
 
-_ENDINGS = {"ttc": "TTC stop"}
-_MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_BODIES = 3600.0, 1000.0, 1e4, 1000
+_OUTCOME_NAMES = {"ttc": "TTC stop"}
+_MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_OBSTACLES = 3600.0, 1000.0, 1e4, 1000
 """what is drawn must fit a picture and a video that somebody waits for"""
 _MAX_NUMBERS = 100_000  # of a scenario: corners of paths are drawn in every frame
 _MAX_ARRAYS, _OVERHEAD = 384 << 20, 200  # [bytes] drawn together, and what a message takes beyond its arrays
@@ -470,17 +470,17 @@ def drawing(path: Path) -> Iterator[None]:
 
 
 def _check_scenario(path: Path, scenario: Any) -> None:
-    """Raise LogError for a tank or bodies that cannot be drawn: what is drawn grows with their extent."""
+    """Raise LogError for a tank or obstacles that cannot be drawn: what is drawn grows with their extent."""
     try:
-        tank, bodies = scenario["tank"], scenario["bodies"]
+        tank, obstacles = scenario["tank"], scenario["obstacles"]
         extents = [float(tank[axis][1]) - float(tank[axis][0]) for axis in ("x_m", "y_m")]
         if not all(0 < extent <= _MAX_EXTENT_M for extent in extents):
             raise ValueError(f"a tank of {extents[0]:g} x {extents[1]:g} m")
-        all_numbers = _numbers([tank, bodies, scenario["goal"], scenario["start"]])
+        all_numbers = _numbers([tank, obstacles, scenario["goal"], scenario["start"]])
         numbers = list(itertools.islice(all_numbers, _MAX_NUMBERS + 1))
         is_near = all(abs(number) <= _FARTHEST_M for number in numbers)
-        if not is_near or len(numbers) > _MAX_NUMBERS or len(bodies) > _MAX_BODIES:
-            raise ValueError("bodies beyond all bounds")
+        if not is_near or len(numbers) > _MAX_NUMBERS or len(obstacles) > _MAX_OBSTACLES:
+            raise ValueError("obstacles beyond all bounds")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
         raise LogError(
             f"{path}: its scenario.json cannot be drawn ({error!r}); give a log that uuv eval --record wrote"

@@ -160,21 +160,21 @@ def checked(text: str) -> str:
 
 Values = Mapping[str, Any]
 """One env at one control step: 'struct.field' of the state -> copy of the env's row (shapes, units and frames
-as in ``state``), and below 'driver.' what drives it: ``applied``, the action (4,) that led here, and of a
-policy ``action`` (4,), ``value``, ``std`` (4,), ``distill_lambda``, ``residual`` and ``uncertainty``, each
-None where there is none."""
+as in ``state``), and below 'agent.' what drives it: ``applied``, the action (4,) that led here, and of a
+policy ``action`` (4,), ``value``, ``std`` (4,), ``distillation_lambda``, ``residual`` and ``uncertainty``,
+each None where there is none."""
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeHeader:
     """What is known before the first step; it comes first in the log."""
 
-    controller: str  # name of the method that drives: 'bt', 'planner', 'straight' or a policy's name
+    controller: str  # name of the agent that drives: 'bt', 'planner', 'straight' or a policy's name
     config: Config
     config_yaml: str  # the same as text
     scenario: dict[str, Any]  # of ``scenario_document``: everything true about the world, in closed form
     reward_terms: tuple[str, ...] = ()  # names of ``reward.term``'s entries
-    tree_nodes: tuple[str, ...] = ()  # names of ``teacher.status``'s entries; numbered where two are equal
+    tree_nodes: tuple[str, ...] = ()  # names of ``behavior.status``'s entries; numbered where two are equal
     tree_xml: bytes = b""  # the tree as it was read; empty = unknown
     git_sha: str = "unknown"
     checkpoint_sha256: str = ""  # of the policy's checkpoint; empty = no policy
@@ -245,7 +245,7 @@ class Moment:
     @property
     def ended(self) -> bool:
         """The episode ended in this step: nothing follows."""
-        return int(self["referee.outcome"]) != RUNNING
+        return int(self["termination.outcome"]) != RUNNING
 
     @property
     def replanned(self) -> bool:
@@ -282,7 +282,7 @@ class Topic:
     schema: Schema | Callable[[EpisodeHeader], Schema]  # a function where it depends on the run
     encode: Encode
     reads: tuple[str, ...] = ()
-    """what ``encode`` looks at; 'struct.field' of the state, or 'driver.' (``moment.Values``)"""
+    """what ``encode`` looks at; 'struct.field' of the state, or 'agent.' (``moment.Values``)"""
     read: Callable[[dict[str, Any]], Any] | None = None
     """what pictures and videos take of a message: an array, a Layer, or a tuple with some of them"""
     in_picture: bool = False  # pictures show it too, not videos alone
@@ -295,7 +295,7 @@ class Topic:
 
 
 _ROUTE = ("route.n_way", "route.plan_step")
-_OUTCOME = ("referee.outcome",)
+_OUTCOME = ("termination.outcome",)
 
 EVERY_STEP = When("every control step", lambda moment, waited: True)
 NEW_SCAN = When("every new scan", lambda moment, waited: bool(moment["scan.fresh"]), ("scan.fresh",))
@@ -324,8 +324,8 @@ SONAR_IMAGES = When(
 )
 EVADING = When(
     "every decision that looks for an evasion",
-    lambda moment, waited: bool(moment["teacher.want_evade"]),
-    ("teacher.want_evade",),
+    lambda moment, waited: bool(moment["behavior.want_evade"]),
+    ("behavior.want_evade",),
 )
 EVENTS = When(
     "replans, end of the episode",

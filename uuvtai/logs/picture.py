@@ -1,4 +1,4 @@
-"""One picture per episode: what the vehicle mapped, every method's trajectory, goal and truth."""
+"""One picture per episode: what the vehicle mapped, every agent's trajectory, goal and truth."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from uuvtai.logs.drawing import (
     Canvas,
     Color,
     Recording,
+    agent_inks,
     drawing,
     load_recording,
     map_canvas,
-    method_inks,
     mixed,
     paint_layers,
     paint_ruler,
@@ -48,12 +48,12 @@ def picture(
     obstacles: bool = True,
     width_px: int = 1600,
     remark: str = "",
-    methods: Sequence[str] = (),
+    agents: Sequence[str] = (),
 ) -> Path:
-    """Draw logs of the same episode into one PNG: trajectories overlaid, a colour per method.
+    """Draw logs of the same episode into one PNG: trajectories overlaid, a colour per agent.
 
-    ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true bodies and their
-    paths as thin lines; ``remark`` stands beside the title; ``methods``: all that are compared with each
+    ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true obstacles and
+    their paths as thin lines; ``remark`` stands beside the title; ``agents``: all that are compared with each
     other, in order, so that each keeps its colour. Raises LogError; the file appears whole or not at all.
     """
     out = Path(out)
@@ -64,7 +64,7 @@ def picture(
     recordings = [load_recording(path, PICTURE_TOPICS) for path in found]
     check_same_episode(recordings)
     with drawing(found[0]):
-        image = paint_picture(recordings, clearance, obstacles, width_px, remark, methods).image
+        image = paint_picture(recordings, clearance, obstacles, width_px, remark, agents).image
     return save_image(image, out)
 
 
@@ -99,13 +99,13 @@ def paint_picture(
     obstacles: bool = True,
     width_px: int = 1600,
     remark: str = "",
-    methods: Sequence[str] = (),
+    agents: Sequence[str] = (),
 ) -> Canvas:
     """The picture on a canvas; the other arguments as of ``picture``."""
     tank = recordings[0].scenario["tank"]
     side, legend = 92 if clearance else 0, _BOTTOM + _ROW * max(len(recordings), 3)
     canvas = map_canvas(tank, width_px, (_LEFT, _RIGHT + side, _TOP, legend))
-    inks = _inks(recordings, methods)
+    inks = _inks(recordings, agents)
     paint_water(canvas, tank)
     if clearance:
         _paint_clearance(canvas, recordings, side)
@@ -119,12 +119,12 @@ def paint_picture(
     return canvas
 
 
-def _inks(recordings: list[Recording], methods: Sequence[str]) -> list[Color]:
-    """Colour of each recording: its method's; several logs of one method are told apart by their place."""
-    names = [recording.method for recording in recordings]
+def _inks(recordings: list[Recording], agents: Sequence[str]) -> list[Color]:
+    """Colour of each recording: its agent's; several logs of one agent are told apart by their place."""
+    names = [recording.agent for recording in recordings]
     if len(set(names)) < len(names):
         names = [f"{i} {name}" for i, name in enumerate(names)]
-    found = method_inks([*methods, *names])
+    found = agent_inks([*agents, *names])
     return [found[name] for name in names]
 
 
@@ -167,7 +167,7 @@ def _paint_color_bar(canvas: Canvas, top_m: float) -> None:
 
 
 def _paint_trajectories(canvas: Canvas, recordings: list[Recording], inks: list[Color]) -> None:
-    """The first method on top; those below a little wider each, so that all show where they go one way."""
+    """The first agent on top; those below a little wider each, so that all show where they go one way."""
     wide = [3 + 3 * min(i, 3) for i in range(len(recordings))]
     for recording, width in zip(recordings, wide, strict=True):
         canvas.line(recording.positions[:, :2], PAPER, width + 3)
@@ -199,7 +199,7 @@ def _paint_frame(
     moving = f", {scenario['D']} dynamic at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
     canvas.text(
         (_LEFT - 2, 70),
-        f"{scenario['S']} static obstacles{moving}; map and obstacles when {recordings[0].method} ends",
+        f"{scenario['S']} static obstacles{moving}; map and obstacles when {recordings[0].agent} ends",
         18,
         GREY,
     )
@@ -212,9 +212,9 @@ def _paint_frame(
 
 def _legend_row(canvas: Canvas, y: float, recording: Recording, color: Color) -> None:
     canvas.filled(np.array([(_LEFT, y - 8), (_LEFT + 34, y - 8), (_LEFT + 34, y - 3), (_LEFT, y - 3)]), color)
-    width = canvas.text((_LEFT + 46, y), recording.method, 19, INK, bold=True)
+    width = canvas.text((_LEFT + 46, y), recording.agent, 19, INK, bold=True)
     closest = "" if recording.min_clearance_m is None else f", closest {recording.min_clearance_m:.2f} m"
-    summary = f"{recording.ending} after {recording.duration_s:.1f} s{closest}"
+    summary = f"{recording.outcome_text} after {recording.duration_s:.1f} s{closest}"
     canvas.text((_LEFT + 46 + max(width, 90) + 14, y), summary, 18, GREY)
 
 

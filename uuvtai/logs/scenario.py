@@ -15,7 +15,7 @@ FRAMES = {
 
 FORMULAS = {
     "obstacle_position": (
-        "z stays. Without a path a body rests. arc(t) = (phase_m + speed_m_s * t) mod length_m. circle: "
+        "z stays. Without a path an obstacle rests. arc(t) = (phase_m + speed_m_s * t) mod length_m. circle: "
         "angle = arc / radius_m (radius_m < 0 is clockwise), (x, y) = center + |radius_m| (cos angle, sin "
         "angle). polyline: the point at arc along corners[0], corners[1], .., back to corners[0]; with two "
         "corners that is back and forth. Velocity = speed_m_s along the path. t = step * control_dt_s."
@@ -27,12 +27,13 @@ FORMULAS = {
     "sonar": (
         "Beam i looks along the true yaw + start_angle + i (end_angle - start_angle) / (n - 1), angles of "
         "/sonar/scan (start_angle alone where n = 1), in the horizontal plane of the true position at the "
-        "scan's own timestamp. A body is "
+        "scan's own timestamp. An obstacle is "
         "met where the beam enters its horizontal outline (of a sphere: a circle of radius sqrt(r^2 - g^2), "
         "g = max(|dz| - d tan(a), 0), d = horizontal distance of its centre) if the vertical gap is at most "
         "range * tan(a); a = sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and "
         "surface never; "
-        "nothing beyond sensors.sonar.max_range_m returns. Doppler = (velocity of the body or wall that is "
+        "nothing beyond sensors.sonar.max_range_m returns. Doppler = (velocity of the obstacle or wall that "
+        "is "
         "met - own velocity) . beam: how fast that piece of surface recedes; none is measured where "
         "sensors.sonar.doppler is false. Errors as in sensors.sonar. If sensors.sonar.mechanical, a scan "
         "holds the beams taken in that control step; a beam returns the nearest that 16 rays meet, evenly "
@@ -45,8 +46,8 @@ FORMULAS = {
         "vehicle.hull_radius_m). clearance_m = smallest distance of its surface to any body or side wall."
     ),
     "ttc": (
-        "Smallest clearance / closing speed over the bodies whose closing speed exceeds "
-        "episode.ttc_closing_m_s; closing speed = rate at which that body's clearance shrinks, from the "
+        "Smallest clearance / closing speed over the obstacles whose closing speed exceeds "
+        "episode.ttc_closing_m_s; closing speed = rate at which that obstacle's clearance shrinks, from the "
         "velocities of both nearest points. null = none."
     ),
     "outcome": (
@@ -80,7 +81,7 @@ FORMULAS = {
         "error = 3 (sigma + range_jitter_m) + range_quantum_m, wall = range "
         "of the known side wall along the beam. It is a moving one if |velocity + own_velocity . beam| "
         "(/sonar/doppler, beam in body axes) > max(doppler_evidence_m_s, 3 doppler_sigma_m_s), or if the "
-        "beam is listed in /tracks, or if the cell speaks against a body at rest: (free_scans >= "
+        "beam is listed in /tracks, or if the cell speaks against an obstacle at rest: (free_scans >= "
         "ceil(free_confident_s / P) or 0 < dynamic_scans < ceil(promote_s / P)) and no cell within m rows "
         "and columns has static >= occupied, P being that of the gains, m = min(4, 1 + floor((spacing of the "
         "beams (or half their width, if more) * range + error) / "
@@ -107,7 +108,8 @@ FORMULAS = {
         "replan may lie before their log time."
     ),
     "candidates": (
-        "Velocities in the order of `costs` of /evasion; names are keys of `teacher`, followed, asked and "
+        "Velocities in the order of `costs` of /evasion; names are keys of `behaviour tree`, followed, asked "
+        "and "
         "top defined here. followed = `follow`; asked = `asked` of /action one control step before; "
         "top(h) = min(evade_m_s, 1 / max(|cos(h - yaw)| / max_surge_m_s, |sin(h - yaw)| / max_sway_m_s)), "
         "limits of `vehicle`; h0 = heading of followed. First n_heading * n_speed level ones with the "
@@ -129,7 +131,7 @@ FORMULAS = {
         "forecast_dt_s, t = k forecast_dt_s, body and radius of a hypothesis of /futures: g = "
         "max(min(above - z, z - below), 0) vertical_weight; r = level distance of the axes; distance = r "
         "- radius if g = 0, else sqrt(max(r - radius, 0)^2 + g^2); closing = max(rate at which r shrinks, "
-        "0), times max(r - radius, 0) / distance if g > 0, the body's velocity being that of its last "
+        "0), times max(r - radius, 0) / distance if g > 0, the obstacle's velocity being that of its last "
         "forecast_dt_s; free = distance - hull_reach_m - patience closing_s closing; wanted = contact_m + "
         "patience caution (margin_m + margin_growth_m_s t), the second term times future_margin for "
         "hypotheses other than the forecast; depth = max(wanted - free, 0). Of a hypothesis: largest depth; "
@@ -141,8 +143,8 @@ FORMULAS = {
     ),
     "evasion_choice": (
         "Least = the first candidate of least cost. Mean = mean of the candidates with weights exp(-(cost "
-        "- least cost) / softness), those 12 softness above left out, held for the whole horizon. The "
-        "mean is taken if its own cost is at most least cost + softness, else the least."
+        "- least cost) / temperature), those 12 temperature above left out, held for the whole horizon. The "
+        "mean is taken if its own cost is at most least cost + temperature, else the least."
     ),
 }
 """How an outsider recomputes the log's figures; names such as mapping.occupied are keys of config.yaml."""
@@ -153,13 +155,13 @@ def scenario_document(
 ) -> dict[str, Any]:
     """Content of scenario.json. ``described``: ``closed_form.describe_scenario`` at step 0."""
     wanted, tank = config.world, config.world.tank
-    moving = sum(body["path"] is not None for body in described["bodies"])
+    moving = sum(body["path"] is not None for body in described["obstacles"])
     return {
         "schema": 1,
         "world": world,
         "seed": seed,
         "episode": episode,
-        "S": len(described["bodies"]) - moving,
+        "S": len(described["obstacles"]) - moving,
         "D": moving,
         "v_m_s": wanted.dynamic_speed_m_s,
         "control_dt_s": config.episode.control_dt_s,

@@ -29,11 +29,11 @@ from uuvtai.logs.drawing import (
     STATIC,
     Color,
     Recording,
+    agent_inks,
     bgr,
     drawing,
     load_recording,
     map_canvas,
-    method_inks,
     mixed,
     paint_layers,
     paint_ruler,
@@ -85,36 +85,36 @@ def video(
     speed: float = 1.0,
     progress: Progress | None = None,
     remark: str = "",
-    methods: Sequence[str] = (),
+    agents: Sequence[str] = (),
 ) -> Path:
     """Render a log as WebM, MP4 or GIF, as the name of ``out`` ends; ``width_px`` and ``fps`` default to what
     ``FORMATS`` says of it.
 
-    ``speed`` 2 shows it twice as fast as it was, ``remark`` stands beside the title; ``methods``: all that
+    ``speed`` 2 shows it twice as fast as it was, ``remark`` stands beside the title; ``agents``: all that
     are compared with each other, in order, so that each has the colour of the picture of them all. Raises
     LogError; the file appears whole or not at all.
     """
     out = Path(out)
     suffix = checked_suffix(out, tuple(FORMATS), "video")
     width_px, fps = width_px or FORMATS[suffix][0], fps or FORMATS[suffix][1]
-    _check_film(width_px, fps, speed)
+    _check_video(width_px, fps, speed)
     recording = load_recording(path)
     times = frame_times(recording, fps, speed)
     with drawing(Path(path)):
-        artist = FrameArtist(recording, max(width_px, _DRAWN_PX), remark, methods)
+        artist = FrameArtist(recording, max(width_px, _DRAWN_PX), remark, agents)
         samples = [_sized(artist.frame(recording.duration_s * share), width_px) for share in (0.0, 0.5, 1.0)]
-    return _filmed(out, _frames(artist, times, width_px, progress), fps, samples, artist.inks)
+    return _encoded(out, _frames(artist, times, width_px, progress), fps, samples, artist.inks)
 
 
-def _filmed(
+def _encoded(
     out: Path, frames: Iterator[np.ndarray], fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
 ) -> Path:
-    """Write frames as the film that the name of ``out`` asks for, whole or not at all. Raises LogError."""
+    """Write frames as the video that the name of ``out`` asks for, whole or not at all. Raises LogError."""
 
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(out, f".tmp{out.suffix.lower()}") as (_, part):
-            check_whole(part, write_film(part, frames, fps, samples, inks), out)
+            check_whole(part, write_video(part, frames, fps, samples, inks), out)
     except OSError as error:
         raise LogError(
             f"{out}: cannot write the video ({error.strerror}); choose another place with --out FILE"
@@ -122,8 +122,8 @@ def _filmed(
     return out
 
 
-def _check_film(width_px: int, fps: float, speed: float) -> None:
-    """Raise LogError for a width, a rate or a speed beyond what a film may have."""
+def _check_video(width_px: int, fps: float, speed: float) -> None:
+    """Raise LogError for a width, a rate or a speed beyond what a video may have."""
     given = ("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)
     for name, value, (least, most) in given:
         if not least <= value <= most:
@@ -171,10 +171,10 @@ class FrameArtist:
     """Draws the frame of any moment of a recording; what stays between two maps is drawn once."""
 
     def __init__(
-        self, recording: Recording, width_px: int = 1280, remark: str = "", methods: Sequence[str] = ()
+        self, recording: Recording, width_px: int = 1280, remark: str = "", agents: Sequence[str] = ()
     ) -> None:
         self.recording, self.remark = recording, remark
-        self._ink = method_inks([*methods, recording.method])[recording.method]
+        self._ink = agent_inks([*agents, recording.agent])[recording.agent]
         self._canvas = map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
         self._base: np.ndarray | None = None
         self._base_map: Layer | None = None
@@ -254,7 +254,7 @@ class FrameArtist:
         canvas, recording, scenario = self._canvas, self.recording, self.recording.scenario
         width = canvas.image.shape[1]
         which = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
-        end = 24 + canvas.text((24, 34), f"{recording.method} · {which}", 22, INK, bold=True)
+        end = 24 + canvas.text((24, 34), f"{recording.agent} · {which}", 22, INK, bold=True)
         canvas.text((end + 20, 34), self.remark, 17, FAILED)
         moving = f", {scenario['D']} dynamic at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
         canvas.text(
@@ -267,7 +267,7 @@ class FrameArtist:
         if time_s >= recording.duration_s:
             good = recording.outcome == "success"
             ink = _GOOD if good else FAILED
-            canvas.text((width - 150, 36), recording.ending, 24, ink, bold=True, align="right")
+            canvas.text((width - 150, 36), recording.outcome_text, 24, ink, bold=True, align="right")
 
     # -------------------------------------------------------------------------------------------- panel below
 
@@ -353,7 +353,7 @@ _CODECS: dict[str, tuple[str, dict[str, str]]] = {
 _GIF_TICKS = 100  # per second: a GIF counts hundredths
 
 
-def write_film(
+def write_video(
     part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
 ) -> int:
     """Write frames into ``part``, as its name ends; gives their number. Raises OSError.

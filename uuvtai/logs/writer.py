@@ -239,24 +239,24 @@ class RecordedJob(Protocol):
 class PolicyNote:
     """What a log says of the policy that drives."""
 
-    pilot: Any  # its ``learn.pilot.Pilot``, or an ``own.own_driver.OwnDriver``, which expects nothing
+    agent: Any  # its ``learn.agent.PolicyAgent``, or an ``adapters.PluginAgent``, which expects nothing
     checkpoint_sha256: str
-    distill_lambda: float | None  # weight of the distillation when the checkpoint was written
+    distillation_lambda: float | None  # weight of the distillation when the checkpoint was written
 
     def outputs(self, row: int) -> dict[str, Any]:
-        decision, foresees = self.pilot.decision, self.pilot.world_model is not None
+        decision, foresees = self.agent.decision, self.agent.world_model is not None
         return {
-            "driver.action": decision.action[row].cpu().numpy(),
-            "driver.value": float(decision.value[row]) if len(decision.value) else None,
-            "driver.std": decision.std.cpu().numpy() if len(decision.std) else None,
-            "driver.distill_lambda": self.distill_lambda,
-            "driver.residual": float(decision.residual[row]) if foresees else None,
-            "driver.uncertainty": float(decision.uncertainty[row]) if foresees else None,
+            "agent.action": decision.action[row].cpu().numpy(),
+            "agent.value": float(decision.value[row]) if len(decision.value) else None,
+            "agent.std": decision.std.cpu().numpy() if len(decision.std) else None,
+            "agent.distillation_lambda": self.distillation_lambda,
+            "agent.residual": float(decision.residual[row]) if foresees else None,
+            "agent.uncertainty": float(decision.uncertainty[row]) if foresees else None,
         }
 
 
 NO_POLICY: dict[str, Any] = dict.fromkeys(
-    f"driver.{name}" for name in ("action", "value", "std", "distill_lambda", "residual", "uncertainty")
+    f"agent.{name}" for name in ("action", "value", "std", "distillation_lambda", "residual", "uncertainty")
 )
 """the same where the tree drives"""
 
@@ -314,7 +314,7 @@ class EpisodeReader:
     def _write(self, sim: Recordable, rows: list[int]) -> None:
         values = {
             row: {
-                "driver.applied": self._applied[row],
+                "agent.applied": self._applied[row],
                 **(self._policy.outputs(row) if self._policy else NO_POLICY),
             }
             for row in rows
@@ -324,7 +324,7 @@ class EpisodeReader:
         _fill(sim, values, {row: [name for topic in due[row] for name in topic.reads] for row in rows})
         for row in rows:
             self._sinks[row].write(values[row])
-            self._applied[row] = values[row]["driver.action" if self._policy else "teacher.action"]
+            self._applied[row] = values[row]["agent.action" if self._policy else "behavior.action"]
 
 
 class EpisodeRecorder(EpisodeReader):

@@ -1,6 +1,6 @@
-"""Pieces that the user brings: a planner, a controller or a policy in a file of her own, beside the shipped
+"""Plugins that the user brings: a planner, a controller or a policy in a file of her own, beside the built-in
 ones."""
 
-from uuvtai.plugins.api import About, Forecast, View, piece
+from uuvtai.plugins.api import About, Forecast, View, plugin
 
-__all__ = ["About", "Forecast", "View", "piece"]
+__all__ = ["About", "Forecast", "View", "plugin"]

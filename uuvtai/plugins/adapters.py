@@ -14,14 +14,14 @@ import numpy as np
 import torch
 
 from uuvtai.config import SonarConfig
-from uuvtai.learning.policy_agent import CHUNK, PilotDecision
+from uuvtai.learning.policy_agent import CHUNK, AgentDecision
 from uuvtai.plugins.api import (
     ACTION,
     COMMAND,
     Ego,
     OccupancyGrid,
-    PieceError,
-    PieceSpec,
+    PluginError,
+    PluginSpec,
     Scan,
     Tracks,
     View,
@@ -111,7 +111,7 @@ def _scan(read: list[Array], age_s: Array, sonar_cfg: SonarConfig) -> Scan:
     )
 
 
-class PieceView:
+class PluginView:
     """A ``protocol.View`` of readings: the whole batch, or one row of it."""
 
     def __init__(self, readings: Readings, fixed: Fixed, pick: int | None = None) -> None:
@@ -219,18 +219,18 @@ _ENDS_M = 1e-4
 
 
 def commands(found: Any, n: int, place: str, meaning: str, device: torch.device) -> torch.Tensor:
-    """(n, 4) float32 of what a controller or policy answered. Raises PieceError."""
+    """(n, 4) float32 of what a controller or policy answered. Raises PluginError."""
     values = _tensor(found, place, f"({n}, 4): {meaning}")
     if values.shape != (n, 4):
         columns = values.shape[-1] if values.dim() else 0
         wrong = (
             f"{columns} columns" if values.dim() == 2 and len(values) == n else f"shape {tuple(values.shape)}"
         )
-        raise PieceError(f"{place}: gave {wrong}; wanted is shape ({n}, 4): {meaning}")
+        raise PluginError(f"{place}: gave {wrong}; wanted is shape ({n}, 4): {meaning}")
     bad = (~torch.isfinite(values)).nonzero()
     if len(bad):
         row, column = bad[0].tolist()
-        raise PieceError(
+        raise PluginError(
             f"{place}: gave {float(values[row, column])} in row {row}, column {column} of {n} x 4 ({meaning})"
             f", and {len(bad) - 1} more that are not finite"
         )
@@ -238,32 +238,32 @@ def commands(found: Any, n: int, place: str, meaning: str, device: torch.device)
 
 
 def command(found: Any, place: str, meaning: str) -> torch.Tensor:
-    """(1, 4) float32 of what a controller answered for one env. Raises PieceError."""
+    """(1, 4) float32 of what a controller answered for one env. Raises PluginError."""
     values = _tensor(found, place, f"(4,): {meaning}")
     if values.shape not in ((4,), (1, 4)):
-        raise PieceError(f"{place}: gave shape {tuple(values.shape)}; wanted is shape (4,): {meaning}")
+        raise PluginError(f"{place}: gave shape {tuple(values.shape)}; wanted is shape (4,): {meaning}")
     return values.reshape(1, 4)
 
 
 def waypoints(
     found: Any, ends: tuple[np.ndarray, np.ndarray], size_m: tuple[float, float], place: str
 ) -> np.ndarray:
-    """Corners (n >= 2, 2) [m] of what a planner answered, from start to goal. Raises PieceError."""
+    """Corners (n >= 2, 2) [m] of what a planner answered, from start to goal. Raises PluginError."""
     wanted = "waypoints (n, 2) [m] from the grid's corner, or None"
     values = _tensor(found, place, wanted).numpy()
     if values.ndim != 2 or values.shape[1] != 2 or len(values) > MAX_WAYPOINTS:
-        raise PieceError(
+        raise PluginError(
             f"{place}: gave shape {values.shape}; wanted are {wanted}, at most {MAX_WAYPOINTS:,}"
         )
     if not np.isfinite(values).all():
         number = int(np.flatnonzero(~np.isfinite(values).all(1))[0])
-        raise PieceError(
+        raise PluginError(
             f"{place}: waypoint {number} is {values[number].tolist()}; wanted are finite numbers"
         )
     outside = ((values < 0) | (values > size_m)).any(1)
     if outside.any():
         number = int(np.flatnonzero(outside)[0])
-        raise PieceError(
+        raise PluginError(
             f"{place}: waypoint {number} is {np.round(values[number], 3).tolist()}, outside the grid of "
             f"{size_m[0]:g} x {size_m[1]:g} m; places are x = column * cell_m, y = row * cell_m"
         )
@@ -277,7 +277,7 @@ def waypoints(
 
 def _tensor(found: Any, place: str, wanted: str) -> torch.Tensor:
     if found is None:
-        raise PieceError(f"{place}: gave None; wanted is {wanted}; does it return something on every way?")
+        raise PluginError(f"{place}: gave None; wanted is {wanted}; does it return something on every way?")
     if isinstance(found, torch.Tensor):
         values = found.detach()
         kind = "?" if values.dtype == torch.bool else "c" if values.is_complex() else "f"
@@ -286,17 +286,17 @@ def _tensor(found: Any, place: str, wanted: str) -> torch.Tensor:
         try:
             array = np.asarray(found)
         except (TypeError, ValueError) as error:
-            raise PieceError(
+            raise PluginError(
                 f"{place}: gave {type(found).__name__}, no array ({error}); wanted is {wanted}"
             ) from None
         kind = array.dtype.kind
         if kind not in "fiu":
-            raise PieceError(
+            raise PluginError(
                 f"{place}: gave {type(found).__name__} of {array.dtype}; wanted are real numbers, {wanted}"
             )
         return torch.from_numpy(array.astype(np.float32))
     if kind != "f":
-        raise PieceError(f"{place}: gave a tensor of {found.dtype}; wanted are real numbers, {wanted}")
+        raise PluginError(f"{place}: gave a tensor of {found.dtype}; wanted are real numbers, {wanted}")
     return values.to(torch.float32)
 
 
@@ -400,7 +400,7 @@ class CallMeter:
 
 
 class Marks(NamedTuple):
-    """How a piece wants to be called (``protocol.piece``)."""
+    """How a plugin wants to be called (``protocol.plugin``)."""
 
     rows: str = "batch"
     arrays: str = "numpy"
@@ -410,7 +410,7 @@ class Marks(NamedTuple):
 class OwnCode(NamedTuple):
     """The user's functions, and where they come from."""
 
-    spec: PieceSpec
+    spec: PluginSpec
     act: Callable[..., Any]
     reset: Callable[..., Any] | None
     place: str
@@ -419,7 +419,7 @@ class OwnCode(NamedTuple):
     meter: CallMeter
 
     def called(self, function: Callable[..., Any], given: Any, decisions: int) -> Any:
-        """What a function of hers answers. PieceError names the line where it fails."""
+        """What a function of hers answers. PluginError names the line where it fails."""
         try:
             with self.meter.call(decisions):
                 return function(given)
@@ -440,8 +440,8 @@ Ask = Callable[[list[int], torch.Tensor], torch.Tensor]
 """(rows, their observations (n, n_obs)) -> actions (n, 4) in parts of the limits"""
 
 
-class OwnDriver:
-    """Asks for every row once per decision, the running rows alone. A ``playing.Driver``."""
+class PluginAgent:
+    """Asks for every row once per decision, the running rows alone. A ``episodes.Agent``."""
 
     world_model = None
 
@@ -459,7 +459,7 @@ class OwnDriver:
         self.code.forget(rows)
 
     @torch.no_grad()
-    def decide(self, obs: torch.Tensor) -> PilotDecision:
+    def decide(self, obs: torch.Tensor) -> AgentDecision:
         """What to do now; rows that have decided already are not asked again."""
         running = self._sim.rows(self._sim.s.clock.active) == 1
         rows = np.flatnonzero(self._due & running)
@@ -475,9 +475,9 @@ class OwnDriver:
         self._age += 1
         self._due |= self._age % self.code.marks.hold_steps == 0
 
-    def _decision(self) -> PilotDecision:
+    def _decision(self) -> AgentDecision:
         nothing = torch.zeros(0)
-        return PilotDecision(self._action.clone(), *(nothing,) * (len(PilotDecision._fields) - 1))
+        return AgentDecision(self._action.clone(), *(nothing,) * (len(AgentDecision._fields) - 1))
 
 
 def asking_controller(sim: Sim, code: OwnCode, columns: Mapping[str, slice], limits: np.ndarray) -> Ask:
@@ -486,11 +486,11 @@ def asking_controller(sim: Sim, code: OwnCode, columns: Mapping[str, slice], lim
 
     def ask(rows: list[int], obs: torch.Tensor) -> torch.Tensor:
         readings = Readings(sim, rows, obs)
-        view: View = PieceView(readings, fixed)
+        view: View = PluginView(readings, fixed)
         if code.marks.rows == "batch":
             found = code.called(code.act, view, len(rows))
         else:
-            each = (code.called(code.act, PieceView(readings, fixed, i), 1) for i in range(len(rows)))
+            each = (code.called(code.act, PluginView(readings, fixed, i), 1) for i in range(len(rows)))
             found = torch.cat([command(one, code.place, COMMAND) for one in each])
         return commands(found, len(rows), code.place, COMMAND, sim.device) / top
 

@@ -1,4 +1,4 @@
-"""What a piece of the user's is called with and what it gives back: the types that her checker knows.
+"""What a plugin of the user's is called with and what it gives back: the types that her checker knows.
 
 A planner is a function ``plan`` or an object with that method, a controller one of ``act``, a policy one of
 ``act``, ``predict`` (Stable-Baselines3's) or any callable. Whoever keeps something per env has ``reset`` too.
@@ -44,7 +44,7 @@ class About:
 
 
 class Forecast(NamedTuple):
-    """Where tracked moving bodies are expected, B of them at K times."""
+    """Where tracked moving obstacles are expected, B of them at K times."""
 
     position: np.ndarray
     """(B, K, 2) [m] in the frame of start and goal; k = 0 is now"""
@@ -107,7 +107,7 @@ class Tracks(NamedTuple):
     """Forecast that the tracker follows."""
 
     moving: Any
-    """(n, T) bool: the slot holds a body that is known to move"""
+    """(n, T) bool: the slot holds an obstacle that is known to move"""
     position: Any
     """(n, T, 2) [m] world"""
     velocity: Any
@@ -128,7 +128,7 @@ class OccupancyGrid(NamedTuple):
     moving: Any
     """(n, n_row, n_col) occupancy of what moves"""
     clearance: Any
-    """(n, n_row, n_col) [m] to the nearest resting cell or wall"""
+    """(n, n_row, n_col) [m] to the nearest static cell or wall"""
 
 
 class Way(NamedTuple):
@@ -150,7 +150,7 @@ class Way(NamedTuple):
 
 class View(Protocol):
     """What a controller is shown of n envs: what they sense, remember and decided, never the truth. Arrays
-    are NumPy's or torch's as ``piece(arrays=...)`` says; with ``rows="one"`` their first axis is gone."""
+    are NumPy's or torch's as ``plugin(arrays=...)`` says; with ``rows="one"`` their first axis is gone."""
 
     rows: Any
     """(n,) numbers of the envs: their own memory is kept by these"""
@@ -211,12 +211,12 @@ class Remembers(Protocol):
         """New episodes begin in these envs (numbers)."""
 
 
-Piece = TypeVar("Piece", bound=Callable[..., Any])
+Plugin = TypeVar("Plugin", bound=Callable[..., Any])
 
 
-def piece(
+def plugin(
     rows: Literal["batch", "one"] = "batch", arrays: Literal["numpy", "torch"] = "numpy", hold_steps: int = 1
-) -> Callable[[Piece], Piece]:
+) -> Callable[[Plugin], Plugin]:
     """Decorator of a controller or policy, function or class: how it wants to be called.
 
     rows: all envs at once, or one after the other; arrays: what it is given; hold_steps: control steps that a
@@ -227,7 +227,7 @@ def piece(
     if not isinstance(hold_steps, int) or isinstance(hold_steps, bool) or not 1 <= hold_steps <= 10_000:
         raise ValueError(f"hold_steps is a number of control steps from 1, got {hold_steps!r}")
 
-    def marked(found: Piece) -> Piece:
+    def marked(found: Plugin) -> Plugin:
         for name, value in (("rows", rows), ("arrays", arrays), ("hold_steps", hold_steps)):
             setattr(found, name, value)
         return found
@@ -236,14 +236,14 @@ def piece(
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What goes wrong in a piece of the user's, told by her file and line.
+# What goes wrong in a plugin of the user's, told by her file and line.
 
 
-class PieceError(OwnCodeError):
-    """A piece cannot be used, or its code failed: which line, what, and what is wanted."""
+class PluginError(OwnCodeError):
+    """A plugin cannot be used, or its code failed: which line, what, and what is wanted."""
 
 
-def failed(error: BaseException, path: Path, what: str) -> PieceError:
+def failed(error: BaseException, path: Path, what: str) -> PluginError:
     """Of an exception in the user's code: the last line of her file on the way to it."""
     line = line_in(error.__traceback__, path)
     if isinstance(error, SyntaxError) and error.filename == str(path):
@@ -251,7 +251,7 @@ def failed(error: BaseException, path: Path, what: str) -> PieceError:
     place = f"{path}:{line}" if line else str(path)
     reason = " ".join(str(error).split())[:300]
     told = f"{place}: {type(error).__name__}{f': {reason}' if reason else ''} ({what})"
-    found = PieceError(told)
+    found = PluginError(told)
     found.__cause__ = error
     return found
 
@@ -278,7 +278,7 @@ def _is(frame: FrameType, path: Path) -> bool:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Names of the user's pieces on a command line: ``mine.py:plan``, ``mine.py:load=FOLDER``, ``model.onnx``.
+# Names of the user's plugins on a command line: ``mine.py:plan``, ``mine.py:load=FOLDER``, ``model.onnx``.
 
 
 PLANNER, CONTROLLER, POLICY = "planner", "controller", "policy"
@@ -293,8 +293,8 @@ _EXAMPLE = {
 
 
 @dataclass(frozen=True)
-class PieceSpec:
-    """A piece as it was named."""
+class PluginSpec:
+    """A plugin as it was named."""
 
     kind: str
     path: Path
@@ -305,7 +305,7 @@ class PieceSpec:
 
     @property
     def text(self) -> str:
-        """As a request keeps it: ``piece_spec`` reads it."""
+        """As a request keeps it: ``plugin_spec`` reads it."""
         return f"{self.kind}:{self.typed}"
 
     @property
@@ -320,7 +320,7 @@ class PieceSpec:
         """As it is typed, with its option."""
         if self.kind == PLANNER:
             return f"--planner {self.typed}"
-        is_plain = piece_spec(self.typed).kind == self.kind
+        is_plain = plugin_spec(self.typed).kind == self.kind
         return f"--agent {self.typed if is_plain else self.text}"
 
     @property
@@ -338,7 +338,7 @@ class PieceSpec:
         """Whether using it runs Python of the user's."""
         return self.path.suffix == ".py"
 
-    def located(self, folder: Path) -> PieceSpec:
+    def located(self, folder: Path) -> PluginSpec:
         """The same with its file, and an argument that is a path, looked for in ``folder`` where they are not
         here."""
         argument = folder / self.argument
@@ -346,43 +346,43 @@ class PieceSpec:
         path = self.path if self.path.exists() else folder / self.path
         return replace(self, path=path, argument=str(argument) if moved else self.argument)
 
-    def absolute(self) -> PieceSpec:
+    def absolute(self) -> PluginSpec:
         """The same from any folder."""
         argument = Path(self.argument)
         found = str(argument.resolve()) if self.argument and argument.exists() else self.argument
         return replace(self, path=self.path.resolve(), argument=found)
 
 
-def is_piece(text: str) -> bool:
-    """Whether an agent's name is that of a piece of the user's."""
+def is_plugin(text: str) -> bool:
+    """Whether an agent's name is that of a plugin of the user's."""
     kind, colon, _rest = text.partition(":")
     return (kind in _DEFAULT and bool(colon)) or bool(_PYTHON.fullmatch(text)) or text.endswith(".onnx")
 
 
-def piece_spec(text: str, kind: str = "") -> PieceSpec:
-    """The piece of a text. ``kind`` where the text does not begin with one; without either, a graph and an
+def plugin_spec(text: str, kind: str = "") -> PluginSpec:
+    """The plugin of a text. ``kind`` where the text does not begin with one; without either, a graph and an
     object named ``load`` are policies, every other one is a controller. SettingError."""
     first, colon, rest = text.partition(":")
     if first in _DEFAULT and colon:
         kind, text = first, rest
     if kind in ("", POLICY) and text.endswith(".onnx"):
-        return PieceSpec(POLICY, Path(text))
+        return PluginSpec(POLICY, Path(text))
     found = _PYTHON.fullmatch(text)
     if not kind:
         kind = POLICY if found and found["name"] == _DEFAULT[POLICY] else CONTROLLER
     option = "--planner" if kind == PLANNER else "--agent"
     if found is None:
-        raise SettingError(f"{option} {text!r}: names no piece; for example {_EXAMPLE[kind]}")
+        raise SettingError(f"{option} {text!r}: names no plugin; for example {_EXAMPLE[kind]}")
     name = found["name"] or _DEFAULT[kind]
     if not name.isidentifier():
         raise SettingError(f"{option} {text!r}: {name!r} is no name of Python; for example {_EXAMPLE[kind]}")
-    return PieceSpec(kind, Path(found["file"]), name, found["argument"] or "")
+    return PluginSpec(kind, Path(found["file"]), name, found["argument"] or "")
 
 
 def refuse_code(place: Path, names: Sequence[str], allowed: bool) -> None:
     """SettingError where going on with a run folder would run Python that the folder names, unless the user
     said that it is hers: a folder may come from anybody."""
-    code = [spec.path for name in names if is_piece(name) and (spec := piece_spec(name)).is_code]
+    code = [spec.path for name in names if is_plugin(name) and (spec := plugin_spec(name)).is_code]
     if code and not allowed:
         files = ", ".join(map(str, dict.fromkeys(code)))
         raise SettingError(

@@ -24,17 +24,17 @@ from uuvtai.learning.export import graph as graph_check
 from uuvtai.learning.export import graph as onnx_session
 from uuvtai.learning.policy_agent import CHUNK
 from uuvtai.plugins import adapters
-from uuvtai.plugins.adapters import CallMeter, Marks, OwnCode, OwnDriver, asking_controller, asking_policy
+from uuvtai.plugins.adapters import CallMeter, Marks, OwnCode, PluginAgent, asking_controller, asking_policy
 from uuvtai.plugins.api import (
     CONTROLLER,
     PLANNER,
     POLICY,
     About,
     Forecast,
-    PieceError,
-    PieceSpec,
+    PluginError,
+    PluginSpec,
     failed,
-    piece,
+    plugin,
 )
 from uuvtai.sim.rrt import PlanRequest
 from uuvtai.sim.sim import Sim
@@ -60,26 +60,26 @@ class _OwnSource(SourceFileLoader):
         pass
 
 
-def content_of(spec: PieceSpec, limit: int) -> bytes:
-    """The piece's file. Raises PieceError where there is none, FileError for what is no plain file."""
+def content_of(spec: PluginSpec, limit: int) -> bytes:
+    """The plugin's file. Raises PluginError where there is none, FileError for what is no plain file."""
     try:
         return read_bytes(spec.path, limit)
     except OSError as error:
-        raise PieceError(f"{spec.option}: {spec.path} cannot be read ({error.strerror})") from None
+        raise PluginError(f"{spec.option}: {spec.path} cannot be read ({error.strerror})") from None
 
 
-def object_of(spec: PieceSpec) -> Any:
-    """The object that the piece names, its file imported once per content. Raises PieceError, FileError."""
+def object_of(spec: PluginSpec) -> Any:
+    """The object that the plugin names, its file imported once per content. Raises PluginError, FileError."""
     module = _module(spec)
     if not hasattr(module, spec.name):
         there = [name for name, value in vars(module).items() if _is_own(value, module)]
-        raise PieceError(
+        raise PluginError(
             f"{spec.option}: {spec.path} has no {spec.name!r}; it has {', '.join(there) or 'no function'}"
         )
     return getattr(module, spec.name)
 
 
-def _module(spec: PieceSpec) -> ModuleType:
+def _module(spec: PluginSpec) -> ModuleType:
     digest = hashlib.sha256(content_of(spec, MAX_BYTES)).hexdigest()
     key = str(spec.path.resolve()), digest
     if key not in _loaded:
@@ -104,15 +104,15 @@ def _is_own(value: Any, module: ModuleType) -> bool:
     return callable(value) and getattr(value, "__module__", "") == module.__name__
 
 
-def made(found: Any, spec: PieceSpec, about: About) -> Any:
+def made(found: Any, spec: PluginSpec, about: About) -> Any:
     """What drives: the object itself, an instance of a class, or what a function named ``load`` returns.
-    Raises PieceError."""
+    Raises PluginError."""
     is_class, make = inspect.isclass(found), cast("Callable[..., Any]", found)
     if not is_class and not (spec.name == FACTORY and inspect.isroutine(found)):
         return found
     takes = _parameters(found)
     if takes > 1:
-        raise PieceError(
+        raise PluginError(
             f"{place_of(found, spec)}: {spec.name} needs {takes} arguments; it gets one (about) or none"
         )
     try:
@@ -126,7 +126,7 @@ def made(found: Any, spec: PieceSpec, about: About) -> Any:
 
 
 class _Marked:
-    """An object of somebody else's library with the marks of ``piece``."""
+    """An object of somebody else's library with the marks of ``plugin``."""
 
     def __init__(self, inner: Any, marks: dict[str, Any]) -> None:
         self.inner, self.rows, self.arrays, self.hold_steps = (
@@ -159,15 +159,15 @@ def _may_take(found: Any) -> bool:
         return False
 
 
-def method_of(
-    found: Any, names: tuple[str, ...], spec: PieceSpec, usage: str, count: int
+def agent_of(
+    found: Any, names: tuple[str, ...], spec: PluginSpec, usage: str, count: int
 ) -> Callable[..., Any]:
     """The function to call: the first method of ``names`` that the object has, or the object itself. Raises
-    PieceError where there is none, or where it takes other than ``count`` arguments."""
+    PluginError where there is none, or where it takes other than ``count`` arguments."""
     inner = inner_of(found)
     method = next((getattr(inner, name) for name in names if callable(getattr(inner, name, None))), inner)
     if not callable(method):
-        raise PieceError(
+        raise PluginError(
             f"{spec.option}: {spec.name} is {type(inner).__name__}, which cannot be called and has no "
             f"{' or '.join(names)}; {usage}"
         )
@@ -175,13 +175,13 @@ def method_of(
         taken = inspect.signature(method)
         taken.bind(*range(count), **({"row": 0} if "row" in taken.parameters else {}))
     except TypeError as error:
-        raise PieceError(f"{place_of(method, spec)}: {error}; {usage}") from None
+        raise PluginError(f"{place_of(method, spec)}: {error}; {usage}") from None
     except ValueError:  # of compiled code
         pass
     return method
 
 
-def place_of(found: Any, spec: PieceSpec) -> str:
+def place_of(found: Any, spec: PluginSpec) -> str:
     """FILE:LINE where a function or a class begins, as far as it is known."""
     code = getattr(inspect.unwrap(found) if inspect.isroutine(found) else found, "__code__", None)
     if code is not None and code.co_filename == str(spec.path):
@@ -201,18 +201,18 @@ _OUTPUTS = ("action", "actions", "mean_action", "mean_actions", "mean")
 MAX_GRAPH_BYTES = graph_check.MAX_BYTES
 
 
-def graph_of(spec: PieceSpec) -> bytes:
-    """The file, with its weights if they lie beside it, no larger than a graph may be. Raises PieceError,
+def graph_of(spec: PluginSpec) -> bytes:
+    """The file, with its weights if they lie beside it, no larger than a graph may be. Raises PluginError,
     FileError."""
     if not onnx_session.is_installed():
-        raise PieceError(f"{spec.option}: needs onnx and onnxruntime: pip install 'uuvtai[export]'")
+        raise PluginError(f"{spec.option}: needs onnx and onnxruntime: pip install 'uuvtai[export]'")
     graph = content_of(spec, MAX_GRAPH_BYTES)
 
     def beside(name: str) -> bytes:
         try:
             return read_bytes(spec.path.parent / name, MAX_GRAPH_BYTES, spec.path.parent)
         except OSError as error:
-            raise PieceError(
+            raise PluginError(
                 f"{spec.path}: its weights are in {name}, which cannot be read ({error.strerror}); copy that "
                 "file too, beside it"
             ) from None
@@ -220,42 +220,43 @@ def graph_of(spec: PieceSpec) -> bytes:
     try:
         return graph_check.with_weights(graph, beside)
     except graph_check.GraphError as error:
-        raise PieceError(f"{spec.path}: {error.reason}") from None
+        raise PluginError(f"{spec.path}: {error.reason}") from None
 
 
-def onnx_policy(spec: PieceSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
+def onnx_policy(spec: PluginSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
     """(function from observations (n, n_obs) to actions (n, 4), control steps per decision). Raises
-    PieceError for a graph that is strange, or made for another observation."""
+    PluginError for a graph that is strange, or made for another observation."""
     try:
         head = graph_check.head_of(graph)
         output = next((known for known in _OUTPUTS if known in head.outputs), head.outputs[0])
         if len(head.outputs) > 1:
             graph = graph_check.only(graph, output)
         if len(head.inputs) != 1:
-            raise PieceError(
+            raise PluginError(
                 f"{spec.path}: takes {', '.join(head.inputs) or 'nothing'}; a policy takes one input, "
                 f"observations (n, {n_obs}), and keeps no state; of 'uuv export' evaluate its run"
             )
         name, (width, rows, dtype) = next(iter(head.inputs.items()))
         if dtype is None or rows == 0 or (rows or 0) > CHUNK:
-            raise PieceError(
+            raise PluginError(
                 f"{spec.path}: {name} takes no observations: a float input (n, {n_obs}) does, n "
                 f"open, 1, or up to {CHUNK}"
             )
         if width not in (None, n_obs):
-            raise PieceError(
+            raise PluginError(
                 f"{spec.path}: takes observations of {width} columns, here they have {n_obs} "
-                "(docs/extend.md lists them); --set features.n_track=.. and features.teacher=true add columns"
+                "(docs/extend.md lists them); --set observation.n_track=.. and observation.behavior=true add "
+                "columns"
             )
         calls = -(-CHUNK // (rows or CHUNK))
         graph_check.refuse_strange(graph, {name: (rows or CHUNK, n_obs)}, calls, rows or 1)
         session = onnx_session.session(graph)
     except graph_check.GraphError as error:
-        raise PieceError(f"{spec.path}: {error.reason}") from None
-    except PieceError:
+        raise PluginError(f"{spec.path}: {error.reason}") from None
+    except PluginError:
         raise
     except Exception as error:  # ONNX Runtime's own, which share no base class beyond this
-        raise PieceError(
+        raise PluginError(
             f"{spec.path}: ONNX Runtime cannot use it ({' '.join(str(error).split())[:200]})"
         ) from None
 
@@ -271,17 +272,17 @@ def onnx_policy(spec: PieceSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np
     return act, _hold(spec, head.metadata)
 
 
-def _hold(spec: PieceSpec, metadata: dict[str, str]) -> int:
+def _hold(spec: PluginSpec, metadata: dict[str, str]) -> int:
     text = metadata.get(HOLD, "1")
     if not text.isascii() or not text.isdigit() or not 1 <= int(text[:9]) <= 10_000:
-        raise PieceError(
+        raise PluginError(
             f"{spec.path}: metadata {HOLD} = {text[:40]!r}; a whole number of control steps from 1"
         )
     return int(text)
 
 
 # ------------------------------------------------------------------------------------------------------------
-# A piece of the user's from its name to what drives or plans in a simulator.
+# A plugin of the user's from its name to what drives or plans in a simulator.
 
 
 _USAGE = {
@@ -289,7 +290,7 @@ _USAGE = {
     CONTROLLER: "a controller is called act(view)",
     POLICY: "a policy is called act(obs)",
 }
-_METHODS = {PLANNER: ("plan",), CONTROLLER: ("act",), POLICY: ("act", "predict")}
+_AGENTS = {PLANNER: ("plan",), CONTROLLER: ("act",), POLICY: ("act", "predict")}
 _ARGUMENTS = {PLANNER: 5, CONTROLLER: 1, POLICY: 1}
 _LIMITS = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
 
@@ -299,10 +300,10 @@ def _say(text: str) -> None:
 
 
 @dataclass
-class OwnPiece:
-    """A piece that was found: its file can be read and has what it names."""
+class LoadedPlugin:
+    """A plugin that was found: its file can be read and has what it names."""
 
-    spec: PieceSpec
+    spec: PluginSpec
     sha256: str
     """of its file; what that imports is not in it"""
     found: Any
@@ -316,19 +317,19 @@ class OwnPiece:
         """What it is called in tables."""
         return self.spec.label
 
-    def driver(self, sim: Sim) -> OwnDriver | None:
-        """Who drives this simulator; None for a planner, where the tree does. Raises PieceError."""
+    def agent(self, sim: Sim) -> PluginAgent | None:
+        """Who drives this simulator; None for a planner, where the tree does. Raises PluginError."""
         if self.spec.kind == PLANNER:
             return None
         columns = columns_of(sim)
         about = about_of(sim, self.spec.argument)
         code = self._code(sim, about)
         if self.spec.kind == CONTROLLER:
-            return OwnDriver(sim, code, asking_controller(sim, code, columns, about.limits))
-        return OwnDriver(sim, code, asking_policy(code, sim.device))
+            return PluginAgent(sim, code, asking_controller(sim, code, columns, about.limits))
+        return PluginAgent(sim, code, asking_policy(code, sim.device))
 
     def planner(self, sim: Sim) -> RouteSource | None:
-        """Who plans routes in this simulator; None where its own planner does. Raises PieceError."""
+        """Who plans routes in this simulator; None where its own planner does. Raises PluginError."""
         if self.spec.kind != PLANNER:
             return None
         code = self._code(sim, about_of(sim, self.spec.argument))
@@ -363,7 +364,7 @@ class OwnPiece:
             return OwnCode(spec, act, None, str(spec.path), Marks(hold_steps=hold_steps), self.meter)
         drives = made(self.found, spec, about)
         inner = inner_of(drives)
-        act = method_of(drives, _METHODS[kind], spec, _USAGE[kind], _ARGUMENTS[kind])
+        act = agent_of(drives, _AGENTS[kind], spec, _USAGE[kind], _ARGUMENTS[kind])
         place = f"{place_of(act, spec)}: {spec.name if act is inner else getattr(act, '__name__', spec.name)}"
         marks = _marks(drives, place)
         if kind == POLICY and getattr(act, "__name__", "") == "predict":
@@ -371,23 +372,23 @@ class OwnPiece:
         return OwnCode(spec, act, _reset_of(inner, self.found), place, marks, self.meter)
 
 
-def own_piece(spec: PieceSpec) -> OwnPiece:
-    """The piece of a name, refused at once where its file or object is missing. Raises PieceError,
+def load_plugin(spec: PluginSpec) -> LoadedPlugin:
+    """The plugin of a name, refused at once where its file or object is missing. Raises PluginError,
     FileError."""
     if not spec.is_code:
         graph = graph_of(spec)
-        return OwnPiece(spec, hashlib.sha256(graph).hexdigest(), graph)
+        return LoadedPlugin(spec, hashlib.sha256(graph).hexdigest(), graph)
     content = content_of(spec, MAX_BYTES)
-    return OwnPiece(spec, hashlib.sha256(content).hexdigest(), object_of(spec))
+    return LoadedPlugin(spec, hashlib.sha256(content).hexdigest(), object_of(spec))
 
 
 def columns_of(sim: Sim) -> dict[str, slice]:
     """Columns of the observation by name."""
-    return {c.name: slice(first, first + width) for c, first, width in placed_columns(sim.config.features)}
+    return {c.name: slice(first, first + width) for c, first, width in placed_columns(sim.config.observation)}
 
 
 def about_of(sim: Sim, argument: str = "") -> About:
-    """What a piece is told before it begins."""
+    """What a plugin is told before it begins."""
     config, columns = sim.config, columns_of(sim)
     limits = np.array([getattr(config.vehicle, name) for name in _LIMITS], np.float32)
     assert len(limits) == NUM_ACTIONS
@@ -406,9 +407,9 @@ def _marks(drives: Any, place: str) -> Marks:
     )
     given: Any = found
     try:
-        piece(*given)
+        plugin(*given)
     except ValueError as error:
-        raise PieceError(f"{place}: {error}") from None
+        raise PluginError(f"{place}: {error}") from None
     return found
 
 
@@ -444,8 +445,8 @@ class RouteSource:
         self.code.forget(mask)
 
     def plan(self, asked: PlanRequest) -> np.ndarray | None:
-        """Corners (n >= 2, 2) [m] from start to goal; None = no way. PieceError for any other answer."""
-        forecast = Forecast(asked.body, asked.radius_m, self._dt_s)
+        """Corners (n >= 2, 2) [m] from start to goal; None = no way. PluginError for any other answer."""
+        forecast = Forecast(asked.obstacle, asked.radius_m, self._dt_s)
         more = {"row": asked.env} if self._wants_row else {}
 
         def called(_given: None) -> object:

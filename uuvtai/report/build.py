@@ -50,12 +50,12 @@ Detail = dict[str, Any]
 
 @dataclass(frozen=True)
 class _Shown:
-    """A file and the episode in it; pictures show the same episode of every method."""
+    """A file and the episode in it; pictures show the same episode of every agent."""
 
     path: Path
-    method: str
+    agent: str
     episode: tuple[int, int] | None
-    details: tuple[tuple[str, Detail], ...]  # (method, how its episode went)
+    details: tuple[tuple[str, Detail], ...]  # (agent, how its episode went)
     remark: str
 
     @property
@@ -72,9 +72,9 @@ class _Shown:
 
 def media(folder: Path, result: dict[str, Any] | None, budget: int = MEDIA_BYTES) -> list[Block]:
     """Pictures, then videos, of a run; ``result``: document of ``uuv eval --json``; ``budget`` in bytes."""
-    methods = (result or {}).get("methods", [])
-    pictures = _worst_first(sorted([*folder.glob("pictures/*.png"), *folder.glob("explain/*.png")]), methods)
-    videos = _worst_first(sorted([*folder.glob("explain/*.webm"), *folder.glob("videos/*.webm")]), methods)
+    agents = (result or {}).get("agents", [])
+    pictures = _worst_first(sorted([*folder.glob("pictures/*.png"), *folder.glob("explain/*.png")]), agents)
+    videos = _worst_first(sorted([*folder.glob("explain/*.webm"), *folder.glob("videos/*.webm")]), agents)
     blocks: list[Block] = []
     for title, shown, mime, most in (
         ("Trajectories over the occupancy map", pictures, "image/png", PICTURE_BYTES),
@@ -139,33 +139,33 @@ def _trimmed(gallery: Gallery, budget: int) -> Gallery:
     )
 
 
-def _worst_first(paths: Iterable[Path], methods: list[dict[str, Any]]) -> list[_Shown]:
-    return sorted((_shown(path, methods) for path in paths), key=lambda one: one.severity)
+def _worst_first(paths: Iterable[Path], agents: list[dict[str, Any]]) -> list[_Shown]:
+    return sorted((_shown(path, agents) for path in paths), key=lambda one: one.severity)
 
 
 def _once(shown: list[_Shown]) -> list[_Shown]:
     """A failure that was recorded again to explain it is shown once, with its cause."""
-    explained = {(one.method, one.episode) for one in shown if one.remark}
-    return [one for one in shown if one.remark or (one.method, one.episode) not in explained]
+    explained = {(one.agent, one.episode) for one in shown if one.remark}
+    return [one for one in shown if one.remark or (one.agent, one.episode) not in explained]
 
 
-def _shown(path: Path, methods: list[dict[str, Any]]) -> _Shown:
+def _shown(path: Path, agents: list[dict[str, Any]]) -> _Shown:
     found = _NAME.fullmatch(path.stem)
     if found is None:
         return _Shown(path, "", None, (), path.stem)
     label, episode = found["label"], (int(found["seed"]), int(found["episode"]))
-    method = _method_of(label, methods)
-    remark = label.removesuffix(method).strip("_") if method else found["rest"].strip("_")
-    own = [m for m in methods if not label or m["name"] == method]
+    agent = _agent_of(label, agents)
+    remark = label.removesuffix(agent).strip("_") if agent else found["rest"].strip("_")
+    own = [m for m in agents if not label or m["name"] == agent]
     details = tuple(
         (m["name"], d) for m in own for d in m["episodes_detail"] if (d["seed"], d["episode"]) == episode
     )
-    return _Shown(path, method, episode, details, remark.replace("_", " "))
+    return _Shown(path, agent, episode, details, remark.replace("_", " "))
 
 
-def _method_of(label: str, methods: list[dict[str, Any]]) -> str:
-    """The method that a file's label ends with; before it may stand why the episode failed."""
-    names = [m["name"] for m in methods if label == m["name"] or label.endswith(f"_{m['name']}")]
+def _agent_of(label: str, agents: list[dict[str, Any]]) -> str:
+    """The agent that a file's label ends with; before it may stand why the episode failed."""
+    names = [m["name"] for m in agents if label == m["name"] or label.endswith(f"_{m['name']}")]
     return max(names, key=len, default="")
 
 
@@ -244,7 +244,7 @@ def checkpoints(folder: Path) -> list[Block]:
     return [Table(columns, rows, "Checkpoints")]
 
 
-def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]:
+def origins(agents: list[dict[str, Any]], trainings: list[Path]) -> list[Block]:
     """By its checkpoint's sha256, the training that made each policy of an evaluation; [] without."""
     kept = {
         hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest(): (run.name, path.parent.name)
@@ -252,15 +252,15 @@ def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]
         for path in (run / "checkpoints").glob("*/manifest.json")
     }
     sentences = []
-    for method in methods if trainings else []:
-        digest = str(method.get("checkpoint", {}).get("sha256", ""))
+    for agent in agents if trainings else []:
+        digest = str(agent.get("checkpoint", {}).get("sha256", ""))
         if digest in kept:
             sentences.append(
-                "{} is checkpoint {} of the training {}.".format(method["name"], *reversed(kept[digest]))
+                "{} is checkpoint {} of the training {}.".format(agent["name"], *reversed(kept[digest]))
             )
         elif digest:
             sentences.append(
-                f"{method['name']} (checkpoint {digest[:16]}) is none of the checkpoints that these "
+                f"{agent['name']} (checkpoint {digest[:16]}) is none of the checkpoints that these "
                 "trainings keep."
             )
     return [Paragraph(" ".join(sentences))] if sentences else []
@@ -285,7 +285,7 @@ def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Re
     """Write the page of a run folder to ``out`` (default: its report.html) and its figures as PNG to
     ``figures/`` beside the page.
 
-    Several folders make one page, for which ``out`` must be given: trainings (seeds of a method, or methods)
+    Several folders make one page, for which ``out`` must be given: trainings (seeds of an agent, or agents)
     are compared in one section, what the other folders hold follows, an evaluation beside the training that
     it is of. Everything is read and drawn before anything is written. The default page and its figures are
     renewed; elsewhere files are replaced with ``force`` only, and files of the run never. Raises ConfigError
@@ -392,10 +392,10 @@ def _named_after(run: Path, trainings: list[Path]) -> list[PageSection]:
     """Sections of one of several folders. An evaluation names the trainings of its policies."""
     with damage_named(run):
         sections = content(run)
-        methods = (read_json(run, "eval/result.json") or {}).get("methods", [])
+        agents = (read_json(run, "eval/result.json") or {}).get("agents", [])
     if not sections:
         raise ConfigError(f"{run}: {NOTHING}")
-    origin = origins(methods, trainings)
+    origin = origins(agents, trainings)
     named = [
         replace(section, title=f"{section.title}: {run.name}", blocks=_figures_of(run, section.blocks))
         for section in sections

@@ -1,12 +1,12 @@
-"""Tables of an evaluation (the document of ``uuv eval --json``): methods, pairs of them, why they failed."""
+"""Tables of an evaluation (the document of ``uuv eval --json``): agents, pairs of them, why they failed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
 
-from uuvtai.common.colours import method_colours
-from uuvtai.common.enums import ENDINGS
+from uuvtai.common.colours import agent_colours
+from uuvtai.common.enums import FINAL_OUTCOMES
 from uuvtai.report.blocks import Block, Figure, Paragraph
 from uuvtai.report.figures import Line, intervals, rates_text
 from uuvtai.report.tables import (
@@ -17,8 +17,8 @@ from uuvtai.report.tables import (
     Data,
     Table,
     accidents,
-    bodies,
     number,
+    obstacles,
     percent,
     probability,
     rate,
@@ -28,7 +28,7 @@ from uuvtai.report.tables import (
     with_interval,
 )
 
-DAGGER = "\u2020"  # marks privileged methods in the terminal
+DAGGER = "\u2020"  # marks privileged agents in the terminal
 
 _ENDS = ("collision", "ttc", "out_of_tank", "timeout")
 
@@ -60,8 +60,8 @@ TIME = Column(
 )
 TTS = Column("TTS s", 4, of=lambda r: number(r.get("tts_s")))
 
-_METHODS = (
-    Column("method", left=True, of=_name),
+_AGENTS = (
+    Column("agent", left=True, of=_name),
     SUCCESS,
     COLLISION,
     ENDS,
@@ -92,10 +92,10 @@ def _own_ms(m: dict[str, Any]) -> Cell:
 _OWN = Column("own code: ms a decision", 1, short="own code ms\n(slowest)", of=_own_ms)
 
 
-def methods_table(methods: list[dict[str, Any]], title: str, **page: Any) -> Table:
-    """One row a method: rates with counts and 95 % Wilson intervals, other ends, times, own code's time."""
-    columns = (*_METHODS, _OWN) if any(m.get("own") for m in methods) else _METHODS
-    return Table(columns, methods, title, **page)
+def agents_table(agents: list[dict[str, Any]], title: str, **page: Any) -> Table:
+    """One row an agent: rates with counts and 95 % Wilson intervals, other ends, times, own code's time."""
+    columns = (*_AGENTS, _OWN) if any(m.get("own") for m in agents) else _AGENTS
+    return Table(columns, agents, title, **page)
 
 
 def _difference(pair: dict[str, Any]) -> str:
@@ -120,7 +120,7 @@ _PAIRS = (
 
 
 def paired_table(pairs: list[dict[str, Any]], title: str, **page: Any) -> Table:
-    """Two methods on the episodes of both: who alone arrives, how sure, difference in time of both."""
+    """Two agents on the episodes of both: who alone arrives, how sure, difference in time of both."""
     return Table(_PAIRS, pairs, title, **page)
 
 
@@ -133,7 +133,7 @@ _CAUSES = (
     Column("n", of=lambda c: str(c["count"])),
     Column("share", of=lambda c: percent(c["share"], 0)),
     Column("knew", 2, of=lambda c: percent(c["knew_share"], 0)),
-    Column("unseen s", 3, short="unseen", of=lambda c: _median(c, "unseen_median_s")),
+    Column("unseen s", 3, short="unseen", of=lambda c: _median(c, "undetected_median_s")),
     Column("evading s", 4, short="evading", of=lambda c: _median(c, "evading_median_s")),
     Column("last chance s", 5, short="chance", of=lambda c: _median(c, "last_chance_median_s")),
     Column("worst", 1, left=True, only=TERMINAL, of=lambda c: ":".join(map(str, c["examples"][0]))),
@@ -141,32 +141,32 @@ _CAUSES = (
 )
 
 
-def causes_table(method: dict[str, Any], title: str) -> Table:
-    """Why episodes of a method failed, the most frequent cause first."""
-    return Table(_CAUSES, method["causes"], title)
+def causes_table(agent: dict[str, Any], title: str) -> Table:
+    """Why episodes of an agent failed, the most frequent cause first."""
+    return Table(_CAUSES, agent["causes"], title)
 
 
-# ---- Blocks of an evaluation (the document of ``uuv eval --json``): methods, and why they failed.
+# ---- Blocks of an evaluation (the document of ``uuv eval --json``): agents, and why they failed.
 
-Method = dict[str, Any]
+AgentSpec = dict[str, Any]
 
 
 def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
     """Everything that an evaluation has to show but its pictures."""
-    methods = result["methods"]
-    table = methods_table(methods, _SHOWN, data=evaluation_data(methods), swatches=_swatches(methods))
+    agents = result["agents"]
+    table = agents_table(agents, _SHOWN, data=evaluation_data(agents), swatches=_swatches(agents))
     blocks: list[Block] = [Paragraph(conditions(result)), table]
-    if methods:
-        blocks.append(_rates_figure(methods, command))
+    if agents:
+        blocks.append(_rates_figure(agents, command))
     blocks += _paired(result.get("paired", []))
-    blocks.append(Table(_PLANNING, methods, "Planning", swatches=_swatches(methods)))
-    for method in methods:
-        blocks += _causes(method)
+    blocks.append(Table(_PLANNING, agents, "Planning", swatches=_swatches(agents)))
+    for agent in agents:
+        blocks += _causes(agent)
     return blocks
 
 
 _SHOWN = (
-    "Methods. Collision counts contacts, TTC stops and episodes out of the tank; intervals are 95 % Wilson. "
+    "Agents. Collision counts contacts, TTC stops and episodes out of the tank; intervals are 95 % Wilson. "
     "Time to goal: mean over successes; TTS: mean time over success rate."
 )
 
@@ -175,15 +175,15 @@ def conditions(result: dict[str, Any]) -> str:
     speed = f", v = {result['v_m_s']} m/s" if result["D"] else ""
     seeds = ", ".join(map(str, result["seeds"]))
     return (
-        f"World {result['world']}, {bodies(result, ' static', ' dynamic obstacles')}{speed}, "
+        f"World {result['world']}, {obstacles(result, ' static', ' dynamic obstacles')}{speed}, "
         f"{vehicle(result)}{sensing(result)}; seeds {seeds}, {result['episodes_per_seed']} episodes each, "
-        "the same ones for every method."
+        "the same ones for every agent."
     )
 
 
-def _swatches(methods: list[Method]) -> list[str]:
-    names = [m["name"] for m in methods]
-    colours = method_colours(names)
+def _swatches(agents: list[AgentSpec]) -> list[str]:
+    names = [m["name"] for m in agents]
+    colours = agent_colours(names)
     return [colours[name] for name in names]
 
 
@@ -198,36 +198,36 @@ _PLAIN = (
 )
 
 
-def evaluation_data(methods: list[Method]) -> Data:
-    """Counts, rates, bounds and times of every method as numbers."""
+def evaluation_data(agents: list[AgentSpec]) -> Data:
+    """Counts, rates, bounds and times of every agent as numbers."""
     bounds = ("success_ci95_low", "success_ci95_high", "collision_ci95_low", "collision_ci95_high")
     rows = []
-    for m in methods:
+    for m in agents:
         rates = [*(m["success_ci95"] or (None, None)), *(m["collision_ci95"] or (None, None))]
-        counts = [m["outcomes"][name] for name in ENDINGS]
+        counts = [m["outcomes"][name] for name in FINAL_OUTCOMES]
         rows.append([m["name"], m["episodes"], *counts, *rates, *(m.get(name) for name in _PLAIN)])
-    return Data(["method", "episodes", *ENDINGS, *bounds, *_PLAIN], rows)
+    return Data(["agent", "episodes", *FINAL_OUTCOMES, *bounds, *_PLAIN], rows)
 
 
-def _rates_figure(methods: list[Method], command: str) -> Figure:
-    names = [m["name"] for m in methods]
-    colours = _swatches(methods)
+def _rates_figure(agents: list[AgentSpec], command: str) -> Figure:
+    names = [m["name"] for m in agents]
+    colours = _swatches(agents)
     panels = [
         intervals(
-            [_rates_line(i, m, key, colours[i]) for i, m in enumerate(methods)], names, key, "", joined=False
+            [_rates_line(i, m, key, colours[i]) for i, m in enumerate(agents)], names, key, "", joined=False
         )
         for key in ("success", "collision")
     ]
-    caption = "Success and collision of every method with 95 % Wilson intervals"
-    return Figure("methods", panels, caption, evaluation_data(methods), command)
+    caption = "Success and collision of every agent with 95 % Wilson intervals"
+    return Figure("agents", panels, caption, evaluation_data(agents), command)
 
 
-def _rates_line(place: int, method: Method, key: str, colour: str) -> Line:
-    """The one point of a method; none where it played nothing."""
-    if method[f"{key}_rate"] is None:
-        return Line(method["name"], [], [], [], [], colour=colour)
-    name, value, (low, high) = method["name"], method[f"{key}_rate"], method[f"{key}_ci95"]
-    return Line(name, [place], [value], [low], [high], [f"{name}\n{rates_text(method)}"], colour)
+def _rates_line(place: int, agent: AgentSpec, key: str, colour: str) -> Line:
+    """The one point of an agent; none where it played nothing."""
+    if agent[f"{key}_rate"] is None:
+        return Line(agent["name"], [], [], [], [], colour=colour)
+    name, value, (low, high) = agent["name"], agent[f"{key}_rate"], agent[f"{key}_ci95"]
+    return Line(name, [place], [value], [low], [high], [f"{name}\n{rates_text(agent)}"], colour)
 
 
 _PAIRED = (
@@ -245,11 +245,11 @@ _BOUNDS = "time_difference_ci95"
 
 
 def _paired(pairs: list[dict[str, Any]]) -> list[Block]:
-    """[] without two methods."""
+    """[] without two agents."""
     if not pairs:
         return []
     caption = (
-        "Pairs of methods on the same episodes: who alone arrives, with McNemar's exact p, and the mean "
+        "Pairs of agents on the same episodes: who alone arrives, with McNemar's exact p, and the mean "
         "times where both arrive, their difference with its 95 % bootstrap interval. The values of p are not "
         "adjusted for the number of pairs"
     )
@@ -262,12 +262,12 @@ def paired_data(pairs: list[dict[str, Any]]) -> Data:
     return Data([*keys, f"{_BOUNDS}_low", f"{_BOUNDS}_high"], rows)
 
 
-def _counts(method: Method, key: str, *names: str) -> str:
-    return " / ".join(str(method.get(key, {}).get(name, "-")) for name in names)
+def _counts(agent: AgentSpec, key: str, *names: str) -> str:
+    return " / ".join(str(agent.get(key, {}).get(name, "-")) for name in names)
 
 
 _PLANNING = (
-    Column("method", left=True, of=lambda m: m["name"]),
+    Column("agent", left=True, of=lambda m: m["name"]),
     Column("replans an episode", of=lambda m: number(m.get("replans_per_episode"))),
     Column(
         "initial / stuck / safety / intersection",
@@ -282,12 +282,12 @@ _PLANNING = (
 # -------------------------------------------------------------------------------------------- causes
 
 
-def _causes(method: Method) -> list[Block]:
-    if not method.get("causes"):
+def _causes(agent: AgentSpec) -> list[Block]:
+    if not agent.get("causes"):
         return []
     caption = (
-        f"Why {len(method['explain'])} of {method['episodes']} episodes of {method['name']} failed. "
+        f"Why {len(agent['explain'])} of {agent['episodes']} episodes of {agent['name']} failed. "
         "Knew: share whose forecast of the killer 1 s before the end was right; the times are medians before "
         "the end"
     )
-    return [causes_table(method, caption)]
+    return [causes_table(agent, caption)]

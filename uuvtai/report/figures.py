@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
-from uuvtai.common.colours import PALETTE, SERIES, ink_on, method_colours, on_page, shade
+from uuvtai.common.colours import PALETTE, SERIES, agent_colours, ink_on, on_page, shade
 from uuvtai.report.blocks import Hover, Panel
 from uuvtai.report.tables import HeatMap, Place, axis_name, number, percent, place_of, rate, value_name
 
@@ -178,7 +178,7 @@ class Line:
     low: Sequence[float] | None = None
     high: Sequence[float] | None = None
     said: Sequence[str] = ()
-    colour: str = ""  # '#rrggbb' of a method; none = by the order of the lines
+    colour: str = ""  # '#rrggbb' of an agent; none = by the order of the lines
 
 
 # -------------------------------------------------------------------------------------------------- heat maps
@@ -233,7 +233,7 @@ def hover_text(cell: dict[str, Any]) -> str:
 
 
 def rates_text(cell: dict[str, Any]) -> str:
-    """Rates of a cell or a method with count and interval, a line each."""
+    """Rates of a cell or an agent with count and interval, a line each."""
     n = cell["episodes"]
     rates = [
         f"{name} {rate(round(share * n), n, cell.get(f'{name}_ci95'))}"
@@ -351,7 +351,7 @@ def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]])
     def draw(axes: Axes) -> Hover:
         axes.set_xlabel("collision %")
         axes.set_ylabel("success %")
-        colours = method_colours([*(line.name for line in series), *(name for name, _, _ in marks)])
+        colours = agent_colours([*(line.name for line in series), *(name for name, _, _ in marks)])
         for line in series:
             axes.plot(
                 [100 * x for x in line.x],

@@ -108,7 +108,7 @@ def _text(value: Any) -> str:
 
 _MAX_LINES = 1_000_000
 _MOST = {
-    "methods": 200,
+    "agents": 200,
     "cells": 20_000,
     "rows": 200,
     "paper_latency": 1000,
@@ -145,7 +145,7 @@ def _refuse_many(document: dict[str, Any], path: Path) -> None:
         if isinstance(axes, dict)
         else []
     )
-    for name, entries, most in [*lists, ("axes", axes, _MOST["methods"])]:
+    for name, entries, most in [*lists, ("axes", axes, _MOST["agents"])]:
         if isinstance(entries, list | dict) and len(entries) > most:
             raise ConfigError(
                 f"{path}: {name} has {len(entries):,} entries, more than the {most:,} that a page has room "

@@ -16,7 +16,7 @@ from uuvtai.report.blocks import Block, Figure
 from uuvtai.report.build import NOTHING, command_of, damage_named, refuse_run, training_of
 from uuvtai.report.evaluation import causes_table, conditions, evaluation_data, paired_data
 from uuvtai.report.html import all_shown, read_json, shown
-from uuvtai.report.sweep import ON_HOVER, axis_column, by_method, cells_data, method_of, sweep
+from uuvtai.report.sweep import ON_HOVER, agent_of, axis_column, by_agent, cells_data, sweep
 from uuvtai.report.tables import (
     PAGE,
     Column,
@@ -36,7 +36,7 @@ from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, training
 
 _MOST_EPISODES = 6  # whose ways are drawn
-_LOG = re.compile(r"(?P<method>.+)_seed(?P<seed>-?\d+)_episode(?P<episode>\d+)")
+_LOG = re.compile(r"(?P<agent>.+)_seed(?P<seed>-?\d+)_episode(?P<episode>\d+)")
 _WORDS = 3  # of a table's title that name it
 _WILSON = "95 % Wilson intervals"
 
@@ -118,8 +118,8 @@ def _interval(m: dict[str, Any], key: str) -> str:
     )
 
 
-_METHODS = (
-    Column("method", left=True, of=lambda m: m["name"]),
+_AGENTS = (
+    Column("agent", left=True, of=lambda m: m["name"]),
     Column("n", of=lambda m: str(m["episodes"])),
     Column("success % [95 %]", of=lambda m: _interval(m, "success")),
     Column("collision % [95 %]", of=lambda m: _interval(m, "collision")),
@@ -132,43 +132,43 @@ _METHODS = (
 
 
 def _of_evaluation(result: dict[str, Any], origin: str) -> list[PaperItem]:
-    methods = result["methods"]
-    if not methods:
+    agents = result["agents"]
+    if not agents:
         return []
     scene = conditions(result)
-    privileged = [m["name"] for m in methods if m.get("privileged")]
+    privileged = [m["name"] for m in agents if m.get("privileged")]
     note = f" Told the truth, so no competitors: {', '.join(privileged)}." if privileged else ""
-    data = evaluation_data(methods)
-    n = f"n = {methods[0]['episodes']} episodes of each method"
+    data = evaluation_data(agents)
+    n = f"n = {agents[0]['episodes']} episodes of each method"
     found = [
         PaperItem(
-            "methods",
-            f"Success and collision of every method. {scene} {n}; whiskers: {_WILSON}.{note}",
+            "agents",
+            f"Success and collision of every agent. {scene} {n}; whiskers: {_WILSON}.{note}",
             origin,
             data,
-            panels=[paper_style.bars(methods, key) for key in ("success", "collision")],
+            panels=[paper_style.bars(agents, key) for key in ("success", "collision")],
         ),
         PaperItem(
-            "methods",
-            f"Methods on the same episodes. {scene} {n}; rates with {_WILSON}, collision counts contacts, "
+            "agents",
+            f"Agents on the same episodes. {scene} {n}; rates with {_WILSON}, collision counts contacts, "
             "stops for the time to collision and leaving the tank; times over successes, with 95 % bootstrap "
             f"intervals.{note}",
             origin,
             data,
-            table=Table(_METHODS, methods),
+            table=Table(_AGENTS, agents),
         ),
     ]
     found += _paired(result.get("paired", []), scene, origin)
-    return [*found, *(_causes(m, scene, origin) for m in methods if m.get("causes"))]
+    return [*found, *(_causes(m, scene, origin) for m in agents if m.get("causes"))]
 
 
-def _causes(method: dict[str, Any], scene: str, origin: str) -> PaperItem:
+def _causes(agent: dict[str, Any], scene: str, origin: str) -> PaperItem:
     caption = (
-        f"Why episodes of {method['name']} failed, judged from the truth. {scene} n = "
-        f"{len(method['explain'])} failures of {method['episodes']} episodes; shares of the failures, "
+        f"Why episodes of {agent['name']} failed, judged from the truth. {scene} n = "
+        f"{len(agent['explain'])} failures of {agent['episodes']} episodes; shares of the failures, "
         "without intervals; times are medians before the end."
     )
-    return PaperItem(f"causes_{method['name']}", caption, origin, None, table=causes_table(method, ""))
+    return PaperItem(f"causes_{agent['name']}", caption, origin, None, table=causes_table(agent, ""))
 
 
 _PAIRS = (
@@ -187,13 +187,13 @@ _PAIRS = (
 
 
 def _paired(pairs: list[dict[str, Any]], scene: str, origin: str) -> list[PaperItem]:
-    """[] without two methods."""
+    """[] without two agents."""
     if not pairs:
         return []
     adjusted = holm_adjusted([pair["mcnemar_p"] for pair in pairs])
     rows = [{**pair, "holm_p": p} for pair, p in zip(pairs, adjusted, strict=True)]
     caption = (
-        f"Pairs of methods. {scene} n = {pairs[0]['episodes']} pairs of episodes; who alone arrives, p of "
+        f"Pairs of agents. {scene} n = {pairs[0]['episodes']} pairs of episodes; who alone arrives, p of "
         f"McNemar's exact test, the same adjusted by Holm (tests: {len(pairs)}); difference in time where "
         "both arrive, with its 95 % bootstrap interval."
     )
@@ -215,7 +215,7 @@ def _of_logs(run: Path, origin: str) -> list[PaperItem]:
     for (seed, episode), logs in sorted(episodes.items())[:_MOST_EPISODES]:
         panel, said = paper_style.ways(logs)
         caption = (
-            f"Ways of {len(logs)} method{'s' if len(logs) > 1 else ''} through one episode, chosen by its "
+            f"Ways of {len(logs)} agent{'s' if len(logs) > 1 else ''} through one episode, chosen by its "
             f"number: {said}; dashed: their ways. Grey: what rests; cross: an end that is no success. "
             "n = 1 episode; no intervals."
         )
@@ -238,12 +238,12 @@ def _of_sweep(document: dict[str, Any], origin: str) -> list[PaperItem]:
     if len(varying(document["axes"])) < 2 or varies_alone(document):
         caption = f"Every cell of the sweep. World {document.get('world', '-')}; {n}, {_WILSON}."
         return [*found, PaperItem("cells", caption, origin, cells_data(cells), table=_cells(cells, document))]
-    for method, own in by_method(cells).items():
+    for agent, own in by_agent(cells).items():
         table, note = _grid(own, document)
         caption = (
-            f"{method}: success / collision [%]. World {document.get('world', '-')}; {n}{_widest(own)}.{note}"
+            f"{agent}: success / collision [%]. World {document.get('world', '-')}; {n}{_widest(own)}.{note}"
         )
-        found.append(PaperItem(f"grid_{method}", caption, origin, cells_data(own), table=table))
+        found.append(PaperItem(f"grid_{agent}", caption, origin, cells_data(own), table=table))
     return found
 
 
@@ -283,14 +283,14 @@ def _grid(own: list[dict[str, Any]], document: dict[str, Any]) -> tuple[Table, s
 
 
 def _cells(cells: list[dict[str, Any]], document: dict[str, Any]) -> Table:
-    """One row a cell: what varies, method, rates with intervals."""
+    """One row a cell: what varies, agent, rates with intervals."""
     if varies_alone(document):
         where = [Column("changed", left=True, of=lambda cell: change_name(cell, document))]
     else:
         where = [axis_column(name) for name in varying(document["axes"])]
     columns = [
         *where,
-        Column("method", left=True, of=method_of),
+        Column("agent", left=True, of=agent_of),
         Column("n", of=lambda cell: str(cell["episodes"])),
         Column("success % [95 %]", of=lambda cell: _interval(cell, "success")),
         Column("collision % [95 %]", of=lambda cell: _interval(cell, "collision")),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from uuvtai.common.colours import method_colours
+from uuvtai.common.colours import agent_colours
 from uuvtai.report.blocks import Hover, Panel
 from uuvtai.report.figures import INK, styled
 from uuvtai.report.html import shown
@@ -140,10 +140,10 @@ _MOST_IN = 4.2  # height of a tank as deep as it is long
 _RESTS, _MOVES = "#8a929b", "#d9480f"
 
 
-def bars(methods: Sequence[dict[str, Any]], key: str) -> PaperPanel:
-    """Rate ``key`` ('success', 'collision') of every method [%], with its 95 % interval."""
-    known = [m for m in methods if m.get(f"{key}_rate") is not None]
-    colours = method_colours([m["name"] for m in methods])
+def bars(agents: Sequence[dict[str, Any]], key: str) -> PaperPanel:
+    """Rate ``key`` ('success', 'collision') of every agent [%], with its 95 % interval."""
+    known = [m for m in agents if m.get(f"{key}_rate") is not None]
+    colours = agent_colours([m["name"] for m in agents])
 
     def draw(axes: Axes) -> Hover:
         for place, m in enumerate(known):
@@ -162,7 +162,7 @@ def bars(methods: Sequence[dict[str, Any]], key: str) -> PaperPanel:
 
 
 def ways(logs: Sequence[Path]) -> tuple[PaperPanel, str]:
-    """The ways of several methods through one episode, and the episode in words. Raises LogError."""
+    """The ways of several agents through one episode, and the episode in words. Raises LogError."""
     from uuvtai.logs.drawing import PICTURE_TOPICS, drawing, load_recording
     from uuvtai.logs.picture import check_same_episode
 
@@ -173,8 +173,8 @@ def ways(logs: Sequence[Path]) -> tuple[PaperPanel, str]:
         (x0, x1), (y0, y1) = scenario["tank"]["x_m"], scenario["tank"]["y_m"]
         ratio = (y1 - y0) / (x1 - x0)
         said = f"world {scenario['world']}, seed {scenario['seed']}, episode {scenario['episode']}"
-        endings = "; ".join(
-            f"{shown(one.method)}: {one.ending} after {one.duration_s:.1f} s" for one in found
+        ends = "; ".join(
+            f"{shown(one.agent)}: {one.outcome_text} after {one.duration_s:.1f} s" for one in found
         )
 
     def draw(axes: Axes) -> Hover:
@@ -185,10 +185,10 @@ def ways(logs: Sequence[Path]) -> tuple[PaperPanel, str]:
     def height(width_in: float) -> float:
         return min(0.6 + 0.15 * -(-len(found) // 3) + ratio * (width_in - 0.5), _MOST_IN)
 
-    moment = f"when {shown(found[0].method)} ends"
+    moment = f"when {shown(found[0].agent)} ends"
     return PaperPanel(
         draw, height, spans=True
-    ), f"{said}. {endings}. Moving bodies are drawn where they are {moment}"
+    ), f"{said}. {ends}. Moving obstacles are drawn where they are {moment}"
 
 
 def _draw_ways(axes: Axes, found: Sequence[Recording]) -> None:
@@ -200,12 +200,12 @@ def _draw_ways(axes: Axes, found: Sequence[Recording]) -> None:
     axes.grid(False)
     axes.set_aspect("equal")
     axes.add_patch(Polygon(tank_outline(scenario["tank"]), facecolor="none", edgecolor=INK, linewidth=1.0))
-    _draw_bodies(axes, scenario, found[0].duration_s)
-    colours = method_colours([shown(one.method) for one in found])
+    _draw_obstacles(axes, scenario, found[0].duration_s)
+    colours = agent_colours([shown(one.agent) for one in found])
     for one in found:
         at = one.positions
-        ink = colours[shown(one.method)]
-        axes.plot(at[:, 0], at[:, 1], color=ink, linewidth=1.2, label=shown(one.method))
+        ink = colours[shown(one.agent)]
+        axes.plot(at[:, 0], at[:, 1], color=ink, linewidth=1.2, label=shown(one.agent))
         end = "o" if one.outcome == "success" else "X"
         axes.plot([at[-1, 0]], [at[-1, 1]], color=ink, marker=end, markersize=4.5, linestyle="none")
     start, goal = scenario["start"], scenario["goal"]
@@ -222,20 +222,20 @@ def _draw_ways(axes: Axes, found: Sequence[Recording]) -> None:
     )  # fmt: skip
 
 
-def _draw_bodies(axes: Axes, scenario: dict[str, Any], time_s: float) -> None:
-    """What rests, filled; what moves, as an outline where it is when the first method ends, on its path."""
+def _draw_obstacles(axes: Axes, scenario: dict[str, Any], time_s: float) -> None:
+    """What rests, filled; what moves, as an outline where it is when the first agent ends, on its path."""
     import numpy as np
     from matplotlib.patches import Polygon
 
-    from uuvtai.common.obstacle_motion import body_positions
-    from uuvtai.logs.drawing import body_outline
+    from uuvtai.common.obstacle_motion import obstacle_positions
+    from uuvtai.logs.drawing import obstacle_outline
 
-    for body in scenario["bodies"]:
-        outline = body_outline(body, body_positions(body, np.array([time_s]))[0])
-        if body["path"] is None:
+    for obstacle in scenario["obstacles"]:
+        outline = obstacle_outline(obstacle, obstacle_positions(obstacle, np.array([time_s]))[0])
+        if obstacle["path"] is None:
             axes.add_patch(Polygon(outline, facecolor=_RESTS, edgecolor="none"))
             continue
-        period = body["path"]["length_m"] / max(body["path"]["speed_m_s"], 1e-6)
-        way = body_positions(body, np.linspace(0, period, 181))
+        period = obstacle["path"]["length_m"] / max(obstacle["path"]["speed_m_s"], 1e-6)
+        way = obstacle_positions(obstacle, np.linspace(0, period, 181))
         axes.plot(way[:, 0], way[:, 1], color=_MOVES, linewidth=0.5, linestyle=(0, (3, 2)), alpha=0.45)
         axes.add_patch(Polygon(outline, facecolor="none", edgecolor=_MOVES, linewidth=0.8))

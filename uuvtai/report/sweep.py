@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from uuvtai.common.colours import method_colours
-from uuvtai.common.enums import ENDINGS
+from uuvtai.common.colours import agent_colours
+from uuvtai.common.enums import FINAL_OUTCOMES
 from uuvtai.report.blocks import Block, Figure, Notice, Paragraph
 from uuvtai.report.evaluation import COLLISION, ENDS, SUCCESS, TIME, TTS
 from uuvtai.report.figures import Line, heat_map, hover_text, intervals
@@ -36,12 +36,12 @@ _SCENE = {"S": "S", "D": "D", "v": "v_m_s"}
 
 def cell_table(cells: list[MapCell], document: dict[str, Any], title: str, **page: Any) -> Table:
     """One row a cell: where it stands, rates with counts and intervals, how the rest ended, times."""
-    method = Column("method", left=True, of=method_of)
+    agent = Column("agent", left=True, of=agent_of)
     columns = [
-        replace(method, only=PAGE),
+        replace(agent, only=PAGE),
         *(axis_column(name) for name in axes_of_cells(cells)),
         *_place(document),
-        replace(method, only=TERMINAL),
+        replace(agent, only=TERMINAL),
         SUCCESS,
         COLLISION,
         replace(ENDS, only=PAGE),
@@ -51,8 +51,8 @@ def cell_table(cells: list[MapCell], document: dict[str, Any], title: str, **pag
     return Table(columns, cells, title, **page)
 
 
-def method_of(cell: MapCell) -> str:
-    return str(cell.get("method", "policy"))
+def agent_of(cell: MapCell) -> str:
+    return str(cell.get("agent", "policy"))
 
 
 def axes_of_cells(cells: list[MapCell]) -> list[str]:
@@ -122,26 +122,26 @@ def _each_axis(document: dict[str, Any], command: str) -> list[Block]:
 
 
 def _maps(document: dict[str, Any], command: str) -> list[Block]:
-    """Two heat maps a method, like the paper's figure."""
+    """Two heat maps an agent, like the paper's figure."""
     cells, axes = document["cells"], document["axes"]
     blocks: list[Block] = []
-    for method, own in by_method(cells).items():
+    for agent, own in by_agent(cells).items():
         chosen = pivot(own, axes)
-        panels = [heat_map(chosen, f"{key}_rate", f"{method}: {key}") for key in ("collision", "success")]
+        panels = [heat_map(chosen, f"{key}_rate", f"{agent}: {key}") for key in ("collision", "success")]
         caption = (
-            f"{method}: collision (left) and success (right) in per cent of the episodes, below each the "
+            f"{agent}: collision (left) and success (right) in per cent of the episodes, below each the "
             "mean time of the successes. Bright is good in both. A cell that spans the row does not depend "
             f"on the column. {ON_HOVER}"
         )
         blocks += [
-            Figure(f"heat_map_{method}", panels, caption, cells_data(own), command),
-            _cells(own, document, f"Every cell of {method}"),
+            Figure(f"heat_map_{agent}", panels, caption, cells_data(own), command),
+            _cells(own, document, f"Every cell of {agent}"),
         ]
     return blocks
 
 
 def _curves(document: dict[str, Any], command: str) -> list[Block]:
-    """Success and collision along the one axis that varies, every method a line."""
+    """Success and collision along the one axis that varies, every agent a line."""
     cells, axes = document["cells"], document["axes"]
     named = varying(axes)
     axis = named[0] if named else next(iter(axes), "")
@@ -155,11 +155,11 @@ def _curves(document: dict[str, Any], command: str) -> list[Block]:
 def _axis_figure(
     cells: list[MapCell], axis: str, places: list[Any], names: list[str], command: str
 ) -> Figure:
-    own = by_method(cells)
-    colours = method_colours(list(own))
+    own = by_agent(cells)
+    colours = agent_colours(list(own))
     panels = [
         intervals(
-            [_line(method, own[method], key, axis, places, colours[method]) for method in own],
+            [_line(agent, own[agent], key, axis, places, colours[agent]) for agent in own],
             names,
             key,
             axis_name(axis),
@@ -170,13 +170,13 @@ def _axis_figure(
     return Figure(f"sweep_{axis}", panels, caption, cells_data(cells), command)
 
 
-def _line(method: str, own: list[MapCell], key: str, axis: str, places: list[Any], colour: str) -> Line:
+def _line(agent: str, own: list[MapCell], key: str, axis: str, places: list[Any], colour: str) -> Line:
     known = [cell for cell in own if cell.get(f"{key}_rate") is not None]
     bounds = [cell.get(f"{key}_ci95") or [cell[f"{key}_rate"]] * 2 for cell in known]
     x = [places.index(cell.get(axis)) for cell in known]
-    said = [f"{method}, {hover_text(cell)}" for cell in known]
+    said = [f"{agent}, {hover_text(cell)}" for cell in known]
     return Line(
-        method,
+        agent,
         x,
         [cell[f"{key}_rate"] for cell in known],
         [low for low, _ in bounds],
@@ -186,17 +186,17 @@ def _line(method: str, own: list[MapCell], key: str, axis: str, places: list[Any
     )
 
 
-def by_method(cells: list[MapCell]) -> dict[str, list[MapCell]]:
-    """Cells of each method, in the order in which they come."""
+def by_agent(cells: list[MapCell]) -> dict[str, list[MapCell]]:
+    """Cells of each agent, in the order in which they come."""
     found: dict[str, list[MapCell]] = {}
     for cell in cells:
-        found.setdefault(method_of(cell), []).append(cell)
+        found.setdefault(agent_of(cell), []).append(cell)
     return found
 
 
 def _cells(cells: list[MapCell], document: dict[str, Any], caption: str) -> Table:
-    colours = method_colours(list(by_method(cells)))
-    swatches = [colours[method_of(cell)] for cell in cells]
+    colours = agent_colours(list(by_agent(cells)))
+    swatches = [colours[agent_of(cell)] for cell in cells]
     return cell_table(cells, document, caption, folded=True, swatches=swatches)
 
 
@@ -204,7 +204,8 @@ def cells_data(cells: list[MapCell]) -> Data:
     axes = axes_of_cells(cells)
     bounds = [f"{key}_ci95_{end}" for key in ("success", "collision") for end in ("low", "high")]
     return Data(
-        ["method", *axes, "episodes", *ENDINGS, *bounds, *_NUMBERS], [_numbers(cell, axes) for cell in cells]
+        ["agent", *axes, "episodes", *FINAL_OUTCOMES, *bounds, *_NUMBERS],
+        [_numbers(cell, axes) for cell in cells],
     )
 
 
@@ -213,5 +214,10 @@ def _numbers(cell: MapCell, axes: list[str]) -> list[Any]:
     bounds = [
         bound for key in ("success", "collision") for bound in (cell.get(f"{key}_ci95") or (None, None))
     ]
-    head = [cell.get("method"), *(cell.get(name) for name in axes), cell["episodes"]]
-    return [*head, *(outcomes.get(name) for name in ENDINGS), *bounds, *(cell.get(name) for name in _NUMBERS)]
+    head = [cell.get("agent"), *(cell.get(name) for name in axes), cell["episodes"]]
+    return [
+        *head,
+        *(outcomes.get(name) for name in FINAL_OUTCOMES),
+        *bounds,
+        *(cell.get(name) for name in _NUMBERS),
+    ]

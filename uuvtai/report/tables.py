@@ -72,7 +72,7 @@ class Table:
     data: Data | None = None  # the same as numbers, for download
     folded: bool = False  # long: shown when asked for
     swatches: Sequence[str] = ()
-    """colour of each row, '#rrggbb': the one that its method has in the figures; none = no colours"""
+    """colour of each row, '#rrggbb': the one that its agent has in the figures; none = no colours"""
 
     def on(self, medium: str) -> tuple[list[Column], list[list[str | Cell]]]:
         """Columns that TERMINAL or PAGE shows, and the cells of each row in them."""
@@ -132,7 +132,7 @@ def sensing(result: Mapping[str, Any]) -> str:
     return f"{result['sensors']} sensing" + (f", {where}" if where else "")
 
 
-def bodies(result: Mapping[str, Any], resting: str = "", moving: str = "") -> str:
+def obstacles(result: Mapping[str, Any], resting: str = "", moving: str = "") -> str:
     """'S = 11 (3 fixed), D = 6' of a result, or of a world; old versions did not count the fixed ones."""
     told = []
     for name, fixed, kind in (("S", "fixed_static", resting), ("D", "fixed_moving", moving)):
@@ -203,7 +203,7 @@ def cell_name(axis: str) -> str:
 
 
 _RESULTS = {
-    "method", "episodes", "outcomes", "k", "n", "success_rate", "success_ci95", "collision_rate",
+    "agent", "episodes", "outcomes", "k", "n", "success_rate", "success_ci95", "collision_rate",
     "collision_ci95", "time_mean_s",
     "tts_s", "time_to_success_mean_s", "return_mean", "env_steps", "wall_s", "env_steps_per_s",
     "min_clearance_mean_m",
@@ -310,7 +310,7 @@ def _refuse_doubles(places: tuple[Place, ...]) -> None:
     for place in places:
         spots = {(place.row, column) for column in range(place.first, place.first + place.n_columns)}
         if spots & taken:
-            raise SettingError(f"two cells of one method stand in the same place: {place.cell}")
+            raise SettingError(f"two cells of one agent stand in the same place: {place.cell}")
         taken |= spots
 
 

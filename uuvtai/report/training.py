@@ -1,4 +1,4 @@
-"""Blocks of trainings: reward, success, losses; seeds of one method as a mean line with a band."""
+"""Blocks of trainings: reward, success, losses; seeds of one agent as a mean line with a band."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from uuvtai.common.colours import method_colours
+from uuvtai.common.colours import agent_colours
 from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.loader import parsed_yaml
 from uuvtai.report.blocks import Block, Figure, Paragraph
@@ -40,7 +40,7 @@ class Training:
 
 
 @dataclass(frozen=True)
-class MethodRuns:
+class AgentRuns:
     """Trainings that differ in their seed only."""
 
     name: str
@@ -48,12 +48,12 @@ class MethodRuns:
 
 
 def training(runs: Sequence[Training], command: str = "") -> list[Block]:
-    """Curves of these trainings, grouped into methods, and where each ended."""
-    methods = grouped([run for run in runs if run.metrics])
-    colours = method_colours([method.name for method in methods])
+    """Curves of these trainings, grouped into agents, and where each ended."""
+    agents = grouped([run for run in runs if run.metrics])
+    colours = agent_colours([agent.name for agent in agents])
     panels, rows = [], []
     for key, title, share in PANELS:
-        lines = [line for method in methods if (line := _line(method, key, colours[method.name])) is not None]
+        lines = [line for agent in agents if (line := _line(agent, key, colours[agent.name])) is not None]
         if lines:
             panels.append(curves(lines, title, "million env-steps", share))
             rows += [
@@ -63,30 +63,29 @@ def training(runs: Sequence[Training], command: str = "") -> list[Block]:
             ]
     if not panels:
         return [Paragraph("No iteration was recorded.")]
-    data = Data(["method", "metric", "million_env_steps", "mean", "lowest", "highest"], rows)
+    data = Data(["agent", "metric", "million_env_steps", "mean", "lowest", "highest"], rows)
     seeds = (
         "the line is the mean over seeds, the band reaches from the lowest to the highest seed; "
-        if any(len(method.runs) > 1 for method in methods)
+        if any(len(agent.runs) > 1 for agent in agents)
         else ""
     )
     caption = (
         f"Training curves: {seeds}shares and rewards over the episodes that ended last, as the trainer "
         "records them"
     )
-    return [Figure("training", panels, caption, data, command), _last_table(methods)]
+    return [Figure("training", panels, caption, data, command), _last_table(agents)]
 
 
-def grouped(runs: Sequence[Training]) -> list[MethodRuns]:
-    """Trainings with the same config but for the seed are one method, named by their preset or folder."""
+def grouped(runs: Sequence[Training]) -> list[AgentRuns]:
+    """Trainings with the same config but for the seed are one agent, named by their preset or folder."""
     by_config: dict[str, list[Training]] = {}
     for run in runs:
         by_config.setdefault(_without_seed(run), []).append(run)
     groups = list(by_config.values())
-    names = [_method_name(group) for group in groups]
+    names = [_agent_name(group) for group in groups]
     unique = len(set(names)) == len(names)
     return [
-        MethodRuns(name if unique else group[0].name, group)
-        for name, group in zip(names, groups, strict=True)
+        AgentRuns(name if unique else group[0].name, group) for name, group in zip(names, groups, strict=True)
     ]
 
 
@@ -112,24 +111,24 @@ def _section(config: dict[str, Any]) -> dict[str, Any]:
     return train if isinstance(train, dict) else {}
 
 
-def _method_name(group: Sequence[Training]) -> str:
+def _agent_name(group: Sequence[Training]) -> str:
     """The preset, or the first folder's name, for several seeds without its number."""
     name = group[0].name
     return group[0].preset or (name.rstrip("_-0123456789") if len(group) > 1 else "") or name
 
 
-def _line(method: MethodRuns, key: str, colour: str) -> Line | None:
+def _line(agent: AgentRuns, key: str, colour: str) -> Line | None:
     """Mean over the seeds at the iterations that all of them have; None where the metric is missing."""
     by_iteration = [
         {row["iteration"]: row for row in run.metrics if _is_number(row.get(key)) and _STEPS in row}
-        for run in method.runs
+        for run in agent.runs
     ]
     common = sorted(set.intersection(*(set(rows) for rows in by_iteration)))
     if not common:
         return None
     values = [[rows[i][key] for rows in by_iteration] for i in common]
     x = [by_iteration[0][i][_STEPS] / 1e6 for i in common]
-    name = f"{method.name} ({len(values[0])} seeds)" if len(values[0]) > 1 else method.name
+    name = f"{agent.name} ({len(values[0])} seeds)" if len(values[0]) > 1 else agent.name
     band = ([min(v) for v in values], [max(v) for v in values]) if len(values[0]) > 1 else (None, None)
     return Line(name, x, [sum(v) / len(v) for v in values], *band, colour=colour)
 
@@ -166,10 +165,10 @@ _LAST = (
 )
 
 
-def _last_table(methods: Sequence[MethodRuns]) -> Table:
-    colours = method_colours([method.name for method in methods])
-    swatches = [colours[method.name] for method in methods for _ in method.runs]
-    runs = [run for method in methods for run in method.runs]
+def _last_table(agents: Sequence[AgentRuns]) -> Table:
+    colours = agent_colours([agent.name for agent in agents])
+    swatches = [colours[agent.name] for agent in agents for _ in agent.runs]
+    runs = [run for agent in agents for run in agent.runs]
     return Table(
         _LAST, runs, "Where each training ended: the record of its last iteration", swatches=swatches
     )

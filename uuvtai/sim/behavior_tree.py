@@ -112,7 +112,7 @@ def _described(stack: list[Element]) -> bool:
 
 
 UNSET = -1.0
-"""Value of a port that is not given: the leaf takes the number of the config's teacher section."""
+"""Value of a port that is not given: the leaf takes the number of the config's ``behavior`` section."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def load_tree(table: TreeTable, tree: FlatTree, put: Put | None = None) -> None:
     n, capacity = len(tree.kind), table.kind.shape[0]
     if n > capacity:
         raise TreeError(
-            f"{tree.source}: {n} nodes do not fit the {capacity} that were allocated (teacher.max_node)"
+            f"{tree.source}: {n} nodes do not fit the {capacity} that were allocated (behavior.max_node)"
         )
     for array, values in (
         (table.kind, tree.kind),
@@ -260,7 +260,7 @@ class _Flattener:
             return
         here = len(self.rows)
         if here >= self.max_node:
-            self._fail(element, f"the tree has more than {self.max_node} nodes (teacher.max_node)")
+            self._fail(element, f"the tree has more than {self.max_node} nodes (behavior.max_node)")
         self.rows.append(self._row(element, kind_name, attributes))
         self.parent.append(parent)
         self.end.append(0)

@@ -18,10 +18,10 @@ if TYPE_CHECKING:  # a forecast is learnt without Taichi
     from uuvtai.compile.memory import Put
     from uuvtai.state import MixtureState
 
-SHIPPED = "shipped"
+BUILT_IN = "built-in"
 """name of the network that comes with the package"""
 WEIGHTS = "forecast.safetensors"
-"""file of a run folder, and of what is shipped"""
+"""file of a run folder, and of what is built in"""
 SHAPES = {
     "bias_in": (N_HIDDEN,), "weight_in": (N_COLUMN, N_HIDDEN),
     "bias_mid": (N_HIDDEN,), "weight_mid": (N_HIDDEN, N_HIDDEN),
@@ -39,8 +39,8 @@ class ForecastError(UserError, ValueError):
 
 
 def weights_file(learned: str) -> Path:
-    """The file that ``forecast.learned`` names: the shipped one, that of a run folder, or a file itself."""
-    if learned == SHIPPED:
+    """The file that ``forecast.learned`` names: the built-in one, that of a run folder, or a file itself."""
+    if learned == BUILT_IN:
         return PRESET_DIR / "forecast" / WEIGHTS
     path = Path(learned)
     return path / WEIGHTS if path.is_dir() else path
@@ -54,7 +54,7 @@ def read_weights(learned: str) -> Weights:
     except FileNotFoundError:
         raise ForecastError(
             f"forecast.learned={learned}: there is no {path}; train a forecast (uuv train forecast --run-dir "
-            "runs/forecast), or take the one that is shipped: forecast.learned=shipped"
+            "runs/forecast), or take the one that is built in: forecast.learned=built-in"
         ) from None
     except (SafetensorError, ValueError, KeyError) as error:
         raise ForecastError(f"{path}: is no safetensors file ({error}); take another one") from None
@@ -64,7 +64,7 @@ def read_weights(learned: str) -> Weights:
             what = "missing" if own is None else f"{own.dtype} {list(own.shape)}"
             raise ForecastError(
                 f"{path}: {name} is {what}, not float32 {list(shape)}: it was not made by this version's "
-                "'uuv train forecast'; train anew or take forecast.learned=shipped"
+                "'uuv train forecast'; train anew or take forecast.learned=built-in"
             )
         if not np.isfinite(own).all():
             raise ForecastError(f"{path}: {name} is not finite: the training failed; take an older file")

@@ -78,8 +78,8 @@ class Plant:
     def reset(self, keys: np.ndarray | None = None) -> None:
         """All vehicles at rest at the origin; ``keys`` (n_env) are the episodes' random keys (default: 0, 1,
         2, ..)."""
+        self.write(self.clock.running, 1)
         self.write(self.clock.active, 1)
-        self.write(self.clock.awake, 1)
         self._set_time(0)
         self.write(self.episode.key, np.arange(self.n_env) if keys is None else keys)
         dynamics.reset_vehicle(self.dynamics_io)

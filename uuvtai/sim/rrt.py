@@ -230,8 +230,8 @@ class PlanRequest(NamedTuple):
     """(2,) own position"""
     goal: np.ndarray
     """(2,)"""
-    body: np.ndarray
-    """(B, K, 2) where the moving bodies are expected"""
+    obstacle: np.ndarray
+    """(B, K, 2) where the moving obstacles are expected"""
     radius_m: np.ndarray
     """(B, K) their radii with what the uncertainty adds"""
 
@@ -308,7 +308,7 @@ class RouteFallback:
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 
         ends = [read(field, envs)[:, :2] - self.origin for field in (io.ego.pos_w, io.mission.goal_w)]
-        bodies, radius = (
+        obstacles, radius = (
             read(f, envs) for f in (stages.triggers.forecast.pos_w, stages.triggers.forecast.radius_m)
         )
         for i, env in enumerate(envs):
@@ -319,7 +319,7 @@ class RouteFallback:
                 self.overlay.copy(),
                 ends[0][i],
                 ends[1][i],
-                bodies[i, moves] - self.origin,
+                obstacles[i, moves] - self.origin,
                 radius[i, moves],
             )
             corners = planner.plan(asked)

@@ -127,9 +127,9 @@ class SceneError(UserError, RuntimeError):
 
 
 @dataclass(frozen=True)
-class BodySlots:
-    """Layout of a body list: explicit obstacles at rest, random static ones, explicit moving ones, random
-    moving ones."""
+class ObstacleSlots:
+    """Layout of an obstacle list: explicit obstacles at rest, random static ones, explicit moving ones,
+    random moving ones."""
 
     n_fixed_static: int
     n_static: int
@@ -146,22 +146,22 @@ class BodySlots:
         return self.n_fixed_static + self.n_static
 
     @property
-    def n_body(self) -> int:
+    def n_obstacle(self) -> int:
         return self.first_dynamic + self.n_dynamic
 
 
-def body_slots(world_cfg: WorldConfig) -> BodySlots:
+def obstacle_slots(world_cfg: WorldConfig) -> ObstacleSlots:
     """Slots of every env's body list."""
-    return BodySlots(
+    return ObstacleSlots(
         world_cfg.n_fixed_static, world_cfg.static_slots, world_cfg.n_fixed_moving, world_cfg.dynamic_slots
     )
 
 
 def scenario_sizes(world_cfg: WorldConfig) -> dict[str, int]:
     """Lengths of the array axes that the world decides."""
-    slots, tank = body_slots(world_cfg), world_cfg.tank
+    slots, tank = obstacle_slots(world_cfg), world_cfg.tank
     return {
-        "n_body": slots.n_body,
+        "n_obstacle": slots.n_obstacle,
         "n_dynamic": slots.n_dynamic,
         "n_fixed": max(1, len(world_cfg.fixed)),
         "n_corner": N_CORNER,
@@ -326,7 +326,7 @@ def arrays_for(config: Config, sizes: dict[str, int], device: torch.device) -> A
             return found
     s = found.s if found else allocate_state(sizes)
     io = bind_all(Stages, s, config.model_copy(update={"world": config.world.compiled()}))
-    anchor = s.clock.active
+    anchor = s.clock.running
     memory = found.memory if found else Memory(s, anchor, address_of(anchor, device), device)
     return Arrays((device.type, sizes), settings, s, io, memory)
 
@@ -393,9 +393,9 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_trigger": N_TRIGGER,
         "n_planner": N_PLANNER,
         "n_reason": N_REASON,
-        "n_sector": config.features.n_sector,
-        "n_node": config.teacher.max_node,
-        "n_candidate": config.teacher.n_candidate,
+        "n_sector": config.observation.n_sector,
+        "n_node": config.behavior.max_node,
+        "n_candidate": config.behavior.n_candidate,
         "n_tuned": len(TUNED),
         "n_trial": config.baselines.n_trial,
         "n_control": _n_control(config),
@@ -523,7 +523,7 @@ class HostCounts:
     """A simulator's numbers for the host, with as few waits for a GPU as can be."""
 
     def __init__(self, memory: Memory, outcome: ti.Field, num_envs: int) -> None:
-        """``outcome``: the referee's, a code of ``outcomes`` a row."""
+        """``outcome``: the termination check's, a code of ``outcomes`` a row."""
         self._memory, self._outcome, self._num_envs = memory, outcome, num_envs
         self.any_ended: int | None = None
         """not 0 where an episode had ended, or rested, at the last ``number``; None: nobody has looked"""

@@ -1,8 +1,9 @@
 """The simulator: allocates every struct and runs the stages in order. ``Sim.step`` is the page to read first.
 
-Data goes one way: action -> actuation -> dynamics -> world -> referee -> sensing -> pose -> tracking ->
-mapping -> clearance -> planning -> teacher -> features -> reward. A pass works on the rows whose
-``clock.awake`` is 1: all running rows in a step, only the rows being reset in a reset.
+Data goes one way: action -> actuation -> dynamics -> world -> termination check -> sensing -> pose ->
+tracking -> mapping -> clearance -> planning -> behaviour tree -> observation -> reward. A pass works on the
+rows whose
+``clock.active`` is 1: all running rows in a step, only the rows being reset in a reset.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Sim:
 
     ``action`` is a torch tensor (n_env, 4) in [-1, 1] on the simulator's device: the behaviour tree writes
     its choice there, the next ``step`` reads it; overwrite it to drive otherwise. ``observation`` is None
-    until somebody asks by ``observe``. ``privileged`` (a yardstick): the tracks of moving bodies are the
+    until somebody asks by ``observe``. ``privileged`` (an oracle): the tracks of moving obstacles are the
     truth. ``planner``: plans the routes on the host in place of the simulator's own planners; None: nobody.
     ``sensors``: fills what the stack senses, in a new simulator its own kernels.
     """
@@ -73,7 +74,7 @@ class Sim:
         self.privileged = False
         self.put = self._memory.put
         self._speeds = self._memory.live(self.s.vehicle.vel_b) if self.device.type == "cpu" else None
-        self.counts = HostCounts(self._memory, self.s.referee.outcome, num_envs)
+        self.counts = HostCounts(self._memory, self.s.termination.outcome, num_envs)
         self._rows = Rows() if config.runtime.native and self.device.type == "cpu" else None
         if self._rows:
             adopt(vars(self.io).values(), self._memory, self._recipe, alone=num_envs == 1)
@@ -92,9 +93,9 @@ class Sim:
         set_scenes(self.s.scene, self.config.world, scenes, self.put)
 
     def observe(self) -> torch.Tensor:
-        """(n_env, n_obs), from the next pass on written for every awake row (``features.columns``)."""
+        """(n_env, n_obs), from the next pass on written for every active row (``observation.columns``)."""
         if self.observation is None:
-            width = observation.observation_width(self.config.features)
+            width = observation.observation_width(self.config.observation)
             self.observation = torch.zeros(self.num_envs, width, device=self.device)
         return self.observation
 
@@ -127,12 +128,12 @@ class Sim:
         with self._stage("world"):
             episode.advance_clock(io.episode)
             scenario.move_obstacles(io.world)
-            episode.judge(io.episode)
+            episode.check_termination(io.episode)
 
     def perceive(self) -> None:
-        """Sensing to teacher for the rows that are awake.
+        """Sensing to behaviour tree for the rows that are active.
 
-        Behind ``sensors`` only yardsticks read the truth, and only the fallback planner draws random numbers
+        Behind ``sensors`` only oracles read the truth, and only the fallback planner draws random numbers
         by the episode's key (``_plan_seed``): the same readings give the same commands
         (``uuvtai.vehicle.onboard``).
         """
@@ -143,14 +144,14 @@ class Sim:
                 proprioception.find_velocity(io.velocity)
         estimated = c.sensors.localization == "estimated"
         if estimated:
-            with self._stage("pose"):
-                localization.predict_pose(io.pose)
+            with self._stage("localization"):
+                localization.predict_pose(io.localization)
         with self._stage("sonar"):
             self.sensors.sense_sonar(io)
             stack.recall(io, c)
-        if estimated and c.pose.use_walls:
-            with self._stage("pose"):
-                localization.correct_pose(io.pose)
+        if estimated and c.localization.use_walls:
+            with self._stage("localization"):
+                localization.correct_pose(io.localization)
         with self._stage("depth"):
             self.sensors.sense_depth(io)
         self._launched(self._see)
@@ -173,11 +174,11 @@ class Sim:
         io, c = self.io, self.config
         with self._stage("planning"):
             route.follow_route(io.route)
-        with self._stage("teacher"):
+        with self._stage("behavior"):
             stack.choose(io, self.tree.leaf, self.action)
         if self.observation is not None:
-            with self._stage("features"):
-                stack.observe(io, c.features, self.observation)
+            with self._stage("observation"):
+                stack.observe(io, c.observation, self.observation)
 
     def _launched(self, work: Callable[[], None]) -> None:
         """Do ``work``, which is nothing but launches; by what ``decides`` about them they are known again."""
@@ -197,7 +198,7 @@ class Sim:
         control.reset_actuation(io.actuation)
         stack.forget(io, self.config)
         reward.reset_reward(io.reward)
-        episode.reset_referee(io.episode)
+        episode.reset_termination(io.episode)
         self.perceive()
         episode.wake(io.episode)
 
@@ -212,14 +213,14 @@ class Sim:
         if self.counts.has_any(self.s.world.faults, mask):
             check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
 
-    def sleep_ended(self) -> None:
+    def deactivate_ended(self) -> None:
         """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""
-        episode.sleep_ended(self.io.episode)
+        episode.deactivate_ended(self.io.episode)
 
     def sleep(self) -> None:
         """Put every row to sleep, as in a new simulator."""
+        self.s.clock.running.fill(0)
         self.s.clock.active.fill(0)
-        self.s.clock.awake.fill(0)
 
     def _plan_seed(self, env: int) -> int:
         """Seed of the fallback planner's random numbers: a function of the episode's key and step alone."""
@@ -238,7 +239,9 @@ class Sim:
 
     def memory(self) -> Memory:
         """Where every array lies, when all kernels are done: for a capture."""
-        return Memory(self.s, self.s.clock.active, address_of(self.s.clock.active, self.device), self.device)
+        return Memory(
+            self.s, self.s.clock.running, address_of(self.s.clock.running, self.device), self.device
+        )
 
     def _stage(self, name: str) -> AbstractContextManager[None]:
         return timed_stage(name, self.stage_s)

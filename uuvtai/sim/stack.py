@@ -1,7 +1,7 @@
 """The navigation stack's stages that are more than one kernel, each a short list; ``Sim.perceive`` runs them
 in order, and ``forget`` empties their memory.
 
-Nothing here reads the truth but the yardsticks, ``true_map`` and ``true_tracks``.
+Nothing here reads the truth but the oracles, ``true_map`` and ``true_tracks``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import taichi as ti
 import torch
 
 from uuvtai.common import tree_codes as codes
-from uuvtai.config import Config, FeaturesConfig, SensorsConfig
+from uuvtai.config import Config, ObservationConfig, SensorsConfig
 from uuvtai.kernels.baselines import dwa, mppi, potential_field, velocity_obstacle
 from uuvtai.kernels.behavior import avoidance, threats, tree
 from uuvtai.kernels.oracle import true_state
@@ -38,7 +38,7 @@ from uuvtai.state import BaselineState
 
 
 class SensorSource(Protocol):
-    """Fills readings of the awake rows, in this order in every control step."""
+    """Fills readings of the active rows, in this order in every control step."""
 
     loses_velocity: bool
     """the DVL may be silent where no filter estimates the velocity: then ``find_velocity`` runs"""
@@ -84,7 +84,7 @@ class SimulatedSensors:
 
 
 def forget_readings(stages: Stages) -> None:
-    """No reading yet in the rows that are awake, whoever fills them."""
+    """No reading yet in the rows that are active, whoever fills them."""
     proprioception.reset_proprioception(stages.proprioception)
     sonar.reset_sonar(stages.sonar)
     depth_camera.reset_depth(stages.depth)
@@ -100,17 +100,17 @@ def recall(stages: Stages, config: Config) -> None:
 
 
 def track(stages: Stages, config: Config, privileged: bool) -> None:
-    """Moving bodies: where they are, how they turn, where they will be, how high they are."""
+    """Moving obstacles: where they are, how they turn, where they will be, how high they are."""
     if privileged:
         true_state.take_true_tracks(stages.true_tracks)
     else:
-        tracking.track_bodies(stages.tracking)
-        if config.spotting.use_camera:  # where the fan misses a body
-            camera_tracking.scan_columns(stages.spotting)
-            camera_tracking.follow_spots(stages.spotting)
-        if config.elevation.use_camera:  # where the fan does not show how high it is
-            camera_tracking.look_at_bodies(stages.look)
-    prediction.learn_habits(stages.forecast)
+        tracking.track_obstacles(stages.tracking)
+        if config.camera_tracking.use_camera:  # where the fan misses an obstacle
+            camera_tracking.scan_columns(stages.camera_tracking)
+            camera_tracking.follow_spots(stages.camera_tracking)
+        if config.height.use_camera:  # where the fan does not show how high it is
+            camera_tracking.look_at_obstacles(stages.look)
+    prediction.learn_turns(stages.forecast)
     prediction.forecast_tracks(stages.forecast)
     if config.forecast.learned or config.forecast.keep_columns:
         prediction_network.remember_past(stages.past)
@@ -140,7 +140,7 @@ def choose(stages: Stages, used: Collection[int], action: torch.Tensor) -> None:
     avoidance.plan_evasion(stages.evasion)
     if _has_baseline(used):
         _plan_by_baseline(stages, used)
-    tree.tick_tree(stages.teacher, action)
+    tree.tick_tree(stages.behavior, action)
 
 
 def clear_baselines(
@@ -167,27 +167,27 @@ def _plan_by_baseline(stages: Stages, used: Collection[int]) -> None:
         mppi.plan_path_integral(stages.path_integral)
 
 
-def observe(stages: Stages, features_cfg: FeaturesConfig, out: torch.Tensor) -> None:
+def observe(stages: Stages, observation_cfg: ObservationConfig, out: torch.Tensor) -> None:
     """What the policy reads, into ``out`` (n_env, n_obs)."""
-    observation.sense_sectors(stages.features)
-    observation.write_observation(stages.features, out)
-    if features_cfg.n_track > 0:
-        observation.write_bodies(stages.features, out)
-    if features_cfg.teacher:
-        observation.write_advice(stages.features, out)
+    observation.sense_sectors(stages.observation)
+    observation.write_observation(stages.observation, out)
+    if observation_cfg.n_track > 0:
+        observation.write_obstacles(stages.observation, out)
+    if observation_cfg.behavior:
+        observation.write_advice(stages.observation, out)
 
 
 def forget(stages: Stages, config: Config) -> None:
-    """Empty readings and memory of the stack in the rows that are awake."""
+    """Empty readings and memory of the stack in the rows that are active."""
     forget_readings(stages)
     if config.sensors.sonar.mechanical:
         sensor_model.reset_echoes(stages.echoes)
     if config.sensors.localization == "estimated":
-        localization.reset_pose(stages.pose)
+        localization.reset_pose(stages.localization)
     tracking.reset_tracks(stages.tracking)
     prediction.reset_forecast(stages.forecast)
     if config.forecast.learned or config.forecast.keep_columns:
         prediction_network.reset_past(stages.past)
     mapping.reset_map(stages.mapping)
     route.reset_route(stages.route)
-    tree.reset_teacher(stages.teacher)
+    tree.reset_behavior(stages.behavior)

@@ -15,15 +15,15 @@ import taichi as ti
 
 from uuvtai.config import Section
 from uuvtai.kernels.baselines.io import BaselineStages
-from uuvtai.kernels.behavior.io import TeacherStages
-from uuvtai.kernels.oracle.io import PrivilegedStages
+from uuvtai.kernels.behavior.io import BehaviorStages
+from uuvtai.kernels.oracle.io import OracleStages
 from uuvtai.kernels.perception.io import PerceptionStages
 from uuvtai.kernels.planning.io import PlanningStages
 from uuvtai.kernels.sensors.io import SensorStages
 from uuvtai.kernels.task.io import TaskStages
 from uuvtai.kernels.vehicle.io import VehicleStages
 from uuvtai.kernels.world.io import WorldStages
-from uuvtai.state.behavior import BaselineStructs, TeacherStructs
+from uuvtai.state.behavior import BaselineStructs, BehaviorStructs
 from uuvtai.state.perception import PerceptionStructs
 from uuvtai.state.planning import PlanningStructs
 from uuvtai.state.sensors import SensorStructs
@@ -32,8 +32,8 @@ from uuvtai.state.vehicle import VehicleStructs
 from uuvtai.state.world import WorldStructs
 
 STAGES = (
-    "dynamics", "world", "proprioception", "sonar", "pose", "depth", "tracking",
-    "mapping", "clearance", "planning", "features", "teacher", "reward",
+    "dynamics", "world", "proprioception", "sonar", "localization", "depth", "tracking",
+    "mapping", "clearance", "planning", "observation", "behavior", "reward",
 )  # fmt: skip
 """what is timed apart, in order"""
 
@@ -59,7 +59,7 @@ class SimState(
     SensorStructs,
     PerceptionStructs,
     PlanningStructs,
-    TeacherStructs,
+    BehaviorStructs,
     BaselineStructs,
 ):
     """Every struct of the simulator, by the noun of its stage."""
@@ -73,9 +73,9 @@ class Stages(
     SensorStages,
     PerceptionStages,
     PlanningStages,
-    TeacherStages,
+    BehaviorStages,
     BaselineStages,
-    PrivilegedStages,
+    OracleStages,
 ):
     """What every stage reads and writes, by the noun of the stage."""
 

@@ -11,26 +11,26 @@ structs from here.
 from __future__ import annotations
 
 from uuvtai.state.arrays import PACKET, REAL, WORD, allocate, array, bytes_of
-from uuvtai.state.behavior import BaselineState, TeacherState, TreeTable
+from uuvtai.state.behavior import BaselineState, BehaviorState, TreeTable
 from uuvtai.state.perception import (
     ClusterState,
     EchoState,
     ForecastState,
     FutureState,
     GridMask,
-    HabitState,
+    LocalizationState,
     MapScratch,
     MapState,
     MixtureState,
     PastState,
-    PoseState,
     SpotState,
     TrackState,
+    TurnHistory,
 )
 from uuvtai.state.planning import (
     ClearanceMemory,
     ClearanceState,
-    FeatureState,
+    ObservationState,
     RouteState,
     VoronoiState,
 )
@@ -42,7 +42,7 @@ from uuvtai.state.sensors import (
     SonarMemory,
     SonarScan,
 )
-from uuvtai.state.task import ClockState, EpisodeState, MissionState, RefereeState, RewardState
+from uuvtai.state.task import ClockState, EpisodeState, MissionState, RewardState, TerminationState
 from uuvtai.state.vehicle import ActuationState, Allocation, CurrentState, VehicleParams, VehicleState
 from uuvtai.state.world import FixedTable, PathState, ScenarioScratch, SceneState, WorldState
 
@@ -53,6 +53,7 @@ __all__ = [
     "ActuationState",
     "Allocation",
     "BaselineState",
+    "BehaviorState",
     "ClearanceMemory",
     "ClearanceState",
     "ClockState",
@@ -61,22 +62,20 @@ __all__ = [
     "DepthImage",
     "EchoState",
     "EpisodeState",
-    "FeatureState",
     "FixedTable",
     "ForecastState",
     "FutureState",
     "GridMask",
-    "HabitState",
+    "LocalizationState",
     "MapScratch",
     "MapState",
     "MissionState",
     "MixtureState",
+    "ObservationState",
     "PastState",
     "PathState",
-    "PoseState",
     "Proprioception",
     "ProprioceptionMemory",
-    "RefereeState",
     "RewardState",
     "RouteState",
     "ScenarioScratch",
@@ -85,9 +84,10 @@ __all__ = [
     "SonarMemory",
     "SonarScan",
     "SpotState",
-    "TeacherState",
+    "TerminationState",
     "TrackState",
     "TreeTable",
+    "TurnHistory",
     "VehicleParams",
     "VehicleState",
     "VoronoiState",

@@ -10,7 +10,7 @@ from uuvtai.state.arrays import array
 
 
 @dataclass(frozen=True, eq=False)
-class TeacherState:
+class BehaviorState:
     """The behaviour tree: blackboard, statuses and action."""
 
     status: ti.Field = array("n_env", "n_node", dtype=ti.i8)
@@ -28,12 +28,12 @@ class TeacherState:
     action: ti.Field = array("n_env", vec=4)
     """[-1, 1] surge, sway, heave, yaw rate of the tree"""
     tuned: ti.Field = array("n_env", "n_tuned", vec=2)
-    """natural logarithms of factors on the config's numbers (``tuned_numbers``), where bodies are slow and
+    """natural logarithms of factors on the config's numbers (``tuned_numbers``), where obstacles are slow and
     where they are fast: a training changes them row by row, a reset sets them to those of the config's
     sections ``slow`` and ``fast``"""
     alert: ti.Field = array("n_env")
-    """[0, 1] share of the second ones in what holds, by how fast the fastest tracked bodies have lately been;
-    -1 = none was tracked in this episode yet: the first ones hold"""
+    """[0, 1] share of the second ones in what holds, by how fast the fastest tracked obstacles have lately
+    been; -1 = none was tracked in this episode yet: the first ones hold"""
     leaf: ti.Field = array("n_env", dtype=ti.i32)
     """node that set the action, -1 = none (then the vehicle is told to stop)"""
     follow_vel_w: ti.Field = array("n_env", vec=3)
@@ -70,8 +70,8 @@ class TeacherState:
     """[s] time of the first predicted conflict of following the route, geometry.FAR_M = none"""
     hold_conflict_s: ti.Field = array("n_env", beside="danger")
     """[s] time of the first predicted conflict of stopping here, geometry.FAR_M = none"""
-    body_near_m: ti.Field = array("n_env", beside="danger")
-    """[m] distance to the nearest forecast body now, hull to surface"""
+    obstacle_near_m: ti.Field = array("n_env", beside="danger")
+    """[m] distance to the nearest forecast obstacle now, hull to surface"""
     waited_s: ti.Field = array("n_env")
     """[s] for how long it has hardly come on along its way,"""
     patience: ti.Field = array("n_env")
@@ -79,9 +79,9 @@ class TeacherState:
     steer_w: ti.Field = array("n_env", vec=2)
     """[m] horizontal way to the point that is steered for: the look-ahead point, or a nearer one where the
     straight way there is narrow"""
-    gaze_w: ti.Field = array("n_env", vec=2)
+    heading_w: ti.Field = array("n_env", vec=2)
     """[m] horizontal way to the body that the camera should look at, zero = none near"""
-    calm_steps: ti.Field = array("n_env", dtype=ti.i32)
+    hysteresis_steps: ti.Field = array("n_env", dtype=ti.i32)
     """control steps since a conflict was last predicted"""
     evading_steps: ti.Field = array("n_env", dtype=ti.i32)
     """control steps since the tree began to evade, 0 = not evading"""
@@ -111,10 +111,10 @@ class TreeTable:
 
 
 @dataclass(frozen=True, eq=False)
-class TeacherStructs:
+class BehaviorStructs:
     """Structs of this room, by the noun of their stage."""
 
-    teacher: TeacherState
+    behavior: BehaviorState
     table: TreeTable
 
 

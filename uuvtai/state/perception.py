@@ -1,4 +1,4 @@
-"""The own pose, moving bodies, where they will be, and the map: what is remembered of what was sensed."""
+"""The own pose, moving obstacles, where they will be, and the map: what is remembered of what was sensed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from uuvtai.state.arrays import array
 
 
 @dataclass(frozen=True, eq=False)
-class PoseState:
+class LocalizationState:
     """Remembered: two Kalman filters, of the horizontal pose and of the depth."""
 
     mean: ti.Field = array("n_env", vec=9)
@@ -56,7 +56,7 @@ class EchoState:
 
 @dataclass(frozen=True, eq=False)
 class TrackState:
-    """Remembered: moving (and candidate) bodies seen by the sonar, one Kalman filter each."""
+    """Remembered: moving (and candidate) obstacles seen by the sonar, one Kalman filter each."""
 
     alive: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """1 = slot in use"""
@@ -93,9 +93,9 @@ class TrackState:
     seen_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """episode step of the last match"""
     height: ti.Field = array("n_env", "n_track", "n_height", packed=True)
-    """share of each height hypothesis (elevation.heights), summing to 1"""
+    """share of each height hypothesis (height.heights), summing to 1"""
     present: ti.Field = array("n_env", "n_track")
-    """probability that the body is where it is expected"""
+    """probability that the obstacle is where it is expected"""
     spot_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """episode step of the image that showed it last, -1 = none"""
     scan_step: ti.Field = array("n_env", dtype=ti.i32)
@@ -127,7 +127,7 @@ class ClusterState:
     count: ti.Field = array("n_env", dtype=ti.i32)
     """clusters found"""
     pos_w: ti.Field = array("n_env", "n_cluster", vec=2)
-    """[m] centre of the body"""
+    """[m] centre of the obstacle"""
     radius_m: ti.Field = array("n_env", "n_cluster")
     """[m] from the half-angle"""
     range_m: ti.Field = array("n_env", "n_cluster")
@@ -168,14 +168,14 @@ class SpotState:
 
 
 @dataclass(frozen=True, eq=False)
-class HabitState:
-    """Remembered: places where moving bodies turned in this episode, of whichever track; and each track's
+class TurnHistory:
+    """Remembered: places where moving obstacles turned in this episode, of whichever track; and each track's
     last straight leg."""
 
     turn: ti.Field = array("n_env", "n_turn_row", "n_turn", packed=True)
-    """rows (``habits.TURN_X`` and so on): place of the turn [m, m], world; unit course before it and after
-    it; times seen, less times that it did not come: not above 0 = empty. One array, for there may be 1,024
-    nodes in all"""
+    """rows (``turn_history.TURN_X`` and so on): place of the turn [m, m], world; unit course before it and
+    after it; times seen, less times that it did not come: not above 0 = empty. One array, for there may be
+    1,024 nodes in all"""
     next_slot: ti.Field = array("n_env", dtype=ti.i32)
     """slot that the next new turn takes"""
     leg: ti.Field = array("n_env", "n_track", vec=4)
@@ -198,12 +198,12 @@ class ForecastState:
     radius_m: ti.Field = array("n_env", "n_track", "n_forecast")
     """[m] body radius plus what the uncertainty adds"""
     turn_m: ti.Field = array("n_env", "n_track")
-    """[m] from the track's state to its next expected turn, for bodies that go straight"""
+    """[m] from the track's state to its next expected turn, for obstacles that go straight"""
     turn_out_w: ti.Field = array("n_env", "n_track", vec=2)
     """course after it, unit vector"""
     above_w: ti.Field = array("n_env", "n_track")
-    """[m] world z of the lowest edge of what may be above the own height; the own height where the body may
-    be level with the vehicle"""
+    """[m] world z of the lowest edge of what may be above the own height; the own height where the obstacle
+    may be level with the vehicle"""
     below_w: ti.Field = array("n_env", "n_track")
     """[m] world z of the highest edge of what may be below"""
 
@@ -213,13 +213,14 @@ class FutureState:
     """What each moving track may do instead of what is forecast, and how probable that is.
 
     Whoever fills it (a learned forecast, say) gives probabilities that sum to 1 at most; what is left is the
-    forecast's own. A body begins all its futures where the forecast does, and is never faster than there.
+    forecast's own. An obstacle begins all its futures where the forecast does, and is never faster than
+    there.
     """
 
     share: ti.Field = array("n_env", "n_track", "n_future")
     """probability of this future, 0 = none"""
     pos_w: ti.Field = array("n_env", "n_track", "n_future", "n_forecast", vec=2)
-    """[m] where the body then is, at the forecast's times"""
+    """[m] where the obstacle then is, at the forecast's times"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,11 +326,11 @@ class PerceptionStructs:
     """Structs of this room, by the noun of their stage."""
 
     echoes: EchoState
-    pose: PoseState
+    localization: LocalizationState
     tracks: TrackState
     clusters: ClusterState
     spots: SpotState
-    habits: HabitState
+    turn_history: TurnHistory
     forecast: ForecastState
     futures: FutureState
     past: PastState

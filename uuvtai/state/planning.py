@@ -134,7 +134,7 @@ class RouteState:
 
 
 @dataclass(frozen=True, eq=False)
-class FeatureState:
+class ObservationState:
     """What the policy and the tree see of the surroundings, by sector (sector 0 centred ahead,
     counter-clockwise)."""
 
@@ -148,7 +148,7 @@ class FeatureState:
     """1 = at least one beam of the sector returned"""
     closest_m: ti.Field = array("n_env", "n_track", scratch=True)
     """[m] closest approach of each moving track within its forecast, FAR_M = does not move; written where the
-    observation shows bodies"""
+    observation shows obstacles"""
     closest_s: ti.Field = array("n_env", "n_track", scratch=True)
     """[s] time until then"""
 
@@ -161,4 +161,4 @@ class PlanningStructs:
     clearance_memory: ClearanceMemory
     voronoi: VoronoiState
     route: RouteState
-    features: FeatureState
+    observation: ObservationState

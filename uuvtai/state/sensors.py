@@ -20,7 +20,8 @@ class Proprioception:
     reading, once that is lost with the heave by pressure; where the pose is estimated the filter's"""
     vel_valid: ti.Field = array("n_env", dtype=ti.i32)
     """1 = known: by the DVL, no longer ago than its period, or by the given position; where the pose is
-    estimated the filter is sure of it (``pose.sure_speed_m_s``); 2 = heave alone is; 0 = the last reading"""
+    estimated the filter is sure of it (``localization.sure_speed_m_s``); 2 = heave alone is; 0 = the last
+    reading"""
     fix_vel_w: ti.Field = array("n_env", vec=3)
     """[m/s] how the given position changes,"""
     fix_valid: ti.Field = array("n_env", dtype=ti.i32)
@@ -138,11 +139,11 @@ class SonarMemory(Truth):
     """[m/s] its true horizontal velocity"""
     heading_w: ti.Field = array("n_env", vec=2, scratch=True)
     """unit vector along beam 0"""
-    body_x_m: ti.Field = array("n_env", "n_body", lanes=True, scratch=True)
-    """[m] scratch of one ping: centre of a body's outline from the sensor, along x of the world"""
-    body_y_m: ti.Field = array("n_env", "n_body", lanes=True, scratch=True)
+    obstacle_x_m: ti.Field = array("n_env", "n_obstacle", lanes=True, scratch=True)
+    """[m] scratch of one ping: centre of an obstacle's outline from the sensor, along x of the world"""
+    obstacle_y_m: ti.Field = array("n_env", "n_obstacle", lanes=True, scratch=True)
     """[m] along y"""
-    body_reach_m: ti.Field = array("n_env", "n_body", lanes=True, scratch=True)
+    obstacle_reach_m: ti.Field = array("n_env", "n_obstacle", lanes=True, scratch=True)
     """[m] radius around it that holds the outline, far below 0 = empty slot"""
     cloud_beam: ti.Field = array("n_env", "n_cloud", dtype=ti.i32, beside="cloud")
     """first beam of a bubble cloud, counted from the world's x axis"""

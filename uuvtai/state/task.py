@@ -1,4 +1,4 @@
-"""Clock and episode, what the vehicle is told, reward, and how the referee sees the episode."""
+"""Clock and episode, what the vehicle is told, reward, and how the termination check sees the episode."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from uuvtai.state.arrays import array
 class ClockState:
     """Which envs run, and their time. Every kernel sees it; it holds no truth about the world."""
 
-    active: ti.Field = array("n_env", dtype=ti.i32)
+    running: ti.Field = array("n_env", dtype=ti.i32)
     """1 = running; 0 = ended, waiting for a reset"""
-    awake: ti.Field = array("n_env", dtype=ti.i32)
+    active: ti.Field = array("n_env", dtype=ti.i32)
     """1 = processed by the kernels of this pass: the running rows in a step, the rows being reset in a
     reset"""
     step: ti.Field = array("n_env", dtype=ti.i32)
@@ -25,7 +25,7 @@ class ClockState:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeState(Truth):
-    """Which episode each env plays. Its key opens every random stream, so only the simulator's side (world,
+    """Which episode each env runs. Its key opens every random stream, so only the simulator's side (world,
     vehicle, sensors) gets it."""
 
     seed: ti.Field = array("n_env", dtype=ti.i32)
@@ -67,8 +67,8 @@ class RewardState:
 
 
 @dataclass(frozen=True, eq=False)
-class RefereeState(Truth):
-    """How each episode stands, judged from the truth. Never an input of mapping, planning, teacher or
+class TerminationState(Truth):
+    """How each episode stands, judged from the truth. Never an input of mapping, planning, behaviour tree or
     policy."""
 
     outcome: ti.Field = array("n_env", dtype=ti.i32)
@@ -92,5 +92,5 @@ class TaskStructs:
     clock: ClockState
     episode: EpisodeState
     mission: MissionState
-    referee: RefereeState
+    termination: TerminationState
     reward: RewardState

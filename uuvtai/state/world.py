@@ -27,15 +27,15 @@ class WorldState(Truth):
     """Truth: obstacles as a list per env, fixed and static ones first, moving ones from ``first_dynamic`` on.
     kind NONE = empty slot."""
 
-    kind: ti.Field = array("n_env", "n_body", dtype=ti.i32)
+    kind: ti.Field = array("n_env", "n_obstacle", dtype=ti.i32)
     """geometry.SPHERE, CYLINDER, BOX or NONE"""
-    pos_w: ti.Field = array("n_env", "n_body", vec=3)
+    pos_w: ti.Field = array("n_env", "n_obstacle", vec=3)
     """[m] centre"""
-    vel_w: ti.Field = array("n_env", "n_body", vec=3)
+    vel_w: ti.Field = array("n_env", "n_obstacle", vec=3)
     """[m/s]"""
-    size: ti.Field = array("n_env", "n_body", vec=3)
+    size: ti.Field = array("n_env", "n_obstacle", vec=3)
     """[m] sphere (r, r, r), cylinder (r, r, half height), box half extents"""
-    yaw: ti.Field = array("n_env", "n_body")
+    yaw: ti.Field = array("n_env", "n_obstacle")
     """[rad]"""
     draws: ti.Field = array("n_env", dtype=ti.i32)
     """how many layouts were drawn until start and goal were joined by free space"""
@@ -92,8 +92,8 @@ class ScenarioScratch(Truth):
 
     reach: ti.Field = array("n_env", "n_coarse_row", "n_coarse_col", dtype=ti.u8, scratch=True)
     """0 = free, 1 = blocked, 2 = reached from the start"""
-    footprint: ti.Field = array("n_env", "n_body", vec=7, scratch=True)
-    """plan view of the bodies at rest (footprint.py)"""
+    footprint: ti.Field = array("n_env", "n_obstacle", vec=7, scratch=True)
+    """plan view of the static obstacles (footprint.py)"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Where things lie in the twin's arrays, and the config sections its kernels are compiled for."""
+"""Where things lie in the surrogate's arrays, and the config sections its kernels are compiled for."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from uuvtai.config import (
     TrackingConfig,
     VehicleConfig,
 )
-from uuvtai.config.learning import TwinConfig
+from uuvtai.config.learning import SurrogateConfig
 from uuvtai.kernels.core.stage import Const, In
 from uuvtai.state import (
     ClearanceState,
@@ -38,28 +38,29 @@ AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL
 signs of the way to the goal, last action, integrals of the velocity loops"""
 EGO_WIDTH = 21
 TRACK_WIDTH = 9
-"""of what the twin's tracker remembers of a body (``sensing_model.sense_twin``)"""
+"""of what the surrogate's tracker remembers of a body (``sensing_model.sense_surrogate``)"""
 RAW_WIDTH = 14
-"""of a body as a tracker delivers it: x, y, vx, vy, turn rate, radius, free water above, below, time unseen,
-displacement in 1 s (2), in 2 s (2), 1 = there"""
+"""of an obstacle as a tracker delivers it: x, y, vx, vy, turn rate, radius, free water above, below, time
+unseen, displacement in 1 s (2), in 2 s (2), 1 = there"""
 TRUTH_WIDTH = 10
-"""of a body as only the critic sees it, in training"""
+"""of an obstacle as only the critic sees it, in training"""
 
 
 @dataclass(frozen=True, eq=False)
-class TwinRules:
-    """What the twin's kernels are compiled for."""
+class SurrogateRules:
+    """What the surrogate's kernels are compiled for."""
 
     vehicle_cfg: Const[VehicleConfig]
     actuation_cfg: Const[ActuationConfig]
     tank_cfg: Const[TankConfig]
     episode_cfg: Const[EpisodeConfig]
-    twin_cfg: Const[TwinConfig]
+    surrogate_cfg: Const[SurrogateConfig]
 
 
 @dataclass(frozen=True, eq=False)
 class ObserverIO:
-    """What a policy over a set of bodies is told by the simulator: nothing that only the simulator knows."""
+    """What a policy over a set of obstacles is told by the simulator: nothing that only the simulator
+    knows."""
 
     clock: In[ClockState]
     mission: In[MissionState]

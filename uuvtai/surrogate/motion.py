@@ -1,5 +1,5 @@
-"""The twin's step: the vehicle's velocity loops axis by axis, bodies in closed form, and the referee's rules,
-by the simulator's own distances.
+"""The surrogate's step: the vehicle's velocity loops axis by axis, obstacles in closed form, and the
+termination check's rules, by the simulator's own distances.
 
 Arrays are the caller's tensors. A scenario is three rows of a bank (``world.py``), which is never
 written: an env knows the number of its scenario.
@@ -22,8 +22,8 @@ from uuvtai.kernels.core.geometry import (
     FAR_M,
     NONE,
     PI,
-    hull_to_body,
     hull_to_floor_or_surface,
+    hull_to_obstacle,
     hull_to_side_wall,
     is_in_tank,
     steady_direction,
@@ -41,7 +41,7 @@ from uuvtai.surrogate.arrays import (
     AT_TIME,
     AT_VEL,
     AT_YAW,
-    TwinRules,
+    SurrogateRules,
 )
 
 # ------------------------------------------------------------------------------------------------------------
@@ -99,16 +99,16 @@ def wished_velocity(x, y, z, flip_x, flip_y, vehicle_cfg: Const[VehicleConfig]):
 STEPS = 5
 """control steps that a decision is held"""
 NEAR_M = 1.5
-"""bodies whose surface is farther cannot matter to referee or reward within a step"""
+"""obstacles whose surface is farther cannot matter to termination check or reward within a step"""
 DRIVEN_M = 0.3
 """more than a hull moves while a decision is held"""
 EVERY_SLOT = -1
-"""as ``near_slots``, of all bodies"""
+"""as ``near_slots``, of all obstacles"""
 
 
 @ti.func
 def path_places(number, lane, times, path: AnyTensor):
-    """Rows of (x, y, vx, vy) of a moving body of scenario ``number`` at some times [s], as the simulator
+    """Rows of (x, y, vx, vy) of a moving obstacle of scenario ``number`` at some times [s], as the simulator
     moves it."""
     length, speed = path[number, lane, 2], path[number, lane, 4]
     n_way = int(path[number, lane, 0])
@@ -143,7 +143,7 @@ def path_places(number, lane, times, path: AnyTensor):
 
 @ti.func
 def path_place(number, lane, t_s, path: AnyTensor):
-    """(x, y, vx, vy) of a moving body at a time."""
+    """(x, y, vx, vy) of a moving obstacle at a time."""
     place = path_places(number, lane, ti.Vector([t_s]), path)
     return ti.Vector([place[0, 0], place[0, 1], place[0, 2], place[0, 3]])
 
@@ -157,7 +157,7 @@ def axis_drag(cfg, axis):
 
 
 @ti.func
-def axis_step(vel, integral, command, axis: Const[int], io: Bundle[TwinRules]):
+def axis_step(vel, integral, command, axis: Const[int], io: Bundle[SurrogateRules]):
     """(velocity, integral) of one of surge, sway, heave, yaw rate after a control step: the simulator's
     velocity loop, whose feed-forward cancels Coriolis forces, against inertia and drag of this axis alone."""
     loops = ti.static(axis_loops(io.actuation_cfg))
@@ -171,27 +171,27 @@ def axis_step(vel, integral, command, axis: Const[int], io: Bundle[TwinRules]):
 
 
 @ti.func
-def reach_of(number, slot, body: AnyTensor, io: Bundle[TwinRules]):
-    """[m] between the centres of hull and body from which on the body is left out."""
+def reach_of(number, slot, obstacle: AnyTensor, io: Bundle[SurrogateRules]):
+    """[m] between the centres of hull and body from which on the obstacle is left out."""
     hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
-    return body[number, slot, 4] + body[number, slot, 5] + hull + NEAR_M
+    return obstacle[number, slot, 4] + obstacle[number, slot, 5] + hull + NEAR_M
 
 
 @ti.func
-def near_slots(number, pos_w, t_s, body: AnyTensor, path: AnyTensor, io: Bundle[TwinRules]):
+def near_slots(number, pos_w, t_s, obstacle: AnyTensor, path: AnyTensor, io: Bundle[SurrogateRules]):
     """A bit for each slot whose body can come near while a decision is held; slots beyond the bits count as
     near."""
     out = 0
-    n_body, n_lane = body.shape[1], path.shape[1]
-    for slot in range(ti.min(n_body, 31)):
-        if body[number, slot, 0] > 0.5:
-            x, y, farthest = body[number, slot, 1], body[number, slot, 2], DRIVEN_M + 0.0
-            lane = slot - (n_body - n_lane)
+    n_obstacle, n_lane = obstacle.shape[1], path.shape[1]
+    for slot in range(ti.min(n_obstacle, 31)):
+        if obstacle[number, slot, 0] > 0.5:
+            x, y, farthest = obstacle[number, slot, 1], obstacle[number, slot, 2], DRIVEN_M + 0.0
+            lane = slot - (n_obstacle - n_lane)
             if lane >= 0:
                 place = path_place(number, lane, t_s, path)
                 x, y = place[0], place[1]
                 farthest += path[number, lane, 4] * STEPS * io.episode_cfg.control_dt_s
-            reach = reach_of(number, slot, body, io) + farthest
+            reach = reach_of(number, slot, obstacle, io) + farthest
             dx, dy = x - pos_w[0], y - pos_w[1]
             if dx * dx + dy * dy < reach * reach:
                 out |= 1 << slot
@@ -207,34 +207,36 @@ def nearest_of(
     vel_w,
     rate,
     t_s,
-    body: AnyTensor,
+    obstacle: AnyTensor,
     path: AnyTensor,
-    io: Bundle[TwinRules],
+    io: Bundle[SurrogateRules],
 ):
-    """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the referee
-    sees it; bodies beyond ``NEAR_M``, and those whose bit is not in ``near``, are left out."""
+    """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the termination
+    check sees it; obstacles beyond ``NEAR_M``, and those whose bit is not in ``near``, are left out."""
     clearance = hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg)
     ttc = FAR_M + 0.0
-    n_body, n_lane = body.shape[1], path.shape[1]
-    for slot in range(n_body):
-        kind = ti.cast(body[number, slot, 0], ti.i32)
+    n_obstacle, n_lane = obstacle.shape[1], path.shape[1]
+    for slot in range(n_obstacle):
+        kind = ti.cast(obstacle[number, slot, 0], ti.i32)
         if kind != NONE and ((near >> ti.min(slot, 31)) & 1 == 1 or slot > 30):
-            at = ti.Vector([body[number, slot, 1], body[number, slot, 2], body[number, slot, 3]])
-            body_vel = ti.Vector([0.0, 0.0, 0.0])
-            lane = slot - (n_body - n_lane)
+            at = ti.Vector([obstacle[number, slot, 1], obstacle[number, slot, 2], obstacle[number, slot, 3]])
+            obstacle_vel = ti.Vector([0.0, 0.0, 0.0])
+            lane = slot - (n_obstacle - n_lane)
             if lane >= 0:
                 place = path_place(number, lane, t_s, path)
                 at[0], at[1] = place[0], place[1]
-                body_vel[0], body_vel[1] = place[2], place[3]
-            size = ti.Vector([body[number, slot, 4], body[number, slot, 5], body[number, slot, 6]])
-            reach = reach_of(number, slot, body, io)
+                obstacle_vel[0], obstacle_vel[1] = place[2], place[3]
+            size = ti.Vector(
+                [obstacle[number, slot, 4], obstacle[number, slot, 5], obstacle[number, slot, 6]]
+            )
+            reach = reach_of(number, slot, obstacle, io)
             dx, dy = at[0] - pos_w[0], at[1] - pos_w[1]
             if dx * dx + dy * dy < reach * reach:
-                gap, normal, along = hull_to_body(
-                    pos_w, axis_w, kind, at, size, body[number, slot, 7], io.vehicle_cfg
+                gap, normal, along = hull_to_obstacle(
+                    pos_w, axis_w, kind, at, size, obstacle[number, slot, 7], io.vehicle_cfg
                 )
                 hull_vel = vel_w + along * ti.Vector([0.0, 0.0, rate]).cross(axis_w)
-                closing = (hull_vel - body_vel).dot(normal)
+                closing = (hull_vel - obstacle_vel).dot(normal)
                 clearance = ti.min(clearance, gap)
                 if closing > io.episode_cfg.ttc_closing_m_s:
                     ttc = ti.min(ttc, ti.max(gap, 0.0) / closing)
@@ -242,8 +244,8 @@ def nearest_of(
 
 
 @ti.func
-def verdict_of(pos_w, axis_w, goal_w, clearance, ttc, t_s, io: Bundle[TwinRules]):
-    """How the episode stands, in the order of the referee's rules."""
+def verdict_of(pos_w, axis_w, goal_w, clearance, ttc, t_s, io: Bundle[SurrogateRules]):
+    """How the episode stands, in the order of the termination check's rules."""
     to_goal = goal_w - pos_w
     out = RUNNING
     if is_in_tank(pos_w, io.tank_cfg) == 0:
@@ -263,13 +265,13 @@ def verdict_of(pos_w, axis_w, goal_w, clearance, ttc, t_s, io: Bundle[TwinRules]
 
 
 @ti.func
-def earned(nearer_m, nearest_m, ended, io: Bundle[TwinRules]):
+def earned(nearer_m, nearest_m, ended, io: Bundle[SurrogateRules]):
     """Reward of a decision that brought the vehicle ``nearer_m`` to its goal and, at the worst, within
     ``nearest_m`` of anything."""
     held_s = ti.static(STEPS * io.episode_cfg.control_dt_s)
-    close = ti.math.clamp(1.0 - nearest_m / io.twin_cfg.soft_clearance_m, 0.0, 1.0)
-    out = io.twin_cfg.progress * nearer_m - held_s * (
-        io.twin_cfg.time_cost + io.twin_cfg.closeness_cost * close
+    close = ti.math.clamp(1.0 - nearest_m / io.surrogate_cfg.soft_clearance_m, 0.0, 1.0)
+    out = io.surrogate_cfg.progress * nearer_m - held_s * (
+        io.surrogate_cfg.time_cost + io.surrogate_cfg.closeness_cost * close
     )
     if ended == SUCCESS:
         out += 1.0
@@ -279,9 +281,9 @@ def earned(nearer_m, nearest_m, ended, io: Bundle[TwinRules]):
 
 
 @ti.func
-def asked_speeds(wish, yaw, z, io: Bundle[TwinRules]):
+def asked_speeds(wish, yaw, z, io: Bundle[SurrogateRules]):
     """[m/s, rad/s] surge, sway, heave and yaw rate that the hull is asked for at a depth."""
-    part = hull_command(wish, yaw, z, io.twin_cfg.vertical_gap_m, io.vehicle_cfg, io.tank_cfg)
+    part = hull_command(wish, yaw, z, io.surrogate_cfg.vertical_gap_m, io.vehicle_cfg, io.tank_cfg)
     return ti.Vector(
         [
             part[0] * io.vehicle_cfg.max_surge_m_s,
@@ -293,10 +295,10 @@ def asked_speeds(wish, yaw, z, io: Bundle[TwinRules]):
 
 
 @ti.kernel
-def drive_twin(
-    io: Bundle[TwinRules],
+def drive_surrogate(
+    io: Bundle[SurrogateRules],
     action: FloatMatrix,
-    body: AnyTensor,
+    obstacle: AnyTensor,
     path: AnyTensor,
     scenario: IntVector,
     ego: FloatMatrix,
@@ -322,7 +324,7 @@ def drive_twin(
         )
         before = ti.math.length(goal_w - pos_w)
         nearest, ended = 9.0, RUNNING
-        near = near_slots(number, pos_w, t_s, body, path, io)
+        near = near_slots(number, pos_w, t_s, obstacle, path, io)
         for _ in range(STEPS):
             if ended == RUNNING:
                 asked = asked_speeds(wish, yaw, pos_w[2], io)
@@ -335,7 +337,7 @@ def drive_twin(
                 pos_w += dt_s * vel_w
                 t_s += dt_s
                 axis_w = ti.Vector([c, s, 0.0])
-                threat = nearest_of(near, number, pos_w, axis_w, vel_w, vel[3], t_s, body, path, io)
+                threat = nearest_of(near, number, pos_w, axis_w, vel_w, vel[3], t_s, obstacle, path, io)
                 nearest = ti.min(nearest, threat[0])
                 ended = verdict_of(pos_w, axis_w, goal_w, threat[0], threat[1], t_s, io)
         for i in ti.static(range(3)):
@@ -351,7 +353,7 @@ def drive_twin(
 
 
 @ti.kernel
-def begin_twin(
+def begin_surrogate(
     begun: IntVector,
     mission: FloatMatrix,
     scenario: IntVector,
@@ -377,10 +379,10 @@ def begin_twin(
 
 
 @ti.kernel
-def judge_states(
-    io: Bundle[TwinRules],
+def check_states(
+    io: Bundle[SurrogateRules],
     pose: FloatMatrix,
-    body: AnyTensor,
+    obstacle: AnyTensor,
     path: AnyTensor,
     seen: FloatMatrix,
     outcome: IntVector,
@@ -393,6 +395,6 @@ def judge_states(
         vel_w = ti.Vector([pose[env, 4], pose[env, 5], pose[env, 6]])
         goal_w = ti.Vector([pose[env, 9], pose[env, 10], pose[env, 11]])
         t_s = pose[env, 8]
-        threat = nearest_of(EVERY_SLOT, env, pos_w, axis_w, vel_w, pose[env, 7], t_s, body, path, io)
+        threat = nearest_of(EVERY_SLOT, env, pos_w, axis_w, vel_w, pose[env, 7], t_s, obstacle, path, io)
         seen[env, 0], seen[env, 1] = threat[0], threat[1]
         outcome[env] = verdict_of(pos_w, axis_w, goal_w, threat[0], threat[1], t_s, io)

@@ -1,8 +1,9 @@
-"""The simulator seen as the twin sees its world: the same rows, of what the vehicle senses and remembers."""
+"""The simulator seen as the surrogate sees its world: the same rows, of what the vehicle senses and
+remembers."""
 
 import taichi as ti
 
-from uuvtai.common.enums import BODY_WIDTH, EGO_COLUMNS, N_BODY, N_RAY, OWN_WIDTH
+from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH, OWN_WIDTH
 from uuvtai.envs.vector_env import ObservationColumn
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
 from uuvtai.kernels.core.grid import cell_of
@@ -47,7 +48,7 @@ def free_ray(env, x, y, ux, uy, io: Bundle[ObserverIO]):
 
 @ti.func
 def put_track(env, lane, track, raw: AnyTensor, io: Bundle[ObserverIO]):
-    """One track as a row of the policy's bodies."""
+    """One track as a row of the policy's obstacles."""
     pos_w = io.forecast.pos_w[env, track, 0]
     state = io.tracks.state[env, track]
     first = io.forecast.pos_w[env, track, 1] - pos_w
@@ -87,7 +88,7 @@ def next_track(env, after, slot, io: Bundle[ObserverIO]):
 
 
 @ti.kernel
-def observe_bodies(
+def observe_obstacles(
     io: Bundle[ObserverIO], due: IntVector, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix
 ):
     """Rows of the vehicle, of its nearest tracks and of the free distances, where ``due`` is 1; the last
@@ -132,26 +133,26 @@ def command_hull(io: Bundle[ObserverIO], gap_m: float, action: FloatMatrix, comm
 
 
 def _table():
-    """Columns of the policy's input: the vehicle's own, then one body's after the other."""
+    """Columns of the policy's input: the vehicle's own, then one obstacle's after the other."""
     own = ObservationColumn(
         "set_own", slice(0, OWN_WIDTH), "mixed", "mirrored world", "vehicle, goal, last action"
     )
     rays = ObservationColumn(
         "set_rays", slice(OWN_WIDTH, EGO_COLUMNS), "1/m", "mirrored world", "nearness of walls"
     )
-    stop = EGO_COLUMNS + N_BODY * BODY_WIDTH
-    bodies = ObservationColumn(
-        "set_bodies", slice(EGO_COLUMNS, stop), "mixed", "mirrored world", "nearest tracks"
+    stop = EGO_COLUMNS + N_OBSTACLE * OBSTACLE_WIDTH
+    obstacles = ObservationColumn(
+        "set_obstacles", slice(EGO_COLUMNS, stop), "mixed", "mirrored world", "nearest tracks"
     )
-    return own, rays, bodies
+    return own, rays, obstacles
 
 
 SET_TABLE = _table()
-"""The observation of a policy over a set of bodies, for a checkpoint's manifest."""
+"""The observation of a policy over a set of obstacles, for a checkpoint's manifest."""
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Columns of the policy over a set of bodies, the same for the twin and the simulator.
+# Columns of the policy over a set of obstacles, the same for the surrogate and the simulator.
 #
 # Everything is seen in the world mirrored so that the goal lies ahead and to the left at the start: four
 # situations that mirror each other are one to the policy.
@@ -188,7 +189,7 @@ def length_of(way):
 
 
 @ti.func
-def body_columns(env, lane, flip, speed, way, ego: FloatMatrix, raw: AnyTensor):
+def obstacle_columns(env, lane, flip, speed, way, ego: FloatMatrix, raw: AnyTensor):
     """What the policy is told of a track; ``flip``, ``speed`` and ``way`` as ``mirrored`` gives them."""
     fx, fy, to_goal = flip[0], flip[1], length_of(way)
     dx = fx * (raw[env, lane, 0] - ego[env, AT_POS])
@@ -228,7 +229,7 @@ def body_columns(env, lane, flip, speed, way, ego: FloatMatrix, raw: AnyTensor):
 
 @ti.func
 def own_columns(env, flip, speed, way, ego: FloatMatrix):
-    """What the policy is told of the vehicle and its goal; as ``body_columns``."""
+    """What the policy is told of the vehicle and its goal; as ``obstacle_columns``."""
     to_goal, yaw, z = length_of(way), ego[env, AT_YAW], ego[env, AT_POS + 2]
     return ti.Vector(
         [
@@ -266,16 +267,16 @@ def mirrored_ray(i, env, ego: FloatMatrix):
 
 @ti.func
 def write_columns_of(
-    env, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, bodies: AnyTensor, own: FloatMatrix
+    env, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, obstacles: AnyTensor, own: FloatMatrix
 ):
     """Columns of one row, as ``write_set_columns``."""
     flip, speed, way = mirrored(env, ego)
     for lane in range(raw.shape[1]):
-        columns = ti.Vector.zero(ti.f32, BODY_WIDTH)
+        columns = ti.Vector.zero(ti.f32, OBSTACLE_WIDTH)
         if raw[env, lane, 13] > 0.5:
-            columns = body_columns(env, lane, flip, speed, way, ego, raw)
-        for i in ti.static(range(BODY_WIDTH)):
-            bodies[env, lane, i] = columns[i]
+            columns = obstacle_columns(env, lane, flip, speed, way, ego, raw)
+        for i in ti.static(range(OBSTACLE_WIDTH)):
+            obstacles[env, lane, i] = columns[i]
     values = own_columns(env, flip, speed, way, ego)
     for i in ti.static(range(OWN_WIDTH)):
         own[env, i] = values[i]
@@ -286,9 +287,9 @@ def write_columns_of(
 
 @ti.kernel
 def write_set_columns(
-    ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, bodies: AnyTensor, own: FloatMatrix
+    ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, obstacles: AnyTensor, own: FloatMatrix
 ):
-    """``bodies`` (n, lanes, BODY_WIDTH) and ``own`` (n, EGO_COLUMNS) from rows of the vehicle
-    (``twin_arrays``), tracks (n, lanes, RAW_WIDTH) and free distances (n, N_RAY) [m]."""
+    """``obstacles`` (n, lanes, OBSTACLE_WIDTH) and ``own`` (n, EGO_COLUMNS) from rows of the vehicle
+    (``surrogate_arrays``), tracks (n, lanes, RAW_WIDTH) and free distances (n, N_RAY) [m]."""
     for env in range(ego.shape[0]):
-        write_columns_of(env, ego, raw, ray, bodies, own)
+        write_columns_of(env, ego, raw, ray, obstacles, own)

@@ -1,5 +1,6 @@
-"""What the tracker delivers of the twin's bodies: a model of its delays, noise, field of view and memory, in
-place of sonar and camera. Rays of free distance are those of the true walls and resting bodies."""
+"""What the tracker delivers of the surrogate's obstacles: a model of its delays, noise, field of view and
+memory, in place of sonar and camera. Rays of free distance are those of the true walls and static
+obstacles."""
 
 import math
 
@@ -17,7 +18,7 @@ from uuvtai.surrogate.arrays import (
     RAW_WIDTH,
     TRACK_WIDTH,
     TRUTH_WIDTH,
-    TwinRules,
+    SurrogateRules,
 )
 from uuvtai.surrogate.motion import path_places
 from uuvtai.surrogate.observation import write_columns_of
@@ -27,9 +28,9 @@ RANGE_M = 12.0
 FAN_SLOPE = 0.1763
 """the sonar's fan: 10 degrees up and down"""
 CAMERA_RANGE_M, HEIGHT_RANGE_M = 4.0, 3.0
-"""the camera sees a body up to the first, and knows how high it is up to the second"""
+"""the camera sees an obstacle up to the first, and knows how high it is up to the second"""
 SPELL = 10
-"""decisions for which a body is seen equally well: part of it, at an edge of the fan, beside another"""
+"""decisions for which an obstacle is seen equally well: part of it, at an edge of the fan, beside another"""
 BEST, SPREAD, MISSED, MISSED_HIDDEN = 0.35, 0.325, 0.985, 0.94
 """how badly: the first, and the second over one minus a uniform number; beyond the third, or the fourth out
 of sight, it is not tracked"""
@@ -43,35 +44,35 @@ POSITION_SIGMA, VELOCITY_SIGMA_M_S, VELOCITY_SIGMA_S = 0.0042, 0.009, 0.0062
 """errors of the tracks, times how badly: of position per metre of distance; of velocity at no distance, and
 per metre. EC, as are the constants around: by quantiles of the simulator's tracks (docs/learning.md)"""
 CAMERA_ALONE = 12.0
-"""times as badly is a body seen that the camera sees and the sonar does not"""
+"""times as badly is an obstacle seen that the camera sees and the sonar does not"""
 QUICKEST, SLOWER, LAG_S = 0.6, 1.1, 0.04
 """share of a change of velocity that is seen at once; less of it beyond the middle uniform number; the place
 is behind by so much of what is not seen yet"""
 HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.04
-"""errors of position, and of velocity as a share of it, times how badly, when a body goes out of sight, which
-it does part by part"""
+"""errors of position, and of velocity as a share of it, times how badly, when an obstacle goes out of sight,
+which it does part by part"""
 FIRST_NORMAL = 1024
-"""number of the first draw of an error; those before it say how badly each body is seen"""
+"""number of the first draw of an error; those before it say how badly each obstacle is seen"""
 UNBOUNDED_M = 99.0
 """nothing in the way of a ray"""
 RAY_SLACK = 0.01
-"""share of the angle between two rays by which a body is looked for wider than it is: rounding"""
+"""share of the angle between two rays by which an obstacle is looked for wider than it is: rounding"""
 COLUMN_M = 1.6
 """free water above and below is cut off here"""
 
 
 @ti.func
-def is_hidden(number, slot_count, x, y, to_x, to_y, body: AnyTensor):
-    """1 where a resting body stands between a place and another."""
+def is_hidden(number, slot_count, x, y, to_x, to_y, obstacle: AnyTensor):
+    """1 where a static obstacle stands between a place and another."""
     dx, dy = to_x - x, to_y - y
     far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
     ux, uy = dx / far, dy / far
     out = 0
     for slot in range(slot_count):
-        if out == 0 and body[number, slot, 0] > 0.5:
-            rx, ry = body[number, slot, 1] - x, body[number, slot, 2] - y
+        if out == 0 and obstacle[number, slot, 0] > 0.5:
+            rx, ry = obstacle[number, slot, 1] - x, obstacle[number, slot, 2] - y
             along, across = rx * ux + ry * uy, ti.abs(rx * uy - ry * ux)
-            wide = 0.9 * ti.max(body[number, slot, 4], body[number, slot, 5])
+            wide = 0.9 * ti.max(obstacle[number, slot, 4], obstacle[number, slot, 5])
             if along > 0.0 and along < far and across < wide:
                 out = 1
     return out
@@ -84,7 +85,7 @@ def rays():
 
 
 @ti.func
-def free_to_wall(x, y, to, io: Bundle[TwinRules]):
+def free_to_wall(x, y, to, io: Bundle[SurrogateRules]):
     """[m] from a place in a direction to the nearest side wall."""
     out = UNBOUNDED_M + 0.0
     if to[0] > 1e-6:
@@ -122,8 +123,8 @@ def free_to_circle(dx, dy, to, wide):
 
 @ti.func
 def rays_towards(dx, dy, reach):
-    """(first, count) of the rays that can meet a body of this radius whose middle is (dx, dy) away: its half
-    angle is at most pi/2 times the ratio of radius to distance."""
+    """(first, count) of the rays that can meet an obstacle of this radius whose middle is (dx, dy) away: its
+    half angle is at most pi/2 times the ratio of radius to distance."""
     first, count = 0, N_RAY
     far = ti.sqrt(dx * dx + dy * dy)
     if far > 1.01 * reach:
@@ -135,19 +136,21 @@ def rays_towards(dx, dy, reach):
 
 
 @ti.func
-def write_rays(env, number, slot_count, x, y, body: AnyTensor, ray: FloatMatrix, io: Bundle[TwinRules]):
-    """[m] from a place along each ray to the nearest wall or resting body, without the hull."""
+def write_rays(
+    env, number, slot_count, x, y, obstacle: AnyTensor, ray: FloatMatrix, io: Bundle[SurrogateRules]
+):
+    """[m] from a place along each ray to the nearest wall or static obstacle, without the hull."""
     towards = ti.Matrix(ti.static(rays()))
     for i in ti.static(range(N_RAY)):
         ray[env, i] = free_to_wall(x, y, ti.Vector([towards[i, 0], towards[i, 1]]), io)
     for slot in range(slot_count):
-        kind = ti.cast(body[number, slot, 0], ti.i32)
+        kind = ti.cast(obstacle[number, slot, 0], ti.i32)
         if kind != NONE:
-            dx, dy = body[number, slot, 1] - x, body[number, slot, 2] - y
-            wide, deep, c, s = body[number, slot, 4], 0.0, 1.0, 0.0
+            dx, dy = obstacle[number, slot, 1] - x, obstacle[number, slot, 2] - y
+            wide, deep, c, s = obstacle[number, slot, 4], 0.0, 1.0, 0.0
             if kind == BOX:
-                deep = body[number, slot, 5]
-                c, s = ti.cos(body[number, slot, 7]), ti.sin(body[number, slot, 7])
+                deep = obstacle[number, slot, 5]
+                c, s = ti.cos(obstacle[number, slot, 7]), ti.sin(obstacle[number, slot, 7])
             first, count = rays_towards(dx, dy, ti.sqrt(wide * wide + deep * deep))
             for k in range(count):
                 i = (first + k + N_RAY) % N_RAY
@@ -161,8 +164,8 @@ def write_rays(env, number, slot_count, x, y, body: AnyTensor, ray: FloatMatrix,
 
 
 @ti.func
-def sight_of(number, slot_count, here, at, radius, high, level, body: AnyTensor):
-    """(1 = seen, 1 = its height is seen, 1 = in the sonar's fan) of a moving body at ``at`` (x, y), from
+def sight_of(number, slot_count, here, at, radius, high, level, obstacle: AnyTensor):
+    """(1 = seen, 1 = its height is seen, 1 = in the sonar's fan) of a moving obstacle at ``at`` (x, y), from
     ``here`` (x, y, z, yaw)."""
     dx, dy = at[0] - here[0], at[1] - here[1]
     far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
@@ -171,20 +174,20 @@ def sight_of(number, slot_count, here, at, radius, high, level, body: AnyTensor)
     camera = ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
     visible, knows = False, False
     if far < RANGE_M and (fan or camera):
-        visible = is_hidden(number, slot_count, here[0], here[1], at[0], at[1], body) == 0
+        visible = is_hidden(number, slot_count, here[0], here[1], at[0], at[1], obstacle) == 0
         knows = visible and camera and far < HEIGHT_RANGE_M
     return ti.Vector([ti.cast(visible, ti.i32), ti.cast(knows, ti.i32), ti.cast(fan, ti.i32)])
 
 
 @ti.func
 def how_badly(drawn):
-    """How badly a body is seen, by a uniform number: 1 in the middle, with a long tail."""
+    """How badly an obstacle is seen, by a uniform number: 1 in the middle, with a long tail."""
     return BEST + SPREAD / (1.0 - ti.min(drawn, MISSED))
 
 
 @ti.func
 def updated_track(old, lane, at, bend_m, speed, ego_at, is_visible, knows_height, in_fan, key):
-    """The row of ``track`` after a decision, of a body that is at ``at`` (x, y, vx, vy): born late, its
+    """The row of ``track`` after a decision, of an obstacle that is at ``at`` (x, y, vx, vy): born late, its
     velocity across the line of sight known later, in error by what this spell (``key``) has for it; while it
     is not seen straight on, or on its circle (``bend_m``: signed radius, else 0)."""
     new = old
@@ -233,7 +236,7 @@ def updated_track(old, lane, at, bend_m, speed, ego_at, is_visible, knows_height
 
 @ti.func
 def is_tracked(track):
-    """1 while the tracker has the body of this row of ``track``."""
+    """1 while the tracker has the obstacle of this row of ``track``."""
     unseen_s, drawn = track[5], track[8]
     limit_s = LOST_HEIGHT_S if track[6] > 0.5 else LOST_S
     is_born = track[4] >= BORN_S * how_badly(drawn) - 1e-4
@@ -242,7 +245,7 @@ def is_tracked(track):
 
 @ti.func
 def write_raw(env, lane, track, places, is_known, turn_rate, over, under, radius, raw: AnyTensor):
-    """What the tracker delivers of a body that is tracked. A closed way that was watched once around
+    """What the tracker delivers of an obstacle that is tracked. A closed way that was watched once around
     (``is_known``) is foreseen as it is (``places``: ``now_and_later``), a circle after a while, other ways
     straight on."""
     turn = turn_rate if track[4] > TURN_KNOWN_S else 0.0
@@ -265,13 +268,13 @@ def write_raw(env, lane, track, places, is_known, turn_rate, over, under, radius
 
 @ti.func
 def now_and_later(number, lane, t_s, path: AnyTensor):
-    """Rows of (x, y, vx, vy) of a moving body, now and in 1, 2 and 3 s."""
+    """Rows of (x, y, vx, vy) of a moving obstacle, now and in 1, 2 and 3 s."""
     return path_places(number, lane, ti.Vector([t_s, t_s + 1.0, t_s + 2.0, t_s + 3.0]), path)
 
 
 @ti.func
 def write_truth(env, lane, places, over, flip, x, y, truth: AnyTensor):
-    """Where a body is and will be (``places``: ``now_and_later``), for the critic."""
+    """Where an obstacle is and will be (``places``: ``now_and_later``), for the critic."""
     fx, fy = 0.25 * flip[0], 0.25 * flip[1]
     truth[env, lane, 0], truth[env, lane, 1] = fx * (places[0, 0] - x), fy * (places[0, 1] - y)
     truth[env, lane, 2], truth[env, lane, 3] = 1.0, ti.math.clamp(over, -COLUMN_M, COLUMN_M)
@@ -281,11 +284,11 @@ def write_truth(env, lane, places, over, flip, x, y, truth: AnyTensor):
 
 
 @ti.kernel
-def sense_twin(
-    io: Bundle[TwinRules],
+def sense_surrogate(
+    io: Bundle[SurrogateRules],
     seed: int,
     count: int,
-    body: AnyTensor,
+    obstacle: AnyTensor,
     path: AnyTensor,
     scenario: IntVector,
     ego: FloatMatrix,
@@ -293,7 +296,7 @@ def sense_twin(
     raw: AnyTensor,
     ray: FloatMatrix,
     truth: AnyTensor,
-    bodies: AnyTensor,
+    obstacles: AnyTensor,
     own: FloatMatrix,
 ):
     """Tracks, rays, what only a critic may see, and the columns of a policy, after a decision or a reset. The
@@ -304,7 +307,7 @@ def sense_twin(
     """
     for env in range(ego.shape[0]):
         number, t_s = scenario[env], ego[env, AT_TIME]
-        n_rest = body.shape[1] - path.shape[1]
+        n_rest = obstacle.shape[1] - path.shape[1]
         x, y, z = ego[env, AT_POS], ego[env, AT_POS + 1], ego[env, AT_POS + 2]
         flip = ti.Vector([ego[env, AT_FLIP], ego[env, AT_FLIP + 1]])
         yaw = ego[env, AT_YAW]
@@ -314,16 +317,20 @@ def sense_twin(
                 raw[env, lane, i] = 0.0
             for i in ti.static(range(TRUTH_WIDTH)):
                 truth[env, lane, i] = 0.0
-            if body[number, slot, 0] > 0.5:
+            if obstacle[number, slot, 0] > 0.5:
                 key = episode_key(seed + (count + 3 * lane) // SPELL, env)  # spells do not begin all at once
                 places = now_and_later(number, lane, t_s, path)
                 at = ti.Vector([places[0, i] for i in ti.static(range(4))])
                 is_circle, speed = path[number, lane, 0] < 0.5, path[number, lane, 4]
                 bend_m = path[number, lane, 1] if is_circle else 0.0
                 turn_rate = speed / bend_m if is_circle else 0.0
-                radius, high, level = body[number, slot, 4], body[number, slot, 6], body[number, slot, 3]
+                radius, high, level = (
+                    obstacle[number, slot, 4],
+                    obstacle[number, slot, 6],
+                    obstacle[number, slot, 3],
+                )
                 here = ti.Vector([x, y, z, yaw])
-                seen = sight_of(number, n_rest, here, at, radius, high, level, body)
+                seen = sight_of(number, n_rest, here, at, radius, high, level, obstacle)
                 old = ti.Vector([track[env, lane, i] for i in ti.static(range(TRACK_WIDTH))])
                 new = updated_track(old, lane, at, bend_m, speed, here, seen[0], seen[1], seen[2], key)
                 for i in ti.static(range(TRACK_WIDTH)):
@@ -333,5 +340,5 @@ def sense_twin(
                     is_known = not is_circle and new[7] > path[number, lane, 2]
                     write_raw(env, lane, new, places, is_known, turn_rate, over, under, radius, raw)
                 write_truth(env, lane, places, over, flip, x, y, truth)
-        write_rays(env, number, n_rest, x, y, body, ray, io)
-        write_columns_of(env, ego, raw, ray, bodies, own)
+        write_rays(env, number, n_rest, x, y, obstacle, ray, io)
+        write_columns_of(env, ego, raw, ray, obstacles, own)

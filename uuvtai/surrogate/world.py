@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from uuvtai.common.enums import BODY_WIDTH, EGO_COLUMNS, N_RAY
+from uuvtai.common.enums import EGO_COLUMNS, N_RAY, OBSTACLE_WIDTH
 from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import TankConfig
@@ -21,10 +21,10 @@ from uuvtai.sim.setup import Scene
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stages import bind
 from uuvtai.surrogate import motion, sensing
-from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, TwinRules
+from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, SurrogateRules
 
 # ------------------------------------------------------------------------------------------------------------
-# Scenarios drawn by the simulator itself, as plain arrays that the twin's kernels read.
+# Scenarios drawn by the simulator itself, as plain arrays that the surrogate's kernels read.
 
 
 BATCH = 256
@@ -33,10 +33,10 @@ BATCH = 256
 
 @dataclass(frozen=True)
 class ScenarioBank:
-    """B scenarios: resting bodies first, then the moving ones."""
+    """B scenarios: static obstacles first, then the moving ones."""
 
-    body: torch.Tensor
-    """(B, n_body, 8) kind, centre (3), size (3), yaw; kind 0 = none"""
+    obstacle: torch.Tensor
+    """(B, n_obstacle, 8) kind, centre (3), size (3), yaw; kind 0 = none"""
     path: torch.Tensor
     """(B, n_lane, 16) corners (0 = circle), radius, length, phase, speed, corners' x and y; of a circle the
     first is its centre"""
@@ -49,14 +49,15 @@ class ScenarioBank:
 
 
 def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, count: int) -> ScenarioBank:
-    """Episodes 0 .. count - 1 of ``seed`` for every pair of a world of ``twin.worlds`` and a scene (S, D, v),
-    drawn by ``Sim.draw``. Raises ConfigError for a world that is none, or has another tank than the run's."""
+    """Episodes 0 .. count - 1 of ``seed`` for every pair of a world of ``surrogate.worlds`` and a scene (S,
+    D, v), drawn by ``Sim.draw``. Raises ConfigError for a world that is none, or has another tank than the
+    run's."""
     parts, names = [], []
-    for world in config.twin.worlds:
+    for world in config.surrogate.worlds:
         most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
         drawn_config = load_config(world, overrides=[*most])
         _refuse_other_tank(world, drawn_config.world.tank, config.world.tank)
-        tree = read_tree(TRAINING_TREE, drawn_config.teacher.max_node)
+        tree = read_tree(TRAINING_TREE, drawn_config.behavior.max_node)
         sim = Sim(drawn_config, min(BATCH, count), tree)
         for scene in scenes:
             rows = drawn(sim, scene, seed, count)
@@ -65,25 +66,26 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
         sim.close()
     widest = [max(part[i].shape[1] for part in parts) for i in range(2)]
     rest = max(part[0].shape[1] - part[1].shape[1] for part in parts)
-    body = torch.cat([_padded(part[0], rest + widest[1], part[1].shape[1], rest) for part in parts])
+    obstacle = torch.cat([_padded(part[0], rest + widest[1], part[1].shape[1], rest) for part in parts])
     path = torch.cat([torch.nn.functional.pad(p[1], (0, 0, 0, widest[1] - p[1].shape[1])) for p in parts])
     mission, origin = (torch.cat([part[i] for part in parts]) for i in (2, 3))
-    return ScenarioBank(body, path, mission, origin, tuple(names))
+    return ScenarioBank(obstacle, path, mission, origin, tuple(names))
 
 
 def _refuse_other_tank(world: str, own: TankConfig, wanted: TankConfig) -> None:
     if own != wanted or own.shape != "rectangle":
         raise ConfigError(
-            f"twin.worlds: {world} has another tank than the run's world, or a round one; the twin has one "
-            "rectangular tank: give worlds that share it, for example twin.worlds=[pool,gauntlet]"
+            f"surrogate.worlds: {world} has another tank than the run's world, or a round one; the surrogate "
+            f"has one "
+            "rectangular tank: give worlds that share it, for example surrogate.worlds=[pool,gauntlet]"
         )
 
 
-def _padded(body: torch.Tensor, width: int, lanes: int, rest: int) -> torch.Tensor:
-    """With empty slots behind the resting and behind the moving bodies."""
-    out = torch.zeros(len(body), width, 8)
-    own = body.shape[1] - lanes
-    out[:, :own], out[:, rest : rest + lanes] = body[:, :own], body[:, own:]
+def _padded(obstacle: torch.Tensor, width: int, lanes: int, rest: int) -> torch.Tensor:
+    """With empty slots behind the static and behind the moving obstacles."""
+    out = torch.zeros(len(obstacle), width, 8)
+    own = obstacle.shape[1] - lanes
+    out[:, :own], out[:, rest : rest + lanes] = obstacle[:, :own], obstacle[:, own:]
     return out
 
 
@@ -97,11 +99,11 @@ def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[torch.Tensor, 
         mask = (number < count).int()
         sim.draw(mask, torch.full_like(mask, seed), number)
         found.append([rows[: int(mask.sum())] for rows in scenario_rows(sim)])
-    body, path, mission = (np.concatenate(part) for part in zip(*found, strict=True))
-    rest = body.shape[1] - path.shape[1]
-    used = np.any(body[:, :, 0] > 0, axis=0)
+    obstacle, path, mission = (np.concatenate(part) for part in zip(*found, strict=True))
+    rest = obstacle.shape[1] - path.shape[1]
+    used = np.any(obstacle[:, :, 0] > 0, axis=0)
     moving = used[rest:]
-    kept = body[:, used].copy(), path[:, moving].copy(), mission
+    kept = obstacle[:, used].copy(), path[:, moving].copy(), mission
     return torch.from_numpy(kept[0]), torch.from_numpy(kept[1]), torch.from_numpy(kept[2])
 
 
@@ -120,32 +122,34 @@ def scenario_rows(sim: Sim) -> list[np.ndarray]:
         [sim.rows(m.start_w), sim.rows(m.goal_w), sim.rows(m.start_yaw)[:, None]], axis=1
     )
     mission = np.concatenate([mission, np.zeros((len(mission), 1))], axis=1)
-    body = np.concatenate([kind[..., None], pos, size, yaw[..., None]], axis=-1)
-    return [np.ascontiguousarray(a, np.float32) for a in (body, path, mission)]
+    obstacle = np.concatenate([kind[..., None], pos, size, yaw[..., None]], axis=-1)
+    return [np.ascontiguousarray(a, np.float32) for a in (obstacle, path, mission)]
 
 
 # ------------------------------------------------------------------------------------------------------------
 
 
-class TwinView(NamedTuple):
-    """What is known of N envs. The tensors are the twin's own: clone what must outlive the next step."""
+class SurrogateView(NamedTuple):
+    """What is known of N envs. The tensors are the surrogate's own: clone what must outlive the next step."""
 
-    bodies: torch.Tensor
-    """(N, lanes, BODY_WIDTH) bodies as tracked; the first column is 1 where there is one, else all are 0"""
+    obstacles: torch.Tensor
+    """(N, lanes, OBSTACLE_WIDTH) obstacles as tracked; the first column is 1 where there is one, else all are
+    0"""
     own: torch.Tensor
     """(N, EGO_COLUMNS) the vehicle, its goal and the free distances around it"""
     truth: torch.Tensor
-    """(N, lanes, TRUTH_WIDTH) true places of the bodies, now and 1, 2, 3 s later: for a critic in training"""
+    """(N, lanes, TRUTH_WIDTH) true places of the obstacles, now and 1, 2, 3 s later: for a critic in
+    training"""
 
 
-class Twin:
+class Surrogate:
     """N episodes of a bank's scenarios. An env whose episode has ended goes on after ``begin``."""
 
     def __init__(self, config: LearningConfig, bank: ScenarioBank, num_envs: int, seed: int) -> None:
         """``seed`` opens the noise of the tracks."""
         start_taichi("cpu")
         self.bank, self.num_envs, self.seed, self.count = bank, num_envs, seed, 0
-        self.rules = bind(TwinRules, config)
+        self.rules = bind(SurrogateRules, config)
         lanes = bank.path.shape[1]
         self.ego = torch.zeros(num_envs, EGO_WIDTH)
         self.scenario = torch.zeros(num_envs, dtype=torch.int32)
@@ -153,8 +157,8 @@ class Twin:
         self.reward, self.outcome = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.int32)
         self._raw = torch.zeros(num_envs, lanes, RAW_WIDTH)
         self._ray = torch.zeros(num_envs, N_RAY)
-        self.view = TwinView(
-            torch.zeros(num_envs, lanes, BODY_WIDTH),
+        self.view = SurrogateView(
+            torch.zeros(num_envs, lanes, OBSTACLE_WIDTH),
             torch.zeros(num_envs, EGO_COLUMNS),
             torch.zeros(num_envs, lanes, TRUTH_WIDTH),
         )
@@ -162,7 +166,7 @@ class Twin:
     @property
     def num_scenarios(self) -> int:
         """How many there are to begin."""
-        return len(self.bank.body)
+        return len(self.bank.obstacle)
 
     @property
     def time_s(self) -> torch.Tensor:
@@ -173,14 +177,14 @@ class Twin:
         """Begin the scenarios of these numbers (N,) in the envs (N,) where ``rows`` is true; ``look`` comes
         next."""
         self.scenario = torch.where(rows, scenario.int(), self.scenario)
-        motion.begin_twin(rows.int(), self.bank.mission, self.scenario, self.ego, self.track)
+        motion.begin_surrogate(rows.int(), self.bank.mission, self.scenario, self.ego, self.track)
 
-    def look(self) -> TwinView:
+    def look(self) -> SurrogateView:
         """Sense once more, after ``step`` and ``begin``."""
         b = self.bank
-        sensing.sense_twin(
-            self.rules, self.seed, self.count, b.body, b.path, self.scenario, self.ego, self.track,
-            self._raw, self._ray, self.view.truth, self.view.bodies, self.view.own,
+        sensing.sense_surrogate(
+            self.rules, self.seed, self.count, b.obstacle, b.path, self.scenario, self.ego, self.track,
+            self._raw, self._ray, self.view.truth, self.view.obstacles, self.view.own,
         )  # fmt: skip
         self.count = (self.count + 1) % 2**30
         return self.view
@@ -188,10 +192,10 @@ class Twin:
     def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Carry out a decision (N, 3): (reward, outcome code), both (N,)."""
         b = self.bank
-        motion.drive_twin(
+        motion.drive_surrogate(
             self.rules,
             action.contiguous(),
-            b.body,
+            b.obstacle,
             b.path,
             self.scenario,
             self.ego,

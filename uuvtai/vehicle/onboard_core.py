@@ -71,7 +71,7 @@ class FedPilot:
         self.limits, self.numbers, self.stack = limits or StaleLimits(), numbers, stack
         views = stack.views
         self.begin_again(mission)
-        self._teacher = {name: views[f"teacher.{name}"] for name in ("action", "last_vel_w", "leaf")}
+        self._behavior = {name: views[f"behavior.{name}"] for name in ("action", "last_vel_w", "leaf")}
         self._route = {name: views[f"route.{name}"] for name in ("n_way", "plan_step", "trigger")}
         self._pos_w = views["ego.pos_w"]
         self._top = np.array(numbers.top, np.float32)
@@ -100,12 +100,12 @@ class FedPilot:
             self.stack.begin(self.mission, self.sensors)
             self._begun = True
             if self.mission.spread and self.numbers.estimated:
-                self.stack.views["pose.cov"][0, _START] = self.mission.spread
+                self.stack.views["localization.cov"][0, _START] = self.mission.spread
         return self._command()
 
     def _command(self) -> PilotCommand:
-        step, node = self.sensors.step, int(self._teacher["leaf"][0])
-        chosen = self._teacher["action"][0].copy()
+        step, node = self.sensors.step, int(self._behavior["leaf"][0])
+        chosen = self._behavior["action"][0].copy()
         held = self._reasons_to_stop(chosen)
         action = np.zeros(4, np.float32) if held else chosen
         planned = self._route["n_way"][0] > 0 and self._route["plan_step"][0] == step
@@ -116,7 +116,7 @@ class FedPilot:
             action=action,
             velocity=action * self._top,
             chosen=chosen,
-            asked_w=self._teacher["last_vel_w"][0].copy(),
+            asked_w=self._behavior["last_vel_w"][0].copy(),
             leaf=self.numbers.nodes[node] if node >= 0 else "",
             trigger=TRIGGERS[trigger - 1] if planned and trigger > 0 else "",
             pos_w=self._pos_w[0].copy(),

@@ -104,12 +104,12 @@ def _config(path: Path, head: LogHead) -> Config:
 
 def _tree(path: Path, head: LogHead, controller: str | None, config: Config) -> FlatTree:
     if controller is not None:
-        return read_tree(controller, config.teacher.max_node)
+        return read_tree(controller, config.behavior.max_node)
     if "tree.xml" not in head.attachments:
         raise LogError(
             f"{path}: the log does not hold the tree that drove; name it: uuv replay {path} --agent bt"
         )
-    return parse_tree(head.attachments["tree.xml"], f"{path}: tree.xml", config.teacher.max_node)
+    return parse_tree(head.attachments["tree.xml"], f"{path}: tree.xml", config.behavior.max_node)
 
 
 def _place(values: Any) -> tuple[float, float, float]:
@@ -213,13 +213,13 @@ class _FeedReader:
             raise LogError(f"{self._feed.path}: is longer than {_MAX_STEPS} steps; no episode of ours is")
         if given_up := m.data.get("given_up"):
             self._arrives(m, onboard.ThrusterLoss(m.time_s, float(given_up)))
-        logged = LoggedStep(_array(m.data["teacher"]), _array(m.data["asked"]), m.data["leaf"], self._pos_w)
+        logged = LoggedStep(_array(m.data["behavior"]), _array(m.data["asked"]), m.data["leaf"], self._pos_w)
         self._feed.steps.append(logged)
 
 
 def uses_camera(config: Config) -> bool:
     """Whether any stage behind the camera looks at its images."""
-    return config.spotting.use_camera or config.elevation.use_camera or config.mapping.depth_hit > 0
+    return config.camera_tracking.use_camera or config.height.use_camera or config.mapping.depth_hit > 0
 
 
 # ---- What goes wrong on the way to the pilot: messages lost or late, a sensor dead for a while.

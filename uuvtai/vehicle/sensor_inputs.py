@@ -187,7 +187,9 @@ class MotionWatch:
         """(3,) [m/s^2] error of the accelerometer: the last numbers of both filters (perception/pose.py)."""
         if not self._estimated:
             return np.zeros(3)
-        return np.append(self._views["pose.mean"][0, 7:9], self._views["pose.depth"][0, 3]).astype(np.float64)
+        return np.append(
+            self._views["localization.mean"][0, 7:9], self._views["localization.depth"][0, 3]
+        ).astype(np.float64)
 
 
 FIX_AGE_S = 0.3

@@ -99,8 +99,8 @@ class Water(Protocol):
 
 
 class Instance:
-    """Until a thruster turns for the first time the vehicle is held at its start and the bodies stand still:
-    an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
+    """Until a thruster turns for the first time the vehicle is held at its start and the obstacles stand
+    still: an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
 
     def __init__(self, config: Config, water: Water, row: int) -> None:
         self._config, self._water, self._row = config, water, row
@@ -181,7 +181,7 @@ class Instance:
 
 
 class WaterRows:
-    """The vehicles of several instances. Row i plays episode ``first + i`` of ``seed``."""
+    """The vehicles of several instances. Row i runs episode ``first + i`` of ``seed``."""
 
     def __init__(self, sim: Sim, seed: int, first: int) -> None:
         """SettingError for a vehicle that is none of ArduSub's frames."""
@@ -191,7 +191,7 @@ class WaterRows:
         """one object for as long as it stays: kernels are launched again by the identity of what they take"""
         memory = self._sim.memory()
         views = memory.views(memory.read(), scratch=True)
-        self._awake, self._active = views["clock.awake"], views["clock.active"]
+        self._active, self._running = views["clock.active"], views["clock.running"]
         self._rpm = views["actuation.rpm_command"]
         names = ("pos_w", "vel_b", "quat_wb", "rate_b", "acc_b")
         self._vehicle = {name: views[f"vehicle.{name}"] for name in names}
@@ -213,7 +213,7 @@ class WaterRows:
         dynamics.reset_vehicle(io.dynamics)
         control.reset_actuation(io.actuation)
         forget_readings(io)
-        episode.reset_referee(io.episode)
+        episode.reset_termination(io.episode)
         self.sense(row)
 
     def push(self, row: int, pwm: tuple[int, ...], dt_s: float) -> None:
@@ -226,13 +226,13 @@ class WaterRows:
         dynamics.move_vehicle(self._sim.io.dynamics, self._dt_s, 1)
 
     def control_step(self, row: int) -> str:
-        """The world moves on by a control step and the referee looks; how the episode stands."""
+        """The world moves on by a control step and the termination check looks; how the episode stands."""
         self._wake(row)
         io = self._sim.io
         episode.advance_clock(io.episode)
         scenario.move_obstacles(io.world)
-        episode.judge(io.episode)
-        outcome = int(self._read["referee.outcome"][row])
+        episode.check_termination(io.episode)
+        outcome = int(self._read["termination.outcome"][row])
         return "" if outcome == RUNNING else OUTCOMES[outcome]
 
     def sense(self, row: int) -> None:
@@ -265,8 +265,8 @@ class WaterRows:
 
     def _wake(self, row: int) -> None:
         """This row alone takes part in what comes."""
-        self._awake[:], self._active[:] = 0, 0
-        self._awake[row] = self._active[row] = 1
+        self._active[:], self._running[:] = 0, 0
+        self._active[row] = self._running[row] = 1
 
 
 def _rotation(quat: np.ndarray) -> np.ndarray:

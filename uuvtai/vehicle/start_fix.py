@@ -4,7 +4,7 @@ checked, corrected, or refused. And under way: whether the walls still fit. NumP
 Returns of all scans are laid into one frame, whose axes are the world's as typed, by attitude and velocity
 since. Of all turns and places near the typed start a histogram of these points says which lay them on the
 walls (a Hough transform); least squares on what fits (P. Huber, Robust Statistics, 1981) refines the best.
-Bodies return short of the walls; nothing returns from behind them, so returns from there, and beams that a
+Obstacles return short of the walls; nothing returns from behind them, so returns from there, and beams that a
 wall should have returned and did not, speak against a place. A direction in which no wall is seen, and two
 places that fit, are no fix: the operator is asked to turn the vehicle.
 """
@@ -33,7 +33,7 @@ _SEARCH_RAYS, _FARTHEST_M = 800, 60.0
 _FLOOR_M, _FLOOR_RAD = 0.02, math.radians(0.3)  # what a fix is never better than: errors that rays share
 _INDEPENDENT = 100  # rays count as no more measurements than this
 _WALL_RAYS, _WALL_M = 12, 1.5
-"""a wall is seen by so many returns at least, that lie so far apart: larger than the face of a body"""
+"""a wall is seen by so many returns at least, that lie so far apart: larger than the face of an obstacle"""
 _WIDE_RAD = math.radians(12.0)  # sectors that are wider are rangefinders, which measure along their axis
 _NEAREST = np.array([0.0, 0.0, 0.56, 0.85, 1.03, 1.16, 1.27, 1.35, 1.42])
 """standard deviations by which the least of so many normal values falls short of their mean"""
@@ -508,7 +508,7 @@ class WallWatch:
                 least = off[np.argmax(same)]
                 moved = short & (fit.off_m >= least) & (fit.off_m <= least + _SAME_M)
                 at = np.flatnonzero(moved)
-                whole = len(at) >= 0.7 * of[at[0] : at[-1] + 1].sum()  # no bodies here and there
+                whole = len(at) >= 0.7 * of[at[0] : at[-1] + 1].sum()  # no obstacles here and there
                 if whole and math.hypot(*np.ptp(ends[moved], 0)) >= _WALL_M:
                     counts[wall, 1] += moved.sum()
         return counts

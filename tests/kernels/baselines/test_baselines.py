@@ -39,12 +39,12 @@ def scene(small):
     memory = small.sim.memory()
     before = memory.read().copy()
     views = memory.views(memory.read(), scratch=True)
-    views["clock.awake"][:], views["clock.step"][:] = 1, 0
+    views["clock.active"][:], views["clock.step"][:] = 1, 0
     views["ego.pos_w"][:], views["ego.vel_b"][:], views["ego.rpy"][:] = HERE, 0, 0
     views["mission.goal_w"][:] = HERE + np.array([8, 0, 0])
     views["mission.start_w"][:] = HERE
-    views["teacher.follow_vel_w"][:] = [0.6, 0, 0]
-    views["teacher.away_w"][:] = 0
+    views["behavior.follow_vel_w"][:] = [0.6, 0, 0]
+    views["behavior.away_w"][:] = 0
     views["forecast.radius_m"][:] = -1
     views["clearance.clearance_m"][:] = 2
     yield SimpleNamespace(sim=small.sim, views=views, config=small.config, n=small.N)
@@ -57,7 +57,7 @@ def near(*way):
 
 
 def body(scene, row, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
-    """A body in straight motion, at any height but the free water from ``below`` to ``above``."""
+    """An obstacle in straight motion, at any height but the free water from ``below`` to ``above``."""
     times = np.arange(scene.views["forecast.pos_w"].shape[2]) * scene.config.tracking.forecast_dt_s
     scene.views["forecast.pos_w"][row, track] = np.asarray(pos) + np.outer(times, vel)
     scene.views["forecast.radius_m"][row, track] = radius
@@ -76,7 +76,7 @@ def decide(scene, name):
 def drive(scene, name, around):
     """Places (4 s, one per decision, x, y, z) [m] of row 0, driven by a planner from rest at ``HERE``;
     ``around(time_s)`` puts down what is near."""
-    dt, lag = scene.config.baselines.period_steps * 0.02, scene.config.teacher.lag_s
+    dt, lag = scene.config.baselines.period_steps * 0.02, scene.config.behavior.lag_s
     at, speed, places, decay = HERE.copy(), np.zeros(3), [], np.exp(-dt / lag)
     for k in range(40):
         around(k * dt)
@@ -90,13 +90,13 @@ def drive(scene, name, around):
 
 
 def touch_m(scene):
-    return scene.config.teacher.hull_reach_m + scene.config.teacher.contact_m
+    return scene.config.behavior.hull_reach_m + scene.config.behavior.contact_m
 
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_free_water_is_driven_as_wanted(scene, name):
-    scene.views["teacher.follow_vel_w"][1] = [0, -0.6, 0]
-    scene.views["teacher.follow_vel_w"][2] = 0
+    scene.views["behavior.follow_vel_w"][1] = [0, -0.6, 0]
+    scene.views["behavior.follow_vel_w"][2] = 0
     scene.views["mission.goal_w"][3] = HERE + np.array([8, 0, 0.3])
     for _ in range(10):  # MPPI's plan converges
         found = decide(scene, name)
@@ -108,17 +108,17 @@ def test_free_water_is_driven_as_wanted(scene, name):
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_a_head_on_body_is_given_way_to(scene, name):
+def test_a_head_on_obstacle_is_given_way_to(scene, name):
     """And passed, but by the potential field, which sees no velocities and is pushed back for longer."""
     start, vel = near(2.4, 0.05), np.array([-0.6, 0.0])
     places = drive(scene, name, lambda time: body(scene, 0, 0, start + vel * time, vel))
-    bodies = start + np.outer((np.arange(len(places)) + 1) * 0.1, vel)
-    assert np.linalg.norm(places[:, :2] - bodies, axis=1).min() > 0.2 + touch_m(scene)
-    assert name == "potential_field" or places[-1, 0] > max(bodies[-1, 0], HERE[0]) + 0.5
+    obstacles = start + np.outer((np.arange(len(places)) + 1) * 0.1, vel)
+    assert np.linalg.norm(places[:, :2] - obstacles, axis=1).min() > 0.2 + touch_m(scene)
+    assert name == "potential_field" or places[-1, 0] > max(obstacles[-1, 0], HERE[0]) + 0.5
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_a_body_that_is_known_to_be_above_or_below_is_passed(scene, name):
+def test_a_obstacle_that_is_known_to_be_above_or_below_is_passed(scene, name):
     over = HERE[2] + 0.9
     body(scene, 0, 0, near(1.0, 0.0), [-0.3, 0.0], above=over, below=-OPEN_M)
     for _ in range(10):
@@ -135,14 +135,14 @@ def test_no_velocity_leads_into_a_wall(scene, name):
     x = grid_origin(tank, cell)[0] + (np.arange(n_col) + 0.5) * cell
     wall = HERE[0] + 0.75
     scene.views["clearance.clearance_m"][:] = np.clip(wall - x, 0, 2)
-    scene.views["teacher.away_w"][:] = [-1, 0]
+    scene.views["behavior.away_w"][:] = [-1, 0]
     places = drive(scene, name, lambda _time: None)
     assert (wall - places[:, 0]).min() > touch_m(scene), "it has not touched the wall"
     assert places[:, 0].min() > HERE[0] - 0.3, "nor fled"
 
 
 def test_a_velocity_obstacle_is_left(scene):
-    """Random bodies: the velocity lies outside the cone of each, wherever the wanted one lies."""
+    """Random obstacles: the velocity lies outside the cone of each, wherever the wanted one lies."""
     rng = np.random.default_rng(4)
     config = scene.config.baselines.velocity_obstacle
     reach = 0.2 + touch_m(scene) + config.margin_m
@@ -163,7 +163,7 @@ def test_a_velocity_obstacle_is_left(scene):
                     vel[row, track],
                     reach,
                     config.horizon_s,
-                    scene.config.teacher.lag_s,
+                    scene.config.behavior.lag_s,
                 )
                 assert not in_cone(found[row], *case, slack=1e-3)
                 inside += in_cone(np.array([0.6, 0.0, 0.0]), *case, slack=0.0)
@@ -171,7 +171,7 @@ def test_a_velocity_obstacle_is_left(scene):
 
 
 def in_cone(velocity, place, vel, reach, horizon_s, lag, slack):
-    """Whether a velocity from rest meets a body's grown outline within the horizon (sampled finely)."""
+    """Whether a velocity from rest meets an obstacle's grown outline within the horizon (sampled finely)."""
     times = np.linspace(0, horizon_s, 600)[:, None]
     begin = -velocity[:2] * lag
     return np.linalg.norm(place + vel * times - begin - velocity[:2] * times, axis=1).min() < reach - slack
@@ -194,7 +194,7 @@ def test_the_dynamic_window_is_what_can_be_reached(scene):
 
 def test_the_potential_field_pushes_away_and_only_within_reach(scene):
     config = scene.config.baselines.potential_field
-    scene.views["teacher.follow_vel_w"][:] = 0
+    scene.views["behavior.follow_vel_w"][:] = 0
     reach = config.reach_m + 0.2 + touch_m(scene)
     ways = np.array([[0.9, 0.0], [0.0, -0.9], [reach - 0.05, 0.0], [reach + 0.05, 0.0]])
     for row, way in enumerate(ways):
@@ -210,7 +210,7 @@ def test_the_potential_field_pushes_away_and_only_within_reach(scene):
 
 
 def test_mppi_is_the_same_in_any_row_and_beside_any_others(scene):
-    """Its random numbers come from start, goal and step; rows that sleep or do not decide keep what they
+    """Its random numbers come from start, goal and step; inactive rows or do not decide keep what they
     have."""
 
     def drama(rows, others):
@@ -232,7 +232,7 @@ def test_mppi_is_the_same_in_any_row_and_beside_any_others(scene):
     np.testing.assert_array_equal(one[:, 0], one[:, 3])
     np.testing.assert_array_equal(one[:, 0], other[:, 5])
     assert (one[:, 0] != one[:, 1]).any() and len(np.unique(one[:, 0], axis=0)) == 3
-    scene.views["clock.awake"][0], scene.views["clock.step"][1:4] = 0, 12
+    scene.views["clock.active"][0], scene.views["clock.step"][1:4] = 0, 12
     scene.views["clock.step"][4:] = 15
     last = decide(scene, "mppi")
     np.testing.assert_array_equal(last[:4], other[-1, :4])
@@ -240,10 +240,10 @@ def test_mppi_is_the_same_in_any_row_and_beside_any_others(scene):
 
 
 READ = {
-    "clock": (state.ClockState, ("awake", "step")),
+    "clock": (state.ClockState, ("active", "step")),
     "ego": (state.Proprioception, ("pos_w", "vel_b", "rpy")),
     "mission": (state.MissionState, ("start_w", "goal_w")),
-    "teacher": (state.TeacherState, ("follow_vel_w",)),
+    "behavior": (state.BehaviorState, ("follow_vel_w",)),
     "forecast": (state.ForecastState, ("pos_w", "radius_m", "above_w", "below_w")),
     "clearance": (state.ClearanceState, ("clearance_m",)),
 }
@@ -283,11 +283,11 @@ def test_all_of_them_are_rows_of_an_evaluation(borrowed, capfd, tmp_path):
     command = ("eval", "--episodes", "2", "--seeds", "77", *SmallSim.OPTIONS, "--agent", ",".join(names))
     code, out, err = uuv(capfd, *command, "--run-dir", str(tmp_path / "run"), "--json")
     assert code == 0, err
-    methods = json.loads(out)["methods"]
-    assert [m["name"] for m in methods] == names and not any(m["privileged"] for m in methods)
-    times = [[d["time_s"] for d in m["episodes_detail"]] for m in methods]
+    agents = json.loads(out)["agents"]
+    assert [m["name"] for m in agents] == names and not any(m["privileged"] for m in agents)
+    times = [[d["time_s"] for d in m["episodes_detail"]] for m in agents]
     assert len({tuple(t) for t in times}) == 4, "each drives in its own way"
-    assert max(m["outcomes"]["success"] for m in methods) == 2
+    assert max(m["outcomes"]["success"] for m in agents) == 2
 
 
 def test_nothing_of_them_runs_under_another_tree(small, monkeypatch):

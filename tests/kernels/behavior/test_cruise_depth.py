@@ -11,7 +11,7 @@ from uuvtai.kernels.behavior.io import ThreatsIO
 from uuvtai.kernels.behavior.threats import choose_depth, level_share
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import AnyTensor, Bundle
-from uuvtai.state import MissionState, Proprioception, TeacherState, allocate
+from uuvtai.state import BehaviorState, MissionState, Proprioception, allocate
 
 N_ENV = 6
 SIZES = {
@@ -26,16 +26,16 @@ LOW, HIGH = -1.4, -0.2
 """Edges of the band: 0.2 m off the floor at -1.6 m and off the surface."""
 
 
-def config(column_share=0.0, **teacher):
-    numbers = {"edge_gap_m": 0.2, "depth_choices": 7} | teacher
+def config(column_share=0.0, **behavior):
+    numbers = {"edge_gap_m": 0.2, "depth_choices": 7} | behavior
     prior = {"column_share": column_share}
-    return Config.model_validate({"traffic": POOL, "elevation": prior, "teacher": numbers})
+    return Config.model_validate({"traffic": POOL, "elevation": prior, "behavior": numbers})
 
 
 @ti.kernel
 def _shares(z: AnyTensor, out: AnyTensor, io: Bundle[ThreatsIO]):
     for i in z:
-        out[i] = level_share(z[i], io.traffic_cfg, io.elevation_cfg, io.teacher_cfg, io.vehicle_cfg)
+        out[i] = level_share(z[i], io.traffic_cfg, io.height_cfg, io.behavior_cfg, io.vehicle_cfg)
 
 
 @ti.kernel
@@ -46,7 +46,7 @@ def _choose(out: AnyTensor, io: Bundle[ThreatsIO]):
 
 class Stage:
     def __init__(self):
-        self.teacher = allocate(TeacherState, SIZES)
+        self.behavior = allocate(BehaviorState, SIZES)
         self.ego, self.mission = allocate(Proprioception, SIZES), allocate(MissionState, SIZES)
 
     def choose(self, goal_z, away_m=10.0, before_z=-0.8, sigma_m=0.0, cfg=None, given_up=0):
@@ -58,14 +58,14 @@ class Stage:
         self.ego.pos_w.from_numpy(np.stack([n + 4, n + 3, n - 0.8], 1))
         goal = np.stack([n + 4 + np.float32(away_m), n + 3, n + np.asarray(goal_z, np.float32)], 1)
         self.mission.goal_w.from_numpy(goal.astype(np.float32))
-        self.teacher.cruise_z_m.from_numpy((n + np.asarray(before_z)).astype(np.float32))
+        self.behavior.cruise_z_m.from_numpy((n + np.asarray(before_z)).astype(np.float32))
         out = np.zeros(N_ENV, np.float32)
         _choose(out, io_for(ThreatsIO, *vars(self).values(), *sections(cfg)))
         return out
 
 
 def sections(cfg):
-    return cfg.traffic, cfg.teacher, cfg.vehicle, cfg.world.tank, cfg.elevation, cfg.episode
+    return cfg.traffic, cfg.behavior, cfg.vehicle, cfg.world.tank, cfg.height, cfg.episode
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +75,8 @@ def stage():
 
 @pytest.mark.parametrize("column_share", [0.0, 0.5])
 def test_expected_share_is_that_of_a_drawn_population(column_share):
-    """Bodies with centres anywhere in the band and half heights of 0.2 m on average; the band's ends are soft
-    by 0.05 m, which moves no share by more than that over the band's length."""
+    """Obstacles with centres anywhere in the band and half heights of 0.2 m on average; the band's ends are
+    soft by 0.05 m, which moves no share by more than that over the band's length."""
     rng, z = np.random.default_rng(7), np.linspace(-1.5, -0.1, 15).astype(np.float32)
     centre, half = rng.uniform(-1.2, -0.4, (200_000, 1)), rng.uniform(0.15, 0.25, (200_000, 1))
     column = rng.random((200_000, 1)) < column_share
@@ -122,7 +122,7 @@ def test_keeps_what_it_has_chosen_where_both_edges_are_as_good(stage):
     np.testing.assert_allclose(stage.choose(-0.85, before_z=LOW), LOW, atol=1e-6)
 
 
-def test_stays_at_the_goals_depth_where_bodies_fill_the_water(stage):
+def test_stays_at_the_goals_depth_where_obstacles_fill_the_water(stage):
     full = config(1.0, weight_depth_change=0.0)
     np.testing.assert_allclose(stage.choose(-0.6, cfg=full), -0.6, atol=1e-6)
     np.testing.assert_allclose(stage.choose(-0.4, cfg=config(free_depth=False)), -0.4, atol=1e-6)

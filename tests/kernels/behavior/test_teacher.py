@@ -10,12 +10,12 @@ import taichi as ti
 import torch
 
 from tests.bundles import io_for
-from tests.oracles import teacher as oracle
+from tests.oracles import behavior as oracle
 from uuvtai import state
-from uuvtai.config import Config, TeacherConfig
+from uuvtai.config import BehaviorConfig, Config
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.behavior import avoidance, threats, tree
-from uuvtai.kernels.behavior.io import EvasionIO, TeacherIO, ThreatsIO
+from uuvtai.kernels.behavior.io import BehaviorIO, EvasionIO, ThreatsIO
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
 from uuvtai.sim.behavior_tree import load_tree, parse_tree, read_tree
@@ -31,15 +31,16 @@ TEACHER = {
     "weight_mean": 6.0,
     "weight_contact": 12.0, "weight_static": 12.0, "weight_static_contact": 30.0, "weight_deviation": 1.0,
     "weight_change": 0.3,
-    "softness": 0.05, "calm_s": 0.5, "conflict_within_s": 2.5, "emergency_ttc_s": 0.35,
+    "temperature": 0.05, "hysteresis_s": 0.5, "conflict_within_s": 2.5, "emergency_ttc_s": 0.35,
     "emergency_range_m": 0.12,
     "emergency_closing_m_s": 0.15, "back_off_m_s": 0.85, "blocked_clearance_m": 0.25, "goal_near_m": 1.5,
     "stuck_s": 4.0, "unstick_s": 1.5,
     "unstick_m_s": 0.3, "slow_clearance_m": 0.6, "slow_fraction": 0.5, "edge_gap_m": 0.26, "depth_gain": 1.0,
     "yaw_gain": 1.5,
-    "gaze_m": 3.0, "gaze_level_m": 1.0, "gaze_clearance_m": 0.6, "askew_clearance_m": 0.5,
+    "heading_range_m": 3.0, "heading_level_m": 1.0, "heading_clearance_m": 0.6, "sideslip_clearance_m": 0.5,
     "place_sigmas": 2.5,
-    "gaze_off_deg": 25.0, "free_depth": False, "least_share": 0.02, "heed_share": 0.2, "future_margin": 0.6,
+    "heading_off_deg": 25.0, "free_depth": False, "least_share": 0.02, "evade_probability": 0.2,
+    "future_margin": 0.6,
 }  # fmt: skip
 """Every number of the stage, so that tuning the defaults breaks nothing here. The dashes end between two
 samples of the forecast."""
@@ -47,7 +48,7 @@ CFG = Config.model_validate(
     {
         "sensors": {"sonar": {"n_ray": N_RAY}},
         "tracking": {"n_track": N_TRACK, "horizon_s": 2.5, "forecast_dt_s": 0.1},
-        "teacher": TEACHER,
+        "behavior": TEACHER,
     }
 )
 TANK = CFG.world.tank
@@ -56,8 +57,8 @@ TIMES = np.arange(N_SAMPLE) * CFG.tracking.forecast_dt_s
 CELL = CFG.mapping.cell_m
 SIZES = {
     "n_env": N_ENV,
-    "n_node": CFG.teacher.max_node,
-    "n_candidate": CFG.teacher.n_candidate,
+    "n_node": CFG.behavior.max_node,
+    "n_candidate": CFG.behavior.n_candidate,
     "n_track": N_TRACK,
     "n_forecast": N_SAMPLE,
     "n_future": 2,
@@ -73,12 +74,12 @@ COST_TOLERANCE = 5e-3
 summed terms; and the kernel's distances are 1e-4 m too long at a mantle (a term under its root), which the
 weights of a body (24 per metre) turn into 2.4e-3."""
 CLOSE_M = 1e-4
-"""A sample this close to a cell's border or to where a body's height begins may fall on its other side in
-float32; such candidates are not compared."""
+"""A sample this close to a cell's border or to where an obstacle's height begins may fall on its other side
+in float32; such candidates are not compared."""
 OPEN_M = FAR_M
 """Height of free water that nothing bounds."""
 STRUCTS = {
-    "t": state.TeacherState,
+    "t": state.BehaviorState,
     "route": state.RouteState,
     "forecast": state.ForecastState,
     "futures": state.FutureState,
@@ -110,7 +111,7 @@ def stage():
 @pytest.fixture
 def scene(stage):
     """Every env alike: at (5, 3), facing +x, at rest, open water, look-ahead 1 m ahead, nothing around."""
-    stage.clock.awake.fill(1)
+    stage.clock.active.fill(1)
     stage.clock.step.fill(0)
     fill(stage.ego.pos_w, (5.0, 3.0, -0.8))
     fill(stage.ego.vel_b, (0, 0, 0))
@@ -137,7 +138,7 @@ def scene(stage):
     stage.clearance.site_row.fill(-1)
     stage.clearance.site_col.fill(-1)
     use(stage, "bt")
-    tree.reset_teacher(io_for(TeacherIO, stage.t, stage.table, stage.mission, stage.clock))
+    tree.reset_behavior(io_for(BehaviorIO, stage.t, stage.table, stage.mission, stage.clock))
     return stage
 
 
@@ -158,7 +159,7 @@ def use(stage, name):
 
 
 def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
-    """A forecast body in straight motion, at any height but the free water from ``below`` to ``above``
+    """A forecast obstacle in straight motion, at any height but the free water from ``below`` to ``above``
     (default: level with -0.8 m)."""
     put(stage.forecast.pos_w, np.asarray(pos) + np.outer(TIMES, vel), env, track)
     put(stage.forecast.radius_m, radius, env, track)
@@ -166,7 +167,7 @@ def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
     put(stage.forecast.below_w, below, env, track)
 
 
-def assess(stage, cfg=CFG.teacher, sonar=CFG.sensors.sonar):
+def assess(stage, cfg=CFG.behavior, sonar=CFG.sensors.sonar):
     threats.assess_threats(
         io_for(
             ThreatsIO,
@@ -182,7 +183,7 @@ def assess(stage, cfg=CFG.teacher, sonar=CFG.sensors.sonar):
             stage.clock,
             cfg,
             sonar,
-            CFG.elevation,
+            CFG.height,
             CFG.traffic,
             CFG.vehicle,
             CFG.tracking,
@@ -204,7 +205,7 @@ def plan(stage):
             stage.clearance,
             stage.ego,
             stage.clock,
-            CFG.teacher,
+            CFG.behavior,
             CFG.vehicle,
             CFG.tracking,
             TANK,
@@ -222,7 +223,7 @@ def decide(stage):
 def tick(stage, sonar=CFG.sensors.sonar):
     tree.tick_tree(
         io_for(
-            TeacherIO,
+            BehaviorIO,
             stage.t,
             stage.baselines,
             stage.table,
@@ -230,7 +231,7 @@ def tick(stage, sonar=CFG.sensors.sonar):
             stage.ego,
             stage.mission,
             stage.clock,
-            CFG.teacher,
+            CFG.behavior,
             sonar,
             CFG.vehicle,
             TANK,
@@ -256,8 +257,8 @@ def step(stage, count=1):
 
 
 def test_packets_equal_the_scalar_oracle(scene):
-    """Costs of all candidates over random bodies, heights, maps and motions; how depth is changed; and what
-    is made of the costs."""
+    """Costs of all candidates over random obstacles, heights, maps and motions; how depth is changed; and
+    what is made of the costs."""
     rng = np.random.default_rng(3)
     bests = []
     for _ in range(2):
@@ -273,28 +274,28 @@ def test_packets_equal_the_scalar_oracle(scene):
             view = View(scene, env)
             commands, bursts = view.candidates()
             wanted, doubt = np.array([view.cost(*pair) for pair in zip(commands, bursts, strict=True)]).T
-            assert len(wanted) == CFG.teacher.n_candidate
+            assert len(wanted) == CFG.behavior.n_candidate
             sure = doubt > CLOSE_M
             assert sure.sum() > 0.6 * len(wanted)
             np.testing.assert_allclose(found[env][sure], wanted[sure], atol=COST_TOLERANCE)
             best = found[env].argmin()
-            mean = oracle.mean_velocity(commands, found[env], CFG.teacher.softness)
+            mean = oracle.mean_velocity(commands, found[env], CFG.behavior.temperature)
             held = view.cost(mean, np.inf)[0]
             taken = (
                 (mean, held)
-                if held <= found[env].min() + CFG.teacher.softness
+                if held <= found[env].min() + CFG.behavior.temperature
                 else (commands[best], found[env].min())
             )
             np.testing.assert_allclose(chosen[env], taken[0], atol=1e-3)
             assert price[env] == pytest.approx(taken[1], abs=COST_TOLERANCE)
             bests.append(best)
     assert (
-        max(bests) >= CFG.teacher.first_burst and (np.array(bests) < 36).any()
+        max(bests) >= CFG.behavior.first_burst and (np.array(bests) < 36).any()
     )  # dashes and level ones have both been best
 
 
 def random_scene(scene, rng):
-    """Own motion, follow and last velocities, maps, and bodies that may be level, above, below, or on both
+    """Own motion, follow and last velocities, maps, and obstacles that may be level, above, below, or on both
     sides of the free water."""
     put(scene.ego.pos_w, rng.uniform([3, 1.5, -1.3], [17, 4.5, -0.3], (N_ENV, 3)))
     put(scene.ego.vel_b, rng.uniform(-0.4, 0.4, (N_ENV, 3)))
@@ -330,7 +331,7 @@ def random_scene(scene, rng):
 def doubt(scene, env):
     """[m] by which walls and mapped obstacles are taken to be nearer."""
     xx, xy, _, yy, _, _ = scene.ego.pose_cov.to_numpy()[env].astype(float)
-    return CFG.teacher.place_sigmas * np.sqrt(np.linalg.eigvalsh([[xx, xy], [xy, yy]])[1])
+    return CFG.behavior.place_sigmas * np.sqrt(np.linalg.eigvalsh([[xx, xy], [xy, yy]])[1])
 
 
 class View:
@@ -353,21 +354,21 @@ class View:
 
     def candidates(self):
         return oracle.candidates(
-            self.follow, self.last, self.yaw, self.pos[2], CFG.teacher, CFG.vehicle, TANK
+            self.follow, self.last, self.yaw, self.pos[2], CFG.behavior, CFG.vehicle, TANK
         )
 
     def cost(self, command, burst_s):
         origin, dt = grid_origin(TANK, CELL), CFG.tracking.forecast_dt_s
-        rest = (self.follow, self.last, self.forecast, self.clearance, origin, CELL, CFG.teacher, TANK, dt)
+        rest = (self.follow, self.last, self.forecast, self.clearance, origin, CELL, CFG.behavior, TANK, dt)
         return oracle.cost(self.pos, self.vel, command, burst_s, *rest)
 
     def depths(self, command):
-        return oracle.body_depths(
+        return oracle.obstacle_depths(
             self.pos,
             self.vel,
             np.asarray(command, float),
             self.forecast,
-            CFG.teacher,
+            CFG.behavior,
             TANK,
             CFG.tracking.forecast_dt_s,
         )
@@ -377,7 +378,7 @@ def test_follow_changes_depth_only_where_that_comes_no_nearer(scene):
     """Against the oracle: peaks with and without the heave towards the goal decide, and the conflict is that
     of what is chosen."""
     rng = np.random.default_rng(5)
-    low, high = oracle.depth_band(TANK, CFG.teacher)
+    low, high = oracle.depth_band(TANK, CFG.behavior)
     heaves, held, seen = 0, 0, 0
     for _ in range(8):
         random_scene(scene, rng)
@@ -391,7 +392,7 @@ def test_follow_changes_depth_only_where_that_comes_no_nearer(scene):
             view = View(scene, env)
             error = np.clip(scene.mission.goal_w.to_numpy()[env, 2], low, high) - view.pos[2]
             heave = np.clip(
-                CFG.teacher.depth_gain * error, -CFG.vehicle.max_heave_m_s, CFG.vehicle.max_heave_m_s
+                CFG.behavior.depth_gain * error, -CFG.vehicle.max_heave_m_s, CFG.vehicle.max_heave_m_s
             )
             level, changing = view.depths((*follow[env, :2], 0.0)), view.depths((*follow[env, :2], heave))
             if min(level[4], changing[4]) < CLOSE_M or 5e-4 < changing[0] - level[0] < 2e-3:
@@ -418,12 +419,12 @@ def test_open_water_is_travelled_at_cruise_speed(scene):
     decide(scene)
     assert acting(scene) == ["FollowRoute"] * N_ENV
     np.testing.assert_allclose(
-        scene.action[0], [CFG.teacher.cruise_m_s / CFG.vehicle.max_surge_m_s, 0, 0, 0], atol=1e-5
+        scene.action[0], [CFG.behavior.cruise_m_s / CFG.vehicle.max_surge_m_s, 0, 0, 0], atol=1e-5
     )
     assert scene.t.conflict_s.to_numpy()[0] == scene.t.ttc_s.to_numpy()[0] == FAR_M
 
 
-def test_head_on_body_is_evaded_with_room(scene):
+def test_head_on_obstacle_is_evaded_with_room(scene):
     """The follow velocity would be hit; the evasive velocity keeps more than contact over the whole
     horizon."""
     body(scene, 0, 0, (7.2, 3.05), (-0.6, 0.0))
@@ -433,14 +434,14 @@ def test_head_on_body_is_evaded_with_room(scene):
 
     def closest(command):
         at, _ = oracle.rolled_out(
-            (5.0, 3.0), (0, 0), np.asarray(command, float), CFG.teacher.lag_s, 0.1, N_SAMPLE - 1
+            (5.0, 3.0), (0, 0), np.asarray(command, float), CFG.behavior.lag_s, 0.1, N_SAMPLE - 1
         )
         return (
             np.hypot(*(at - where).T).min() - 0.2 - CFG.vehicle.hull_radius_m - CFG.vehicle.hull_half_length_m
         )
 
     assert closest(scene.t.follow_vel_w.to_numpy()[0, :2]) < 0
-    assert closest(scene.t.evade_vel_w.to_numpy()[0, :2]) > CFG.teacher.contact_m
+    assert closest(scene.t.evade_vel_w.to_numpy()[0, :2]) > CFG.behavior.contact_m
 
 
 def test_evasion_stays_off_the_wall(scene):
@@ -471,11 +472,13 @@ def test_evasion_holds_between_decisions_and_ends_when_calm(scene):
     decide(scene)
     held = scene.t.evade_vel_w.to_numpy()[0]
     scene.forecast.radius_m.fill(-1.0)
-    step(scene, CFG.teacher.decide_period_steps - 1)
+    step(scene, CFG.behavior.decide_period_steps - 1)
     np.testing.assert_array_equal(scene.t.evade_vel_w.to_numpy()[0], held)
     assert acting(scene)[0] == "Evade"
-    assert scene.t.evading_steps.to_numpy()[0] == CFG.teacher.decide_period_steps
-    step(scene, round(CFG.teacher.calm_s / CFG.episode.control_dt_s) + CFG.teacher.decide_period_steps)
+    assert scene.t.evading_steps.to_numpy()[0] == CFG.behavior.decide_period_steps
+    step(
+        scene, round(CFG.behavior.hysteresis_s / CFG.episode.control_dt_s) + CFG.behavior.decide_period_steps
+    )
     assert acting(scene)[0] == "FollowRoute"
 
 
@@ -502,9 +505,9 @@ def test_sensed_emergency_backs_off_from_it(scene):
     np.testing.assert_allclose(velocity[2], velocity[0], atol=1e-5)
     assert velocity[3, 0] < -0.8
     assert scene.t.ttc_s.to_numpy()[0] == pytest.approx(
-        (0.45 - CFG.teacher.hull_reach_m - CFG.teacher.contact_m) / 0.6, rel=1e-4
+        (0.45 - CFG.behavior.hull_reach_m - CFG.behavior.contact_m) / 0.6, rel=1e-4
     )
-    assert scene.t.nearest_m.to_numpy()[1] == pytest.approx(0.45 - CFG.teacher.hull_reach_m, rel=1e-4)
+    assert scene.t.nearest_m.to_numpy()[1] == pytest.approx(0.45 - CFG.behavior.hull_reach_m, rel=1e-4)
 
 
 def test_the_less_sure_of_its_place_the_nearer_are_walls(scene):
@@ -546,12 +549,12 @@ def test_stuck_creeps_to_the_end_of_its_time(scene):
     put(scene.clearance.site_row, 32)
     put(scene.clearance.site_col, 40)
     scene.clearance.clearance_m.fill(0.6)
-    put(scene.route.stuck_steps, round(CFG.teacher.stuck_s / CFG.episode.control_dt_s), 0)
+    put(scene.route.stuck_steps, round(CFG.behavior.stuck_s / CFG.episode.control_dt_s), 0)
     decide(scene)
     assert acting(scene)[:2] == ["Unstick", "FollowRoute"]
-    assert scene.t.last_vel_w.to_numpy()[0, 0] > 0.9 * CFG.teacher.unstick_m_s
+    assert scene.t.last_vel_w.to_numpy()[0, 0] > 0.9 * CFG.behavior.unstick_m_s
     scene.route.stuck_steps.fill(0)
-    lasts = round(CFG.teacher.unstick_s / CFG.episode.control_dt_s)
+    lasts = round(CFG.behavior.unstick_s / CFG.episode.control_dt_s)
     step(scene, lasts - 2)
     assert acting(scene)[0] == "Unstick"
     step(scene, 4)
@@ -568,7 +571,7 @@ def test_waits_without_a_route_and_before_a_blocked_one(scene):
     np.testing.assert_array_equal(scene.action[:2], 0.0)
 
 
-def test_yardsticks_do_not_avoid_bodies(scene):
+def test_yardsticks_do_not_avoid_obstacles(scene):
     body(scene, 0, 0, (7.0, 3.0), (-0.6, 0.0))
     put(scene.mission.goal_w, (5.0, 5.0, -0.4))
     for name, leaf in (("planner", "FollowRoute"), ("straight", "DriveStraight")):
@@ -580,7 +583,7 @@ def test_yardsticks_do_not_avoid_bodies(scene):
     )  # to port, up, turning there
 
 
-def test_depth_goes_to_the_goals_but_not_towards_a_body(scene):
+def test_depth_goes_to_the_goals_but_not_towards_a_obstacle(scene):
     """Following climbs and dives where nothing can be met there; a tree can ask for it all the same."""
     scene.mission.goal_w.from_numpy(np.tile(np.float32([15.0, 3.0, -1.2]), (N_ENV, 1)))
     near, still = (6.0, 3.0), (0.0, 0.0)
@@ -591,7 +594,7 @@ def test_depth_goes_to_the_goals_but_not_towards_a_body(scene):
     put(scene.mission.goal_w, (15.0, 3.0, -1.6), 4)
     body(scene, 5, 0, near, still, above=OPEN_M, below=-1.1)
     put(scene.mission.goal_w, (15.0, 3.0, -0.6), 5)
-    lowest = TANK.z_m[0] + CFG.teacher.edge_gap_m
+    lowest = TANK.z_m[0] + CFG.behavior.edge_gap_m
     for guard, wanted in (
         ("", (-0.4, 0.0, -0.4, -0.4, lowest + 1.2, 0.2)),
         (' depth_guard="0"', (-0.4, -0.4, -0.4, -0.4, -0.4, 0.2)),
@@ -615,7 +618,7 @@ def test_climbs_or_dives_past_what_fills_the_way(scene):
     """In a corridor something faster than the vehicle comes: over it if it is known to be below, under it if
     above, not beyond the band."""
     corridor(scene, 0.5)
-    top = TANK.z_m[1] - CFG.teacher.edge_gap_m - 0.05
+    top = TANK.z_m[1] - CFG.behavior.edge_gap_m - 0.05
     for env, (above, below) in enumerate(((OPEN_M, -0.8), (-0.8, -OPEN_M), (OPEN_M, top), (-0.8, -0.8))):
         body(scene, env, 0, (6.3, 3.0), (-0.8, 0.0), above=above, below=below)
     put(scene.ego.pos_w, (5.0, 3.0, top), 2)
@@ -623,7 +626,7 @@ def test_climbs_or_dives_past_what_fills_the_way(scene):
     decide(scene)
     heave = scene.t.evade_vel_w.to_numpy()[:, 2]
     assert acting(scene) == ["Evade"] * 4 + ["FollowRoute"] * 2
-    assert heave[0] > 0.9 * CFG.teacher.heave_m_s and heave[1] < -0.9 * CFG.teacher.heave_m_s
+    assert heave[0] > 0.9 * CFG.behavior.heave_m_s and heave[1] < -0.9 * CFG.behavior.heave_m_s
     assert abs(heave[2]) <= 0.05 + 1e-5
     scene.ego.given_up.fill(5)
     decide(scene)
@@ -635,18 +638,18 @@ def test_patience_falls_while_it_does_not_come_on_and_comes_back(scene):
     """At rest, slow, at the speed that is no waiting, driving, going astern; its caution falls with it."""
     speeds = np.array([0.0, 0.125, 0.25, 0.6, -0.25, 0.0])
     put(scene.ego.vel_b, speeds, slice(None), 0)
-    step_s = CFG.teacher.decide_period_steps * CFG.episode.control_dt_s
+    step_s = CFG.behavior.decide_period_steps * CFG.episode.control_dt_s
     for _ in range(50):
         assess(scene)
-    waited = 50 * step_s * np.maximum(1 - speeds / CFG.teacher.waiting_m_s, 0)
+    waited = 50 * step_s * np.maximum(1 - speeds / CFG.behavior.waiting_m_s, 0)
     np.testing.assert_allclose(scene.t.waited_s.to_numpy(), waited, atol=1e-4)
-    patience = np.minimum(1, CFG.teacher.patience_s / np.maximum(waited, 1e-3))
+    patience = np.minimum(1, CFG.behavior.patience_s / np.maximum(waited, 1e-3))
     np.testing.assert_allclose(scene.t.patience.to_numpy(), patience, atol=1e-4)
     put(scene.ego.vel_b, 0.5, slice(None), 0)
     for _ in range(100):
         assess(scene)
     assert np.all(scene.t.patience.to_numpy() == 1)
-    endless = CFG.teacher.model_copy(update={"patience_s": 0.0})
+    endless = CFG.behavior.model_copy(update={"patience_s": 0.0})
     fill(scene.ego.vel_b, (0, 0, 0))
     for _ in range(50):
         assess(scene, endless)
@@ -659,13 +662,13 @@ def test_margins_shrink_with_patience(scene):
     body(scene, 1, 0, (7.0, 3.75), (0.0, 0.0))
     assess(scene)
     assert np.all(scene.t.conflict_s.to_numpy()[:2] < FAR_M)
-    put(scene.t.waited_s, 8 * CFG.teacher.patience_s, 1)
+    put(scene.t.waited_s, 8 * CFG.behavior.patience_s, 1)
     assess(scene)
     assert scene.t.conflict_s[0] < FAR_M == scene.t.conflict_s[1]
 
 
 def test_what_is_far_enough_below_is_no_conflict(scene):
-    """The same body on the way: level, a little below, well below."""
+    """The same obstacle on the way: level, a little below, well below."""
     for env, below in enumerate((-0.8, -0.9, -1.5)):
         body(scene, env, 0, (7.0, 3.0), (-0.6, 0.0), above=OPEN_M, below=below)
     decide(scene)
@@ -674,7 +677,7 @@ def test_what_is_far_enough_below_is_no_conflict(scene):
     assert conflict[0] <= conflict[1] < conflict[2] == FAR_M
 
 
-def test_stopping_is_safe_beside_the_path_of_a_body(scene):
+def test_stopping_is_safe_beside_the_path_of_a_obstacle(scene):
     """Something passes ahead: stop. It comes here: stopping helps nothing. A tree may ask for the next second
     only."""
     body(scene, 0, 0, (6.3, 5.0), (0.0, -0.9))
@@ -692,12 +695,12 @@ def test_stopping_is_safe_beside_the_path_of_a_body(scene):
 
 
 def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene):
-    """Bodies beyond the reach of every velocity are left out of the roll-out: following reaches farther than
-    evading here."""
+    """Obstacles beyond the reach of every velocity are left out of the roll-out: following reaches farther
+    than evading here."""
     body(scene, 0, 0, (6.7, 3.0), (0.0, 0.0))
     assess(scene)
     sooner = scene.t.conflict_s.to_numpy()[0]
-    assess(scene, CFG.teacher.model_copy(update={"evade_m_s": 0.1, "back_off_m_s": 0.1, "unstick_m_s": 0.1}))
+    assess(scene, CFG.behavior.model_copy(update={"evade_m_s": 0.1, "back_off_m_s": 0.1, "unstick_m_s": 0.1}))
     assert scene.t.conflict_s.to_numpy()[0] == sooner < FAR_M
 
 
@@ -712,11 +715,11 @@ def test_a_dash_gets_out_of_the_way_in_a_narrow_place(scene):
     body(scene, 0, 0, (5.0, 3.9), (0.0, -1.2), radius=0.25)
     decide(scene)
     cost = scene.t.candidate_cost.to_numpy()[0]
-    best, first = cost.argmin(), CFG.teacher.first_burst
+    best, first = cost.argmin(), CFG.behavior.first_burst
     assert acting(scene)[0] == "Evade"
     assert best >= first and cost[best] < cost[:first].min() - 0.3
     velocity, lasts = (pair[best] for pair in View(scene, 0).candidates())
-    assert lasts == CFG.teacher.burst_s
+    assert lasts == CFG.behavior.burst_s
     np.testing.assert_allclose(scene.t.evade_vel_w.to_numpy()[0], velocity, atol=1e-5)
 
 
@@ -725,7 +728,7 @@ def test_candidates_fill_whole_packets():
     level = {"n_heading": 5, "n_speed": 3, "n_heave_heading": 4}
     held, first, count = (
         [
-            getattr(TeacherConfig(**level, heave_m_s=heave, burst_s=burst), name)
+            getattr(BehaviorConfig(**level, heave_m_s=heave, burst_s=burst), name)
             for heave, burst in ((0, 0), (0, 0.5), (0.4, 0), (0.4, 0.5))
         ]
         for name in ("n_held", "first_burst", "n_candidate")
@@ -767,7 +770,7 @@ def test_faster_than_the_axes_only_on_diagonals(scene):
     body(scene, 0, 0, (6.6, 3.0), (-0.8, 0.0))
     decide(scene)
     velocity = scene.t.last_vel_w.to_numpy()[0]
-    turn = scene.action[0, 3].item() * CFG.vehicle.max_yaw_rate_rad_s / CFG.teacher.yaw_gain
+    turn = scene.action[0, 3].item() * CFG.vehicle.max_yaw_rate_rad_s / CFG.behavior.yaw_gain
     off = (np.arctan2(velocity[1], velocity[0]) - turn) / (np.pi / 4)
     assert abs(turn) <= np.pi / 4 + 1e-4
     assert abs(off - round(off)) < 0.02 and round(off) % 2 == 1
@@ -814,7 +817,7 @@ def test_round_a_corner_a_nearer_point_of_the_route_is_steered_for(scene):
     follow = scene.t.follow_vel_w.to_numpy()[:, :2]
     np.testing.assert_allclose(np.arctan2(*follow[:5].T), np.arctan2(*steer[:5].T), atol=1e-5)
     np.testing.assert_allclose(
-        np.hypot(*follow[[0, 1, 5]].T), [CFG.teacher.cruise_m_s, CFG.teacher.cruise_m_s, 0.0], atol=1e-5
+        np.hypot(*follow[[0, 1, 5]].T), [CFG.behavior.cruise_m_s, CFG.behavior.cruise_m_s, 0.0], atol=1e-5
     )
 
 
@@ -854,7 +857,7 @@ def test_a_narrow_way_is_entered_lengthwise(scene):
 def test_who_is_looked_at(scene):
     """Above and below before level ones (which count as 1 m farther), the nearest first, nobody beyond 3 m,
     nobody from narrow places."""
-    reach = 0.2 + CFG.teacher.hull_reach_m
+    reach = 0.2 + CFG.behavior.hull_reach_m
     still, over, under = (0.0, 0.0), {"above": -0.3, "below": -OPEN_M}, {"above": OPEN_M, "below": -1.3}
     cases = [
         [((1.0, 0.0), {}), ((0.0, 1.9), over), ((0.0, -2.5), under)],
@@ -864,22 +867,22 @@ def test_who_is_looked_at(scene):
         [((2.05 + reach, 0.0), {}), ((3.05 + reach, 0.0), over)],
         [((0.0, 2.95 + reach), under)],
     ]
-    for env, bodies in enumerate(cases):
-        for track, (way, height) in enumerate(bodies):
+    for env, obstacles in enumerate(cases):
+        for track, (way, height) in enumerate(obstacles):
             body(scene, env, track, np.add((5.0, 3.0), way), still, **height)
     wanted = np.array(
         [(0.0, 1.9), (1.0, 0.0), (-1.5, 0.0), (0.0, 1.95 + reach), (0.0, 0.0), (0.0, 2.95 + reach)]
     )
     assess(scene)
-    np.testing.assert_allclose(scene.t.gaze_w.to_numpy(), wanted, atol=1e-5)
+    np.testing.assert_allclose(scene.t.heading_w.to_numpy(), wanted, atol=1e-5)
     nearest = np.array([1.0 - reach, 1.0 - reach, 1.5 - reach, 1.95, 2.05, 2.95])
-    np.testing.assert_allclose(scene.t.body_near_m.to_numpy(), nearest, atol=1e-5)
+    np.testing.assert_allclose(scene.t.obstacle_near_m.to_numpy(), nearest, atol=1e-5)
     put(scene.clearance.clearance_m, 0.59, slice(0, 3))
     put(scene.clearance.clearance_m, 0.61, 3)
     blocks(scene, 5, (0.55, 0.05))
     assess(scene)
     np.testing.assert_allclose(
-        scene.t.gaze_w.to_numpy(), [*np.zeros((3, 2)), wanted[3], *np.zeros((2, 2))], atol=1e-5
+        scene.t.heading_w.to_numpy(), [*np.zeros((3, 2)), wanted[3], *np.zeros((2, 2))], atol=1e-5
     )
 
 
@@ -899,7 +902,7 @@ def turns(
 ):
     """[degree] that the nose is told to turn by, with the blackboard set by hand: bearings of the gaze and of
     the velocity, None = none."""
-    for name, degrees, length in (("gaze_w", gaze, 1.5), (way_of, way, speed)):
+    for name, degrees, length in (("heading_w", gaze, 1.5), (way_of, way, speed)):
         field = getattr(scene.t, name)
         at = np.array(
             [np.zeros(2) if d is None else polar(d, length) for d in np.broadcast_to(degrees, N_ENV)]
@@ -913,10 +916,10 @@ def turns(
     scene.tree = parse_tree(f'<root BTCPP_format="4"><BehaviorTree ID="main">{xml}</BehaviorTree></root>')
     load_tree(scene.table, scene.tree)
     tick(scene)
-    return np.degrees(scene.action[:, 3].numpy() * CFG.vehicle.max_yaw_rate_rad_s / CFG.teacher.yaw_gain)
+    return np.degrees(scene.action[:, 3].numpy() * CFG.vehicle.max_yaw_rate_rad_s / CFG.behavior.yaw_gain)
 
 
-MOST_DEG = np.degrees(CFG.vehicle.max_yaw_rate_rad_s / CFG.teacher.yaw_gain)
+MOST_DEG = np.degrees(CFG.vehicle.max_yaw_rate_rad_s / CFG.behavior.yaw_gain)
 """A larger angle saturates the yaw rate."""
 
 ANGLE_TOLERANCE = 1e-3
@@ -924,7 +927,7 @@ ANGLE_TOLERANCE = 1e-3
 degrees."""
 
 
-def test_following_the_nose_looks_at_the_body(scene):
+def test_following_the_nose_looks_at_the_obstacle(scene):
     """Whatever the way; without one, along the way; the shorter way round."""
     found = turns(
         scene,
@@ -956,7 +959,7 @@ def test_with_a_fan_ahead_it_turns_before_it_drives(scene):
     assert scene.t.speed_share.to_numpy()[4] == scene.t.speed_share.to_numpy()[0], "a ring sees all around"
 
 
-def test_waiting_the_nose_looks_at_the_body(scene):
+def test_waiting_the_nose_looks_at_the_obstacle(scene):
     np.testing.assert_allclose(
         turns(scene, "<Hold/>", yaw=[0, 10, 0, 0, -175, 0], gaze=[20, 20, None, -35, 175, 38], way=0),
         [20, 10, 0, -35, -10, 38],
@@ -1046,14 +1049,14 @@ def contents(struct):
 
 
 def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
-    """Row 0 gives the same bits whatever its neighbours do; rows that sleep keep theirs; a reset forgets the
+    """Row 0 gives the same bits whatever its neighbours do; inactive rows keep theirs; a reset forgets the
     last episode."""
 
     def drama(scene, others):
-        scene.clock.awake.fill(1)
+        scene.clock.active.fill(1)
         scene.clock.step.fill(0)
         scene.forecast.radius_m.fill(-1.0)
-        tree.reset_teacher(io_for(TeacherIO, scene.t, scene.table, scene.mission, scene.clock))
+        tree.reset_behavior(io_for(BehaviorIO, scene.t, scene.table, scene.mission, scene.clock))
         body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
         for env in range(1, N_ENV):
             if others:
@@ -1065,7 +1068,7 @@ def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
     first, second = drama(scene, False), drama(scene, True)
     for name, value in first.items():
         np.testing.assert_array_equal(value, second[name], err_msg=name)
-    put(scene.clock.awake, 0, 1)
+    put(scene.clock.active, 0, 1)
     before = contents(scene.t)
     put(scene.scan.hit, 1)
     put(scene.scan.range_m, 0.4)

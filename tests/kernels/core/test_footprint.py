@@ -17,7 +17,8 @@ ANGLE_TOL = 4e-7
 
 @ti.kernel
 def compare(kinds: ti.template(), rows: ti.template(), out: ti.template()):
-    """Of bodies 2 i and 2 i + 1: their distance; and the first against a ring around the second's centre."""
+    """Of obstacles 2 i and 2 i + 1: their distance; and the first against a ring around the second's
+    centre."""
     for i in out:
         a = footprint_row(2 * i, kinds, rows)
         b = footprint_row(2 * i + 1, kinds, rows)
@@ -39,7 +40,7 @@ def turn(angles: ti.template(), out: ti.template()):
         out[i] = geometry.steady_direction(angles[i])
 
 
-def test_distances_between_bodies_and_from_rings():
+def test_distances_between_obstacles_and_from_rings():
     rng = np.random.default_rng(0)
     rows = np.hstack(
         [rng.uniform(0, 2.5, (2 * N, 2)), rng.uniform(0.05, 0.8, (2 * N, 2)), rng.uniform(-7, 7, (2 * N, 1))]
@@ -56,14 +57,14 @@ def test_distances_between_bodies_and_from_rings():
     fields[1].from_numpy(rows)
     compare(*fields)
     got = fields[2].to_numpy()
-    bodies = [
+    obstacles = [
         (int(kind), row[:2], row[[2, 3, 3]], float(row[4]))
         for kind, row in zip(kinds, rows.astype(float), strict=True)
     ]
     assert got[0, 0] == 0.0
     overlapping = 0
     for i in range(N):
-        a, b = bodies[2 * i], bodies[2 * i + 1]
+        a, b = obstacles[2 * i], obstacles[2 * i + 1]
         gap = reference.gap(a, b)
         overlapping += gap <= 0
         if gap > 0.01:

@@ -26,7 +26,7 @@ PEN = TankConfig(shape="circle", x_m=(0.0, 16.0), y_m=(0.0, 16.0))
 
 @ti.kernel
 def measure(
-    bodies: ti.template(),
+    obstacles: ti.template(),
     hulls: ti.template(),
     kinds: ti.template(),
     out: ti.template(),
@@ -37,9 +37,11 @@ def measure(
     for i in kinds:
         pos = ti.Vector([hulls[i, 0], hulls[i, 1], hulls[i, 2]])
         axis = ti.Vector([hulls[i, 3], hulls[i, 4], hulls[i, 5]])
-        center = ti.Vector([bodies[i, 0], bodies[i, 1], bodies[i, 2]])
-        size = ti.Vector([bodies[i, 3], bodies[i, 4], bodies[i, 5]])
-        gap, normal, along = geometry.hull_to_body(pos, axis, kinds[i], center, size, bodies[i, 6], vehicle)
+        center = ti.Vector([obstacles[i, 0], obstacles[i, 1], obstacles[i, 2]])
+        size = ti.Vector([obstacles[i, 3], obstacles[i, 4], obstacles[i, 5]])
+        gap, normal, along = geometry.hull_to_obstacle(
+            pos, axis, kinds[i], center, size, obstacles[i, 6], vehicle
+        )
         out[i, 0] = gap
         for j in ti.static(range(3)):
             out[i, 1 + j] = normal[j]
@@ -53,7 +55,7 @@ def measure(
 
 @pytest.fixture(scope="module")
 def measured():
-    """f(hulls (n, 6), kinds (n,), bodies (n, 7)) -> (n, 10) of ``measure``, n <= N."""
+    """f(hulls (n, 6), kinds (n,), obstacles (n, 7)) -> (n, 10) of ``measure``, n <= N."""
     fields = (
         ti.field(ti.f32, (N, 7)),
         ti.field(ti.f32, (N, 6)),
@@ -61,8 +63,8 @@ def measured():
         ti.field(ti.f32, (N, 10)),
     )
 
-    def run(hulls, kinds, bodies):
-        for field, values in zip(fields, (bodies, hulls, kinds), strict=False):
+    def run(hulls, kinds, obstacles):
+        for field, values in zip(fields, (obstacles, hulls, kinds), strict=False):
             padded = np.ones(field.shape, np.int32 if field.dtype == ti.i32 else np.float32)
             padded[: len(values)] = values
             field.from_numpy(padded)
@@ -73,7 +75,7 @@ def measured():
 
 
 def random_scenes(seed, level=False):
-    """Hulls and bodies near each other, some touching; float32-exact."""
+    """Hulls and obstacles near each other, some touching; float32-exact."""
     rng = np.random.default_rng(seed)
     pos = rng.uniform([2, 1, -1.4], [18, 5, -0.2], (N, 3))
     axis = rng.normal(size=(N, 3)) * [1, 1, 0 if level else 0.4]
@@ -84,35 +86,39 @@ def random_scenes(seed, level=False):
     size[kinds != BOX, 1] = size[kinds != BOX, 0]
     size[kinds == SPHERE, 2] = size[kinds == SPHERE, 0]
     yaw = rng.uniform(-7, 7, (N, 1))
-    hulls, bodies = (
+    hulls, obstacles = (
         np.hstack([pos, axis]).astype(np.float32),
         np.hstack([center, size, yaw]).astype(np.float32),
     )
-    return hulls, kinds, bodies
+    return hulls, kinds, obstacles
 
 
-def oracle(hull_row, kind, body):
-    return reference.clearance(hull_row[:3], hull_row[3:], kind, body[:3], body[3:6], float(body[6]))
+def oracle(hull_row, kind, obstacle):
+    return reference.clearance(
+        hull_row[:3], hull_row[3:], kind, obstacle[:3], obstacle[3:6], float(obstacle[6])
+    )
 
 
 @pytest.mark.parametrize("level", [False, True])
 def test_clearance_equals_dense_sampling(measured, level):
-    hulls, kinds, bodies = random_scenes(1, level)
-    got = measured(hulls, kinds, bodies)
+    hulls, kinds, obstacles = random_scenes(1, level)
+    got = measured(hulls, kinds, obstacles)
     for i in range(N):
         assert got[i, 0] == pytest.approx(
-            oracle(hulls[i].astype(float), kinds[i], bodies[i].astype(float)), abs=DISTANCE_TOL_M
+            oracle(hulls[i].astype(float), kinds[i], obstacles[i].astype(float)), abs=DISTANCE_TOL_M
         )
 
 
-def test_the_hull_s_nearest_place_and_direction_reach_the_body(measured):
-    hulls, kinds, bodies = random_scenes(2)
-    got = measured(hulls, kinds, bodies)
+def test_the_hull_s_nearest_place_and_direction_reach_the_obstacle(measured):
+    hulls, kinds, obstacles = random_scenes(2)
+    got = measured(hulls, kinds, obstacles)
     place = hulls[:, :3] + got[:, 4:5] * hulls[:, 3:]
     for i in np.flatnonzero(got[:, 0] > -0.1):
         surface = place[i] + (got[i, 0] + VEHICLE.hull_radius_m) * got[i, 1:4]
-        body = bodies[i].astype(float)
-        at_surface = reference.point_distances(surface[None], kinds[i], body[:3], body[3:6], body[6])[0]
+        obstacle = obstacles[i].astype(float)
+        at_surface = reference.point_distances(
+            surface[None], kinds[i], obstacle[:3], obstacle[3:6], obstacle[6]
+        )[0]
         assert abs(at_surface) < FLOAT_TOL_M
         assert np.linalg.norm(got[i, 1:4]) == pytest.approx(1.0, abs=1e-5)
     assert np.all(np.abs(got[:, 4]) <= VEHICLE.hull_half_length_m + 1e-7)
@@ -120,11 +126,11 @@ def test_the_hull_s_nearest_place_and_direction_reach_the_body(measured):
 
 def test_closing_speed_is_the_rate_at_which_clearance_shrinks(measured):
     """Hull translating and turning, body moving: central differences of the oracle."""
-    hulls, kinds, bodies = (part[:200] for part in random_scenes(3))
-    hulls, bodies = hulls.astype(float), bodies.astype(float)
-    got = measured(hulls, kinds, bodies)
+    hulls, kinds, obstacles = (part[:200] for part in random_scenes(3))
+    hulls, obstacles = hulls.astype(float), obstacles.astype(float)
+    got = measured(hulls, kinds, obstacles)
     rng = np.random.default_rng(4)
-    vel, rate, body_vel = (
+    vel, rate, obstacle_vel = (
         rng.uniform(-0.6, 0.6, (200, 3)),
         rng.uniform(-1, 1, (200, 3)),
         rng.uniform(-1, 1, (200, 3)),
@@ -137,34 +143,34 @@ def test_closing_speed_is_the_rate_at_which_clearance_shrinks(measured):
             continue
         ends = []
         for sign in (-1, 1):
-            moved, body = hulls[i].copy(), bodies[i].copy()
+            moved, obstacle = hulls[i].copy(), obstacles[i].copy()
             moved[:3] += sign * dt * vel[i]
             moved[3:] += sign * dt * np.cross(rate[i], hulls[i, 3:])
-            body[:3] += sign * dt * body_vel[i]
-            ends.append(oracle(moved, kinds[i], body))
+            obstacle[:3] += sign * dt * obstacle_vel[i]
+            ends.append(oracle(moved, kinds[i], obstacle))
         hull_point_vel = vel[i] + got[i, 4] * np.cross(rate[i], hulls[i, 3:])
-        closing = -(body_vel[i] - hull_point_vel) @ got[i, 1:4]
+        closing = -(obstacle_vel[i] - hull_point_vel) @ got[i, 1:4]
         slopes = (ends[0] - ends[1]) / (2 * dt)
         checked += 1
         assert closing == pytest.approx(slopes, abs=SPEED_TOL_M_S)
     assert checked > 100
 
 
-def test_a_body_that_swallows_the_hull_gives_finite_numbers(measured):
+def test_a_obstacle_that_swallows_the_hull_gives_finite_numbers(measured):
     hulls = np.array([[5, 3, -0.8, 1, 0, 0]] * 3)
-    bodies = np.array([[5, 3, -0.8, 0.5, 0.5, 0.5, 0.3]] * 3)
-    got = measured(hulls, np.array([SPHERE, CYLINDER, BOX]), bodies)
+    obstacles = np.array([[5, 3, -0.8, 0.5, 0.5, 0.5, 0.3]] * 3)
+    got = measured(hulls, np.array([SPHERE, CYLINDER, BOX]), obstacles)
     assert np.isfinite(got).all()
     assert got[:, 0] == pytest.approx([-0.67, -0.17, -0.17], abs=FLOAT_TOL_M)
 
 
 def test_side_walls_floor_and_surface(measured):
     rng = np.random.default_rng(5)
-    hulls, kinds, bodies = random_scenes(5)
+    hulls, kinds, obstacles = random_scenes(5)
     hulls[:, :2] = rng.uniform([-1, -1], [21, 17], (N, 2))
     hulls[:, 2] = rng.uniform(-2, 0.4, N)
     hulls = hulls.astype(np.float32)
-    got = measured(hulls, kinds, bodies)
+    got = measured(hulls, kinds, obstacles)
     for i in range(N):
         pos, axis = hulls[i, :3].astype(float), hulls[i, 3:].astype(float)
         flat = reference.wall_clearance(pos, axis, "rectangle", POOL.x_m, POOL.y_m)

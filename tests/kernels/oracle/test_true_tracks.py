@@ -19,7 +19,7 @@ from uuvtai.kernels.oracle.io import TrueTracksIO
 from uuvtai.sim.setup import array_sizes
 
 HEIGHT_STEP_M = 1.6 / 15
-"""Between two hypotheses of a body's height in a tank 1.6 m deep."""
+"""Between two hypotheses of an obstacle's height in a tank 1.6 m deep."""
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +31,10 @@ def known(small):
     for _ in range(100):
         small.sim.step()
     small.sim.privileged = False
-    return small.arrays("tracks", "world", "path", "scan", "forecast", "clock", "ego", "referee")
+    return small.arrays("tracks", "world", "path", "scan", "forecast", "clock", "ego", "termination")
 
 
-def test_tracks_are_the_moving_bodies(known):
+def test_tracks_are_the_moving_obstacles(known):
     n_lane = known["path.n_way"].shape[1]
     kind, pos, vel, size = (
         known[f"world.{name}"][:, -n_lane:] for name in ("kind", "pos_w", "vel_w", "size")
@@ -65,7 +65,7 @@ def test_turn_rates_are_those_of_the_paths(known):
     assert not rate[~circle].any()
 
 
-def test_forecasts_begin_at_the_bodies_and_heights_cover_them(known):
+def test_forecasts_begin_at_the_obstacles_and_heights_cover_them(known):
     n_lane = known["path.n_way"].shape[1]
     there = known["world.kind"][:, -n_lane:] != NONE
     pos, size = known["world.pos_w"][:, -n_lane:], known["world.size"][:, -n_lane:]
@@ -82,12 +82,12 @@ def test_forecasts_begin_at_the_bodies_and_heights_cover_them(known):
     assert np.all(below[under] >= high[under] - 1e-5)
 
 
-def test_returns_are_named_after_the_bodies_they_come_from(known):
-    """Every return near a body's outline is that body's, no other is; bodies move 1.2 cm a step, so the
-    newest scan still tells."""
+def test_returns_are_named_after_the_obstacles_they_come_from(known):
+    """Every return near an obstacle's outline is that obstacle's, no other is; obstacles move 1.2 cm a step,
+    so the newest scan still tells."""
     ray = np.arange(known["scan.range_m"].shape[1])
     named = 0
-    for env in np.flatnonzero(known["referee.outcome"] == 0):
+    for env in np.flatnonzero(known["termination.outcome"] == 0):
         bearing = known["scan.ping_yaw"][env] + 2 * np.pi * ray / len(ray)
         hit = known["scan.ping_pos_w"][env, :2] + known["scan.range_m"][env][:, None] * np.column_stack(
             [np.cos(bearing), np.sin(bearing)]
@@ -104,7 +104,7 @@ def test_returns_are_named_after_the_bodies_they_come_from(known):
     assert named > 20
 
 
-def test_where_tracks_are_too_few_the_nearest_bodies_get_them():
+def test_where_tracks_are_too_few_the_nearest_obstacles_get_them():
     config = Config(world=WorldConfig(n_dynamic=5), tracking=TrackingConfig(n_track=3))
     sizes = array_sizes(config, 1, "cpu")
     nouns = (
@@ -116,7 +116,7 @@ def test_where_tracks_are_too_few_the_nearest_bodies_get_them():
         state.ClockState,
     )
     tracks, clusters, world, path, ego, clock = (state.allocate(noun, sizes) for noun in nouns)
-    clock.awake[0] = 1
+    clock.active[0] = 1
     first = world.kind.shape[1] - 5
     for lane, x in enumerate((9.0, 2.0, 7.0, 1.0, 3.0)):
         world.kind[0, first + lane] = SPHERE if lane != 3 else NONE
@@ -124,8 +124,8 @@ def test_where_tracks_are_too_few_the_nearest_bodies_get_them():
         world.size[0, first + lane] = (0.2, 0.2, 0.2)
         world.vel_w[0, first + lane] = (0.5, 0.0, 0.0)
         path.n_way[0, lane] = 2
-    true_state.know_bodies(
-        io_for(TrueTracksIO, tracks, clusters, world, path, ego, clock, config.elevation, config.world.tank)
+    true_state.know_obstacles(
+        io_for(TrueTracksIO, tracks, clusters, world, path, ego, clock, config.height, config.world.tank)
     )
     ti.sync()
     assert tracks.state.to_numpy()[0, :, 0].tolist() == [2.0, 3.0, 7.0]

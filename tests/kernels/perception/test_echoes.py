@@ -6,11 +6,18 @@ import pytest
 from tests.bundles import io_for
 from tests.kernels.perception.test_tracking import CONFIG, ELEVATION, FORECAST
 from tests.map_bits import get_map
-from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, PoseConfig, TankConfig, VehicleConfig
+from uuvtai.config import (
+    DepthConfig,
+    EpisodeConfig,
+    LocalizationConfig,
+    MappingConfig,
+    TankConfig,
+    VehicleConfig,
+)
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 from uuvtai.kernels.perception import localization, mapping, sensor_model, tracking
-from uuvtai.kernels.perception.io import EchoesIO, MappingIO, PoseIO, TrackingIO
+from uuvtai.kernels.perception.io import EchoesIO, LocalizationIO, MappingIO, TrackingIO
 from uuvtai.sim.setup import load_bounds
 from uuvtai.state import (
     ClockState,
@@ -18,13 +25,13 @@ from uuvtai.state import (
     DepthImage,
     EchoState,
     GridMask,
-    HabitState,
+    LocalizationState,
     MapScratch,
     MapState,
-    PoseState,
     Proprioception,
     SonarScan,
     TrackState,
+    TurnHistory,
     allocate,
 )
 
@@ -40,7 +47,7 @@ SIZES = {
 }  # fmt: skip
 STRUCTS = (
     SonarScan, EchoState, ClockState, MapState, MapScratch, DepthImage, TrackState, ClusterState, GridMask,
-    HabitState,
+    TurnHistory,
 )  # fmt: skip
 
 
@@ -51,10 +58,11 @@ class Head:
         self.made = {struct: allocate(struct, SIZES) for struct in STRUCTS}
         self.scan, self.clock, self.tracks = (self.made[s] for s in (SonarScan, ClockState, TrackState))
         load_bounds(self.made[GridMask], np.array(outside_cells(POND, MAP.cell_m)))
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.io = io_for(EchoesIO, self.scan, self.made[EchoState], self.clock, SONAR)
         self.tracking = io_for(
-            TrackingIO, *(self.made[s] for s in (TrackState, ClusterState, EchoState, HabitState)), self.scan,
+            TrackingIO, *(self.made[s] for s in (TrackState, ClusterState, EchoState, TurnHistory)),
+            self.scan,
             self.clock, CONFIG, FORECAST, ELEVATION, SONAR, POND, RULES,
         )  # fmt: skip
         self.mapping = io_for(MappingIO, *self.made.values(), MAP, SONAR, CAMERA, POND, RULES)
@@ -180,12 +188,21 @@ def test_the_pose_filter_uses_a_beam_once():
     """A wall is heard by one beam; the other beams of the scan hold what was heard before."""
     sizes = {"n_env": 1, "n_ray": 64}
     ego, state, clock, scan = (
-        allocate(struct, sizes) for struct in (Proprioception, PoseState, ClockState, SonarScan)
+        allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
     )
     io = io_for(
-        PoseIO, ego, state, clock, scan, PoseConfig(), SENSORS, POND, EpisodeConfig(), VehicleConfig()
+        LocalizationIO,
+        ego,
+        state,
+        clock,
+        scan,
+        LocalizationConfig(),
+        SENSORS,
+        POND,
+        EpisodeConfig(),
+        VehicleConfig(),
     )
-    clock.awake.fill(1)
+    clock.active.fill(1)
     ego.pos_w.from_numpy(np.array([[9.0, 4.0, -0.8]], np.float32))
     ego.specific_force_b.from_numpy(np.array([[0.0, 0.0, 9.81]], np.float32))
     localization.reset_pose(io)
@@ -203,7 +220,7 @@ def test_the_pose_filter_uses_a_beam_once():
         scan.new_count.fill(count)
         localization.correct_pose(io)
         left[count] = state.cov.to_numpy()[0, 0]
-    one = 1 / (1 / 0.01 + 1 / (0.02**2 + 0.005**2 / 12 + PoseConfig().wall_sigma_m ** 2))
+    one = 1 / (1 / 0.01 + 1 / (0.02**2 + 0.005**2 / 12 + LocalizationConfig().wall_sigma_m ** 2))
     assert left[1] == pytest.approx(one, rel=0.4), "what one range tells, and no more"
     assert left[3] < 0.7 * left[1] < 0.007
 
@@ -219,7 +236,7 @@ def sweep(beam_head, steps, discs_at, drive=(0.0, 0.0)):
         if (beam := beam_head.due()) is not None:
             discs = discs_at(0.02 * beam_head.step)
             beam_head.hear(beam, pos, 0.0, disc_range(pos, beam_head.bearing(beam), discs))
-            tracking.track_bodies(beam_head.tracking)
+            tracking.track_obstacles(beam_head.tracking)
             found.append(
                 [getattr(beam_head.tracks, name).to_numpy()[0] for name in ("alive", "moving", "state")]
             )

@@ -1,5 +1,5 @@
-"""Heights of tracked bodies: the weighing of hypotheses against its float64 oracle, and what memory and free
-water come to."""
+"""Heights of tracked obstacles: the weighing of hypotheses against its float64 oracle, and what memory and
+free water come to."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import taichi as ti
 
 from tests.bundles import clear, io_for, put
 from tests.oracles import elevation as oracle
-from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.config import EpisodeConfig, HeightConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import Const, In, Out
@@ -28,8 +28,8 @@ NUMBERS = {
     "gone_share": 0.25, "tail_share": 0.02, "column_tail_share": 0.15,
 }  # fmt: skip
 """Every number of the stage, so that tuning the defaults breaks nothing here."""
-CFG = ElevationConfig(memory_s=8.0, **NUMBERS)
-FORGETFUL = ElevationConfig(memory_s=0.0, **NUMBERS)
+CFG = HeightConfig(memory_s=8.0, **NUMBERS)
+FORGETFUL = HeightConfig(memory_s=0.0, **NUMBERS)
 SIZES = {"n_env": N_ENV, "n_track": N_TRACK, "n_height": LANES, "n_ray": N_RAY, "n_forecast": 2}
 BEGIN, HIT, MISS = 0, 1, 2
 
@@ -47,7 +47,7 @@ def weigh(
     own: ti.types.ndarray(),  # pyright: ignore
     dt: ti.f32,
     tracks: Out[TrackState],
-    cfg: Const[ElevationConfig],
+    cfg: Const[HeightConfig],
     sonar: Const[SonarConfig],
     tank: Const[TankConfig],
 ):
@@ -68,7 +68,7 @@ def prune(
     tracks: Out[TrackState],
     scan: In[SonarScan],
     tracking: Const[TrackingConfig],
-    cfg: Const[ElevationConfig],
+    cfg: Const[HeightConfig],
     sonar: Const[SonarConfig],
     tank: Const[TankConfig],
     rules: Const[EpisodeConfig],
@@ -90,7 +90,7 @@ class Stage:
         clear(self.tracks, self.clock, self.ego, self.scan)
         self.forecast.above_w.fill(-9.0)
         self.forecast.below_w.fill(-9.0)
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.tracks.alive.fill(1)
         self.tracks.spot_step.fill(-1)
         self.tracks.moving.fill(1)
@@ -102,7 +102,7 @@ class Stage:
         return self
 
     def stand(self):
-        """Bring vehicles and bodies to ``own`` and ``place``."""
+        """Bring vehicles and obstacles to ``own`` and ``place``."""
         put(self.tracks, state=np.concatenate([self.place, np.zeros((N_ENV, N_TRACK, 2))], 2))
         put(self.ego, pos_w=self.own)
         put(self.scan, ping_pos_w=self.own)
@@ -255,7 +255,7 @@ def test_a_wrong_belief_is_given_up(stage):
 
 
 def test_an_unsure_place_makes_a_miss_say_less(stage):
-    """Tracks of equal bodies, one of them known to 2 cm and one to 60 cm."""
+    """Tracks of equal obstacles, one of them known to 2 cm and one to 60 cm."""
     cov = np.zeros((N_ENV, N_TRACK, 10))
     cov[:, 0, [0, 4]], cov[:, 1, [0, 4]] = 0.02**2, 0.6**2
     put(stage.tracks, cov=cov)
@@ -321,29 +321,29 @@ def test_a_likely_column_leaves_no_free_water(stage):
     np.testing.assert_allclose((above[:, 1], below[:, 1]), -0.8, atol=BOUND_TOLERANCE)
 
 
-def test_without_memory_every_body_is_level(stage):
+def test_without_memory_every_obstacle_is_level(stage):
     """And so is what does not move or is not there, with memory too (no trace is left of who had the slot
     before); who sleeps sleeps."""
     share = np.zeros((N_ENV, N_TRACK, LANES))
     share[:, :, near(-0.2)] = 1
     stage.set_share(share)
-    moving, alive, awake = np.ones((N_ENV, N_TRACK)), np.ones((N_ENV, N_TRACK)), np.ones(N_ENV)
-    moving[0, 1], alive[0, 2], awake[1] = 0, 0, 0
+    moving, alive, active = np.ones((N_ENV, N_TRACK)), np.ones((N_ENV, N_TRACK)), np.ones(N_ENV)
+    moving[0, 1], alive[0, 2], active[1] = 0, 0, 0
     put(stage.tracks, moving=moving, alive=alive)
-    put(stage.clock, awake=awake)
+    put(stage.clock, active=active)
     above, below = stage.bound(FORGETFUL)
-    np.testing.assert_allclose((above[awake == 1], below[awake == 1]), -0.8, atol=BOUND_TOLERANCE)
+    np.testing.assert_allclose((above[active == 1], below[active == 1]), -0.8, atol=BOUND_TOLERANCE)
     np.testing.assert_array_equal((above[1], below[1]), -9.0)
     above, below = stage.bound()
-    bounded = (moving * alive * awake[:, None]).astype(bool)
+    bounded = (moving * alive * active[:, None]).astype(bool)
     assert (above[bounded] > -0.5).all() and (below[bounded] < -100).all()
     np.testing.assert_allclose((above[0, 1:3], below[0, 1:3]), -0.8, atol=BOUND_TOLERANCE)
     np.testing.assert_array_equal((above[1], below[1]), -9.0)
 
 
-def test_no_body_is_in_water_called_free(stage):
-    """256 bodies, seen by the fan's geometry from a vehicle that drives by and changes depth: the free water
-    holds none of them.
+def test_no_obstacle_is_in_water_called_free(stage):
+    """256 obstacles, seen by the fan's geometry from a vehicle that drives by and changes depth: the free
+    water holds none of them.
 
     Tolerance: a slice (0.11 m) rounds a height by half of it, the fan's edge is soft, and what is less likely
     than tail_share is given up.
@@ -398,7 +398,7 @@ def pruned(stage, count, cfg=CFG, dt=0.06):
     return stage.tracks.alive.to_numpy()[:, :3]
 
 
-def test_unseen_bodies_are_remembered_for_their_time(stage):
+def test_unseen_obstacles_are_remembered_for_their_time(stage):
     """Behind something nearer nothing is learnt, only forgotten: with the time constant memory_s until
     gone_share."""
     scan_for(stage, 0.5)
@@ -414,7 +414,7 @@ def test_unseen_bodies_are_remembered_for_their_time(stage):
     assert not pruned(stage, 2).any()
 
 
-def test_a_body_seen_through_is_kept_if_it_may_be_above_or_below(stage):
+def test_a_obstacle_seen_through_is_kept_if_it_may_be_above_or_below(stage):
     """Open water all round: near by it may have left the fan, but not far away, where the fan holds the full
     depth."""
     scan_for(stage, SONAR.max_range_m)
@@ -425,7 +425,7 @@ def test_a_body_seen_through_is_kept_if_it_may_be_above_or_below(stage):
     assert stage.share[0, 0, near(-0.8)] < 0.01 < oracle.prior(CFG)[0] < stage.share[0, 0, near(-0.1)]
 
 
-def test_seen_bodies_are_weighed_and_resting_ones_are_not(stage):
+def test_seen_obstacles_are_weighed_and_resting_ones_are_not(stage):
     scan_for(stage, SONAR.max_range_m)
     put(stage.tracks, misses=np.zeros((N_ENV, N_TRACK)))
     moving = np.ones((N_ENV, N_TRACK))
@@ -437,7 +437,8 @@ def test_seen_bodies_are_weighed_and_resting_ones_are_not(stage):
 
 
 def test_memory_can_be_switched_off(stage):
-    """Then a body that beams see through ends after see_through_s, and one that is hidden after hidden_s."""
+    """Then an obstacle that beams see through ends after see_through_s, and one that is hidden after
+    hidden_s."""
     scan_for(stage, SONAR.max_range_m)
     assert pruned(stage, 2, FORGETFUL).all()
     assert not pruned(stage, 3, FORGETFUL).any()
@@ -456,13 +457,13 @@ def test_memory_can_be_switched_off(stage):
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("elevation.memory_s=-1", "elevation.memory_s"),
-        ("elevation.edge_m=0", "elevation.edge_m"),
-        ("elevation.evidence_s=0", "elevation.evidence_s"),
-        ("elevation.hit_share=1.5", "elevation.hit_share"),
-        ("elevation.camera_hit_share=1", "elevation.camera_hit_share"),
-        ("elevation.half_height=0.3", "did you mean 'half_height_m'"),
-        ("elevation.tail_share=0.07", "nowhere"),
+        ("height.memory_s=-1", "height.memory_s"),
+        ("height.edge_m=0", "height.edge_m"),
+        ("height.evidence_s=0", "height.evidence_s"),
+        ("height.hit_share=1.5", "height.hit_share"),
+        ("height.camera_hit_share=1", "height.camera_hit_share"),
+        ("height.half_height=0.3", "did you mean 'half_height_m'"),
+        ("height.tail_share=0.07", "nowhere"),
     ],
 )
 def test_numbers_that_cannot_work_are_refused(override, says):

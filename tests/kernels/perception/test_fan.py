@@ -8,13 +8,13 @@ import taichi as ti
 from tests.bundles import io_for
 from tests.map_bits import get_map
 from tests.oracles import scenes
-from tests.oracles.sonar import body_hits, doppler_by_differences, wall_hits
+from tests.oracles.sonar import doppler_by_differences, obstacle_hits, wall_hits
 from uuvtai.common.errors import UserError
 from uuvtai.config import (
     DepthConfig,
     EpisodeConfig,
-    FeaturesConfig,
     MappingConfig,
+    ObservationConfig,
     SonarConfig,
     TankConfig,
 )
@@ -24,7 +24,7 @@ from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 from uuvtai.kernels.core.stage import AnyTensor, Const
 from uuvtai.kernels.perception import mapping
 from uuvtai.kernels.perception.io import MappingIO
-from uuvtai.kernels.planning.io import FeaturesIO
+from uuvtai.kernels.planning.io import ObservationIO
 from uuvtai.kernels.planning.observation import sense_sectors
 from uuvtai.kernels.sensors import sonar
 from uuvtai.kernels.sensors.io import SonarIO
@@ -34,10 +34,10 @@ from uuvtai.state import (
     ClusterState,
     DepthImage,
     EpisodeState,
-    FeatureState,
     GridMask,
     MapScratch,
     MapState,
+    ObservationState,
     Proprioception,
     SonarMemory,
     SonarScan,
@@ -47,16 +47,23 @@ from uuvtai.state import (
     allocate,
 )
 
-N_ENV, N_BODY = 24, 14
+N_ENV, N_OBSTACLE = 24, 14
 TANK, RULES = TankConfig(), EpisodeConfig()
-SIZES = {"n_env": N_ENV, "n_body": N_BODY, "n_ray": 512, "n_latency": 2, "n_cloud": 1, "n_thruster": 6}
+SIZES = {
+    "n_env": N_ENV,
+    "n_obstacle": N_OBSTACLE,
+    "n_ray": 512,
+    "n_latency": 2,
+    "n_cloud": 1,
+    "n_thruster": 6,
+}
 TOLERANCE_M = 2e-3
 GRAZING_SHARE = 2e-4
 """Beams that pass an edge closer than float32 can tell, of those of all scenes here."""
 SONAR = load_config("pool", "multibeam").sensors.sonar
 CLEAN = {"range_sigma_m": 0.0, "doppler_sigma_m_s": 0.0}
 FLAT = SONAR.model_copy(update={"vertical_half_aperture_deg": 0.0, **CLEAN})
-"""aperture 0: a beam is a line in space, which MuJoCo casts at the bodies themselves"""
+"""aperture 0: a beam is a line in space, which MuJoCo casts at the obstacles themselves"""
 FINE = SonarConfig(n_ray=512, horizontal_aperture_deg=120.0)
 
 
@@ -75,7 +82,7 @@ def aim(scene, env, config):
 
 @pytest.fixture(scope="module")
 def scene():
-    return scenes.random_scenes(np.random.default_rng(7), N_ENV, N_BODY, TANK)
+    return scenes.random_scenes(np.random.default_rng(7), N_ENV, N_OBSTACLE, TANK)
 
 
 def cast(scene, config):
@@ -86,7 +93,7 @@ def cast(scene, config):
     ]
     clock = allocate(ClockState, SIZES)
     scenes.load(scene, parts[3], parts[4])
-    clock.awake.fill(1)
+    clock.active.fill(1)
     sonar.reset_sonar(io_for(SonarIO, parts[0], parts[1], clock))
     sonar.cast_sonar(io_for(SonarIO, *parts, clock, config, TANK, RULES))
     names = ("range_m", "hit", "doppler_m_s")
@@ -149,18 +156,18 @@ def test_a_fans_ranges_are_mujocos(scene):
 def test_a_fine_fans_ranges_and_doppler_are_the_oracles(scene):
     """The vertical aperture too: what a beam meets above or below its plane."""
     range_m, hit, doppler = cast(scene, FINE)
-    slope, wrong, bodies = np.tan(np.radians(10.0)), 0, 0
+    slope, wrong, obstacles = np.tan(np.radians(10.0)), 0, 0
     for env in range(N_ENV):
         u = aim(scene, env, FINE)
         best, who = wall_hits(scene["pos"][env][:2], u, TANK)[0], np.full(FINE.n_ray, -1)
         for body in np.flatnonzero(scene["kind"][env]):
-            r, _ = body_hits(scene, env, body, scene["pos"][env], u, slope)
+            r, _ = obstacle_hits(scene, env, body, scene["pos"][env], u, slope)
             best, who = np.where(r < best, r, best), np.where(r < best, body, who)
         right = np.abs(range_m[env] - np.minimum(best, 12.0)) < TOLERANCE_M
-        wrong, bodies = wrong + (~right).sum(), bodies + (who >= 0).sum()
+        wrong, obstacles = wrong + (~right).sum(), obstacles + (who >= 0).sum()
         rate = doppler_by_differences(scene, env, u, best, who)
         assert np.abs(doppler[env] - rate)[right & (hit[env] == 1)].max() < 1e-4
-    assert wrong < GRAZING_SHARE * N_ENV * FINE.n_ray and bodies > 1000
+    assert wrong < GRAZING_SHARE * N_ENV * FINE.n_ray and obstacles > 1000
 
 
 # ------------------------------------------------------------------------------------- what is made of a scan
@@ -171,8 +178,8 @@ SMALL = SonarConfig(n_ray=64, horizontal_aperture_deg=100.0, doppler=False)
 
 
 def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
-    """At (2, 2), nose to +y: free water within 50 degrees of it up to the wall, a body at (2, 3) at rest; the
-    Doppler that is not measured is not a number."""
+    """At (2, 2), nose to +y: free water within 50 degrees of it up to the wall, an obstacle at (2, 3) at
+    rest; the Doppler that is not measured is not a number."""
     shape = grid_shape(POND, MAP.cell_m)
     sizes = {"n_env": 1, "n_row": shape[0], "n_col": shape[1], "n_ray": 64, "n_track": 4, "n_cluster": 4}
     sizes |= {"n_height": 16, "n_slot": 1, "n_pixel_row": 6, "n_pixel_col": 16}
@@ -193,8 +200,8 @@ def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
     load_bounds(made[GridMask], np.array(outside_cells(POND, MAP.cell_m)))
     world = np.pi / 2 + bearings(SMALL)
     to_wall = np.minimum(2.0 / np.sin(world), 2.0 / np.maximum(np.abs(np.cos(world)), 1e-9))
-    hits_body = np.abs(bearings(SMALL)) < np.radians(10.0)
-    scan.range_m.from_numpy(np.where(hits_body, 1.0, to_wall)[None].astype(np.float32))
+    hits_obstacle = np.abs(bearings(SMALL)) < np.radians(10.0)
+    scan.range_m.from_numpy(np.where(hits_obstacle, 1.0, to_wall)[None].astype(np.float32))
     scan.hit.fill(1)
     scan.doppler_m_s.fill(np.nan)
     scan.ping_yaw.fill(np.pi / 2)
@@ -203,7 +210,7 @@ def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
     scan.ping_vel_valid.fill(1)
     scan.fresh.fill(1)
     made[TrackState].beam_track.fill(-1)
-    made[ClockState].awake.fill(1)
+    made[ClockState].active.fill(1)
     mapping.reset_map(io_for(MappingIO, grid, made[ClockState]))
     io = io_for(MappingIO, *made.values(), MAP, SMALL, CAMERA, POND, RULES)
     for step in range(20):
@@ -224,16 +231,16 @@ def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
 @pytest.mark.parametrize("turned", [0.0, 0.3, np.pi])
 def test_sectors_beside_the_fan_have_no_return(turned):
     """Every beam returns from 3 m; the vehicle has turned since."""
-    n_sector, features, config = 12, FeaturesConfig(), SONAR.model_copy(update={"doppler": True})
+    n_sector, observation, config = 12, ObservationConfig(), SONAR.model_copy(update={"doppler": True})
     sizes = {"n_env": 1, "n_ray": 256, "n_sector": n_sector, "n_track": 4}
-    made = [allocate(struct, sizes) for struct in (FeatureState, SonarScan, Proprioception, ClockState)]
+    made = [allocate(struct, sizes) for struct in (ObservationState, SonarScan, Proprioception, ClockState)]
     state, scan, ego, clock = made
     scan.range_m.fill(3.0)
     scan.hit.fill(1)
     scan.doppler_m_s.fill(-0.5)
     ego.rpy.from_numpy(np.array([[0.0, 0.0, turned]], np.float32))
-    clock.awake.fill(1)
-    sense_sectors(io_for(FeaturesIO, *made, features, config))
+    clock.active.fill(1)
+    sense_sectors(io_for(ObservationIO, *made, observation, config))
     middle = np.arange(n_sector) * 2 * np.pi / n_sector + turned
     away = np.degrees(np.abs(np.angle(np.exp(1j * middle)))) - 15.0
     sees = away < 64.0
@@ -242,5 +249,6 @@ def test_sectors_beside_the_fan_have_no_return(turned):
     np.testing.assert_allclose(state.sector_range_m.to_numpy()[0], np.where(sees, 3.0, 12.0))
     np.testing.assert_allclose(state.sector_closing_m_s.to_numpy()[0], np.where(sees, 0.5, 0.0))
     np.testing.assert_allclose(
-        state.sector_ttc_s.to_numpy()[0], np.where(sees, min(6.0, features.ttc_cap_s), features.ttc_cap_s)
+        state.sector_ttc_s.to_numpy()[0],
+        np.where(sees, min(6.0, observation.ttc_cap_s), observation.ttc_cap_s),
     )

@@ -5,12 +5,20 @@ import pytest
 
 from tests.bundles import clear, io_for, put
 from tests.oracles import forecast as oracle
-from tests.oracles import habits as habit_oracle
+from tests.oracles import turn_history as habit_oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import prediction
 from uuvtai.kernels.perception.io import ForecastIO
-from uuvtai.state import ClockState, ClusterState, DepthImage, ForecastState, HabitState, TrackState, allocate
+from uuvtai.state import (
+    ClockState,
+    ClusterState,
+    DepthImage,
+    ForecastState,
+    TrackState,
+    TurnHistory,
+    allocate,
+)
 
 N_ENV, N_TRACK = 6, 5
 TRACKING, RULES, TANK = TrackingConfig(), EpisodeConfig(), TankConfig()
@@ -47,17 +55,17 @@ class Stage:
             allocate(ClockState, SIZES),
             allocate(ForecastState, SIZES),
         )
-        self.habits, self.clusters, self.image = (
-            allocate(struct, SIZES) for struct in (HabitState, ClusterState, DepthImage)
+        self.turn_history, self.clusters, self.image = (
+            allocate(struct, SIZES) for struct in (TurnHistory, ClusterState, DepthImage)
         )
 
     def begin(self, cfg=None):
         self.cfg = cfg or ForecastConfig()
         clear(self.tracks, self.clock)
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.clusters.fresh.fill(1)
         self.image.fresh.fill(0)
-        prediction.reset_forecast(io_for(ForecastIO, self.forecast, self.habits, self.clock))
+        prediction.reset_forecast(io_for(ForecastIO, self.forecast, self.turn_history, self.clock))
         return self
 
     def put(self, **fields):
@@ -69,7 +77,7 @@ class Stage:
                 ForecastIO,
                 self.forecast,
                 self.tracks,
-                self.habits,
+                self.turn_history,
                 self.clusters,
                 self.image,
                 self.clock,
@@ -146,7 +154,7 @@ def test_forecast_equals_the_arc(stage, use_turn_rate):
 
 
 def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
-    """A track that came to rest or ended loses its forecast; rows asleep keep theirs."""
+    """A track that came to rest or ended loses its forecast; rows inactive keep theirs."""
     stage.begin()
     lay_out(stage, *random_tracks(2))
     _, first = stage.predict()
@@ -156,23 +164,25 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
     alive = np.ones((N_ENV, N_TRACK))
     alive[:, 2] = 0
     stage.put(moving=moving, alive=alive)
-    awake = np.arange(N_ENV) % 2
-    stage.clock.awake.from_numpy(awake.astype(np.int32))
+    active = np.arange(N_ENV) % 2
+    stage.clock.active.from_numpy(active.astype(np.int32))
     _, then = stage.predict()
-    assert (then[awake == 1][:, [1, 2]] < 0).all()
-    assert (then[awake == 1][:, [0, 3, 4]] > 0).all()
-    np.testing.assert_array_equal(then[awake == 0], first[awake == 0])
-    stage.clock.awake.fill(1)
-    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
+    assert (then[active == 1][:, [1, 2]] < 0).all()
+    assert (then[active == 1][:, [0, 3, 4]] > 0).all()
+    np.testing.assert_array_equal(then[active == 0], first[active == 0])
+    stage.clock.active.fill(1)
+    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.turn_history, stage.clock))
     assert (stage.forecast.radius_m.to_numpy() < 0).all()
     assert (stage.forecast.pos_w.to_numpy() == 0).all()
 
 
 @pytest.mark.parametrize("switches", [(True, True), (True, False), (False, True)])
 def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
-    """Bodies on straight courses, with turns remembered on the way of most: the oracle's walk, in leaps of
+    """Obstacles on straight courses, with turns remembered on the way of most: the oracle's walk, in leaps of
     the forecast's samples."""
-    stage.begin(ForecastConfig(n_turn=SIZES["n_turn"], use_habits=switches[0], use_reflection=switches[1]))
+    stage.begin(
+        ForecastConfig(n_turn=SIZES["n_turn"], use_turn_history=switches[0], use_reflection=switches[1])
+    )
     state, cov, radius, _, sigma = random_tracks(3)
     lay_out(stage, state, cov, radius, np.zeros_like(sigma), sigma)
     rng = np.random.default_rng(4)
@@ -188,7 +198,7 @@ def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
         turns[env][i] = habit_oracle.Turn(place.astype(float), came, went, 1.0)
     columns = np.array([[[*t.pos, *t.came, *t.went, t.weight] for t in row] for row in turns])
     rows = dict(zip(habit_oracle.TURN_ROWS, np.moveaxis(columns, -1, 0), strict=True))
-    stage.habits.turn.from_numpy(habit_oracle.packed_turns(rows))
+    stage.turn_history.turn.from_numpy(habit_oracle.packed_turns(rows))
     stage.clock.step.fill(2)
     pos, _ = stage.predict()
     turned = 0
@@ -204,8 +214,8 @@ def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
 
 
 def test_the_first_turn_is_searched_again_when_a_scan_or_an_image_has_come(stage):
-    """A body that goes east and is known to turn north 0.6 m ahead; between scans nothing is searched, so
-    nothing forgotten shows."""
+    """An obstacle that goes east and is known to turn north 0.6 m ahead; between scans nothing is searched,
+    so nothing forgotten shows."""
     for news in ("clusters", "image"):
         stage.begin(ForecastConfig(n_turn=SIZES["n_turn"], use_reflection=False))
         size = (N_ENV, N_TRACK)
@@ -221,11 +231,11 @@ def test_the_first_turn_is_searched_again_when_a_scan_or_an_image_has_come(stage
         rows = {name: np.zeros((N_ENV, SIZES["n_turn"])) for name in habit_oracle.TURN_ROWS}
         for name, value in (("turn_x", 5.6), ("turn_y", 3.0), ("in_x", 1.0), ("out_y", 1.0), ("weight", 1.0)):
             rows[name][:, 0] = value
-        stage.habits.turn.from_numpy(habit_oracle.packed_turns(rows))
+        stage.turn_history.turn.from_numpy(habit_oracle.packed_turns(rows))
         north = 3.0 + 0.5 * AHEAD[-1] - 0.6
         np.testing.assert_allclose(stage.predict()[0][..., -1, 1], north, atol=WALK_TOLERANCE)
         stage.clusters.fresh.fill(0)
-        stage.habits.turn.fill(0.0)
+        stage.turn_history.turn.fill(0.0)
         np.testing.assert_allclose(stage.predict()[0][..., -1, 1], north, atol=WALK_TOLERANCE)
         getattr(stage, news).fresh.fill(1)
         np.testing.assert_allclose(stage.predict()[0][..., -1, 1], 3.0, atol=WALK_TOLERANCE)

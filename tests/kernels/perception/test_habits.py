@@ -1,4 +1,4 @@
-"""What is learnt from tracks that turn, and what follows: kernels against a float64 oracle, and bodies on
+"""What is learnt from tracks that turn, and what follows: kernels against a float64 oracle, and obstacles on
 lines, loops and circles."""
 
 import numpy as np
@@ -6,13 +6,13 @@ import pytest
 import taichi as ti
 
 from tests.bundles import clear, io_for
-from tests.oracles import habits as oracle
+from tests.oracles import turn_history as oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import In
 from uuvtai.kernels.perception import prediction
 from uuvtai.kernels.perception.io import ForecastIO
-from uuvtai.state import ClockState, ClusterState, ForecastState, HabitState, TrackState, allocate
+from uuvtai.state import ClockState, ClusterState, ForecastState, TrackState, TurnHistory, allocate
 
 N_ENV, N_TRACK, PERIOD = 6, 5, 3
 CONFIG, RULES = ForecastConfig(n_turn=16), EpisodeConfig()
@@ -36,16 +36,16 @@ class Stage:
             allocate(ClockState, SIZES),
             allocate(ClusterState, SIZES),
         )
-        self.habits, self.forecast = allocate(HabitState, SIZES), allocate(ForecastState, SIZES)
+        self.turn_history, self.forecast = allocate(TurnHistory, SIZES), allocate(ForecastState, SIZES)
 
     def begin(self):
         clear(self.tracks, self.clock, self.clusters)
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.clusters.fresh.fill(1)
         self.tracks.moving.fill(1)
         self.tracks.alive.fill(1)
         self.step = 0
-        prediction.reset_forecast(io_for(ForecastIO, self.forecast, self.habits, self.clock))
+        prediction.reset_forecast(io_for(ForecastIO, self.forecast, self.turn_history, self.clock))
         return self
 
     def put(self, **fields):
@@ -66,13 +66,13 @@ class Stage:
             scan_step=self.step,
             **{"age": self.step, **fields},
         )
-        prediction.learn_habits(
-            io_for(ForecastIO, self.habits, self.tracks, self.clusters, self.clock, CONFIG, RULES)
+        prediction.learn_turns(
+            io_for(ForecastIO, self.turn_history, self.tracks, self.clusters, self.clock, CONFIG, RULES)
         )
 
     def read(self):
-        """Every array of the habits; the packed ones as (N_ENV, n_turn)."""
-        out = {name: field.to_numpy() for name, field in vars(self.habits).items()}
+        """Every array of the turn history; the packed ones as (N_ENV, n_turn)."""
+        out = {name: field.to_numpy() for name, field in vars(self.turn_history).items()}
         return out | oracle.turn_rows(out.pop("turn"))
 
     def turns(self, env):
@@ -99,7 +99,7 @@ def oracle_turns(table, env):
 
 
 class Loops:
-    """Bodies on closed polylines with as many corners as asked for (2 = a line), all at one speed."""
+    """Obstacles on closed polylines with as many corners as asked for (2 = a line), all at one speed."""
 
     def __init__(self, rng, n_corner, speed, low=(1, 1), high=(19, 5)):
         self.way = rng.uniform(low, high, (N_ENV, N_TRACK, n_corner, 2))
@@ -129,7 +129,7 @@ def test_learning_equals_the_oracle(stage):
     stage.begin()
     rng = np.random.default_rng(1)
     paths = Loops(rng, 3, 1.5)
-    paths.way[:, ::2, 2] = paths.way[:, ::2, 0]  # every other body goes back and forth
+    paths.way[:, ::2, 2] = paths.way[:, ::2, 0]  # every other obstacle goes back and forth
     paths.measure()
     learnt = merged = dropped = 0
     for k in range(260):
@@ -144,7 +144,7 @@ def test_learning_equals_the_oracle(stage):
         }
         if k == 200:
             longer = paths.leg[:, ::2, 0] / paths.length[:, ::2, 0, None]
-            paths.way[:, ::2, 1] += 1.5 * longer  # bodies on lines now go on past the ends they had
+            paths.way[:, ::2, 1] += 1.5 * longer  # obstacles on lines now go on past the ends they had
             paths.measure()
         before = stage.read()
         stage.watch(state, cov, rate, rate_var, **flags)
@@ -188,8 +188,8 @@ def test_learning_equals_the_oracle(stage):
     assert dropped > 5, dropped
 
 
-def one_body(state):
-    """The same body in the first slot of every env, nothing in the others."""
+def one_obstacle(state):
+    """The same obstacle in the first slot of every env, nothing in the others."""
     out = np.zeros((N_ENV, N_TRACK, 4))
     out[:, 0] = state
     alive = np.zeros((N_ENV, N_TRACK))
@@ -212,7 +212,7 @@ def test_both_ends_of_a_line_are_learnt_in_one_go_and_back(stage):
     for k in range(int(8.0 / PERIOD_S)):
         t = k * PERIOD_S
         fresh = min(t % 2.5, 9) < 7 * PERIOD_S and t > 1
-        state, alive = one_body(shuttle(t))
+        state, alive = one_obstacle(shuttle(t))
         stage.watch(state, alive=alive, rate_var=1.0 if fresh else 0.01)
     ends = np.array([5.0, 2.0]) + 3.0 * np.outer([0, 1], [np.cos(0.6), np.sin(0.6)])
     for env in range(N_ENV):
@@ -225,22 +225,22 @@ def test_both_ends_of_a_line_are_learnt_in_one_go_and_back(stage):
 
 
 def test_circles_leave_no_turns(stage):
-    """A body on a circle is on no straight leg once its turn rate stands out; before, its legs bend too
+    """An obstacle on a circle is on no straight leg once its turn rate stands out; before, its legs bend too
     little to be a turn."""
     stage.begin()
     for k in range(120):
         a = 0.8 * k * PERIOD_S
-        state, alive = one_body([10 + np.cos(a), 3 + np.sin(a), -0.8 * np.sin(a), 0.8 * np.cos(a)])
+        state, alive = one_obstacle([10 + np.cos(a), 3 + np.sin(a), -0.8 * np.sin(a), 0.8 * np.cos(a)])
         stage.watch(state, alive=alive, rate=0.8 if k > 8 else 0.1, rate_var=0.02 if k > 8 else 0.1)
     assert (stage.read()["weight"] == 0).all()
 
 
 def test_a_turn_that_does_not_come_is_forgotten(stage):
-    """Learnt once from one body, contradicted by another that goes straight on over the same place on the
+    """Learnt once from one obstacle, contradicted by another that goes straight on over the same place on the
     same course."""
     stage.begin()
     for k in range(int(4.0 / PERIOD_S)):
-        state, alive = one_body(shuttle(k * PERIOD_S))
+        state, alive = one_obstacle(shuttle(k * PERIOD_S))
         stage.watch(state, alive=alive)
     assert all(len(stage.turns(env)) == 1 for env in range(N_ENV))
     alive = np.zeros((N_ENV, N_TRACK))
@@ -257,7 +257,7 @@ def test_the_oldest_turn_goes_when_memory_is_full(stage):
     for j in range(CONFIG.n_turn + 3):
         for k in range(int(2.5 / PERIOD_S)):
             t = k * PERIOD_S
-            state, alive = one_body(shuttle(t, length=1.5, begin=(1 + 0.9 * j, 1.0), course=0.5 * np.pi))
+            state, alive = one_obstacle(shuttle(t, length=1.5, begin=(1 + 0.9 * j, 1.0), course=0.5 * np.pi))
             stage.watch(state, alive=alive, age=k)
     table = stage.read()
     assert (table["weight"] > 0).all()
@@ -267,17 +267,17 @@ def test_the_oldest_turn_goes_when_memory_is_full(stage):
 
 def test_only_awake_rows_learn_and_forget(stage):
     stage.begin()
-    awake = np.arange(N_ENV) % 2
-    stage.clock.awake.from_numpy(awake.astype(np.int32))
+    active = np.arange(N_ENV) % 2
+    stage.clock.active.from_numpy(active.astype(np.int32))
     for k in range(int(4.0 / PERIOD_S)):
-        state, alive = one_body(shuttle(k * PERIOD_S))
+        state, alive = one_obstacle(shuttle(k * PERIOD_S))
         stage.watch(state, alive=alive)
-    assert [len(stage.turns(env)) for env in range(N_ENV)] == list(awake)
-    stage.clock.awake.from_numpy((1 - awake).astype(np.int32))
-    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
-    assert [len(stage.turns(env)) for env in range(N_ENV)] == list(awake)
-    stage.clock.awake.fill(1)
-    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
+    assert [len(stage.turns(env)) for env in range(N_ENV)] == list(active)
+    stage.clock.active.from_numpy((1 - active).astype(np.int32))
+    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.turn_history, stage.clock))
+    assert [len(stage.turns(env)) for env in range(N_ENV)] == list(active)
+    stage.clock.active.fill(1)
+    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.turn_history, stage.clock))
     assert (stage.read()["leg_step"] == -1).all()
     for name, value in stage.read().items():
         assert name == "leg_step" or (value == 0).all(), f"{name} keeps a trace of the last episode"
@@ -285,8 +285,8 @@ def test_only_awake_rows_learn_and_forget(stage):
 
 @pytest.mark.parametrize("shape", ["rectangle", "circle"])
 def test_coasting_equals_the_oracle(stage, shape):
-    """Unseen bodies near remembered turns and walls: one step of 0.06 s or of 0.5 s ends where the oracle's
-    walk ends."""
+    """Unseen obstacles near remembered turns and walls: one step of 0.06 s or of 0.5 s ends where the
+    oracle's walk ends."""
     stage.begin()
     tank = TankConfig(shape=shape, y_m=(0.0, 6.0) if shape == "rectangle" else (0.0, 20.0))
     rng = np.random.default_rng(2)
@@ -295,7 +295,7 @@ def test_coasting_equals_the_oracle(stage, shape):
     seconds = rng.choice([0.06, 0.5], n).astype(np.float32)
 
     @ti.kernel
-    def coast(tracks: In[TrackState], memory: In[HabitState]):
+    def coast(tracks: In[TrackState], memory: In[TurnHistory]):
         for i in range(n):
             out[i] = prediction.coasted(i % N_ENV, 0, mean[i], time[i], memory, tracks, CONFIG, tank)
 
@@ -304,7 +304,7 @@ def test_coasting_equals_the_oracle(stage, shape):
     low = [1, 1] if shape == "rectangle" else [5, 5]
     pos = rng.uniform(low, high, (n, 2))
     rows = {name: np.zeros((N_ENV, CONFIG.n_turn)) for name in oracle.TURN_ROWS}
-    for i in range(0, 90):  # a turn just ahead of every other body, or at its side, or behind
+    for i in range(0, 90):  # a turn just ahead of every other obstacle, or at its side, or behind
         env, slot = i % N_ENV, i // N_ENV
         angle, after = course[i] + rng.normal(0, 0.2), rng.uniform(-np.pi, np.pi)
         place = (
@@ -313,7 +313,7 @@ def test_coasting_equals_the_oracle(stage, shape):
         values = *place, np.cos(angle), np.sin(angle), np.cos(after), np.sin(after), rng.choice([-1, 1, 1, 4])
         for name, value in zip(rows, values, strict=True):
             rows[name][env, slot] = value
-    stage.habits.turn.from_numpy(oracle.packed_turns(rows))
+    stage.turn_history.turn.from_numpy(oracle.packed_turns(rows))
     x = np.concatenate([pos, speed[:, None] * np.stack([np.cos(course), np.sin(course)], -1)], -1).astype(
         np.float32
     )
@@ -323,7 +323,7 @@ def test_coasting_equals_the_oracle(stage, shape):
     mean.from_numpy(x)
     time.from_numpy(seconds)
     stage.put(radius_m=0.25)
-    coast(stage.tracks, stage.habits)
+    coast(stage.tracks, stage.turn_history)
     got, table, turned = out.to_numpy(), stage.read(), 0
     for i in range(n):
         turns = oracle_turns(table, i % N_ENV)
@@ -337,8 +337,8 @@ def test_coasting_equals_the_oracle(stage, shape):
 
 
 def test_a_way_remembers_what_kind_of_turn_began_it(stage):
-    """Bodies that have swum to and fro, and round corners, for some ways: 2 = began with a turn back, 3 = a
-    corner."""
+    """Obstacles that have swum to and fro, and round corners, for some ways: 2 = began with a turn back, 3 =
+    a corner."""
     for corners, kind in ((2, prediction.BEGIN_SEEN), (3, prediction.CORNER_SEEN)):
         stage.begin()
         paths = Loops(np.random.default_rng(4), corners, 1.5)

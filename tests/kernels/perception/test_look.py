@@ -9,7 +9,7 @@ from tests.oracles import elevation as weighing
 from tests.oracles import look as oracle
 from tests.oracles.depth import camera_position, camera_rays, z_depths
 from tests.oracles.scenes import BOX, CYLINDER, SPHERE, quaternions
-from uuvtai.config import DepthConfig, ElevationConfig, EpisodeConfig, TankConfig
+from uuvtai.config import DepthConfig, EpisodeConfig, HeightConfig, TankConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import camera_tracking
 from uuvtai.kernels.perception.io import LookIO
@@ -18,7 +18,7 @@ from uuvtai.state import ClockState, DepthImage, TrackState, allocate
 N_ENV, N_TRACK = 12, 3
 TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
 CAMERA = DepthConfig(rows=36, cols=64, fov_deg=90.0, offset_b_m=(0.2, 0.0, 0.0), max_range_m=8.0)
-CFG = ElevationConfig(column_share=0.05, use_camera=True, camera_hit_share=0.6)
+CFG = HeightConfig(column_share=0.05, use_camera=True, camera_hit_share=0.6)
 SIZES = {
     "n_env": N_ENV,
     "n_track": N_TRACK,
@@ -53,10 +53,10 @@ class Rig:
         """Nothing tracked, nothing but walls in view, everyone level at (5, 3, -0.8) and facing +x; a fresh
         image at step 0."""
         clear(self.tracks, self.image, self.clock)
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.image.fresh.fill(1)
         self.pos, self.rpy = np.tile(OWN, (N_ENV, 1)), np.zeros((N_ENV, 3))
-        self.bodies = [[] for _ in range(N_ENV)]
+        self.obstacles = [[] for _ in range(N_ENV)]
         self.place, self.radius = np.zeros((N_ENV, N_TRACK, 2)), np.zeros((N_ENV, N_TRACK))
         self.share, self.present = np.tile(PRIOR, (N_ENV, N_TRACK, 1)), np.full((N_ENV, N_TRACK), 0.9)
         return self
@@ -65,30 +65,30 @@ class Rig:
         self.place[env, track], self.radius[env, track] = (x, y), radius
 
     def put(self, env, kind, x, y, z, size, tracked=True):
-        """A body: size = radius of a ball, (radius, half height) of a cylinder, (half x, half y) of a
+        """An obstacle: size = radius of a ball, (radius, half height) of a cylinder, (half x, half y) of a
         full-column box."""
         extents = {
             SPHERE: lambda: (size,) * 3,
             CYLINDER: lambda: (size[0], *size),
             BOX: lambda: (*size, 0.8),
         }[kind]()
-        self.bodies[env].append((kind, (x, y, z), extents))
+        self.obstacles[env].append((kind, (x, y, z), extents))
         if tracked:
             self.track(env, x, y, size if kind == SPHERE else size[0])
 
     def load(self):
         """Draw the images, and bring everything to the kernel's structs."""
-        n_body = max(1, *(len(bodies) for bodies in self.bodies))
+        n_obstacle = max(1, *(len(obstacles) for obstacles in self.obstacles))
         scene = {
-            "pos": self.pos, "quat": quaternions(self.rpy), "kind": np.zeros((N_ENV, n_body), int),
-            "yaw": np.zeros((N_ENV, n_body)),
-            "body_pos": np.zeros((N_ENV, n_body, 3)), "size": np.ones((N_ENV, n_body, 3)),
+            "pos": self.pos, "quat": quaternions(self.rpy), "kind": np.zeros((N_ENV, n_obstacle), int),
+            "yaw": np.zeros((N_ENV, n_obstacle)),
+            "obstacle_pos": np.zeros((N_ENV, n_obstacle, 3)), "size": np.ones((N_ENV, n_obstacle, 3)),
         }  # fmt: skip
         pixels = np.argwhere(np.ones((CAMERA.rows, CAMERA.cols)))
         self.depth_m = np.zeros((N_ENV, CAMERA.rows, CAMERA.cols))
-        for env, bodies in enumerate(self.bodies):
-            for slot, (kind, pos, size) in enumerate(bodies):
-                scene["kind"][env, slot], scene["body_pos"][env, slot], scene["size"][env, slot] = (
+        for env, obstacles in enumerate(self.obstacles):
+            for slot, (kind, pos, size) in enumerate(obstacles):
+                scene["kind"][env, slot], scene["obstacle_pos"][env, slot], scene["size"][env, slot] = (
                     kind,
                     pos,
                     size,
@@ -104,7 +104,7 @@ class Rig:
 
     def look(self):
         """(shares, presences) after the kernel."""
-        camera_tracking.look_at_bodies(
+        camera_tracking.look_at_obstacles(
             io_for(LookIO, self.tracks, self.image, self.clock, CFG, CAMERA, TANK, RULES)
         )
         return self.tracks.height.to_numpy()[:, :, 0].astype(float), self.tracks.present.to_numpy().astype(
@@ -128,7 +128,7 @@ def mass(share, low, high):
     return share[:-1][(first < HEIGHTS) & (last > HEIGHTS)].sum()
 
 
-def test_a_body_seen_wholly_lies_where_it_is_seen(rig):
+def test_a_obstacle_seen_wholly_lies_where_it_is_seen(rig):
     """Balls and cylinders at several heights and distances; also with the nose up or down, rolled, and turned
     to any side."""
     z = np.linspace(-1.2, -0.4, N_ENV)
@@ -151,7 +151,7 @@ def test_a_body_seen_wholly_lies_where_it_is_seen(rig):
     np.testing.assert_allclose(present[:, 0], 0.9, atol=1e-6)
 
 
-def test_a_body_cut_by_the_image_tells_its_visible_end_only(rig):
+def test_a_obstacle_cut_by_the_image_tells_its_visible_end_only(rig):
     """Close by and high (or low): what may be is from the middle of what shows to 0.4 m beyond its visible
     end, and nothing else."""
     x = EYE_X + 0.8
@@ -174,8 +174,8 @@ def test_a_body_cut_by_the_image_tells_its_visible_end_only(rig):
 
 
 def test_a_column_shows_from_edge_to_edge(rig):
-    """Far enough away that floor and surface are in view: a body from one to the other is a column, a tall
-    one is not."""
+    """Far enough away that floor and surface are in view: an obstacle from one to the other is a column, a
+    tall one is not."""
     rig.put(0, CYLINDER, EYE_X + 2.5, 3.0, -0.8, (0.2, 0.8))
     rig.put(1, CYLINDER, EYE_X + 2.5, 3.0, -0.9, (0.2, 0.5))
     rig.load()
@@ -236,9 +236,9 @@ def test_an_end_behind_something_nearer_is_not_an_end(rig):
     np.testing.assert_allclose(share[1, 0, :15], share[0, 0, :15][::-1], atol=1e-5)
 
 
-def test_only_fresh_images_of_moving_bodies_in_view_count(rig):
-    """One case per env: an old image, a resting body, a dead track, behind the camera, beside the image, too
-    far, too near, asleep."""
+def test_only_fresh_images_of_moving_obstacles_in_view_count(rig):
+    """One case per env: an old image, a static obstacle, a dead track, behind the camera, beside the image,
+    too far, too near, inactive."""
     for env in range(9):
         rig.track(env, EYE_X + 2.0, 3.0)
     for env, place in {
@@ -253,14 +253,14 @@ def test_only_fresh_images_of_moving_bodies_in_view_count(rig):
         name: np.ones(shape)
         for name, shape in (
             ("fresh", N_ENV),
-            ("awake", N_ENV),
+            ("active", N_ENV),
             ("moving", (N_ENV, N_TRACK)),
             ("alive", (N_ENV, N_TRACK)),
         )
     }
-    flags["fresh"][0] = flags["moving"][1, 0] = flags["alive"][2, 0] = flags["awake"][7] = 0
+    flags["fresh"][0] = flags["moving"][1, 0] = flags["alive"][2, 0] = flags["active"][7] = 0
     put(rig.image, fresh=flags["fresh"])
-    put(rig.clock, awake=flags["awake"])
+    put(rig.clock, active=flags["active"])
     put(rig.tracks, moving=flags["moving"], alive=flags["alive"] * (rig.radius > 0))
     share, present = rig.look()
     np.testing.assert_array_equal(share[:8, 0].astype(np.float32), np.tile(PRIOR.astype(np.float32), (8, 1)))
@@ -286,8 +286,8 @@ def test_a_track_is_looked_for_where_it_is_now(rig):
 
 
 def test_any_scene_equals_the_oracle(rig):
-    """Random attitudes, scenes of up to four bodies, tracks on and beside them: shares and presences of every
-    track in view."""
+    """Random attitudes, scenes of up to four obstacles, tracks on and beside them: shares and presences of
+    every track in view."""
     rng = np.random.default_rng(12)
     compared = {"shown": 0, "missed": 0, "untouched": 0}
     for _ in range(4):

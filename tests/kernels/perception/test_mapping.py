@@ -64,7 +64,7 @@ class Stage:
             "n_ray": SONAR.n_ray,
             "n_track": 4,
             "n_cluster": 4,
-            "n_body": 4,
+            "n_obstacle": 4,
             "n_height": 16,
             "n_slot": 4,
         }
@@ -88,13 +88,13 @@ class Stage:
         self.tank = tank
         load_bounds(self.mask, np.array(outside_cells(tank, MAP.cell_m)))
 
-    def reset(self, awake=1):
-        self.set_awake(awake)
+    def reset(self, active=1):
+        self.set_active(active)
         self.set_step(0)
         mapping.reset_map(io_for(MappingIO, self.grid_map, self.clock))
 
-    def set_awake(self, awake):
-        self.clock.awake.from_numpy(np.broadcast_to(awake, self.n_env).astype(np.int32).copy())
+    def set_active(self, active):
+        self.clock.active.from_numpy(np.broadcast_to(active, self.n_env).astype(np.int32).copy())
 
     def set_step(self, step):
         self.clock.step.from_numpy(np.broadcast_to(step, self.n_env).astype(np.int32).copy())
@@ -171,7 +171,7 @@ def _default_tank(stage):
 # ----------------------------------------------------------------------------------------------------- scenes
 
 
-def ring(pos, bodies=(), yaw=0.0, vel=(0.0, 0.0, 0.0), noise=None):
+def ring(pos, obstacles=(), yaw=0.0, vel=(0.0, 0.0, 0.0), noise=None):
     """Scan of the rectangular tank with discs (x, y, radius, vx, vy): ranges, hits, Doppler with ego
     motion."""
     pos = np.array([*pos, -0.8])
@@ -182,17 +182,17 @@ def ring(pos, bodies=(), yaw=0.0, vel=(0.0, 0.0, 0.0), noise=None):
             np.where(u[:, 0] > 0, TANK.x_m[1] - pos[0], pos[0] - TANK.x_m[0]) / np.abs(u[:, 0]),
             np.where(u[:, 1] > 0, TANK.y_m[1] - pos[1], pos[1] - TANK.y_m[0]) / np.abs(u[:, 1]),
         )
-    body_vel = np.zeros((SONAR.n_ray, 2))
-    of_body = np.zeros(SONAR.n_ray, bool)
-    for x, y, radius, vx, vy in bodies:
+    obstacle_vel = np.zeros((SONAR.n_ray, 2))
+    of_obstacle = np.zeros(SONAR.n_ray, bool)
+    for x, y, radius, vx, vy in obstacles:
         along, across = u @ (np.array([x, y]) - pos[:2]), u[:, 0] * (y - pos[1]) - u[:, 1] * (x - pos[0])
         inside = radius**2 - across**2
         r = np.where((inside > 0) & (along > 0), along - np.sqrt(np.maximum(inside, 0)), np.inf)
-        body_vel[r < best], of_body[r < best] = (vx, vy), True
+        obstacle_vel[r < best], of_obstacle[r < best] = (vx, vy), True
         best = np.minimum(best, r)
     c, s = np.cos(yaw), np.sin(yaw)
     own = np.array([c * vel[0] - s * vel[1], s * vel[0] + c * vel[1]])
-    doppler = np.sum((body_vel - own) * u, axis=1)
+    doppler = np.sum((obstacle_vel - own) * u, axis=1)
     if noise is not None:
         best = np.maximum(
             0.05,
@@ -201,7 +201,7 @@ def ring(pos, bodies=(), yaw=0.0, vel=(0.0, 0.0, 0.0), noise=None):
     hit = np.ones(SONAR.n_ray, int)
     return {
         "pos": pos, "yaw": yaw, "range": best, "hit": hit, "doppler": doppler, "vel": np.array(vel),
-        "tracked": np.zeros(SONAR.n_ray, bool), "of_body": of_body,
+        "tracked": np.zeros(SONAR.n_ray, bool), "of_obstacle": of_obstacle,
     }  # fmt: skip
 
 
@@ -222,16 +222,16 @@ def around(layer, x, y, half=3):
 
 
 def random_scan(rng, tank):
-    """Bodies, walls, noise, missed and false returns, Doppler of all sizes."""
+    """Obstacles, walls, noise, missed and false returns, Doppler of all sizes."""
     while True:
         pos = np.array([rng.uniform(*tank.x_m), rng.uniform(*tank.y_m)])
         if MapOracle(MAP, SONAR, DEPTH_CAMERA, tank, EPISODE).gap(pos) > 0.2:
             break
-    bodies = [
+    obstacles = [
         (rng.uniform(0, 6), rng.uniform(0, 4), rng.uniform(0.1, 0.5), *rng.normal(0, 0.3, 2))
         for _ in range(4)
     ]
-    scan = ring(pos, bodies, rng.uniform(-7, 7), rng.normal(0, 0.3, 3), rng)
+    scan = ring(pos, obstacles, rng.uniform(-7, 7), rng.normal(0, 0.3, 3), rng)
     if tank.shape == "circle":
         scan["range"] = np.minimum(scan["range"], rng.uniform(0.2, 4.0, SONAR.n_ray))
     false = rng.random(SONAR.n_ray) < 0.1
@@ -370,7 +370,7 @@ FACE = (BODY[0] - BODY[2], BODY[1])
 """where beam 0 meets the body: the middle of a cell"""
 
 
-def test_static_body_appears_and_outlives_its_sight(stage):
+def test_static_obstacle_appears_and_outlives_its_sight(stage):
     stage.reset()
     after = stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 25)
     assert after["static"][cell(*FACE)] > MAP.occupied
@@ -390,7 +390,7 @@ def test_known_walls_are_not_mapped(stage):
     assert after["free_scans"].max() == CONFIDENT
 
 
-def test_moving_body_feeds_the_dynamic_layer_only(stage):
+def test_moving_obstacle_feeds_the_dynamic_layer_only(stage):
     """Towards the vehicle at 0.4 m/s: Doppler. It is never static, and its wake is free again."""
     stage.reset()
 
@@ -420,7 +420,7 @@ WRONG = (0.5, -0.3)
 
 
 def misread(yaw, valid, walls):
-    """A scan at rest whose own velocity is said to be ``WRONG``, beside a body that stands still."""
+    """A scan at rest whose own velocity is said to be ``WRONG``, beside an obstacle that stands still."""
     c, s = np.cos(yaw), np.sin(yaw)
     measured = (c * WRONG[0] + s * WRONG[1], -s * WRONG[0] + c * WRONG[1], 0.0)
     return ring(EYE, [(*BODY, 0.0, 0.0)], yaw=yaw) | {
@@ -449,7 +449,7 @@ def test_a_valid_reading_is_not_mended_by_an_older_scan(stage):
 
 
 def test_without_a_reading_and_without_walls_doppler_proves_nothing(stage):
-    """Nobody knows the own velocity: what stands does not move by it. A body faster than all doubt still
+    """Nobody knows the own velocity: what stands does not move by it. An obstacle faster than all doubt still
     does."""
     stage.reset()
     blindly = stage.run(lambda k: misread(0.0, False, ((0.0, 0.0), 1.0, True)), 1)
@@ -466,12 +466,12 @@ def test_without_a_reading_and_without_walls_doppler_proves_nothing(stage):
 def test_beams_of_a_moving_track_are_dynamic_evidence(stage):
     stage.reset()
     scan = ring(EYE, [(*BODY, 0, 0)])
-    after = stage.run(lambda k: scan | {"tracked": scan["of_body"]}, 3)
+    after = stage.run(lambda k: scan | {"tracked": scan["of_obstacle"]}, 3)
     assert after["dynamic"][cell(*FACE)] > 0 and after["static"].max() == 0
 
 
 def appearing(k, n_free=20):
-    """A body without Doppler that is suddenly there, long after its place was seen free."""
+    """An obstacle without Doppler that is suddenly there, long after its place was seen free."""
     return ring(EYE, [(*BODY, 0, 0)] if k >= n_free else [])
 
 
@@ -495,8 +495,8 @@ def test_no_temporal_evidence_before_the_cell_was_free_for_long(stage):
     assert after["dynamic"].max() == 0 and after["static"][cell(*FACE)] > 0
 
 
-def test_noisy_edges_of_a_static_body_never_become_dynamic(stage):
-    """Twelve seconds of range noise and slow turning around a body whose rim cells are partly free."""
+def test_noisy_edges_of_a_static_obstacle_never_become_dynamic(stage):
+    """Twelve seconds of range noise and slow turning around an obstacle whose rim cells are partly free."""
     stage.reset()
     noise = np.random.default_rng(3)
     worst = 0.0
@@ -509,7 +509,7 @@ def test_noisy_edges_of_a_static_body_never_become_dynamic(stage):
     assert after["static"][cell(*FACE)] > MAP.occupied
 
 
-def test_free_water_clears_a_removed_body(stage):
+def test_free_water_clears_a_removed_obstacle(stage):
     stage.reset()
     stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 25)
     after = stage.run(lambda k: ring(EYE), 40, first=25)
@@ -568,7 +568,7 @@ def test_depth_alone_maps_nothing_but_strengthens_what_the_sonar_saw(stage):
     assert both - without == pytest.approx(2 * 0.8 * MAP.depth_hit, abs=1e-3)
 
 
-def test_depth_never_burns_a_moving_body_into_the_static_layer(stage):
+def test_depth_never_burns_a_moving_obstacle_into_the_static_layer(stage):
     stage.reset()
     after = stage.run(lambda k: ring(EYE, [(*BODY, -0.3, 0.0)]), 10, image_of=lambda k: wall_ahead(PLANE_M))
     assert after["dynamic"][cell(*FACE)] > MAP.occupied and after["static"][cell(*FACE)] == 0
@@ -599,14 +599,14 @@ def test_image_between_scans_waits_for_the_next_merge(stage):
 def test_scans_closer_than_the_period_stale_scans_and_sleeping_rows_change_nothing(stage):
     stage.reset()
     first = stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 1)
-    for step, fresh, awake in ((1, 1, 1), (2, 0, 1), (3, 1, 0)):
+    for step, fresh, active in ((1, 1, 1), (2, 0, 1), (3, 1, 0)):
         stage.set_step(step)
-        stage.set_awake(awake)
+        stage.set_active(active)
         stage.scan.fresh.fill(fresh)
         stage.update()
         for name, value in stage.read().items():
             np.testing.assert_array_equal(value[0], first[name])
-    stage.set_awake(1)
+    stage.set_active(1)
     stage.update()
     assert stage.read()["static"][0][cell(*FACE)] > first["static"][cell(*FACE)]
 
@@ -671,13 +671,13 @@ def test_position_estimate_off_the_grid_is_harmless(stage):
 def test_reset_empties_awake_rows_only(stage):
     random_run(stage, range(N_ENV), 5)
     before = stage.read()
-    awake = np.array([1, 0, 1, 0, 0, 1])
-    stage.reset(awake)
+    active = np.array([1, 0, 1, 0, 0, 1])
+    stage.reset(active)
     after = stage.read()
     for env in range(N_ENV):
         for name in FIELDS:
             np.testing.assert_array_equal(
-                after[name][env], np.zeros(SHAPE) if awake[env] else before[name][env]
+                after[name][env], np.zeros(SHAPE) if active[env] else before[name][env]
             )
     # and a reset row starts to map at once, whatever its last scan was
     assert stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 1)["static"][cell(*FACE)] > 0
@@ -686,10 +686,10 @@ def test_reset_empties_awake_rows_only(stage):
 # ------------------------------------------------------------------------------------------------------ stamp
 
 
-def test_debugging_stamp_is_off_by_default_and_marks_moving_bodies_only(stage):
+def test_debugging_stamp_is_off_by_default_and_marks_moving_obstacles_only(stage):
     assert MappingConfig().stamp == 0.0
     stage.reset()
-    world = allocate(WorldState, {"n_env": N_ENV, "n_body": 4})
+    world = allocate(WorldState, {"n_env": N_ENV, "n_obstacle": 4})
     kind, pos, vel, size = (
         np.zeros((N_ENV, 4), np.int32),
         np.zeros((N_ENV, 4, 3)),

@@ -19,10 +19,10 @@ from uuvtai.state import (
     ClusterState,
     ForecastState,
     FutureState,
-    HabitState,
     MixtureState,
     PastState,
     TrackState,
+    TurnHistory,
     allocate,
 )
 
@@ -41,18 +41,18 @@ WIDTH_M, LENGTH_M = 6.0, 20.0
 
 
 class Stage:
-    """Tracks of bodies, what is remembered of them, and a network that says what they may do."""
+    """Tracks of obstacles, what is remembered of them, and a network that says what they may do."""
 
     def __init__(self):
-        kinds = (TrackState, HabitState, ForecastState, FutureState, ClockState, ClusterState)
-        self.tracks, self.habits, self.forecast, self.futures, self.clock, self.clusters = (
+        kinds = (TrackState, TurnHistory, ForecastState, FutureState, ClockState, ClusterState)
+        self.tracks, self.turn_history, self.forecast, self.futures, self.clock, self.clusters = (
             allocate(kind, SIZES) for kind in kinds
         )
         self.past, self.mixture = allocate(PastState, SIZES), allocate(MixtureState, SIZES)
 
     def begin(self):
-        clear(self.tracks, self.habits, self.forecast, self.futures, self.clock, self.clusters)
-        self.clock.awake.fill(1)
+        clear(self.tracks, self.turn_history, self.forecast, self.futures, self.clock, self.clusters)
+        self.clock.active.fill(1)
         self.clusters.fresh.fill(1)
         self.tracks.alive.fill(1)
         self.tracks.moving.fill(1)
@@ -68,7 +68,7 @@ class Stage:
             self.clock,
             self.clusters,
             self.forecast,
-            self.habits,
+            self.turn_history,
             self.tracks,
             CFG,
         )
@@ -204,13 +204,13 @@ def test_a_mirrored_track_has_mirrored_columns(stage):
         put(stage.tracks.turn_rate, flip * rate)
         stage.tracks.turn_cov.fill(0.1)
         put(
-            stage.habits.run_from_w,
+            stage.turn_history.run_from_w,
             np.where(flip > 0, 0, WIDTH_M) * np.array([0, 1]) + (begin - 0.5) * mirror,
         )
-        stage.habits.run_kind.fill(2)
+        stage.turn_history.run_kind.fill(2)
         turned = np.zeros((N_ENV, 7, 3, LANES), np.float32)
         turned[..., 0] = np.array([14, 3, 1, 0, -0.6, 0.8 * flip, 1.0])[None, :, None]
-        stage.habits.turn.from_numpy(turned)
+        stage.turn_history.turn.from_numpy(turned)
         drive(
             stage, np.where(flip > 0, 0, WIDTH_M) * np.array([0, 1]) + begin * mirror, velocity * mirror, 2.0
         )
@@ -236,11 +236,11 @@ def test_a_new_track_remembers_nothing(stage):
 
 def test_turns_are_remembered_newest_first(stage):
     stage.begin()
-    stage.habits.run_kind.fill(2)
+    stage.turn_history.run_kind.fill(2)
     bends = [(2.0, 2.0), (5.0, 2.0), (2.05, 2.0), (5.1, 2.0), (2.0, 2.1), (5.0, 2.1)]
     for nth, bend in enumerate(bends):
         for again in range(2):
-            put(stage.habits.run_from_w, np.broadcast_to(bend, (N_ENV, N_TRACK, 2)))
+            put(stage.turn_history.run_from_w, np.broadcast_to(bend, (N_ENV, N_TRACK, 2)))
             stage.scan(30 * nth + 3 * again)
     n = enums.N_BEND
     np.testing.assert_allclose(stage.past.bend_w.to_numpy()[0, 0], bends[::-1][:n], atol=1e-6)

@@ -7,23 +7,23 @@ from scipy.stats import chi2
 from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.oracles import pose as oracle
-from uuvtai.config import EpisodeConfig, PoseConfig, TankConfig, VehicleConfig
+from uuvtai.config import EpisodeConfig, LocalizationConfig, TankConfig, VehicleConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.perception import localization
-from uuvtai.kernels.perception.io import PoseIO
-from uuvtai.state import ClockState, PoseState, Proprioception, SonarScan, allocate
+from uuvtai.kernels.perception.io import LocalizationIO
+from uuvtai.state import ClockState, LocalizationState, Proprioception, SonarScan, allocate
 
 N_ENV, STEPS = 200, 201
 RULES = EpisodeConfig()
 SENSORS = {name: load_config("pool", name).sensors for name in ("nominal", "harsh")}
 POOL, PEN = TankConfig(), TankConfig(shape="circle", x_m=(0.0, 8.0), y_m=(0.0, 8.0))
 SEA = TankConfig(x_m=(-100.0, 100.0), y_m=(-100.0, 100.0))
-DEFAULT = PoseConfig()
-PLAIN = PoseConfig(bearing_sigma_rad=0.0, wall_sigma_m=1e-4)
+DEFAULT = LocalizationConfig()
+PLAIN = LocalizationConfig(bearing_sigma_rad=0.0, wall_sigma_m=1e-4)
 """What the made-up worlds need: errors are those of the sensors, of the few false returns and ghosts that
-pass the gate, and of bodies."""
+pass the gate, and of obstacles."""
 VEHICLE = VehicleConfig()
-BODIES = ((0.7, 4.0, 0.3), (6.9, 5.6, 0.35), (4.2, 0.5, 0.3), (5.5, 4.6, 0.2))
+OBSTACLES = ((0.7, 4.0, 0.3), (6.9, 5.6, 0.35), (4.2, 0.5, 0.3), (5.5, 4.6, 0.2))
 """(x, y, radius) [m]: three at the pen's wall, closer than the gate is wide, and one before it"""
 
 WRONG = 7.0
@@ -41,13 +41,13 @@ class Rig:
     def __init__(self):
         sizes = {"n_env": N_ENV, "n_ray": SENSORS["harsh"].sonar.n_ray}
         self.ego, self.pose, self.clock, self.scan = (
-            allocate(struct, sizes) for struct in (Proprioception, PoseState, ClockState, SonarScan)
+            allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
         )
 
     def begin(self, voyage, cfg):
         self.voyage, self.cfg, self.pings = voyage, cfg, {}
         self.io = io_for(
-            PoseIO,
+            LocalizationIO,
             self.ego,
             self.pose,
             self.clock,
@@ -58,7 +58,7 @@ class Rig:
             RULES,
             VEHICLE,
         )
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         set_step(self.clock, 0)
         self.ego.pos_w.from_numpy(voyage.pos[0].astype(np.float32))
         self.ego.vel_b.fill(0)
@@ -157,7 +157,7 @@ def assert_close(found, filters, rows):
 @pytest.mark.parametrize(("preset", "cfg", "tank"), [("harsh", DEFAULT, PEN), ("nominal", PLAIN, POOL)])
 def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
     """Each step from what the kernel had before it: rounding does not add up, a wrong term shows at once."""
-    rows, v = (0, 75, 150), voyage(preset, cfg, tank, 3, bodies=BODIES)
+    rows, v = (0, 75, 150), voyage(preset, cfg, tank, 3, obstacles=OBSTACLES)
     rig.begin(v, cfg)
     filters = {row: oracle.Filter(v.pos[0][row], v.sensors, cfg, tank, RULES.control_dt_s) for row in rows}
     assert_close(rig.state(), filters, rows)
@@ -216,9 +216,9 @@ def test_without_a_wall_in_reach_the_uncertainty_grows_and_stays_honest(rig):
     assert np.all(late[never_lost][:, [0, 3, 5]] > early[never_lost][:, [0, 3, 5]])
 
 
-def test_bodies_at_a_round_wall_do_not_make_it_too_sure(rig):
-    """The defaults: bodies closer to the wall than the gate is wide pass for it."""
-    rig.begin(voyage("harsh", DEFAULT, PEN, 13, bodies=BODIES), DEFAULT)
+def test_obstacles_at_a_round_wall_do_not_make_it_too_sure(rig):
+    """The defaults: obstacles closer to the wall than the gate is wide pass for it."""
+    rig.begin(voyage("harsh", DEFAULT, PEN, 13, obstacles=OBSTACLES), DEFAULT)
     nees, _, off = rig.play()
     assert nees.mean() < chi2.ppf(0.975, 3 * N_ENV) / N_ENV
     assert np.quantile(off, 0.95) < 0.15
@@ -255,7 +255,7 @@ def test_a_velocity_that_nothing_tells_is_not_valid(rig):
 
 
 def test_what_stands_before_the_walls_makes_them_count_less(rig):
-    """As many beams meet the walls both times, but once the others end at bodies, before the walls."""
+    """As many beams meet the walls both times, but once the others end at obstacles, before the walls."""
     v = voyage("harsh", PLAIN, POOL, 17)
     rig.begin(v, PLAIN)
     rig.play(6)
@@ -265,7 +265,7 @@ def test_what_stands_before_the_walls_makes_them_count_less(rig):
     for short in (0, 1):
         hit[:, ::4] = short
         for field, values in zip(("mean", "cov", "depth", "depth_cov", "motion"), before, strict=True):
-            getattr(rig.pose, field).from_numpy(values)
+            getattr(rig.localization, field).from_numpy(values)
         rig.deliver(5, (ranges, doppler, hit, *told))
         localization.correct_pose(rig.io)
         sure.append(rig.ego.pose_cov.to_numpy()[:, [0, 3, 5]])
@@ -277,7 +277,7 @@ def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
     rig.play(21)
     first = rig.state()
     rig.begin(voyage("harsh", PLAIN, POOL, 15), PLAIN)
-    rig.clock.awake.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
+    rig.clock.active.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
     rig.play(21)
     second = rig.state()
     for one, other in zip(first, second, strict=True):

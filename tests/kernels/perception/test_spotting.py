@@ -1,4 +1,4 @@
-"""Bodies that the camera shows while the sonar's beams pass above or below them: scenes drawn by the depth
+"""Obstacles that the camera shows while the sonar's beams pass above or below them: scenes drawn by the depth
 camera, and a float64 oracle."""
 
 import numpy as np
@@ -11,28 +11,28 @@ from tests.oracles.scenes import BOX, CYLINDER, SPHERE, load, quaternions
 from tests.oracles.tracking import predicted
 from uuvtai import state
 from uuvtai.config import (
+    CameraTrackingConfig,
     DepthConfig,
-    ElevationConfig,
     EpisodeConfig,
+    HeightConfig,
     SonarConfig,
-    SpottingConfig,
     TankConfig,
     TrackingConfig,
 )
 from uuvtai.kernels.perception import camera_tracking
-from uuvtai.kernels.perception.io import SpottingIO
+from uuvtai.kernels.perception.io import CameraTrackingIO
 from uuvtai.kernels.sensors import depth_camera
 from uuvtai.kernels.sensors.io import DepthIO
 
-N_ENV, N_TRACK, N_BODY = 12, 3, 3
+N_ENV, N_TRACK, N_OBSTACLE = 12, 3, 3
 TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
 CAMERA, SONAR, ELEVATION, TRACKING = (
     DepthConfig(period_steps=5),
     SonarConfig(n_ray=256),
-    ElevationConfig(),
+    HeightConfig(),
     TrackingConfig(),
 )
-CFG = SpottingConfig(
+CFG = CameraTrackingConfig(
     range_m=4.0,
     band_m=0.9,
     wall_margin_m=0.25,
@@ -44,7 +44,7 @@ CFG = SpottingConfig(
     turn_gate=12.0,
 )
 SIZES = {
-    "n_env": N_ENV, "n_track": N_TRACK, "n_body": N_BODY, "n_height": 16, "n_ray": SONAR.n_ray,
+    "n_env": N_ENV, "n_track": N_TRACK, "n_obstacle": N_OBSTACLE, "n_height": 16, "n_ray": SONAR.n_ray,
     "n_thruster": 6,
     "n_pixel_row": CAMERA.rows, "n_pixel_col": CAMERA.cols,
 }  # fmt: skip
@@ -93,10 +93,10 @@ class Rig:
         """Everyone level at OWN and facing +x in an empty tank at step 100; nothing tracked; the newest ping,
         just come, met nothing."""
         self.pos, self.rpy = np.tile(OWN, (N_ENV, 1)), np.zeros((N_ENV, 3))
-        self.kind, self.body_pos, self.size = (
-            np.zeros((N_ENV, N_BODY), int),
-            np.zeros((N_ENV, N_BODY, 3)),
-            np.ones((N_ENV, N_BODY, 3)),
+        self.kind, self.obstacle_pos, self.size = (
+            np.zeros((N_ENV, N_OBSTACLE), int),
+            np.zeros((N_ENV, N_OBSTACLE, 3)),
+            np.ones((N_ENV, N_OBSTACLE, 3)),
         )
         self.memory = {name: np.zeros_like(field.to_numpy()) for name, field in vars(self.tracks).items()}
         self.memory["spot_step"][:] = -1
@@ -106,13 +106,13 @@ class Rig:
             "ping_yaw": np.zeros(N_ENV),
             "ping_step": np.full(N_ENV, STEP), "ping_pos_w": self.pos,
         }  # fmt: skip
-        self.awake, self.step = np.ones(N_ENV), STEP
+        self.active, self.step = np.ones(N_ENV), STEP
         self.spots.column_m.fill(oracle.FAR_M)
         self.spots.edge_m.fill(oracle.FAR_M)
         return self
 
     def put(self, env, x, y, z=HIGH, kind=SPHERE, size=(RADIUS, RADIUS, RADIUS), slot=0):
-        self.kind[env, slot], self.body_pos[env, slot], self.size[env, slot] = kind, (x, y, z), size
+        self.kind[env, slot], self.obstacle_pos[env, slot], self.size[env, slot] = kind, (x, y, z), size
 
     def track(self, env, place, vel=(0.0, 0.0), slot=0, unseen_s=1.0, sigma=(0.15, 0.3), **fields):
         """A moving track that neither the sonar nor the camera has seen for ``unseen_s``."""
@@ -134,12 +134,12 @@ class Rig:
     def load(self):
         scene = {
             "kind": self.kind,
-            "body_pos": self.body_pos,
+            "obstacle_pos": self.obstacle_pos,
             "size": self.size,
-            "yaw": np.zeros((N_ENV, N_BODY)),
+            "yaw": np.zeros((N_ENV, N_OBSTACLE)),
         }
         scene |= {
-            "body_vel": np.zeros((N_ENV, N_BODY, 3)),
+            "obstacle_vel": np.zeros((N_ENV, N_OBSTACLE, 3)),
             "pos": self.pos,
             "quat": quaternions(self.rpy),
             "vel_b": np.zeros((N_ENV, 3)),
@@ -148,7 +148,7 @@ class Rig:
         put(self.ego, pos_w=self.pos, rpy=self.rpy)
         put(self.tracks, **self.memory)
         put(self.scan, **self.scanned)
-        put(self.clock, awake=self.awake, step=np.full(N_ENV, self.step))
+        put(self.clock, active=self.active, step=np.full(N_ENV, self.step))
 
     def look(self):
         """Draw the image and follow what it shows; returns the memory afterwards."""
@@ -161,11 +161,11 @@ class Rig:
 
     def follow(self):
         camera_tracking.scan_columns(
-            io_for(SpottingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK)
+            io_for(CameraTrackingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK)
         )
         camera_tracking.follow_spots(
             io_for(
-                SpottingIO,
+                CameraTrackingIO,
                 self.tracks,
                 self.spots,
                 self.image,
@@ -214,8 +214,8 @@ def rig(made):
 
 
 def off_m(rig, env, slot=0, body=0):
-    """Distance of a track from a body's true centre."""
-    return np.hypot(*(rig.memory["state"][env, slot, :2] - rig.body_pos[env, body, :2]))
+    """Distance of a track from an obstacle's true centre."""
+    return np.hypot(*(rig.memory["state"][env, slot, :2] - rig.obstacle_pos[env, body, :2]))
 
 
 # ----------------------------------------------------------------------------------------------------- oracle
@@ -263,7 +263,7 @@ def random_scene(rig, rng):
         (rng.random((N_ENV, 256)) < 0.15),
         np.float32(rng.uniform(0.5, 3, (N_ENV, 256))),
     )
-    for env, slot in np.ndindex(N_ENV, N_BODY):
+    for env, slot in np.ndindex(N_ENV, N_OBSTACLE):
         bearing, away = rig.rpy[env, 2] + rng.uniform(-0.8, 0.8), rng.uniform(0.9, 3.0)
         x, y = rig.pos[env, :2] + away * np.array([np.cos(bearing), np.sin(bearing)])
         kind = rng.choice([SPHERE, CYLINDER, BOX], p=[0.5, 0.4, 0.1])
@@ -366,7 +366,7 @@ def assert_equal_tracks(memory, env, expected):
 # ----------------------------------------------------------------------------------------------------- scenes
 
 
-def test_a_body_above_or_below_the_fan_corrects_its_track(rig):
+def test_a_obstacle_above_or_below_the_fan_corrects_its_track(rig):
     """At several places, heights and attitudes the track, 15 cm off, comes to within a few centimetres, and
     to nobody else's."""
     for env in range(N_ENV):
@@ -386,14 +386,14 @@ def test_a_body_above_or_below_the_fan_corrects_its_track(rig):
 
 
 def test_the_expected_place_is_that_of_the_images_time(rig):
-    """The states refer to a ping 0.1 s ago: a body at 1 m/s has gone on by 10 cm."""
+    """The states refer to a ping 0.1 s ago: an obstacle at 1 m/s has gone on by 10 cm."""
     rig.put(0, 7.0, 3.1)
     rig.track(0, (7.0, 3.0), (0.0, 1.0), sigma=(0.05, 0.3))
     rig.memory["scan_step"][:] = STEP - 5
     assert np.abs(rig.look()["state"][0, 0] - [7.0, 3.0, 0.0, 1.0]).max() < 0.03
 
 
-def test_a_body_that_turned_back_is_recovered(rig):
+def test_a_obstacle_that_turned_back_is_recovered(rig):
     """Unseen for 0.6 s it has turned back, and is 0.7 m from where it is expected; four images later its
     motion is known again."""
     rig.put(0, 6.8, 2.7)
@@ -402,7 +402,7 @@ def test_a_body_that_turned_back_is_recovered(rig):
     assert off_m(rig, 0) < PLACE_M
     for _ in range(5):
         rig.wait()
-        rig.body_pos[0, 0, 1] -= 0.6 * PERIOD_S
+        rig.obstacle_pos[0, 0, 1] -= 0.6 * PERIOD_S
         rig.look()
     assert off_m(rig, 0) < PLACE_M
     assert rig.memory["alive"][0].sum() == 1
@@ -410,8 +410,8 @@ def test_a_body_that_turned_back_is_recovered(rig):
 
 
 def test_how_far_a_track_may_be_found(rig):
-    """One offset, 0.5 m: a body that was seen just now, or is slow, cannot have come so far; a quick one that
-    was long unseen can."""
+    """One offset, 0.5 m: an obstacle that was seen just now, or is slow, cannot have come so far; a quick one
+    that was long unseen can."""
     for env, (speed, unseen_s) in enumerate(((0.5, 0.16), (0.05, 1.0), (0.5, 0.3), (2.0, 1.0))):
         rig.put(env, 6.8, 3.0)
         rig.track(env, (6.8 + (1.25 if speed == 2.0 else 0.5), 3.0), (0.0, speed), unseen_s=unseen_s)
@@ -419,12 +419,12 @@ def test_how_far_a_track_may_be_found(rig):
     np.testing.assert_array_equal(memory["spot_step"][:4, 0] == STEP, [False, False, True, False])
     np.testing.assert_array_equal(
         memory["alive"][:4].sum(1), [1, 1, 1, 2]
-    )  # 1.25 m away it is a body of its own
+    )  # 1.25 m away it is an obstacle of its own
 
 
 def test_one_track_takes_one_spot(rig):
-    """Two small bodies within reach of it: the left one, which comes first, is it; the other is too near for
-    a track of its own."""
+    """Two small obstacles within reach of it: the left one, which comes first, is it; the other is too near
+    for a track of its own."""
     for slot, y in enumerate((3.13, 2.87)):
         rig.put(0, 6.8, y, size=(0.1, 0.1, 0.1), slot=slot)
     rig.track(0, (6.8, 3.02), radius_m=0.1)
@@ -432,7 +432,7 @@ def test_one_track_takes_one_spot(rig):
     assert off_m(rig, 0) < PLACE_M
 
 
-def test_an_unknown_body_rests_until_its_second_sighting(rig):
+def test_an_unknown_obstacle_rests_until_its_second_sighting(rig):
     """Born at its place with unknown heights; called moving by the first image more than 0.15 s later, and
     then its velocity is learnt."""
     for env in range(2):
@@ -458,7 +458,7 @@ def test_an_unknown_body_rests_until_its_second_sighting(rig):
     moving = []
     for _ in range(6):
         rig.wait()
-        rig.body_pos[:2, 0, 1] += 0.5 * PERIOD_S
+        rig.obstacle_pos[:2, 0, 1] += 0.5 * PERIOD_S
         rig.look()
         moving.append(rig.memory["moving"][0, 2])
         assert rig.memory["alive"][:2].sum() == 3
@@ -554,14 +554,14 @@ def test_a_spot_cut_by_the_image_corrects_loosely(rig):
 
 
 def test_sleeping_rows_old_images_and_other_rows(rig):
-    """Rows give the same bits in any company; sleeping rows and rows without a new image keep theirs."""
+    """Rows give the same bits in any company; inactive rows and rows without a new image keep theirs."""
     rng = np.random.default_rng(4)
     random_scene(rig, rng)
     first = rig.look()
     rig.begin()
     random_scene(rig, np.random.default_rng(4))
     order = np.random.default_rng(5).permutation(N_ENV)
-    for name in ("pos", "rpy", "kind", "body_pos", "size"):
+    for name in ("pos", "rpy", "kind", "obstacle_pos", "size"):
         setattr(rig, name, getattr(rig, name)[order])
     for group in (rig.memory, rig.scanned):
         group.update({name: value[order] for name, value in group.items()})
@@ -571,7 +571,7 @@ def test_sleeping_rows_old_images_and_other_rows(rig):
     for still, rows in (("asleep", slice(0, 6)), ("stale", slice(6, 12))):
         rig.begin()
         random_scene(rig, np.random.default_rng(4))
-        rig.awake[rows] = still == "stale"
+        rig.active[rows] = still == "stale"
         rig.load()
         before = {name: field.to_numpy() for name, field in vars(rig.tracks).items()}
         depth_camera.cast_depth(
@@ -592,9 +592,9 @@ def test_without_the_camera_nothing_is_spotted(small, monkeypatch):
     are."""
     sim = small.sim
     for use in (False, True):
-        changed = small.config.spotting.model_copy(update={"use_camera": use})
+        changed = small.config.camera_tracking.model_copy(update={"use_camera": use})
         if not use:
-            monkeypatch.setattr(sim, "config", small.config.model_copy(update={"spotting": changed}))
+            monkeypatch.setattr(sim, "config", small.config.model_copy(update={"camera_tracking": changed}))
         else:
             monkeypatch.undo()
         small.begin(list(range(small.N)))

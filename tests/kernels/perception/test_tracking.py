@@ -11,9 +11,9 @@ from tests.conftest import set_step
 from tests.oracles import small_sonar
 from tests.oracles import tracking as oracle
 from uuvtai.config import (
-    ElevationConfig,
     EpisodeConfig,
     ForecastConfig,
+    HeightConfig,
     SonarConfig,
     TankConfig,
     TrackingConfig,
@@ -21,14 +21,14 @@ from uuvtai.config import (
 from uuvtai.kernels.core import kalman
 from uuvtai.kernels.perception import tracking
 from uuvtai.kernels.perception.io import TrackingIO
-from uuvtai.state import ClockState, ClusterState, HabitState, SonarScan, TrackState, allocate
+from uuvtai.state import ClockState, ClusterState, SonarScan, TrackState, TurnHistory, allocate
 
 N_ENV = 16
 DT_S = 0.02
 TANK = TankConfig()
 RULES = EpisodeConfig()
 CONFIG = TrackingConfig()
-ELEVATION = ElevationConfig(memory_s=0.0)
+ELEVATION = HeightConfig(memory_s=0.0)
 FORECAST = ForecastConfig(use_coasting=False, use_turning_back=False)
 PAPER = SonarConfig(range_sigma_m=0.02, doppler_sigma_m_s=0.05)
 HARSH = SonarConfig(
@@ -65,7 +65,7 @@ three of seven digits."""
 PERIOD_S = CONFIG.period_steps * DT_S
 
 N_LEAVING = 35
-"""scans of a body, the last two of its sides alone"""
+"""scans of an obstacle, the last two of its sides alone"""
 
 PARTIAL = CONFIG.model_copy(update={"partial_sigmas": 2.0})
 
@@ -78,11 +78,11 @@ class Lab:
         self.tracks, self.clusters, self.scan, self.clock = (
             allocate(struct, SIZES) for struct in (TrackState, ClusterState, SonarScan, ClockState)
         )
-        self.habits = allocate(HabitState, SIZES)
+        self.turn_history = allocate(TurnHistory, SIZES)
 
     def begin(self, seed=0, cfg=CONFIG):
         self.rng, self.cfg = np.random.default_rng(seed), cfg
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         tracking.reset_tracks(io_for(TrackingIO, self.tracks, self.clusters, self.clock))
         return self
 
@@ -105,7 +105,7 @@ class Lab:
         parts = (
             self.tracks,
             self.clusters,
-            self.habits,
+            self.turn_history,
             self.scan,
             self.clock,
             self.cfg,
@@ -115,14 +115,14 @@ class Lab:
             TANK,
             RULES,
         )
-        tracking.track_bodies(io_for(TrackingIO, *parts))
+        tracking.track_obstacles(io_for(TrackingIO, *parts))
 
-    def sense(self, step, pos, yaw, vel_w, bodies, clean=False):
-        """Cast, spoil and track one scan of ``bodies`` = (centre, vel, radius, half, yaw); returns the true
-        body of each beam."""
-        centre, vel, radius, half, body_yaw = bodies
+    def sense(self, step, pos, yaw, vel_w, obstacles, clean=False):
+        """Cast, spoil and track one scan of ``obstacles`` = (centre, vel, radius, half, yaw); returns the
+        true obstacle of each beam."""
+        centre, vel, radius, half, obstacle_yaw = obstacles
         range_m, doppler, hit, body = small_sonar.cast(
-            pos, yaw, vel_w, centre, vel, radius, half, body_yaw, TANK
+            pos, yaw, vel_w, centre, vel, radius, half, obstacle_yaw, TANK
         )
         if not clean:
             range_m, doppler, hit = small_sonar.noisy(range_m, doppler, hit, self.rng, self.sonar)
@@ -162,7 +162,7 @@ class Drive:
 
 
 def resting(rng, n, apart_m=1.7):
-    """n static bodies per env, cylinders and boxes in turn: (centre, vel, radius, half, yaw)."""
+    """n static obstacles per env, cylinders and boxes in turn: (centre, vel, radius, half, yaw)."""
     centre = np.zeros((N_ENV, n, 2))
     for env in range(N_ENV):
         for i in range(n):
@@ -181,7 +181,7 @@ def resting(rng, n, apart_m=1.7):
 
 
 def with_movers(still, centre, vel, radius):
-    """Append circles to the resting bodies."""
+    """Append circles to the static obstacles."""
     n = centre.shape[1]
     return (
         np.concatenate([still[0], centre], 1), np.concatenate([still[1], vel], 1),
@@ -191,14 +191,14 @@ def with_movers(still, centre, vel, radius):
     )  # fmt: skip
 
 
-def no_bodies():
+def no_obstacles():
     return resting(np.random.default_rng(0), 0)
 
 
 def one_circle(centre, vel, radius=0.25):
     """The same circle in every env."""
     tile = [np.broadcast_to(np.asarray(v, float), (N_ENV, 1, 2)) for v in (centre, vel)]
-    return with_movers(no_bodies(), *tile, np.full((N_ENV, 1), radius))
+    return with_movers(no_obstacles(), *tile, np.full((N_ENV, 1), radius))
 
 
 def at_rest(x=10.0, y=3.0, yaw=0.0):
@@ -349,7 +349,7 @@ def test_one_scan_equals_oracle(preset, cfg, request):
 
 
 def test_covariance_stays_positive_and_equals_joseph():
-    """A filter run for a thousand scans of bodies on circles in float32 equals the float64 one and never
+    """A filter run for a thousand scans of obstacles on circles in float32 equals the float64 one and never
     loses positive definiteness."""
     n_step, n_run = 1000, 8
     mean, cov, link = (ti.Vector.field(size, ti.f32, n_run) for size in (4, 10, 5))
@@ -417,8 +417,8 @@ def test_covariance_stays_positive_and_equals_joseph():
 
 def errors(lab, rng, paths, seconds, settle_s=1.0):
     """Errors of the movers in view (three beams or more) for ``settle_s``: rows of (velocity, position,
-    called moving); and of the beams on resting bodies, how many belong to moving tracks and how many there
-    are (without bodies that a mover or the vehicle runs through).
+    called moving); and of the beams on static obstacles, how many belong to moving tracks and how many there
+    are (without obstacles that a mover or the vehicle runs through).
     """
     drive, still, n = Drive(rng), resting(rng, 8), 6
     radius = rng.uniform(0.15, 0.35, (N_ENV, n))
@@ -488,7 +488,7 @@ def test_slow_mover_recognised_within_a_second(paper):
     vel = 0.2 * np.stack([np.cos(course), np.sin(course)], -1)[:, None]
 
     def sense(k):
-        circles = with_movers(no_bodies(), [11.0, 3.0] + vel * k * PERIOD_S, vel, np.full((N_ENV, 1), 0.2))
+        circles = with_movers(no_obstacles(), [11.0, 3.0] + vel * k * PERIOD_S, vel, np.full((N_ENV, 1), 0.2))
         body = lab.sense(k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, circles)
         drive.advance(PERIOD_S)
         return body
@@ -522,7 +522,7 @@ def test_track_survives_occlusion_and_dies_when_seen_through(paper):
         centre = np.broadcast_to(np.concatenate([screen[0], mover]), (N_ENV, 2, 2))
         vel = np.broadcast_to([[0.0, 0.0], [0.0, 1.0]], (N_ENV, 2, 2))
         lab.sense(
-            3 * k, pos, yaw, own, with_movers(no_bodies(), centre, vel, np.tile([0.35, 0.2], (N_ENV, 1)))
+            3 * k, pos, yaw, own, with_movers(no_obstacles(), centre, vel, np.tile([0.35, 0.2], (N_ENV, 1)))
         )
         if k == 15:
             name = lab.read("moving").argmax(1)
@@ -540,7 +540,7 @@ def test_track_survives_occlusion_and_dies_when_seen_through(paper):
             pos,
             yaw,
             own,
-            with_movers(no_bodies(), centre[:, :1], vel[:, :1], np.full((N_ENV, 1), 0.35)),
+            with_movers(no_obstacles(), centre[:, :1], vel[:, :1], np.full((N_ENV, 1), 0.35)),
         )
     assert not lab.read("moving").any()
     assert (lab.read("alive").sum(1) == 1).all()
@@ -579,8 +579,8 @@ def test_what_the_camera_shows_is_not_seen_through(paper):
         assert ((lived_s[stops == last] > most - 2 * PERIOD_S) & (lived_s[stops == last] <= most)).all()
 
 
-def test_partly_hidden_body_keeps_its_centre(paper):
-    """Half of a resting cylinder comes to lie behind a nearer one as the vehicle moves: its track stays at
+def test_partly_hidden_obstacle_keeps_its_centre(paper):
+    """Half of a static cylinder comes to lie behind a nearer one as the vehicle moves: its track stays at
     the centre and at rest."""
     lab, (pos, yaw, own) = paper.begin(6), at_rest(5.0, 3.6)
     centre = np.broadcast_to([[7.0, 3.0], [9.0, 3.55]], (N_ENV, 2, 2))
@@ -592,7 +592,7 @@ def test_partly_hidden_body_keeps_its_centre(paper):
             pos,
             yaw,
             own,
-            with_movers(no_bodies(), centre, np.zeros((N_ENV, 2, 2)), np.full((N_ENV, 2), 0.3)),
+            with_movers(no_obstacles(), centre, np.zeros((N_ENV, 2, 2)), np.full((N_ENV, 2), 0.3)),
         )
         hidden += (lab.clusters.hidden.to_numpy() > 0).any(1).sum()
         pos = pos + own * PERIOD_S
@@ -611,9 +611,9 @@ def course_after_leaving_the_fan(lab, cfg):
     vel, start, radius = np.array([-0.25, 0.35]), np.array([11.9, 2.0]), 0.25
     sided = 0
     for k in range(N_LEAVING):
-        bodies = one_circle(start + vel * k * PERIOD_S, vel, radius)
-        range_m, doppler, hit, body = small_sonar.cast(pos, yaw, own, *bodies, TANK)
-        beyond, *_ = small_sonar.cast(pos, yaw, own, *no_bodies(), TANK)
+        obstacles = one_circle(start + vel * k * PERIOD_S, vel, radius)
+        range_m, doppler, hit, body = small_sonar.cast(pos, yaw, own, *obstacles, TANK)
+        beyond, *_ = small_sonar.cast(pos, yaw, own, *no_obstacles(), TANK)
         over = (body == 0) & (range_m < 1.2)
         sided += (over.any(1) & ((body == 0) & ~over).any(1)).sum()
         range_m, doppler = np.where(over, beyond, range_m), np.where(over, 0.0, doppler)
@@ -630,7 +630,7 @@ def course_after_leaving_the_fan(lab, cfg):
     )
 
 
-def test_a_body_half_out_of_the_fan_keeps_its_course(paper):
+def test_a_obstacle_half_out_of_the_fan_keeps_its_course(paper):
     """A side of it says little about where its middle is; taken for all of it, it turns the course."""
     turned, off = course_after_leaving_the_fan(paper, PARTIAL)
     assert turned.max() < 8.0 and off.max() < 0.05
@@ -638,7 +638,7 @@ def test_a_body_half_out_of_the_fan_keeps_its_course(paper):
     assert turned.min() > 12.0 and off.min() > 0.05
 
 
-def test_body_across_beam_zero_is_one_cluster(paper):
+def test_obstacle_across_beam_zero_is_one_cluster(paper):
     lab, (pos, _, own) = paper.begin(7), at_rest()
     yaw = np.linspace(-0.3, 0.3, N_ENV)
     lab.sense(0, pos, yaw, own, one_circle([12.0, 3.0], [0.0, 0.0]), clean=True)
@@ -647,7 +647,7 @@ def test_body_across_beam_zero_is_one_cluster(paper):
     np.testing.assert_allclose(lab.read("radius_m")[:, 0], 0.25, atol=0.04)
 
 
-def test_missed_beams_inside_a_body_are_bridged(paper):
+def test_missed_beams_inside_a_obstacle_are_bridged(paper):
     lab, (pos, yaw, own) = paper.begin(8), at_rest()
     range_m, doppler, hit, body = small_sonar.cast(pos, yaw, own, *one_circle([12.0, 3.0], [0.0, 0.0]), TANK)
     hit[:, 1] = 0
@@ -662,7 +662,7 @@ def test_missed_beams_inside_a_body_are_bridged(paper):
 
 
 def test_own_velocity_error_does_not_move_the_world(paper):
-    """A DVL wrong by 0.3 m/s, or stale: the walls' Doppler tells, so resting bodies stay at rest."""
+    """A DVL wrong by 0.3 m/s, or stale: the walls' Doppler tells, so static obstacles stay at rest."""
     rng = np.random.default_rng(9)
     lab, (pos, yaw, _), still = paper.begin(9), at_rest(), resting(rng, 6)
     for k in range(20):
@@ -682,7 +682,7 @@ def test_own_velocity_error_equals_the_oracle(preset, valid, request):
     for dead in (0.0, 0.7):
         lab.begin(12)
         drive, wrong = Drive(rng), rng.normal(0, 0.4, (N_ENV, 2))
-        range_m, doppler, hit, _ = small_sonar.cast(drive.pos, drive.yaw, drive.vel, *no_bodies(), TANK)
+        range_m, doppler, hit, _ = small_sonar.cast(drive.pos, drive.yaw, drive.vel, *no_obstacles(), TANK)
         range_m, doppler, hit = small_sonar.noisy(range_m, doppler, hit, rng, lab.sonar)
         hit[rng.random(hit.shape) < dead] = 0
         lab.feed(0, drive.pos, drive.yaw, drive.vel + wrong, range_m, doppler, hit, valid=valid)
@@ -709,7 +709,7 @@ def test_a_held_velocity_is_left_to_the_walls_and_a_reading_is_not(paper):
     """One beam says that its wall moves by 0.6 m/s: a reading that is good to 0.05 m/s is half believed, a
     held one is not at all; without any wall the error is unknown, and how much of it is left says so."""
     lab, (pos, yaw, own) = paper.begin(13), at_rest()
-    range_m, doppler, hit, _ = small_sonar.cast(pos, yaw, own, *no_bodies(), TANK)
+    range_m, doppler, hit, _ = small_sonar.cast(pos, yaw, own, *no_obstacles(), TANK)
     doppler[:, 0], hit[:, 1:] = 0.6, 0
     found = {}
     for valid in (1, 0):
@@ -734,14 +734,14 @@ def ring_of(n, radius=0.15, at_m=2.4):
     angle = 2 * np.pi * np.arange(n) / n
     centre = np.array([10.0, 3.0]) + at_m * np.stack([np.cos(angle), np.sin(angle)], -1)
     return with_movers(
-        no_bodies(),
+        no_obstacles(),
         np.broadcast_to(centre, (N_ENV, n, 2)),
         np.zeros((N_ENV, n, 2)),
         np.full((N_ENV, n), radius),
     )
 
 
-def test_more_bodies_than_slots_and_slot_reuse(paper):
+def test_more_obstacles_than_slots_and_slot_reuse(paper):
     lab, (pos, yaw, own) = paper.begin(10), at_rest()
     for k in range(5):
         lab.sense(3 * k, pos, yaw, own, ring_of(30))
@@ -755,9 +755,9 @@ def test_more_bodies_than_slots_and_slot_reuse(paper):
     )
     for k in range(5, 10):
         lab.sense(3 * k, pos, yaw, own, (comer[0] + comer[1] * k * PERIOD_S, *comer[1:]))
-    assert (lab.read("moving").sum(1) == 1).all()  # a mover displaces a resting track
+    assert (lab.read("moving").sum(1) == 1).all()  # a mover displaces a static track
     for k in range(10, 40):
-        lab.sense(3 * k, pos, yaw, own, no_bodies())
+        lab.sense(3 * k, pos, yaw, own, no_obstacles())
     assert not lab.read("alive").any()
     lab.sense(120, pos, yaw, own, one_circle([12.0, 3.0], [0.0, 0.0]))
     assert (only_track(lab) == 0).all()
@@ -767,7 +767,7 @@ def test_empty_scan_and_walls_only(paper):
     lab, (pos, yaw, own) = paper.begin(11), at_rest()
     blank = np.full((N_ENV, 256), 12.0), np.zeros((N_ENV, 256)), np.zeros((N_ENV, 256))
     lab.feed(0, pos, yaw, own, *blank)
-    lab.sense(3, pos, yaw, own, no_bodies())
+    lab.sense(3, pos, yaw, own, no_obstacles())
     assert not lab.read("alive").any()
     assert (lab.read("beam_track") == -1).all()
 
@@ -810,8 +810,8 @@ def test_nothing_moves_in_harsh_static_scene(harsh):
 # --------------------------------------------------------------------------------------------------- contract
 
 
-def busy_run(lab, order, awake=None, n_scan=12):
-    """A noisy scene whose row i is played by env order[i]; returns the memory in the order of the rows."""
+def busy_run(lab, order, active=None, n_scan=12):
+    """A noisy scene whose row i is run by env order[i]; returns the memory in the order of the rows."""
     lab.begin(0)
     rng = np.random.default_rng(15)
     drive, still, at = Drive(rng), resting(rng, 6), circles(rng, 4, 0.8)
@@ -822,8 +822,8 @@ def busy_run(lab, order, awake=None, n_scan=12):
             drive.pos, drive.yaw, drive.vel, *with_movers(still, centre, vel, np.full((N_ENV, 4), 0.2)), TANK
         )
         seen = small_sonar.noisy(*truth[:3], rng, PAPER)
-        if awake is not None:
-            lab.clock.awake.from_numpy(awake[place].astype(np.int32))
+        if active is not None:
+            lab.clock.active.from_numpy(active[place].astype(np.int32))
         lab.feed(3 * k, *(v[place] for v in (drive.pos, drive.yaw, drive.vel, *seen)))
         drive.advance(PERIOD_S)
     return {n: v[order] for n, v in lab.everything().items()}
@@ -843,15 +843,15 @@ def test_runs_are_bit_identical_and_envs_independent(paper):
 
 
 def test_only_awake_rows_change(paper):
-    straight, awake = np.arange(N_ENV), np.arange(N_ENV) % 2
-    whole, half = busy_run(paper, straight), busy_run(paper, straight, awake)
-    assert_same(whole, half, awake == 1)
-    assert not half["alive"][awake == 0].any()
-    paper.clock.awake.from_numpy((1 - awake).astype(np.int32))
+    straight, active = np.arange(N_ENV), np.arange(N_ENV) % 2
+    whole, half = busy_run(paper, straight), busy_run(paper, straight, active)
+    assert_same(whole, half, active == 1)
+    assert not half["alive"][active == 0].any()
+    paper.clock.active.from_numpy((1 - active).astype(np.int32))
     before = paper.everything()
     tracking.reset_tracks(io_for(TrackingIO, paper.tracks, paper.clusters, paper.clock))
-    assert_same(before, paper.everything(), awake == 1)
-    paper.clock.awake.fill(1)
+    assert_same(before, paper.everything(), active == 1)
+    paper.clock.active.fill(1)
     tracking.reset_tracks(io_for(TrackingIO, paper.tracks, paper.clusters, paper.clock))
     assert not paper.read("alive").any()
     assert (paper.read("beam_track") == -1).all()
@@ -896,7 +896,7 @@ def test_turn_rate_of_a_circle_is_learnt(paper):
             pos,
             yaw,
             own,
-            with_movers(no_bodies(), centre[:, None], vel[:, None], np.full((N_ENV, 1), 0.2)),
+            with_movers(no_obstacles(), centre[:, None], vel[:, None], np.full((N_ENV, 1), 0.2)),
         )
     track = only_track(lab)
     assert np.abs(lab.read("turn_rate")[np.arange(N_ENV), track] - 0.8 * sign).max() < 0.15

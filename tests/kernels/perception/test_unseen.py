@@ -1,4 +1,4 @@
-"""Unseen bodies that may turn back: first and second moments against a drawn population and a float64
+"""Unseen obstacles that may turn back: first and second moments against a drawn population and a float64
 oracle, rates against the ways that are expected."""
 
 from functools import cache
@@ -8,14 +8,14 @@ import pytest
 import taichi as ti
 
 from tests.bundles import clear, io_for
-from tests.oracles import habits as habit_oracle
+from tests.oracles import turn_history as habit_oracle
 from uuvtai.config import Config
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import AnyTensor, Bundle
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.track_filter import turn_back_rate, turned_back
 from uuvtai.kernels.perception.tracking import predict_tracks
-from uuvtai.state import ClusterState, HabitState, SonarScan, TrackState, allocate
+from uuvtai.state import ClusterState, SonarScan, TrackState, TurnHistory, allocate
 
 N = 64
 SIZES = {
@@ -114,7 +114,7 @@ def test_moments_are_those_of_the_oracle(dt):
 
 
 def test_moments_are_those_of_a_drawn_population():
-    """Bodies along (0.6, 0.8) at 1.5 m/s, known exactly at first, that turn back 0.4 times a second: after
+    """Obstacles along (0.6, 0.8) at 1.5 m/s, known exactly at first, that turn back 0.4 times a second: after
     1.2 s as a population drawn in small steps, in steps of 0.06 s as the tracker takes them."""
     rate, speed, steps = 0.4, 1.5, 20
     course = np.array([0.6, 0.8])
@@ -139,26 +139,26 @@ def test_moments_are_those_of_a_drawn_population():
 
 
 @cache
-def straight_bodies():
-    return allocate(TrackState, SIZES), allocate(HabitState, SIZES)
+def straight_obstacles():
+    return allocate(TrackState, SIZES), allocate(TurnHistory, SIZES)
 
 
 def rates_of(kind, way, dt, turn_rate=0.0, turn_var=0.0, turned=None):
-    """[1/s] of bodies that swim along +x at 1.5 m/s and have gone straight for ``way`` [m] since a turn that
-    was seen (``kind`` 2), or since they were met (1)."""
-    tracks, habits = straight_bodies()
-    clear(tracks, habits)
+    """[1/s] of obstacles that swim along +x at 1.5 m/s and have gone straight for ``way`` [m] since a turn
+    that was seen (``kind`` 2), or since they were met (1)."""
+    tracks, turn_history = straight_obstacles()
+    clear(tracks, turn_history)
     state = np.stack([way, 0 * way, 0 * way + SPEED, 0 * way], 1)[:, None]
     tracks.state.from_numpy(state.astype(np.float32))
     tracks.turn_rate.fill(turn_rate)
     cov = np.zeros((N, 1, 5), np.float32)
     cov[..., 4] = turn_var
     tracks.turn_cov.from_numpy(cov)
-    habits.run_kind.fill(kind)
+    turn_history.run_kind.fill(kind)
     if turned is not None:
-        habits.turn.from_numpy(turned)
+        turn_history.turn.from_numpy(turned)
     out = np.zeros(N, np.float32)
-    _rates(dt, out, io_for(TrackingIO, tracks, habits, CFG.forecast, CFG.tracking, CFG.traffic))
+    _rates(dt, out, io_for(TrackingIO, tracks, turn_history, CFG.forecast, CFG.tracking, CFG.traffic))
     return out
 
 
@@ -192,7 +192,7 @@ def test_rate_is_that_of_a_drawn_population(kind):
     assert expected.max() > 3 * expected.min()
 
 
-def test_bodies_that_may_circle_turn_back_less_and_known_turns_leave_no_doubt():
+def test_obstacles_that_may_circle_turn_back_less_and_known_turns_leave_no_doubt():
     """The share that goes straight is that of Bayes' rule: the prior odds against the turn rate's density of
     0 in its prior over that in its posterior."""
     way = np.full(N, 3.0)
@@ -207,10 +207,10 @@ def test_bodies_that_may_circle_turn_back_less_and_known_turns_leave_no_doubt():
     assert usual.all() and not rates_of(2, way, 0.06, turned=habit_oracle.packed_turns(rows)).any()
 
 
-def test_only_bodies_that_beams_pass_by_may_have_turned():
+def test_only_obstacles_that_beams_pass_by_may_have_turned():
     """One third each: beams meet nothing where the body is expected, meet something nearer, have just met the
     body."""
-    structs = [allocate(struct, SIZES) for struct in (TrackState, HabitState, ClusterState, SonarScan)]
+    structs = [allocate(struct, SIZES) for struct in (TrackState, TurnHistory, ClusterState, SonarScan)]
     clear(*structs)
     tracks, _, clusters, scan = structs
     kind = np.arange(N) % 3

@@ -46,7 +46,7 @@ class Stage:
         self.clearance, self.grid_map = allocate(ClearanceState, sizes), allocate(MapState, sizes)
         self.memory = allocate(ClearanceMemory, sizes)
         self.mask, self.clock = allocate(GridMask, sizes), allocate(ClockState, sizes)
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.set_outside(np.array(outside_cells(TANK, MAP.cell_m)))
 
     def set_outside(self, outside):
@@ -82,7 +82,7 @@ def stage():
 
 @pytest.fixture(autouse=True)
 def _fresh_clock(stage):
-    stage.clock.awake.fill(1)
+    stage.clock.active.fill(1)
     stage.clock.step.fill(0)
     stage.set_outside(np.array(outside_cells(TANK, MAP.cell_m)))
 
@@ -281,10 +281,10 @@ def test_envs_are_independent(stage, static, order, changed):
 def test_only_awake_rows_whose_step_is_due_are_computed(stage):
     before = stage.compute(maps_of(8))[0]
     stage.clearance.fresh.from_numpy(np.array([0, 1, 0, 1, 0, 1, 0, 1], np.int32))
-    stage.clock.awake.from_numpy(np.array([1, 1, 0, 0, 1, 1, 0, 0], np.int32))
+    stage.clock.active.from_numpy(np.array([1, 1, 0, 0, 1, 1, 0, 0], np.int32))
     stage.clock.step.from_numpy(np.array([0, 1, 0, 1, 5, 4, 10, 11], np.int32))
     after = stage.compute(maps_of(9)[::-1])[0]
     changed = (before != after).any(axis=(1, 2))
     np.testing.assert_array_equal(changed, [True, False, False, False, True, False, False, False])
-    # sleeping rows keep their flag too
+    # inactive rows keep their flag too
     np.testing.assert_array_equal(stage.clearance.fresh.to_numpy(), [1, 0, 0, 1, 1, 0, 0, 1])

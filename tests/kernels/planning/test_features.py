@@ -9,15 +9,15 @@ from tests.oracles import features as oracle
 from uuvtai.common import tree_codes as codes
 from uuvtai.config import (
     EpisodeConfig,
-    FeaturesConfig,
     ForecastConfig,
+    ObservationConfig,
     SonarConfig,
     TankConfig,
     TrackingConfig,
 )
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.planning.io import FeaturesIO
+from uuvtai.kernels.planning.io import ObservationIO
 from uuvtai.kernels.planning.observation import (
     COLUMNS,
     columns,
@@ -25,25 +25,25 @@ from uuvtai.kernels.planning.observation import (
     placed_columns,
     sense_sectors,
     write_advice,
-    write_bodies,
     write_observation,
+    write_obstacles,
 )
 from uuvtai.state import (
+    BehaviorState,
     ClockState,
-    FeatureState,
     ForecastState,
     MissionState,
+    ObservationState,
     Proprioception,
     RouteState,
     SonarScan,
-    TeacherState,
     TrackState,
     TreeTable,
     allocate,
 )
 
 N_ENV, N_RAY, N_SECTOR, N_TRACK = 20, 256, 12, 5
-FEATURES, SONAR = FeaturesConfig(), SonarConfig()
+FEATURES, SONAR = ObservationConfig(), SonarConfig()
 
 ROUNDING = 1e-5
 """Single precision of one division."""
@@ -54,18 +54,18 @@ class Stage:
 
     def __init__(self):
         sizes = {"n_env": N_ENV, "n_ray": N_RAY, "n_sector": N_SECTOR, "n_track": N_TRACK}
-        self.features, self.scan = allocate(FeatureState, sizes), allocate(SonarScan, sizes)
+        self.features, self.scan = allocate(ObservationState, sizes), allocate(SonarScan, sizes)
         self.ego, self.clock = allocate(Proprioception, sizes), allocate(ClockState, sizes)
 
-    def run(self, range_m, doppler, hit, yaw, ping_yaw, awake=None):
+    def run(self, range_m, doppler, hit, yaw, ping_yaw, active=None):
         """(4, n_env, n_sector): range, ttc, closing, valid."""
         self.scan.range_m.from_numpy(range_m.astype(np.float32))
         self.scan.doppler_m_s.from_numpy(doppler.astype(np.float32))
         self.scan.hit.from_numpy(hit.astype(np.int32))
         self.scan.ping_yaw.from_numpy(ping_yaw.astype(np.float32))
         self.ego.rpy.from_numpy(np.stack([0 * yaw, 0 * yaw, yaw], axis=1).astype(np.float32))
-        self.clock.awake.from_numpy(np.ones(N_ENV, np.int32) if awake is None else awake.astype(np.int32))
-        sense_sectors(io_for(FeaturesIO, self.features, self.scan, self.ego, self.clock, FEATURES, SONAR))
+        self.clock.active.from_numpy(np.ones(N_ENV, np.int32) if active is None else active.astype(np.int32))
+        sense_sectors(io_for(ObservationIO, self.features, self.scan, self.ego, self.clock, FEATURES, SONAR))
         f = self.features
         return np.array(
             [x.to_numpy() for x in (f.sector_range_m, f.sector_ttc_s, f.sector_closing_m_s, f.sector_valid)]
@@ -111,7 +111,7 @@ def test_a_turn_across_pi_is_no_turn_of_the_beams(stage):
     assert np.allclose(near, wrapped, atol=ROUNDING)
 
 
-def test_one_approaching_body_by_hand(stage):
+def test_one_approaching_obstacle_by_hand(stage):
     range_m, doppler, hit = np.full((N_ENV, N_RAY), 12.0), np.zeros((N_ENV, N_RAY)), np.zeros((N_ENV, N_RAY))
     range_m[:, 64:67], doppler[:, 64:67], hit[:, 64:67] = (
         [2.0, 1.9, 2.1],
@@ -127,10 +127,10 @@ def test_one_approaching_body_by_hand(stage):
 def test_sleeping_rows_keep_their_features(stage):
     quiet = np.zeros(N_ENV)
     first = stage.run(*random_scan(2), quiet, quiet)
-    awake = np.arange(N_ENV) % 3 == 0
-    second = stage.run(*random_scan(3), quiet, quiet, awake=awake)
-    assert np.array_equal(second[:, ~awake], first[:, ~awake])
-    assert (second[:, awake] != first[:, awake]).any(axis=(0, 2)).all()
+    active = np.arange(N_ENV) % 3 == 0
+    second = stage.run(*random_scan(3), quiet, quiet, active=active)
+    assert np.array_equal(second[:, ~active], first[:, ~active])
+    assert (second[:, active] != first[:, active]).any(axis=(0, 2)).all()
 
 
 # ------------------------------------------------------------------------------------------------ observation
@@ -141,7 +141,7 @@ OBSERVATION_ROUNDING = 1e-5
 
 @pytest.fixture(scope="module")
 def observed(stage):
-    """(observation (n_env, n_obs), arrays it was made of, rows awake) for random states; -7 was there
+    """(observation (n_env, n_obs), arrays it was made of, rows active) for random states; -7 was there
     before."""
     sizes = {"n_env": N_ENV, "n_way": 2, "n_ahead": 2, "n_trigger": 4, "n_planner": 3, "n_reason": 4}
     route, mission = allocate(RouteState, sizes), allocate(MissionState, sizes)
@@ -150,24 +150,24 @@ def observed(stage):
         route: ("lookahead_w", "heading_error", "cross_track_m", "remaining_m", "path_risk"),
         mission: ("goal_w",),
         stage.ego: ("pos_w", "rpy", "vel_b", "rate_b", "depth_m"),
-        stage.features: ("sector_range_m", "sector_ttc_s", "sector_closing_m_s"),
+        stage.observation: ("sector_range_m", "sector_ttc_s", "sector_closing_m_s"),
     }.items():
         for name in names:
             field = getattr(struct, name)
             arrays[name] = rng.uniform(-3, 3, field.to_numpy().shape).astype(np.float32)
             field.from_numpy(arrays[name])
-    awake = np.arange(N_ENV) % 4 != 1
-    stage.clock.awake.from_numpy(awake.astype(np.int32))
+    active = np.arange(N_ENV) % 4 != 1
+    stage.clock.active.from_numpy(active.astype(np.int32))
     obs = torch.full((N_ENV, observation_width(FEATURES)), -7.0)
     write_observation(
-        io_for(FeaturesIO, stage.features, route, stage.ego, mission, stage.clock, FEATURES), obs
+        io_for(ObservationIO, stage.observation, route, stage.ego, mission, stage.clock, FEATURES), obs
     )
-    return obs.numpy(), arrays, awake
+    return obs.numpy(), arrays, active
 
 
 def test_observation_equals_the_oracle_in_every_column(observed):
-    obs, arrays, awake = observed
-    for env in np.flatnonzero(awake):
+    obs, arrays, active = observed
+    for env in np.flatnonzero(active):
         want = oracle.observation({name: np.float64(a[env]) for name, a in arrays.items()})
         assert list(want) == [c.name for c in COLUMNS]
         for column, first, width in placed_columns(FEATURES):
@@ -178,8 +178,8 @@ def test_observation_equals_the_oracle_in_every_column(observed):
 
 
 def test_sleeping_rows_keep_their_observation(observed):
-    obs, _arrays, awake = observed
-    assert (obs[~awake] == -7).all()
+    obs, _arrays, active = observed
+    assert (obs[~active] == -7).all()
 
 
 def test_first_columns_are_the_papers_targets_of_the_world_model():
@@ -198,42 +198,43 @@ def test_first_columns_are_the_papers_targets_of_the_world_model():
     assert names[:24] == [name for name, width in paper.items() for _ in range(width)]
 
 
-# ------------------------------------------------------------------------------------------ bodies and advice
+# ------------------------------------------------------------------------------------------ obstacles and
+# advice
 
-MORE = FeaturesConfig(n_track=3, teacher=True)
+MORE = ObservationConfig(n_track=3, teacher=True)
 FORECAST, TRACKING, TANK, RULES = ForecastConfig(), TrackingConfig(), TankConfig(), EpisodeConfig()
 N_FORECAST = 8
 
-BODY_ROUNDING = 2e-5
+OBSTACLE_ROUNDING = 2e-5
 """Single precision of positions of about 10 m that are rotated."""
 
 
 def span(name):
-    """Columns of a group with bodies and advice."""
+    """Columns of a group with obstacles and advice."""
     first, width = next(
         (first, width) for column, first, width in placed_columns(MORE) if column.name == name
     )
     return slice(first, first + width)
 
 
-class Bodies:
-    """Structs of what is remembered of moving bodies, and one call."""
+class Obstacles:
+    """Structs of what is remembered of moving obstacles, and one call."""
 
     def __init__(self, stage):
         sizes = {"n_env": N_ENV, "n_track": N_TRACK, "n_forecast": N_FORECAST, "n_height": 16, "n_ray": N_RAY}
-        self.features, self.ego, self.clock = stage.features, stage.ego, stage.clock
+        self.features, self.ego, self.clock = stage.observation, stage.ego, stage.clock
         self.tracks, self.forecast = allocate(TrackState, sizes), allocate(ForecastState, sizes)
 
-    def run(self, values, awake=None):
+    def run(self, values, active=None):
         """Observation (n_env, n_obs), -7 where nothing is written; ``values`` by 'struct.array'."""
         for name, array in values.items():
             struct, field = name.split(".")
             getattr(getattr(self, struct), field).from_numpy(array)
-        self.clock.awake.from_numpy(np.ones(N_ENV, np.int32) if awake is None else awake.astype(np.int32))
+        self.clock.active.from_numpy(np.ones(N_ENV, np.int32) if active is None else active.astype(np.int32))
         obs = torch.full((N_ENV, observation_width(MORE)), -7.0)
-        write_bodies(
+        write_obstacles(
             io_for(
-                FeaturesIO,
+                ObservationIO,
                 self.features,
                 self.forecast,
                 self.tracks,
@@ -251,11 +252,11 @@ class Bodies:
 
 
 @pytest.fixture(scope="module")
-def bodies(stage):
-    return Bodies(stage)
+def obstacles(stage):
+    return Obstacles(stage)
 
 
-def no_bodies():
+def no_obstacles():
     """Values of envs that rest level at the origin, 1 m deep, and remember nothing."""
     return {
         "forecast.radius_m": np.full((N_ENV, N_TRACK, N_FORECAST), -1, np.float32),
@@ -273,10 +274,10 @@ def no_bodies():
     }
 
 
-def random_bodies(seed):
-    """Up to all slots moving, curved forecasts, every second body's turn rate well known, heights known or
-    not, own motion and tilt."""
-    rng, values = np.random.default_rng(seed), no_bodies()
+def random_obstacles(seed):
+    """Up to all slots moving, curved forecasts, every second obstacle's turn rate well known, heights known
+    or not, own motion and tilt."""
+    rng, values = np.random.default_rng(seed), no_obstacles()
     moving = rng.uniform(size=(N_ENV, N_TRACK)) < 0.6
     growth = rng.uniform(0, 0.02, (N_ENV, N_TRACK, N_FORECAST)).cumsum(axis=2)
     values["forecast.radius_m"] = np.where(
@@ -298,13 +299,13 @@ def random_bodies(seed):
     return {name: array.astype(kinds.get(name, np.float32)) for name, array in values.items()}
 
 
-def test_bodies_equal_the_oracle_in_every_column(bodies):
+def test_obstacles_equal_the_oracle_in_every_column(obstacles):
     seen = 0
     for seed in range(3):
-        values = random_bodies(seed)
-        obs = bodies.run(values)
+        values = random_obstacles(seed)
+        obs = obstacles.run(values)
         for env in range(N_ENV):
-            want = oracle.bodies(
+            want = oracle.obstacles(
                 {name: np.float64(a[env]) for name, a in values.items()},
                 MORE.n_track,
                 FORECAST,
@@ -314,17 +315,17 @@ def test_bodies_equal_the_oracle_in_every_column(bodies):
             )
             for name, rows in want.items():
                 np.testing.assert_allclose(
-                    obs[env, span(name)], rows.ravel(), atol=BODY_ROUNDING, err_msg=f"{name} in env {env}"
+                    obs[env, span(name)], rows.ravel(), atol=OBSTACLE_ROUNDING, err_msg=f"{name} in env {env}"
                 )
-            seen += int(want["body_valid"].sum())
+            seen += int(want["obstacle_valid"].sum())
         assert list(want) == [column.name for column in columns(MORE) if column.per == "body"]
     assert 100 < seen < 3 * N_ENV * MORE.n_track
 
 
-def test_bodies_by_hand(bodies):
+def test_obstacles_by_hand(obstacles):
     """Heading along y at 0.5 m/s. One body stands 2 m ahead, one comes from the right ahead at 1 m/s and
     passes behind, one recedes."""
-    values = no_bodies()
+    values = no_obstacles()
     values["ego.rpy"][:, 2] = np.pi / 2
     values["ego.vel_b"][:, 0] = 0.5
     values["forecast.radius_m"][:, [0, 2, 4]] = 0.3
@@ -336,33 +337,39 @@ def test_bodies_by_hand(bodies):
     values["tracks.state"][:, 4] = [0, -1, 0, -1]
     values["tracks.seen_step"][:] = 75
     values["forecast.above_w"][:, 2], values["forecast.below_w"][:, 2] = -0.4, -FAR_M
-    obs = bodies.run(values)[0]
-    np.testing.assert_allclose(obs[span("body_valid")], [1, 1, 1])
-    np.testing.assert_allclose(obs[span("body_position")], [0, -0.5, -1, 0, 2, 0], atol=BODY_ROUNDING)
-    np.testing.assert_allclose(obs[span("body_velocity")], [-0.5, 1, -1.5, 0, -0.5, 0], atol=BODY_ROUNDING)
+    obs = obstacles.run(values)[0]
+    np.testing.assert_allclose(obs[span("obstacle_valid")], [1, 1, 1])
+    np.testing.assert_allclose(obs[span("obstacle_position")], [0, -0.5, -1, 0, 2, 0], atol=OBSTACLE_ROUNDING)
+    np.testing.assert_allclose(
+        obs[span("obstacle_velocity")], [-0.5, 1, -1.5, 0, -0.5, 0], atol=OBSTACLE_ROUNDING
+    )
     depth = TANK.z_m[1] - TANK.z_m[0]
-    np.testing.assert_allclose(obs[span("body_free_water")], [0.6, depth, 0, 0, 0, 0], atol=BODY_ROUNDING)
-    np.testing.assert_allclose(obs[span("body_age")], [0.5, 0.5, 0.5], atol=BODY_ROUNDING)
+    np.testing.assert_allclose(
+        obs[span("obstacle_free_water")], [0.6, depth, 0, 0, 0, 0], atol=OBSTACLE_ROUNDING
+    )
+    np.testing.assert_allclose(obs[span("obstacle_age")], [0.5, 0.5, 0.5], atol=OBSTACLE_ROUNDING)
     # the crossing body: relative course (-1, -0.5) from (0.5, 0): closest at t = 0.4 s, where it is at (0.1,
     # -0.2)
     np.testing.assert_allclose(
-        obs[span("body_closest")], [np.hypot(0.1, 0.2) - 0.3, 0.7, 2 - 0.5 * 0.7 - 0.3], atol=BODY_ROUNDING
+        obs[span("obstacle_closest")],
+        [np.hypot(0.1, 0.2) - 0.3, 0.7, 2 - 0.5 * 0.7 - 0.3],
+        atol=OBSTACLE_ROUNDING,
     )
-    np.testing.assert_allclose(obs[span("body_closest_time")], [0.4, 0, 0.7], atol=BODY_ROUNDING)
+    np.testing.assert_allclose(obs[span("obstacle_closest_time")], [0.4, 0, 0.7], atol=OBSTACLE_ROUNDING)
 
 
-def test_without_bodies_their_columns_are_zero(bodies):
-    obs = bodies.run(no_bodies())
+def test_without_obstacles_their_columns_are_zero(obstacles):
+    obs = obstacles.run(no_obstacles())
     first = min(span(column.name).start for column in columns(MORE) if column.per == "body")
     last = max(span(column.name).stop for column in columns(MORE) if column.per == "body")
     assert not obs[:, first:last].any()
     assert (obs[:, :first] == -7).all() and (obs[:, last:] == -7).all(), "the others' columns are left alone"
 
 
-def test_sleeping_rows_keep_their_bodies(bodies):
-    awake = np.arange(N_ENV) % 2 == 0
-    obs = bodies.run(random_bodies(1), awake)
-    assert (obs[~awake] == -7).all() and (obs[awake] != -7).any(axis=1).all()
+def test_sleeping_rows_keep_their_obstacles(obstacles):
+    active = np.arange(N_ENV) % 2 == 0
+    obs = obstacles.run(random_obstacles(1), active)
+    assert (obs[~active] == -7).all() and (obs[active] != -7).any(axis=1).all()
 
 
 LEAVES = (codes.BACK_OFF, codes.EVADE, codes.HOLD, codes.UNSTICK, codes.FOLLOW_ROUTE, codes.DRIVE_STRAIGHT)
@@ -372,7 +379,7 @@ CLASS_OF_LEAF = (0, 1, 2, 3, 4, 4)
 def test_advice_is_what_the_tree_says(stage):
     """A tree of the six action leaves; env i lets leaf i act, the seventh none."""
     sizes = {"n_env": N_ENV, "n_node": 8, "n_candidate": 16, "n_tuned": len(TUNED)}
-    teacher, table = allocate(TeacherState, sizes), allocate(TreeTable, sizes)
+    behavior, table = allocate(BehaviorState, sizes), allocate(TreeTable, sizes)
     table.leaf.from_numpy(np.array([*LEAVES, -1, -1], np.int32))
     acting = np.full(N_ENV, -1, np.int32)
     acting[: len(LEAVES)] = np.arange(len(LEAVES))
@@ -381,33 +388,33 @@ def test_advice_is_what_the_tree_says(stage):
     conflict = np.where(np.arange(N_ENV) % 2 == 0, FAR_M, rng.uniform(0, 2.5, N_ENV)).astype(np.float32)
     cost = rng.uniform(0, 20, N_ENV).astype(np.float32)
     for field, array in (
-        (teacher.leaf, acting),
-        (teacher.action, action),
-        (teacher.conflict_s, conflict),
-        (teacher.evade_cost, cost),
+        (behavior.leaf, acting),
+        (behavior.action, action),
+        (behavior.conflict_s, conflict),
+        (behavior.evade_cost, cost),
     ):
         field.from_numpy(array)
-    awake = np.arange(N_ENV) != 9
-    stage.clock.awake.from_numpy(awake.astype(np.int32))
+    active = np.arange(N_ENV) != 9
+    stage.clock.active.from_numpy(active.astype(np.int32))
     tensor = torch.full((N_ENV, observation_width(MORE)), -7.0)
-    write_advice(io_for(FeaturesIO, teacher, table, stage.clock, MORE), tensor)
+    write_advice(io_for(ObservationIO, behavior, table, stage.clock, MORE), tensor)
     obs = tensor.numpy()
-    assert span("teacher_class").stop == obs.shape[1], "the last columns of all"
+    assert span("behavior_class").stop == obs.shape[1], "the last columns of all"
     assert (obs[9] == -7).all() and (obs[:, : span("teacher_action").start] == -7).all()
-    np.testing.assert_array_equal(obs[awake, span("teacher_action")], action[awake])
+    np.testing.assert_array_equal(obs[active, span("teacher_action")], action[active])
     np.testing.assert_array_equal(
-        obs[awake, span("teacher_conflict")][:, 0], np.minimum(conflict, MORE.ttc_cap_s)[awake]
+        obs[active, span("behavior_conflict")][:, 0], np.minimum(conflict, MORE.ttc_cap_s)[active]
     )
     np.testing.assert_array_equal(
-        obs[awake, span("teacher_evade_cost")][:, 0], np.where(acting == 1, cost, 0)[awake]
+        obs[active, span("behavior_evade_cost")][:, 0], np.where(acting == 1, cost, 0)[active]
     )
     kinds = np.zeros((N_ENV, 5))
     kinds[np.arange(len(LEAVES)), CLASS_OF_LEAF] = 1
-    np.testing.assert_array_equal(obs[awake, span("teacher_class")], kinds[awake])
+    np.testing.assert_array_equal(obs[active, span("behavior_class")], kinds[active])
 
 
 def test_what_is_added_stands_behind_the_papers_columns():
     plain, more = placed_columns(FEATURES), placed_columns(MORE)
     assert more[: len(plain)] == plain and len(more) > len(plain)
-    assert placed_columns(FeaturesConfig(n_track=3))[-1][0].per == "body"
-    assert placed_columns(FeaturesConfig(teacher=True))[-1][0].name == "teacher_class"
+    assert placed_columns(ObservationConfig(n_track=3))[-1][0].per == "body"
+    assert placed_columns(ObservationConfig(teacher=True))[-1][0].name == "behavior_class"

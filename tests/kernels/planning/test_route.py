@@ -208,7 +208,7 @@ def test_intersection_with_the_map_before_the_clearance_is_renewed():
     assert held(0) == ["intersection"] and held(1) == []
 
 
-def put_body(env, when, at, radius=0.2):
+def put_obstacle(env, when, at, radius=0.2):
     s = stage()
     radii, pos = s.forecast.radius_m.to_numpy(), s.forecast.pos_w.to_numpy()
     radii[env, 1], pos[env, 1] = radius, (-50.0, 3.0)  # forecast at all steps, far away at the others
@@ -231,7 +231,7 @@ def put_body(env, when, at, radius=0.2):
 )
 def test_intersection_with_the_forecast(when, at, fires):
     s = with_routes()
-    put_body(4, when, at)
+    put_obstacle(4, when, at)
     fire()
     assert held(4) == (["intersection"] if fires else [])
     assert held(0) == []
@@ -242,7 +242,7 @@ def test_intersection_with_the_forecast(when, at, fires):
 def test_intersection_with_the_forecast_keeps_the_radius_of_that_moment(now, then, fires):
     """Passing 0.65 m away after 2 s: within 0.35 m of a radius of 0.4 m, not of one of 0.2 m."""
     s = with_routes()
-    put_body(4, (1.9, 2.1), (3.1, 3.65))
+    put_obstacle(4, (1.9, 2.1), (3.1, 3.65))
     times = np.arange(s.forecast.radius_m.shape[2]) * CONFIG.tracking.forecast_dt_s
     radii = s.forecast.radius_m.to_numpy()
     radii[4, 1] = np.where(times < 1.0, now, then)
@@ -253,7 +253,7 @@ def test_intersection_with_the_forecast_keeps_the_radius_of_that_moment(now, the
 
 def test_the_queue_holds_awake_envs_in_order():
     s = clean()
-    s.clock.awake.from_numpy(np.array([0, 1, 0, 1, 1, 0, 0, 1], np.int32))
+    s.clock.active.from_numpy(np.array([0, 1, 0, 1, 1, 0, 0, 1], np.int32))
     fire()
     assert s.route.n_queue[None] == 4
     assert sorted(s.route.queue[i] for i in range(4)) == [1, 3, 4, 7]
@@ -443,7 +443,7 @@ def test_reset_clears_only_the_rows_that_are_awake():
         for name in vars(s.route)
         if getattr(s.route, name).shape[:1] == (N_ENV,)
     }
-    s.clock.awake.from_numpy(np.array([1, 0, 1, 0, 0, 0, 0, 0], np.int32))
+    s.clock.active.from_numpy(np.array([1, 0, 1, 0, 0, 0, 0, 0], np.int32))
     route.reset_route(io_for(RouteIO, s.route, s.clock))
     for name, values in before.items():
         after = getattr(s.route, name).to_numpy()
@@ -457,7 +457,7 @@ def test_asleep_rows_are_left_alone():
     s = with_routes()
     fire()
     follow()
-    s.clock.awake.fill(0)
+    s.clock.active.fill(0)
     before = {
         name: getattr(s.route, name).to_numpy()
         for name in ("arc", "lookahead_w", "stuck_steps", "ahead_w", "path_risk", "fired")

@@ -20,10 +20,11 @@ from uuvtai.state import (
     allocate,
 )
 
-N_ENV, N_BODY, N_BATCH = 125, 14, 8
+N_ENV, N_OBSTACLE, N_BATCH = 125, 14, 8
 CLEAN = DepthConfig()
 SIZES = {
-    "n_env": N_ENV, "n_body": N_BODY, "n_thruster": 6, "n_pixel_row": CLEAN.rows, "n_pixel_col": CLEAN.cols,
+    "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_thruster": 6, "n_pixel_row": CLEAN.rows,
+    "n_pixel_col": CLEAN.cols,
 }  # fmt: skip
 EVERY = 5
 """MuJoCo and the oracle look at every fifth pixel, at another offset in each scene (5 is coprime to the
@@ -58,7 +59,7 @@ class Rig:
         """Reset every row at step 0 with this scene; row i gets random key key + i."""
         scenes.load(scene, self.vehicle, self.world)
         self.episode.key.from_numpy((np.arange(N_ENV) + key).astype(np.uint32))
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.clock.step.fill(0)
         depth_camera.reset_depth(io_for(DepthIO, self.image, self.clock))
 
@@ -78,7 +79,7 @@ def rig():
 @pytest.fixture(scope="module")
 def batches():
     rng = np.random.default_rng(30)
-    return [scenes.random_scenes(rng, N_ENV, N_BODY, TANK) for _ in range(N_BATCH)]
+    return [scenes.random_scenes(rng, N_ENV, N_OBSTACLE, TANK) for _ in range(N_BATCH)]
 
 
 def compare(image, scene, env, offset, tank, truth_of):
@@ -113,14 +114,14 @@ def assert_images(images, scene, tank, truth_of, envs=range(N_ENV)):
 
 
 def test_1000_scenes_against_mujoco(rig, batches):
-    showing_bodies = 0.0
+    showing_obstacles = 0.0
     for scene in batches:
         rig.start(scene)
         images = rig.shoot()
         assert_images(images, scene, TANK, by_mujoco)
         rig.start({**scene, "kind": np.zeros_like(scene["kind"])})
-        showing_bodies += np.mean(np.abs(images - rig.shoot()) > 0.01) / N_BATCH
-    assert 0.1 < showing_bodies < 0.9, "the scenes must show bodies and walls"
+        showing_obstacles += np.mean(np.abs(images - rig.shoot()) > 0.01) / N_BATCH
+    assert 0.1 < showing_obstacles < 0.9, "the scenes must show obstacles and walls"
 
 
 def test_1000_scenes_against_oracle(rig, batches):
@@ -130,7 +131,7 @@ def test_1000_scenes_against_oracle(rig, batches):
 
 
 def test_round_tank_against_mujoco(rig):
-    scene = scenes.random_scenes(np.random.default_rng(4), N_ENV, N_BODY, ROUND_TANK)
+    scene = scenes.random_scenes(np.random.default_rng(4), N_ENV, N_OBSTACLE, ROUND_TANK)
     rig.start(scene)
     assert_images(rig.shoot(CLEAN, ROUND_TANK), scene, ROUND_TANK, by_mujoco, range(40))
 
@@ -138,8 +139,13 @@ def test_round_tank_against_mujoco(rig):
 def test_axes_and_scale_of_the_image(rig):
     """A ball 0.5 m to the left of and 0.25 m above the axis, 2 m ahead of the camera, level and then rolled
     by 90 deg to the left."""
-    scene = scenes.one_body_scene(
-        N_ENV, N_BODY, (5.0, 3.0, -0.8), kind=scenes.SPHERE, body_pos=(7.2, 3.5, -0.55), size=(0.1, 0.1, 0.1)
+    scene = scenes.one_obstacle_scene(
+        N_ENV,
+        N_OBSTACLE,
+        (5.0, 3.0, -0.8),
+        kind=scenes.SPHERE,
+        obstacle_pos=(7.2, 3.5, -0.55),
+        size=(0.1, 0.1, 0.1),
     )
     rig.start(scene)
     image = rig.shoot()[0]
@@ -153,10 +159,15 @@ def test_axes_and_scale_of_the_image(rig):
     assert (row, col) == pytest.approx((35.5 - 64 * 0.25, 63.5 + 64 * 0.125), abs=0.6)
 
 
-def test_body_around_the_image_plane_is_not_lost(rig):
+def test_obstacle_around_the_image_plane_is_not_lost(rig):
     """A box whose corners lie behind the camera while its face is in view."""
-    scene = scenes.one_body_scene(
-        N_ENV, N_BODY, (5.0, 3.0, -0.8), kind=scenes.BOX, body_pos=(5.2, 4.0, -0.8), size=(0.9, 0.5, 0.8)
+    scene = scenes.one_obstacle_scene(
+        N_ENV,
+        N_OBSTACLE,
+        (5.0, 3.0, -0.8),
+        kind=scenes.BOX,
+        obstacle_pos=(5.2, 4.0, -0.8),
+        size=(0.9, 0.5, 0.8),
     )
     rig.start(scene)
     image = rig.shoot()[0]
@@ -166,7 +177,7 @@ def test_body_around_the_image_plane_is_not_lost(rig):
 
 def test_noise_grows_with_depth_and_stops_at_the_range(rig):
     config = DepthConfig(sigma_m=0.02, sigma_slope=0.01, period_steps=1)
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (13.0, 3.0, -0.8))
+    scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (13.0, 3.0, -0.8))
     rig.start(scene)
     clean = rig.shoot()
     first, again = rig.shoot(config), rig.shoot(config)
@@ -179,13 +190,13 @@ def test_noise_grows_with_depth_and_stops_at_the_range(rig):
     rig.clock.step.fill(1)
     later = ((rig.shoot(config) - clean) / (0.02 + 0.01 * clean))[returns]
     assert abs(np.corrcoef(error, later)[0, 1]) < SIGMAS / np.sqrt(error.size)
-    rig.start(scenes.one_body_scene(N_ENV, N_BODY, (5.0, 3.0, -0.8)))
+    rig.start(scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (5.0, 3.0, -0.8)))
     far = rig.shoot() == CLEAN.max_range_m
     assert far.any() and np.all(rig.shoot(config)[far] == CLEAN.max_range_m), "no noise on no return"
 
 
 def test_rate_and_labels(rig):
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (13.0, 3.0, -0.8))
+    scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (13.0, 3.0, -0.8))
     rig.start(scene)
     seen = []
     for step in range(12):
@@ -214,7 +225,7 @@ def test_envs_do_not_touch_each_other_and_sleepers_keep_their_image(rig, batches
     rig.episode.key.from_numpy((np.arange(N_ENV) + 1)[order].astype(np.uint32))
     assert np.array_equal(rig.shoot(config), first[order])
     before = rig.image.depth_m.to_numpy()
-    rig.clock.awake.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
+    rig.clock.active.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
     scenes.load(batches[1], rig.vehicle, rig.world)
     after = rig.shoot(config)
     assert np.array_equal(before[::2], after[::2]) and not np.array_equal(before[1::2], after[1::2])

@@ -16,14 +16,14 @@ from tests.kernels.perception.test_tracking import (
     PERIOD_S,
     Drive,
     Lab,
-    no_bodies,
+    no_obstacles,
     resting,
     with_movers,
 )
 from uuvtai.config import (
     Config,
     EpisodeConfig,
-    PoseConfig,
+    LocalizationConfig,
     SensorsConfig,
     SonarConfig,
     TankConfig,
@@ -33,11 +33,11 @@ from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.beams import range_rate
 from uuvtai.kernels.core.stage import AnyTensor, Const, In
 from uuvtai.kernels.perception import localization
-from uuvtai.kernels.perception.io import PoseIO
+from uuvtai.kernels.perception.io import LocalizationIO
 from uuvtai.logs.encode import EpisodeHeader, Moment
 from uuvtai.logs.topics.sensors import SONAR_ROWS
 from uuvtai.plugins.adapters import Readings
-from uuvtai.state import ClockState, PoseState, Proprioception, SonarScan, TrackState, allocate
+from uuvtai.state import ClockState, LocalizationState, Proprioception, SonarScan, TrackState, allocate
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, SonarPing
 
 DEAF = PAPER.model_copy(update={"doppler": False})
@@ -69,7 +69,7 @@ def test_what_rests_is_not_called_moving(deaf):
         lab.sense(k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, still)
         called += lab.read("moving").sum()
         drive.advance(PERIOD_S)
-    assert called <= 0.01 * 12 * 100 * N_ENV, "of 12 bodies"
+    assert called <= 0.01 * 12 * 100 * N_ENV, "of 12 obstacles"
     assert finite(lab)
 
 
@@ -80,8 +80,8 @@ def test_a_mover_is_told_within_two_seconds_by_its_displacement(deaf):
     vel = 0.6 * np.stack([np.cos(course), np.sin(course)], -1)[:, None]
     for k in range(int(2.0 / PERIOD_S)):
         centre = np.array([11.0, 3.0]) + vel * k * PERIOD_S
-        bodies = with_movers(no_bodies(), centre, vel, np.full((N_ENV, 1), 0.2))
-        body = lab.sense(k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, bodies)
+        obstacles = with_movers(no_obstacles(), centre, vel, np.full((N_ENV, 1), 0.2))
+        body = lab.sense(k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, obstacles)
         drive.advance(PERIOD_S)
     owner = np.array([lab.read("beam_track")[env][body[env] == 0][0] for env in range(N_ENV)])
     rows = np.arange(N_ENV)
@@ -95,7 +95,7 @@ def test_a_first_scan_alone_shows_no_motion_and_no_speed(deaf):
     vel = np.tile([[[-2.0, 0.0]]], (N_ENV, 1, 1))
     pos, yaw = np.tile([10.0, 3.0], (N_ENV, 1)), np.zeros(N_ENV)
     lab.sense(
-        0, pos, yaw, np.zeros((N_ENV, 2)), with_movers(no_bodies(), centre, vel, np.full((N_ENV, 1), 0.2))
+        0, pos, yaw, np.zeros((N_ENV, 2)), with_movers(no_obstacles(), centre, vel, np.full((N_ENV, 1), 0.2))
     )
     alive = lab.read("alive") == 1
     assert alive.any() and not lab.read("moving").any()
@@ -142,12 +142,21 @@ def test_walls_tell_the_place_and_not_the_speed():
     sensors = usual.model_copy(update={"sonar": usual.sonar.model_copy(update={"doppler": False})})
     sizes, tank, n = {"n_env": 1, "n_ray": 256}, TankConfig(), 256
     ego, state, clock, scan = (
-        allocate(struct, sizes) for struct in (Proprioception, PoseState, ClockState, SonarScan)
+        allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
     )
     io = io_for(
-        PoseIO, ego, state, clock, scan, PoseConfig(), sensors, tank, EpisodeConfig(), VehicleConfig()
+        LocalizationIO,
+        ego,
+        state,
+        clock,
+        scan,
+        LocalizationConfig(),
+        sensors,
+        tank,
+        EpisodeConfig(),
+        VehicleConfig(),
     )
-    clock.awake.fill(1)
+    clock.active.fill(1)
     ego.pos_w.from_numpy(np.array([[10.0, 3.0, -0.8]], np.float32))
     ego.specific_force_b.from_numpy(np.array([[0.0, 0.0, 9.81]], np.float32))
     localization.reset_pose(io)

@@ -6,7 +6,7 @@ import taichi as ti
 
 from tests.bundles import io_for
 from tests.oracles import scenes
-from tests.oracles.sonar import body_hits, wall_hits
+from tests.oracles.sonar import obstacle_hits, wall_hits
 from uuvtai.common.errors import UserError
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
 from uuvtai.config.loader import load_config
@@ -24,11 +24,18 @@ from uuvtai.state import (
     allocate,
 )
 
-N_ENV, N_BODY, STEPS = 24, 14, 60
+N_ENV, N_OBSTACLE, STEPS = 24, 14, 60
 TANK, RULES = TankConfig(), EpisodeConfig()
 SECTOR = load_config("pool", "ping360").sensors.sonar
 TURN = SECTOR.model_copy(update={"n_ray": 400, "horizontal_aperture_deg": 360.0, "max_range_m": 12.0})
-SIZES = {"n_env": N_ENV, "n_body": N_BODY, "n_ray": 400, "n_latency": 2, "n_cloud": 1, "n_thruster": 6}
+SIZES = {
+    "n_env": N_ENV,
+    "n_obstacle": N_OBSTACLE,
+    "n_ray": 400,
+    "n_latency": 2,
+    "n_cloud": 1,
+    "n_thruster": 6,
+}
 TOLERANCE_M = 2e-3
 GRAZING_SHARE = 2e-3
 """Sixteen rays a beam pass sixteen times as many edges as one."""
@@ -85,7 +92,7 @@ def test_beams_of_one_control_step_are_neighbours(is_ring):
 
 @pytest.fixture(scope="module")
 def scene():
-    return scenes.random_scenes(np.random.default_rng(11), N_ENV, N_BODY, TANK)
+    return scenes.random_scenes(np.random.default_rng(11), N_ENV, N_OBSTACLE, TANK)
 
 
 def nearest(scene, env, config, beam):
@@ -97,7 +104,7 @@ def nearest(scene, env, config, beam):
     best = wall_hits(scene["pos"][env][:2], u, TANK)[0]
     for body in np.flatnonzero(scene["kind"][env]):
         slope = np.tan(np.radians(config.vertical_half_aperture_deg))
-        best = np.minimum(best, body_hits(scene, env, body, scene["pos"][env], u, slope)[0])
+        best = np.minimum(best, obstacle_hits(scene, env, body, scene["pos"][env], u, slope)[0])
     return best.min()
 
 
@@ -109,7 +116,7 @@ def test_beams_come_in_turn_and_hear_what_is_nearest_within_them(scene, config):
     ]
     scan, clock = parts[0], allocate(ClockState, SIZES)
     scenes.load(scene, parts[3], parts[4])
-    clock.awake.fill(1)
+    clock.active.fill(1)
     sonar.reset_sonar(io_for(SonarIO, parts[0], parts[1], clock))
     io = io_for(SonarIO, *parts, clock, config, TANK, RULES)
     wrong = heard = 0

@@ -51,7 +51,7 @@ def driven(alone, tmp_path_factory):
         alone.step()
         recorder.step(alone)
         fresh, count = alone.rows(alone.s.scan.fresh)[0], alone.rows(alone.s.scan.new_count)[0]
-        asked = alone.rows(alone.s.teacher.last_vel_w)[0, :2]
+        asked = alone.rows(alone.s.behavior.last_vel_w)[0, :2]
         rows.append((*alone.rows(alone.s.ego.pos_w)[0, :2], *asked, fresh * count))
     recorder.end(alone, 0, END)
     rows = np.array(rows, float)
@@ -63,9 +63,9 @@ def test_it_waits_for_the_first_sweep_and_then_drives_no_farther_in_one_than_it_
     first = int(SONAR.sweep_s / 0.02)
     speed = np.linalg.norm(asked, axis=1)
     assert speed[: first - 2].max() < 1e-6 < speed[first + 20 :].max()
-    assert speed.max() <= CONFIG.teacher.sweep_way_m / SONAR.sweep_s + 1e-5
+    assert speed.max() <= CONFIG.behavior.sweep_way_m / SONAR.sweep_s + 1e-5
     apart = np.linalg.norm(place[first:] - place[:-first], axis=1)
-    assert 0.1 < apart.max() <= 1.1 * CONFIG.teacher.sweep_way_m
+    assert 0.1 < apart.max() <= 1.1 * CONFIG.behavior.sweep_way_m
     assert heard.sum() == pytest.approx(STEPS * 0.02 / (SONAR.step_us / 1e6), abs=1)
 
 

@@ -63,7 +63,7 @@ class Rig:
         }
         self.move(**{**still, **truth})
         self.episode.key.from_numpy((np.arange(N_ENV) * 31 + key).astype(np.uint32))
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.clock.step.fill(0)
         proprioception.reset_proprioception(
             io_for(ProprioceptionIO, self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors)
@@ -388,7 +388,7 @@ def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
     first = run(truth, keys)
     permuted = run({name: value[order] for name, value in truth.items()}, keys[order])
     assert all(np.array_equal(first[name][order], permuted[name]) for name in READINGS)
-    rig.clock.awake.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
+    rig.clock.active.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
     rig.move(vel_b=(3, 3, 3))
     proprioception.reset_proprioception(
         io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors)

@@ -26,8 +26,15 @@ from uuvtai.state import (
     allocate,
 )
 
-N_ENV, N_BODY, N_RAY, N_BATCH = 125, 14, 256, 8
-SIZES = {"n_env": N_ENV, "n_body": N_BODY, "n_ray": N_RAY, "n_latency": 3, "n_cloud": 8, "n_thruster": 6}
+N_ENV, N_OBSTACLE, N_RAY, N_BATCH = 125, 14, 256, 8
+SIZES = {
+    "n_env": N_ENV,
+    "n_obstacle": N_OBSTACLE,
+    "n_ray": N_RAY,
+    "n_latency": 3,
+    "n_cloud": 8,
+    "n_thruster": 6,
+}
 
 RANGE_TOLERANCE_M = 2.0e-3
 """Asked for by the issue; float32 rounding itself is below 0.1 mm but for grazing hits."""
@@ -70,7 +77,7 @@ class Rig:
         """Reset every row at step 0 with this scene; row i gets random key key + i."""
         scenes.load(scene, self.vehicle, self.world)
         self.episode.key.from_numpy((np.arange(N_ENV) + key).astype(np.uint32))
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.clock.step.fill(0)
         self.ego.pos_w.from_numpy(scene["pos"].astype(np.float32))
         sonar.reset_sonar(io_for(SonarIO, self.scan, self.memory, self.clock))
@@ -108,7 +115,7 @@ def rig():
 def batches():
     """1,000 scenes in batches of N_ENV."""
     rng = np.random.default_rng(20)
-    return [scenes.random_scenes(rng, N_ENV, N_BODY, TANK) for _ in range(N_BATCH)]
+    return [scenes.random_scenes(rng, N_ENV, N_OBSTACLE, TANK) for _ in range(N_BATCH)]
 
 
 def assert_ranges(got, hit, lowest, truth, highest, max_range_m):
@@ -152,9 +159,9 @@ def test_1000_scenes_against_mujoco(rig, batches):
 
 
 def test_1000_scenes_against_oracle_with_aperture(rig, batches):
-    """Range, hit flag, intensity and Doppler under the aperture rule; most bodies are above or below the
+    """Range, hit flag, intensity and Doppler under the aperture rule; most obstacles are above or below the
     beams' plane."""
-    different, bodies, compared = 0, 0, 0
+    different, obstacles, compared = 0, 0, 0
     for scene in batches:
         rig.start(scene)
         out = rig.cast(CLEAN)
@@ -182,16 +189,16 @@ def test_1000_scenes_against_oracle_with_aperture(rig, batches):
             gently = steady & (cosine > 0.05)
             assert np.abs(out["intensity"][env] - intensity)[gently].max() < 1.0e-3
             assert np.all(out["doppler_m_s"][env][out["hit"][env] == 0] == 0)
-            bodies += np.sum(who != WALL)
+            obstacles += np.sum(who != WALL)
             different += np.sum(np.abs(truth - sonar_scan(scene, env, TANK, N_RAY, 0.0)[0]) > 0.1)
     assert compared > 0.9 * N_BATCH * N_ENV * N_RAY
-    assert bodies > 20000 and different > 5000, (
-        "the scenes must show bodies, many of them only thanks to the aperture"
+    assert obstacles > 20000 and different > 5000, (
+        "the scenes must show obstacles, many of them only thanks to the aperture"
     )
 
 
 def test_round_tank_against_mujoco(rig):
-    scene = scenes.random_scenes(np.random.default_rng(3), N_ENV, N_BODY, ROUND_TANK)
+    scene = scenes.random_scenes(np.random.default_rng(3), N_ENV, N_OBSTACLE, ROUND_TANK)
     rig.start(scene)
     out = rig.cast(FLAT, ROUND_TANK)
     truth, low, high = [], [], []
@@ -211,14 +218,14 @@ def test_round_tank_against_mujoco(rig):
 
 
 @pytest.mark.parametrize("distance, seen", [(3.0, True), (1.5, False)])
-def test_body_above_the_beams_is_seen_from_afar_and_lost_close_by(rig, distance, seen):
+def test_obstacle_above_the_beams_is_seen_from_afar_and_lost_close_by(rig, distance, seen):
     """A short cylinder whose lower end is 0.4 m above the beams: seen beyond 0.4 / tan 10 deg = 2.27 m."""
-    scene = scenes.one_body_scene(
+    scene = scenes.one_obstacle_scene(
         N_ENV,
-        N_BODY,
+        N_OBSTACLE,
         (5.0, 3.0, -1.2),
         kind=scenes.CYLINDER,
-        body_pos=(5.0 + distance + 0.2, 3.0, -0.6),
+        obstacle_pos=(5.0 + distance + 0.2, 3.0, -0.6),
         size=(0.2, 0.2, 0.2),
     )
     rig.start(scene)
@@ -227,7 +234,7 @@ def test_body_above_the_beams_is_seen_from_afar_and_lost_close_by(rig, distance,
 
 
 def test_own_motion_along_the_beam_is_negative_doppler_of_everything_still(rig):
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (10.0, 3.0, -1.0))
+    scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 3.0, -1.0))
     scene["vel_b"][:] = (0.5, 0.2, 0.1)
     rig.start(scene)
     out = rig.cast()
@@ -365,7 +372,7 @@ def test_ghost_takes_the_mirrored_path(rig):
     """Heading 0 in an empty tank: beam 32 (45 deg) bounces off the wall y = 6 and then meets x = 20 (or the
     range limit)."""
     config = SonarConfig(ghost=1.0)
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (15.0, 4.0, -1.0))
+    scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (15.0, 4.0, -1.0))
     scene["vel_b"][:] = (0.3, 0.1, 0.0)
     rig.start(scene)
     out = rig.cast(config)
@@ -375,14 +382,14 @@ def test_ghost_takes_the_mirrored_path(rig):
     assert out["range_m"][0, 0] == pytest.approx(5.0, abs=1e-4), (
         "back along the axis: 5 + 20 m is out of range, the direct return stays"
     )
-    moving = scenes.one_body_scene(
+    moving = scenes.one_obstacle_scene(
         N_ENV,
-        N_BODY,
+        N_OBSTACLE,
         (10.0, 4.0, -1.0),
         kind=scenes.BOX,
-        body_pos=(14.5, 4.0, -1.0),
+        obstacle_pos=(14.5, 4.0, -1.0),
         size=(0.5, 1.0, 0.5),
-        body_vel=(-0.7, 0.2, 0.0),
+        obstacle_vel=(-0.7, 0.2, 0.0),
     )
     rig.start(moving)
     out = rig.cast(config)
@@ -398,7 +405,7 @@ HARSH = load_config("pool", "harsh").sensors.sonar
 
 def test_harsh_preset_shows_every_error_at_its_rate(rig):
     """All switches on: 125 envs in an empty tank, so near a wall that its far end is grazed, 41 pings."""
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (10.0, 2.0, -0.8))
+    scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 2.0, -0.8))
     clean, cosine, _ = sonar_scan(scene, 0, TANK, N_RAY, 10.0)
     heard = cosine > HARSH.grazing_cosine
     rig.start(scene)
@@ -442,7 +449,7 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
     """Only clouds on: share of covered beams = rate x mean duration x mean width / n_ray; each is a run of
     3-8 beams at one range."""
     config = SonarConfig(bubble_clouds_per_s=0.5, period_steps=5)
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (10.0, 3.0, -0.8))
+    scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 3.0, -0.8))
     rig.start(scene)
     clean = rig.cast(CLEAN)
     rig.start(scene)
@@ -471,7 +478,7 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
 def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
     """Ping every 2 steps, delivered 3 steps later (two scans under way at once)."""
     config = SonarConfig(period_steps=2, latency_steps=3)
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (10.0, 3.0, -0.8))
+    scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 3.0, -0.8))
     rig.start(scene)
     fresh = {}
     for step in range(12):
@@ -501,7 +508,7 @@ def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
 def test_sleeping_rows_keep_their_scan(rig, batches):
     rig.start(batches[0])
     before = rig.cast()
-    rig.clock.awake.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
+    rig.clock.active.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
     scenes.load(batches[1], rig.vehicle, rig.world)
     rig.clock.step.fill(1)
     after = rig.cast()

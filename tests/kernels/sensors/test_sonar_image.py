@@ -44,9 +44,10 @@ from uuvtai.state import (
 SMALL = {"sensors.sonar.n_ray": 64, "sensors.sonar.image_bins": 96}
 SONAR = load_config("pool", "multibeam_image", overrides=SMALL).sensors.sonar
 TANK, RULES = TankConfig(), EpisodeConfig()
-N_ENV, N_BODY, N_BIN = 6, 14, SONAR.image_bins
+N_ENV, N_OBSTACLE, N_BIN = 6, 14, SONAR.image_bins
 SIZES = {
-    "n_env": N_ENV, "n_body": N_BODY, "n_ray": SONAR.n_ray, "n_latency": 2, "n_cloud": 8, "n_thruster": 6,
+    "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_ray": SONAR.n_ray, "n_latency": 2, "n_cloud": 8,
+    "n_thruster": 6,
     "n_heard": len(heard_bearings(SONAR)), "n_bin": N_BIN, "n_elevation": len(elevations()),
 }  # fmt: skip
 NAMES = {1: "sphere", 2: "cylinder", 3: "box"}
@@ -87,7 +88,7 @@ class Rig:
     def start(self, scene, keys):
         scenes.load(scene, self.vehicle, self.world)
         self.episode.key.from_numpy(np.asarray(keys, np.uint32))
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         self.clock.step.fill(0)
         sonar.reset_sonar(self.io)
 
@@ -107,20 +108,20 @@ def rig():
 @pytest.fixture(scope="module")
 def scene():
     """Level vehicles, for the oracle's sonar is level too."""
-    found = scenes.random_scenes(np.random.default_rng(7), N_ENV, N_BODY, TANK, tilt=0.0)
+    found = scenes.random_scenes(np.random.default_rng(7), N_ENV, N_OBSTACLE, TANK, tilt=0.0)
     return found
 
 
 def document(scene, env):
     """An env's scene as a log's scenario.json has it, which the oracle reads."""
-    bodies = [
-        {"kind": NAMES[kind], "path": None, "position": scene["body_pos"][env, k].tolist(),
+    obstacles = [
+        {"kind": NAMES[kind], "path": None, "position": scene["obstacle_pos"][env, k].tolist(),
          "size": scene["size"][env, k].tolist(), "yaw": float(scene["yaw"][env, k])}
         for k, kind in enumerate(scene["kind"][env]) if kind
     ]  # fmt: skip
     return {
         "tank": {"shape": TANK.shape, "x_m": TANK.x_m, "y_m": TANK.y_m, "z_m": TANK.z_m},
-        "bodies": bodies,
+        "obstacles": obstacles,
     }
 
 
@@ -130,7 +131,7 @@ def power_of(scene, env):
 
 
 def test_power_is_the_oracles(rig, scene):
-    """But for rays on the edge of a body or of a bin, which float32 puts elsewhere."""
+    """But for rays on the edge of an obstacle or of a bin, which float32 puts elsewhere."""
     rig.start(scene, range(N_ENV))
     fold_only(rig.io)
     found = rig.image.echo.to_numpy()[:, :, :N_BIN]
@@ -172,10 +173,10 @@ def test_side_lobes_and_returns_are_the_oracles(rig, scene):
 
 
 def test_returns_are_where_something_stands(rig):
-    """A box ahead: what the beams that look at it report; a body's front is met to a bin."""
+    """A box ahead: what the beams that look at it report; an obstacle's front is met to a bin."""
     size = [0.4, 0.4, 0.8]
-    scene = scenes.one_body_scene(
-        N_ENV, N_BODY, (8.0, 3.0, -0.8), kind=scenes.BOX, body_pos=(11.0, 3.0, -0.8), size=size
+    scene = scenes.one_obstacle_scene(
+        N_ENV, N_OBSTACLE, (8.0, 3.0, -0.8), kind=scenes.BOX, obstacle_pos=(11.0, 3.0, -0.8), size=size
     )
     rig.start(scene, range(N_ENV))
     ranges, hit, _ = rig.ping()
@@ -202,12 +203,12 @@ def test_noise_alone_passes_as_rarely_as_asked(detector):
 
 
 def test_no_row_depends_on_another(rig, scene):
-    """Rows in another order, and asleep beside, have the same bits."""
+    """Rows in another order, and inactive beside, have the same bits."""
     rig.start(scene, range(N_ENV))
     first = rig.ping()
     order = [3, 1, 5, 0, 4, 2]
     rig.start({name: value[order] for name, value in scene.items()}, order)
-    rig.clock.awake.from_numpy(np.array([1, 1, 1, 0, 1, 1], np.int32))
+    rig.clock.active.from_numpy(np.array([1, 1, 1, 0, 1, 1], np.int32))
     again = rig.ping()
     for one, other in zip(first, again, strict=True):
         for row in (0, 1, 2, 4, 5):
@@ -244,15 +245,15 @@ def test_what_cannot_be_detected_is_refused(changes, told):
 FAN = load_config("pool", "multibeam").sensors.sonar
 FAN_BINS = 240
 POOL = {"shape": "rectangle", "x_m": [-40.0, 40.0], "y_m": [-40.0, 40.0], "z_m": [-40.0, 40.0]}
-"""so large that nothing but bodies is within reach"""
+"""so large that nothing but obstacles is within reach"""
 
 
 def body(kind, position, size):
     return {"kind": kind, "position": position, "size": size, "yaw": 0.0, "path": None}
 
 
-def scene_of(*bodies, **tank):
-    return {"tank": POOL | tank, "bodies": list(bodies)}
+def scene_of(*obstacles, **tank):
+    return {"tank": POOL | tank, "obstacles": list(obstacles)}
 
 
 def test_its_rays_are_mujocos():
@@ -263,13 +264,13 @@ def test_its_rays_are_mujocos():
     for env in range(8):
         az, el = rng.uniform(0, 2 * np.pi, 4000), rng.uniform(-0.7, 0.7, 4000)
         unit = np.column_stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
-        bodies = [
-            body(NAMES[kind], drawn["body_pos"][env, k].tolist(), drawn["size"][env, k].tolist())
+        obstacles = [
+            body(NAMES[kind], drawn["obstacle_pos"][env, k].tolist(), drawn["size"][env, k].tolist())
             | {"yaw": float(drawn["yaw"][env, k])}
             for k, kind in enumerate(drawn["kind"][env])
             if kind
         ]
-        seen = cast_rays({"tank": tank, "bodies": bodies}, 0.0, drawn["pos"][env], unit)
+        seen = cast_rays({"tank": tank, "obstacles": obstacles}, 0.0, drawn["pos"][env], unit)
         truth = scenes.Caster(drawn, env, TANK).distances(drawn["pos"][env], unit)
         level = seen.surface > -2  # MuJoCo's tank has neither floor nor surface
         wrong += (np.abs(seen.range_m - truth)[level] > 2e-3).sum()

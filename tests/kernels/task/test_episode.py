@@ -1,4 +1,4 @@
-"""The referee on hand-made states, the order of its rules, and the clock."""
+"""The termination check on hand-made states, the order of its rules, and the clock."""
 
 import numpy as np
 import pytest
@@ -7,18 +7,27 @@ import torch
 from tests.bundles import clear, io_for
 from tests.oracles import noise as noise_reference
 from uuvtai import state
-from uuvtai.common.enums import COLLIDED, COLLISION, ENDINGS, OUT_OF_TANK, OUTCOMES, SUCCESS, TIMEOUT, TTC
+from uuvtai.common.enums import (
+    COLLIDED,
+    COLLISION,
+    FINAL_OUTCOMES,
+    OUT_OF_TANK,
+    OUTCOMES,
+    SUCCESS,
+    TIMEOUT,
+    TTC,
+)
 from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, SPHERE
 from uuvtai.kernels.task import episode
 from uuvtai.kernels.task.io import EpisodeIO
 
-N, N_BODY = 8, 3
+N, N_OBSTACLE = 8, 3
 TOL = 1e-5
 """float32 at a few metres"""
 VEHICLE, TANK, RULES = VehicleConfig(), TankConfig(), EpisodeConfig(horizon_steps=100)
 FRONT_M = VEHICLE.hull_half_length_m + VEHICLE.hull_radius_m
-SIZES = {"n_env": N, "n_body": N_BODY, "n_thruster": 6}
+SIZES = {"n_env": N, "n_obstacle": N_OBSTACLE, "n_thruster": 6}
 
 
 class Court:
@@ -27,27 +36,27 @@ class Court:
 
     def __init__(self):
         structs = (
-            state.RefereeState,
+            state.TerminationState,
             state.ClockState,
             state.VehicleState,
             state.WorldState,
             state.MissionState,
             state.EpisodeState,
         )
-        self.referee, self.clock, self.vehicle, self.world, self.mission, self.episode = (
+        self.termination, self.clock, self.vehicle, self.world, self.mission, self.episode = (
             state.allocate(s, SIZES) for s in structs
         )
 
     def clean(self):
-        clear(self.referee, self.clock, self.vehicle, self.world, self.mission)
+        clear(self.termination, self.clock, self.vehicle, self.world, self.mission)
+        self.clock.running.fill(1)
         self.clock.active.fill(1)
-        self.clock.awake.fill(1)
         for env in range(N):
             self.vehicle.pos_w[env] = (10.0, 3.0, -0.8)
             self.vehicle.quat_wb[env] = (1.0, 0.0, 0.0, 0.0)
             self.mission.goal_w[env] = (18.0, 3.0, -0.8)
-        episode.reset_referee(
-            io_for(EpisodeIO, self.referee, self.clock, self.vehicle, self.world, VEHICLE, TANK, RULES)
+        episode.reset_termination(
+            io_for(EpisodeIO, self.termination, self.clock, self.vehicle, self.world, VEHICLE, TANK, RULES)
         )
         return self
 
@@ -58,10 +67,18 @@ class Court:
 
     def judge(self):
         io = io_for(
-            EpisodeIO, self.referee, self.clock, self.vehicle, self.world, self.mission, VEHICLE, TANK, RULES
+            EpisodeIO,
+            self.termination,
+            self.clock,
+            self.vehicle,
+            self.world,
+            self.mission,
+            VEHICLE,
+            TANK,
+            RULES,
         )
-        episode.judge(io)
-        return {name: field.to_numpy() for name, field in vars(self.referee).items()}
+        episode.check_termination(io)
+        return {name: field.to_numpy() for name, field in vars(self.termination).items()}
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +169,7 @@ def test_time_to_collision_counts_own_motion_towards_a_static_obstacle(court):
 
 
 def test_time_to_collision_counts_the_hull_s_turning(court):
-    """A body abeam of the bow; turning left at 1 rad/s moves the bow end of the axis towards it at 0.1
+    """An obstacle abeam of the bow; turning left at 1 rad/s moves the bow end of the axis towards it at 0.1
     m/s."""
     court.put(0, 0, SPHERE, (10.1, 3 + 0.17 + 0.2 + 0.15, -0.8), (0.2, 0.2, 0.2))
     court.vehicle.rate_b[0] = (0, 0, 1)
@@ -220,27 +237,27 @@ def test_book_of_the_episode(court):
     """Way driven sums straight steps; the smallest clearance stays; a reset starts with the clearance there
     and then."""
     court.put(0, 0, SPHERE, (10 + FRONT_M + 1.2, 3, -0.8), (0.2, 0.2, 0.2))
-    episode.reset_referee(
-        io_for(EpisodeIO, court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
+    episode.reset_termination(
+        io_for(EpisodeIO, court.termination, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
     )
-    assert court.referee.min_clearance_m[0] == pytest.approx(1.0, abs=TOL)
+    assert court.termination.min_clearance_m[0] == pytest.approx(1.0, abs=TOL)
     for x in (10.3, 10.5, 10.1):
         court.vehicle.pos_w[0] = (x, 3.0, -0.8)
         book = court.judge()
     assert book["path_length_m"][0] == pytest.approx(0.3 + 0.2 + 0.4, abs=TOL)
     assert book["min_clearance_m"][0] == pytest.approx(0.5, abs=TOL)
     assert book["clearance_m"][0] == pytest.approx(0.9, abs=TOL)
-    episode.reset_referee(
-        io_for(EpisodeIO, court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
+    episode.reset_termination(
+        io_for(EpisodeIO, court.termination, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
     )
-    again = {name: field.to_numpy()[0] for name, field in vars(court.referee).items()}
+    again = {name: field.to_numpy()[0] for name, field in vars(court.termination).items()}
     assert again["path_length_m"] == 0
     assert again["min_clearance_m"] == again["clearance_m"] == pytest.approx(0.9, abs=TOL)
     assert again["outcome"] == episode.RUNNING
 
 
 def test_sleeping_rows_stay_as_they_are(court):
-    court.clock.awake[1] = 0
+    court.clock.active[1] = 0
     court.vehicle.pos_w.fill(30.0)
     book = court.judge()
     assert outcome(book, 0) == "out_of_tank"
@@ -258,25 +275,25 @@ def begin(court, mask, seed=3, number=7):
 
 def test_episodes_begin_advance_end_and_sleep(court):
     even = [1, 0] * (N // 2)
-    court.clock.active.fill(0)
+    court.clock.running.fill(0)
     court.clock.step.fill(50)
     begin(court, even)
-    assert list(court.clock.awake.to_numpy()) == list(court.clock.active.to_numpy()) == even
+    assert list(court.clock.active.to_numpy()) == list(court.clock.running.to_numpy()) == even
     assert list(court.clock.step.to_numpy()) == [0, 50] * (N // 2)
     assert court.episode.key[0] == noise_reference.episode_key(3, 7)
     begin(
         court, [0] + [1] * (N - 1)
     )  # a reset pass of other rows: row 0 rests meanwhile, and goes on afterwards
-    assert court.clock.awake[0] == 0
+    assert court.clock.active[0] == 0
     episode.wake(io_for(EpisodeIO, court.clock))
-    assert court.clock.awake.to_numpy().all()
+    assert court.clock.active.to_numpy().all()
     episode.advance_clock(io_for(EpisodeIO, court.clock))
     assert np.all(court.clock.step.to_numpy() == 1)
-    court.referee.outcome[2] = episode.TIMEOUT
-    episode.sleep_ended(io_for(EpisodeIO, court.clock, court.referee))
+    court.termination.outcome[2] = episode.TIMEOUT
+    episode.deactivate_ended(io_for(EpisodeIO, court.clock, court.termination))
     episode.advance_clock(io_for(EpisodeIO, court.clock))
     assert court.clock.step.to_numpy().tolist() == [2, 2, 1] + [2] * (N - 3)
-    assert court.clock.active[2] == court.clock.awake[2] == 0
+    assert court.clock.running[2] == court.clock.active[2] == 0
 
 
 def test_negative_seeds_have_keys_too(court):
@@ -285,6 +302,8 @@ def test_negative_seeds_have_keys_too(court):
 
 
 def test_codes_and_names_of_the_endings_agree():
-    assert ("running", *ENDINGS) == OUTCOMES
-    assert [OUTCOMES[code] for code in (SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT)] == list(ENDINGS)
-    assert set(COLLIDED) < set(ENDINGS)
+    assert ("running", *FINAL_OUTCOMES) == OUTCOMES
+    assert [OUTCOMES[code] for code in (SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT)] == list(
+        FINAL_OUTCOMES
+    )
+    assert set(COLLIDED) < set(FINAL_OUTCOMES)

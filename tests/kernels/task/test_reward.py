@@ -27,14 +27,14 @@ class Bench:
     def __init__(self):
         structs = (
             state.RewardState,
-            state.RefereeState,
+            state.TerminationState,
             state.VehicleState,
             state.RouteState,
             state.ActuationState,
             state.ClockState,
         )
         self.structs = [state.allocate(struct, SIZES) for struct in structs]
-        self.reward, self.referee, self.vehicle, self.route, self.actuation, self.clock = self.structs
+        self.reward, self.termination, self.vehicle, self.route, self.actuation, self.clock = self.structs
         self.out = torch.zeros(N), torch.zeros(N, dtype=torch.int32), torch.zeros(N, dtype=torch.int32)
         self.target = {
             "quat": self.vehicle.quat_wb,
@@ -44,10 +44,10 @@ class Bench:
             "lookahead": self.route.lookahead_w,
             "cross_track": self.route.cross_track_m,
             "heading_error": self.route.heading_error,
-            "clearance": self.referee.clearance_m,
-            "ttc": self.referee.ttc_s,
+            "clearance": self.termination.clearance_m,
+            "ttc": self.termination.ttc_s,
             "n_way": self.route.n_way,
-            "outcome": self.referee.outcome,
+            "outcome": self.termination.outcome,
             "remaining": self.route.remaining_m,
             "plan_step": self.route.plan_step,
             "step": self.clock.step,
@@ -55,7 +55,7 @@ class Bench:
 
     def clean(self):
         """Every row upright at 10 m, driving ahead at 0.5 m/s on a route of old, one step in."""
-        self.clock.awake.fill(1)
+        self.clock.active.fill(1)
         reward.reset_reward(io_for(RewardIO, self.reward, self.clock))
         rest = {
             "quat": (1, 0, 0, 0),
@@ -182,7 +182,7 @@ def test_bytes_and_booleans_hold_the_ends_too(bench):
 def test_sleeping_rows_earn_nothing_and_keep_their_end(bench):
     bench.set("outcome", np.full(N, OUTCOMES.index("success")))
     bench.compute()
-    bench.clock.awake.fill(0)
+    bench.clock.active.fill(0)
     before = bench.reward.episode_return.to_numpy()
     bench.compute()
     assert not bench.out[0].any()

@@ -372,10 +372,10 @@ def test_rows_are_independent_and_permute(plant):
 def test_sleeping_rows_do_not_move(plant):
     random_state(plant, 4)
     before = motion(plant)
-    plant.clock.awake.from_numpy(np.array([1, 0, 1, 0, 0, 1], np.int32))
+    plant.clock.active.from_numpy(np.array([1, 0, 1, 0, 0, 1], np.int32))
     plant.step()
     moved = (motion(plant) != before).any(axis=1)
-    plant.clock.awake.fill(1)
+    plant.clock.active.fill(1)
     assert moved.tolist() == [True, False, True, False, False, True]
 
 

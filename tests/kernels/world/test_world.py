@@ -67,7 +67,7 @@ class Drawn:
         self.world, self.path, self.mission, _, self.scene, self.fixed, self.episode, self.clock = (
             self.structs
         )
-        self.slots = setup.body_slots(cfg)
+        self.slots = setup.obstacle_slots(cfg)
         setup.load_fixed(self.fixed, cfg)
 
     def draw(self, seed=0, numbers=None, mask=None, scene=None):
@@ -79,11 +79,11 @@ class Drawn:
         rows = (np.broadcast_to(a, n).astype(np.int32) for a in (mask, seed, numbers))
         episode.begin_episodes(io_for(EpisodeIO, self.clock, self.episode), *rows)
         scenarios.generate_scenarios(io_for(WorldIO, *self.structs, cfg))
-        return self.at(0, keep_awake=True)
+        return self.at(0, keep_active=True)
 
-    def at(self, step, keep_awake=False):
+    def at(self, step, keep_active=False):
         """Arrays by name with the obstacles where they are at a step."""
-        if not keep_awake:
+        if not keep_active:
             episode.wake(io_for(EpisodeIO, self.clock))
         set_step(self.clock, step)
         scenarios.move_obstacles(io_for(WorldIO, self.world, self.path, self.clock, RULES))
@@ -92,16 +92,16 @@ class Drawn:
             out |= {name: field.to_numpy() for name, field in vars(struct).items()}
         return out
 
-    def bodies(self, drawn, env, first=0, last=None):
-        """(kind, pos, size, yaw) in float64 of the bodies in a range of slots."""
+    def obstacles(self, drawn, env, first=0, last=None):
+        """(kind, pos, size, yaw) in float64 of the obstacles in a range of slots."""
         rows = [drawn[name][env].astype(float) for name in ("kind", "pos_w", "size", "yaw")]
-        slots = range(self.slots.n_body)[first:last]
+        slots = range(self.slots.n_obstacle)[first:last]
         return [
             (int(rows[0][i]), rows[1][i], rows[2][i], float(rows[3][i])) for i in slots if rows[0][i] != NONE
         ]
 
     def still(self, drawn, env):
-        return self.bodies(drawn, env, 0, self.slots.first_dynamic)
+        return self.obstacles(drawn, env, 0, self.slots.first_dynamic)
 
 
 @functools.cache
@@ -153,11 +153,11 @@ def test_static_obstacles_keep_sizes_and_gaps(any_world):
     of, drawn = any_world
     cfg, n_fixed = of.cfg, of.cfg.n_fixed_static
     for env in range(N):
-        bodies = of.still(drawn, env)
-        for i, body in enumerate(bodies):
-            kind, pos, size, _ = body
+        obstacles = of.still(drawn, env)
+        for i, obstacle in enumerate(obstacles):
+            kind, pos, size, _ = obstacle
             ends = [
-                reference.plan_distances(drawn[end][env, :2].astype(float), *body)
+                reference.plan_distances(drawn[end][env, :2].astype(float), *obstacle)
                 for end in ("start_w", "goal_w")
             ]
             assert min(ends) >= cfg.static.endpoint_gap_m - FLOAT_TOL_M
@@ -167,9 +167,9 @@ def test_static_obstacles_keep_sizes_and_gaps(any_world):
             assert pos[2] + size[2] == pytest.approx(cfg.tank.z_m[1], abs=FLOAT_TOL_M)
             sizes = size[:2] if kind == BOX else size[:1]
             assert within(sizes, cfg.static.half_extent_m if kind == BOX else cfg.static.radius_m)
-            assert reference.wall_distances(reference.outline(*body), cfg.tank).min() >= -FLOAT_TOL_M
-            for other in bodies[:i]:
-                assert reference.keeps_gap(body, other, cfg.static.gap_m - FLOAT_TOL_M)
+            assert reference.wall_distances(reference.outline(*obstacle), cfg.tank).min() >= -FLOAT_TOL_M
+            for other in obstacles[:i]:
+                assert reference.keeps_gap(obstacle, other, cfg.static.gap_m - FLOAT_TOL_M)
 
 
 def test_half_of_the_static_obstacles_are_boxes(any_world):
@@ -189,7 +189,7 @@ def test_moving_obstacles_keep_sizes_depths_and_the_gap_to_the_start(any_world):
     of, drawn = any_world
     cfg, first = of.cfg.dynamic, of.slots.first_dynamic
     for env in range(N):
-        for kind, pos, size, _ in of.bodies(drawn, env, first):
+        for kind, pos, size, _ in of.obstacles(drawn, env, first):
             assert within(size[0], cfg.radius_m)
             assert np.hypot(*(pos - drawn["start_w"][env])[:2]) >= cfg.start_gap_m - FLOAT_TOL_M
             full = size[2] > cfg.height_m[1]
@@ -257,7 +257,9 @@ def test_paths_keep_clear_of_static_obstacles_or_are_counted(any_world):
         for lane in range(n):
             points = reference.path_points(*_row(drawn, env, lane))
             room = drawn["size"][env, first + lane, 0]
-            gaps = [reference.plan_distances(points, *body).min() - room for body in of.still(drawn, env)]
+            gaps = [
+                reference.plan_distances(points, *obstacle).min() - room for obstacle in of.still(drawn, env)
+            ]
             touching += min(gaps, default=1.0) < -OUTLINE_TOL_M
         assert touching <= drawn["unclear_paths"][env] <= n
 
@@ -298,13 +300,13 @@ def test_the_log_s_closed_form_gives_the_same_positions(any_world):
     drawn = of.at(777)
     for env in range(0, N, 16):
         document = describe_scenario(lambda name, env=env: attrgetter(name)(of).to_numpy()[env])
-        assert len(document["bodies"]) == np.sum(drawn["kind"][env] != NONE)
-        for body in document["bodies"]:
-            assert KIND_NAMES[drawn["kind"][env, body["slot"]]] == body["kind"]
-            if body["path"] is not None:
-                (at,) = path_positions(body["path"], np.array([777 * RULES.control_dt_s]))
+        assert len(document["obstacles"]) == np.sum(drawn["kind"][env] != NONE)
+        for obstacle in document["obstacles"]:
+            assert KIND_NAMES[drawn["kind"][env, obstacle["slot"]]] == obstacle["kind"]
+            if obstacle["path"] is not None:
+                (at,) = path_positions(obstacle["path"], np.array([777 * RULES.control_dt_s]))
                 assert at == pytest.approx(
-                    drawn["pos_w"][env, body["slot"], :2], abs=1e-3
+                    drawn["pos_w"][env, obstacle["slot"], :2], abs=1e-3
                 )  # float32 arcs of up to 10 m
 
 
@@ -371,7 +373,7 @@ def test_a_reset_touches_only_its_rows_and_forgets_what_was_there():
     other = of.draw(seed=5, scene=(12, 15, 3.0))
     for name in PURE:
         assert np.array_equal(mixed[name][::2], drawn[name][::2]), name
-        if name not in ("pos_w", "vel_w"):  # moved to step 0 of the new clock only where awake
+        if name not in ("pos_w", "vel_w"):  # moved to step 0 of the new clock only where active
             assert np.array_equal(mixed[name][1::2], other[name][1::2]), name
     of.draw()
 
@@ -436,7 +438,7 @@ def test_batch_size_and_thread_count_change_nothing(tmp_path):
         for name in PURE:
             mine = drawn[name][:7]
             if (
-                mine.ndim > 1 and mine.shape[1] == of.slots.n_body
+                mine.ndim > 1 and mine.shape[1] == of.slots.n_obstacle
             ):  # the same slots, where capacities are not larger than counts
                 mine = np.concatenate([mine[:, : of.cfg.n_static], mine[:, first : first + n]], axis=1)
             assert np.array_equal(other[name], mine), name
@@ -478,7 +480,7 @@ def test_explicit_obstacles_stand_and_move_as_written():
     assert drawn["draws"].max() > 16, "some pairs of start and goal must have been given up"
     side = (drawn["start_w"][:, 0] - 10) * (drawn["goal_w"][:, 0] - 10)
     assert np.all(side > 0)
-    assert [kind for kind, *_ in of.bodies(drawn, 0)] == [BOX, CYLINDER, BOX, SPHERE]
+    assert [kind for kind, *_ in of.obstacles(drawn, 0)] == [BOX, CYLINDER, BOX, SPHERE]
     dt = RULES.control_dt_s
     later = of.at(150)  # 3 s: the box is 1.5 m back on its way, the sphere 1.8 m along
     assert later["pos_w"][:, 2] == pytest.approx(np.tile([3.5, 2, -1.0], (64, 1)), abs=FLOAT_TOL_M)
@@ -551,15 +553,15 @@ def test_worlds_that_make_no_sense_are_refused(wrong):
 
 @pytest.mark.parametrize("world", sorted(preset_names("world")))
 def test_what_is_known_beforehand_is_true_of_the_world(world):
-    """The prior that a world's preset gives the vehicle says of its moving bodies what the world draws."""
+    """The prior that a world's preset gives the vehicle says of its moving obstacles what the world draws."""
     config = load_config(world)
-    bodies, known = config.world.dynamic, config.traffic
+    obstacles, known = config.world.dynamic, config.traffic
     if config.world.n_dynamic == 0:
         assert known == TrafficConfig()  # nothing is said of what is not there
         return
-    assert known.z_m == bodies.z_m
-    assert config.elevation.column_share <= max(0.05, bodies.full_column_fraction)
-    drawn = [*(2 * radius for radius in bodies.radius_m), *bodies.height_m]
+    assert known.z_m == obstacles.z_m
+    assert config.height.column_share <= max(0.05, obstacles.full_column_fraction)
+    drawn = [*(2 * radius for radius in obstacles.radius_m), *obstacles.height_m]
     assert min(drawn) <= known.height_m[0] <= known.height_m[1] <= max(drawn)
-    if bodies.motion == "line_circle" and bodies.circle_fraction < 1:
-        assert known.leg_m == bodies.line_length_m
+    if obstacles.motion == "line_circle" and obstacles.circle_fraction < 1:
+        assert known.leg_m == obstacles.line_length_m

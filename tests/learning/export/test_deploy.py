@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from tests.command import run_cli
-from uuvtai.config import FeaturesConfig
+from uuvtai.config import ObservationConfig
 from uuvtai.config.loader import ConfigError, load_training
 from uuvtai.kernels.planning.observation import observation_width, placed_columns
 from uuvtai.learning import checkpoint
@@ -27,9 +27,9 @@ from uuvtai.learning.export.folder import of_torch
 from uuvtai.learning.export.graph import TOLERANCE, OneDecision, golden_of, missing_packages
 from uuvtai.learning.export.spec import weights_of
 from uuvtai.learning.networks import ActorCritic
-from uuvtai.learning.policy_agent import TEACHER_COLUMN, Pilot, load_pilot
+from uuvtai.learning.policy_agent import TEACHER_COLUMN, PolicyAgent, load_agent
 from uuvtai.learning.world_model import N_TARGET, WorldModel
-from uuvtai.plugins.api import piece_spec
+from uuvtai.plugins.api import plugin_spec
 from uuvtai.plugins.loading import graph_of, onnx_policy
 
 N_OBS = 40
@@ -109,7 +109,7 @@ CASES = {
 @pytest.mark.parametrize("changes", CASES.values(), ids=CASES)
 def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, changes):
     found = saved(tmp_path, load_training("smoke", list((SMALL | changes).items())))
-    pilot = load_pilot(found, 1)
+    pilot = load_agent(found, 1)
     golden = golden_of(pilot)
     spec = {
         "observation": {"width": N_OBS},
@@ -132,7 +132,7 @@ def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, chan
 
 def test_networks_that_have_seen_nothing_agree_too():
     config, rng = config_of(), torch.Generator().manual_seed(0)
-    pilot = Pilot(
+    pilot = PolicyAgent(
         ActorCritic(N_OBS + 2, config.policy, None, rng), WorldModel(N_OBS, config.world_model, rng), 1
     )
     golden = golden_of(pilot)
@@ -201,7 +201,7 @@ def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
     spec = run_policy.read_spec(tmp_path / "out")
     columns = spec["observation"]["columns"]
     assert [column["index"] for column in columns] == list(range(N_OBS))
-    norm = load_pilot(found, 1).policy.observation_norm
+    norm = load_agent(found, 1).policy.observation_norm
     mean, std = float(norm.mean[2]), float(norm.std()[2])
     assert columns[2] == {
         "index": 2,
@@ -304,8 +304,8 @@ def test_networks_that_cannot_drive_are_not_exported(tmp_path, no_onnx):
 def result_of(found, k=90, n=100):
     """A result of ``uuv eval`` with this checkpoint and a tree."""
     outcomes = {"success": k, "collision": n - k - 2, "ttc": 1, "out_of_tank": 0, "timeout": 1}
-    methods = [{"name": "bt", "episodes": n, "outcomes": outcomes}]
-    methods.append(
+    agents = [{"name": "bt", "episodes": n, "outcomes": outcomes}]
+    agents.append(
         {"name": "mine", "episodes": n, "outcomes": outcomes, "checkpoint": {"sha256": found.sha256}}
     )
     return {
@@ -315,7 +315,7 @@ def result_of(found, k=90, n=100):
         "v_m_s": 0.6,
         "sensors": "paper",
         "seeds": [1, 2],
-        "methods": methods,
+        "agents": agents,
     }
 
 
@@ -353,15 +353,15 @@ def test_without_evaluations_the_card_says_so(folder):
 def test_evaluations_of_something_else_are_refused(tmp_path):
     found = saved(tmp_path / "run")
     other = result_of(found)
-    other["methods"][1]["checkpoint"]["sha256"] = "0" * 64
+    other["agents"][1]["checkpoint"]["sha256"] = "0" * 64
     with pytest.raises(ConfigError, match="does not evaluate this checkpoint"):
         evaluations_of(found, [written(tmp_path / "other", other)])
     for number, broken in enumerate(
         (
             result_of(found, k=-3),
-            {"methods": [3]},
+            {"agents": [3]},
             [],
-            {"methods": [{"checkpoint": {"sha256": found.sha256}}]},
+            {"agents": [{"checkpoint": {"sha256": found.sha256}}]},
         )
     ):
         with pytest.raises(ConfigError, match="is no result of uuv eval"):
@@ -423,7 +423,7 @@ def resigned(folder, name, content):
 
 def test_other_weights_with_the_right_sha256_are_exit_3(folder, tmp_path, capfd):
     other = saved(tmp_path / "other", config_of(), metrics={"a": 1.0})
-    weights = weights_of(load_pilot(other, 1))
+    weights = weights_of(load_agent(other, 1))
     weights["actor.4.bias"] += 0.01
     from safetensors.torch import save
 
@@ -457,13 +457,13 @@ def test_bad_usage(arguments, says, code, capfd, tmp_path, monkeypatch):
 def test_the_example_writes_a_graph_that_is_taken_as_a_policy(tmp_path, monkeypatch):
     """``python examples/own_onnx.py``, then ``uuv eval --agent model.onnx``."""
     pytest.importorskip("onnxscript", reason="needs the extra uuvtai[export]")
-    columns = {c.name: slice(first, first + width) for c, first, width in placed_columns(FeaturesConfig())}
-    n_obs = observation_width(FeaturesConfig())
+    columns = {c.name: slice(first, first + width) for c, first, width in placed_columns(ObservationConfig())}
+    n_obs = observation_width(ObservationConfig())
     env = SimpleNamespace(num_obs=n_obs, columns=columns)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("uuvtai.make", lambda *_given, **_others: env)
     module = runpy.run_path(str(Path(__file__).parents[3] / "examples/own_onnx.py"), run_name="__main__")
-    spec = piece_spec("model.onnx", "policy")
+    spec = plugin_spec("model.onnx", "policy")
     act, hold_steps = onnx_policy(spec, graph_of(spec), n_obs)
     obs = torch.randn(64, n_obs)
     np.testing.assert_allclose(act(obs.numpy()), module["Policy"](columns)(obs), rtol=1e-5, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Exported policies over a set of bodies and forecasts: NumPy, ONNX Runtime and torch agree with
+"""Exported policies over a set of obstacles and forecasts: NumPy, ONNX Runtime and torch agree with
 what drives in the simulator, the hull rule is the kernel's, and folders are checked and never believed."""
 
 import copy
@@ -13,11 +13,11 @@ import torch
 from tests.command import run_cli
 from tests.learning.export.test_deploy import resigned
 from tests.oracles import hull_rule as reference
-from uuvtai.common.enums import BODY_WIDTH, COLUMNS, EGO_COLUMNS, N_BODY, N_COLUMN
+from uuvtai.common.enums import COLUMNS, EGO_COLUMNS, N_COLUMN, N_OBSTACLE, OBSTACLE_WIDTH
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.config.loader import load_training
 from uuvtai.learning import checkpoint, networks, set_networks
-from uuvtai.learning.agents import load_set_pilot
+from uuvtai.learning.agents import load_set_agent
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.export import folder as deploy
 from uuvtai.learning.export import run_policy, run_set_policy
@@ -37,7 +37,7 @@ from uuvtai.learning.set_networks import SetActor, SetCritic
 from uuvtai.surrogate.arrays import TRUTH_WIDTH
 from uuvtai.surrogate.observation import SET_TABLE
 
-NET = {"twin.body_hidden": 8, "twin.head_hidden": 8}
+NET = {"surrogate.obstacle_hidden": 8, "surrogate.head_hidden": 8}
 
 
 def filled(module, seed, spread=0.3):
@@ -51,14 +51,14 @@ def filled(module, seed, spread=0.3):
 
 def actor_and_critic(config):
     rng = torch.Generator().manual_seed(1)
-    actor = filled(SetActor(BODY_WIDTH, EGO_COLUMNS, config, rng), 2)
-    critic = SetCritic(BODY_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, rng)
+    actor = filled(SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, rng), 2)
+    critic = SetCritic(OBSTACLE_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, rng)
     return {"policy": actor.state_dict(), "critic": critic.state_dict(), "counters": {}, "env": {}}
 
 
 def saved(kind, folder, change=None):
     """A run folder with one checkpoint of a kind, after ``change`` of its state."""
-    preset, table = ("twin", SET_TABLE) if kind == "set" else ("forecast", (column_row(),))
+    preset, table = ("surrogate", SET_TABLE) if kind == "set" else ("forecast", (column_row(),))
     config = load_training(preset, overrides=NET)
     state = actor_and_critic(config)
     if kind == "forecast":
@@ -109,7 +109,7 @@ def test_the_card_says_where_it_was_judged(whole, kind):
     card = (whole[1] / "README.md").read_text()
     if kind == "set":
         assert (
-            "the kinematic twin, pool and gauntlet, S = 8, D = 9, v = 1.5 m/s; S = 8, D = 9, v = 1 m/s; "
+            "the kinematic surrogate, pool and gauntlet, S = 8, D = 9, v = 1.5 m/s; S = 8, D = 9, v = 1 m/s; "
             in card
         )
         assert "| 768/1536 = 50.0 % | 384/1536 = 25.0 % |" in card, (
@@ -147,9 +147,9 @@ def test_the_golden_pairs_say_something(kind, whole):
         assert golden["pair_columns"].shape == (64, COLUMNS) and np.ptp(golden["pair_log_weight"]) > 0.1
         assert (golden["pair_sigma"] > 0).all() and golden["pair_place"].shape == (64, 6, 5, 2)
         return
-    there = golden["pair_bodies"][..., 0]
-    assert set(there.sum(1).astype(int)) >= {0, 1, N_BODY} and np.ptp(golden["pair_mean_wish"]) > 0.5
-    assert (golden["pair_bodies"][there == 0] == 0).all()
+    there = golden["pair_obstacles"][..., 0]
+    assert set(there.sum(1).astype(int)) >= {0, 1, N_OBSTACLE} and np.ptp(golden["pair_mean_wish"]) > 0.5
+    assert (golden["pair_obstacles"][there == 0] == 0).all()
 
 
 def test_no_critic_and_no_truth_is_exported(kind, whole):
@@ -165,7 +165,7 @@ def test_no_critic_and_no_truth_is_exported(kind, whole):
     text = (folder / "policy_spec.json").read_text() + (folder / "README.md").read_text()
     assert "critic" not in text and "truth" not in text
     if kind != "forecast":
-        assert arrays["actor.body.0.weight"].shape[1] == BODY_WIDTH
+        assert arrays["actor.body.0.weight"].shape[1] == OBSTACLE_WIDTH
         assert arrays["actor.own.0.weight"].shape[1] == EGO_COLUMNS
 
 
@@ -185,8 +185,8 @@ def test_the_graph_says_the_same(kind, tmp_path):
 
     rng = np.random.default_rng(0)
     few = {name: rng.normal(size=(3, policy.widths[name])).astype(np.float32) for name in policy.inputs[1:]}
-    few["bodies"] = rng.normal(size=(3, 2, BODY_WIDTH)).astype(np.float32)
-    few["bodies"][..., 0] = 1.0
+    few["obstacles"] = rng.normal(size=(3, 2, OBSTACLE_WIDTH)).astype(np.float32)
+    few["obstacles"][..., 0] = 1.0
     graph = session((out / "policy.onnx").read_bytes())
     (wish, *_) = graph.run(["mean_wish"], few)
     np.testing.assert_allclose(wish, policy.said(few)["mean_wish"], atol=1e-5)
@@ -203,7 +203,7 @@ def golden_inputs(folder, policy):
 def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp_path, no_onnx):
     """Columns that the pilot wrote, the wish, and the hull rule where each vehicle then is."""
     found, _, out = exported("set", tmp_path)
-    policy, pilot = run_set_policy.load(out), load_set_pilot(found, small.sim)
+    policy, pilot = run_set_policy.load(out), load_set_agent(found, small.sim)
     small.begin(range(small.N), seed=5)
     pilot.reset(torch.ones(small.N))
     ways = small.sim.rows(small.sim.s.mission.goal_w) - small.sim.rows(small.sim.s.mission.start_w)
@@ -215,8 +215,8 @@ def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp
         )
         if step % 5 == 0:
             wishes = [
-                policy.act(bodies, own).wish
-                for bodies, own in zip(pilot.bodies.numpy(), pilot.own.numpy(), strict=True)
+                policy.act(obstacles, own).wish
+                for obstacles, own in zip(pilot.obstacles.numpy(), pilot.own.numpy(), strict=True)
             ]
             np.testing.assert_allclose(wishes, pilot.wish.numpy(), atol=1e-5)
         flips = np.where(ways[:, :2] >= 0, 1, -1)
@@ -228,7 +228,7 @@ def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp
 
 
 def test_the_hull_rule_is_that_of_the_oracle():
-    config = load_training("twin", overrides=NET)
+    config = load_training("surrogate", overrides=NET)
     decision = module_policy()
     rng = np.random.default_rng(0)
     low, high = [-1.5, -1.5, -1.5, -np.pi, -1.6], [1.5, 1.5, 1.5, np.pi, 0.0]
@@ -246,12 +246,12 @@ def test_the_hull_rule_is_that_of_the_oracle():
 
 def module_policy():
     """A policy of made-up weights, without a folder."""
-    config = load_training("twin", overrides=NET)
-    actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    config = load_training("surrogate", overrides=NET)
+    actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
     spec = {
         "observation": {
             "meaning": "",
-            "bodies": {"columns": [0] * BODY_WIDTH},
+            "obstacles": {"columns": [0] * OBSTACLE_WIDTH},
             "own": {"columns": [0] * EGO_COLUMNS},
         },
         "network": {"goal_gain": 0.7},
@@ -261,21 +261,24 @@ def module_policy():
     return run_set_policy.SetPolicy(spec, arrays)
 
 
-def test_order_and_number_of_bodies_do_not_matter():
+def test_order_and_number_of_obstacles_do_not_matter():
     policy, rng = module_policy(), np.random.default_rng(3)
-    bodies, own = rng.normal(size=(5, BODY_WIDTH)), rng.normal(size=EGO_COLUMNS)
-    bodies[:, 0] = 1.0
-    wish = policy.act(bodies, own).wish
-    np.testing.assert_allclose(policy.act(bodies[::-1], own).wish, wish, atol=1e-6)
-    more = np.concatenate([bodies, np.zeros((4, BODY_WIDTH))])
+    obstacles, own = rng.normal(size=(5, OBSTACLE_WIDTH)), rng.normal(size=EGO_COLUMNS)
+    obstacles[:, 0] = 1.0
+    wish = policy.act(obstacles, own).wish
+    np.testing.assert_allclose(policy.act(obstacles[::-1], own).wish, wish, atol=1e-6)
+    more = np.concatenate([obstacles, np.zeros((4, OBSTACLE_WIDTH))])
     np.testing.assert_allclose(policy.act(more, own).wish, wish, atol=1e-6)
 
 
 def test_words_and_constants_are_those_of_the_package():
     text = set_columns_text
-    assert [len(columns) for columns in (text.BODY_COLUMNS, text.OWN_COLUMNS)] == [BODY_WIDTH, EGO_COLUMNS]
-    names = [row["name"] for columns in (text.BODY_COLUMNS, text.OWN_COLUMNS) for row in columns]
-    assert names[12] == "way_in_1s.x" and names[BODY_WIDTH + 3] == "goal_direction.x"
+    assert [len(columns) for columns in (text.OBSTACLE_COLUMNS, text.OWN_COLUMNS)] == [
+        OBSTACLE_WIDTH,
+        EGO_COLUMNS,
+    ]
+    names = [row["name"] for columns in (text.OBSTACLE_COLUMNS, text.OWN_COLUMNS) for row in columns]
+    assert names[12] == "way_in_1s.x" and names[OBSTACLE_WIDTH + 3] == "goal_direction.x"
     for own, theirs in (
         (run_set_policy.AT_DIRECTION, set_networks.AT_DIRECTION),
         (run_set_policy.SUM_SCALE, set_networks._SUM_SCALE),
@@ -306,9 +309,9 @@ def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda b, o: (b[:, 1:], o), r"bodies must have shape \(n, 22\)"),
-        (lambda b, o: (b[0], o), r"bodies must have shape \(n, 22\)"),
-        (lambda b, o: (b[:0], o), r"bodies must have shape \(n, 22\)"),
+        (lambda b, o: (b[:, 1:], o), r"obstacles must have shape \(n, 22\)"),
+        (lambda b, o: (b[0], o), r"obstacles must have shape \(n, 22\)"),
+        (lambda b, o: (b[:0], o), r"obstacles must have shape \(n, 22\)"),
         (lambda b, o: (b, o[1:]), r"own must have shape \(41,\), got \(40,\)"),
         (lambda b, o: (b * np.nan, o), "not finite"),
         (lambda b, o: (b, o * np.inf), "not finite"),
@@ -317,7 +320,7 @@ def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
 )
 def test_bad_columns_are_refused(change, says):
     with pytest.raises(ValueError, match=says):
-        module_policy().act(*change(np.ones((3, BODY_WIDTH)), np.ones(EGO_COLUMNS)))
+        module_policy().act(*change(np.ones((3, OBSTACLE_WIDTH)), np.ones(EGO_COLUMNS)))
 
 
 def test_the_other_driver_is_named(tmp_path, no_onnx):
@@ -402,10 +405,10 @@ def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
     [
         lambda g: g.pop("pair_own"),
         lambda g: g.update({"pair_own": g["pair_own"][:5]}),
-        lambda g: g.update({"pair_bodies": g["pair_bodies"] * np.float32(0.5)}),
-        lambda g: g.update({"pair_bodies": np.zeros((0, 9, BODY_WIDTH), np.float32)}),
-        lambda g: g.update({"pair_bodies": np.float32(3)}),
-        lambda g: g.update({name: np.repeat(g[name], 2000, 0) for name in ("pair_bodies", "pair_own")}),
+        lambda g: g.update({"pair_obstacles": g["pair_obstacles"] * np.float32(0.5)}),
+        lambda g: g.update({"pair_obstacles": np.zeros((0, 9, OBSTACLE_WIDTH), np.float32)}),
+        lambda g: g.update({"pair_obstacles": np.float32(3)}),
+        lambda g: g.update({name: np.repeat(g[name], 2000, 0) for name in ("pair_obstacles", "pair_own")}),
     ],
 )
 def test_golden_pairs_are_read_without_trust(change, tmp_path, no_onnx, capfd):

@@ -3,7 +3,7 @@ Avoidance", IEEE Robotics & Automation Magazine 4(1), 1997.
 
 Of the velocities that can be reached within a short time those are admissible that come to rest before they
 touch anything, and of these the best has the largest weighted sum of heading, clearance and speed. Adapted:
-the vehicle moves sideways too (``local_planner.py``); bodies move, so a velocity is rolled out with the
+the vehicle moves sideways too (``local_planner.py``); obstacles move, so a velocity is rolled out with the
 vehicle's lag against their forecast; speed beyond the wanted one is worth nothing more; where nothing is
 admissible, the velocity that touches least and latest is driven.
 """
@@ -30,7 +30,7 @@ _FORBIDDEN = -100.0
 @ti.kernel
 def plan_dynamic_window(io: Bundle[DynamicWindowIO]):
     """Velocity of best score for the rows that decide in this step."""
-    n, n_trial = ti.static(io.clock.awake.shape[0], io.baselines_cfg.n_reachable)
+    n, n_trial = ti.static(io.clock.active.shape[0], io.baselines_cfg.n_reachable)
     for env, trial in ti.ndrange(n, n_trial):
         if decides(env, io.clock, io.baselines_cfg):
             io.baselines.score[env, trial] = _score(env, _wanted(env, io), _trial(env, trial, io), io)
@@ -46,7 +46,7 @@ def plan_dynamic_window(io: Bundle[DynamicWindowIO]):
 @ti.func
 def _wanted(env, io: Bundle[DynamicWindowIO]):
     return wanted_velocity(
-        env, io.ego, io.mission, io.teacher, io.baselines_cfg, io.tank_cfg, io.teacher_cfg, io.vehicle_cfg
+        env, io.ego, io.mission, io.behavior, io.baselines_cfg, io.tank_cfg, io.behavior_cfg, io.vehicle_cfg
     )
 
 
@@ -60,7 +60,7 @@ def _trial(env, trial, io: Bundle[DynamicWindowIO]):
         ti.static(io.dwa_cfg.window_s),
         io.baselines_cfg,
         io.tank_cfg,
-        io.teacher_cfg,
+        io.behavior_cfg,
         io.vehicle_cfg,
     )
 
@@ -83,7 +83,7 @@ def _score(env, wanted, velocity, io: Bundle[DynamicWindowIO]):
     out = (
         ti.static(io.dwa_cfg.weight_heading) * heading
         + ti.static(io.dwa_cfg.weight_clearance) * free
-        + ti.static(io.dwa_cfg.weight_speed) * fast * ti.static(1.0 / io.teacher_cfg.cruise_m_s)
+        + ti.static(io.dwa_cfg.weight_speed) * fast * ti.static(1.0 / io.behavior_cfg.cruise_m_s)
     )
     # v^2 <= 2 a d with d = v t: in time to come to rest
     if touch_s < 0.5 * speed * ti.static(1.0 / io.baselines_cfg.acceleration_m_s2):
@@ -97,22 +97,22 @@ def _rolled_out(env, velocity, io: Bundle[DynamicWindowIO]):
 
     A mapped obstacle that is too near already counts only where it comes nearer.
     """
-    dt, lag = ti.static(io.tracking_cfg.forecast_dt_s, io.teacher_cfg.lag_s)
+    dt, lag = ti.static(io.tracking_cfg.forecast_dt_s, io.behavior_cfg.lag_s)
     n_sample = ti.static(
         min(io.forecast.radius_m.shape[2] - 1, round(io.dwa_cfg.horizon_s / io.tracking_cfg.forecast_dt_s))
     )
     pos, own = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
-    here = mapped_m(env, pos, io.clearance, io.mapping_cfg, io.tank_cfg, io.teacher_cfg)
+    here = mapped_m(env, pos, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
     wanted_static = ti.min(ti.static(io.baselines_cfg.static_margin_m), here)
     room, touch_s, decay = FAR_M, FAR_M, 1.0
     for k in range(1, n_sample + 1):
-        decay *= ti.static(2.718281828459045 ** (-io.tracking_cfg.forecast_dt_s / io.teacher_cfg.lag_s))
+        decay *= ti.static(2.718281828459045 ** (-io.tracking_cfg.forecast_dt_s / io.behavior_cfg.lag_s))
         settle = lag * (1.0 - decay)
         at = pos + own * settle + velocity * (k * dt - settle)
-        free = nearest_body_m(env, k, at, io.forecast, io.baselines_cfg, io.teacher_cfg) - ti.static(
+        free = nearest_body_m(env, k, at, io.forecast, io.baselines_cfg, io.behavior_cfg) - ti.static(
             io.dwa_cfg.margin_m
         )
-        mapped = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.teacher_cfg) - wanted_static
+        mapped = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg) - wanted_static
         smaller = ti.min(free, mapped)
         room = ti.min(room, smaller)
         if smaller < 0.0 and touch_s == FAR_M:

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from uuvtai.config import (
     BaselinesConfig,
+    BehaviorConfig,
     DynamicWindowConfig,
     EpisodeConfig,
     MappingConfig,
     PathIntegralConfig,
     PotentialFieldConfig,
     TankConfig,
-    TeacherConfig,
     TrackingConfig,
     VehicleConfig,
     VelocityObstacleConfig,
@@ -20,12 +20,12 @@ from uuvtai.config import (
 from uuvtai.kernels.core.stage import Const, In, Out
 from uuvtai.state import (
     BaselineState,
+    BehaviorState,
     ClearanceState,
     ClockState,
     ForecastState,
     MissionState,
     Proprioception,
-    TeacherState,
     TrackState,
 )
 
@@ -40,12 +40,12 @@ class DynamicWindowIO:
     ego: In[Proprioception]
     forecast: In[ForecastState]
     mission: In[MissionState]
-    teacher: In[TeacherState]
+    behavior: In[BehaviorState]
     baselines_cfg: Const[BaselinesConfig]
     dwa_cfg: Const[DynamicWindowConfig]
     mapping_cfg: Const[MappingConfig]
     tank_cfg: Const[TankConfig]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
     tracking_cfg: Const[TrackingConfig]
     vehicle_cfg: Const[VehicleConfig]
 
@@ -60,12 +60,12 @@ class PotentialFieldIO:
     ego: In[Proprioception]
     forecast: In[ForecastState]
     mission: In[MissionState]
-    teacher: In[TeacherState]
+    behavior: In[BehaviorState]
     baselines_cfg: Const[BaselinesConfig]
     field_cfg: Const[PotentialFieldConfig]
     mapping_cfg: Const[MappingConfig]
     tank_cfg: Const[TankConfig]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
     vehicle_cfg: Const[VehicleConfig]
 
 
@@ -79,13 +79,13 @@ class VelocityObstacleIO:
     ego: In[Proprioception]
     forecast: In[ForecastState]
     mission: In[MissionState]
-    teacher: In[TeacherState]
+    behavior: In[BehaviorState]
     tracks: In[TrackState]
     baselines_cfg: Const[BaselinesConfig]
     mapping_cfg: Const[MappingConfig]
     obstacle_cfg: Const[VelocityObstacleConfig]
     tank_cfg: Const[TankConfig]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
     vehicle_cfg: Const[VehicleConfig]
 
 
@@ -99,13 +99,13 @@ class PathIntegralIO:
     ego: In[Proprioception]
     forecast: In[ForecastState]
     mission: In[MissionState]
-    teacher: In[TeacherState]
+    behavior: In[BehaviorState]
     baselines_cfg: Const[BaselinesConfig]
     episode_cfg: Const[EpisodeConfig]
     mapping_cfg: Const[MappingConfig]
     mppi_cfg: Const[PathIntegralConfig]
     tank_cfg: Const[TankConfig]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
     tracking_cfg: Const[TrackingConfig]
     vehicle_cfg: Const[VehicleConfig]
 

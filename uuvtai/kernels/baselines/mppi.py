@@ -4,8 +4,8 @@ Integral Control: From Theory to Parallel Computation", Journal of Guidance, Con
 
 Random sequences of velocities around the last plan are rolled out; the plan becomes their mean, weighted by
 exp(-cost / temperature), its first velocity is commanded, and the rest is the next decision's start. The
-model is the vehicle's velocity loop (a first-order lag), bodies move as forecast, costs are those of
-tracking the wanted velocity, of bodies and of the map. Adapted: the noise is correlated in time, since
+model is the vehicle's velocity loop (a first-order lag), obstacles move as forecast, costs are those of
+tracking the wanted velocity, of obstacles and of the map. Adapted: the noise is correlated in time, since
 white noise is gone after the lag; one trial each is the plan itself, the wanted velocity, and a stop, and
 one in eight samples spreads around the wanted velocity instead of the plan, so that a plan that leads
 nowhere is given up.
@@ -43,7 +43,7 @@ _NEGLIGIBLE = 16.0
 @ti.kernel
 def plan_path_integral(io: Bundle[PathIntegralIO]):
     """One iteration of MPPI for the rows that decide in this step."""
-    n, n_sample = ti.static(io.clock.awake.shape[0], io.mppi_cfg.n_sample)
+    n, n_sample = ti.static(io.clock.active.shape[0], io.mppi_cfg.n_sample)
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and decides(env, io.clock, io.baselines_cfg):
             _shift(env, io)
@@ -61,7 +61,7 @@ def plan_path_integral(io: Bundle[PathIntegralIO]):
 @ti.func
 def _wanted(env, io: Bundle[PathIntegralIO]):
     return wanted_velocity(
-        env, io.ego, io.mission, io.teacher, io.baselines_cfg, io.tank_cfg, io.teacher_cfg, io.vehicle_cfg
+        env, io.ego, io.mission, io.behavior, io.baselines_cfg, io.tank_cfg, io.behavior_cfg, io.vehicle_cfg
     )
 
 
@@ -121,16 +121,18 @@ def _base(env, sample, k, wanted, io: Bundle[PathIntegralIO]):
 def _cost(env, sample, io: Bundle[PathIntegralIO]):
     """Cost of one sample: of its states, and of the control's share that the theory asks for."""
     n_control = ti.static(io.baselines.plan_w.shape[1])
-    step_s, lag = ti.static(io.baselines_cfg.period_steps * io.episode_cfg.control_dt_s, io.teacher_cfg.lag_s)
+    step_s, lag = ti.static(
+        io.baselines_cfg.period_steps * io.episode_cfg.control_dt_s, io.behavior_cfg.lag_s
+    )
     decay = ti.static(2.718281828459045 ** (-step_s / lag))
     wanted, key, yaw = _wanted(env, io), _key(env, io), io.ego.rpy[env][2]
     begin, at, own = io.ego.pos_w[env], io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], yaw)
-    here = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.teacher_cfg)
+    here = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
     cost, noise, is_touching = 0.0, ti.Vector([0.0, 0.0, 0.0]), 0.0
     for k in range(n_control):
         noise = _noise(key, sample, k, noise, io)
         base = _base(env, sample, k, wanted, io)
-        command = speed_limited(base + noise, yaw, io.teacher_cfg, io.vehicle_cfg)
+        command = speed_limited(base + noise, yaw, io.behavior_cfg, io.vehicle_cfg)
         command[2] = edge_stopped(command[2], at[2], io.tank_cfg, io.baselines_cfg)
         at += command * step_s + (own - command) * (lag * (1.0 - decay))
         own = command + (own - command) * decay
@@ -159,10 +161,10 @@ def _state_cost(env, k, at, here, io: Bundle[PathIntegralIO]):
         ti.cast(time * ti.static(1.0 / io.tracking_cfg.forecast_dt_s) + 0.5, ti.i32),
         ti.static(io.forecast.radius_m.shape[2] - 1),
     )
-    free = nearest_body_m(env, sample, at, io.forecast, io.baselines_cfg, io.teacher_cfg)
-    mapped = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.teacher_cfg)
+    free = nearest_body_m(env, sample, at, io.forecast, io.baselines_cfg, io.behavior_cfg)
+    mapped = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
     margin = ti.static(io.mppi_cfg.margin_m) + ti.static(io.mppi_cfg.margin_growth_m_s) * time
-    cost = ti.static(io.mppi_cfg.weight_body) * ti.max(margin - free, 0.0)
+    cost = ti.static(io.mppi_cfg.weight_obstacle) * ti.max(margin - free, 0.0)
     cost += ti.static(io.mppi_cfg.weight_static) * ti.max(
         ti.static(io.baselines_cfg.static_margin_m) - mapped, 0.0
     )
@@ -190,5 +192,5 @@ def _average(env, io: Bundle[PathIntegralIO]):
                 io.baselines.change_w[env, k] += weight * (_base(env, sample, k, wanted, io) + noise)
     for k in range(n_control):
         io.baselines.plan_w[env, k] = speed_limited(
-            io.baselines.change_w[env, k] / total, yaw, io.teacher_cfg, io.vehicle_cfg
+            io.baselines.change_w[env, k] / total, yaw, io.behavior_cfg, io.vehicle_cfg
         )

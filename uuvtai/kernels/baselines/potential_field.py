@@ -3,9 +3,9 @@ Robots", International Journal of Robotics Research 5(1), 1986.
 
 The goal pulls, and whatever is nearer than its reach pushes with FIRAS, gain (1 / d - 1 / reach) / d^2
 along the way out. Adapted: the force is taken as the velocity to be commanded, for the inner loop is a
-velocity loop; the pull is the velocity-limited one of the paper, towards the local goal; bodies count where
-they are now, whatever their velocity; of the mapped obstacles and walls the nearest pushes; a body that is
-known to be above or below pushes down or up too.
+velocity loop; the pull is the velocity-limited one of the paper, towards the local goal; obstacles count
+where they are now, whatever their velocity; of the mapped obstacles and walls the nearest pushes; an obstacle
+that is known to be above or below pushes down or up too.
 """
 
 import taichi as ti
@@ -28,20 +28,20 @@ from uuvtai.kernels.core.stage import Bundle, spread
 @ti.kernel
 def plan_potential_field(io: Bundle[PotentialFieldIO]):
     """Velocity along the sum of pull and pushes for the rows that decide in this step."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and decides(env, io.clock, io.baselines_cfg):
             pull = wanted_velocity(
                 env,
                 io.ego,
                 io.mission,
-                io.teacher,
+                io.behavior,
                 io.baselines_cfg,
                 io.tank_cfg,
-                io.teacher_cfg,
+                io.behavior_cfg,
                 io.vehicle_cfg,
             )
-            force = pull + _push_of_bodies(env, io) + _push_of_map(env, io)
+            force = pull + _push_of_obstacles(env, io) + _push_of_map(env, io)
             heave = ti.static(io.baselines_cfg.heave_m_s)
             if ti.static(heave > 0):
                 force[2] = edge_stopped(
@@ -52,7 +52,9 @@ def plan_potential_field(io: Bundle[PotentialFieldIO]):
                 )
             else:
                 force[2] = pull[2]
-            io.baselines.vel_w[env] = speed_limited(force, io.ego.rpy[env][2], io.teacher_cfg, io.vehicle_cfg)
+            io.baselines.vel_w[env] = speed_limited(
+                force, io.ego.rpy[env][2], io.behavior_cfg, io.vehicle_cfg
+            )
 
 
 @ti.func
@@ -63,7 +65,7 @@ def _firas(distance_m, reach_m, gain, io: Bundle[PotentialFieldIO]):
 
 
 @ti.func
-def _push_of_bodies(env, io: Bundle[PotentialFieldIO]):
+def _push_of_obstacles(env, io: Bundle[PotentialFieldIO]):
     pos, push = io.ego.pos_w[env], ti.Vector([0.0, 0.0, 0.0])
     for track in range(ti.static(io.forecast.radius_m.shape[1])):
         radius = io.forecast.radius_m[env, track, 0]
@@ -72,12 +74,12 @@ def _push_of_bodies(env, io: Bundle[PotentialFieldIO]):
             middle = ti.max(off.norm(), 1.0e-6)
             gap = free_water_m(env, track, pos[2], io.forecast, io.baselines_cfg)
             apart = apart_m(middle - radius, gap)
-            # the body's surface is ``apart`` away, most of it on the level or most of it up or down
+            # the obstacle's surface is ``apart`` away, most of it on the level or most of it up or down
             rise = ti.select(gap > 0.0, gap / ti.max(apart, 1.0e-6), 0.0)
             out = off / middle * ti.sqrt(ti.max(1.0 - rise * rise, 0.0))
             is_above = io.forecast.above_w[env, track] - pos[2] < pos[2] - io.forecast.below_w[env, track]
             size = _firas(
-                apart - ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m),
+                apart - ti.static(io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m),
                 ti.static(io.field_cfg.reach_m),
                 ti.static(io.field_cfg.gain),
                 io,
@@ -89,7 +91,7 @@ def _push_of_bodies(env, io: Bundle[PotentialFieldIO]):
 @ti.func
 def _push_of_map(env, io: Bundle[PotentialFieldIO]):
     """From the nearest mapped obstacle or wall, on the level."""
-    away = io.teacher.away_w[env]
-    room = mapped_m(env, io.ego.pos_w[env], io.clearance, io.mapping_cfg, io.tank_cfg, io.teacher_cfg)
+    away = io.behavior.away_w[env]
+    room = mapped_m(env, io.ego.pos_w[env], io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
     size = _firas(room, ti.static(io.field_cfg.static_reach_m), ti.static(io.field_cfg.static_gain), io)
     return size * ti.Vector([away[0], away[1], 0.0])

@@ -1,10 +1,10 @@
 """Velocity obstacles after Fiorini and Shiller, "Motion Planning in Dynamic Environments Using Velocity
 Obstacles", International Journal of Robotics Research 17(7), 1998.
 
-A velocity lies in a body's cone if it meets the body, grown by the hull, within the horizon, while the body
-goes straight on. Of the velocities that can be reached and lie outside all cones the one nearest to the
-wanted velocity is driven. Adapted: the vehicle's lag (a new velocity v leads to where it would if the
-vehicle began to drive it from x + (v0 - v) lag); bodies that it passes above or below have no cone; mapped
+A velocity lies in an obstacle's cone if it meets the obstacle, grown by the hull, within the horizon, while
+the obstacle goes straight on. Of the velocities that can be reached and lie outside all cones the one nearest
+to the wanted velocity is driven. Adapted: the vehicle's lag (a new velocity v leads to where it would if the
+vehicle began to drive it from x + (v0 - v) lag); obstacles that it passes above or below have no cone; mapped
 obstacles and walls forbid the velocities that come too near to them; where every velocity is in a cone, the
 one that collides last is driven (the paper leaves that to the designer).
 """
@@ -34,7 +34,7 @@ _MAP_STEP_S = 0.1
 @ti.kernel
 def plan_velocity_obstacle(io: Bundle[VelocityObstacleIO]):
     """Velocity of least cost for the rows that decide in this step."""
-    n, n_trial = ti.static(io.clock.awake.shape[0], io.baselines_cfg.n_reachable)
+    n, n_trial = ti.static(io.clock.active.shape[0], io.baselines_cfg.n_reachable)
     for env, trial in ti.ndrange(n, n_trial):
         if decides(env, io.clock, io.baselines_cfg):
             io.baselines.score[env, trial] = _cost(env, _trial(env, trial, io), io)
@@ -51,7 +51,7 @@ def plan_velocity_obstacle(io: Bundle[VelocityObstacleIO]):
 @ti.func
 def _wanted(env, io: Bundle[VelocityObstacleIO]):
     return wanted_velocity(
-        env, io.ego, io.mission, io.teacher, io.baselines_cfg, io.tank_cfg, io.teacher_cfg, io.vehicle_cfg
+        env, io.ego, io.mission, io.behavior, io.baselines_cfg, io.tank_cfg, io.behavior_cfg, io.vehicle_cfg
     )
 
 
@@ -65,7 +65,7 @@ def _trial(env, trial, io: Bundle[VelocityObstacleIO]):
         ti.static(io.obstacle_cfg.window_s),
         io.baselines_cfg,
         io.tank_cfg,
-        io.teacher_cfg,
+        io.behavior_cfg,
         io.vehicle_cfg,
     )
 
@@ -76,7 +76,7 @@ def _cost(env, velocity, io: Bundle[VelocityObstacleIO]):
     hit_s = _map_hit_s(env, velocity, io)
     for track in range(ti.static(io.forecast.radius_m.shape[1])):
         if io.forecast.radius_m[env, track, 0] >= 0:
-            hit_s = ti.min(hit_s, _body_hit_s(env, track, velocity, io))
+            hit_s = ti.min(hit_s, _obstacle_hit_s(env, track, velocity, io))
     out = (velocity - _wanted(env, io)).norm()
     if hit_s < FAR_M:
         out = _FORBIDDEN + out - 10.0 * hit_s
@@ -84,21 +84,22 @@ def _cost(env, velocity, io: Bundle[VelocityObstacleIO]):
 
 
 @ti.func
-def _body_hit_s(env, track, velocity, io: Bundle[VelocityObstacleIO]):
-    """Time [s] at which a velocity meets a body's grown outline within the horizon; FAR_M = outside its cone.
+def _obstacle_hit_s(env, track, velocity, io: Bundle[VelocityObstacleIO]):
+    """Time [s] at which a velocity meets an obstacle's grown outline within the horizon; FAR_M = outside its
+    cone.
 
     Where it is inside at once: the depth [m] below 0, so that the least deep is the best of bad ones. Who is
     nearer than the margin already keeps what is left of it.
     """
     pos, own = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
-    begin = pos + (own - velocity) * ti.static(io.teacher_cfg.lag_s)
-    state, body = io.tracks.state[env, track], io.forecast.pos_w[env, track, 0]
-    ahead = body - ti.Vector([begin[0], begin[1]])
+    begin = pos + (own - velocity) * ti.static(io.behavior_cfg.lag_s)
+    state, obstacle = io.tracks.state[env, track], io.forecast.pos_w[env, track, 0]
+    ahead = obstacle - ti.Vector([begin[0], begin[1]])
     closing = ti.Vector([velocity[0] - state[2], velocity[1] - state[3]])
     touch = io.forecast.radius_m[env, track, 0] + ti.static(
-        io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m
+        io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m
     )
-    kept = (body - ti.Vector([pos[0], pos[1]])).norm() - touch
+    kept = (obstacle - ti.Vector([pos[0], pos[1]])).norm() - touch
     reach = touch + ti.math.clamp(kept, 0.0, ti.static(io.obstacle_cfg.margin_m))
     speed2, along = closing.norm_sqr(), ahead.dot(closing)
     depth = reach - ahead.norm()
@@ -119,9 +120,9 @@ def _body_hit_s(env, track, velocity, io: Bundle[VelocityObstacleIO]):
 
 @ti.func
 def _passes(env, track, z, heave, first_s, last_s, io: Bundle[VelocityObstacleIO]):
-    """Whether the hull is clear above or below the body from ``first_s`` to ``last_s``: free water has no
+    """Whether the hull is clear above or below the obstacle from ``first_s`` to ``last_s``: free water has no
     corners, so both ends decide."""
-    needed = ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m + io.obstacle_cfg.margin_m)
+    needed = ti.static(io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m + io.obstacle_cfg.margin_m)
     first = free_water_m(env, track, z + heave * first_s, io.forecast, io.baselines_cfg)
     last = free_water_m(env, track, z + heave * last_s, io.forecast, io.baselines_cfg)
     return ti.min(first, last) > needed
@@ -133,8 +134,8 @@ def _map_hit_s(env, velocity, io: Bundle[VelocityObstacleIO]):
     never."""
     n_sample = ti.static(max(1, round(io.obstacle_cfg.static_horizon_s / _MAP_STEP_S)))
     pos, own = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
-    lag = ti.static(io.teacher_cfg.lag_s)
-    here = mapped_m(env, pos, io.clearance, io.mapping_cfg, io.tank_cfg, io.teacher_cfg)
+    lag = ti.static(io.behavior_cfg.lag_s)
+    here = mapped_m(env, pos, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
     wanted = ti.min(ti.static(io.baselines_cfg.static_margin_m), here)
     out = FAR_M
     for k in range(1, n_sample + 1):
@@ -142,7 +143,7 @@ def _map_hit_s(env, velocity, io: Bundle[VelocityObstacleIO]):
         settle = lag * (1.0 - ti.exp(-time / lag))
         at = pos + own * settle + velocity * (time - settle)
         if out == FAR_M and (
-            mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.teacher_cfg) < wanted
+            mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg) < wanted
         ):
             out = time
     return out

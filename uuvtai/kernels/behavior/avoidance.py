@@ -4,13 +4,13 @@ rolled out in packets."""
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.config.behavior import BURST, CHANGE, CONTACT, DEVIATION, HEAVE, MEAN, PEAK, SOFTNESS, STATIC
+from uuvtai.config.behavior import BURST, CHANGE, CONTACT, DEVIATION, HEAVE, MEAN, PEAK, STATIC, TEMPERATURE
 from uuvtai.kernels.behavior.io import EvasionIO
 from uuvtai.kernels.behavior.rollout import (
-    body_depths,
     depth_band,
     drive_of,
     edge_gap,
+    obstacle_depths,
     place_doubt,
     static_depths,
     tuned,
@@ -25,28 +25,28 @@ from uuvtai.kernels.core.stage import Bundle, Const, spread
 def plan_evasion(io: Bundle[EvasionIO]):
     """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is
     as good as the best one."""
-    n, lanes = ti.static(io.clock.awake.shape[0], n_lane())
-    n_packet = ti.static(io.teacher.candidate_cost.shape[1] // lanes)
+    n, lanes = ti.static(io.clock.active.shape[0], n_lane())
+    n_packet = ti.static(io.behavior.candidate_cost.shape[1] // lanes)
     for env, packet in ti.ndrange(n, n_packet):
-        if io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
+        if io.clock.active[env] == 1 and io.behavior.want_evade[env] == 1:
             cx, cy, cz = candidate_lanes(env, packet * lanes, lanes, io)
             burst_s = ti.select(
-                packet * lanes >= io.teacher_cfg.first_burst,
-                io.teacher_cfg.burst_s * tuned(env, BURST, io.teacher),
+                packet * lanes >= io.behavior_cfg.first_burst,
+                io.behavior_cfg.burst_s * tuned(env, BURST, io.behavior),
                 FAR_M,
             )
             cost = cost_lanes(env, cx, cy, cz, burst_s, io)
             for i in ti.static(range(lanes)):
-                io.teacher.candidate_cost[env, packet * lanes + i] = cost[i]
+                io.behavior.candidate_cost[env, packet * lanes + i] = cost[i]
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.behavior.want_evade[env] == 1:
             index, best_cost, mean = _chosen(env, io)
             cx, cy, cz = filled(mean[0], lanes), filled(mean[1], lanes), filled(mean[2], lanes)
             cost = cost_lanes(env, cx, cy, cz, FAR_M, io)
-            good = cost[0] <= best_cost + io.teacher_cfg.softness * tuned(env, SOFTNESS, io.teacher)
-            io.teacher.evade_vel_w[env] = ti.select(good, mean, candidate(env, index, io))
-            io.teacher.evade_candidate[env] = ti.select(good, -1, index)
-            io.teacher.evade_cost[env] = ti.select(good, cost[0], best_cost)
+            good = cost[0] <= best_cost + io.behavior_cfg.temperature * tuned(env, TEMPERATURE, io.behavior)
+            io.behavior.evade_vel_w[env] = ti.select(good, mean, candidate(env, index, io))
+            io.behavior.evade_candidate[env] = ti.select(good, -1, index)
+            io.behavior.evade_cost[env] = ti.select(good, cost[0], best_cost)
 
 
 @ti.func
@@ -68,27 +68,29 @@ def candidate(env, index, io: Bundle[EvasionIO]):
     Padding repeats standing still.
     """
     n_level, n_heave = ti.static(
-        io.teacher_cfg.n_heading * io.teacher_cfg.n_speed, io.teacher_cfg.n_heave_heading
+        io.behavior_cfg.n_heading * io.behavior_cfg.n_speed, io.behavior_cfg.n_heave_heading
     )
-    follow = io.teacher.follow_vel_w[env]
+    follow = io.behavior.follow_vel_w[env]
     out = ti.Vector([0.0, 0.0, 0.0])
-    if index >= ti.static(io.teacher_cfg.first_burst):
-        turn = ti.static(TWO_PI / 32) * (index - ti.static(io.teacher_cfg.first_burst))
+    if index >= ti.static(io.behavior_cfg.first_burst):
+        turn = ti.static(TWO_PI / 32) * (index - ti.static(io.behavior_cfg.first_burst))
         out = _towards(env, turn, 1.0, follow[2], io)
     elif index < n_level:
-        speed = 1.0 / ti.static(io.teacher_cfg.n_speed) * (index // ti.static(io.teacher_cfg.n_heading) + 1)
-        turn = ti.static(TWO_PI / io.teacher_cfg.n_heading) * (index % ti.static(io.teacher_cfg.n_heading))
+        speed = 1.0 / ti.static(io.behavior_cfg.n_speed) * (index // ti.static(io.behavior_cfg.n_heading) + 1)
+        turn = ti.static(TWO_PI / io.behavior_cfg.n_heading) * (index % ti.static(io.behavior_cfg.n_heading))
         out = _towards(env, turn, speed, follow[2], io)
     elif index == n_level + 1:
-        out = io.teacher.last_vel_w[env]
+        out = io.behavior.last_vel_w[env]
         out[2] = edge_limited(env, out[2], io)
     elif index == n_level + 2:
         out = follow
-    elif index > n_level + 2 and index < ti.static(io.teacher_cfg.n_held):
+    elif index > n_level + 2 and index < ti.static(io.behavior_cfg.n_held):
         nth = index - n_level - 3
-        heave = ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s * tuned(env, HEAVE, io.teacher)
+        heave = (
+            ti.select(nth % 2 == 0, 1.0, -1.0) * io.behavior_cfg.heave_m_s * tuned(env, HEAVE, io.behavior)
+        )
         heave = edge_limited(env, heave, io)
-        turn = ti.static(TWO_PI / io.teacher_cfg.n_heave_heading) * (nth // 2)
+        turn = ti.static(TWO_PI / io.behavior_cfg.n_heave_heading) * (nth // 2)
         out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, io)
     return out
 
@@ -96,16 +98,18 @@ def candidate(env, index, io: Bundle[EvasionIO]):
 @ti.func
 def _towards(env, turn, share, heave, io: Bundle[EvasionIO]):
     """World velocity at an angle from the follow direction, at a share of the speed possible there."""
-    follow = io.teacher.follow_vel_w[env]
+    follow = io.behavior.follow_vel_w[env]
     heading = ti.atan2(follow[1], follow[0]) + turn
-    speed = share * ti.min(ti.static(io.teacher_cfg.evade_m_s), speed_limit(heading - io.ego.rpy[env][2], io))
+    speed = share * ti.min(
+        ti.static(io.behavior_cfg.evade_m_s), speed_limit(heading - io.ego.rpy[env][2], io)
+    )
     return ti.Vector([ti.cos(heading) * speed, ti.sin(heading) * speed, heave])
 
 
 @ti.func
 def edge_limited(env, heave, io: Bundle[EvasionIO]):
     """Heave [m/s] that stops at the band's edges instead of running into floor or surface."""
-    low, high = depth_band(edge_gap(env, io.ego, io.teacher_cfg), io.tank_cfg)
+    low, high = depth_band(edge_gap(env, io.ego, io.behavior_cfg), io.tank_cfg)
     own_z = io.ego.pos_w[env][2]
     return ti.math.clamp(heave, ti.min(low - own_z, 0.0), ti.max(high - own_z, 0.0))
 
@@ -123,33 +127,34 @@ def speed_limit(angle, io: Bundle[EvasionIO]):
 def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
     """Cost of a packet of commanded velocities. Violations count by depth: a flat penalty drives straight on
     when every candidate is bad."""
-    drive = drive_of(env, cx, cy, cz, burst_s, io.ego, io.teacher, io.teacher_cfg)
-    peak, mean, contact, _ = body_depths(
-        env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
+    drive = drive_of(env, cx, cy, cz, burst_s, io.ego, io.behavior, io.behavior_cfg)
+    peak, mean, contact, _ = obstacle_depths(
+        env, drive, io.forecast, io.futures, io.behavior_cfg, io.tracking_cfg, io.tank_cfg
     )
-    doubt = place_doubt(io.ego.pose_cov[env], io.teacher_cfg)
+    doubt = place_doubt(io.ego.pose_cov[env], io.behavior_cfg)
     static_mean, static_contact = static_depths(
         env,
         drive,
         doubt,
         io.clearance,
-        io.teacher_cfg,
+        io.behavior_cfg,
         io.tank_cfg,
         io.mapping_cfg,
     )
-    off = _distance_lanes(cx, cy, cz, io.teacher.follow_vel_w[env]) * (
-        ti.static(io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s)
-        * tuned(env, DEVIATION, io.teacher)
+    off = _distance_lanes(cx, cy, cz, io.behavior.follow_vel_w[env]) * (
+        ti.static(io.behavior_cfg.weight_deviation / io.behavior_cfg.cruise_m_s)
+        * tuned(env, DEVIATION, io.behavior)
     )
-    change = _distance_lanes(cx, cy, cz, io.teacher.last_vel_w[env]) * (
-        ti.static(io.teacher_cfg.weight_change / io.teacher_cfg.cruise_m_s) * tuned(env, CHANGE, io.teacher)
+    change = _distance_lanes(cx, cy, cz, io.behavior.last_vel_w[env]) * (
+        ti.static(io.behavior_cfg.weight_change / io.behavior_cfg.cruise_m_s)
+        * tuned(env, CHANGE, io.behavior)
     )
-    of_peak = io.teacher_cfg.weight_peak * tuned(env, PEAK, io.teacher)
-    of_mean = io.teacher_cfg.weight_mean * tuned(env, MEAN, io.teacher)
-    of_contact = io.teacher_cfg.weight_contact * tuned(env, CONTACT, io.teacher)
-    of_static = io.teacher_cfg.weight_static * tuned(env, STATIC, io.teacher)
+    of_peak = io.behavior_cfg.weight_peak * tuned(env, PEAK, io.behavior)
+    of_mean = io.behavior_cfg.weight_mean * tuned(env, MEAN, io.behavior)
+    of_contact = io.behavior_cfg.weight_contact * tuned(env, CONTACT, io.behavior)
+    of_static = io.behavior_cfg.weight_static * tuned(env, STATIC, io.behavior)
     moving = peak * of_peak + mean * of_mean
-    touching = contact * of_contact + static_contact * ti.static(io.teacher_cfg.weight_static_contact)
+    touching = contact * of_contact + static_contact * ti.static(io.behavior_cfg.weight_static_contact)
     return moving + touching + static_mean * of_static + off + change
 
 
@@ -164,17 +169,17 @@ def _distance_lanes(cx, cy, cz, velocity):
 @ti.func
 def _chosen(env, io: Bundle[EvasionIO]):
     """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost /
-    softness)."""
-    n_used = ti.static(io.teacher_cfg.n_candidate)
+    temperature)."""
+    n_used = ti.static(io.behavior_cfg.n_candidate)
     best_cost, best = FAR_M, 0
     for index in range(n_used):
-        if io.teacher.candidate_cost[env, index] < best_cost:
-            best_cost = io.teacher.candidate_cost[env, index]
+        if io.behavior.candidate_cost[env, index] < best_cost:
+            best_cost = io.behavior.candidate_cost[env, index]
             best = index
     total, mean = 0.0, ti.Vector([0.0, 0.0, 0.0])
-    sharpness = ti.static(1.0 / io.teacher_cfg.softness) / tuned(env, SOFTNESS, io.teacher)
+    sharpness = ti.static(1.0 / io.behavior_cfg.temperature) / tuned(env, TEMPERATURE, io.behavior)
     for index in range(n_used):
-        excess = (io.teacher.candidate_cost[env, index] - best_cost) * sharpness
+        excess = (io.behavior.candidate_cost[env, index] - best_cost) * sharpness
         if excess < 12.0:
             weight = ti.exp(-excess)
             total += weight

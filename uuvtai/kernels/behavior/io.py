@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uuvtai.config import (
-    ElevationConfig,
+    BehaviorConfig,
     EpisodeConfig,
     FastConfig,
+    HeightConfig,
     MappingConfig,
     SonarConfig,
     TankConfig,
-    TeacherConfig,
     TrackingConfig,
     TrafficConfig,
     VehicleConfig,
@@ -19,6 +19,7 @@ from uuvtai.config import (
 from uuvtai.kernels.core.stage import Const, In, Out
 from uuvtai.state import (
     BaselineState,
+    BehaviorState,
     ClearanceState,
     ClockState,
     ForecastState,
@@ -27,7 +28,6 @@ from uuvtai.state import (
     Proprioception,
     RouteState,
     SonarScan,
-    TeacherState,
     TrackState,
     TreeTable,
 )
@@ -37,7 +37,7 @@ from uuvtai.state import (
 class EvasionIO:
     """The evasive velocity of least cost."""
 
-    teacher: Out[TeacherState]
+    behavior: Out[BehaviorState]
     clearance: In[ClearanceState]
     clock: In[ClockState]
     ego: In[Proprioception]
@@ -45,16 +45,16 @@ class EvasionIO:
     futures: In[FutureState]
     mapping_cfg: Const[MappingConfig]
     tank_cfg: Const[TankConfig]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
     tracking_cfg: Const[TrackingConfig]
     vehicle_cfg: Const[VehicleConfig]
 
 
 @dataclass(frozen=True, eq=False)
-class TeacherIO:
+class BehaviorIO:
     """The behaviour tree and its action."""
 
-    teacher: Out[TeacherState]
+    behavior: Out[BehaviorState]
     baselines: In[BaselineState]
     clock: In[ClockState]
     ego: In[Proprioception]
@@ -63,7 +63,7 @@ class TeacherIO:
     table: In[TreeTable]
     episode_cfg: Const[EpisodeConfig]
     sonar_cfg: Const[SonarConfig]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
     vehicle_cfg: Const[VehicleConfig]
 
 
@@ -71,7 +71,7 @@ class TeacherIO:
 class ThreatsIO:
     """What is dangerous now."""
 
-    teacher: Out[TeacherState]
+    behavior: Out[BehaviorState]
     clearance: In[ClearanceState]
     clock: In[ClockState]
     ego: In[Proprioception]
@@ -81,22 +81,22 @@ class ThreatsIO:
     route: In[RouteState]
     scan: In[SonarScan]
     tracks: In[TrackState]
-    elevation_cfg: Const[ElevationConfig]
+    height_cfg: Const[HeightConfig]
     episode_cfg: Const[EpisodeConfig]
     fast_cfg: Const[FastConfig]
     mapping_cfg: Const[MappingConfig]
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
     tracking_cfg: Const[TrackingConfig]
     traffic_cfg: Const[TrafficConfig]
     vehicle_cfg: Const[VehicleConfig]
 
 
 @dataclass(frozen=True, eq=False)
-class TeacherStages:
+class BehaviorStages:
     """Bundles of this room, by the noun of their stage."""
 
     threats: ThreatsIO
     evasion: EvasionIO
-    teacher: TeacherIO
+    behavior: BehaviorIO

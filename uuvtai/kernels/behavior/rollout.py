@@ -1,4 +1,4 @@
-"""Roll-outs of a packet of commanded velocities at once against forecast bodies and the mapped clearance.
+"""Roll-outs of a packet of commanded velocities at once against forecast obstacles and the mapped clearance.
 
 A commanded velocity c is reached with a first-order lag tau, so from velocity v0 the vehicle drives
 x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): linear in c, which is all the
@@ -9,22 +9,22 @@ from typing import Any
 
 import taichi as ti
 
-from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
+from uuvtai.config import BehaviorConfig, MappingConfig, TankConfig, TrackingConfig, VehicleConfig
 from uuvtai.config.behavior import CAUTION, CLOSING, DOUBT, GROWTH, HORIZON, LAG, STATIC_MARGIN, VERTICAL
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.simd import filled
 from uuvtai.kernels.core.stage import Const, In, Out
-from uuvtai.state import ClearanceState, ForecastState, FutureState, Proprioception, TeacherState
+from uuvtai.state import BehaviorState, ClearanceState, ForecastState, FutureState, Proprioception
 
 _SLACK_S = 1.0e-3
 """the last sample is within the horizon, however times are rounded"""
 
 
 @ti.func
-def tuned(env, number, teacher: In[TeacherState]):
+def tuned(env, number, behavior: In[BehaviorState]):
     """Factor on one of the config's numbers in this row and at this time (``tuned_numbers``)."""
-    share, log_factor = ti.max(teacher.alert[env], 0.0), teacher.tuned[env, number]
+    share, log_factor = ti.max(behavior.alert[env], 0.0), behavior.tuned[env, number]
     return ti.exp((1.0 - share) * log_factor[0] + share * log_factor[1])
 
 
@@ -36,11 +36,11 @@ def drive_of(
     cz,
     burst_s,
     ego: In[Proprioception],
-    teacher: In[TeacherState],
-    teacher_cfg: Const[TeacherConfig],
+    behavior: In[BehaviorState],
+    behavior_cfg: Const[BehaviorConfig],
 ):
     """A packet of commanded velocities (lanes x, y, z [m/s]) from where the vehicle is, and what it is judged
-    by: the struct ``drive`` of ``body_depths``."""
+    by: the struct ``drive`` of ``obstacle_depths``."""
     return ti.Struct(
         x=cx,
         y=cy,
@@ -48,76 +48,76 @@ def drive_of(
         burst_s=burst_s,
         pos=ego.pos_w[env],
         vel=turned_z3(ego.vel_b[env], ego.rpy[env][2]),
-        gap=edge_gap(env, ego, teacher_cfg),
-        caution=teacher_cfg.caution * tuned(env, CAUTION, teacher) * teacher.patience[env],
-        growth_m_s=teacher_cfg.margin_growth_m_s * tuned(env, GROWTH, teacher),
-        closing_s=teacher_cfg.closing_s * tuned(env, CLOSING, teacher) * teacher.patience[env],
-        horizon_s=teacher_cfg.horizon_s * tuned(env, HORIZON, teacher) + _SLACK_S,
-        slower=tuned(env, LAG, teacher),
-        vertical=teacher_cfg.vertical_weight * tuned(env, VERTICAL, teacher),
-        doubt=teacher_cfg.body_doubt * tuned(env, DOUBT, teacher) - 1.0,
-        static_margin_m=teacher_cfg.static_margin_m * tuned(env, STATIC_MARGIN, teacher),
+        gap=edge_gap(env, ego, behavior_cfg),
+        caution=behavior_cfg.caution * tuned(env, CAUTION, behavior) * behavior.patience[env],
+        growth_m_s=behavior_cfg.margin_growth_m_s * tuned(env, GROWTH, behavior),
+        closing_s=behavior_cfg.closing_s * tuned(env, CLOSING, behavior) * behavior.patience[env],
+        horizon_s=behavior_cfg.horizon_s * tuned(env, HORIZON, behavior) + _SLACK_S,
+        slower=tuned(env, LAG, behavior),
+        vertical=behavior_cfg.vertical_weight * tuned(env, VERTICAL, behavior),
+        doubt=behavior_cfg.obstacle_growth * tuned(env, DOUBT, behavior) - 1.0,
+        static_margin_m=behavior_cfg.static_margin_m * tuned(env, STATIC_MARGIN, behavior),
     )
 
 
 @ti.func
-def body_depths(
+def obstacle_depths(
     env,
     drive,
     forecast: In[ForecastState],
     futures: In[FutureState],
-    teacher_cfg: Const[TeacherConfig],
+    behavior_cfg: Const[BehaviorConfig],
     tracking_cfg: Const[TrackingConfig],
     tank_cfg: Const[TankConfig],
 ):
-    """How deep each commanded velocity violates the wanted clearance from the forecast bodies.
+    """How deep each commanded velocity violates the wanted clearance from the forecast obstacles.
 
     ``drive``: struct of the velocities (lanes x, y, z [m/s]), which are commanded for ``burst_s`` [s], then
     stop, and of the own position ``pos`` [m] and velocity ``vel`` [m/s] now, world, the ``gap`` [m] kept from
     floor and surface, and the row's own margins, weights, horizon and lag (``drive_of``). Returns lanes:
-    largest depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact
-    [m]; time of the first violation [s], FAR_M = none. Each body counts with the mean of its futures,
-    weighted by their probabilities; a future that is less probable than ``heed_share`` has no first
-    violation. The clearance is reduced by closing_s times the closing speed, as the referee also stops at a
-    small time to collision. Bodies are upright cylinders; water known to be free above or below them
-    (``above_w``, ``below_w``) adds to the distance.
+    largest depth [m]; depth averaged over the horizon and summed over obstacles [m]; largest depth below
+    contact [m]; time of the first violation [s], FAR_M = none. Each body counts with the mean of its futures,
+    weighted by their probabilities; a future that is less probable than ``evade_probability`` has no first
+    violation. The clearance is reduced by closing_s times the closing speed, as the termination check also
+    stops at a small time to collision. Obstacles are upright cylinders; water known to be free above or below
+    them (``above_w``, ``below_w``) adds to the distance.
     """
     found = _no_depths(drive)
     for track in range(ti.static(forecast.radius_m.shape[1])):
         near = forecast.radius_m[env, track, 0] >= 0
-        if near and _within_reach(env, track, drive, forecast, teacher_cfg, tracking_cfg):
-            left, body = 1.0, _no_depths(drive)
+        if near and _within_reach(env, track, drive, forecast, behavior_cfg, tracking_cfg):
+            left, obstacle = 1.0, _no_depths(drive)
             for nth in range(ti.static(futures.share.shape[2] + 1)):
                 future = ti.static(futures.share.shape[2]) - 1 - nth  # the forecast itself comes last: -1
                 likely = left
                 if future >= 0:
                     likely = futures.share[env, track, future]
-                if likely > ti.static(teacher_cfg.least_share):
+                if likely > ti.static(behavior_cfg.least_share):
                     left -= likely
                     one = _future_depths(
-                        env, track, future, drive, forecast, futures, teacher_cfg, tracking_cfg, tank_cfg
+                        env, track, future, drive, forecast, futures, behavior_cfg, tracking_cfg, tank_cfg
                     )
-                    _take_future(found, body, one, likely, teacher_cfg)
+                    _take_future(found, obstacle, one, likely, behavior_cfg)
             for i in ti.static(range(drive.x.n)):
-                found.peak[i] = ti.max(found.peak[i], body.peak[i])
-                found.contact[i] = ti.max(found.contact[i], body.contact[i])
+                found.peak[i] = ti.max(found.peak[i], obstacle.peak[i])
+                found.contact[i] = ti.max(found.contact[i], obstacle.contact[i])
     return found.peak, found.mean, found.contact, found.first
 
 
 @ti.func
-def _take_future(found: Out[Any], body: Out[Any], one, likely, teacher_cfg: Const[TeacherConfig]):
+def _take_future(found: Out[Any], obstacle: Out[Any], one, likely, behavior_cfg: Const[BehaviorConfig]):
     """Add the depths of ``one`` future, as ``likely`` as it is, to those of its body and of all."""
     found.mean += likely * one.mean
-    body.peak += likely * one.peak
-    body.contact += likely * one.contact
-    if likely >= ti.static(teacher_cfg.heed_share):
+    obstacle.peak += likely * one.peak
+    obstacle.contact += likely * one.contact
+    if likely >= ti.static(behavior_cfg.evade_probability):
         for i in ti.static(range(one.first.n)):
             found.first[i] = ti.min(found.first[i], one.first[i])
 
 
 @ti.func
 def _no_depths(drive):
-    """Depths of no body at all, a lane per velocity."""
+    """Depths of no obstacle at all, a lane per velocity."""
     zero = filled(0.0, drive.x.n)
     return ti.Struct(peak=zero, mean=zero, contact=zero, first=filled(FAR_M, drive.x.n))
 
@@ -128,19 +128,19 @@ def _within_reach(
     track,
     drive,
     forecast: In[ForecastState],
-    teacher_cfg: Const[TeacherConfig],
+    behavior_cfg: Const[BehaviorConfig],
     tracking_cfg: Const[TrackingConfig],
 ):
-    """Whether a body can come so near within the horizon that any of its futures counts for any lane."""
+    """Whether an obstacle can come so near within the horizon that any of its futures counts for any lane."""
     first, second = forecast.pos_w[env, track, 0], forecast.pos_w[env, track, 1]
-    n = ti.static(_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
+    n = ti.static(_samples(forecast.radius_m.shape[2], behavior_cfg, tracking_cfg))
     time = ti.static((n - 1) * tracking_cfg.forecast_dt_s)
     closing = (second - first).norm() * ti.static(1.05 / tracking_cfg.forecast_dt_s)
-    closing += ti.Vector([drive.vel[0], drive.vel[1]]).norm() + ti.static(_fastest(teacher_cfg))
+    closing += ti.Vector([drive.vel[0], drive.vel[1]]).norm() + ti.static(_fastest(behavior_cfg))
     told = forecast.radius_m[env, track, n - 1]
     bound = told + ti.max(drive.doubt, 0.0) * ti.max(told - forecast.radius_m[env, track, 0], 0.0)
-    bound += ti.static(teacher_cfg.hull_reach_m)
-    bound += _wanted_m(time, drive, teacher_cfg) + closing * (time + drive.closing_s)
+    bound += ti.static(behavior_cfg.hull_reach_m)
+    bound += _wanted_m(time, drive, behavior_cfg) + closing * (time + drive.closing_s)
     return (first - ti.Vector([drive.pos[0], drive.pos[1]])).norm_sqr() < bound * bound
 
 
@@ -152,22 +152,22 @@ def _future_depths(
     drive,
     forecast: In[ForecastState],
     futures: In[FutureState],
-    teacher_cfg: Const[TeacherConfig],
+    behavior_cfg: Const[BehaviorConfig],
     tracking_cfg: Const[TrackingConfig],
     tank_cfg: Const[TankConfig],
 ):
-    """The lanes' depths for one future of one body; -1 = its forecast."""
-    n_sample = ti.static(_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
+    """The lanes' depths for one future of one obstacle; -1 = its forecast."""
+    n_sample = ti.static(_samples(forecast.radius_m.shape[2], behavior_cfg, tracking_cfg))
     dt = ti.static(tracking_cfg.forecast_dt_s)
     low, high = depth_band(drive.gap, tank_cfg)
     found = _no_depths(drive)
     level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
-    reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
+    reach_speed = level_vel.norm() + ti.static(_fastest(behavior_cfg))
     above, below = forecast.above_w[env, track], forecast.below_w[env, track]
-    step_decay = ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s)) * ti.exp(
-        ti.static(-tracking_cfg.forecast_dt_s / teacher_cfg.lag_s) * (1.0 / drive.slower - 1.0)
+    step_decay = ti.static(_decay(tracking_cfg.forecast_dt_s, behavior_cfg.lag_s)) * ti.exp(
+        ti.static(-tracking_cfg.forecast_dt_s / behavior_cfg.lag_s) * (1.0 / drive.slower - 1.0)
     )
-    lag_s = teacher_cfg.lag_s * drive.slower
+    lag_s = behavior_cfg.lag_s * drive.slower
     decay, rest, before = 1.0, 1.0, forecast.pos_w[env, track, 0]
     for k in range(1, n_sample):
         # exp(-t / tau) by one factor a sample: settle = A(t), gain = B(t) - B(t - T), and the
@@ -176,64 +176,68 @@ def _future_depths(
         time = k * dt
         over = ti.max(time - drive.burst_s, 0.0)
         if over > 0.0:
-            rest = ti.exp(over * ti.static(-1.0 / teacher_cfg.lag_s) / drive.slower)
+            rest = ti.exp(over * ti.static(-1.0 / behavior_cfg.lag_s) / drive.slower)
         settle = lag_s * (1.0 - decay)
         gain = time - settle - over + lag_s * (1.0 - rest)
-        body, wanted = forecast.pos_w[env, track, k], _wanted_m(time, drive, teacher_cfg)
+        obstacle, wanted = forecast.pos_w[env, track, k], _wanted_m(time, drive, behavior_cfg)
         if future >= 0:
-            body = futures.pos_w[env, track, future, k]
-            wanted -= ti.static(1.0 - teacher_cfg.future_margin) * (wanted - teacher_cfg.contact_m)
-        body_vel = (body - before) / dt
-        before = body
-        start = level + level_vel * settle - body
-        drift = level_vel * decay - body_vel
+            obstacle = futures.pos_w[env, track, future, k]
+            wanted -= ti.static(1.0 - behavior_cfg.future_margin) * (wanted - behavior_cfg.contact_m)
+        obstacle_vel = (obstacle - before) / dt
+        before = obstacle
+        start = level + level_vel * settle - obstacle
+        drift = level_vel * decay - obstacle_vel
         told = forecast.radius_m[env, track, k]
         radius = told + drive.doubt * (told - forecast.radius_m[env, track, 0])
-        bound = _bound_m(radius, wanted, gain, drive.closing_s * (reach_speed + body_vel.norm()), teacher_cfg)
+        bound = _bound_m(
+            radius, wanted, gain, drive.closing_s * (reach_speed + obstacle_vel.norm()), behavior_cfg
+        )
         if told >= 0 and time <= drive.horizon_s and start.norm_sqr() < bound * bound:
             z = ti.math.clamp(drive.z * gain + (drive.pos[2] + drive.vel[2] * settle), low, high)
             gap = ti.max(ti.min(above - z, z - below), 0.0) * drive.vertical
             free = _free_lanes(
-                drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, drive.closing_s, teacher_cfg
+                drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, drive.closing_s, behavior_cfg
             )
-            _deepen(found, wanted, free, time, n_sample - 1, teacher_cfg)
+            _deepen(found, wanted, free, time, n_sample - 1, behavior_cfg)
     return found
 
 
 @ti.func
-def _bound_m(radius, wanted, gain, reserve, teacher_cfg: Const[TeacherConfig]):
+def _bound_m(radius, wanted, gain, reserve, behavior_cfg: Const[BehaviorConfig]):
     """Distance [m] of ``start`` beyond which no lane's depth is above 0: however c is chosen, a lane comes no
     nearer than |start| - fastest x gain, and what closing takes off is at most ``reserve`` [m]."""
-    bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted
-    bound += ti.static(_fastest(teacher_cfg)) * gain
+    bound = radius + ti.static(behavior_cfg.hull_reach_m) + wanted
+    bound += ti.static(_fastest(behavior_cfg)) * gain
     return bound + reserve
 
 
 @ti.func
-def _deepen(found: Out[Any], wanted, free, time, n_ahead: Const[int], teacher_cfg: Const[TeacherConfig]):
-    """Take one sample of one body into the lanes' largest and mean depths and first violations."""
+def _deepen(found: Out[Any], wanted, free, time, n_ahead: Const[int], behavior_cfg: Const[BehaviorConfig]):
+    """Take one sample of one obstacle into the lanes' largest and mean depths and first violations."""
     for i in ti.static(range(free.n)):
         depth = ti.max(wanted - free[i], 0.0)
         found.peak[i] = ti.max(found.peak[i], depth)
         found.mean[i] += depth * ti.static(1.0 / n_ahead)
-        found.contact[i] = ti.max(found.contact[i], ti.static(teacher_cfg.contact_m) - free[i])
+        found.contact[i] = ti.max(found.contact[i], ti.static(behavior_cfg.contact_m) - free[i])
         found.first[i] = ti.min(found.first[i], ti.select(depth > 0.0, time, FAR_M))
 
 
 @ti.func
-def _wanted_m(time, drive, teacher_cfg: Const[TeacherConfig]):
+def _wanted_m(time, drive, behavior_cfg: Const[BehaviorConfig]):
     """Clearance [m] wanted ``time`` [s] ahead: it grows as the forecast's error does."""
-    margin = teacher_cfg.margin_m + drive.growth_m_s * time
-    return teacher_cfg.contact_m + drive.caution * margin
+    margin = behavior_cfg.margin_m + drive.growth_m_s * time
+    return behavior_cfg.contact_m + drive.caution * margin
 
 
 @ti.func
-def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, closing_s, teacher_cfg: Const[TeacherConfig]):
+def _free_lanes(
+    cx, cy, gap, start, drift, gain, share, radius, closing_s, behavior_cfg: Const[BehaviorConfig]
+):
     """Surface-to-surface distance less closing_s times the closing speed, per lane; ``gap`` = weighted free
     water above or below.
 
-    Position relative to the body is start + c gain, relative velocity drift + c share. Level with the body
-    (gap 0) the distance goes on below zero inside its radius, so that deeper is worse.
+    Position relative to the obstacle is start + c gain, relative velocity drift + c share. Level with the
+    obstacle (gap 0) the distance goes on below zero inside its radius, so that deeper is worse.
     """
     dx = cx * gain + start[0]
     dy = cy * gain + start[1]
@@ -243,7 +247,7 @@ def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, closing_s, teach
     distance = ti.sqrt(beyond * beyond + gap * gap + 1.0e-8)
     approach = -(dx * (cx * share + drift[0]) + dy * (cy * share + drift[1])) / middle
     closing = ti.max(approach, 0.0) * ti.select(gap > 0.0, beyond / distance, 1.0)
-    return distance + within - ti.static(teacher_cfg.hull_reach_m) - closing_s * closing
+    return distance + within - ti.static(behavior_cfg.hull_reach_m) - closing_s * closing
 
 
 @ti.func
@@ -252,20 +256,20 @@ def static_depths(
     drive,
     doubt,
     clearance: In[ClearanceState],
-    teacher_cfg: Const[TeacherConfig],
+    behavior_cfg: Const[BehaviorConfig],
     tank_cfg: Const[TankConfig],
     mapping_cfg: Const[MappingConfig],
 ):
     """How deep each commanded velocity of ``drive_of`` violates the wanted static clearance, ``doubt`` [m]
     (of ``place_doubt``) more than is mapped: lanes mean depth and largest depth below contact [m]."""
     mean, contact = filled(0.0, drive.x.n), filled(0.0, drive.x.n)
-    n_sample = ti.static(max(1, round(teacher_cfg.static_horizon_s / teacher_cfg.static_dt_s)))
-    touch = ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m)
+    n_sample = ti.static(max(1, round(behavior_cfg.static_horizon_s / behavior_cfg.static_dt_s)))
+    touch = ti.static(behavior_cfg.hull_reach_m + behavior_cfg.contact_m)
     for k in range(1, n_sample + 1):
-        time = k * ti.static(teacher_cfg.static_dt_s)
-        settle = settling(time, drive.slower, teacher_cfg)
+        time = k * ti.static(behavior_cfg.static_dt_s)
+        settle = settling(time, drive.slower, behavior_cfg)
         over = ti.max(time - drive.burst_s, 0.0)
-        gain = time - settle - over + settling(over, drive.slower, teacher_cfg)
+        gain = time - settle - over + settling(over, drive.slower, behavior_cfg)
         free = clearance_lanes(
             env,
             drive.x * gain + (drive.pos[0] + drive.vel[0] * settle),
@@ -282,10 +286,10 @@ def static_depths(
 
 
 @ti.func
-def settling(time, slower, teacher_cfg: Const[TeacherConfig]):
+def settling(time, slower, behavior_cfg: Const[BehaviorConfig]):
     """A(t) [s] of the module's text, with ``slower`` times the lag."""
-    rate = ti.static(1.0 / teacher_cfg.lag_s) / slower
-    return teacher_cfg.lag_s * slower * (1.0 - ti.exp(-time * rate))
+    rate = ti.static(1.0 / behavior_cfg.lag_s) / slower
+    return behavior_cfg.lag_s * slower * (1.0 - ti.exp(-time * rate))
 
 
 @ti.func
@@ -307,49 +311,49 @@ def clearance_lanes(
 
 
 @ti.func
-def held_heave(error_m, teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]):
+def held_heave(error_m, behavior_cfg: Const[BehaviorConfig], vehicle_cfg: Const[VehicleConfig]):
     """Vertical speed [m/s] that corrects a depth error [m]."""
     top = ti.static(vehicle_cfg.max_heave_m_s)
-    return ti.math.clamp(error_m * ti.static(teacher_cfg.depth_gain), -top, top)
+    return ti.math.clamp(error_m * ti.static(behavior_cfg.depth_gain), -top, top)
 
 
 @ti.func
-def edge_gap(env, ego: In[Proprioception], teacher_cfg: Const[TeacherConfig]):
+def edge_gap(env, ego: In[Proprioception], behavior_cfg: Const[BehaviorConfig]):
     """[m] to keep from floor and surface: the less sure of the own z, and with a dead vertical thruster, the
     more."""
-    least = ti.select(ego.given_up[env] != 0, teacher_cfg.lost_edge_gap_m, 0.0)
-    return ti.max(teacher_cfg.edge_gap_m, least) + teacher_cfg.edge_sigmas * ti.sqrt(ego.z_var[env])
+    least = ti.select(ego.given_up[env] != 0, behavior_cfg.lost_edge_gap_m, 0.0)
+    return ti.max(behavior_cfg.edge_gap_m, least) + behavior_cfg.edge_sigmas * ti.sqrt(ego.z_var[env])
 
 
 @ti.func
 def depth_band(gap, tank_cfg: Const[TankConfig]):
-    """(lowest, highest) own z [m] that the teacher steers for, ``gap`` [m] off floor and surface."""
+    """(lowest, highest) own z [m] that the behaviour tree steers for, ``gap`` [m] off floor and surface."""
     floor, top = ti.static(tank_cfg.z_m)
     gap = ti.min(gap, ti.static(0.5 * (tank_cfg.z_m[1] - tank_cfg.z_m[0])))
     return floor + gap, top - gap
 
 
 @ti.func
-def place_doubt(pose_cov, teacher_cfg: Const[TeacherConfig]):
+def place_doubt(pose_cov, behavior_cfg: Const[BehaviorConfig]):
     """[m] by which the clearance from walls and mapped obstacles may be smaller than the map says: the less
     sure the own place is in its worst direction (``pose_cov``: upper triangle of x, y, heading), the larger.
     """
     half, apart = 0.5 * (pose_cov[0] + pose_cov[3]), 0.5 * (pose_cov[0] - pose_cov[3])
     worst = half + ti.sqrt(apart * apart + pose_cov[1] * pose_cov[1])
-    return teacher_cfg.place_sigmas * ti.sqrt(ti.max(worst, 0.0))
+    return behavior_cfg.place_sigmas * ti.sqrt(ti.max(worst, 0.0))
 
 
 def _decay(dt_s, lag_s):
     return 2.718281828459045 ** (-dt_s / lag_s)
 
 
-def _fastest(teacher_cfg):
+def _fastest(behavior_cfg):
     """[m/s] no level velocity that is ever rolled out is faster."""
     return max(
-        teacher_cfg.evade_m_s, teacher_cfg.cruise_m_s, teacher_cfg.back_off_m_s, teacher_cfg.unstick_m_s
+        behavior_cfg.evade_m_s, behavior_cfg.cruise_m_s, behavior_cfg.back_off_m_s, behavior_cfg.unstick_m_s
     )
 
 
-def _samples(n_forecast, teacher_cfg, tracking_cfg):
+def _samples(n_forecast, behavior_cfg, tracking_cfg):
     """Forecast samples used: the horizon, or what there is."""
-    return min(n_forecast, round(teacher_cfg.horizon_s / tracking_cfg.forecast_dt_s) + 1)
+    return min(n_forecast, round(behavior_cfg.horizon_s / tracking_cfg.forecast_dt_s) + 1)

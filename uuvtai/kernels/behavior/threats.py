@@ -6,15 +6,15 @@ import math
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.config import ElevationConfig, SonarConfig, TeacherConfig, TrafficConfig, VehicleConfig
-from uuvtai.config.behavior import ARRIVAL, CALM, DEPTH_CHANGE, GAZE, GOAL_DEPTH, SLOPE, TTC
+from uuvtai.config import BehaviorConfig, HeightConfig, SonarConfig, TrafficConfig, VehicleConfig
+from uuvtai.config.behavior import ARRIVAL, DEPTH_CHANGE, GOAL_DEPTH, HEADING_RANGE, HYSTERESIS, SLOPE, TTC
 from uuvtai.kernels.behavior.io import ThreatsIO
 from uuvtai.kernels.behavior.rollout import (
-    body_depths,
     depth_band,
     drive_of,
     edge_gap,
     held_heave,
+    obstacle_depths,
     place_doubt,
     tuned,
 )
@@ -34,66 +34,66 @@ def edge_of_sight(sonar_cfg):
     return math.radians(0.5 * sonar_cfg.horizontal_aperture_deg)
 
 
-def widest_way(sonar_cfg, teacher_cfg):
+def widest_way(sonar_cfg, behavior_cfg):
     """[rad] from ahead within which the way is well in sight; plain Python."""
-    return max(edge_of_sight(sonar_cfg) - math.radians(teacher_cfg.sight_margin_deg), 0.0)
+    return max(edge_of_sight(sonar_cfg) - math.radians(behavior_cfg.sight_margin_deg), 0.0)
 
 
 @ti.func
-def sight_share(off, sonar_cfg: Const[SonarConfig], teacher_cfg: Const[TeacherConfig]):
+def sight_share(off, sonar_cfg: Const[SonarConfig], behavior_cfg: Const[BehaviorConfig]):
     """Share of the speed at which a way may be driven that lies ``off`` [rad] from ahead."""
     share = 1.0
     if ti.static(not sonar_cfg.is_ring):
-        edge, wide = ti.static(edge_of_sight(sonar_cfg), widest_way(sonar_cfg, teacher_cfg))
+        edge, wide = ti.static(edge_of_sight(sonar_cfg), widest_way(sonar_cfg, behavior_cfg))
         inside = edge - ti.abs(wrapped_angle(off))
         share = ti.math.clamp(inside / ti.static(max(edge - wide, 1.0e-3)), 0.0, 1.0)
     return share
 
 
 @ti.func
-def sweep_share(age_s, sonar_cfg: Const[SonarConfig], teacher_cfg: Const[TeacherConfig]):
+def sweep_share(age_s, sonar_cfg: Const[SonarConfig], behavior_cfg: Const[BehaviorConfig]):
     """Share of the cruising speed that a mechanical beam allows, ``age_s`` after the start: what it has not
     looked at for long may have changed. None in the first sweep."""
     share = 1.0
     if ti.static(sonar_cfg.mechanical):
-        allowed = ti.static(min(teacher_cfg.sweep_way_m / sonar_cfg.sweep_s / teacher_cfg.cruise_m_s, 1.0))
+        allowed = ti.static(min(behavior_cfg.sweep_way_m / sonar_cfg.sweep_s / behavior_cfg.cruise_m_s, 1.0))
         share = ti.select(age_s < ti.static(sonar_cfg.sweep_s), 0.0, allowed)
     return share
 
 
 @ti.func
-def kept_in_sight(turn, way, sonar_cfg: Const[SonarConfig], teacher_cfg: Const[TeacherConfig]):
+def kept_in_sight(turn, way, sonar_cfg: Const[SonarConfig], behavior_cfg: Const[BehaviorConfig]):
     """Angle to turn by, next to ``turn``, after which a way that lies ``way`` [rad] from ahead is well in
     sight."""
-    wide = ti.static(widest_way(sonar_cfg, teacher_cfg))
+    wide = ti.static(widest_way(sonar_cfg, behavior_cfg))
     return wrapped_angle(way + ti.math.clamp(wrapped_angle(turn - way), -wide, wide))
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Which depth to cruise at: where the fewest moving bodies are to be met, as far as the goal's depth can
+# Which depth to cruise at: where the fewest moving obstacles are to be met, as far as the goal's depth can
 # still be reached in time; with a dead vertical thruster at the goal's.
 
 
 _BLUR_M = 0.1
-"""A body's edge is known to this, vertically."""
+"""An obstacle's edge is known to this, vertically."""
 
 
 @ti.func
 def choose_depth(env, io: Bundle[ThreatsIO]):
     """Set ``cruise_z_m``: the cheapest of ``depth_choices`` depths from edge to edge."""
-    low, high = depth_band(edge_gap(env, io.ego, io.teacher_cfg), io.tank_cfg)
+    low, high = depth_band(edge_gap(env, io.ego, io.behavior_cfg), io.tank_cfg)
     goal, pos = io.mission.goal_w[env], io.ego.pos_w[env]
     wanted = ti.math.clamp(goal[2], low, high)
-    if ti.static(io.teacher_cfg.free_depth):
+    if ti.static(io.behavior_cfg.free_depth):
         best_cost, best = FAR_M, wanted
-        of_goal = io.teacher_cfg.weight_goal_depth * tuned(env, GOAL_DEPTH, io.teacher)
-        of_change = io.teacher_cfg.weight_depth_change * tuned(env, DEPTH_CHANGE, io.teacher)
-        n = ti.static(io.teacher_cfg.depth_choices)
-        before = ti.math.clamp(io.teacher.cruise_z_m[env], low, high)
+        of_goal = io.behavior_cfg.weight_goal_depth * tuned(env, GOAL_DEPTH, io.behavior)
+        of_change = io.behavior_cfg.weight_depth_change * tuned(env, DEPTH_CHANGE, io.behavior)
+        n = ti.static(io.behavior_cfg.depth_choices)
+        before = ti.math.clamp(io.behavior.cruise_z_m[env], low, high)
         for choice in range(n):
             z = low + (high - low) * (choice / ti.max(n - 1, 1))
-            cost = ti.static(io.teacher_cfg.weight_traffic) * level_share(
-                z, io.traffic_cfg, io.elevation_cfg, io.teacher_cfg, io.vehicle_cfg
+            cost = ti.static(io.behavior_cfg.weight_traffic) * level_share(
+                z, io.traffic_cfg, io.height_cfg, io.behavior_cfg, io.vehicle_cfg
             )
             cost += of_goal * ti.abs(z - goal[2])
             cost += of_change * ti.abs(z - before)
@@ -101,10 +101,10 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
                 best_cost, best = cost, z
         away = ti.Vector([goal[0] - pos[0], goal[1] - pos[1]]).norm()
         radius = ti.static(io.episode_cfg.goal_radius_m)
-        slope = io.teacher_cfg.return_slope * tuned(env, SLOPE, io.teacher)
-        share = io.teacher_cfg.arrival_depth_share * tuned(env, ARRIVAL, io.teacher)
+        slope = io.behavior_cfg.return_slope * tuned(env, SLOPE, io.behavior)
+        share = io.behavior_cfg.arrival_depth_share * tuned(env, ARRIVAL, io.behavior)
         off = share * radius + slope * ti.max(away - radius, 0.0)
-        io.teacher.cruise_z_m[env] = best
+        io.behavior.cruise_z_m[env] = best
         if io.ego.given_up[env] == 0:
             wanted = ti.math.clamp(ti.math.clamp(best, goal[2] - off, goal[2] + off), low, high)
     return wanted
@@ -114,23 +114,23 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
 def level_share(
     z,
     traffic_cfg: Const[TrafficConfig],
-    elevation_cfg: Const[ElevationConfig],
-    teacher_cfg: Const[TeacherConfig],
+    height_cfg: Const[HeightConfig],
+    behavior_cfg: Const[BehaviorConfig],
     vehicle_cfg: Const[VehicleConfig],
 ):
-    """Share of the expected bodies that a vehicle at ``z`` [m] would touch, were it at the same place."""
+    """Share of the expected obstacles that a vehicle at ``z`` [m] would touch, were it at the same place."""
     low, high = ti.static(traffic_cfg.z_m)
-    reach = ti.static(_reach_m(traffic_cfg, teacher_cfg, vehicle_cfg))
+    reach = ti.static(_reach_m(traffic_cfg, behavior_cfg, vehicle_cfg))
     blur = ti.static(0.5 * _BLUR_M)
     above = ti.min(high + blur, z + reach)
     below = ti.max(low - blur, z - reach)
     share = ti.math.clamp((above - below) * ti.static(1.0 / (high - low + 2 * blur)), 0.0, 1.0)
-    return elevation_cfg.column_share + (1.0 - elevation_cfg.column_share) * share
+    return height_cfg.column_share + (1.0 - height_cfg.column_share) * share
 
 
-def _reach_m(traffic_cfg, teacher_cfg, vehicle_cfg):
-    """[m] a body's centre nearer than this in height touches the hull."""
-    return 0.25 * sum(traffic_cfg.height_m) + vehicle_cfg.hull_radius_m + teacher_cfg.contact_m
+def _reach_m(traffic_cfg, behavior_cfg, vehicle_cfg):
+    """[m] an obstacle's centre nearer than this in height touches the hull."""
+    return 0.25 * sum(traffic_cfg.height_m) + vehicle_cfg.hull_radius_m + behavior_cfg.contact_m
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -148,9 +148,9 @@ _NEARER_M = 0.2
 @ti.kernel
 def assess_threats(io: Bundle[ThreatsIO]):
     """Fill the blackboard, and decide which envs must plan an evasion in this step."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             if io.scan.fresh[env] == 1:
                 _sense_contact(env, io)
             _read_clearance(env, io)
@@ -180,10 +180,10 @@ def _sense_contact(env, io: Bundle[ThreatsIO]):
                 nearest = gap
                 nearest_beam = beam
     turned = io.scan.ping_yaw[env] - io.ego.rpy[env][2]
-    io.teacher.ttc_s[env] = ttc
-    io.teacher.threat_bearing[env] = wrapped_angle(turned + beam_bearing(threat, io.sonar_cfg))
-    io.teacher.nearest_m[env] = nearest - ti.static(io.teacher_cfg.hull_reach_m)
-    io.teacher.nearest_bearing[env] = wrapped_angle(turned + beam_bearing(nearest_beam, io.sonar_cfg))
+    io.behavior.ttc_s[env] = ttc
+    io.behavior.threat_bearing[env] = wrapped_angle(turned + beam_bearing(threat, io.sonar_cfg))
+    io.behavior.nearest_m[env] = nearest - ti.static(io.behavior_cfg.hull_reach_m)
+    io.behavior.nearest_bearing[env] = wrapped_angle(turned + beam_bearing(nearest_beam, io.sonar_cfg))
 
 
 @ti.func
@@ -191,11 +191,11 @@ def _beam_ttc(env, beam, io: Bundle[ThreatsIO]):
     """Time until what the beam hit reaches the hull's contact distance; FAR_M where it does not approach."""
     closing = -range_rate(env, beam, io.scan, io.tracks, io.sonar_cfg)
     out = FAR_M
-    if io.scan.hit[env, beam] == 1 and closing > ti.static(io.teacher_cfg.emergency_closing_m_s):
+    if io.scan.hit[env, beam] == 1 and closing > ti.static(io.behavior_cfg.emergency_closing_m_s):
         out = (
             ti.max(
                 io.scan.range_m[env, beam]
-                - ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m),
+                - ti.static(io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m),
                 0.0,
             )
             / closing
@@ -210,8 +210,8 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
     pos = io.ego.pos_w[env]
     n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
     cell = _held_cell(pos, n_row, n_col, io)
-    doubt = place_doubt(io.ego.pose_cov[env], io.teacher_cfg)
-    io.teacher.clearance_m[env] = io.clearance.clearance_m[env, cell[0], cell[1]] - doubt
+    doubt = place_doubt(io.ego.pose_cov[env], io.behavior_cfg)
+    io.behavior.clearance_m[env] = io.clearance.clearance_m[env, cell[0], cell[1]] - doubt
     away = ti.Vector([0.0, 0.0])
     if io.clearance.site_row[env, cell[0], cell[1]] >= 0:
         site = centre_of(
@@ -221,11 +221,11 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
             ti.static(io.mapping_cfg.cell_m),
         )
         away = _unit(ti.Vector([pos[0] - site[0], pos[1] - site[1]]))
-    io.teacher.away_w[env] = away
+    io.behavior.away_w[env] = away
     here = ti.Vector([pos[0], pos[1]])
     steer, room = (
         ti.Vector([io.route.lookahead_w[env][0], io.route.lookahead_w[env][1]]),
-        io.teacher.clearance_m[env],
+        io.behavior.clearance_m[env],
     )
     if io.route.n_way[env] > 0:
         room = _room_to(env, here, steer, doubt, io)
@@ -234,7 +234,7 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
             if (
                 room
                 < ti.static(
-                    io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m + io.teacher_cfg.static_margin_m
+                    io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m + io.behavior_cfg.static_margin_m
                 )
                 and nth < io.route.n_ahead[env]
             ):
@@ -242,15 +242,15 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
                 wider = _room_to(env, here, point, doubt, io)
                 if wider > room:
                     steer, room = point, wider
-    io.teacher.path_clearance_m[env] = room
-    io.teacher.steer_w[env] = steer - here
+    io.behavior.path_clearance_m[env] = room
+    io.behavior.steer_w[env] = steer - here
 
 
 @ti.func
 def _room_to(env, here, there, doubt, io: Bundle[ThreatsIO]):
     """Smallest mapped clearance [m] on the straight way to a place, the own one included, less ``doubt``."""
     n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
-    smallest = io.teacher.clearance_m[env]
+    smallest = io.behavior.clearance_m[env]
     for k in range(1, _PATH_SAMPLES + 1):
         on_way = _held_cell(here + (there - here) * (k / _PATH_SAMPLES), n_row, n_col, io)
         smallest = ti.min(smallest, io.clearance.clearance_m[env, on_way[0], on_way[1]] - doubt)
@@ -271,40 +271,40 @@ def _unit(v):
 @ti.func
 def _follow_velocity(env, io: Bundle[ThreatsIO]):
     """Level velocity towards the point that is steered for, slower in narrow places; zero without a route."""
-    level = io.teacher.steer_w[env]
+    level = io.behavior.steer_w[env]
     room = (
-        io.teacher.clearance_m[env] - ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m)
-    ) / ti.static(io.teacher_cfg.slow_clearance_m)
-    share = ti.static(io.teacher_cfg.slow_fraction) + ti.static(
-        1.0 - io.teacher_cfg.slow_fraction
+        io.behavior.clearance_m[env] - ti.static(io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m)
+    ) / ti.static(io.behavior_cfg.slow_clearance_m)
+    share = ti.static(io.behavior_cfg.slow_fraction) + ti.static(
+        1.0 - io.behavior_cfg.slow_fraction
     ) * ti.math.clamp(room, 0.0, 1.0)
     sideways = ti.abs(ti.sin(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2]))
-    if io.teacher.path_clearance_m[env] < ti.static(
-        io.teacher_cfg.askew_clearance_m
+    if io.behavior.path_clearance_m[env] < ti.static(
+        io.behavior_cfg.sideslip_clearance_m
     ):  # across the way the hull is wider: let it turn first
         share *= 1.0 - 0.6 * sideways
-    share *= sight_share(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2], io.sonar_cfg, io.teacher_cfg)
+    share *= sight_share(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2], io.sonar_cfg, io.behavior_cfg)
     age_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
-    share *= sweep_share(age_s, io.sonar_cfg, io.teacher_cfg)
-    io.teacher.speed_share[env] = ti.select(io.route.n_way[env] > 0, share, 0.0)
+    share *= sweep_share(age_s, io.sonar_cfg, io.behavior_cfg)
+    io.behavior.speed_share[env] = ti.select(io.route.n_way[env] > 0, share, 0.0)
     wanted = _unit(level) * cruising_speed(
-        ti.static(io.teacher_cfg.cruise_m_s),
-        io.teacher.speed_share[env],
-        io.teacher.path_clearance_m[env],
-        io.teacher_cfg,
+        ti.static(io.behavior_cfg.cruise_m_s),
+        io.behavior.speed_share[env],
+        io.behavior.path_clearance_m[env],
+        io.behavior_cfg,
         io.vehicle_cfg,
     )
-    io.teacher.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], io.teacher.follow_vel_w[env][2]])
+    io.behavior.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], io.behavior.follow_vel_w[env][2]])
 
 
 @ti.func
 def cruising_speed(
-    top_m_s, share, room_m, teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]
+    top_m_s, share, room_m, behavior_cfg: Const[BehaviorConfig], vehicle_cfg: Const[VehicleConfig]
 ):
     """[m/s] along the route: a ``share`` of the wanted speed, and in narrow places, where the nose lies along
     the way and no diagonal of the body is faster, no more than the nose drives ahead."""
     speed = top_m_s * share
-    if room_m <= ti.static(teacher_cfg.gaze_clearance_m):
+    if room_m <= ti.static(behavior_cfg.heading_clearance_m):
         speed = ti.min(speed, ti.static(vehicle_cfg.max_surge_m_s))
     return speed
 
@@ -321,23 +321,23 @@ def _note_speeds(env, io: Bundle[ThreatsIO]):
     if fastest >= 0.0:
         slow, fast = ti.static(io.fast_cfg.from_m_s, io.fast_cfg.full_m_s)
         now = ti.math.clamp((fastest - slow) / ti.static(max(fast - slow, 1e-6)), 0.0, 1.0)
-        before = io.teacher.alert[env]
+        before = io.behavior.alert[env]
         rate = ti.static(
-            min(1.0, io.teacher_cfg.decide_period_steps * io.episode_cfg.control_dt_s / io.fast_cfg.settle_s)
+            min(1.0, io.behavior_cfg.decide_period_steps * io.episode_cfg.control_dt_s / io.fast_cfg.settle_s)
         )
-        io.teacher.alert[env] = ti.select(before < 0.0, now, before + rate * (now - before))
+        io.behavior.alert[env] = ti.select(before < 0.0, now, before + rate * (now - before))
 
 
 @ti.func
 def _note_waiting(env, io: Bundle[ThreatsIO]):
     """Count the time in which the vehicle does not come on along its way, and what patience it leaves."""
-    vel, way = turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2]), _unit(io.teacher.steer_w[env])
-    slow = 1.0 - ti.Vector([vel[0], vel[1]]).dot(way) / io.teacher_cfg.waiting_m_s
-    period_s = ti.static(io.teacher_cfg.decide_period_steps * io.episode_cfg.control_dt_s)
-    waited = ti.max(io.teacher.waited_s[env] + period_s * slow, 0.0)
-    io.teacher.waited_s[env] = waited
-    if io.teacher_cfg.patience_s > 0:
-        io.teacher.patience[env] = ti.min(1.0, io.teacher_cfg.patience_s / ti.max(waited, 1.0e-3))
+    vel, way = turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2]), _unit(io.behavior.steer_w[env])
+    slow = 1.0 - ti.Vector([vel[0], vel[1]]).dot(way) / io.behavior_cfg.waiting_m_s
+    period_s = ti.static(io.behavior_cfg.decide_period_steps * io.episode_cfg.control_dt_s)
+    waited = ti.max(io.behavior.waited_s[env] + period_s * slow, 0.0)
+    io.behavior.waited_s[env] = waited
+    if io.behavior_cfg.patience_s > 0:
+        io.behavior.patience[env] = ti.min(1.0, io.behavior_cfg.patience_s / ti.max(waited, 1.0e-3))
 
 
 @ti.func
@@ -347,64 +347,68 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
 
     Depth is changed only where that comes no nearer to any body: what is above or below is easily forgotten.
     """
-    io.teacher.want_evade[env] = 0
-    io.teacher.calm_steps[env] += 1
-    if io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0:
+    io.behavior.want_evade[env] = 0
+    io.behavior.hysteresis_steps[env] += 1
+    if io.clock.step[env] % ti.static(io.behavior_cfg.decide_period_steps) == 0:
         _note_speeds(env, io)
         _note_waiting(env, io)
         pos = io.ego.pos_w[env]
-        follow = io.teacher.follow_vel_w[env]
-        heave = held_heave(choose_depth(env, io) - pos[2], io.teacher_cfg, io.vehicle_cfg)
+        follow = io.behavior.follow_vel_w[env]
+        heave = held_heave(choose_depth(env, io) - pos[2], io.behavior_cfg, io.vehicle_cfg)
         # lanes 0 to 2: follow at this depth, follow and change depth, stop; the others repeat lane 0
         lanes = ti.static(max(n_lane(), 3))
         cz = filled(0.0, lanes)
         cz[1] = heave
         cx, cy = filled(follow[0], lanes), filled(follow[1], lanes)
         cx[2], cy[2] = 0.0, 0.0
-        drive = drive_of(env, cx, cy, cz, FAR_M, io.ego, io.teacher, io.teacher_cfg)
-        peak, _, _, first = body_depths(
-            env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
+        drive = drive_of(env, cx, cy, cz, FAR_M, io.ego, io.behavior, io.behavior_cfg)
+        peak, _, _, first = obstacle_depths(
+            env, drive, io.forecast, io.futures, io.behavior_cfg, io.tracking_cfg, io.tank_cfg
         )
         climbs = peak[1] <= peak[0] + 1.0e-3
-        io.teacher.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
-        io.teacher.conflict_s[env] = ti.select(climbs, first[1], first[0])
-        io.teacher.hold_conflict_s[env] = first[2]
-        gap, way = _nearest_body(env, pos, io)
-        io.teacher.body_near_m[env] = gap
-        io.teacher.gaze_w[env] = way * ti.cast(
-            io.teacher.path_clearance_m[env] > ti.static(io.teacher_cfg.gaze_clearance_m), ti.f32
+        io.behavior.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
+        io.behavior.conflict_s[env] = ti.select(climbs, first[1], first[0])
+        io.behavior.hold_conflict_s[env] = first[2]
+        gap, way = _nearest_obstacle(env, pos, io)
+        io.behavior.obstacle_near_m[env] = gap
+        io.behavior.heading_w[env] = way * ti.cast(
+            io.behavior.path_clearance_m[env] > ti.static(io.behavior_cfg.heading_clearance_m), ti.f32
         )
-        if io.teacher.conflict_s[env] < FAR_M:
-            io.teacher.calm_steps[env] = 0
-        calm = io.teacher.calm_steps[env] * ti.static(io.episode_cfg.control_dt_s)
-        urgent = io.teacher.ttc_s[env] < io.teacher_cfg.emergency_ttc_s * tuned(env, TTC, io.teacher)
+        if io.behavior.conflict_s[env] < FAR_M:
+            io.behavior.hysteresis_steps[env] = 0
+        quiet_s = io.behavior.hysteresis_steps[env] * ti.static(io.episode_cfg.control_dt_s)
+        urgent = io.behavior.ttc_s[env] < io.behavior_cfg.emergency_ttc_s * tuned(env, TTC, io.behavior)
         if (
-            io.teacher.conflict_s[env] < FAR_M
+            io.behavior.conflict_s[env] < FAR_M
             or urgent
             or (
-                io.teacher.evading_steps[env] > 0
-                and calm <= io.teacher_cfg.calm_s * tuned(env, CALM, io.teacher) + 0.2
+                io.behavior.evading_steps[env] > 0
+                and quiet_s <= io.behavior_cfg.hysteresis_s * tuned(env, HYSTERESIS, io.behavior) + 0.2
             )
         ):
-            io.teacher.want_evade[env] = 1
+            io.behavior.want_evade[env] = 1
 
 
 @ti.func
-def _nearest_body(env, pos, io: Bundle[ThreatsIO]):
-    """(distance [m] from the hull to the nearest forecast body, horizontal way [m] to the one that needs to
-    be looked at).
+def _nearest_obstacle(env, pos, io: Bundle[ThreatsIO]):
+    """(distance [m] from the hull to the nearest forecast obstacle, horizontal way [m] to the one that needs
+    to be looked at).
 
-    A body above or below the sonar's fan needs it most. FAR_M and zero where there is none.
+    An obstacle above or below the sonar's fan needs it most. FAR_M and zero where there is none.
     """
-    nearest, need, way = FAR_M, io.teacher_cfg.gaze_m * tuned(env, GAZE, io.teacher), ti.Vector([0.0, 0.0])
+    nearest, need, way = (
+        FAR_M,
+        io.behavior_cfg.heading_range_m * tuned(env, HEADING_RANGE, io.behavior),
+        ti.Vector([0.0, 0.0]),
+    )
     for track in range(ti.static(io.forecast.radius_m.shape[1])):
         radius = io.forecast.radius_m[env, track, 0]
         if radius >= 0:
             off = io.forecast.pos_w[env, track, 0] - ti.Vector([pos[0], pos[1]])
-            gap = off.norm() - radius - ti.static(io.teacher_cfg.hull_reach_m)
+            gap = off.norm() - radius - ti.static(io.behavior_cfg.hull_reach_m)
             nearest = ti.min(nearest, gap)
             level = io.forecast.above_w[env, track] <= pos[2] and io.forecast.below_w[env, track] >= pos[2]
-            wanted = gap + ti.select(level, ti.static(io.teacher_cfg.gaze_level_m), 0.0)
+            wanted = gap + ti.select(level, ti.static(io.behavior_cfg.heading_level_m), 0.0)
             if wanted < need:
                 need, way = wanted, off
     return nearest, way

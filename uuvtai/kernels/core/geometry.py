@@ -8,7 +8,7 @@ import taichi as ti
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.kernels.core.stage import Const
 
-# kinds of a body in the per-env list
+# kinds of an obstacle in the per-env list
 NONE = 0
 SPHERE = 1
 CYLINDER = 2
@@ -82,7 +82,7 @@ def turned_z3(v, yaw):
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Distances of the hull, a capsule along body x, to bodies and side walls: clearance, where, and in which
+# Distances of the hull, a capsule along body x, to obstacles and side walls: clearance, where, and in which
 # direction.
 #
 # The capsule follows the full attitude (roll does not matter). Distance to a convex body is a convex function
@@ -99,8 +99,8 @@ _TINY = 1e-9
 
 @ti.func
 def nearest_point(kind, q, size):
-    """Point of a body's core nearest to q; body frame. The core of a sphere is its centre, other bodies are
-    their own core."""
+    """Point of an obstacle's core nearest to q; body frame. The core of a sphere is its centre, other
+    obstacles are their own core."""
     out = ti.Vector([0.0, 0.0, 0.0])
     if kind == BOX:
         out = ti.math.clamp(q, -size, size)
@@ -141,7 +141,7 @@ def nearest_along(kind, center, axis, half_length, size):
 
 @ti.func
 def body_frame(v, kind, yaw):
-    """Vector turned from the world into a body's frame (only boxes have a heading)."""
+    """Vector turned from the world into an obstacle's frame (only boxes have a heading)."""
     out = v
     if kind == BOX:
         flat = turned_z(v, -yaw)
@@ -150,13 +150,13 @@ def body_frame(v, kind, yaw):
 
 
 @ti.func
-def hull_to_body(pos_w, axis_w, kind, body_pos_w, size, yaw, vehicle_cfg: Const[VehicleConfig]):
+def hull_to_obstacle(pos_w, axis_w, kind, obstacle_pos_w, size, yaw, vehicle_cfg: Const[VehicleConfig]):
     """(clearance [m], unit vector from hull to body, place on the axis [m from the middle]).
 
-    ``axis_w`` is the hull's unit x axis. With the body's axis inside the other body the clearance stays at
-    minus the hull's radius. The clearance shrinks at ``-(v_body - v_hull_point) . normal``.
+    ``axis_w`` is the hull's unit x axis. With the body's axis inside the other obstacle the clearance stays
+    at minus the hull's radius. The clearance shrinks at ``-(v_obstacle - v_hull_point) . normal``.
     """
-    center = body_frame(pos_w - body_pos_w, kind, yaw)
+    center = body_frame(pos_w - obstacle_pos_w, kind, yaw)
     axis = body_frame(axis_w, kind, yaw)
     along = nearest_along(kind, center, axis, vehicle_cfg.hull_half_length_m, size)
     q = center + along * axis
@@ -215,7 +215,7 @@ def is_in_tank(pos_w, tank_cfg: Const[TankConfig]):
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Plan view of bodies: rectangles with rounded corners, and how far apart they are. Floor of the scenario's
+# Plan view of obstacles: rectangles with rounded corners, and how far apart they are. Floor of the scenario's
 # drawing.
 #
 # A footprint is seven numbers (centre x, y; direction x, y; half extents along and across, in units of the
@@ -341,10 +341,10 @@ def is_apart(a, b, gap_m):
 
 
 @ti.func
-def is_off_ring(shape, center, radius, body_radius):
+def is_off_ring(shape, center, radius, obstacle_radius):
     """1 where a disc that goes around a circle never meets the footprint."""
-    outer = radius + body_radius + shape[6]
-    inner = radius - body_radius - shape[6]
+    outer = radius + obstacle_radius + shape[6]
+    inner = radius - obstacle_radius - shape[6]
     outside = nearest_squared(shape, center) > outer * outer
     inside = inner > 0.0 and farthest_squared(shape, center) < inner * inner
     return ti.cast(outside or inside, ti.i32)

@@ -3,7 +3,7 @@ number at a time.
 
 Mean (x, y, vx, vy) with covariance as its upper triangle row by row; beside it the turn rate with its
 ``link``: covariance with each of the four, and its own variance. A link of zeros is a plain filter of
-constant velocity: what a body at rest gets.
+constant velocity: what an obstacle at rest gets.
 
 The covariance is symmetric by storage. A measurement of one number needs no inverse; its update P - (Ph)(Ph)'
 / s equals Joseph's form for the optimal gain. Variances are kept above a floor: float32 rounds P to 1e-7 of
@@ -123,7 +123,7 @@ def largest_position_variance(cov, dt):
 
 @ti.func
 def born(pos, along, radial_var, cross_var, speed, speed_var, cross_speed_var):
-    """Mean and covariance of a body first seen at ``pos``, moving with ``speed`` along the unit vector
+    """Mean and covariance of an obstacle first seen at ``pos``, moving with ``speed`` along the unit vector
     ``along``."""
     xx, yy, xy = along[0] * along[0], along[1] * along[1], along[0] * along[1]
     mean = ti.Vector([pos[0], pos[1], speed * along[0], speed * along[1]])

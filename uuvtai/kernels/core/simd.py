@@ -102,19 +102,19 @@ def lane_bits(condition):
 
 
 @ti.func
-def n_awake(first, lanes: Const[int], clock: In[ClockState]):
+def n_active(first, lanes: Const[int], clock: In[ClockState]):
     """How many of the rows from ``first`` on are processed in this pass; the last packet may be short."""
     count = 0
-    for env in range(first, ti.min(first + lanes, ti.static(clock.awake.shape[0]))):
-        count += clock.awake[env]
+    for env in range(first, ti.min(first + lanes, ti.static(clock.active.shape[0]))):
+        count += clock.active[env]
     return count
 
 
 @ti.func
-def is_awake(env, clock: In[ClockState]):
+def is_active(env, clock: In[ClockState]):
     """Whether a row exists and is processed in this pass."""
-    n = ti.static(clock.awake.shape[0])
-    return env < n and clock.awake[ti.min(env, n - 1)] == 1
+    n = ti.static(clock.active.shape[0])
+    return env < n and clock.active[ti.min(env, n - 1)] == 1
 
 
 # ------------------------------------------------------------------------------------------------------------

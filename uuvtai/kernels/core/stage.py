@@ -71,14 +71,14 @@ class ColumnGroup(NamedTuple):
 
     name: str
     width: int
-    """columns of the env, or of each of its sectors or bodies"""
+    """columns of the env, or of each of its sectors or obstacles"""
     unit: str
     frame: str
     """"level" is the body frame without roll and pitch: x along the heading, y to its left, z up"""
     meaning: str
     source: Any
     """func that returns the values of one env, or the value of one of its sectors, or the values of all
-    groups of one of its bodies"""
+    groups of one of its obstacles"""
     per: str = ""
     """'sector' or 'body': there are so many for each"""
 

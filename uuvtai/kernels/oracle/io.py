@@ -1,10 +1,10 @@
-"""What each yardstick reads and writes."""
+"""What each oracle reads and writes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uuvtai.config import ElevationConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
+from uuvtai.config import EpisodeConfig, HeightConfig, MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels.core.stage import Const, In, Out
 from uuvtai.state import (
     ClockState,
@@ -20,7 +20,7 @@ from uuvtai.state import (
 
 @dataclass(frozen=True, eq=False)
 class TrueMapIO:
-    """A yardstick: the map as it truly is."""
+    """An oracle: the map as it truly is."""
 
     grid_map: Out[MapState]
     clock: In[ClockState]
@@ -31,7 +31,7 @@ class TrueMapIO:
 
 @dataclass(frozen=True, eq=False)
 class TrueTracksIO:
-    """A yardstick: the tracks as they truly are."""
+    """An oracle: the tracks as they truly are."""
 
     clusters: Out[ClusterState]
     tracks: Out[TrackState]
@@ -40,14 +40,14 @@ class TrueTracksIO:
     path: In[PathState]
     scan: In[SonarScan]
     world: In[WorldState]
-    elevation_cfg: Const[ElevationConfig]
+    height_cfg: Const[HeightConfig]
     episode_cfg: Const[EpisodeConfig]
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
 
 
 @dataclass(frozen=True, eq=False)
-class PrivilegedStages:
+class OracleStages:
     """Bundles of this room, by the noun of their stage."""
 
     true_tracks: TrueTracksIO

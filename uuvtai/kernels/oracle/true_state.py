@@ -1,4 +1,4 @@
-"""Debugging aid: writes moving bodies into the dynamic layer from the truth. Never part of a preset: it
+"""Debugging aid: writes moving obstacles into the dynamic layer from the truth. Never part of a preset: it
 breaks observation-only sensing.
 
 Launched only where ``mapping.stamp`` > 0 (default 0).
@@ -19,23 +19,23 @@ from uuvtai.kernels.world.motion import first_moving
 
 
 @ti.func
-def covers(env, body, point, io: Bundle[TrueMapIO]):
-    """True where a moving body lies over or under a horizontal point."""
-    offset = point - ti.Vector([io.world.pos_w[env, body][0], io.world.pos_w[env, body][1]])
-    size = io.world.size[env, body]
+def covers(env, obstacle, point, io: Bundle[TrueMapIO]):
+    """True where a moving obstacle lies over or under a horizontal point."""
+    offset = point - ti.Vector([io.world.pos_w[env, obstacle][0], io.world.pos_w[env, obstacle][1]])
+    size = io.world.size[env, obstacle]
     inside = offset.norm() <= size[0]
-    if io.world.kind[env, body] == BOX:
-        local = turned_z(offset, -io.world.yaw[env, body])
+    if io.world.kind[env, obstacle] == BOX:
+        local = turned_z(offset, -io.world.yaw[env, obstacle])
         inside = ti.abs(local[0]) <= size[0] and ti.abs(local[1]) <= size[1]
-    return inside and io.world.kind[env, body] != NONE and io.world.vel_w[env, body].norm() > 0.0
+    return inside and io.world.kind[env, obstacle] != NONE and io.world.vel_w[env, obstacle].norm() > 0.0
 
 
 @ti.func
 def is_covered(env, point, io: Bundle[TrueMapIO]):
-    """1 where any moving body does."""
+    """1 where any moving obstacle does."""
     covered = 0
-    for body in range(ti.static(io.world.kind.shape[1])):
-        if covers(env, body, point, io):
+    for obstacle in range(ti.static(io.world.kind.shape[1])):
+        if covers(env, obstacle, point, io):
             covered = 1
     return covered
 
@@ -52,19 +52,19 @@ def stamp(env, row, col, io: Bundle[TrueMapIO]):
 
 @ti.kernel
 def stamp_truth(io: Bundle[TrueMapIO]):
-    """Add ``stamp`` to the dynamic occupancy of every cell whose centre a moving body covers, clipped at
+    """Add ``stamp`` to the dynamic occupancy of every cell whose centre a moving obstacle covers, clipped at
     1."""
     n_env, n_row, n_col = ti.static(io.grid_map.dynamic_occ.shape)
     for env, row in ti.ndrange(n_env, n_row):
-        if io.clock.awake[env] == 1:
+        if io.clock.active[env] == 1:
             for col in range(n_col):
                 if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), io) == 1:
                     stamp(env, row, col, io)
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Privileged reference: the tracks of moving bodies, taken from the truth instead of from tracking. It breaks
-# observation-only sensing.
+# Privileged reference: the tracks of moving obstacles, taken from the truth instead of from tracking. It
+# breaks observation-only sensing.
 #
 # Launched only while ``Sim.privileged`` is on, which no config key and no preset can do. What reads tracks
 # (forecast, heights, threats, planning) works on as it does; what stands still is sensed and mapped as ever.
@@ -74,28 +74,30 @@ _VARIANCE = 1.0e-6
 """[m^2, m^2/s^2, rad^2/s^2] of what is known exactly: small, but a filter's variance is never 0."""
 
 _NAMED_M = 0.15
-"""A return so close to a body's outline is its own (EC: 3 sigma of the harsh sonar's range)."""
+"""A return so close to an obstacle's outline is its own (EC: 3 sigma of the harsh sonar's range)."""
 
 _COLUMN_SHARE = 0.9
-"""A body that takes up so much of the water's depth goes through all of it."""
+"""An obstacle that takes up so much of the water's depth goes through all of it."""
 
 
 def take_true_tracks(io: TrueTracksIO) -> None:
-    """Tracks of the awake rows as they truly are in this very step, and which of them every beam of a fresh
+    """Tracks of the active rows as they truly are in this very step, and which of them every beam of a fresh
     scan hit."""
-    know_bodies(io)
+    know_obstacles(io)
     name_beams_truly(io)
 
 
 @quick_launch
 @ti.kernel
-def know_bodies(io: Bundle[TrueTracksIO]):
-    """One track for every moving body, in the order of the bodies; the nearest bodies where the tracks are
-    too few."""
+def know_obstacles(io: Bundle[TrueTracksIO]):
+    """One track for every moving obstacle, in the order of the obstacles; the nearest obstacles where the
+    tracks are too few."""
     n, n_track = ti.static(io.tracks.alive.shape)
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
-        if pad == 0 and io.clock.awake[env] == 1:
-            io.clusters.fresh[env] = 1  # tracks have changed: habits and forecasts are to be worked out anew
+        if pad == 0 and io.clock.active[env] == 1:
+            io.clusters.fresh[env] = (
+                1  # tracks have changed: turn history and forecasts are to be worked out anew
+            )
             io.tracks.scan_step[env] = io.clock.step[env]
             clear_track(env, track, io.tracks)
             lane = lane_of(env, track, ti.static(n_track), io)
@@ -106,7 +108,7 @@ def know_bodies(io: Bundle[TrueTracksIO]):
 
 @ti.func
 def lane_of(env, track, n_track: Const[int], io: Bundle[TrueTracksIO]):
-    """Which moving body a track holds, -1 = none."""
+    """Which moving obstacle a track holds, -1 = none."""
     n_lane = ti.static(io.path.n_way.shape[1])
     found = -1
     if ti.static(n_lane <= n_track):
@@ -125,7 +127,7 @@ def lane_of(env, track, n_track: Const[int], io: Bundle[TrueTracksIO]):
 
 @ti.func
 def rank_of(env, lane, io: Bundle[TrueTracksIO]):
-    """How many moving bodies are nearer to the vehicle."""
+    """How many moving obstacles are nearer to the vehicle."""
     first, nearer = first_moving(io.world, io.path), 0
     own = (io.world.pos_w[env, first + lane] - io.ego.pos_w[env]).norm_sqr()
     for other in range(ti.static(io.path.n_way.shape[1])):
@@ -140,8 +142,12 @@ def rank_of(env, lane, io: Bundle[TrueTracksIO]):
 @ti.func
 def know_motion(env, track, lane, io: Bundle[TrueTracksIO]):
     """Position, velocity, turn rate and radius; of a box the radius that holds it."""
-    body = first_moving(io.world, io.path) + lane
-    pos, vel, size = io.world.pos_w[env, body], io.world.vel_w[env, body], io.world.size[env, body]
+    obstacle = first_moving(io.world, io.path) + lane
+    pos, vel, size = (
+        io.world.pos_w[env, obstacle],
+        io.world.vel_w[env, obstacle],
+        io.world.size[env, obstacle],
+    )
     io.tracks.alive[env, track] = 1
     io.tracks.moving[env, track] = ti.cast(vel.norm() > 0.0, ti.i32)
     io.tracks.state[env, track] = ti.Vector([pos[0], pos[1], vel[0], vel[1]])
@@ -149,7 +155,7 @@ def know_motion(env, track, lane, io: Bundle[TrueTracksIO]):
         io.tracks.cov[env, track][diagonal] = _VARIANCE
     io.tracks.z_m[env, track] = pos[2]
     io.tracks.radius_m[env, track] = ti.select(
-        io.world.kind[env, body] == BOX, ti.sqrt(size[0] ** 2 + size[1] ** 2), size[0]
+        io.world.kind[env, obstacle] == BOX, ti.sqrt(size[0] ** 2 + size[1] ** 2), size[0]
     )
     io.tracks.radius_var[env, track] = _VARIANCE
     io.tracks.turn_cov[env, track][4] = _VARIANCE
@@ -161,13 +167,13 @@ def know_motion(env, track, lane, io: Bundle[TrueTracksIO]):
 
 
 @ti.func
-def know_height(env, track, body, io: Bundle[TrueTracksIO]):
-    """Equal shares for the fewest neighbouring heights whose bodies, as high as the stack takes them to be,
-    cover this one."""
+def know_height(env, track, obstacle, io: Bundle[TrueTracksIO]):
+    """Equal shares for the fewest neighbouring heights whose obstacles, as high as the stack takes them to
+    be, cover this one."""
     step = ti.static((io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0]) / COLUMN)
-    half = io.world.size[env, body][2]
-    beyond = ti.max(half - half_height(env, track, io.tracks, io.elevation_cfg), 0.0)
-    at = io.world.pos_w[env, body][2] - ti.static(io.tank_cfg.z_m[0])
+    half = io.world.size[env, obstacle][2]
+    beyond = ti.max(half - half_height(env, track, io.tracks, io.height_cfg), 0.0)
+    at = io.world.pos_w[env, obstacle][2] - ti.static(io.tank_cfg.z_m[0])
     low = ti.math.clamp(ti.floor((at - beyond) / step - 0.5), 0.0, COLUMN - 1.0)
     high = ti.math.clamp(ti.ceil((at + beyond) / step - 0.5), 0.0, COLUMN - 1.0)
     if 2.0 * half > ti.static(_COLUMN_SHARE * (io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0])):
@@ -181,11 +187,11 @@ def know_height(env, track, body, io: Bundle[TrueTracksIO]):
 @quick_launch
 @ti.kernel
 def name_beams_truly(io: Bundle[TrueTracksIO]):
-    """Every return of a fresh scan within ``_NAMED_M`` of a body's outline, where it was at the ping, belongs
-    to the nearest such body."""
+    """Every return of a fresh scan within ``_NAMED_M`` of an obstacle's outline, where it was at the ping,
+    belongs to the nearest such body."""
     n, n_ray = ti.static(io.tracks.beam_track.shape)
     for env, ray, pad in ti.ndrange(n, n_ray, ti.static(spread(n, n_ray))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.scan.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
             ago = (io.clock.step[env] - io.scan.ping_step[env]) * io.episode_cfg.control_dt_s
             bearing = (io.scan.ping_yaw[env] + ti.static(io.sonar_cfg.first_beam_rad)) + ray * ti.static(
                 io.sonar_cfg.beam_step_rad
@@ -204,8 +210,10 @@ def nearest_track(env, hit_x, hit_y, ago, io: Bundle[TrueTracksIO]):
     named, nearest = -1, _NAMED_M
     for track in range(ti.static(io.tracks.alive.shape[1])):
         if io.tracks.alive[env, track] == 1:
-            body = io.tracks.state[env, track]
-            off = ti.Vector([hit_x - body[0] + ago * body[2], hit_y - body[1] + ago * body[3]])
+            obstacle = io.tracks.state[env, track]
+            off = ti.Vector(
+                [hit_x - obstacle[0] + ago * obstacle[2], hit_y - obstacle[1] + ago * obstacle[3]]
+            )
             gap = off.norm() - io.tracks.radius_m[env, track]
             if gap < nearest:
                 named, nearest = track, gap

@@ -1,1 +1,1 @@
-"""Bodies that move, where they will be, and the map."""
+"""Obstacles that move, where they will be, and the map."""

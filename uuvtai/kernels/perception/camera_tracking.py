@@ -1,5 +1,5 @@
-"""Tracked bodies that the camera shows while the sonar does not: above or below the fan they are followed by
-the image.
+"""Tracked obstacles that the camera shows while the sonar does not: above or below the fan they are followed
+by the image.
 
 Per column of the image the nearest thing before the known walls, at a height that matters; neighbouring
 columns make a spot. A spot that the sonar's beams show too is the sonar's affair; of the others each corrects
@@ -16,20 +16,20 @@ from uuvtai.kernels.core.kalman import born, corrected, position_variance
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
 from uuvtai.kernels.core.stage import Bundle, spread
 from uuvtai.kernels.perception.height import COLUMN, begin_height, heights, weigh_camera
-from uuvtai.kernels.perception.io import LookIO, SpottingIO
+from uuvtai.kernels.perception.io import CameraTrackingIO, LookIO
 from uuvtai.kernels.perception.sensor_model import NO_RETURN_SHARE, pinhole, wall_lanes
 from uuvtai.kernels.perception.track_filter import bearing_vector
 from uuvtai.kernels.perception.tracking import clear_track
 
 _ROW_STRIDE = 2
-"""Rows of the image that are looked at: every second one; a body fills several within the range that
+"""Rows of the image that are looked at: every second one; an obstacle fills several within the range that
 matters."""
 
 _ROUNDING_M = 1.0e-3
 """Far more than float32 rounds a distance by."""
 
 _PRESENT = 0.95
-"""Probability of a body that has just been seen to be where it is expected."""
+"""Probability of an obstacle that has just been seen to be where it is expected."""
 
 _NEWLY_SEEN_S = 0.15
 """[s] a track that the sonar saw this lately needs no image."""
@@ -37,12 +37,12 @@ _NEWLY_SEEN_S = 0.15
 
 @quick_launch
 @ti.kernel
-def scan_columns(io: Bundle[SpottingIO]):
+def scan_columns(io: Bundle[CameraTrackingIO]):
     """Horizontal distance of the nearest thing in every column of a fresh image, FAR_M = none within range,
     height band and walls."""
-    n, n_packet = ti.static(io.clock.awake.shape[0], io.depth_cfg.cols // LANES)
+    n, n_packet = ti.static(io.clock.active.shape[0], io.depth_cfg.cols // LANES)
     for env, packet, pad in ti.ndrange(n, n_packet, ti.static(spread(n, n_packet))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.image.fresh[env] == 1:
             near, edge = column_distances(env, packet * LANES, io)
             for i in ti.static(range(LANES)):
                 io.spots.column_m[env, packet * LANES + i] = near[i]
@@ -50,7 +50,7 @@ def scan_columns(io: Bundle[SpottingIO]):
 
 
 @ti.func
-def eye_of(env, io: Bundle[SpottingIO]):
+def eye_of(env, io: Bundle[CameraTrackingIO]):
     """(position [m, world], body to world) of the camera when the image was taken, as estimated."""
     rpy = io.image.shot_rpy[env]
     R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
@@ -60,7 +60,7 @@ def eye_of(env, io: Bundle[SpottingIO]):
 
 
 @ti.func
-def column_distances(env, first_col, io: Bundle[SpottingIO]):
+def column_distances(env, first_col, io: Bundle[CameraTrackingIO]):
     """(nearest thing, nearest thing in the first or last row looked at): horizontal distances [m] of sixteen
     columns, FAR_M = none."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
@@ -74,7 +74,7 @@ def column_distances(env, first_col, io: Bundle[SpottingIO]):
     wall = wall_lanes(ti.Vector([eye[0], eye[1]]), level_x * scale, level_y * scale, io.tank_cfg)
     near, edge, limit = f16x(FAR_M), f16x(FAR_M), f16x(0.0)
     for i in ti.static(range(LANES)):
-        limit[i] = ti.min(wall[i] - io.spotting_cfg.wall_margin_m, io.spotting_cfg.range_m)
+        limit[i] = ti.min(wall[i] - io.camera_tracking_cfg.wall_margin_m, io.camera_tracking_cfg.range_m)
     sway = ti.sqrt(R_wb[0, 2] * R_wb[0, 2] + R_wb[1, 2] * R_wb[1, 2])
     for k in range(ti.static(io.depth_cfg.rows // _ROW_STRIDE)):
         row = k * _ROW_STRIDE
@@ -92,12 +92,12 @@ def column_distances(env, first_col, io: Bundle[SpottingIO]):
                 z = R_wb[2, 0] + R_wb[2, 1] * left[i] + R_wb[2, 2] * up
                 level = away[i] * ti.sqrt(x * x + y * y)
                 shown = (away[i] < ti.static(NO_RETURN_SHARE * io.depth_cfg.max_range_m)) & (
-                    ti.abs(away[i] * z) < io.spotting_cfg.band_m
+                    ti.abs(away[i] * z) < io.camera_tracking_cfg.band_m
                 )
                 shown = (
                     shown
-                    & (level < wall[i] - io.spotting_cfg.wall_margin_m)
-                    & (level < io.spotting_cfg.range_m)
+                    & (level < wall[i] - io.camera_tracking_cfg.wall_margin_m)
+                    & (level < io.camera_tracking_cfg.range_m)
                 )
                 near[i] = ti.min(near[i], ti.select(shown, level, FAR_M))
                 edge[i] = ti.min(
@@ -111,16 +111,16 @@ def column_distances(env, first_col, io: Bundle[SpottingIO]):
 
 @quick_launch
 @ti.kernel
-def follow_spots(io: Bundle[SpottingIO]):
+def follow_spots(io: Bundle[CameraTrackingIO]):
     """Gather columns to spots and correct the moving tracks that they show."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.image.fresh[env] == 1:
             take_spots(env, io)
 
 
 @ti.func
-def take_spots(env, io: Bundle[SpottingIO]):
+def take_spots(env, io: Bundle[CameraTrackingIO]):
     """A spot ends where the distance jumps, and at the image's edge."""
     eye, R_wb = eye_of(env, io)
     first, near, edge, before = 0, FAR_M, FAR_M, FAR_M
@@ -128,7 +128,7 @@ def take_spots(env, io: Bundle[SpottingIO]):
         at = FAR_M
         if col < ti.static(io.depth_cfg.cols):
             at = io.spots.column_m[env, col]
-        if ti.abs(at - before) > io.spotting_cfg.split_m:
+        if ti.abs(at - before) > io.camera_tracking_cfg.split_m:
             if before < FAR_M:
                 use_spot(env, first, col - 1, near, edge, eye, R_wb, io)
             first, near, edge = col, FAR_M, FAR_M
@@ -139,7 +139,7 @@ def take_spots(env, io: Bundle[SpottingIO]):
 
 
 @ti.func
-def bearing_of(col, R_wb, io: Bundle[SpottingIO]):
+def bearing_of(col, R_wb, io: Bundle[CameraTrackingIO]):
     """[rad] world bearing of a place in the image, ``col`` in columns, at the height of the optical axis."""
     focal, _, middle_col = ti.static(pinhole(io.depth_cfg))
     left = (middle_col - col) / focal
@@ -147,7 +147,7 @@ def bearing_of(col, R_wb, io: Bundle[SpottingIO]):
 
 
 @ti.func
-def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[SpottingIO]):
+def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[CameraTrackingIO]):
     """Match one spot with a track and correct that; a spot that is nobody's begins a track.
 
     The spot: columns first..last; ``near`` [m] its smallest horizontal distance, ``edge`` [m] that in the
@@ -163,7 +163,9 @@ def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[SpottingIO]):
         best, best_offset = match_of(env, seen, along, late, io)
         cut = first == 0 or last == ti.static(io.depth_cfg.cols - 1)
         if best >= 0:
-            correct_track(env, best, best_offset, along, cut, edge < near + io.spotting_cfg.split_m, io)
+            correct_track(
+                env, best, best_offset, along, cut, edge < near + io.camera_tracking_cfg.split_m, io
+            )
             io.tracks.spot_step[env, best] = io.clock.step[env]
         elif not cut and io.scan.ping_step[env] >= 0:
             radius = ti.max(0.5 * width * near, io.tracking_cfg.min_radius_m)
@@ -171,7 +173,7 @@ def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[SpottingIO]):
 
 
 @ti.func
-def match_of(env, seen, along, late, io: Bundle[SpottingIO]):
+def match_of(env, seen, along, late, io: Bundle[CameraTrackingIO]):
     """(track that most easily is what shows at ``seen`` [m], its centre minus where it is expected [m]); -1
     where none is within reach.
 
@@ -193,7 +195,7 @@ def match_of(env, seen, along, late, io: Bundle[SpottingIO]):
 
 
 @ti.func
-def is_off_fan(seen, env, io: Bundle[SpottingIO]):
+def is_off_fan(seen, env, io: Bundle[CameraTrackingIO]):
     """1 where the sonar's beams towards a place met nothing near it: what is there lies above or below the
     fan."""
     own = io.scan.ping_pos_w[env]
@@ -206,14 +208,14 @@ def is_off_fan(seen, env, io: Bundle[SpottingIO]):
         if (
             beam_there(middle + k, io.sonar_cfg) >= 0
             and io.scan.hit[env, ray] == 1
-            and ti.abs(io.scan.range_m[env, ray] - distance) < io.spotting_cfg.split_m
+            and ti.abs(io.scan.range_m[env, ray] - distance) < io.camera_tracking_cfg.split_m
         ):
             off = 0
     return off
 
 
 @ti.func
-def is_wanted(env, track, io: Bundle[SpottingIO]):
+def is_wanted(env, track, io: Bundle[CameraTrackingIO]):
     """1 for a track that moves, or was begun by the camera, and that neither the sonar saw lately nor this
     image already."""
     moving = io.tracks.alive[env, track] == 1 and (
@@ -226,7 +228,7 @@ def is_wanted(env, track, io: Bundle[SpottingIO]):
 
 
 @ti.func
-def reach_of(env, track, io: Bundle[SpottingIO]):
+def reach_of(env, track, io: Bundle[CameraTrackingIO]):
     """[m] how far from its place a track may be found: as far as it went unseen, if it has turned, within
     bounds."""
     seen = ti.max(io.tracks.seen_step[env, track], io.tracks.spot_step[env, track])
@@ -236,28 +238,28 @@ def reach_of(env, track, io: Bundle[SpottingIO]):
         * (io.clock.step[env] - seen)
         * io.episode_cfg.control_dt_s
     )
-    return ti.min(io.spotting_cfg.gate_m + 2.0 * way, io.spotting_cfg.max_gate_m)
+    return ti.min(io.camera_tracking_cfg.gate_m + 2.0 * way, io.camera_tracking_cfg.max_gate_m)
 
 
 @ti.func
-def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[SpottingIO]):
+def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[CameraTrackingIO]):
     """Correct position, and by it velocity; what surprises has turned: its velocity is opened up first."""
     across = ti.Vector([-along[1], along[0]])
     mean, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
     rate, link = io.tracks.turn_rate[env, track], io.tracks.turn_cov[env, track]
     radial_var = (
-        ti.static(io.spotting_cfg.sigma_m**2)
+        ti.static(io.camera_tracking_cfg.sigma_m**2)
         + io.tracks.radius_var[env, track]
         + ti.select(cut_high, io.tracks.radius_m[env, track] ** 2, 0.0)
     )
-    cross_var = ti.static(io.spotting_cfg.sigma_m**2) + ti.select(
+    cross_var = ti.static(io.camera_tracking_cfg.sigma_m**2) + ti.select(
         cut, io.tracks.radius_m[env, track] ** 2, 0.0
     )
     radial, cross = offset.dot(along), offset.dot(across)
     surprise = radial * radial / (position_variance(cov, along) + radial_var) + cross * cross / (
         position_variance(cov, across) + cross_var
     )
-    if surprise > io.spotting_cfg.turn_gate:
+    if surprise > io.camera_tracking_cfg.turn_gate:
         speed = ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
         cov[7] += ti.max(speed, 0.5) ** 2
         cov[9] += ti.max(speed, 0.5) ** 2
@@ -279,9 +281,9 @@ def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[SpottingI
 
 
 @ti.func
-def begin_spotted(env, at, along, radius, late, height, io: Bundle[SpottingIO]):
-    """A track of a body that only the camera has seen yet, in a free slot, unless one is there already. It
-    rests until it is seen again."""
+def begin_spotted(env, at, along, radius, late, height, io: Bundle[CameraTrackingIO]):
+    """A track of an obstacle that only the camera has seen yet, in a free slot, unless one is there already.
+    It rests until it is seen again."""
     slot = -1
     known = False
     for track in range(io.tracks.alive.shape[1]):
@@ -290,10 +292,10 @@ def begin_spotted(env, at, along, radius, late, height, io: Bundle[SpottingIO]):
         else:
             mean = io.tracks.state[env, track]
             x, y = mean[0] + late * mean[2] - at[0], mean[1] + late * mean[3] - at[1]
-            reach = io.tracks.radius_m[env, track] + ti.static(io.spotting_cfg.apart_m)
+            reach = io.tracks.radius_m[env, track] + ti.static(io.camera_tracking_cfg.apart_m)
             known = known or x * x + y * y < reach * reach
     if slot >= 0 and not known:
-        var = ti.static(io.spotting_cfg.sigma_m**2)
+        var = ti.static(io.camera_tracking_cfg.sigma_m**2)
         speed_var = ti.static(io.tracking_cfg.birth_speed_sigma_m_s**2)
         mean, cov = born(at, along, var, var, 0.0, speed_var, speed_var)
         clear_track(env, slot, io.tracks)
@@ -308,25 +310,25 @@ def begin_spotted(env, at, along, radius, late, height, io: Bundle[SpottingIO]):
         io.tracks.seen_step[env, slot] = io.clock.step[env]
         io.tracks.spot_step[env, slot] = io.clock.step[env]
         io.tracks.misses[env, slot] = 1
-        begin_height(env, slot, io.tracks, io.elevation_cfg)
+        begin_height(env, slot, io.tracks, io.height_cfg)
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What the camera says about the height of a tracked body: the column of pixels through its middle shows
+# What the camera says about the height of a tracked obstacle: the column of pixels through its middle shows
 # where it begins and ends.
 #
-# Only what lies in the image and at the body's distance counts; a body cut by the image's edge or by
+# Only what lies in the image and at the obstacle's distance counts; an obstacle cut by the image's edge or by
 # something
-# nearer tells one end, a column through which the camera sees farther tells where no body is. Feeds the
+# nearer tells one end, a column through which the camera sees farther tells where no obstacle is. Feeds the
 # height
 # hypotheses of ``elevation.py``; sees the image and tracks only.
 
 
 _DEPTH_SLACK_M = 0.25
-"""A pixel this close to the body's expected distance shows the body (track errors and the size's)."""
+"""A pixel this close to the obstacle's expected distance shows the obstacle (track errors and the size's)."""
 
 _TRUNCATED_M = 0.4
-"""[m] farthest that the middle of a body may be from its one visible end."""
+"""[m] farthest that the middle of an obstacle may be from its one visible end."""
 
 _EDGE_M = 0.1
 """[m] a column through the full water column must reach this close to floor and surface, and a middle is
@@ -335,22 +337,22 @@ known this well."""
 _LEAST = 0.05
 """Likelihood of a height that the image contradicts."""
 
-# what a pixel of the column shows: something nearer than the body (or the image's edge), the body, something
-# beyond it
+# what a pixel of the column shows: something nearer than the obstacle (or the image's edge), the obstacle,
+# something beyond it
 _HIDES = 0
-_BODY = 1
+_OBSTACLE = 1
 _PAST = 2
 
 
 @quick_launch
 @ti.kernel
-def look_at_bodies(io: Bundle[LookIO]):
+def look_at_obstacles(io: Bundle[LookIO]):
     """Weigh the heights of every moving track in the view of a fresh image."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         if (
             pad == 0
-            and io.clock.awake[env] == 1
+            and io.clock.active[env] == 1
             and io.image.fresh[env] == 1
             and io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1
         ):
@@ -391,7 +393,7 @@ def look_at(env, track, at, io: Bundle[LookIO]):
 
 @ti.func
 def column_ends(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
-    """What one column of pixels shows of a body ``ahead`` [m] of the camera.
+    """What one column of pixels shows of an obstacle ``ahead`` [m] of the camera.
 
     (lowest, highest) z of its pixels, low > high where there are none; and whether it goes on unseen at its
     (lower, upper) end: beyond the image's edge or behind something nearer.
@@ -407,24 +409,24 @@ def column_ends(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
         if away <= ahead - radius - _DEPTH_SLACK_M:
             shown = _HIDES
         elif away < ahead + _DEPTH_SLACK_M:
-            shown = _BODY
-        if shown == _BODY:
+            shown = _OBSTACLE
+        if shown == _OBSTACLE:
             z = eye_z + (R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left) * away
             low, high = ti.min(low, z), ti.max(high, z)
-        if shown == _BODY and before == _HIDES:
+        if shown == _OBSTACLE and before == _HIDES:
             cut[1] = 1
-        if before == _BODY and shown == _HIDES:
+        if before == _OBSTACLE and shown == _HIDES:
             cut[0] = 1
         before = shown
-    if before == _BODY:
+    if before == _OBSTACLE:
         cut[0] = 1
     return ti.Vector([low, high]), cut
 
 
 @ti.func
 def shown_heights(ends, cut, io: Bundle[LookIO]):
-    """Likelihood per hypothesis of a body that shows between ends[0] and ends[1] and goes on beyond an edge
-    where ``cut``."""
+    """Likelihood per hypothesis of an obstacle that shows between ends[0] and ends[1] and goes on beyond an
+    edge where ``cut``."""
     step = ti.static((io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0]) / COLUMN)
     middle = 0.5 * (ends[0] + ends[1])
     first, last = middle, middle
@@ -448,8 +450,8 @@ def shown_heights(ends, cut, io: Bundle[LookIO]):
 
 @ti.func
 def missing_heights(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
-    """Likelihood per hypothesis of a body that does not show: less where the camera sees past the place of
-    its middle."""
+    """Likelihood per hypothesis of an obstacle that does not show: less where the camera sees past the place
+    of its middle."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
     tilt = R_wb[2, 0] + R_wb[2, 1] * (middle_col - col) / focal
     front = ahead - 0.5 * radius
@@ -460,6 +462,6 @@ def missing_heights(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
         row = ti.cast(ti.floor(middle_row - focal * up + 0.5), ti.i32)
         held = ti.math.clamp(row, 0, io.depth_cfg.rows - 1)
         if row == held and io.image.depth_m[env, held, col] > ahead - radius - _DEPTH_SLACK_M:
-            out[i] = 1.0 - io.elevation_cfg.camera_hit_share
-            out[COLUMN] = 1.0 - io.elevation_cfg.camera_hit_share
+            out[i] = 1.0 - io.height_cfg.camera_hit_share
+            out[COLUMN] = 1.0 - io.height_cfg.camera_hit_share
     return out

@@ -2,9 +2,9 @@
 stage).
 
 Returns from the known walls are left out, runs split at jumps of range or Doppler, a missed or false beam
-inside a body is bridged, and runs wider than a body is expected to be are dropped. A body's outline is taken
-for a circle: its half-angle a gives the radius R = d sin a, and the mean range of the visible arc, d - (pi /
-4) R for small angles, gives the centre at the distance d.
+inside an obstacle is bridged, and runs wider than an obstacle is expected to be are dropped. An obstacle's
+outline is taken for a circle: its half-angle a gives the radius R = d sin a, and the mean range of the
+visible arc, d - (pi / 4) R for small angles, gives the centre at the distance d.
 """
 
 import math
@@ -22,13 +22,13 @@ ARC = 0.25 * math.pi
 before the centre."""
 
 _CANDIDATE = 1 << 20
-"""Label of a beam that may belong to a body and is in no cluster yet."""
+"""Label of a beam that may belong to an obstacle and is in no cluster yet."""
 
 _BRIDGE = 3
 """A run may step this many beams at once: over one beam of any kind, or over two without return."""
 
 _MODEL_SIGMA_M = 0.01
-"""What remains of a range's error however many beams are averaged: bodies are not circles (EC)."""
+"""What remains of a range's error however many beams are averaged: obstacles are not circles (EC)."""
 
 HELD_SIGMA_M_S = 1.0
 """Trust in the own velocity's last reading while the DVL has lost the bottom: it may be off by as much as the
@@ -50,7 +50,8 @@ def range_variance(range_m, io: Bundle[TrackingIO]):
 
 @ti.func
 def split_distance(range_m, io: Bundle[TrackingIO]):
-    """Jump of range [m] between two beams that ends a body: the design's rule, or what noise alone can do."""
+    """Jump of range [m] between two beams that ends an obstacle: the design's rule, or what noise alone can
+    do."""
     return ti.max(
         io.tracking_cfg.split_m + io.tracking_cfg.split_slope * range_m,
         4.0 * ti.sqrt(range_variance(range_m, io)),
@@ -96,7 +97,7 @@ def label_beams(env, io: Bundle[TrackingIO]):
             margin += ti.static(io.sonar_cfg.half_width_rad) * range_m
         free = wall_distance(pos[0] + range_m * ux, pos[1] + range_m * uy, io) - margin
         wall = ti.select(free < 0.0, hit, f16x(0.0))
-        body = hit - wall
+        obstacle = hit - wall
         if ti.static(io.sonar_cfg.doppler):
             still = vel[0] * ux + vel[1] * uy
             for i in ti.static(range(LANES)):
@@ -109,7 +110,7 @@ def label_beams(env, io: Bundle[TrackingIO]):
                 [(wx * ux).sum(), (wx * uy).sum(), (wy * uy).sum(), (error * ux).sum(), (error * uy).sum()]
             )
         for i in ti.static(range(LANES)):
-            io.clusters.beam_cluster[env, packet * LANES + i] = ti.select(body[i] > 0.5, _CANDIDATE, -1)
+            io.clusters.beam_cluster[env, packet * LANES + i] = ti.select(obstacle[i] > 0.5, _CANDIDATE, -1)
     slip_w, sigma = ti.Vector([0.0, 0.0]), ti.select(io.scan.ping_vel_valid[env] == 1, 0.0, HELD_SIGMA_M_S)
     if ti.static(io.sonar_cfg.doppler):
         slip_w, sigma = velocity_slip(normal, io.scan.ping_vel_valid[env], io)
@@ -140,7 +141,7 @@ def leave_told(env, io: Bundle[TrackingIO]):
 
 @ti.func
 def next_open(env, at, way, io: Bundle[TrackingIO]):
-    """The next candidate, ``way`` from this beam, of the body on which the head still is; it is none from
+    """The next candidate, ``way`` from this beam, of the obstacle on which the head still is; it is none from
     then on. -1 = there is none."""
     found = -1
     for k in range(_BRIDGE + 1):
@@ -154,7 +155,7 @@ def next_open(env, at, way, io: Bundle[TrackingIO]):
 
 @ti.func
 def may_be_one(env, a, b, io: Bundle[TrackingIO]):
-    """Whether the ranges of two beams allow that they lie on one body; one without return allows all."""
+    """Whether the ranges of two beams allow that they lie on one obstacle; one without return allows all."""
     jump = ti.abs(io.scan.range_m[env, b] - io.scan.range_m[env, a])
     return io.scan.hit[env, a] == 0 or jump <= split_distance(io.scan.range_m[env, a], io)
 
@@ -202,7 +203,7 @@ def velocity_slip(normal, valid, io: Bundle[TrackingIO]):
 
 @ti.func
 def joined(env, a, b, io: Bundle[TrackingIO]):
-    """Whether two beams may lie on one body."""
+    """Whether two beams may lie on one obstacle."""
     out = False
     if (
         io.clusters.beam_cluster[env, a] == _CANDIDATE
@@ -277,7 +278,7 @@ def walk_run(env, start, first, io: Bundle[TrackingIO]):
 
 @ti.func
 def store_run(env, start, first, last, sums, io: Bundle[TrackingIO]):
-    """Keep a run as a cluster if it can be a body; else take the label off its beams."""
+    """Keep a run as a cluster if it can be an obstacle; else take the label off its beams."""
     c = io.clusters.count[env]
     a, b = (start + first) % io.sonar_cfg.n_ray, (start + last) % io.sonar_cfg.n_ray
     range_m = sums[1] / sums[0] - io.sonar_cfg.range_jitter_m
@@ -305,7 +306,7 @@ def store_run(env, start, first, last, sums, io: Bundle[TrackingIO]):
 
 @ti.func
 def is_narrow(env, a, b, steps, io: Bundle[TrackingIO]):
-    """Whether the chord between the end beams can belong to a body."""
+    """Whether the chord between the end beams can belong to a obstacle."""
     ra, rb = io.scan.range_m[env, a], io.scan.range_m[env, b]
     half_circle = ti.static(io.sonar_cfg.circle_beams // 2)
     half = ti.sin(ti.min(steps, half_circle) * ti.static(0.5 * io.sonar_cfg.beam_step_rad))

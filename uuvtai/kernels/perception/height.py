@@ -1,11 +1,12 @@
-"""How high a tracked body may be, and whether it is still where it is expected: a memory in 3-D of what a
+"""How high a tracked obstacle may be, and whether it is still where it is expected: a memory in 3-D of what a
 horizontal sonar cannot show.
 
-The fan opens by a known angle: a body that is hit at a distance lies within the fan there, one that is
+The fan opens by a known angle: an obstacle that is hit at a distance lies within the fan there, one that is
 expected there and is not hit lies above or below it, or has gone elsewhere. Per track sixteen hypotheses are
-weighed by Bayes' rule: the centre at one of fifteen heights from floor to surface, or a body through the full
-water column; beside them the probability that the body is where it is expected at all. Neither sign of the
-height is known from the sonar alone; it shows when the own depth changes. Sees sensor data and tracks only.
+weighed by Bayes' rule: the centre at one of fifteen heights from floor to surface, or an obstacle through the
+full water column; beside them the probability that the obstacle is where it is expected at all. Neither sign
+of the height is known from the sonar alone; it shows when the own depth changes. Sees sensor data and tracks
+only.
 """
 
 import math
@@ -13,7 +14,7 @@ import math
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.config import ElevationConfig, SonarConfig, TankConfig
+from uuvtai.config import HeightConfig, SonarConfig, TankConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
@@ -29,11 +30,11 @@ _LEAST = 0.01
 """Likelihood of what cannot be, for one scan may be wrong."""
 
 _LEAST_SHARE = 1.0e-3
-"""Share that every hypothesis keeps: many scans may be wrong (two bodies that cross swap their tracks), and
-nothing comes back from 0."""
+"""Share that every hypothesis keeps: many scans may be wrong (two obstacles that cross swap their tracks),
+and nothing comes back from 0."""
 
 _WELL_THERE = 0.95
-"""Probability of a body that has just been matched to be where it is expected."""
+"""Probability of an obstacle that has just been matched to be where it is expected."""
 
 
 @ti.func
@@ -57,19 +58,19 @@ def shared(weighed):
 
 
 @ti.func
-def begin_height(env, track, tracks: Out[TrackState], elevation_cfg: Const[ElevationConfig]):
+def begin_height(env, track, tracks: Out[TrackState], height_cfg: Const[HeightConfig]):
     """Nothing known but that it is there."""
-    share = f16x(ti.static((1.0 - elevation_cfg.column_share) / COLUMN))
-    share[COLUMN] = elevation_cfg.column_share
+    share = f16x(ti.static((1.0 - height_cfg.column_share) / COLUMN))
+    share[COLUMN] = height_cfg.column_share
     tracks.height[env, track, 0] = share
     tracks.present[env, track] = _WELL_THERE
 
 
 @ti.func
-def half_height(env, track, tracks: In[TrackState], elevation_cfg: Const[ElevationConfig]):
-    """[m] half height of a body that is no column: that of a ball of the tracked radius, or the configured
-    usual one."""
-    return ti.max(tracks.radius_m[env, track], ti.static(elevation_cfg.half_height_m))
+def half_height(env, track, tracks: In[TrackState], height_cfg: Const[HeightConfig]):
+    """[m] half height of an obstacle that is no column: that of a ball of the tracked radius, or the
+    configured usual one."""
+    return ti.max(tracks.radius_m[env, track], ti.static(height_cfg.half_height_m))
 
 
 @ti.func
@@ -79,11 +80,12 @@ def in_fan(
     own,
     half,
     tracks: In[TrackState],
-    elevation_cfg: Const[ElevationConfig],
+    height_cfg: Const[HeightConfig],
     sonar_cfg: Const[SonarConfig],
     tank_cfg: Const[TankConfig],
 ):
-    """Per hypothesis the probability that a beam from ``own`` [m, world] hits the body where it is expected.
+    """Per hypothesis the probability that a beam from ``own`` [m, world] hits the obstacle where it is
+    expected.
 
     ``half`` = its half height [m], guessed: large for hits and small for misses, so that neither says more
     than it knows. Soft at the fan's edge.
@@ -96,7 +98,7 @@ def in_fan(
     out = f16x(0.0)
     for i in ti.static(range(LANES)):
         out[i] = ti.math.clamp(
-            (reach - ti.abs(at[i] - own[2])) * ti.static(0.5 / elevation_cfg.edge_m) + 0.5, 0.0, 1.0
+            (reach - ti.abs(at[i] - own[2])) * ti.static(0.5 / height_cfg.edge_m) + 0.5, 0.0, 1.0
         )
     out[COLUMN] = 1.0
     return out
@@ -108,7 +110,7 @@ def weigh_seen(
     track,
     own,
     tracks: Out[TrackState],
-    elevation_cfg: Const[ElevationConfig],
+    height_cfg: Const[HeightConfig],
     sonar_cfg: Const[SonarConfig],
     tank_cfg: Const[TankConfig],
 ):
@@ -117,9 +119,9 @@ def weigh_seen(
         env,
         track,
         own,
-        half_height(env, track, tracks, elevation_cfg) + elevation_cfg.edge_m,
+        half_height(env, track, tracks, height_cfg) + height_cfg.edge_m,
         tracks,
-        elevation_cfg,
+        height_cfg,
         sonar_cfg,
         tank_cfg,
     )
@@ -135,7 +137,7 @@ def weigh_unseen(
     own,
     dt,
     tracks: Out[TrackState],
-    elevation_cfg: Const[ElevationConfig],
+    height_cfg: Const[HeightConfig],
     sonar_cfg: Const[SonarConfig],
     tank_cfg: Const[TankConfig],
 ):
@@ -146,15 +148,15 @@ def weigh_unseen(
     """
     radius = tracks.radius_m[env, track]
     spread_var = largest_position_variance(tracks.cov[env, track], 0.0)
-    sure = ti.static(elevation_cfg.hit_share) * radius * radius / (radius * radius + spread_var)
-    hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / elevation_cfg.evidence_s), 1.0)
+    sure = ti.static(height_cfg.hit_share) * radius * radius / (radius * radius + spread_var)
+    hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / height_cfg.evidence_s), 1.0)
     likely = in_fan(
         env,
         track,
         own,
-        elevation_cfg.least_half_height_m - elevation_cfg.edge_m,
+        height_cfg.least_half_height_m - height_cfg.edge_m,
         tracks,
-        elevation_cfg,
+        height_cfg,
         sonar_cfg,
         tank_cfg,
     )
@@ -167,7 +169,7 @@ def weigh_unseen(
 
 @ti.func
 def weigh_camera(env, track, likely, missing, tracks: Out[TrackState]):
-    """An image's likelihood per hypothesis; where it shows no body (``missing`` 1) the body is also less
+    """An image's likelihood per hypothesis; where it shows no body (``missing`` 1) the obstacle is also less
     surely where it is expected."""
     weighed = tracks.height[env, track, 0] * likely
     total = weighed.sum()
@@ -181,16 +183,16 @@ def weigh_camera(env, track, likely, missing, tracks: Out[TrackState]):
 @ti.kernel
 def bound_heights(io: Bundle[HeightsIO]):
     """Free water above and below the own height: ``above_w`` is the lowest edge of what may be above,
-    ``below_w`` the highest edge of what may be below; both are the own height where the body may be level
+    ``below_w`` the highest edge of what may be below; both are the own height where the obstacle may be level
     with the vehicle, and for tracks that do not move.
     """
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             own_z = io.ego.pos_w[env][2]
             above, below = own_z, own_z
             if (
-                ti.static(io.elevation_cfg.memory_s > 0)
+                ti.static(io.height_cfg.memory_s > 0)
                 and io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1
             ):
                 above, below = free_water(env, track, own_z, io)
@@ -202,14 +204,14 @@ def bound_heights(io: Bundle[HeightsIO]):
 def free_water(env, track, own_z, io: Bundle[HeightsIO]):
     """(lowest edge above, highest edge below) [m] of the hypotheses that hold more than ``tail_share``."""
     at, share = heights(io.tank_cfg), io.tracks.height[env, track, 0]
-    half = half_height(env, track, io.tracks, io.elevation_cfg)
+    half = half_height(env, track, io.tracks, io.height_cfg)
     above, below = FAR_M, -FAR_M
     for i in ti.static(range(COLUMN)):
-        if share[i] > ti.static(io.elevation_cfg.tail_share):
+        if share[i] > ti.static(io.height_cfg.tail_share):
             if at[i] >= own_z:
                 above = ti.min(above, ti.max(at[i] - half, own_z))
             if at[i] <= own_z:
                 below = ti.max(below, ti.min(at[i] + half, own_z))
-    if share[COLUMN] > ti.static(io.elevation_cfg.column_tail_share):
+    if share[COLUMN] > ti.static(io.height_cfg.column_tail_share):
         above, below = own_z, own_z
     return above, below

@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uuvtai.config import (
+    BehaviorConfig,
+    CameraTrackingConfig,
     DepthConfig,
-    ElevationConfig,
     EpisodeConfig,
     ForecastConfig,
+    HeightConfig,
+    LocalizationConfig,
     MappingConfig,
-    PoseConfig,
     SensorsConfig,
     SonarConfig,
-    SpottingConfig,
     TankConfig,
-    TeacherConfig,
     TrackingConfig,
     TrafficConfig,
     VehicleConfig,
@@ -29,16 +29,16 @@ from uuvtai.state import (
     ForecastState,
     FutureState,
     GridMask,
-    HabitState,
+    LocalizationState,
     MapScratch,
     MapState,
     MixtureState,
     PastState,
-    PoseState,
     Proprioception,
     SonarScan,
     SpotState,
     TrackState,
+    TurnHistory,
 )
 
 
@@ -54,10 +54,10 @@ class EchoesIO:
 
 @dataclass(frozen=True, eq=False)
 class ForecastIO:
-    """Where bodies will be: arcs, and legs between the turns that they were seen to take."""
+    """Where obstacles will be: arcs, and legs between the turns that they were seen to take."""
 
     forecast: Out[ForecastState]
-    habits: Out[HabitState]
+    turn_history: Out[TurnHistory]
     clock: In[ClockState]
     clusters: In[ClusterState]
     image: In[DepthImage]
@@ -77,35 +77,35 @@ class PastIO:
     clock: In[ClockState]
     clusters: In[ClusterState]
     forecast: In[ForecastState]
-    habits: In[HabitState]
+    turn_history: In[TurnHistory]
     tracks: In[TrackState]
     episode_cfg: Const[EpisodeConfig]
     forecast_cfg: Const[ForecastConfig]
     tank_cfg: Const[TankConfig]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureIO:
-    """What a network says that the bodies may do."""
+    """What a network says that the obstacles may do."""
 
     forecast: Out[ForecastState]
     futures: Out[FutureState]
     mixture: Out[MixtureState]
     clock: In[ClockState]
-    teacher_cfg: Const[TeacherConfig]
+    behavior_cfg: Const[BehaviorConfig]
     tracking_cfg: Const[TrackingConfig]
 
 
 @dataclass(frozen=True, eq=False)
 class HeightsIO:
-    """How high forecast bodies may reach."""
+    """How high forecast obstacles may reach."""
 
     forecast: Out[ForecastState]
     clock: In[ClockState]
     ego: In[Proprioception]
     tracks: In[TrackState]
-    elevation_cfg: Const[ElevationConfig]
+    height_cfg: Const[HeightConfig]
     tank_cfg: Const[TankConfig]
 
 
@@ -117,7 +117,7 @@ class LookIO:
     clock: In[ClockState]
     image: In[DepthImage]
     depth_cfg: Const[DepthConfig]
-    elevation_cfg: Const[ElevationConfig]
+    height_cfg: Const[HeightConfig]
     episode_cfg: Const[EpisodeConfig]
     tank_cfg: Const[TankConfig]
 
@@ -142,23 +142,23 @@ class MappingIO:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseIO:
+class LocalizationIO:
     """Where the vehicle is."""
 
     ego: Out[Proprioception]
-    pose: Out[PoseState]
+    localization: Out[LocalizationState]
     clock: In[ClockState]
     scan: In[SonarScan]
     episode_cfg: Const[EpisodeConfig]
-    pose_cfg: Const[PoseConfig]
+    localization_cfg: Const[LocalizationConfig]
     sensors_cfg: Const[SensorsConfig]
     tank_cfg: Const[TankConfig]
     vehicle_cfg: Const[VehicleConfig]
 
 
 @dataclass(frozen=True, eq=False)
-class SpottingIO:
-    """Bodies that only the camera sees."""
+class CameraTrackingIO:
+    """Obstacles that only the camera sees."""
 
     spots: Out[SpotState]
     tracks: Out[TrackState]
@@ -166,25 +166,25 @@ class SpottingIO:
     image: In[DepthImage]
     scan: In[SonarScan]
     depth_cfg: Const[DepthConfig]
-    elevation_cfg: Const[ElevationConfig]
+    height_cfg: Const[HeightConfig]
     episode_cfg: Const[EpisodeConfig]
     sonar_cfg: Const[SonarConfig]
-    spotting_cfg: Const[SpottingConfig]
+    camera_tracking_cfg: Const[CameraTrackingConfig]
     tank_cfg: Const[TankConfig]
     tracking_cfg: Const[TrackingConfig]
 
 
 @dataclass(frozen=True, eq=False)
 class TrackingIO:
-    """Bodies followed from ping to ping."""
+    """Obstacles followed from ping to ping."""
 
     clusters: Out[ClusterState]
     echoes: Out[EchoState]
     tracks: Out[TrackState]
     clock: In[ClockState]
-    habits: In[HabitState]
+    turn_history: In[TurnHistory]
     scan: In[SonarScan]
-    elevation_cfg: Const[ElevationConfig]
+    height_cfg: Const[HeightConfig]
     episode_cfg: Const[EpisodeConfig]
     forecast_cfg: Const[ForecastConfig]
     sonar_cfg: Const[SonarConfig]
@@ -198,9 +198,9 @@ class PerceptionStages:
     """Bundles of this room, by the noun of their stage."""
 
     echoes: EchoesIO
-    pose: PoseIO
+    localization: LocalizationIO
     tracking: TrackingIO
-    spotting: SpottingIO
+    camera_tracking: CameraTrackingIO
     look: LookIO
     forecast: ForecastIO
     past: PastIO

@@ -24,7 +24,7 @@ from uuvtai.kernels.core.geometry import quaternion_wb, rotation_wb, wrapped_ang
 from uuvtai.kernels.core.kalman import halved, measured, place
 from uuvtai.kernels.core.simd import LANES, f16x, lane_bits
 from uuvtai.kernels.core.stage import Bundle, Out, spread
-from uuvtai.kernels.perception.io import PoseIO
+from uuvtai.kernels.perception.io import LocalizationIO
 from uuvtai.kernels.perception.sensor_model import is_new
 
 # ------------------------------------------------------------------------------------------------------------
@@ -33,14 +33,14 @@ from uuvtai.kernels.perception.sensor_model import is_new
 # A beam along the unit vector u meets a wall of inward normal n at the range r: the point where it ends lies
 # e = c (range - r), c = -u'n, off the wall, and that is n'(error of the position) + r n'v (error of the
 # heading), v = u turned to the left by a right angle. The wall does not move, so its Doppler is -u'(own
-# velocity). Each beam adds its part to an information matrix and vector; bodies before a wall, ghosts and
+# velocity). Each beam adds its part to an information matrix and vector; obstacles before a wall, ghosts and
 # clutter lie outside the gate, or outside that of a few neighbouring beams together. What passes all the same
 # makes every beam count less, as much as the sonar's rates of wrong returns and the returns before the walls
 # say. A sonar without Doppler says nothing of the velocity.
 
 
 _BESIDE = 2
-"""Beams on either side that are looked at together with one: most bodies are wider."""
+"""Beams on either side that are looked at together with one: most obstacles are wider."""
 
 _MOST_WRONG = 0.5
 """No sonar is taken to be worse."""
@@ -59,7 +59,7 @@ matrices, and the vectors H'R^-1 residual."""
 
 
 @ti.func
-def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
+def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[LocalizationIO]):
     """Fix from the newest scan. ``place_cov`` (6) and ``speed_cov`` (3): covariance of the pose at the ping
     and of the velocity, their upper triangles, for the gates; ``speed`` (2) the velocity."""
     pos, yaw = io.scan.ping_pos_w[env], io.scan.ping_yaw[env]
@@ -76,20 +76,22 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
         along = range_variance(r, io)
         var = (
             cosine * cosine * along
-            + lever * lever * ti.static(aim_variance(io.sensors_cfg, io.pose_cfg))
-            + ti.static(io.pose_cfg.wall_sigma_m**2)
+            + lever * lever * ti.static(aim_variance(io.sensors_cfg, io.localization_cfg))
+            + ti.static(io.localization_cfg.wall_sigma_m**2)
         )
         doubt = form3(place_cov, nx, ny, lever)
-        near = r + io.pose_cfg.gate_sigmas * ti.sqrt(along) < ti.static(surest_range(io.sensors_cfg))
-        fits = e * e < ti.static(io.pose_cfg.gate_sigmas**2) * (var + doubt)
+        near = r + io.localization_cfg.gate_sigmas * ti.sqrt(along) < ti.static(surest_range(io.sensors_cfg))
+        fits = e * e < ti.static(io.localization_cfg.gate_sigmas**2) * (var + doubt)
         good = beams.hit * ti.select(near & fits, 1.0, 0.0)
         n = ti.max(beside(good), 1.0)
         mean = beside(good * e) / n
-        together = mean * mean < ti.static(io.pose_cfg.gate_sigmas**2) * (var / n + doubt)
+        together = mean * mean < ti.static(io.localization_cfg.gate_sigmas**2) * (var / n + doubt)
         good *= ti.select(together, 1.0, 0.0)
         seen += good.sum()
         short += (beams.hit * ti.select(near & (e < 0.0) & ~fits, 1.0, 0.0)).sum()
-        weight = good / (var * ti.static(gated(wrong_ranges(io.sensors_cfg, io.pose_cfg), io.pose_cfg)))
+        weight = good / (
+            var * ti.static(gated(wrong_ranges(io.sensors_cfg, io.localization_cfg), io.localization_cfg))
+        )
         wx, wy, wt = weight * nx, weight * ny, weight * lever
         fix.pose += ti.Vector(
             [
@@ -101,7 +103,7 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
         kept[packet] = lane_bits(good > 0.0)
     # what stands before the walls, as much as was seen of it, stands unseen just before them too
     share = short / ti.max(short + seen, 1.0)
-    together = 1.0 / (1.0 + share * ti.static(unseen_returns(io.sensors_cfg, io.pose_cfg)))
+    together = 1.0 / (1.0 + share * ti.static(unseen_returns(io.sensors_cfg, io.localization_cfg)))
     fix.pose *= together
     fix.pose_part *= together
     if ti.static(io.sensors_cfg.sonar.doppler):
@@ -110,7 +112,7 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
 
 
 @ti.func
-def add_dopplers(env, fix: Out[Any], kept, speed, speed_cov, io: Bundle[PoseIO]):
+def add_dopplers(env, fix: Out[Any], kept, speed, speed_cov, io: Bundle[LocalizationIO]):
     """What the Doppler of the beams that end on a wall says of the velocity; ``kept``: a bit for each of
     them, by packet. A loop of its own: both together need more registers than a GPU's thread has."""
     for packet in range(ti.static(io.sensors_cfg.sonar.n_ray // LANES)):
@@ -121,10 +123,12 @@ def add_dopplers(env, fix: Out[Any], kept, speed, speed_cov, io: Bundle[PoseIO])
             doppler[i] = io.scan.doppler_m_s[env, packet * LANES + i]
         slip = doppler + speed[0] * ahead + speed[1] * left
         swing = ti.static(doppler_variance(io.sensors_cfg)) + form2(speed_cov, ahead, left)
-        still = good * ti.select(slip * slip < ti.static(io.pose_cfg.gate_sigmas**2) * swing, 1.0, 0.0)
+        still = good * ti.select(
+            slip * slip < ti.static(io.localization_cfg.gate_sigmas**2) * swing, 1.0, 0.0
+        )
         trust = still * ti.static(
             1.0
-            / gated(wrong_dopplers(io.sensors_cfg, io.pose_cfg), io.pose_cfg)
+            / gated(wrong_dopplers(io.sensors_cfg, io.localization_cfg), io.localization_cfg)
             / doppler_variance(io.sensors_cfg)
         )
         va, vl = trust * ahead, trust * left
@@ -143,7 +147,7 @@ def beside(values):
 
 
 @ti.func
-def read_beams(env, packet, io: Bundle[PoseIO]):
+def read_beams(env, packet, io: Bundle[LocalizationIO]):
     """Sixteen beams; ranges without the mean of their one-sided error. What a mechanical beam heard before
     was used then: it counts as no return."""
     ahead, left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
@@ -158,7 +162,7 @@ def read_beams(env, packet, io: Bundle[PoseIO]):
 
 
 @ti.func
-def expected_wall(x, y, ux, uy, io: Bundle[PoseIO]):
+def expected_wall(x, y, ux, uy, io: Bundle[LocalizationIO]):
     """(range, inward normal x, y) of the side wall that level beams (ux, uy) from (x, y) meet; lanes."""
     r, nx, ny = f16x(0.0), f16x(0.0), f16x(0.0)
     if ti.static(io.tank_cfg.shape == "circle"):
@@ -180,7 +184,7 @@ def expected_wall(x, y, ux, uy, io: Bundle[PoseIO]):
 
 
 @ti.func
-def range_variance(range_m, io: Bundle[PoseIO]):
+def range_variance(range_m, io: Bundle[LocalizationIO]):
     """Variance [m^2] of one beam's range."""
     sigma = io.sensors_cfg.sonar.range_sigma_m + io.sensors_cfg.sonar.range_sigma_slope * range_m
     return sigma * sigma + ti.static(
@@ -201,45 +205,46 @@ def middle_sigma(sensors_cfg):
     return math.sqrt(normal**2 + sonar.range_jitter_m**2 + sonar.range_quantum_m**2 / 12.0)
 
 
-def wrong_ranges(sensors_cfg, pose_cfg):
+def wrong_ranges(sensors_cfg, localization_cfg):
     """Share of the beams that pass the gate and do not come from the wall: clutter and ghosts are anywhere in
     reach; plain Python."""
     sonar = sensors_cfg.sonar
-    width = 2.0 * pose_cfg.gate_sigmas * middle_sigma(sensors_cfg)
+    width = 2.0 * localization_cfg.gate_sigmas * middle_sigma(sensors_cfg)
     return min((sonar.false_return + sonar.ghost) * width / sonar.max_range_m, _MOST_WRONG)
 
 
-def wrong_dopplers(sensors_cfg, pose_cfg):
+def wrong_dopplers(sensors_cfg, localization_cfg):
     """The same of their Doppler; plain Python."""
     sonar = sensors_cfg.sonar
     if sonar.doppler_outlier_m_s == 0.0:
         return 0.0
-    width = pose_cfg.gate_sigmas * math.sqrt(doppler_variance(sensors_cfg))
+    width = localization_cfg.gate_sigmas * math.sqrt(doppler_variance(sensors_cfg))
     return min(sonar.doppler_outlier * min(width / sonar.doppler_outlier_m_s, 1.0), _MOST_WRONG)
 
 
-def gated(wrong, pose_cfg):
+def gated(wrong, localization_cfg):
     """How many times larger the variance of a gated measurement is, of which a share ``wrong`` is anywhere in
     the gate: that of an M-estimator that leaves out what lies beyond the gate (P. Huber, Robust Statistics,
     1981, section 3.2), for as many as pass; plain Python."""
-    g = pose_cfg.gate_sigmas
+    g = localization_cfg.gate_sigmas
     inside = math.erf(g / math.sqrt(2.0))
     slope = (1.0 - wrong) * (inside - 2.0 * g * math.exp(-0.5 * g * g) / math.sqrt(2.0 * math.pi))
     square = slope + wrong * g * g / 3.0
     return ((1.0 - wrong) * inside + wrong) * square / slope**2
 
 
-def unseen_returns(sensors_cfg, pose_cfg):
-    """Returns that err together, times the share of the water before a wall in which a body passes for the
-    wall, half the sonar's reach away. The deeper that water, the longer a body stays in it; plain Python."""
-    deep = pose_cfg.gate_sigmas * middle_sigma(sensors_cfg) / math.sqrt(2 * _BESIDE + 1)
-    return pose_cfg.body_returns_per_m * deep * deep / (0.5 * sensors_cfg.sonar.max_range_m)
+def unseen_returns(sensors_cfg, localization_cfg):
+    """Returns that err together, times the share of the water before a wall in which an obstacle passes for
+    the wall, half the sonar's reach away. The deeper that water, the longer an obstacle stays in it; plain
+    Python."""
+    deep = localization_cfg.gate_sigmas * middle_sigma(sensors_cfg) / math.sqrt(2 * _BESIDE + 1)
+    return localization_cfg.obstacle_returns_per_m * deep * deep / (0.5 * sensors_cfg.sonar.max_range_m)
 
 
-def aim_variance(sensors_cfg, pose_cfg):
+def aim_variance(sensors_cfg, localization_cfg):
     """[rad^2] of a beam's direction, which a wide beam has anywhere in its width; plain Python."""
     width = sensors_cfg.sonar.half_width_rad
-    return pose_cfg.bearing_sigma_rad**2 + sensors_cfg.imu.attitude_sigma_rad**2 + width**2
+    return localization_cfg.bearing_sigma_rad**2 + sensors_cfg.imu.attitude_sigma_rad**2 + width**2
 
 
 def doppler_variance(sensors_cfg):
@@ -278,48 +283,50 @@ _LEAST_DEPTH_SIGMA_M = 0.001
 
 @quick_launch
 @ti.kernel
-def reset_pose(io: Bundle[PoseIO]):
-    """At the known start, where ``ego.pos_w`` is, with the heading that the IMU says. Awake rows only."""
-    n = ti.static(io.clock.awake.shape[0])
+def reset_pose(io: Bundle[LocalizationIO]):
+    """At the known start, where ``ego.pos_w`` is, with the heading that the IMU says. Active rows only."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             pos = io.ego.pos_w[env]
-            io.pose.mean[env] = ti.Vector([pos[0], pos[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-            io.pose.depth[env] = ti.Vector([pos[2], 0.0, 0.0, 0.0])
-            io.pose.cov[env] = 0.0
-            io.pose.depth_cov[env] = 0.0
-            io.pose.motion[env] = 0.0
+            io.localization.mean[env] = ti.Vector([pos[0], pos[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+            io.localization.depth[env] = ti.Vector([pos[2], 0.0, 0.0, 0.0])
+            io.localization.cov[env] = 0.0
+            io.localization.depth_cov[env] = 0.0
+            io.localization.motion[env] = 0.0
             drift, scale = io.sensors_cfg.imu.heading_drift_rad_s, io.sensors_cfg.dvl.scale_error
             bias = io.sensors_cfg.imu.accel_bias_m_s2
             for axis in ti.static((3, 4)):
-                io.pose.cov[env][ti.static(place(axis, axis, _N))] = _START_SPEED_M_S * _START_SPEED_M_S
-                io.pose.cov[env][ti.static(place(axis + 4, axis + 4, _N))] = bias * bias
-            io.pose.cov[env][ti.static(place(5, 5, _N))] = drift * drift
-            io.pose.cov[env][ti.static(place(6, 6, _N))] = scale * scale
+                io.localization.cov[env][ti.static(place(axis, axis, _N))] = (
+                    _START_SPEED_M_S * _START_SPEED_M_S
+                )
+                io.localization.cov[env][ti.static(place(axis + 4, axis + 4, _N))] = bias * bias
+            io.localization.cov[env][ti.static(place(5, 5, _N))] = drift * drift
+            io.localization.cov[env][ti.static(place(6, 6, _N))] = scale * scale
             zeroed = io.sensors_cfg.pressure.sigma_m * io.sensors_cfg.pressure.sigma_m
-            io.pose.depth_cov[env][ti.static(place(1, 1, _D))] = _START_SPEED_M_S * _START_SPEED_M_S
-            io.pose.depth_cov[env][ti.static(place(2, 2, _D))] = zeroed
-            io.pose.depth_cov[env][ti.static(place(3, 3, _D))] = bias * bias
+            io.localization.depth_cov[env][ti.static(place(1, 1, _D))] = _START_SPEED_M_S * _START_SPEED_M_S
+            io.localization.depth_cov[env][ti.static(place(2, 2, _D))] = zeroed
+            io.localization.depth_cov[env][ti.static(place(3, 3, _D))] = bias * bias
 
 
 @quick_launch
 @ti.kernel
-def predict_pose(io: Bundle[PoseIO]):
+def predict_pose(io: Bundle[LocalizationIO]):
     """Move both filters to this step, take in DVL and pressure, and say where the vehicle is: the sonar's
-    ping is noted there. Awake rows only."""
-    n = ti.static(io.clock.awake.shape[0])
+    ping is noted there. Active rows only."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             step = io.clock.step[env]
             motion = level_motion(env, io)
             if step > 0:
-                jump = motion - io.pose.motion[env]
-                between = motion - ti.static(1.0 - io.pose_cfg.newest_share) * jump
+                jump = motion - io.localization.motion[env]
+                between = motion - ti.static(1.0 - io.localization_cfg.newest_share) * jump
                 between[3] = motion[3] - 0.5 * jump[3]
                 between -= leaning(env, io)
                 move_on(env, between, jump, io)
                 sink_on(env, between[2], jump[2], io)
-            io.pose.motion[env] = motion
+            io.localization.motion[env] = motion
             if step % io.sensors_cfg.dvl.period_steps == 0 and io.ego.vel_valid[env] == 1:
                 take_dvl(env, io)
             if step > 0:
@@ -329,12 +336,12 @@ def predict_pose(io: Bundle[PoseIO]):
 
 @quick_launch
 @ti.kernel
-def correct_pose(io: Bundle[PoseIO]):
-    """Take in the walls of a scan that has just come. Awake rows only."""
-    n = ti.static(io.clock.awake.shape[0])
+def correct_pose(io: Bundle[LocalizationIO]):
+    """Take in the walls of a scan that has just come. Active rows only."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.scan.fresh[env] == 1:
-            before = io.pose.mean[env][2]
+        if pad == 0 and io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
+            before = io.localization.mean[env][2]
             take_walls(env, io)
             tell_pose(env, before, io)
 
@@ -343,14 +350,14 @@ def correct_pose(io: Bundle[PoseIO]):
 
 
 @ti.func
-def level_rotation(env, io: Bundle[PoseIO]):
+def level_rotation(env, io: Bundle[LocalizationIO]):
     """Matrix from the body's axes to the level frame of the same yaw."""
     rpy = io.ego.rpy[env]
     return rotation_wb(quaternion_wb(rpy[0], rpy[1], 0.0))
 
 
 @ti.func
-def level_motion(env, io: Bundle[PoseIO]):
+def level_motion(env, io: Bundle[LocalizationIO]):
     """What the IMU says of the level body frame: acceleration ahead, to the left and upwards [m/s^2], without
     gravity, and rate of the yaw [rad/s]."""
     rpy, rate = io.ego.rpy[env], io.ego.rate_b[env]
@@ -360,20 +367,22 @@ def level_motion(env, io: Bundle[PoseIO]):
 
 
 @ti.func
-def leaning(env, io: Bundle[PoseIO]):
+def leaning(env, io: Bundle[LocalizationIO]):
     """Error of ``level_motion`` beyond the accelerometer's as the filters have it: along the axes of the
     body, which leans, less along those of the level frame."""
-    bias = ti.Vector([io.pose.mean[env][7], io.pose.mean[env][8], io.pose.depth[env][3]])
+    bias = ti.Vector(
+        [io.localization.mean[env][7], io.localization.mean[env][8], io.localization.depth[env][3]]
+    )
     level = level_rotation(env, io) @ bias
     return ti.Vector([level[0] - bias[0], level[1] - bias[1], level[2] - bias[2], 0.0])
 
 
 @ti.func
-def move_on(env, motion, jump, io: Bundle[PoseIO]):
+def move_on(env, motion, jump, io: Bundle[LocalizationIO]):
     """Predict the horizontal filter by one control step of the mean ``motion`` (of ``level_motion``), which
     changed by ``jump`` in it."""
     dt = ti.static(io.episode_cfg.control_dt_s)
-    mean, cov, turn = io.pose.mean[env], io.pose.cov[env], dt * motion[3]
+    mean, cov, turn = io.localization.mean[env], io.localization.cov[env], dt * motion[3]
     yaw = io.ego.rpy[env][2] + mean[2] - 0.5 * turn  # half-way through the step
     spin, ahead = ti.Vector([ti.cos(turn), ti.sin(turn)]), ti.Vector([dt * ti.cos(yaw), dt * ti.sin(yaw)])
     way = ti.Vector([0.0, 0.0])
@@ -397,8 +406,8 @@ def move_on(env, motion, jump, io: Bundle[PoseIO]):
     cov[ti.static(place(2, 2, _N))] += ti.static(io.sensors_cfg.imu.gyro_noise_rad_s_rthz**2) * dt
     for axis in ti.static((3, 4)):
         cov[ti.static(place(axis, axis, _N))] += won_variance(jump[axis - 3], io)
-    io.pose.mean[env] = moved
-    io.pose.cov[env] = cov
+    io.localization.mean[env] = moved
+    io.localization.cov[env] = cov
 
 
 @ti.func
@@ -424,28 +433,28 @@ def carried(u, way, ahead, spin, dt):
 
 
 @ti.func
-def won_variance(jump, io: Bundle[PoseIO]):
+def won_variance(jump, io: Bundle[LocalizationIO]):
     """[m^2/s^2] by which a velocity becomes less sure in one step in which its acceleration changed by
     ``jump`` [m/s^2]."""
-    missed = jump * ti.static(io.pose_cfg.jump_share * io.episode_cfg.control_dt_s)
+    missed = jump * ti.static(io.localization_cfg.jump_share * io.episode_cfg.control_dt_s)
     return missed * missed + ti.static(
-        accel_variance(io.pose_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg)
+        accel_variance(io.localization_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg)
     )
 
 
-def accel_variance(pose_cfg, dt, sensors_cfg, vehicle_cfg):
+def accel_variance(localization_cfg, dt, sensors_cfg, vehicle_cfg):
     """[m^2/s^2] The same of a steady acceleration: noise of the accelerometer and of the attitude, by which
     gravity leaks into the level axes; plain Python."""
     leak = vehicle_cfg.gravity_m_s2 * sensors_cfg.imu.attitude_sigma_rad
-    return (sensors_cfg.imu.accel_sigma_m_s2**2 + leak**2) * dt**2 + pose_cfg.accel_density * dt
+    return (sensors_cfg.imu.accel_sigma_m_s2**2 + leak**2) * dt**2 + localization_cfg.accel_density * dt
 
 
 @ti.func
-def sink_on(env, accel, jump, io: Bundle[PoseIO]):
+def sink_on(env, accel, jump, io: Bundle[LocalizationIO]):
     """Predict the depth's filter by one control step of mean vertical acceleration ``accel`` [m/s^2], which
     changed by ``jump`` in it."""
     dt = ti.static(io.episode_cfg.control_dt_s)
-    mean, cov = sunk(io.pose.depth[env], dt), io.pose.depth_cov[env]
+    mean, cov = sunk(io.localization.depth[env], dt), io.localization.depth_cov[env]
     mean[0] += 0.5 * dt * dt * accel
     mean[1] += dt * accel
     half = ti.Matrix.zero(ti.f32, _D, _D)
@@ -458,7 +467,7 @@ def sink_on(env, accel, jump, io: Bundle[PoseIO]):
         for j in ti.static(range(i, _D)):
             cov[ti.static(place(i, j, _D))] = row[j]
     cov[ti.static(place(1, 1, _D))] += won_variance(jump, io)
-    io.pose.depth[env], io.pose.depth_cov[env] = mean, cov
+    io.localization.depth[env], io.localization.depth_cov[env] = mean, cov
 
 
 @ti.func
@@ -471,45 +480,45 @@ def sunk(u, dt):
 
 
 @ti.func
-def take_dvl(env, io: Bundle[PoseIO]):
+def take_dvl(env, io: Bundle[LocalizationIO]):
     """A fresh reading of the DVL: (1 + scale error) x velocity, turned level."""
     variance = ti.static(max(io.sensors_cfg.dvl.sigma_m_s, _LEAST_SPEED_SIGMA_M_S) ** 2)
     reading = level_rotation(env, io) @ io.ego.vel_b[env]
-    mean, cov = io.pose.mean[env], io.pose.cov[env]
+    mean, cov = io.localization.mean[env], io.localization.cov[env]
     for axis in range(2):
         h = ti.Vector([0.0] * _N)
         h[3 + axis], h[6] = 1.0 + mean[6], mean[3 + axis]
         residual = reading[axis] - (1.0 + mean[6]) * mean[3 + axis]
         moved, shrunk = measured(mean, cov, h, residual, variance)
         mean, cov = moved, shrunk
-    io.pose.mean[env], io.pose.cov[env] = mean, cov
+    io.localization.mean[env], io.localization.cov[env] = mean, cov
     depth, depth_cov = measured(
-        io.pose.depth[env],
-        io.pose.depth_cov[env],
+        io.localization.depth[env],
+        io.localization.depth_cov[env],
         ti.Vector([0.0, 1.0, 0.0, 0.0]),
-        reading[2] - io.pose.depth[env][1],
+        reading[2] - io.localization.depth[env][1],
         variance,
     )
-    io.pose.depth[env], io.pose.depth_cov[env] = depth, depth_cov
+    io.localization.depth[env], io.localization.depth_cov[env] = depth, depth_cov
 
 
 @ti.func
-def take_pressure(env, io: Bundle[PoseIO]):
+def take_pressure(env, io: Bundle[LocalizationIO]):
     """A reading of the pressure sensor: -z + what the first reading was off."""
     depth, depth_cov = measured(
-        io.pose.depth[env],
-        io.pose.depth_cov[env],
+        io.localization.depth[env],
+        io.localization.depth_cov[env],
         ti.Vector([-1.0, 0.0, 1.0, 0.0]),
-        io.ego.depth_m[env] + io.pose.depth[env][0] - io.pose.depth[env][2],
+        io.ego.depth_m[env] + io.localization.depth[env][0] - io.localization.depth[env][2],
         ti.static(max(io.sensors_cfg.pressure.sigma_m, _LEAST_DEPTH_SIGMA_M) ** 2),
     )
-    io.pose.depth[env], io.pose.depth_cov[env] = depth, depth_cov
+    io.localization.depth[env], io.localization.depth_cov[env] = depth, depth_cov
 
 
 @ti.func
-def take_walls(env, io: Bundle[PoseIO]):
+def take_walls(env, io: Bundle[LocalizationIO]):
     """The newest scan: pose at the ping by its ranges, velocity by their Doppler."""
-    mean, cov = io.pose.mean[env], io.pose.cov[env]
+    mean, cov = io.localization.mean[env], io.localization.cov[env]
     late = (io.clock.step[env] - io.scan.ping_step[env]) * ti.static(io.episode_cfg.control_dt_s)
     overdue = io.clock.step[env] - io.scan.ping_step[env] - ti.static(io.sensors_cfg.sonar.latency_steps)
     drifted = ti.max(overdue, 0) * ti.static(io.episode_cfg.control_dt_s)  # 0 in a simulator's own loop
@@ -525,7 +534,9 @@ def take_walls(env, io: Bundle[PoseIO]):
         rows[k, 0], rows[k, 1], rows[k, 2], found[k] = a, b, root[2, k], seen[k]
         rows[k, 3], rows[k, 4] = -a * back_x - b * back_y, a * back_y - b * back_x
         rows[k, 7], rows[k, 8] = 0.5 * drifted * rows[k, 3], 0.5 * drifted * rows[k, 4]
-    won = ti.static(accel_variance(io.pose_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg))
+    won = ti.static(
+        accel_variance(io.localization_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg)
+    )
     info, part = blurred(fix.velocity, fix.velocity_part, won * (io.clock.step[env] - io.scan.ping_step[env]))
     half, slip = halved(info, part)
     for k in ti.static(range(2)):
@@ -536,7 +547,7 @@ def take_walls(env, io: Bundle[PoseIO]):
         h = ti.Vector([rows[k, j] for j in range(_N)])
         moved, shrunk = measured(now, cov, h, found[k] - h.dot(now - mean), 1.0)
         now, cov = moved, shrunk
-    io.pose.mean[env], io.pose.cov[env] = now, cov
+    io.localization.mean[env], io.localization.cov[env] = now, cov
 
 
 @ti.func
@@ -586,22 +597,22 @@ def place_cov(cov, back_x, back_y):
 
 
 @ti.func
-def tell_pose(env, before, io: Bundle[PoseIO]):
+def tell_pose(env, before, io: Bundle[LocalizationIO]):
     """Write what the stack takes for the own pose, its covariance, and the velocity, which is valid where it
     is sure enough, whether the DVL has a reading or not.
 
     ``before``: the heading's correction that ``ego.rpy`` already has in it.
     """
-    mean, cov, rpy = io.pose.mean[env], io.pose.cov[env], io.ego.rpy[env]
-    io.ego.pos_w[env] = ti.Vector([mean[0], mean[1], io.pose.depth[env][0]])
+    mean, cov, rpy = io.localization.mean[env], io.localization.cov[env], io.ego.rpy[env]
+    io.ego.pos_w[env] = ti.Vector([mean[0], mean[1], io.localization.depth[env][0]])
     io.ego.rpy[env] = ti.Vector([rpy[0], rpy[1], wrapped_angle(rpy[2] + mean[2] - before)])
     for i in ti.static(range(3)):
         for j in ti.static(range(i, 3)):
             io.ego.pose_cov[env][ti.static(place(i, j, 3))] = cov[ti.static(place(i, j, _N))]
     io.ego.pose_cov[env][5] += ti.static(io.sensors_cfg.imu.attitude_sigma_rad**2)
-    io.ego.z_var[env] = io.pose.depth_cov[env][0]
-    level = ti.Vector([mean[3], mean[4], io.pose.depth[env][1]])
+    io.ego.z_var[env] = io.localization.depth_cov[env][0]
+    level = ti.Vector([mean[3], mean[4], io.localization.depth[env][1]])
     io.ego.vel_b[env] = level_rotation(env, io).transpose() @ level
     unsure = ti.max(cov[ti.static(place(3, 3, _N))], cov[ti.static(place(4, 4, _N))])
-    unsure = ti.max(unsure, io.pose.depth_cov[env][ti.static(place(1, 1, _D))])
-    io.ego.vel_valid[env] = ti.cast(unsure < ti.static(io.pose_cfg.sure_speed_m_s**2), ti.i32)
+    unsure = ti.max(unsure, io.localization.depth_cov[env][ti.static(place(1, 1, _D))])
+    io.ego.vel_valid[env] = ti.cast(unsure < ti.static(io.localization_cfg.sure_speed_m_s**2), ti.i32)

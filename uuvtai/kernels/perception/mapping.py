@@ -7,9 +7,9 @@ apply:
     M^d = clip((1 - lambda_d) M^d + eta_dyn I^d-hit - eta_dyn,free I^free, 0, 1)
 
 A return of either kind cancels I^free in its cell. What moves is told from observations only: compensated
-Doppler, a moving track, or a return where the map was confident of free water; it feeds M^d alone. A body
-that stops is promoted after ``promote_s``: without newer evidence of motion its returns then count as static
-ones, and M^d decays.
+Doppler, a moving track, or a return where the map was confident of free water; it feeds M^d alone. An
+obstacle that stops is promoted after ``promote_s``: without newer evidence of motion its returns then count
+as static ones, and M^d decays.
 
 I^depth is "depth-gated consistency": a camera point at the vehicle's own depth counts where the sonar
 supports it (the cell is not free of static occupancy, or has a static return in this scan) and does not
@@ -98,7 +98,7 @@ def bit_fields(grid_map):
 def is_due(env, io: Bundle[MappingIO]):
     """1 where a scan arrived that is to be mapped."""
     due = (
-        io.clock.awake[env] == 1
+        io.clock.active[env] == 1
         and io.scan.fresh[env] == 1
         and io.clock.step[env] - io.grid_map.map_step[env]
         >= ti.static(1 if io.sonar_cfg.mechanical else io.mapping_cfg.period_steps)
@@ -266,7 +266,7 @@ def merge_word(env, slot, row, word, in_fan, points, confident_scans: Const[int]
 @ti.func
 def take_alone(env, slot, confident_scans: Const[int], promote_scans: Const[int], io: Bundle[MappingIO]):
     """One env's turn, by one thread: a fresh image's points and a fresh scan that is due."""
-    if io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
+    if io.clock.active[env] == 1 and io.image.fresh[env] == 1:
         mark_depth(env, 0, io)
         io.grid_map.depth_waits[env] = 1
     if is_due(env, io) == 1:
@@ -283,7 +283,7 @@ def take_alone(env, slot, confident_scans: Const[int], promote_scans: Const[int]
 @ti.func
 def mark_together(env, item, promote_scans: Const[int], io: Bundle[MappingIO]):
     """What an item marks of an env's image and scan; on a GPU an env has its own slot."""
-    if io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
+    if io.clock.active[env] == 1 and io.image.fresh[env] == 1:
         mark_depth(env, item, io)
         if item == 0:
             io.grid_map.depth_waits[env] = 1
@@ -329,7 +329,7 @@ def merge_together(env, item, confident_scans: Const[int], io: Bundle[MappingIO]
 def update_map(io: Bundle[MappingIO]):
     """Take a fresh image's points and fold a fresh scan that is due into both layers; else the map stays as
     it is."""
-    n_env, n_slot = ti.static(io.clock.awake.shape[0], io.map_scratch.fan_edge.shape[0])
+    n_env, n_slot = ti.static(io.clock.active.shape[0], io.map_scratch.fan_edge.shape[0])
     look_s = ti.static(look_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
     confident, promote = ti.static(
         scans_in(io.mapping_cfg.free_confident_s, look_s), scans_in(io.mapping_cfg.promote_s, look_s)
@@ -357,7 +357,7 @@ def reset_map(io: Bundle[MappingIO]):
     """An empty map: nothing occupied, nothing seen."""
     n_env, n_row, n_col = ti.static(io.grid_map.static_occ.shape)
     for env, row in ti.ndrange(n_env, n_row):
-        if io.clock.awake[env] == 1:
+        if io.clock.active[env] == 1:
             io.grid_map.map_step[env] = _NO_SCAN
             io.grid_map.depth_waits[env] = 0
             for col in range(n_col):

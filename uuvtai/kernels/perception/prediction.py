@@ -12,16 +12,16 @@ from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.simd import LANES, f16x
 from uuvtai.kernels.core.stage import Bundle, Const, In, spread
 from uuvtai.kernels.perception.io import ForecastIO
-from uuvtai.state import HabitState, TrackState
+from uuvtai.state import TrackState, TurnHistory
 
 # ------------------------------------------------------------------------------------------------------------
-# Habits of moving bodies, learnt within the episode: places where one turned, from which course to which.
-# Sees tracks only.
+# Turn history of moving obstacles, learnt within the episode: places where one turned, from which course to
+# which. Sees tracks only.
 #
-# A body on a line turns back at the same two ends, one on a loop turns at the same corners; who reaches a
-# remembered turn on its course will turn there again. The memory belongs to the env, not to a track: a body
-# that was lost and found again, or one never seen to turn while it was tracked, is known by where it goes.
-# Circles need no memory, their turn rate is in the filter.
+# An obstacle on a line turns back at the same two ends, one on a loop turns at the same corners; who reaches
+# a remembered turn on its course will turn there again. The memory belongs to the env, not to a track: an
+# obstacle that was lost and found again, or one never seen to turn while it was tracked, is known by where it
+# goes. Circles need no memory, their turn rate is in the filter.
 #
 # A turn is what lies between two straight legs of one track. Their ends p0, p1 [m], unit courses d0, d1 and
 # the
@@ -31,10 +31,10 @@ from uuvtai.state import HabitState, TrackState
 
 
 TURN_X, TURN_Y, IN_X, IN_Y, OUT_X, OUT_Y, WEIGHT = range(7)
-"""what is remembered of a turn: rows of ``HabitState.turn``"""
+"""what is remembered of a turn: rows of ``TurnHistory.turn``"""
 
 _STRAIGHT_SIGMA = 0.4
-"""[rad/s] a body is on a straight leg where its turn rate is known to this and less than its standard
+"""[rad/s] an obstacle is on a straight leg where its turn rate is known to this and less than its standard
 deviation."""
 
 _SETTLED = 0.05
@@ -63,44 +63,44 @@ _MOST_WEIGHT = 4.0
 
 
 @ti.func
-def forget_habits(env, io: Bundle[ForecastIO]):
-    io.habits.next_slot[env] = 0
-    for packet in range(io.habits.turn.shape[2]):
-        io.habits.turn[env, TURN_X, packet] = ti.zero(io.habits.turn[env, TURN_X, packet])
-        io.habits.turn[env, TURN_Y, packet] = ti.zero(io.habits.turn[env, TURN_Y, packet])
-        io.habits.turn[env, IN_X, packet] = ti.zero(io.habits.turn[env, IN_X, packet])
-        io.habits.turn[env, IN_Y, packet] = ti.zero(io.habits.turn[env, IN_Y, packet])
-        io.habits.turn[env, OUT_X, packet] = ti.zero(io.habits.turn[env, OUT_X, packet])
-        io.habits.turn[env, OUT_Y, packet] = ti.zero(io.habits.turn[env, OUT_Y, packet])
-        io.habits.turn[env, WEIGHT, packet] = ti.zero(io.habits.turn[env, WEIGHT, packet])
-    for track in range(io.habits.leg_step.shape[1]):
-        io.habits.leg[env, track] = ti.zero(io.habits.leg[env, track])
-        io.habits.leg_step[env, track] = -1
-        io.habits.run_from_w[env, track] = ti.Vector([0.0, 0.0])
-        io.habits.run_kind[env, track] = 0
+def forget_turns(env, io: Bundle[ForecastIO]):
+    io.turn_history.next_slot[env] = 0
+    for packet in range(io.turn_history.turn.shape[2]):
+        io.turn_history.turn[env, TURN_X, packet] = ti.zero(io.turn_history.turn[env, TURN_X, packet])
+        io.turn_history.turn[env, TURN_Y, packet] = ti.zero(io.turn_history.turn[env, TURN_Y, packet])
+        io.turn_history.turn[env, IN_X, packet] = ti.zero(io.turn_history.turn[env, IN_X, packet])
+        io.turn_history.turn[env, IN_Y, packet] = ti.zero(io.turn_history.turn[env, IN_Y, packet])
+        io.turn_history.turn[env, OUT_X, packet] = ti.zero(io.turn_history.turn[env, OUT_X, packet])
+        io.turn_history.turn[env, OUT_Y, packet] = ti.zero(io.turn_history.turn[env, OUT_Y, packet])
+        io.turn_history.turn[env, WEIGHT, packet] = ti.zero(io.turn_history.turn[env, WEIGHT, packet])
+    for track in range(io.turn_history.leg_step.shape[1]):
+        io.turn_history.leg[env, track] = ti.zero(io.turn_history.leg[env, track])
+        io.turn_history.leg_step[env, track] = -1
+        io.turn_history.run_from_w[env, track] = ti.Vector([0.0, 0.0])
+        io.turn_history.run_kind[env, track] = 0
 
 
 # ------------------------------------------------------------------------------------------------------ learn
 
 
 @ti.func
-def learn_habit(env, track, io: Bundle[ForecastIO]):
+def learn_turn(env, track, io: Bundle[ForecastIO]):
     """Where a track is on a straight leg: remember the turn since its last one, and forget a turn that it
     went past."""
     if io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0:
-        io.habits.leg_step[env, track] = -1
-        io.habits.run_kind[env, track] = 0
+        io.turn_history.leg_step[env, track] = -1
+        io.turn_history.run_kind[env, track] = 0
     elif (
         io.tracks.moving[env, track] == 1
         and io.tracks.misses[env, track] == 0
         and on_straight_leg(env, track, io)
     ):
-        now, leg = io.tracks.state[env, track], io.habits.leg[env, track]
-        time = (io.tracks.scan_step[env] - io.habits.leg_step[env, track]) * io.episode_cfg.control_dt_s
-        begin, kind = io.habits.run_from_w[env, track], io.habits.run_kind[env, track]
+        now, leg = io.tracks.state[env, track], io.turn_history.leg[env, track]
+        time = (io.tracks.scan_step[env] - io.turn_history.leg_step[env, track]) * io.episode_cfg.control_dt_s
+        begin, kind = io.turn_history.run_from_w[env, track], io.turn_history.run_kind[env, track]
         if kind == 0 or time >= _LONGEST_S:
             begin, kind = ti.Vector([now[0], now[1]]), 1
-        if io.habits.leg_step[env, track] >= 0 and time < _LONGEST_S:
+        if io.turn_history.leg_step[env, track] >= 0 and time < _LONGEST_S:
             speed, leg_speed = ti.sqrt(now[2] ** 2 + now[3] ** 2), ti.sqrt(leg[2] ** 2 + leg[3] ** 2)
             course, leg_course = (
                 ti.Vector([now[2] / speed, now[3] / speed]),
@@ -113,9 +113,9 @@ def learn_habit(env, track, io: Bundle[ForecastIO]):
                 )
             else:
                 drop_passed(env, ti.Vector([now[0], now[1]]), course, speed * time, io)
-        io.habits.leg[env, track] = now
-        io.habits.leg_step[env, track] = io.tracks.scan_step[env]
-        io.habits.run_from_w[env, track], io.habits.run_kind[env, track] = begin, kind
+        io.turn_history.leg[env, track] = now
+        io.turn_history.leg_step[env, track] = io.tracks.scan_step[env]
+        io.turn_history.run_from_w[env, track], io.turn_history.run_kind[env, track] = begin, kind
 
 
 @ti.func
@@ -150,68 +150,75 @@ def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
 @ti.func
 def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
     """Average with the same turn seen before; else a new one in the place of the oldest."""
-    n_packet = ti.static(io.habits.turn.shape[2])
-    slot, weight = io.habits.next_slot[env], 1.0
+    n_packet = ti.static(io.turn_history.turn.shape[2])
+    slot, weight = io.turn_history.next_slot[env], 1.0
     known = 0
     for packet in range(n_packet):
         for lane in range(LANES):
-            if known == 0 and io.habits.turn[env, WEIGHT, packet][lane] > 0.0:
+            if known == 0 and io.turn_history.turn[env, WEIGHT, packet][lane] > 0.0:
                 off = (
                     ti.Vector(
-                        [io.habits.turn[env, TURN_X, packet][lane], io.habits.turn[env, TURN_Y, packet][lane]]
+                        [
+                            io.turn_history.turn[env, TURN_X, packet][lane],
+                            io.turn_history.turn[env, TURN_Y, packet][lane],
+                        ]
                     )
                     - pos
                 )
                 alike_in = (
-                    io.habits.turn[env, IN_X, packet][lane] * d0[0]
-                    + io.habits.turn[env, IN_Y, packet][lane] * d0[1]
+                    io.turn_history.turn[env, IN_X, packet][lane] * d0[0]
+                    + io.turn_history.turn[env, IN_Y, packet][lane] * d0[1]
                     > _ALIKE_COS
                 )
                 alike_out = (
-                    io.habits.turn[env, OUT_X, packet][lane] * d1[0]
-                    + io.habits.turn[env, OUT_Y, packet][lane] * d1[1]
+                    io.turn_history.turn[env, OUT_X, packet][lane] * d1[0]
+                    + io.turn_history.turn[env, OUT_Y, packet][lane] * d1[1]
                     > _ALIKE_COS
                 )
                 if alike_in and alike_out and off.norm_sqr() < ti.static(_SAME_M**2):
                     known, slot = 1, packet * LANES + lane
     packet, lane = slot // LANES, slot % LANES
     if known == 1:
-        weight = ti.min(io.habits.turn[env, WEIGHT, packet][lane] + 1.0, _MOST_WEIGHT)
+        weight = ti.min(io.turn_history.turn[env, WEIGHT, packet][lane] + 1.0, _MOST_WEIGHT)
     else:
-        io.habits.next_slot[env] = (slot + 1) % ti.static(LANES * n_packet)
+        io.turn_history.next_slot[env] = (slot + 1) % ti.static(LANES * n_packet)
     keep, gain = 1.0 - 1.0 / weight, 1.0 / weight
     came = (
         keep
         * known
-        * ti.Vector([io.habits.turn[env, IN_X, packet][lane], io.habits.turn[env, IN_Y, packet][lane]])
+        * ti.Vector(
+            [io.turn_history.turn[env, IN_X, packet][lane], io.turn_history.turn[env, IN_Y, packet][lane]]
+        )
         + gain * d0
     )
     went = (
         keep
         * known
-        * ti.Vector([io.habits.turn[env, OUT_X, packet][lane], io.habits.turn[env, OUT_Y, packet][lane]])
+        * ti.Vector(
+            [io.turn_history.turn[env, OUT_X, packet][lane], io.turn_history.turn[env, OUT_Y, packet][lane]]
+        )
         + gain * d1
     )
     came, went = came.normalized(), went.normalized()
-    io.habits.turn[env, TURN_X, packet][lane] = (
-        keep * io.habits.turn[env, TURN_X, packet][lane] * known + gain * pos[0]
+    io.turn_history.turn[env, TURN_X, packet][lane] = (
+        keep * io.turn_history.turn[env, TURN_X, packet][lane] * known + gain * pos[0]
     )
-    io.habits.turn[env, TURN_Y, packet][lane] = (
-        keep * io.habits.turn[env, TURN_Y, packet][lane] * known + gain * pos[1]
+    io.turn_history.turn[env, TURN_Y, packet][lane] = (
+        keep * io.turn_history.turn[env, TURN_Y, packet][lane] * known + gain * pos[1]
     )
-    io.habits.turn[env, IN_X, packet][lane] = came[0]
-    io.habits.turn[env, IN_Y, packet][lane] = came[1]
-    io.habits.turn[env, OUT_X, packet][lane] = went[0]
-    io.habits.turn[env, OUT_Y, packet][lane] = went[1]
-    io.habits.turn[env, WEIGHT, packet][lane] = weight
+    io.turn_history.turn[env, IN_X, packet][lane] = came[0]
+    io.turn_history.turn[env, IN_Y, packet][lane] = came[1]
+    io.turn_history.turn[env, OUT_X, packet][lane] = went[0]
+    io.turn_history.turn[env, OUT_Y, packet][lane] = went[1]
+    io.turn_history.turn[env, WEIGHT, packet][lane] = weight
 
 
 @ti.func
 def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
-    """A body that was expected to turn and has gone straight on past the place, in the last ``moved`` [m],
-    takes one off its weight."""
-    for packet in range(io.habits.turn.shape[2]):
-        along, across = offsets(env, packet, pos, course, io.habits)
+    """An obstacle that was expected to turn and has gone straight on past the place, in the last ``moved``
+    [m], takes one off its weight."""
+    for packet in range(io.turn_history.turn.shape[2]):
+        along, across = offsets(env, packet, pos, course, io.turn_history)
         for lane in ti.static(range(LANES)):
             behind = (
                 along[lane] < -io.forecast_cfg.passed_m and along[lane] + moved >= -io.forecast_cfg.passed_m
@@ -219,23 +226,25 @@ def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
             if (
                 behind
                 and across[lane] < ti.static(0.5 * io.forecast_cfg.across_m)
-                and io.habits.turn[env, WEIGHT, packet][lane] > 0.0
+                and io.turn_history.turn[env, WEIGHT, packet][lane] > 0.0
             ):
-                io.habits.turn[env, WEIGHT, packet][lane] -= 1.0
+                io.turn_history.turn[env, WEIGHT, packet][lane] -= 1.0
 
 
 # ----------------------------------------------------------------------------------------------------- recall
 
 
 @ti.func
-def offsets(env, packet, pos, course, habits: In[HabitState]):
+def offsets(env, packet, pos, course, turn_history: In[TurnHistory]):
     """Lanes: how far ahead along the course a remembered turn lies, and how far aside; FAR_M aside for those
     on another course."""
-    dx, dy = habits.turn[env, TURN_X, packet] - pos[0], habits.turn[env, TURN_Y, packet] - pos[1]
+    dx, dy = turn_history.turn[env, TURN_X, packet] - pos[0], turn_history.turn[env, TURN_Y, packet] - pos[1]
     along = dx * course[0] + dy * course[1]
     aside = dx * course[1] - dy * course[0]
-    alike = habits.turn[env, IN_X, packet] * course[0] + habits.turn[env, IN_Y, packet] * course[1]
-    weight = habits.turn[env, WEIGHT, packet]
+    alike = (
+        turn_history.turn[env, IN_X, packet] * course[0] + turn_history.turn[env, IN_Y, packet] * course[1]
+    )
+    weight = turn_history.turn[env, WEIGHT, packet]
     across = f16x(FAR_M)
     for lane in ti.static(range(LANES)):
         across[lane] = ti.select(alike[lane] > _ALIKE_COS and weight[lane] > 0.0, ti.abs(aside[lane]), FAR_M)
@@ -243,11 +252,11 @@ def offsets(env, packet, pos, course, habits: In[HabitState]):
 
 
 @ti.func
-def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[ForecastConfig]):
+def next_turn(env, pos, course, turn_history: In[TurnHistory], forecast_cfg: Const[ForecastConfig]):
     """(distance [m] to the nearest remembered turn ahead, course after it); FAR_M = none."""
     gap, slot = FAR_M, 0
-    for packet in range(habits.turn.shape[2]):
-        along, across = offsets(env, packet, pos, course, habits)
+    for packet in range(turn_history.turn.shape[2]):
+        along, across = offsets(env, packet, pos, course, turn_history)
         for lane in ti.static(range(LANES)):
             meets = (
                 across[lane] < forecast_cfg.across_m + forecast_cfg.across_slope * along[lane]
@@ -260,8 +269,8 @@ def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[Fore
         gap = ti.max(gap, 0.0)
         out = ti.Vector(
             [
-                habits.turn[env, OUT_X, slot // LANES][slot % LANES],
-                habits.turn[env, OUT_Y, slot // LANES][slot % LANES],
+                turn_history.turn[env, OUT_X, slot // LANES][slot % LANES],
+                turn_history.turn[env, OUT_Y, slot // LANES][slot % LANES],
             ]
         )
     return gap, out
@@ -269,7 +278,7 @@ def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[Fore
 
 @ti.func
 def wall_ahead(pos, course, radius, tank_cfg: Const[TankConfig]):
-    """Distance [m] along the course at which a body of that radius touches a side wall; it may be
+    """Distance [m] along the course at which an obstacle of that radius touches a side wall; it may be
     negative."""
     gap = FAR_M
     if ti.static(tank_cfg.shape == "circle"):
@@ -296,19 +305,19 @@ def next_event(
     pos,
     course,
     radius,
-    habits: In[HabitState],
+    turn_history: In[TurnHistory],
     forecast_cfg: Const[ForecastConfig],
     tank_cfg: Const[TankConfig],
 ):
     """(distance [m] to the next turn on a straight course, course after it): a remembered one, or the wall if
     that comes first.
 
-    At a wall bodies are expected to turn back: right for lines, and nearer than a mirrored course to what
+    At a wall obstacles are expected to turn back: right for lines, and nearer than a mirrored course to what
     loops do, whose next leg goes anywhere into the tank.
     """
     gap, out = FAR_M, course
-    if ti.static(forecast_cfg.use_habits):
-        gap, out = next_turn(env, pos, course, habits, forecast_cfg)
+    if ti.static(forecast_cfg.use_turn_history):
+        gap, out = next_turn(env, pos, course, turn_history, forecast_cfg)
     if ti.static(forecast_cfg.use_reflection):
         far = ti.max(wall_ahead(pos, course, radius, tank_cfg), 0.0)
         if far < gap:
@@ -324,7 +333,7 @@ def expected_turn_rate(
     forecast_cfg: Const[ForecastConfig],
     tracking_cfg: Const[TrackingConfig],
 ):
-    """[rad/s] the filter's turn rate, where that explains the track better than none: most bodies go
+    """[rad/s] the filter's turn rate, where that explains the track better than none: most obstacles go
     straight.
 
     Odds for a turn = density of rate 0 in the prior over that in the posterior (Savage-Dickey): an uncertain
@@ -350,13 +359,13 @@ def coasted(
     track,
     mean,
     time,
-    habits: In[HabitState],
+    turn_history: In[TurnHistory],
     tracks: In[TrackState],
     forecast_cfg: Const[ForecastConfig],
     tank_cfg: Const[TankConfig],
 ):
-    """Mean (x, y, vx, vy) of an unseen body on a straight leg after ``time`` [s]: it turns where bodies
-    turn."""
+    """Mean (x, y, vx, vy) of an unseen obstacle on a straight leg after ``time`` [s]: it turns where
+    obstacles turn."""
     speed = ti.max(ti.sqrt(mean[2] ** 2 + mean[3] ** 2), 1e-6)
     course, way = ti.Vector([mean[2] / speed, mean[3] / speed]), speed * time
     gap, out = next_event(
@@ -364,7 +373,7 @@ def coasted(
         ti.Vector([mean[0], mean[1]]),
         course,
         tracks.radius_m[env, track],
-        habits,
+        turn_history,
         forecast_cfg,
         tank_cfg,
     )
@@ -381,17 +390,17 @@ def coasted(
 
 
 MOST_LEGS = 6
-"""Turns within one forecast; beyond them a body goes straight on."""
+"""Turns within one forecast; beyond them an obstacle goes straight on."""
 
 
 @quick_launch
 @ti.kernel
 def reset_forecast(io: Bundle[ForecastIO]):
-    """Know no habits and expect nothing in the awake rows."""
-    n = ti.static(io.clock.awake.shape[0])
+    """Know no turn history and expect nothing in the active rows."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
-            forget_habits(env, io)
+        if pad == 0 and io.clock.active[env] == 1:
+            forget_turns(env, io)
             for track in range(io.forecast.radius_m.shape[1]):
                 clear_forecast(env, track, io)
                 io.forecast.turn_m[env, track], io.forecast.turn_out_w[env, track] = (
@@ -404,31 +413,31 @@ def reset_forecast(io: Bundle[ForecastIO]):
 
 @quick_launch
 @ti.kernel
-def learn_habits(io: Bundle[ForecastIO]):
+def learn_turns(io: Bundle[ForecastIO]):
     """Watch how the tracks move, after each tracked scan."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.clusters.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             for track in range(io.tracks.alive.shape[1]):
-                learn_habit(env, track, io)
+                learn_turn(env, track, io)
 
 
 @quick_launch
 @ti.kernel
 def forecast_tracks(io: Bundle[ForecastIO]):
-    """From now to the horizon, for the moving tracks of the awake rows; the others get a negative radius.
+    """From now to the horizon, for the moving tracks of the active rows; the others get a negative radius.
 
     The radius grows by ``growth_sigmas`` standard deviations of the predicted position along its worst axis,
     as the filter knows it today: turns to come are not in it (the planner's own growing margin is for them).
     At most ``max_growth_m``.
     """
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     n_track = ti.static(io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             changed = (
                 io.clusters.fresh[env] + io.image.fresh[env] > 0
-            )  # only a tracked scan or an image changes tracks and habits
+            )  # only a tracked scan or an image changes tracks and turn history
             if io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
                 if expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) != 0.0:
                     follow_arc(env, track, io)
@@ -474,7 +483,7 @@ def follow_legs(env, track, changed, io: Bundle[ForecastIO]):
     course = ti.Vector([mean[2], mean[3]]) / speed
     gap, out = io.forecast.turn_m[env, track], io.forecast.turn_out_w[env, track]
     if changed:
-        gap, out = next_event(env, pos, course, radius, io.habits, io.forecast_cfg, io.tank_cfg)
+        gap, out = next_event(env, pos, course, radius, io.turn_history, io.forecast_cfg, io.tank_cfg)
         io.forecast.turn_m[env, track] = gap
         io.forecast.turn_out_w[env, track] = out
     legs = 0
@@ -485,7 +494,7 @@ def follow_legs(env, track, changed, io: Bundle[ForecastIO]):
             pos += gap * course
             way -= gap
             course = out
-            gap, out = next_event(env, pos, course, radius, io.habits, io.forecast_cfg, io.tank_cfg)
+            gap, out = next_event(env, pos, course, radius, io.turn_history, io.forecast_cfg, io.tank_cfg)
             legs += 1
         pos += way * course
         gap -= way

@@ -2,7 +2,7 @@
 and how probable that is. It sees the columns of ``motion_columns`` and nothing else.
 
 It says the logits of ``N_MODE`` futures, then each one's places at ``ANCHORS`` times ``ANCHOR_S`` apart, in
-the track's frame and in parts of the way that it can go till then. Between them bodies go straight, never
+the track's frame and in parts of the way that it can go till then. Between them obstacles go straight, never
 faster than now. The trained network says spreads too; they are not needed here.
 """
 
@@ -40,10 +40,10 @@ from uuvtai.kernels.perception.prediction import IN_X, IN_Y, OUT_X, OUT_Y, WEIGH
 def mix_futures(io: Bundle[MixtureIO]):
     """In decision steps: the likeliest future of every track that has a forecast becomes its forecast, the
     others are its futures, with their probabilities."""
-    n, n_track = ti.static(io.clock.awake.shape[0], io.forecast.radius_m.shape[1])
+    n, n_track = ti.static(io.clock.active.shape[0], io.forecast.radius_m.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
-        due = io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0
-        if pad == 0 and due and io.clock.awake[env] == 1:
+        due = io.clock.step[env] % ti.static(io.behavior_cfg.decide_period_steps) == 0
+        if pad == 0 and due and io.clock.active[env] == 1:
             if io.forecast.radius_m[env, track, 0] >= 0:
                 _think(env, track, io)
                 _tell(env, track, io)
@@ -144,10 +144,10 @@ _BACK_COS = -0.9
 @quick_launch
 @ti.kernel
 def reset_past(io: Bundle[PastIO]):
-    """Remember nothing in the awake rows."""
-    n, n_track = ti.static(io.clock.awake.shape[0], io.tracks.alive.shape[1])
+    """Remember nothing in the active rows."""
+    n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             _forget(env, track, io)
             for i in range(io.mixture.frame.shape[2]):
                 io.mixture.frame[env, track, i] = 0.0
@@ -161,9 +161,9 @@ def reset_past(io: Bundle[PastIO]):
 @ti.kernel
 def remember_past(io: Bundle[PastIO]):
     """After each tracked scan: where the tracks are, and where they turned. A new track remembers nothing."""
-    n, n_track = ti.static(io.clock.awake.shape[0], io.tracks.alive.shape[1])
+    n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.clusters.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             if io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0:
                 _forget(env, track, io)
             if io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
@@ -174,10 +174,10 @@ def remember_past(io: Bundle[PastIO]):
 @ti.kernel
 def describe_motion(io: Bundle[PastIO]):
     """In decision steps: the columns of every track that has a forecast."""
-    n, n_track = ti.static(io.clock.awake.shape[0], io.tracks.alive.shape[1])
+    n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
-        due = io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0
-        if pad == 0 and due and io.clock.awake[env] == 1 and io.forecast.radius_m[env, track, 0] >= 0:
+        due = io.clock.step[env] % ti.static(io.behavior_cfg.decide_period_steps) == 0
+        if pad == 0 and due and io.clock.active[env] == 1 and io.forecast.radius_m[env, track, 0] >= 0:
             mean, place = io.tracks.state[env, track], io.forecast.pos_w[env, track, 0]
             speed = ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
             scale = 1.0 / ti.max(speed, 1.0e-6)
@@ -213,8 +213,8 @@ def _remember(env, track, io: Bundle[PastIO]):
         io.past.past_w[env, track, 0] = ti.Vector([mean[0], mean[1]])
         io.past.past_step[env, track] = now
         io.past.past_count[env, track] = ti.min(count + 1, N_PAST)
-    if io.habits.run_kind[env, track] == 2:
-        bend, known = io.habits.run_from_w[env, track], io.past.bend_count[env, track]
+    if io.turn_history.run_kind[env, track] == 2:
+        bend, known = io.turn_history.run_from_w[env, track], io.past.bend_count[env, track]
         if known == 0 or (bend - io.past.bend_w[env, track, 0]).norm() > _NEW_BEND_M:
             for i in range(N_BEND - 1):
                 io.past.bend_w[env, track, N_BEND - 1 - i] = io.past.bend_w[env, track, N_BEND - 2 - i]
@@ -243,9 +243,9 @@ def _put_motion(env, track, speed, course, io: Bundle[PastIO]):
         io.tracks.turn_cov[env, track][4],
     )
     unseen = (io.clock.step[env] - io.tracks.seen_step[env, track]) * dt
-    kind, begun = io.habits.run_kind[env, track], 0.0
+    kind, begun = io.turn_history.run_kind[env, track], 0.0
     if kind > 0:
-        begun = (io.forecast.pos_w[env, track, 0] - io.habits.run_from_w[env, track]).dot(course)
+        begun = (io.forecast.pos_w[env, track, 0] - io.turn_history.run_from_w[env, track]).dot(course)
     spread_v = ti.sqrt(ti.max(cov[7] + cov[9], 0.0))
     values = ti.Vector([
         speed,
@@ -274,7 +274,7 @@ def _put_ahead(env, track, place, course, io: Bundle[PastIO]):
     io.mixture.column[env, track, at + 1] = _scaled(wall_ahead(place, -course, radius, io.tank_cfg))
     io.mixture.column[env, track, at + 2] = _scaled(wall_ahead(place, left, radius, io.tank_cfg))
     io.mixture.column[env, track, at + 3] = _scaled(wall_ahead(place, -left, radius, io.tank_cfg))
-    gap, out = next_turn(env, place, course, io.habits, io.forecast_cfg)
+    gap, out = next_turn(env, place, course, io.turn_history, io.forecast_cfg)
     known = gap < FAR_M
     io.mixture.column[env, track, at + 4] = _scaled(gap)
     io.mixture.column[env, track, at + 5] = ti.select(known, out.dot(course), 0.0)
@@ -310,12 +310,12 @@ def _put_behind(env, track, place, course, io: Bundle[PastIO]):
 def _turns_seen(env, io: Bundle[PastIO]):
     """How many of the remembered turns of this water are turns back, and how many are others."""
     back, aside = 0.0, 0.0
-    for packet in range(io.habits.turn.shape[2]):
+    for packet in range(io.turn_history.turn.shape[2]):
         cos = (
-            io.habits.turn[env, IN_X, packet] * io.habits.turn[env, OUT_X, packet]
-            + io.habits.turn[env, IN_Y, packet] * io.habits.turn[env, OUT_Y, packet]
+            io.turn_history.turn[env, IN_X, packet] * io.turn_history.turn[env, OUT_X, packet]
+            + io.turn_history.turn[env, IN_Y, packet] * io.turn_history.turn[env, OUT_Y, packet]
         )
-        weight = io.habits.turn[env, WEIGHT, packet]
+        weight = io.turn_history.turn[env, WEIGHT, packet]
         for lane in ti.static(range(LANES)):
             if weight[lane] > 0.0:
                 back += ti.select(cos[lane] < _BACK_COS, 1.0, 0.0)

@@ -254,10 +254,10 @@ def is_new(env, beam, scan: In[SonarScan], sonar_cfg: Const[SonarConfig]):
 @quick_launch
 @ti.kernel
 def reset_echoes(io: Bundle[EchoesIO]):
-    """Nothing was heard yet, in the awake rows."""
-    n = ti.static(io.clock.awake.shape[0])
+    """Nothing was heard yet, in the active rows."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             for slot in range(io.echoes.step.shape[1]):
                 io.echoes.step[env, slot] = NEVER
                 io.echoes.pos_x_m[env, slot] = 0.0
@@ -274,9 +274,9 @@ def reset_echoes(io: Bundle[EchoesIO]):
 @ti.kernel
 def recall_echoes(io: Bundle[EchoesIO]):
     """Keep the new beams, and fill the others of the scan with what is remembered."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.scan.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
             keep_new(env, io)
             show_old(env, io)
 
@@ -335,7 +335,7 @@ def show_in(env, slot, beam, range_m, io: Bundle[EchoesIO]):
 
 
 _MAX_REACH = 4
-"""[cells] farthest neighbour that may explain a surprising return as the edge of a static body."""
+"""[cells] farthest neighbour that may explain a surprising return as the edge of a static obstacle."""
 
 NO_RETURN_SHARE = 0.999
 """A depth pixel beyond this share of the camera's range saw nothing."""
@@ -469,9 +469,9 @@ def is_inconsistent(env, row, col, range_m, promote_scans: Const[int], io: Bundl
     """1 where a return contradicts a cell that was confidently free, or one that such evidence holds and has
     not yet promoted.
 
-    The edge of a static body does this too: range noise and the gap between beams move its returns into cells
-    that other beams cleared. So nothing counts near a statically occupied cell: within one cell plus beam
-    spacing plus range error.
+    The edge of a static obstacle does this too: range noise and the gap between beams move its returns into
+    cells that other beams cleared. So nothing counts near a statically occupied cell: within one cell plus
+    beam spacing plus range error.
     """
     confident = bit_of(io.grid_map.confident[env, row, col // WORD], col % WORD)
     held = bit_of(io.grid_map.held[env, row, col // WORD], col % WORD)
@@ -515,8 +515,8 @@ def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
     """Of a packet of beams: kind of return (0 = none or from a known wall, 1 = at rest as far as it tells
     itself, 2 = moving by its Doppler), row, column, range [m].
 
-    ``vel`` [m/s] is the own velocity along x and y of the body, ``threshold`` [m/s] the compensated Doppler
-    that counts as motion.
+    ``vel`` [m/s] is the own velocity along x and y of the obstacle, ``threshold`` [m/s] the compensated
+    Doppler that counts as motion.
     """
     n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
     lanes = ti.static(n_lane())

@@ -19,8 +19,8 @@ from uuvtai.kernels.perception.prediction import BEGIN_SEEN, next_turn
 from uuvtai.state import TrackState
 
 # ------------------------------------------------------------------------------------------------------------
-# What a cluster says about a body of known radius: where its centre is, how surely, how well it fits a track
-# (part of tracking).
+# What a cluster says about an obstacle of known radius: where its centre is, how surely, how well it fits a
+# track (part of tracking).
 
 
 _CROSS_SIGMA_M = 0.02
@@ -38,8 +38,8 @@ def bearing_vector(bearing):
 
 @ti.func
 def centre_sight(env, c, radius, io: Bundle[TrackingIO]):
-    """(bearing [rad], distance [m], half-angle [rad]) of the centre of a body of known radius; the open edge
-    stands in for a hidden one."""
+    """(bearing [rad], distance [m], half-angle [rad]) of the centre of an obstacle of known radius; the open
+    edge stands in for a hidden one."""
     distance = io.clusters.range_m[env, c] + ARC * radius
     half = radius / distance
     distance /= 1.0 - half * half / 6.0
@@ -54,11 +54,11 @@ def centre_sight(env, c, radius, io: Bundle[TrackingIO]):
 
 @ti.func
 def missing_width(env, c, radius, radius_var, io: Bundle[TrackingIO]):
-    """[m] by which a cluster with two free edges is narrower on one side than a body of known radius, beyond
-    what noise explains.
+    """[m] by which a cluster with two free edges is narrower on one side than an obstacle of known radius,
+    beyond what noise explains.
 
-    A body leaves the sonar's fan by its nearest part first: what is left of it are its two sides, and one
-    of them says no more than that the centre is this near.
+    An obstacle leaves the sonar's fan by its nearest part first: what is left of it are its two sides, and
+    one of them says no more than that the centre is this near.
     """
     missing = 0.0
     if ti.static(io.tracking_cfg.partial_sigmas > 0):
@@ -266,7 +266,7 @@ def is_moving(env, track, c, dt, io: Bundle[TrackingIO]):
 
 @ti.func
 def has_shifted(env, track, c, dt, io: Bundle[TrackingIO]):
-    """Whether the displacement shows motion: larger than noise and than what a turned view of a resting box
+    """Whether the displacement shows motion: larger than noise and than what a turned view of a static box
     feigns, and along the velocity.
 
     A box shows other faces as the bearing turns: its apparent centre moves by up to its half-extent times
@@ -288,10 +288,10 @@ def has_shifted(env, track, c, dt, io: Bundle[TrackingIO]):
 
 @ti.func
 def update_turn_rate(env, track, before, io: Bundle[TrackingIO]):
-    """Estimate the turn rate of a moving body from when its velocity is settled until that jumps: corners
+    """Estimate the turn rate of a moving obstacle from when its velocity is settled until that jumps: corners
     tell nothing about it.
 
-    Without it the filter lags behind bodies on circles by a third of their speed.
+    Without it the filter lags behind obstacles on circles by a third of their speed.
     """
     after, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
     unsettled = (cov[7] + cov[9]) / (_SETTLED * (after[2] * after[2] + after[3] * after[3]))
@@ -311,24 +311,24 @@ def update_turn_rate(env, track, before, io: Bundle[TrackingIO]):
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Bodies above or below the fan may turn back: where they are then, and how uncertain that is (part of
+# Obstacles above or below the fan may turn back: where they are then, and how uncertain that is (part of
 # tracking).
 #
-# A body that swims to and fro at constant speed and turns back at the rate h [1/s] has the velocity s(t) v
-# with
+# An obstacle that swims to and fro at constant speed and turns back at the rate h [1/s] has the velocity s(t)
+# v with
 # s = +-1: its mean is exp(-2ht) v, and the covariance of its velocity at two times falls as exp(-2h |t - t'|)
 # (Kac's telegraph process). An Ornstein-Uhlenbeck velocity with the rate 2h and the same mean square has the
 # same first and second moments at all times, so a Kalman filter can carry them: the mean slows down and stays
 # ahead of the last sight by v / 2h, the variance along the way grows backwards as well as forwards. The mean
-# square of the velocity, mean^2 + variance, is what such a body keeps: its largest axis is the way, its root
-# the speed.
+# square of the velocity, mean^2 + variance, is what such an obstacle keeps: its largest axis is the way, its
+# root the speed.
 
 
 _SLOWEST_M_S = 0.1
 """A slower body is where it is, whichever way it turns."""
 
 _LEAST_SHARE = 1.0e-3
-"""Share of ways at least that a body may still be on."""
+"""Share of ways at least that an obstacle may still be on."""
 
 _ODD_SHARE = 0.05
 """Share of ways that are longer than any expected: their length is exponential."""
@@ -348,7 +348,7 @@ def way_of(mean, cov):
 
 @ti.func
 def turn_back_rate(env, track, dt, io: Bundle[TrackingIO]):
-    """[1/s] at which an unseen body turns back, from the length of way that it was seen to go straight; 0
+    """[1/s] at which an unseen obstacle turns back, from the length of way that it was seen to go straight; 0
     where its next turn is known."""
     mean = io.tracks.state[env, track]
     course, square = way_of(mean, io.tracks.cov[env, track])
@@ -356,12 +356,12 @@ def turn_back_rate(env, track, dt, io: Bundle[TrackingIO]):
     rate = 0.0
     if speed > _SLOWEST_M_S:
         turn = FAR_M + 0.0
-        if ti.static(io.forecast_cfg.use_habits):
-            turn, _ = next_turn(env, pos, course, io.habits, io.forecast_cfg)
+        if ti.static(io.forecast_cfg.use_turn_history):
+            turn, _ = next_turn(env, pos, course, io.turn_history, io.forecast_cfg)
         if turn >= FAR_M:
-            begun, known = 0.0, io.habits.run_kind[env, track] >= BEGIN_SEEN
-            if io.habits.run_kind[env, track] > 0:
-                begun = ti.max((pos - io.habits.run_from_w[env, track]).dot(course), 0.0)
+            begun, known = 0.0, io.turn_history.run_kind[env, track] >= BEGIN_SEEN
+            if io.turn_history.run_kind[env, track] > 0:
+                begun = ti.max((pos - io.turn_history.run_from_w[env, track]).dot(course), 0.0)
             first = ti.max(longer_share(begun, known, io.traffic_cfg), _LEAST_SHARE)
             last = ti.max(longer_share(begun + speed * dt, known, io.traffic_cfg), _LEAST_SHARE)
             straight = straight_share(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg)
@@ -391,7 +391,8 @@ def straight_share(
     forecast_cfg: Const[ForecastConfig],
     tracking_cfg: Const[TrackingConfig],
 ):
-    """Probability that the body goes straight rather than in a circle (``habits.expected_turn_rate``)."""
+    """Probability that the obstacle goes straight rather than in a circle
+    (``turn_history.expected_turn_rate``)."""
     share = 1.0
     if ti.static(forecast_cfg.use_turn_rate and tracking_cfg.turn_rate_sigma_rad_s > 0):
         rate, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
@@ -404,7 +405,7 @@ def straight_share(
 
 @ti.func
 def turned_back(mean, cov, link, rate, dt):
-    """(mean, covariance, link) that went straight for dt [s], of a body that turns back at ``rate``
+    """(mean, covariance, link) that went straight for dt [s], of an obstacle that turns back at ``rate``
     [1/s]."""
     course, square = way_of(mean, cov)
     x = 2.0 * rate * dt

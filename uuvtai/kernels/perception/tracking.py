@@ -1,4 +1,4 @@
-"""Tracking: from clusters of beams to tracks of moving bodies. Sees sensor data and its own memory only.
+"""Tracking: from clusters of beams to tracks of moving obstacles. Sees sensor data and its own memory only.
 
 One scan: label beams - find clusters - predict - associate - update - prune - spawn - name beams. One Kalman
 filter per track on position and mean Doppler; all states refer to the ping of the newest tracked scan
@@ -35,8 +35,8 @@ from uuvtai.kernels.perception.track_filter import (
 from uuvtai.state import TrackState
 
 # ------------------------------------------------------------------------------------------------------------
-# Which slot holds which body: lost tracks end, new ones begin, beams get the names of their tracks (part of
-# the tracking stage).
+# Which slot holds which obstacle: lost tracks end, new ones begin, beams get the names of their tracks (part
+# of the tracking stage).
 
 
 SEEN_THROUGH = 1
@@ -50,10 +50,10 @@ _MISS_S = 0.1
 """One "miss" of the config: a nominal 10 Hz scan."""
 
 _SPOTTED_S = 0.3
-"""[s] a body that the camera showed this lately is there, though beams pass above or below it."""
+"""[s] an obstacle that the camera showed this lately is there, though beams pass above or below it."""
 
 _PEEKING_RADIUS_M = 0.2
-"""Least radius given to a body first seen past something nearer: half the size of the design's typical
+"""Least radius given to an obstacle first seen past something nearer: half the size of the design's typical
 body."""
 
 
@@ -88,11 +88,11 @@ def clear_track(env, track, tracks: Out[TrackState]):
 
 @ti.func
 def prune_tracks(env, dt, io: Bundle[TrackingIO]):
-    """Weigh how high moving bodies may be, and end unmatched tracks that are not where they are expected, or
-    doubled a matched one."""
+    """Weigh how high moving obstacles may be, and end unmatched tracks that are not where they are expected,
+    or doubled a matched one."""
     for track in range(io.tracks.alive.shape[1]):
         if io.tracks.alive[env, track] == 1:
-            remembered = ti.static(io.elevation_cfg.memory_s > 0) and io.tracks.moving[env, track] == 1
+            remembered = ti.static(io.height_cfg.memory_s > 0) and io.tracks.moving[env, track] == 1
             if io.tracks.misses[env, track] == 0:
                 if remembered:
                     weigh_seen(
@@ -100,7 +100,7 @@ def prune_tracks(env, dt, io: Bundle[TrackingIO]):
                         track,
                         io.scan.ping_pos_w[env],
                         io.tracks,
-                        io.elevation_cfg,
+                        io.height_cfg,
                         io.sonar_cfg,
                         io.tank_cfg,
                     )
@@ -119,14 +119,14 @@ def prune_tracks(env, dt, io: Bundle[TrackingIO]):
 
 @ti.func
 def is_forgotten(env, track, sight, dt, io: Bundle[TrackingIO]):
-    """1 where a moving body is hardly where it is expected any more: seen through within the fan, or unseen
-    for long."""
+    """1 where a moving obstacle is hardly where it is expected any more: seen through within the fan, or
+    unseen for long."""
     if sight == SEEN_THROUGH:
         weigh_unseen(
-            env, track, io.scan.ping_pos_w[env], dt, io.tracks, io.elevation_cfg, io.sonar_cfg, io.tank_cfg
+            env, track, io.scan.ping_pos_w[env], dt, io.tracks, io.height_cfg, io.sonar_cfg, io.tank_cfg
         )
-    io.tracks.present[env, track] *= ti.exp(-dt * ti.static(1.0 / max(io.elevation_cfg.memory_s, 1e-3)))
-    return ti.cast(io.tracks.present[env, track] < io.elevation_cfg.gone_share, ti.i32)
+    io.tracks.present[env, track] *= ti.exp(-dt * ti.static(1.0 / max(io.height_cfg.memory_s, 1e-3)))
+    return ti.cast(io.tracks.present[env, track] < io.height_cfg.gone_share, ti.i32)
 
 
 @ti.func
@@ -215,7 +215,7 @@ def is_double(env, track, io: Bundle[TrackingIO]):
 
 @ti.func
 def spawn_tracks(env, io: Bundle[TrackingIO]):
-    """Begin a track for every unmatched cluster, unless it is a splinter of a body that is tracked
+    """Begin a track for every unmatched cluster, unless it is a splinter of an obstacle that is tracked
     already."""
     for c in range(io.clusters.count[env]):
         if io.clusters.match[env, c] < 0:
@@ -249,10 +249,10 @@ def owner_of(env, c, io: Bundle[TrackingIO]):
 
 @ti.func
 def free_slot(env, c, io: Bundle[TrackingIO]):
-    """A dead slot; else that of the least useful resting track: lost ones first, then the farthest if it is
+    """A dead slot; else that of the least useful static track: lost ones first, then the farthest if it is
     farther than the newcomer.
 
-    A newcomer with clear Doppler displaces any resting track. -1 = none.
+    A newcomer with clear Doppler displaces any static track. -1 = none.
     """
     own = io.scan.ping_pos_w[env]
     moves = ti.abs(io.clusters.doppler_m_s[env, c]) > ti.max(
@@ -305,7 +305,7 @@ def begin_track(env, track, c, io: Bundle[TrackingIO]):
     io.tracks.doppler_m_s[env, track] = io.clusters.doppler_m_s[env, c]
     io.tracks.doppler_var[env, track] = io.clusters.doppler_var[env, c]
     io.tracks.seen_step[env, track] = io.scan.ping_step[env]
-    begin_height(env, track, io.tracks, io.elevation_cfg)
+    begin_height(env, track, io.tracks, io.height_cfg)
     io.tracks.moving[env, track] = moves_at_sight(env, c, io)
 
 
@@ -365,7 +365,7 @@ def mover_at(env, x, y, slack, io: Bundle[TrackingIO]):
 @ti.func
 def carry_names(env, io: Bundle[TrackingIO]):
     """Name the beams of a scan that is not tracked after the last one that was: same bearing, and a range at
-    which that body can be."""
+    which that obstacle can be."""
     if ti.static(io.sonar_cfg.mechanical):
         name_by_place(env, io)
     else:
@@ -457,9 +457,9 @@ def pair_cost(env, track, c, dt, io: Bundle[TrackingIO]):
 
 @ti.func
 def swept_reach(env, track, io: Bundle[TrackingIO]):
-    """[m] from where it is expected to where a track may be found by a mechanical beam: as far as bodies get
-    since it was seen, if the beam has looked there since; else it may still be there, and what is found
-    elsewhere is another body."""
+    """[m] from where it is expected to where a track may be found by a mechanical beam: as far as obstacles
+    get since it was seen, if the beam has looked there since; else it may still be there, and what is found
+    elsewhere is another obstacle."""
     own, mean = io.scan.ping_pos_w[env], io.tracks.state[env, track]
     bearing = ti.atan2(mean[1] - own[1], mean[0] - own[0]) - io.scan.ping_yaw[env]
     beam = beam_there(beam_towards(bearing, io.sonar_cfg), io.sonar_cfg)
@@ -477,10 +477,10 @@ def swept_reach(env, track, io: Bundle[TrackingIO]):
 @quick_launch
 @ti.kernel
 def reset_tracks(io: Bundle[TrackingIO]):
-    """Forget everything about the awake rows."""
-    n = ti.static(io.clock.awake.shape[0])
+    """Forget everything about the active rows."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             io.tracks.scan_step[env] = -1
             io.clusters.scan_step[env] = -1
             io.clusters.slip_w[env] = ti.zero(io.clusters.slip_w[env])
@@ -499,8 +499,8 @@ def tracked_period_s(tracking, sonar, rules):
     return sonar.period_steps * math.ceil(tracking.period_steps / sonar.period_steps) * rules.control_dt_s
 
 
-def track_bodies(io: TrackingIO) -> None:
-    """Bring the tracks of the awake rows to the newest scan, where one has come and the last tracked one is
+def track_obstacles(io: TrackingIO) -> None:
+    """Bring the tracks of the active rows to the newest scan, where one has come and the last tracked one is
     ``period_steps`` old.
 
     Four kernels, launched in turn: as one they compile three times as long, for the compiler's time grows
@@ -508,7 +508,7 @@ def track_bodies(io: TrackingIO) -> None:
     """
     take_scan(io)
     cluster_beams(io)
-    follow_bodies(io)
+    follow_obstacles(io)
     keep_slots(io)
 
 
@@ -516,10 +516,10 @@ def track_bodies(io: TrackingIO) -> None:
 @with_cse()
 @ti.kernel
 def take_scan(io: Bundle[TrackingIO]):
-    """See whether a scan is due, and which of its beams may have hit a body."""
-    n = ti.static(io.clock.awake.shape[0])
+    """See whether a scan is due, and which of its beams may have hit a obstacle."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             io.clusters.fresh[env] = is_due(env, io)
             if io.clusters.fresh[env] == 1:
                 io.clusters.scan_step[env] = io.scan.ping_step[env]
@@ -531,19 +531,19 @@ def take_scan(io: Bundle[TrackingIO]):
 @ti.kernel
 def cluster_beams(io: Bundle[TrackingIO]):
     """Gather the beams into clusters."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.clusters.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             find_clusters(env, io)
 
 
 @quick_launch
 @ti.kernel
-def follow_bodies(io: Bundle[TrackingIO]):
+def follow_obstacles(io: Bundle[TrackingIO]):
     """Predict the tracks to the new ping, match them with clusters and correct them."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.clusters.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             dt = predict_tracks(env, io)
             associate(env, dt, io)
             update_tracks(env, dt, io)
@@ -553,13 +553,13 @@ def follow_bodies(io: Bundle[TrackingIO]):
 @ti.kernel
 def keep_slots(io: Bundle[TrackingIO]):
     """End lost tracks, begin new ones, and name the beams."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.clusters.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             prune_tracks(env, ti.static(tracked_period_s(io.tracking_cfg, io.sonar_cfg, io.episode_cfg)), io)
             spawn_tracks(env, io)
             name_beams(env, io)
-        if pad == 0 and io.clock.awake[env] == 1 and io.clusters.fresh[env] == 0 and io.scan.fresh[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 0 and io.scan.fresh[env] == 1:
             carry_names(env, io)
 
 
@@ -583,7 +583,7 @@ def is_due(env, io: Bundle[TrackingIO]):
 @ti.func
 def moved_on(env, track, dt, io: Bundle[TrackingIO]):
     """State, covariance and link to the turn rate of a track ``dt`` [s] later; one that is not seen may coast
-    along its habits or turn back."""
+    along its turn history or turn back."""
     mean, cov, link = predicted(
         io.tracks.state[env, track],
         io.tracks.cov[env, track],
@@ -601,7 +601,7 @@ def moved_on(env, track, dt, io: Bundle[TrackingIO]):
                 track,
                 io.tracks.state[env, track],
                 dt,
-                io.habits,
+                io.turn_history,
                 io.tracks,
                 io.forecast_cfg,
                 io.tank_cfg,

@@ -327,7 +327,7 @@ def redo_packets(env, slot, packet, changed, io: Bundle[ClearanceIO]):
 @ti.func
 def bring_up_to_date(env, slot, io: Bundle[ClearanceIO]):
     """One env's turn: where it is due, everything that changed since its last one."""
-    if io.clock.awake[env] == 1:
+    if io.clock.active[env] == 1:
         io.clearance.fresh[env] = is_due(env, io)
     if is_due(env, io) == 1:
         changed = take_sites(env, slot, ti.static(squared_limit(io.clearance_cfg, io.mapping_cfg)), io)
@@ -341,7 +341,7 @@ def bring_up_to_date(env, slot, io: Bundle[ClearanceIO]):
 def compute_clearance(io: Bundle[ClearanceIO]):
     """Clearance of every cell from the layer that the planner must avoid (``voronoi.use``), where it is
     due."""
-    n_env, n_slot = ti.static(io.clock.awake.shape[0], io.clearance_memory.row_key.shape[0])
+    n_env, n_slot = ti.static(io.clock.active.shape[0], io.clearance_memory.row_key.shape[0])
     if ti.static(n_item() > 1):  # each loop ends before the next begins
         for env, item in ti.ndrange(n_env, ti.static(n_item())):
             find_changes(env, item, io)

@@ -70,7 +70,7 @@ def site_word(env, row, word, io: Bundle[ClearanceIO]):
 def is_due(env, io: Bundle[ClearanceIO]):
     """1 where the clearance is computed in this step."""
     return ti.cast(
-        io.clock.awake[env] == 1 and io.clock.step[env] % io.clearance_cfg.period_steps == 0, ti.i32
+        io.clock.active[env] == 1 and io.clock.step[env] % io.clearance_cfg.period_steps == 0, ti.i32
     )
 
 
@@ -84,7 +84,7 @@ def is_due(env, io: Bundle[ClearanceIO]):
 def find_changes(env, item, io: Bundle[ClearanceIO]):
     """Take an item's share of an env's sites, and mark what those that changed may concern, or everything
     where nothing is known."""
-    if item == 0 and io.clock.awake[env] == 1:
+    if item == 0 and io.clock.active[env] == 1:
         io.clearance.fresh[env] = is_due(env, io)
     if is_due(env, io) == 1:
         n_row, n_word = ti.static(io.clearance_memory.sites.shape[1:])

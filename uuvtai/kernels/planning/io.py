@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from uuvtai.config import (
     ClearanceConfig,
     EpisodeConfig,
-    FeaturesConfig,
     ForecastConfig,
     MappingConfig,
+    ObservationConfig,
     QuietConfig,
     RouteConfig,
     SonarConfig,
@@ -19,18 +19,18 @@ from uuvtai.config import (
 )
 from uuvtai.kernels.core.stage import Const, In, Out
 from uuvtai.state import (
+    BehaviorState,
     ClearanceMemory,
     ClearanceState,
     ClockState,
-    FeatureState,
     ForecastState,
     GridMask,
     MapState,
     MissionState,
+    ObservationState,
     Proprioception,
     RouteState,
     SonarScan,
-    TeacherState,
     TrackState,
     TreeTable,
     VoronoiState,
@@ -52,10 +52,10 @@ class ClearanceIO:
 
 
 @dataclass(frozen=True, eq=False)
-class FeaturesIO:
+class ObservationIO:
     """The observation: what the policy reads."""
 
-    features: Out[FeatureState]
+    observation: Out[ObservationState]
     clock: In[ClockState]
     ego: In[Proprioception]
     forecast: In[ForecastState]
@@ -63,10 +63,10 @@ class FeaturesIO:
     route: In[RouteState]
     scan: In[SonarScan]
     table: In[TreeTable]
-    teacher: In[TeacherState]
+    behavior: In[BehaviorState]
     tracks: In[TrackState]
     episode_cfg: Const[EpisodeConfig]
-    features_cfg: Const[FeaturesConfig]
+    observation_cfg: Const[ObservationConfig]
     forecast_cfg: Const[ForecastConfig]
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
@@ -139,7 +139,7 @@ class PlanningStages:
     """Bundles of this room, by the noun of their stage."""
 
     clearance: ClearanceIO
-    features: FeaturesIO
+    observation: ObservationIO
     triggers: TriggersIO
     voronoi: VoronoiIO
     route: RouteIO

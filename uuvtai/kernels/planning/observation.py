@@ -8,15 +8,15 @@ import taichi as ti
 
 from uuvtai.common import tree_codes as codes
 from uuvtai.compile.launch import quick_launch
-from uuvtai.config import FeaturesConfig
+from uuvtai.config import ObservationConfig
 from uuvtai.kernels.core.beams import range_rate
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, turned_z
 from uuvtai.kernels.core.stage import Bundle, ColumnGroup, FloatMatrix, Out, spread
 from uuvtai.kernels.perception.prediction import expected_turn_rate
-from uuvtai.kernels.planning.io import FeaturesIO
+from uuvtai.kernels.planning.io import ObservationIO
 
 # ------------------------------------------------------------------------------------------------------------
-# Columns of the moving bodies that the vehicle remembers: where each is, how it moves, and how close it is
+# Columns of the moving obstacles that the vehicle remembers: where each is, how it moves, and how close it is
 # going to come.
 #
 # A policy without memory sees no motion in one observation; track and forecast hold what many scans have
@@ -25,12 +25,12 @@ from uuvtai.kernels.planning.io import FeaturesIO
 
 
 @ti.func
-def closest_approach(env, track, io: Bundle[FeaturesIO]):
-    """(distance [m] from the own centre to a body's surface where it is smallest within the forecast, time
-    [s] until then).
+def closest_approach(env, track, io: Bundle[ObservationIO]):
+    """(distance [m] from the own centre to an obstacle's surface where it is smallest within the forecast,
+    time [s] until then).
 
-    The own velocity is taken to stay as it was measured; the body keeps to its forecast, straight from one of
-    its points to the next.
+    The own velocity is taken to stay as it was measured; the obstacle keeps to its forecast, straight from
+    one of its points to the next.
     """
     own = ti.Vector([io.ego.pos_w[env][0], io.ego.pos_w[env][1]])
     step = _own_velocity(env, io) * ti.static(io.tracking_cfg.forecast_dt_s)
@@ -49,22 +49,22 @@ def closest_approach(env, track, io: Bundle[FeaturesIO]):
 
 
 @ti.func
-def next_body(env, after, io: Bundle[FeaturesIO]):
+def next_obstacle(env, after, io: Bundle[ObservationIO]):
     """Track that follows ``after`` in the order of closest approach (equals: of slots), -1 = none; the first
     one follows -1."""
     after_m = -FAR_M
     if after >= 0:
-        after_m = io.features.closest_m[env, after]
+        after_m = io.observation.closest_m[env, after]
     found, found_m = -1, FAR_M + 0.0
-    for track in range(io.features.closest_m.shape[1]):
-        gap = io.features.closest_m[env, track]
+    for track in range(io.observation.closest_m.shape[1]):
+        gap = io.observation.closest_m[env, track]
         if (gap > after_m or (gap == after_m and track > after)) and gap < found_m:
             found, found_m = track, gap
     return found
 
 
 @ti.func
-def _own_velocity(env, io: Bundle[FeaturesIO]):
+def _own_velocity(env, io: Bundle[ObservationIO]):
     """Measured horizontal velocity in the world frame."""
     rpy = io.ego.rpy[env]
     vel = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2])) @ io.ego.vel_b[env]
@@ -72,8 +72,8 @@ def _own_velocity(env, io: Bundle[FeaturesIO]):
 
 
 @ti.func
-def body_values(env, track, io: Bundle[FeaturesIO]):
-    """All values of ``BODY_COLUMNS`` of one moving body, in their order."""
+def obstacle_values(env, track, io: Bundle[ObservationIO]):
+    """All values of ``OBSTACLE_COLUMNS`` of one moving obstacle, in their order."""
     yaw, own_z = io.ego.rpy[env][2], io.ego.pos_w[env][2]
     at = turned_z(
         io.forecast.pos_w[env, track, 0] - ti.Vector([io.ego.pos_w[env][0], io.ego.pos_w[env][1]]), -yaw
@@ -93,74 +93,80 @@ def body_values(env, track, io: Bundle[FeaturesIO]):
             ti.min(io.forecast.above_w[env, track] - own_z, water),
             ti.min(own_z - io.forecast.below_w[env, track], water),
             (io.clock.step[env] - io.tracks.seen_step[env, track]) * ti.static(io.episode_cfg.control_dt_s),
-            io.features.closest_m[env, track],
-            io.features.closest_s[env, track],
+            io.observation.closest_m[env, track],
+            io.observation.closest_s[env, track],
         ]
     )
 
 
-BODY_COLUMNS = (
+OBSTACLE_COLUMNS = (
     ColumnGroup(
-        "body_valid",
+        "obstacle_valid",
         1,
         "1",
         "level",
-        "1 = a moving body is remembered, 0 = no more bodies: all of its columns are 0",
-        body_values,
+        "1 = a moving obstacle is remembered, 0 = no more obstacles: all of its columns are 0",
+        obstacle_values,
         "body",
     ),
     ColumnGroup(
-        "body_position", 2, "m", "level", "where it is now, from the position estimate", body_values, "body"
+        "obstacle_position",
+        2,
+        "m",
+        "level",
+        "where it is now, from the position estimate",
+        obstacle_values,
+        "body",
     ),
-    ColumnGroup("body_velocity", 2, "m/s", "level", "its velocity less the own", body_values, "body"),
+    ColumnGroup("obstacle_velocity", 2, "m/s", "level", "its velocity less the own", obstacle_values, "body"),
     ColumnGroup(
-        "body_turn_rate",
+        "obstacle_turn_rate",
         1,
         "rad/s",
         "level",
         "rate at which its velocity turns, left positive; 0 = straight on",
-        body_values,
+        obstacle_values,
         "body",
     ),
     ColumnGroup(
-        "body_radius",
+        "obstacle_radius",
         1,
         "m",
         "level",
         "its radius and what the uncertainty of its place adds",
-        body_values,
+        obstacle_values,
         "body",
     ),
     ColumnGroup(
-        "body_free_water",
+        "obstacle_free_water",
         2,
         "m",
         "level",
         "above and below the own depth, up to where it may be; 0 = level",
-        body_values,
+        obstacle_values,
         "body",
     ),
-    ColumnGroup("body_age", 1, "s", "level", "since it was last seen", body_values, "body"),
+    ColumnGroup("obstacle_age", 1, "s", "level", "since it was last seen", obstacle_values, "body"),
     ColumnGroup(
-        "body_closest",
+        "obstacle_closest",
         1,
         "m",
         "level",
         "to its surface at the closest approach, if the own velocity stays as it is",
-        body_values,
+        obstacle_values,
         "body",
     ),
     ColumnGroup(
-        "body_closest_time",
+        "obstacle_closest_time",
         1,
         "s",
         "level",
         "until then; at most the forecast's horizon",
-        body_values,
+        obstacle_values,
         "body",
     ),
 )
-"""Of each of the bodies that come closest, the closest first: how close matters more than how soon, and a
+"""Of each of the obstacles that come closest, the closest first: how close matters more than how soon, and a
 body that recedes, whose closest approach is now, does not push one out that is still to come.
 """
 
@@ -183,31 +189,31 @@ N_CLASS = len(CLASSES)
 
 
 @ti.func
-def _leaf(env, io: Bundle[FeaturesIO]):
+def _leaf(env, io: Bundle[ObservationIO]):
     """Code of the leaf that acts, -1 = none."""
-    node, leaf = io.teacher.leaf[env], -1
+    node, leaf = io.behavior.leaf[env], -1
     if node >= 0:
         leaf = io.table.leaf[node]
     return leaf
 
 
 @ti.func
-def _action(env, io: Bundle[FeaturesIO]):
-    return io.teacher.action[env]
+def _action(env, io: Bundle[ObservationIO]):
+    return io.behavior.action[env]
 
 
 @ti.func
-def _conflict(env, io: Bundle[FeaturesIO]):
-    return ti.Vector([ti.min(io.teacher.conflict_s[env], io.features_cfg.ttc_cap_s)])
+def _conflict(env, io: Bundle[ObservationIO]):
+    return ti.Vector([ti.min(io.behavior.conflict_s[env], io.observation_cfg.ttc_cap_s)])
 
 
 @ti.func
-def _evade_cost(env, io: Bundle[FeaturesIO]):
-    return ti.Vector([ti.select(_leaf(env, io) == codes.EVADE, io.teacher.evade_cost[env], 0.0)])
+def _evade_cost(env, io: Bundle[ObservationIO]):
+    return ti.Vector([ti.select(_leaf(env, io) == codes.EVADE, io.behavior.evade_cost[env], 0.0)])
 
 
 @ti.func
-def _class(env, io: Bundle[FeaturesIO]):
+def _class(env, io: Bundle[ObservationIO]):
     leaf = _leaf(env, io)
     out = ti.Vector([0.0] * N_CLASS)
     for i, leaves in ti.static(enumerate(CLASSES)):
@@ -227,18 +233,18 @@ TEACHER_COLUMNS = (
         _action,
     ),
     ColumnGroup(
-        "teacher_conflict",
+        "behavior_conflict",
         1,
         "s",
         "route",
-        "until following the route comes too close to a forecast body, capped",
+        "until following the route comes too close to a forecast obstacle, capped",
         _conflict,
     ),
     ColumnGroup(
-        "teacher_evade_cost", 1, "1", "route", "cost of the evasion that is driven; 0 = none is", _evade_cost
+        "behavior_evade_cost", 1, "1", "route", "cost of the evasion that is driven; 0 = none is", _evade_cost
     ),
     ColumnGroup(
-        "teacher_class",
+        "behavior_class",
         N_CLASS,
         "1",
         "route",
@@ -253,12 +259,12 @@ TEACHER_COLUMNS = (
 
 @quick_launch
 @ti.kernel
-def sense_sectors(io: Bundle[FeaturesIO]):
+def sense_sectors(io: Bundle[ObservationIO]):
     """Sector s is centred at s * 360 / n_sector degrees from ahead, counter-clockwise. One work item per
     sector."""
-    n, n_sector = ti.static(io.features.sector_range_m.shape[0], io.features.sector_range_m.shape[1])
+    n, n_sector = ti.static(io.observation.sector_range_m.shape[0], io.observation.sector_range_m.shape[1])
     for env, sector in ti.ndrange(n, n_sector):
-        if io.clock.awake[env] == 1:
+        if io.clock.active[env] == 1:
             first, last = sector_beams(
                 sector,
                 io.ego.rpy[env][2] - io.scan.ping_yaw[env] - ti.static(io.sonar_cfg.first_beam_rad),
@@ -269,11 +275,16 @@ def sense_sectors(io: Bundle[FeaturesIO]):
 
 
 @ti.func
-def _summarise(env, sector, first, last, io: Bundle[FeaturesIO]):
+def _summarise(env, sector, first, last, io: Bundle[ObservationIO]):
     """A range's rate already holds the own motion, so a beam's time to collision is its range over its
     closing speed."""
     circle, n_ray = ti.static(io.sonar_cfg.circle_beams, io.sonar_cfg.n_ray)
-    nearest, ttc, closing, hits = 0.0 + io.sonar_cfg.max_range_m, 0.0 + io.features_cfg.ttc_cap_s, -FAR_M, 0
+    nearest, ttc, closing, hits = (
+        0.0 + io.sonar_cfg.max_range_m,
+        0.0 + io.observation_cfg.ttc_cap_s,
+        -FAR_M,
+        0,
+    )
     begin = first % circle
     for i in range(last - first):  # no branches: signs of noisy rates cannot be predicted
         beam = begin + i
@@ -291,11 +302,11 @@ def _summarise(env, sector, first, last, io: Bundle[FeaturesIO]):
         hits += ti.cast(hit, ti.i32)
         closing = ti.max(closing, ti.select(hit, rate, -FAR_M))
         nearest = ti.min(nearest, ti.select(hit, gap, io.sonar_cfg.max_range_m))
-        ttc = ti.min(ttc, ti.select(hit & (rate > 0.0), gap / rate, io.features_cfg.ttc_cap_s))
-    io.features.sector_range_m[env, sector] = nearest
-    io.features.sector_ttc_s[env, sector] = ttc
-    io.features.sector_closing_m_s[env, sector] = ti.select(hits > 0, closing, 0.0)
-    io.features.sector_valid[env, sector] = ti.cast(hits > 0, ti.i32)
+        ttc = ti.min(ttc, ti.select(hit & (rate > 0.0), gap / rate, io.observation_cfg.ttc_cap_s))
+    io.observation.sector_range_m[env, sector] = nearest
+    io.observation.sector_ttc_s[env, sector] = ttc
+    io.observation.sector_closing_m_s[env, sector] = ti.select(hits > 0, closing, 0.0)
+    io.observation.sector_valid[env, sector] = ti.cast(hits > 0, ti.i32)
 
 
 @ti.func
@@ -319,73 +330,73 @@ def _in_body(vector_w, rpy):
 
 
 @ti.func
-def _goal(env, io: Bundle[FeaturesIO]):
+def _goal(env, io: Bundle[ObservationIO]):
     return _in_body(io.mission.goal_w[env] - io.ego.pos_w[env], io.ego.rpy[env])
 
 
 @ti.func
-def _heading_error(env, io: Bundle[FeaturesIO]):
+def _heading_error(env, io: Bundle[ObservationIO]):
     return ti.Vector([ti.sin(io.route.heading_error[env]), ti.cos(io.route.heading_error[env])])
 
 
 @ti.func
-def _velocity(env, io: Bundle[FeaturesIO]):
+def _velocity(env, io: Bundle[ObservationIO]):
     return io.ego.vel_b[env]
 
 
 @ti.func
-def _yaw_rate(env, io: Bundle[FeaturesIO]):
+def _yaw_rate(env, io: Bundle[ObservationIO]):
     return ti.Vector([io.ego.rate_b[env][2]])
 
 
 @ti.func
-def _depth(env, io: Bundle[FeaturesIO]):
+def _depth(env, io: Bundle[ObservationIO]):
     return ti.Vector([io.ego.depth_m[env]])
 
 
 @ti.func
-def _tilt(env, io: Bundle[FeaturesIO]):
+def _tilt(env, io: Bundle[ObservationIO]):
     return ti.Vector([io.ego.rpy[env][0], io.ego.rpy[env][1]])
 
 
 @ti.func
-def _lookahead(env, io: Bundle[FeaturesIO]):
+def _lookahead(env, io: Bundle[ObservationIO]):
     return _in_body(io.route.lookahead_w[env] - io.ego.pos_w[env], io.ego.rpy[env])
 
 
 @ti.func
-def _cross_track(env, io: Bundle[FeaturesIO]):
+def _cross_track(env, io: Bundle[ObservationIO]):
     return ti.Vector([io.route.cross_track_m[env]])
 
 
 @ti.func
-def _remaining(env, io: Bundle[FeaturesIO]):
+def _remaining(env, io: Bundle[ObservationIO]):
     return ti.Vector([io.route.remaining_m[env]])
 
 
 @ti.func
-def _path_risk(env, io: Bundle[FeaturesIO]):
+def _path_risk(env, io: Bundle[ObservationIO]):
     return ti.Vector([io.route.path_risk[env]])
 
 
 @ti.func
-def _tilt_rate(env, io: Bundle[FeaturesIO]):
+def _tilt_rate(env, io: Bundle[ObservationIO]):
     return ti.Vector([io.ego.rate_b[env][0], io.ego.rate_b[env][1]])
 
 
 @ti.func
-def _sector_range(env, sector, io: Bundle[FeaturesIO]):
-    return io.features.sector_range_m[env, sector]
+def _sector_range(env, sector, io: Bundle[ObservationIO]):
+    return io.observation.sector_range_m[env, sector]
 
 
 @ti.func
-def _sector_ttc(env, sector, io: Bundle[FeaturesIO]):
-    return io.features.sector_ttc_s[env, sector]
+def _sector_ttc(env, sector, io: Bundle[ObservationIO]):
+    return io.observation.sector_ttc_s[env, sector]
 
 
 @ti.func
-def _sector_closing(env, sector, io: Bundle[FeaturesIO]):
-    return io.features.sector_closing_m_s[env, sector]
+def _sector_closing(env, sector, io: Bundle[ObservationIO]):
+    return io.observation.sector_closing_m_s[env, sector]
 
 
 COLUMNS = (
@@ -445,31 +456,32 @@ A config may add columns behind them (``columns``).
 """
 
 
-def columns(features_cfg: FeaturesConfig) -> tuple[ColumnGroup, ...]:
-    """The groups of a config's observation: ``COLUMNS``, then the bodies' where any are asked for, then the
-    tree's."""
+def columns(observation_cfg: ObservationConfig) -> tuple[ColumnGroup, ...]:
+    """The groups of a config's observation: ``COLUMNS``, then the obstacles' where any are asked for, then
+    the tree's."""
     return (
         COLUMNS
-        + (BODY_COLUMNS if features_cfg.n_track > 0 else ())
-        + (TEACHER_COLUMNS if features_cfg.teacher else ())
+        + (OBSTACLE_COLUMNS if observation_cfg.n_track > 0 else ())
+        + (TEACHER_COLUMNS if observation_cfg.behavior else ())
     )
 
 
-def placed_columns(features_cfg: FeaturesConfig) -> list[tuple[ColumnGroup, int, int]]:
+def placed_columns(observation_cfg: ObservationConfig) -> list[tuple[ColumnGroup, int, int]]:
     """(group, first column, number of columns) of every group."""
     out, first = [], 0
-    for column in columns(features_cfg):
+    for column in columns(observation_cfg):
         width = (
-            column.width * {"": 1, "sector": features_cfg.n_sector, "body": features_cfg.n_track}[column.per]
+            column.width
+            * {"": 1, "sector": observation_cfg.n_sector, "body": observation_cfg.n_track}[column.per]
         )
         out.append((column, first, width))
         first += width
     return out
 
 
-def observation_width(features_cfg: FeaturesConfig) -> int:
+def observation_width(observation_cfg: ObservationConfig) -> int:
     """Columns of the observation."""
-    return sum(width for _column, _first, width in placed_columns(features_cfg))
+    return sum(width for _column, _first, width in placed_columns(observation_cfg))
 
 
 def _sources(group, cfg):
@@ -478,77 +490,77 @@ def _sources(group, cfg):
     return [(c.source, first, c.width) for c, first, _width in placed_columns(cfg) if c in group]
 
 
-def _body_places(cfg):
-    """(place in ``body_values``, first column of the first body, width of one) of the groups of BODY_COLUMNS;
-    plain Python."""
-    widths = [column.width for column in BODY_COLUMNS]
+def _obstacle_places(cfg):
+    """(place in ``obstacle_values``, first column of the first body, width of one) of the groups of
+    OBSTACLE_COLUMNS; plain Python."""
+    widths = [column.width for column in OBSTACLE_COLUMNS]
     return [
-        (sum(widths[:n]), first, width) for n, (_, first, width) in enumerate(_sources(BODY_COLUMNS, cfg))
+        (sum(widths[:n]), first, width) for n, (_, first, width) in enumerate(_sources(OBSTACLE_COLUMNS, cfg))
     ]
 
 
-_BODY_WIDTH = sum(column.width for column in BODY_COLUMNS)
+_OBSTACLE_WIDTH = sum(column.width for column in OBSTACLE_COLUMNS)
 _SECTOR_COLUMNS = tuple(column for column in COLUMNS if column.per == "sector")
 _OWN_COLUMNS = tuple(column for column in COLUMNS if not column.per)
 
 
 @quick_launch
 @ti.kernel
-def write_observation(io: Bundle[FeaturesIO], obs: FloatMatrix):
-    """Observation (n_env, n_obs) of the awake rows, raw SI units, in the order of ``COLUMNS``."""
-    n, n_sector = ti.static(io.features.sector_range_m.shape[0], io.features.sector_range_m.shape[1])
+def write_observation(io: Bundle[ObservationIO], obs: FloatMatrix):
+    """Observation (n_env, n_obs) of the active rows, raw SI units, in the order of ``COLUMNS``."""
+    n, n_sector = ti.static(io.observation.sector_range_m.shape[0], io.observation.sector_range_m.shape[1])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
-            for source, first, width in ti.static(_sources(_OWN_COLUMNS, io.features_cfg)):
+        if pad == 0 and io.clock.active[env] == 1:
+            for source, first, width in ti.static(_sources(_OWN_COLUMNS, io.observation_cfg)):
                 value = source(env, io)
                 for i in ti.static(range(width)):
                     obs[env, first + i] = ti.cast(value[i], ti.f32)
             for sector in range(n_sector):
-                for source, first, _width in ti.static(_sources(_SECTOR_COLUMNS, io.features_cfg)):
+                for source, first, _width in ti.static(_sources(_SECTOR_COLUMNS, io.observation_cfg)):
                     obs[env, first + sector] = ti.cast(source(env, sector, io), ti.f32)
 
 
 @quick_launch
 @ti.kernel
-def write_bodies(io: Bundle[FeaturesIO], obs: FloatMatrix):
-    """Columns of the ``n_track`` moving bodies that come closest to the awake rows, in the order of
-    ``BODY_COLUMNS``."""
+def write_obstacles(io: Bundle[ObservationIO], obs: FloatMatrix):
+    """Columns of the ``n_track`` moving obstacles that come closest to the active rows, in the order of
+    ``OBSTACLE_COLUMNS``."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     for env, track in ti.ndrange(n, n_track):
-        if io.clock.awake[env] == 1:
-            io.features.closest_m[env, track] = FAR_M
+        if io.clock.active[env] == 1:
+            io.observation.closest_m[env, track] = FAR_M
             if io.forecast.radius_m[env, track, 0] >= 0.0:
                 gap, time = closest_approach(env, track, io)
-                io.features.closest_m[env, track], io.features.closest_s[env, track] = gap, time
+                io.observation.closest_m[env, track], io.observation.closest_s[env, track] = gap, time
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             track, used = -1, 1
-            for slot in range(ti.static(io.features_cfg.n_track)):
+            for slot in range(ti.static(io.observation_cfg.n_track)):
                 if used == 1:
-                    track = next_body(env, track, io)
+                    track = next_obstacle(env, track, io)
                     used = ti.cast(track >= 0, ti.i32)
-                value = ti.Vector.zero(ti.f32, ti.static(_BODY_WIDTH))
+                value = ti.Vector.zero(ti.f32, ti.static(_OBSTACLE_WIDTH))
                 if used == 1:
-                    value = body_values(env, track, io)
-                put_body_columns(env, slot, value, obs, io)
+                    value = obstacle_values(env, track, io)
+                put_obstacle_columns(env, slot, value, obs, io)
 
 
 @ti.func
-def put_body_columns(env, slot, value, obs: Out[FloatMatrix], io: Bundle[FeaturesIO]):
+def put_obstacle_columns(env, slot, value, obs: Out[FloatMatrix], io: Bundle[ObservationIO]):
     """One body's values into the columns of its slot."""
-    for at, first, width in ti.static(_body_places(io.features_cfg)):
+    for at, first, width in ti.static(_obstacle_places(io.observation_cfg)):
         for i in ti.static(range(width)):
             obs[env, first + slot * width + i] = ti.cast(value[at + i], ti.f32)
 
 
 @quick_launch
 @ti.kernel
-def write_advice(io: Bundle[FeaturesIO], obs: FloatMatrix):
-    """Columns of what the behaviour tree does now in the awake rows, in the order of ``TEACHER_COLUMNS``."""
-    n = ti.static(io.clock.awake.shape[0])
+def write_advice(io: Bundle[ObservationIO], obs: FloatMatrix):
+    """Columns of what the behaviour tree does now in the active rows, in the order of ``TEACHER_COLUMNS``."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
-            for source, first, width in ti.static(_sources(TEACHER_COLUMNS, io.features_cfg)):
+        if pad == 0 and io.clock.active[env] == 1:
+            for source, first, width in ti.static(_sources(TEACHER_COLUMNS, io.observation_cfg)):
                 value = source(env, io)
                 for i in ti.static(range(width)):
                     obs[env, first + i] = ti.cast(value[i], ti.f32)

@@ -137,10 +137,10 @@ _LONG_AGO = -(1 << 20)
 @quick_launch
 @ti.kernel
 def reset_route(io: Bundle[RouteIO]):
-    """No route, no history, in the awake rows."""
-    n = ti.static(io.clock.awake.shape[0])
+    """No route, no history, in the active rows."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             for field in ti.static(
                 (
                     io.route.n_way,
@@ -181,11 +181,11 @@ def reset_route(io: Bundle[RouteIO]):
 @quick_launch
 @ti.kernel
 def follow_route(io: Bundle[RouteIO]):
-    """Path-relative terms of the awake rows, from the foot that ``fire_triggers`` moved or from the start of
+    """Path-relative terms of the active rows, from the foot that ``fire_triggers`` moved or from the start of
     a route planned since."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             if io.route.want_plan[env] == 1:  # else ``fire_triggers`` has just looked along the same route
                 _look_again(env, io)
             if io.route.n_way[env] > 0:

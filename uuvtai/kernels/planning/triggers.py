@@ -4,7 +4,8 @@ them is counted per replan.
 - initial: there is no route.
 - stuck: slower than stuck_speed_m_s for stuck_s, farther from the goal than its radius.
 - safety: a sonar return nearer than safety_range_m, or range / closing speed below safety_ttc_s.
-- intersection: a point of the look-ahead segment is not traversable any more, or a forecast body comes closer
+- intersection: a point of the look-ahead segment is not traversable any more, or a forecast obstacle comes
+closer
   to the segment than forecast_clearance_m at a time when the vehicle could be there: the part of the segment
   within reach_speed_m_s times that time.
 """
@@ -34,10 +35,10 @@ from uuvtai.kernels.planning.route import advanced_arc, cell_on_grid, level, loo
 def fire_triggers(io: Bundle[TriggersIO]):
     """Move the foot along the route, look along it, find the triggers that hold, and queue the envs that plan
     in this step, in any order."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     io.route.n_queue[None] = 0
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             if io.route.n_way[env] > 0:
                 io.route.arc[env] = advanced_arc(io.route, env, level(io.ego.pos_w[env]), io.route_cfg)
             look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
@@ -58,7 +59,7 @@ def _count_stuck(env, io: Bundle[TriggersIO]):
 
 @ti.func
 def _held_triggers(env, closed, io: Bundle[TriggersIO]):
-    """Bit set (bit = code - 1) of the triggers that hold and are not resting; ``closed``: the path is."""
+    """Bit set (bit = code - 1) of the triggers that hold and are not static; ``closed``: the path is."""
     dt = ti.static(io.episode_cfg.control_dt_s)
     bits = 0
     for trigger in ti.static(range(TRIGGER_INITIAL, N_TRIGGER + 1)):
@@ -117,36 +118,36 @@ def _is_path_closed(env, io: Bundle[TriggersIO]):
 
 @ti.func
 def _path_meets_forecast(env, io: Bundle[TriggersIO]):
-    """True where a body comes too close to the part of the look-ahead segment that the vehicle can have
+    """True where an obstacle comes too close to the part of the look-ahead segment that the vehicle can have
     reached by then."""
     meets = False
     for track in range(io.forecast.radius_m.shape[1]):
         # a track is forecast at all steps or at none
         if io.forecast.radius_m[env, track, 0] >= 0 and not meets:
             for k in range(io.forecast.radius_m.shape[2]):
-                if _body_meets_path(env, track, k, io):
+                if _obstacle_meets_path(env, track, k, io):
                     meets = True
     return meets
 
 
 @ti.func
-def _body_meets_path(env, track, k, io: Bundle[TriggersIO]):
-    """The same for one body at forecast step k.
+def _obstacle_meets_path(env, track, k, io: Bundle[TriggersIO]):
+    """The same for one obstacle at forecast step k.
 
     Points of the segment lie a cell apart, so those with an arc up to reach + one cell are looked at. None of
-    them is farther from the first one than that: a body beyond reach + cell + limit of it meets none.
+    them is farther from the first one than that: an obstacle beyond reach + cell + limit of it meets none.
     """
     meets = False
     limit = io.forecast.radius_m[env, track, k] + ti.static(io.route_cfg.forecast_clearance_m)
-    body = io.forecast.pos_w[env, track, k]
+    obstacle = io.forecast.pos_w[env, track, k]
     reach = k * ti.static(io.route_cfg.reach_speed_m_s * io.tracking_cfg.forecast_dt_s)
-    if (body - io.route.ahead_w[env, 0]).norm() < reach + ti.static(io.mapping_cfg.cell_m) + limit:
+    if (obstacle - io.route.ahead_w[env, 0]).norm() < reach + ti.static(io.mapping_cfg.cell_m) + limit:
         last = ti.min(
             ti.cast(reach / ti.static(io.mapping_cfg.cell_m), ti.i32) + 1,
             io.route.n_ahead[env] - 1,
         )
         for j in range(last + 1):
-            if (body - io.route.ahead_w[env, j]).norm() < limit:
+            if (obstacle - io.route.ahead_w[env, j]).norm() < limit:
                 meets = True
     return meets
 

@@ -3,8 +3,8 @@ columns.
 
 Optical axis = body x, image right = -y, down = -z; square pixels, fx = fy = cols / 2 / tan(fov / 2),
 principal point in the middle of the image, pixel centres at + 0.5. z-depth = the parameter of a ray whose
-body-x component is 1. It sees bodies (caps and faces too) and side walls (without vertical bound), not floor
-and surface. Each body is tested only inside the rectangle that bounds it in the image.
+body-x component is 1. It sees obstacles (caps and faces too) and side walls (without vertical bound), not
+floor and surface. Each body is tested only inside the rectangle that bounds it in the image.
 """
 
 import math
@@ -20,14 +20,14 @@ from uuvtai.kernels.sensors.io import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
 
 _BLOCK = 36
-"""Image rows per loop item on a CPU: bodies are projected once per item."""
+"""Image rows per loop item on a CPU: obstacles are projected once per item."""
 
 _BLOCK_GPU = 4
 """Rows per loop item where items are threads and thousands of them must be there."""
 
 _NEAR_M = 0.02
-"""A bounding corner nearer than this to the camera's plane is not projected: the body is then tested in the
-whole image."""
+"""A bounding corner nearer than this to the camera's plane is not projected: the obstacle is then tested in
+the whole image."""
 
 _MARGIN = 0.01
 """[pixel] added around the bounding rectangle against rounding."""
@@ -42,10 +42,10 @@ CameraPose = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
 @quick_launch
 @ti.kernel
 def reset_depth(io: Bundle[DepthIO]):
-    """Forget the image of the awake rows (the shot of step 0 fills it)."""
+    """Forget the image of the active rows (the shot of step 0 fills it)."""
     n, n_row, n_col = ti.static(io.image.depth_m.shape)
     for env, row, pad in ti.ndrange(n, n_row, ti.static(spread(n, n_row))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             for col in range(n_col):
                 io.image.depth_m[env, row, col] = 0.0
             if row == 0:
@@ -60,11 +60,11 @@ def reset_depth(io: Bundle[DepthIO]):
 def cast_depth(io: Bundle[DepthIO]):
     """New image in the rows whose step is a multiple of period_steps (step 0 included); the others keep
     theirs with ``fresh`` = 0."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     block_rows = ti.static(rows_per_item())
     n_block = ti.static(-(-io.depth_cfg.rows // block_rows))
     for env, block, pad in ti.ndrange(n, n_block, ti.static(spread(n, n_block))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             due = io.clock.step[env] % io.depth_cfg.period_steps == 0
             if block == 0:
                 label_image(env, due, io)
@@ -89,7 +89,7 @@ def label_image(env, due, io: Bundle[DepthIO]):
 
 @ti.func
 def fill_block(env, first_row, io: Bundle[DepthIO]):
-    """Noise-free depth of _BLOCK rows: walls first, then every body over them inside its bounding
+    """Noise-free depth of _BLOCK rows: walls first, then every obstacle over them inside its bounding
     rectangle."""
     R_wb = rotation_wb(io.vehicle.quat_wb[env]).cast(ti.f32)
     offset_b = ti.Vector(
@@ -102,9 +102,9 @@ def fill_block(env, first_row, io: Bundle[DepthIO]):
             dx, dy, _dz = ray_directions(row, packet * LANES, eye.R_wb, io)
             seen = ti.min(wall_depth(eye, dx, dy, io), io.depth_cfg.max_range_m)
             paint(env, row, packet * LANES, seen, io)
-    for body in range(io.world.kind.shape[1]):
-        if io.world.kind[env, body] != NONE:
-            draw_body(env, body, first_row, last_row, eye, io)
+    for obstacle in range(io.world.kind.shape[1]):
+        if io.world.kind[env, obstacle] != NONE:
+            draw_obstacle(env, obstacle, first_row, last_row, eye, io)
 
 
 @ti.func
@@ -164,19 +164,19 @@ def nearness(direction, low, high):
 
 
 @ti.func
-def draw_body(env, body, first_row, last_row, eye, io: Bundle[DepthIO]):
-    """Overwrite the pixels of these rows in which the body is nearer than what is there."""
-    kind = io.world.kind[env, body]
-    size = io.world.size[env, body].cast(ti.f32)
-    yaw = ti.cast(io.world.yaw[env, body], ti.f32)
-    offset = eye.pos - io.world.pos_w[env, body].cast(ti.f32)
+def draw_obstacle(env, obstacle, first_row, last_row, eye, io: Bundle[DepthIO]):
+    """Overwrite the pixels of these rows in which the obstacle is nearer than what is there."""
+    kind = io.world.kind[env, obstacle]
+    size = io.world.size[env, obstacle].cast(ti.f32)
+    yaw = ti.cast(io.world.yaw[env, obstacle], ti.f32)
+    offset = eye.pos - io.world.pos_w[env, obstacle].cast(ti.f32)
     if may_be_seen(offset, size.norm(), eye.R_wb, io):
         c, s = ti.cos(yaw), ti.sin(yaw)
         left, right, top, bottom = image_rectangle(offset, size, c, s, eye.R_wb, io)
         for row in range(ti.max(top, first_row), ti.min(bottom + 1, last_row)):
             for packet in range(left // LANES, (right + LANES) // LANES):
                 dx, dy, dz = ray_directions(row, packet * LANES, eye.R_wb, io)
-                enter = body_entry(kind, size, c, s, offset, dx, dy, dz)
+                enter = obstacle_entry(kind, size, c, s, offset, dx, dy, dz)
                 paint_nearer(env, row, packet * LANES, enter, io)
 
 
@@ -246,8 +246,9 @@ def pixel_span(low, high, count):
 
 
 @ti.func
-def body_entry(kind, size, c, s, offset, dx, dy, dz):
-    """z-depth at which sixteen rays enter a body from outside; not positive, or FAR_M, where they do not.
+def obstacle_entry(kind, size, c, s, offset, dx, dy, dz):
+    """z-depth at which sixteen rays enter an obstacle from outside; not positive, or FAR_M, where they do
+    not.
 
     A convex body is an intersection of simple sets, so its span is (largest enter, smallest leave).
     """

@@ -25,9 +25,9 @@ from uuvtai.kernels.sensors.sonar import note_ping, place_sonar, reported, sonar
 def turn_head(io: Bundle[SonarIO]):
     """Take the beams that are due; ``scan.fresh`` is 1 only where there is one. The first is due at
     step 0."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             step = io.clock.step[env]
             begin, end = ti.cast(0, ti.i64), head_steps(step, io)
             if step > 0:

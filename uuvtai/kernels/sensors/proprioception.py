@@ -38,11 +38,11 @@ _RISE_RATE = 4.0
 @quick_launch
 @ti.kernel
 def reset_proprioception(io: Bundle[ProprioceptionIO]):
-    """Draw the errors that stay constant over an episode; the estimate starts at the true position. Awake
+    """Draw the errors that stay constant over an episode; the estimate starts at the true position. Active
     rows only."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             draw_constants(env, io)
             clear_readings(env, io)
 
@@ -52,8 +52,8 @@ def reset_proprioception(io: Bundle[ProprioceptionIO]):
 def sense_exactly(io: Bundle[ExactProprioceptionIO]):
     """Perfect velocity, attitude and rates for the inner loop: experiments on the plant alone have no
     sensors."""
-    for env in range(ti.static(io.clock.awake.shape[0])):
-        if io.clock.awake[env] == 1:
+    for env in range(ti.static(io.clock.active.shape[0])):
+        if io.clock.active[env] == 1:
             io.ego.vel_b[env] = io.vehicle.vel_b[env]
             io.ego.vel_valid[env] = 1
             io.ego.rate_b[env] = io.vehicle.rate_b[env]
@@ -105,10 +105,10 @@ def clear_readings(env, io: Bundle[ProprioceptionIO]):
 @quick_launch
 @ti.kernel
 def sense_proprioception(io: Bundle[ProprioceptionIO]):
-    """One reading of every sensor whose turn it is, then the pose estimate. Awake rows only."""
-    n = ti.static(io.clock.awake.shape[0])
+    """One reading of every sensor whose turn it is, then the pose estimate. Active rows only."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             key, step = io.episode.key[env], io.clock.step[env]
             read_imu(env, key, step, io)
             io.ego.dvl_fresh[env], io.ego.fix_valid[env] = 0, 1
@@ -221,11 +221,11 @@ def loses_velocity(sensors_cfg):
 @quick_launch
 @ti.kernel
 def find_velocity(io: Bundle[VelocityIO]):
-    """Find what is known of the velocity where the DVL says nothing, whoever filled the readings. Awake rows
+    """Find what is known of the velocity where the DVL says nothing, whoever filled the readings. Active rows
     only."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             rpy = io.ego.rpy[env]
             rotation = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
             if ti.static(io.sensors_cfg.localization == "truth"):

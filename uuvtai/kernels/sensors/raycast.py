@@ -1,8 +1,8 @@
 """Rays against convex primitives: each function returns the span (enter, leave) of the ray parameter inside
 the primitive.
 
-A body is an intersection of such sets, so its own span is (largest enter, smallest leave); it is hit from
-outside where 0 < enter <= leave. Arguments may be scalars or 16-lane packets: a scalar start with packet
+An obstacle is an intersection of such sets, so its own span is (largest enter, smallest leave); it is hit
+from outside where 0 < enter <= leave. Arguments may be scalars or 16-lane packets: a scalar start with packet
 directions is the usual mix.
 """
 
@@ -84,27 +84,27 @@ def rim_distance(x, y, dx, dy, radius):
 
 
 @ti.func
-def place_bodies(env, x, y, io: Bundle[SonarIO]):
-    """Write centre and reach of every body's outline, as seen from (x, y), for ``bodies_in_wedge``; an empty
-    slot reaches nowhere."""
-    n_body = ti.static(io.world.kind.shape[1])
-    for slot in range(io.sonar_memory.body_reach_m.shape[1]):
+def place_obstacles(env, x, y, io: Bundle[SonarIO]):
+    """Write centre and reach of every obstacle's outline, as seen from (x, y), for ``obstacles_in_wedge``; an
+    empty slot reaches nowhere."""
+    n_obstacle = ti.static(io.world.kind.shape[1])
+    for slot in range(io.sonar_memory.obstacle_reach_m.shape[1]):
         reach = -FAR_M
-        if slot < n_body:
+        if slot < n_obstacle:
             kind = io.world.kind[env, slot]
             if kind != NONE:
                 size = io.world.size[env, slot]
-                io.sonar_memory.body_x_m[env, slot] = io.world.pos_w[env, slot][0] - x
-                io.sonar_memory.body_y_m[env, slot] = io.world.pos_w[env, slot][1] - y
+                io.sonar_memory.obstacle_x_m[env, slot] = io.world.pos_w[env, slot][0] - x
+                io.sonar_memory.obstacle_y_m[env, slot] = io.world.pos_w[env, slot][1] - y
                 reach = ti.cast(
                     size[0] + ti.select(kind == BOX, size[1], 0.0), ti.f32
                 )  # no less than half a box's diagonal
-        io.sonar_memory.body_reach_m[env, slot] = reach
+        io.sonar_memory.obstacle_reach_m[env, slot] = reach
 
 
 @ti.func
-def bodies_in_wedge(env, first, wedge, io: Bundle[SonarIO]):
-    """Bit set of those among sixteen bodies whose outline may reach into a wedge at the sensor
+def obstacles_in_wedge(env, first, wedge, io: Bundle[SonarIO]):
+    """Bit set of those among sixteen obstacles whose outline may reach into a wedge at the sensor
     (conservative).
 
     ``wedge`` = (x, y) of its middle direction, then (cos, sin) of its half angle.
@@ -112,9 +112,9 @@ def bodies_in_wedge(env, first, wedge, io: Bundle[SonarIO]):
     x, y, reach = f16x(0.0), f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
         x[i], y[i], reach[i] = (
-            io.sonar_memory.body_x_m[env, first + i],
-            io.sonar_memory.body_y_m[env, first + i],
-            io.sonar_memory.body_reach_m[env, first + i],
+            io.sonar_memory.obstacle_x_m[env, first + i],
+            io.sonar_memory.obstacle_y_m[env, first + i],
+            io.sonar_memory.obstacle_reach_m[env, first + i],
         )
     along = x * wedge[0] + y * wedge[1]
     across = ti.abs(x * wedge[1] - y * wedge[0])
@@ -122,11 +122,11 @@ def bodies_in_wedge(env, first, wedge, io: Bundle[SonarIO]):
 
 
 @ti.func
-def bodies_there(env, first, io: Bundle[SonarIO]):
+def obstacles_there(env, first, io: Bundle[SonarIO]):
     """Bit set of the slots in use among sixteen."""
     reach = f16x(0.0)
     for i in ti.static(range(LANES)):
-        reach[i] = io.sonar_memory.body_reach_m[env, first + i]
+        reach[i] = io.sonar_memory.obstacle_reach_m[env, first + i]
     return lane_bits(reach >= 0.0)
 
 
@@ -136,35 +136,37 @@ def nearest_echo(env, x, y, ux, uy, travelled, wedge, direct: Const[bool], io: B
     ``travelled`` [m]: a struct of lanes, range [m] (FAR_M = nothing), outward unit normal and velocity [m/s]
     of the surface.
 
-    A body counts where its vertical gap is at most ``fan_slope`` x path. (x, y) and ``travelled`` are
-    scalars, or lanes after a bounce. ``direct`` rays start at the sensor, where only bodies in their
+    An obstacle counts where its vertical gap is at most ``fan_slope`` x path. (x, y) and ``travelled`` are
+    scalars, or lanes after a bounce. ``direct`` rays start at the sensor, where only obstacles in their
     ``wedge`` need a test.
     """
     echo = wall_echo(x, y, ux, uy, io)
-    for group in range(ti.static(io.sonar_memory.body_reach_m.shape[1] // LANES)):
+    for group in range(ti.static(io.sonar_memory.obstacle_reach_m.shape[1] // LANES)):
         waiting = 0
         if ti.static(direct):
-            waiting = bodies_in_wedge(env, group * LANES, wedge, io)
+            waiting = obstacles_in_wedge(env, group * LANES, wedge, io)
         else:
-            waiting = bodies_there(env, group * LANES, io)
+            waiting = obstacles_there(env, group * LANES, io)
         while waiting != 0:
-            body = group * LANES + 31 - ti.math.clz(waiting & -waiting)  # the lowest bit
+            obstacle = group * LANES + 31 - ti.math.clz(waiting & -waiting)  # the lowest bit
             waiting &= waiting - 1
-            echo = nearer_echo(env, body, echo, x, y, ux, uy, travelled, io)
+            echo = nearer_echo(env, obstacle, echo, x, y, ux, uy, travelled, io)
     return echo
 
 
 @ti.func
-def nearer_echo(env, body, echo, x, y, ux, uy, travelled, io: Bundle[SonarIO]):
-    """The echo, or a body's where that is nearer."""
+def nearer_echo(env, obstacle, echo, x, y, ux, uy, travelled, io: Bundle[SonarIO]):
+    """The echo, or an obstacle's where that is nearer."""
     out = echo
     slope = ti.static(fan_slope(io.sonar_cfg))
-    kind = io.world.kind[env, body]
-    pos, size = io.world.pos_w[env, body].cast(ti.f32), io.world.size[env, body].cast(ti.f32)
+    kind = io.world.kind[env, obstacle]
+    pos, size = io.world.pos_w[env, obstacle].cast(ti.f32), io.world.size[env, obstacle].cast(ti.f32)
     sx, sy, rise = x - pos[0], y - pos[1], pos[2] - ti.cast(io.sonar_memory.mount_w[env][2], ti.f32)
     enter, normal_x, normal_y = filled(FAR_M, ux.n), filled(0.0, ux.n), filled(0.0, ux.n)
     if kind == BOX:
-        enter, normal_x, normal_y = box_entry(sx, sy, ux, uy, size, ti.cast(io.world.yaw[env, body], ti.f32))
+        enter, normal_x, normal_y = box_entry(
+            sx, sy, ux, uy, size, ti.cast(io.world.yaw[env, obstacle], ti.f32)
+        )
     else:
         # a sphere's slice at height h over its centre is a disc of radius sqrt(R^2 - h^2); the beam, as high
         # as its path times the slope, meets the slice that is ``lost`` = rise less that height away
@@ -173,7 +175,7 @@ def nearer_echo(env, body, echo, x, y, ux, uy, travelled, io: Bundle[SonarIO]):
         enter, normal_x, normal_y = disc_entry(sx, sy, ux, uy, radius_squared)
     gap = ti.select(kind == SPHERE, 0.0, ti.max(ti.abs(rise) - size[2], 0.0))
     nearer = (enter > _SKIN_M) & (enter < echo.range_m) & ((enter + travelled) * slope >= gap)
-    vel = io.world.vel_w[env, body].cast(ti.f32)
+    vel = io.world.vel_w[env, obstacle].cast(ti.f32)
     out.range_m = ti.select(nearer, enter, echo.range_m)
     out.normal_x = ti.select(nearer, normal_x, echo.normal_x)
     out.normal_y = ti.select(nearer, normal_y, echo.normal_y)

@@ -1,11 +1,11 @@
-"""Sonar: level beams at the body origin, a ring or a fan, cast analytically in packets of sixteen
+"""Sonar: level beams at the obstacle origin, a ring or a fan, cast analytically in packets of sixteen
 neighbouring beams.
 
-Beam i looks along the true yaw + the bearing of beam 0 + i times the spacing (``SonarConfig``). A body is
-seen where the beam enters its horizontal outline and the vertical gap is within range x tan(half aperture);
-the side walls are always seen, floor and surface never. Every error source is a switch that is compiled away
-at zero. Order: geometry, ghost, grazing loss, bubble cloud, missed return, range noise, false return,
-quantisation.
+Beam i looks along the true yaw + the bearing of beam 0 + i times the spacing (``SonarConfig``). An obstacle
+is seen where the beam enters its horizontal outline and the vertical gap is within range x tan(half
+aperture); the side walls are always seen, floor and surface never. Every error source is a switch that is
+compiled away at zero. Order: geometry, ghost, grazing loss, bubble cloud, missed return, range noise, false
+return, quantisation.
 """
 
 import math
@@ -31,7 +31,7 @@ from uuvtai.kernels.core.simd import LANES, filled
 from uuvtai.kernels.core.stage import Bundle, Const, spread
 from uuvtai.kernels.sensors.cfar import detected
 from uuvtai.kernels.sensors.io import SonarIO
-from uuvtai.kernels.sensors.raycast import nearest_echo, place_bodies
+from uuvtai.kernels.sensors.raycast import nearest_echo, place_obstacles
 
 # ------------------------------------------------------------------------------------------------------------
 # What goes wrong in a sonar beam, error by error; each is compiled away at zero. Packets of beams,
@@ -241,11 +241,11 @@ Mount = ti.types.struct(pos=ti.math.vec3, vel=ti.math.vec2, heading=ti.math.vec2
 @quick_launch
 @ti.kernel
 def reset_sonar(io: Bundle[SonarIO]):
-    """Forget scans and clouds of the awake rows: no return anywhere, nothing fresh or under way (step 0 then
+    """Forget scans and clouds of the active rows: no return anywhere, nothing fresh or under way (step 0 then
     fills the scan)."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             clear_scan(env, io)
             clear_memory(env, io)
 
@@ -285,16 +285,16 @@ def cast_sonar(io: Bundle[SonarIO]):
     only then), so that the first observation is not empty. ``memory`` needs n_latency > latency_steps /
     period_steps.
     """
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     beams = ti.static(n_beam())
     n_part = ti.static(io.sonar_cfg.n_ray // beams)
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0:
+        if pad == 0 and io.clock.active[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0:
             place_sonar(env, io)
             if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
                 start_cloud(env, io)
     for env, part, pad in ti.ndrange(n, n_part, ti.static(spread(n, n_part))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             step = io.clock.step[env]
             if step % io.sonar_cfg.period_steps == 0:
                 ping(env, part * beams, step, io)
@@ -444,7 +444,7 @@ def place_sonar(env, io: Bundle[SonarIO]):
     io.sonar_memory.mount_w[env] = io.vehicle.pos_w[env]
     io.sonar_memory.mount_vel_w[env] = ti.Vector([vel_w[0], vel_w[1]])
     io.sonar_memory.heading_w[env] = heading
-    place_bodies(env, io.vehicle.pos_w[env][0], io.vehicle.pos_w[env][1], io)
+    place_obstacles(env, io.vehicle.pos_w[env][0], io.vehicle.pos_w[env][1], io)
 
 
 @ti.func

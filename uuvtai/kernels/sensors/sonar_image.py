@@ -1,6 +1,6 @@
 """The intensity image of a multibeam, ping by ping, in which ranges are detected (``cfar.py``).
 
-Rays of one bearing and all elevations meet bodies, side walls, floor and surface; their power folds into
+Rays of one bearing and all elevations meet obstacles, side walls, floor and surface; their power folds into
 range bins; random phases make speckle of it; beams hear all bearings by their pattern, and noise. Numbers are
 those of ``multibeam.py``, speckle and noise are functions of (episode, step, bearing or beam, bin).
 """
@@ -31,19 +31,19 @@ from uuvtai.kernels.core.noise import (
 from uuvtai.kernels.core.simd import LANES, f16x
 from uuvtai.kernels.core.stage import Bundle, spread
 from uuvtai.kernels.sensors.io import SonarIO
-from uuvtai.kernels.sensors.raycast import ball_span, bodies_in_wedge, disc_span, slab_span, wall_echo
+from uuvtai.kernels.sensors.raycast import ball_span, disc_span, obstacles_in_wedge, slab_span, wall_echo
 from uuvtai.kernels.sensors.sonar import place_sonar, sonar_mount
 
 _WALL, _FLOOR, _SURFACE = -1, -2, -3
-"""surfaces that are no body"""
+"""surfaces that are no obstacle"""
 
 
 @quick_launch
 @with_cse()
 @ti.kernel
 def hear(io: Bundle[SonarIO]):
-    """Fill ``heard`` of the awake rows whose sonar pings in this step."""
-    n = ti.static(io.clock.awake.shape[0])
+    """Fill ``heard`` of the active rows whose sonar pings in this step."""
+    n = ti.static(io.clock.active.shape[0])
     n_heard, n_packet = ti.static(io.sonar_image.echo.shape[1], packets(io.sonar_cfg))
     for beams in range(n_heard):
         io.sonar_image.across[beams] = heard_across(beams, io)
@@ -69,7 +69,7 @@ def packets(sonar_cfg: SonarConfig) -> int:
 @ti.func
 def pings(env, io: Bundle[SonarIO]):
     """Whether a row pings in this step."""
-    return io.clock.awake[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0
+    return io.clock.active[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0
 
 
 # --------------------------------------------------------------------------------------------------- patterns
@@ -114,13 +114,15 @@ def fold(env, bearing, io: Bundle[SonarIO]):
     for cell in range(ti.static(packets(io.sonar_cfg) * LANES)):
         io.sonar_image.echo[env, bearing, cell] = 0.0
     level = towards(env, bearing, io)
-    bodies = ti.Vector([0 for _ in range(ti.static(io.sonar_memory.body_reach_m.shape[1] // LANES))])
-    for group in ti.static(range(bodies.n)):
-        bodies[group] = bodies_in_wedge(env, group * LANES, ti.Vector([level[0], level[1], 1.0, 0.0]), io)
+    obstacles = ti.Vector([0 for _ in range(ti.static(io.sonar_memory.obstacle_reach_m.shape[1] // LANES))])
+    for group in ti.static(range(obstacles.n)):
+        obstacles[group] = obstacles_in_wedge(
+            env, group * LANES, ti.Vector([level[0], level[1], 1.0, 0.0]), io
+        )
     last_cell, last_surface, last_power, farthest = 0, 0, 0.0, 0
     for row in range(ti.static(io.sonar_image.upright.shape[0])):
         up = io.sonar_image.upright[row]
-        range_m, cosine, surface = met(env, level, up, bodies, io)
+        range_m, cosine, surface = met(env, level, up, obstacles, io)
         lost = ti.exp(ti.static(-4.0 * ABSORPTION_NP_M) * range_m) / ti.max(range_m, 0.1) ** 2
         power = up[2] * cosine * lost
         cell = bin_of(range_m, io)
@@ -162,7 +164,7 @@ def deposit(env, bearing, low, high, power, io: Bundle[SonarIO]):
 
 
 @ti.func
-def met(env, level, up, bodies, io: Bundle[SonarIO]):
+def met(env, level, up, obstacles, io: Bundle[SonarIO]):
     """(range [m], cosine of incidence, surface) of what a ray meets first."""
     mount = sonar_mount(env, io)
     wall = wall_echo(mount.pos[0], mount.pos[1], ti.Vector([level[0]]), ti.Vector([level[1]]), io)
@@ -174,22 +176,22 @@ def met(env, level, up, bodies, io: Bundle[SonarIO]):
         if away < range_m:
             range_m, cosine, surface = away, ti.abs(up[0]), ti.select(up[0] < 0.0, _FLOOR, _SURFACE)
     ray = ti.Vector([level[0] * up[1], level[1] * up[1], up[0]])
-    for group in ti.static(range(bodies.n)):
-        waiting = bodies[group]
+    for group in ti.static(range(obstacles.n)):
+        waiting = obstacles[group]
         while waiting != 0:
-            body = group * LANES + 31 - ti.math.clz(waiting & -waiting)
+            obstacle = group * LANES + 31 - ti.math.clz(waiting & -waiting)
             waiting &= waiting - 1
-            enter, steep = body_met(env, body, mount.pos, ray, io)
+            enter, steep = obstacle_met(env, obstacle, mount.pos, ray, io)
             if enter < range_m:
-                range_m, cosine, surface = enter, steep, body
+                range_m, cosine, surface = enter, steep, obstacle
     return range_m, cosine, surface
 
 
 @ti.func
-def body_met(env, body, start, ray, io: Bundle[SonarIO]):
-    """(range [m], cosine of incidence) where a ray enters a body from outside; FAR_M = it does not."""
-    kind, size = io.world.kind[env, body], io.world.size[env, body].cast(ti.f32)
-    off = start - io.world.pos_w[env, body].cast(ti.f32)
+def obstacle_met(env, obstacle, start, ray, io: Bundle[SonarIO]):
+    """(range [m], cosine of incidence) where a ray enters an obstacle from outside; FAR_M = it does not."""
+    kind, size = io.world.kind[env, obstacle], io.world.size[env, obstacle].cast(ti.f32)
+    off = start - io.world.pos_w[env, obstacle].cast(ti.f32)
     enter, leave, cosine = FAR_M, -FAR_M, 0.0
     if kind == SPHERE:
         enter, leave = ball_span(off[0], off[1], off[2], ray[0], ray[1], ray[2], size[0] * size[0])
@@ -197,7 +199,7 @@ def body_met(env, body, start, ray, io: Bundle[SonarIO]):
     else:
         in_z, out_z = slab_span(off[2], ray[2], size[2])
         if kind == BOX:
-            yaw = ti.cast(io.world.yaw[env, body], ti.f32)
+            yaw = ti.cast(io.world.yaw[env, obstacle], ti.f32)
             c, s = ti.cos(yaw), ti.sin(yaw)
             dx, dy = ray[0] * c + ray[1] * s, ray[1] * c - ray[0] * s
             in_x, out_x = slab_span(off[0] * c + off[1] * s, dx, size[0])

@@ -1,5 +1,5 @@
-"""Clock, begin and end of episodes: the referee judges every control step from the truth, in the order of the
-rules."""
+"""Clock, begin and end of episodes: the termination check looks at every control step from the truth, in the
+order of the rules."""
 
 import taichi as ti
 
@@ -8,8 +8,8 @@ from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import (
     FAR_M,
     NONE,
-    hull_to_body,
     hull_to_floor_or_surface,
+    hull_to_obstacle,
     hull_to_side_wall,
     is_in_tank,
     rotation_wb,
@@ -26,9 +26,9 @@ __all__ = ["COLLISION", "OUTCOMES", "OUT_OF_TANK", "RUNNING", "SUCCESS", "TIMEOU
 def begin_episodes(io: Bundle[EpisodeIO], mask: IntVector, seed: IntVector, number: IntVector):
     """Give the rows of ``mask`` a new episode and wake only them."""
     for env in range(mask.shape[0]):
-        io.clock.awake[env] = mask[env]
+        io.clock.active[env] = mask[env]
         if mask[env] == 1:
-            io.clock.active[env] = 1
+            io.clock.running[env] = 1
             io.clock.step[env] = 0
             io.episode.seed[env] = seed[env]
             io.episode.number[env] = number[env]
@@ -38,9 +38,9 @@ def begin_episodes(io: Bundle[EpisodeIO], mask: IntVector, seed: IntVector, numb
 @quick_launch
 @ti.kernel
 def advance_clock(io: Bundle[EpisodeIO]):
-    """One control step more for the awake rows."""
-    for env in range(ti.static(io.clock.awake.shape[0])):
-        if io.clock.awake[env] == 1:
+    """One control step more for the active rows."""
+    for env in range(ti.static(io.clock.active.shape[0])):
+        if io.clock.active[env] == 1:
             io.clock.step[env] += 1
 
 
@@ -48,18 +48,18 @@ def advance_clock(io: Bundle[EpisodeIO]):
 @ti.kernel
 def wake(io: Bundle[EpisodeIO]):
     """After a reset: every running row takes part in the next step."""
-    for env in range(ti.static(io.clock.awake.shape[0])):
-        io.clock.awake[env] = io.clock.active[env]
+    for env in range(ti.static(io.clock.active.shape[0])):
+        io.clock.active[env] = io.clock.running[env]
 
 
 @quick_launch
 @ti.kernel
-def sleep_ended(io: Bundle[EpisodeIO]):
+def deactivate_ended(io: Bundle[EpisodeIO]):
     """Rows whose episode has ended take no part in further steps."""
-    for env in range(ti.static(io.clock.awake.shape[0])):
-        if io.referee.outcome[env] != RUNNING:
+    for env in range(ti.static(io.clock.active.shape[0])):
+        if io.termination.outcome[env] != RUNNING:
+            io.clock.running[env] = 0
             io.clock.active[env] = 0
-            io.clock.awake[env] = 0
 
 
 @ti.func
@@ -73,20 +73,20 @@ def nearest_threat(env, io: Bundle[EpisodeIO]):
     rate_w = R_wb @ io.vehicle.rate_b[env]
     clearance = hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg)
     ttc = FAR_M + 0.0
-    for body in range(io.world.kind.shape[1]):
-        kind = io.world.kind[env, body]
+    for obstacle in range(io.world.kind.shape[1]):
+        kind = io.world.kind[env, obstacle]
         if kind != NONE:
-            gap, normal, along = hull_to_body(
+            gap, normal, along = hull_to_obstacle(
                 pos_w,
                 axis_w,
                 kind,
-                io.world.pos_w[env, body],
-                io.world.size[env, body],
-                io.world.yaw[env, body],
+                io.world.pos_w[env, obstacle],
+                io.world.size[env, obstacle],
+                io.world.yaw[env, obstacle],
                 io.vehicle_cfg,
             )
             hull_vel = vel_w + along * rate_w.cross(axis_w)
-            closing = (hull_vel - io.world.vel_w[env, body]).dot(normal)
+            closing = (hull_vel - io.world.vel_w[env, obstacle]).dot(normal)
             clearance = ti.min(clearance, gap)
             if closing > io.episode_cfg.ttc_closing_m_s:
                 ttc = ti.min(ttc, ti.max(gap, 0.0) / closing)
@@ -104,11 +104,11 @@ def outcome_of(env, io: Bundle[EpisodeIO]):
     if is_in_tank(pos_w, io.tank_cfg) == 0:
         out = OUT_OF_TANK
     elif (
-        io.referee.clearance_m[env] < io.episode_cfg.collision_clearance_m
+        io.termination.clearance_m[env] < io.episode_cfg.collision_clearance_m
         or hull_to_floor_or_surface(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg) < 0.0
     ):
         out = COLLISION
-    elif io.referee.ttc_s[env] < io.episode_cfg.ttc_s:
+    elif io.termination.ttc_s[env] < io.episode_cfg.ttc_s:
         out = TTC
     elif to_goal.dot(to_goal) <= io.episode_cfg.goal_radius_m**2:
         out = SUCCESS
@@ -119,32 +119,34 @@ def outcome_of(env, io: Bundle[EpisodeIO]):
 
 @quick_launch
 @ti.kernel
-def reset_referee(io: Bundle[EpisodeIO]):
-    """Start the referee's book of the awake rows with the initial clearance."""
-    n = ti.static(io.clock.awake.shape[0])
+def reset_termination(io: Bundle[EpisodeIO]):
+    """Start the termination check's book of the active rows with the initial clearance."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             threat = nearest_threat(env, io)
-            io.referee.outcome[env] = RUNNING
-            io.referee.clearance_m[env] = threat[0]
-            io.referee.ttc_s[env] = threat[1]
-            io.referee.min_clearance_m[env] = threat[0]
-            io.referee.path_length_m[env] = 0.0
-            io.referee.last_pos_w[env] = io.vehicle.pos_w[env]
+            io.termination.outcome[env] = RUNNING
+            io.termination.clearance_m[env] = threat[0]
+            io.termination.ttc_s[env] = threat[1]
+            io.termination.min_clearance_m[env] = threat[0]
+            io.termination.path_length_m[env] = 0.0
+            io.termination.last_pos_w[env] = io.vehicle.pos_w[env]
 
 
 @quick_launch
 @ti.kernel
-def judge(io: Bundle[EpisodeIO]):
-    """Clearance, time to collision, way driven and outcome of the awake rows after they and the obstacles
+def check_termination(io: Bundle[EpisodeIO]):
+    """Clearance, time to collision, way driven and outcome of the active rows after they and the obstacles
     have moved."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             threat = nearest_threat(env, io)
-            io.referee.clearance_m[env] = threat[0]
-            io.referee.ttc_s[env] = threat[1]
-            io.referee.min_clearance_m[env] = ti.min(io.referee.min_clearance_m[env], threat[0])
-            io.referee.path_length_m[env] += (io.vehicle.pos_w[env] - io.referee.last_pos_w[env]).norm()
-            io.referee.last_pos_w[env] = io.vehicle.pos_w[env]
-            io.referee.outcome[env] = outcome_of(env, io)
+            io.termination.clearance_m[env] = threat[0]
+            io.termination.ttc_s[env] = threat[1]
+            io.termination.min_clearance_m[env] = ti.min(io.termination.min_clearance_m[env], threat[0])
+            io.termination.path_length_m[env] += (
+                io.vehicle.pos_w[env] - io.termination.last_pos_w[env]
+            ).norm()
+            io.termination.last_pos_w[env] = io.vehicle.pos_w[env]
+            io.termination.outcome[env] = outcome_of(env, io)

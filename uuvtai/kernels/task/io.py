@@ -11,9 +11,9 @@ from uuvtai.state import (
     ClockState,
     EpisodeState,
     MissionState,
-    RefereeState,
     RewardState,
     RouteState,
+    TerminationState,
     VehicleState,
     WorldState,
 )
@@ -21,11 +21,11 @@ from uuvtai.state import (
 
 @dataclass(frozen=True, eq=False)
 class EpisodeIO:
-    """The clock of each env, and the referee."""
+    """The clock of each env, and the termination."""
 
     clock: Out[ClockState]
     episode: Out[EpisodeState]
-    referee: Out[RefereeState]
+    termination: Out[TerminationState]
     mission: In[MissionState]
     vehicle: In[VehicleState]
     world: In[WorldState]
@@ -41,7 +41,7 @@ class RewardIO:
     reward: Out[RewardState]
     actuation: In[ActuationState]
     clock: In[ClockState]
-    referee: In[RefereeState]
+    termination: In[TerminationState]
     route: In[RouteState]
     vehicle: In[VehicleState]
     episode_cfg: Const[EpisodeConfig]

@@ -3,7 +3,7 @@
 r = r_alive + w_p ds - w_d d - w_ct |e_ct| - w_c C - w_ttc T - w_v |v|_over^2 + w_u U + w_h H + w_s succ - w_f
 fail - w_tilt Theta - w_eff E
 
-Safety terms come from the referee (truth), which the reward may use; the policy never sees them.
+Safety terms come from the termination check (truth), which the reward may use; the policy never sees them.
 """
 
 import taichi as ti
@@ -48,9 +48,9 @@ def is_failure(outcome):
 @quick_launch
 @ti.kernel
 def reset_reward(io: Bundle[RewardIO]):
-    """Forget the last episode of the awake rows."""
-    for env in range(ti.static(io.clock.awake.shape[0])):
-        if io.clock.awake[env] == 1:
+    """Forget the last episode of the active rows."""
+    for env in range(ti.static(io.clock.active.shape[0])):
+        if io.clock.active[env] == 1:
             for term in range(ti.static(N_TERM)):
                 io.reward.term[env, term] = 0.0
                 io.reward.episode_sum[env, term] = 0.0
@@ -101,7 +101,7 @@ def unweighted_terms(env, progress, io: Bundle[RewardIO]):
     """Every term before its weight, in the order of TERMS. Path terms are 0 while there is no route."""
     upright = rotation_wb(io.vehicle.quat_wb[env])[2, 2]
     over = ti.max(0.0, io.vehicle.vel_b[env].norm() - io.reward_cfg.safe_speed_m_s)
-    outcome = io.referee.outcome[env]
+    outcome = io.termination.outcome[env]
     reference = 0.0
     cross_track = 0.0
     heading = 0.0
@@ -115,8 +115,8 @@ def unweighted_terms(env, progress, io: Bundle[RewardIO]):
             progress,
             reference,
             cross_track,
-            ti.math.clamp(1.0 - io.referee.clearance_m[env] / io.reward_cfg.soft_clearance_m, 0.0, 1.0),
-            ti.math.clamp(1.0 - io.referee.ttc_s[env] / io.reward_cfg.soft_ttc_s, 0.0, 1.0),
+            ti.math.clamp(1.0 - io.termination.clearance_m[env] / io.reward_cfg.soft_clearance_m, 0.0, 1.0),
+            ti.math.clamp(1.0 - io.termination.ttc_s[env] / io.reward_cfg.soft_ttc_s, 0.0, 1.0),
             over * over,
             upright,
             heading,
@@ -136,11 +136,11 @@ def compute_reward(
     """Reward of the step, weighted terms, their sums, and how the step ended. Rows that sleep earn 0 and keep
     their end."""
     weights = ti.Vector(ti.static(list(signed_weights(io.reward_cfg))))
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 0 and env < reward_out.shape[0]:
+        if pad == 0 and io.clock.active[env] == 0 and env < reward_out.shape[0]:
             reward_out[env] = 0.0
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             progress = route_progress(env, io.episode_cfg.control_dt_s, io)
             terms = unweighted_terms(env, progress, io)
             total = 0.0
@@ -152,7 +152,7 @@ def compute_reward(
             io.reward.total[env] = total
             io.reward.episode_return[env] += total
             reward_out[env] = total
-            outcome = io.referee.outcome[env]
+            outcome = io.termination.outcome[env]
             terminated[env] = ti.cast(outcome == SUCCESS, ti.i32) | is_failure(outcome)
             truncated[env] = ti.cast(outcome == TIMEOUT, ti.i32)
 
@@ -175,7 +175,7 @@ def write_results(
             episode_terms[env, i] = ti.cast(io.reward.episode_sum[env, i], ti.f32)
         episode_return[env] = ti.cast(io.reward.episode_return[env], ti.f32)
         episode_steps[env] = io.clock.step[env]
-        outcome[env] = io.referee.outcome[env]
+        outcome[env] = io.termination.outcome[env]
 
 
 @quick_launch
@@ -184,7 +184,7 @@ def write_ends(io: Bundle[RewardIO], terminated: ByteVector, truncated: ByteVect
     """Which episodes have ended, and how: 1 or 0."""
     io.reward.n_ended[None] = 0
     for env in range(terminated.shape[0]):
-        outcome = io.referee.outcome[env]
+        outcome = io.termination.outcome[env]
         is_late = outcome == TIMEOUT
         is_over = outcome == SUCCESS or is_failure(outcome) == 1
         terminated[env], truncated[env] = ti.cast(is_over, ti.u8), ti.cast(is_late, ti.u8)

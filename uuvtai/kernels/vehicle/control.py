@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.kernels.core.simd import column, is_awake, n_awake, n_column, put_column
+from uuvtai.kernels.core.simd import column, is_active, n_active, n_column, put_column
 from uuvtai.kernels.core.stage import Bundle, Const, FloatMatrix, In, Out, spread
 from uuvtai.kernels.vehicle.dynamics import rpm_of_thrust, thrust_limits, thrust_of_rpm
 from uuvtai.kernels.vehicle.io import ActuationIO
@@ -25,12 +25,12 @@ _LARGEST = 3.4028234663852886e38
 def command_thrusters(io: Bundle[ActuationIO], action: FloatMatrix):
     """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits ->
     actuation.rpm_command."""
-    n, lanes = ti.static(io.clock.awake.shape[0], n_column())
+    n, lanes = ti.static(io.clock.active.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
     for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
-        if pad == 0 and n_awake(packet * lanes, lanes, io.clock) > 0:
+        if pad == 0 and n_active(packet * lanes, lanes, io.clock) > 0:
             for env in range(packet * lanes, (packet + 1) * lanes):
-                if is_awake(env, io.clock):
+                if is_active(env, io.clock):
                     raw = ti.Vector([action[env, 0], action[env, 1], action[env, 2], action[env, 3]])
                     io.actuation.command[env] = scaled_command(raw, io)
             _drive(packet * lanes, lanes, io)
@@ -56,9 +56,9 @@ def take_action(io: Bundle[ActuationIO], asked: FloatMatrix, action: FloatMatrix
 @ti.kernel
 def reset_actuation(io: Bundle[ActuationIO]):
     """Nothing commanded, nothing under way."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             io.actuation.command[env] = 0.0
             io.actuation.integral[env] = 0.0
             for i in ti.static(range(io.actuation.response.shape[1])):
@@ -145,7 +145,7 @@ def _drive(first, lanes: Const[int], io: Bundle[ActuationIO]):
     for lane in range(lanes):
         _control(lane, fleet, inverse, io)
     for lane in range(lanes):
-        if is_awake(first + lane, io.clock):
+        if is_active(first + lane, io.clock):
             _store_vehicle(lane, first + lane, fleet, io)
 
 

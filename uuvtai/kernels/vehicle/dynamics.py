@@ -28,7 +28,7 @@ from uuvtai.kernels.core.noise import (
     stream_key,
     uniform_in,
 )
-from uuvtai.kernels.core.simd import column, is_awake, n_awake, n_column, put_column
+from uuvtai.kernels.core.simd import column, is_active, n_active, n_column, put_column
 from uuvtai.kernels.core.stage import Bundle, Const, In, Out, spread
 from uuvtai.kernels.vehicle.io import DynamicsIO
 
@@ -132,10 +132,10 @@ _DRAW_QUADRATIC = 13
 def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
     """One control step of dt_s [s] in n_substep substeps; then the current moves on to the end of the
     step."""
-    n, lanes = ti.static(io.clock.awake.shape[0], n_column())
+    n, lanes = ti.static(io.clock.active.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
     for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
-        if pad == 0 and n_awake(packet * lanes, lanes, io.clock) > 0:
+        if pad == 0 and n_active(packet * lanes, lanes, io.clock) > 0:
             _move(packet * lanes, lanes, dt_s / n_substep, n_substep, io)
             if ti.static(io.disturbance_cfg.current_sigma_m_s > 0):
                 _change_currents(packet * lanes, lanes, dt_s, io)
@@ -145,9 +145,9 @@ def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
 @ti.kernel
 def reset_vehicle(io: Bundle[DynamicsIO]):
     """At rest at the mission's start, with this episode's parameters and current."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             _place(env, io)
             _draw_body(env, io)
             _draw_thrusters(env, io)
@@ -193,7 +193,7 @@ def _move(first, lanes: Const[int], dt, n_substep, io: Bundle[DynamicsIO]):
         for lane in range(lanes):
             _advance(lane, fleet, geometry, kept, dt, io)
     for lane in range(lanes):
-        if is_awake(first + lane, io.clock):
+        if is_active(first + lane, io.clock):
             _store_vehicle(lane, first + lane, fleet, io)
 
 
@@ -319,7 +319,7 @@ def body_of(lane, fleet: In[Any], io: Bundle[DynamicsIO]):
 @ti.func
 def acceleration(q, v, w, force, moment, current_w, body: In[Any], io: Bundle[DynamicsIO]):
     """(dv/dt, dw/dt) in body axes [m/s^2, rad/s^2]: Fossen's equation solved for the derivative of nu."""
-    # Kirchhoff's equations of a body in a uniform current (Fossen 2011, chapter 6), v_r = v - current:
+    # Kirchhoff's equations of an obstacle in a uniform current (Fossen 2011, chapter 6), v_r = v - current:
     #   force   m (dv + w x v) + A dv_r + w x (A v_r) = tau - D(v_r) v_r + (B - W) up
     #   moment  (I + A_w) dw + w x ((I + A_w) w) + v_r x (A v_r) = tau - D(w) w + (0, 0, height) x B up
     # dv_r = dv + w x current, as the current stands still in the world (or dv, by ``added_mass_follows``);
@@ -381,7 +381,7 @@ def turned(q, w, dt):
 def _change_currents(first, lanes: Const[int], dt_s, io: Bundle[DynamicsIO]):
     """Move the current of a packet of envs on by dt_s [s]."""
     for env in range(first, first + lanes):
-        if is_awake(env, io.clock):
+        if is_active(env, io.clock):
             key = stream_key(io.episode.key[env], io.clock.step[env], STREAM_CURRENT)
             io.current.vel_w[env] = current_after(
                 io.current.mean_w[env], io.current.vel_w[env], key, dt_s, io

@@ -78,10 +78,10 @@ def _offset_n2(vehicle_cfg, sensors_cfg):
 @quick_launch
 @ti.kernel
 def watch_thrusters(io: Bundle[ThrusterWatchIO]):
-    """Weigh what the last commands did, before new ones are given. Awake rows only."""
-    n = ti.static(io.clock.awake.shape[0])
+    """Weigh what the last commands did, before new ones are given. Active rows only."""
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
+        if pad == 0 and io.clock.active[env] == 1:
             watched = io.clock.step[env] > 0 and io.ego.vel_valid[env] == 1
             if watched and io.ego.given_up[env] <= 0:
                 _weigh(env, io)

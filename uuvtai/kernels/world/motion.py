@@ -21,13 +21,13 @@ from uuvtai.kernels.world.io import WorldIO
 from uuvtai.state import PathState, WorldState
 
 # ------------------------------------------------------------------------------------------------------------
-# The list of bodies of each env: how slots are written and which of them move. Floor of the scenario's
+# The list of obstacles of each env: how slots are written and which of them move. Floor of the scenario's
 # drawing.
 
 
 @ti.func
-def put_body(env, slot, kind, pos_w, size, yaw, io: Bundle[WorldIO]):
-    """Write one body, at rest."""
+def put_obstacle(env, slot, kind, pos_w, size, yaw, io: Bundle[WorldIO]):
+    """Write one obstacle, at rest."""
     io.world.kind[env, slot] = kind
     io.world.pos_w[env, slot] = pos_w
     io.world.vel_w[env, slot] = ti.Vector([0.0, 0.0, 0.0])
@@ -37,7 +37,7 @@ def put_body(env, slot, kind, pos_w, size, yaw, io: Bundle[WorldIO]):
 
 @ti.func
 def first_moving(world: In[WorldState], path: In[PathState]):
-    """Slot of the first moving body."""
+    """Slot of the first moving obstacle."""
     return ti.static(world.kind.shape[1] - path.n_way.shape[1])
 
 
@@ -100,20 +100,20 @@ def path_point(env, lane, arc_m, io: Bundle[WorldIO]):
 
 
 @ti.func
-def draw_moving_bodies(env, io: Bundle[WorldIO]):
+def draw_moving_obstacles(env, io: Bundle[WorldIO]):
     """Draw D moving obstacles with their paths; obstacle i is the same for every D and v."""
     n_moving = ti.min(io.scene.n_dynamic[env], ti.static(io.world_cfg.dynamic_slots))
     for i in range(n_moving):
         lane = ti.static(io.world_cfg.n_fixed_moving) + i
         slot = first_moving(io.world, io.path) + lane
         key = stream_key(io.episode.key[env], i, STREAM_PATH)
-        draw_moving_body(env, slot, i, key, io)
+        draw_moving_obstacle(env, slot, i, key, io)
         io.path.speed_m_s[env, lane] = io.scene.speed_m_s[env]
         draw_clear_path(env, lane, slot, i, key, io)
 
 
 @ti.func
-def draw_moving_body(env, slot, i, key, io: Bundle[WorldIO]):
+def draw_moving_obstacle(env, slot, i, key, io: Bundle[WorldIO]):
     """Kind, size and depth of a moving obstacle."""
     radius = uniform_in(key, 0, io.world_cfg.dynamic.radius_m[0], io.world_cfg.dynamic.radius_m[1])
     z = uniform_in(key, 2, io.world_cfg.dynamic.z_m[0], io.world_cfg.dynamic.z_m[1])
@@ -132,7 +132,7 @@ def draw_moving_body(env, slot, i, key, io: Bundle[WorldIO]):
             ):
                 z = 0.5 * (io.world_cfg.tank.z_m[0] + io.world_cfg.tank.z_m[1])
                 size[2] = 0.5 * (io.world_cfg.tank.z_m[1] - io.world_cfg.tank.z_m[0])
-    put_body(env, slot, kind, ti.Vector([0.0, 0.0, z]), size, 0.0, io)
+    put_obstacle(env, slot, kind, ti.Vector([0.0, 0.0, z]), size, 0.0, io)
 
 
 @ti.func

@@ -25,12 +25,12 @@ from uuvtai.kernels.core.noise import STREAM_SCENARIO, stream_key, uniform, unif
 from uuvtai.kernels.core.stage import Bundle, spread
 from uuvtai.kernels.world.io import WorldIO
 from uuvtai.kernels.world.motion import (
-    draw_moving_bodies,
+    draw_moving_obstacles,
     first_moving,
     is_chosen,
     path_point,
     polyline_length,
-    put_body,
+    put_obstacle,
 )
 
 # ------------------------------------------------------------------------------------------------------------
@@ -73,7 +73,7 @@ def draw_layout(env, io: Bundle[WorldIO]):
             fault = draw_endpoints(env, pair, io)
         layout_fault = fault
         if ti.static(io.world_cfg.static_slots > 0):
-            if draw_static_bodies(env, draws, io) == 0:
+            if draw_static_obstacles(env, draws, io) == 0:
                 layout_fault |= FAULT_STATIC
         if ti.static(io.world_cfg.n_fixed_static + io.world_cfg.static_slots > 0):
             if layout_fault == 0 and is_joined(env, io) == 0:
@@ -128,7 +128,7 @@ def keeps_endpoints(env, shape, io: Bundle[WorldIO]):
 
 
 @ti.func
-def draw_static_bodies(env, layout, io: Bundle[WorldIO]):
+def draw_static_obstacles(env, layout, io: Bundle[WorldIO]):
     """Draw S static obstacles one after the other; 0 where one finds no place."""
     key = stream_key(io.episode.key[env], layout, STREAM_SCENARIO)
     n_static = ti.min(io.scene.n_static[env], ti.static(io.world_cfg.static_slots))
@@ -138,13 +138,13 @@ def draw_static_bodies(env, layout, io: Bundle[WorldIO]):
     placed = 1
     i = 0
     while placed == 1 and i < n_static:
-        placed = draw_static_body(env, first + i, i, key, io)
+        placed = draw_static_obstacle(env, first + i, i, key, io)
         i += 1
     return placed
 
 
 @ti.func
-def draw_static_body(env, slot, i, key, io: Bundle[WorldIO]):
+def draw_static_obstacle(env, slot, i, key, io: Bundle[WorldIO]):
     """Draw size and heading once, then places until the gaps are kept; 0 where none keeps them."""
     first = i * (8 + 2 * _PLACE_DRAWS)
     half_height = 0.5 * (io.world_cfg.tank.z_m[1] - io.world_cfg.tank.z_m[0])
@@ -171,17 +171,17 @@ def draw_static_body(env, slot, i, key, io: Bundle[WorldIO]):
         if is_inside(shape, 0.0, io.world_cfg.tank) == 1 and keeps_endpoints(env, shape, io) == 1:
             found = keeps_gaps(env, shape, slot, io.world_cfg.static.gap_m, io)
         if found == 1:
-            put_body(env, slot, kind, pos_w, size, yaw, io)
+            put_obstacle(env, slot, kind, pos_w, size, yaw, io)
             io.scratch.footprint[env, slot] = shape
         draw += 1
     return found
 
 
 @ti.func
-def keeps_gaps(env, shape, n_body, gap_m, io: Bundle[WorldIO]):
-    """1 where a footprint keeps its gap from the first bodies of the list."""
+def keeps_gaps(env, shape, n_obstacle, gap_m, io: Bundle[WorldIO]):
+    """1 where a footprint keeps its gap from the first obstacles of the list."""
     kept = 1
-    for slot in range(n_body):
+    for slot in range(n_obstacle):
         if kept == 1:
             kept = is_apart(shape, io.scratch.footprint[env, slot], gap_m)
     return kept
@@ -294,25 +294,25 @@ def flood_sweep(env, backward, io: Bundle[WorldIO]):
 @quick_launch
 @ti.kernel
 def generate_scenarios(io: Bundle[WorldIO]):
-    """Draw start, goal, static and moving obstacles of every awake row; ``move_obstacles`` then puts the
+    """Draw start, goal, static and moving obstacles of every active row; ``move_obstacles`` then puts the
     moving ones in place."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 1:
-            clear_bodies(env, io)
+        if pad == 0 and io.clock.active[env] == 1:
+            clear_obstacles(env, io)
             place_fixed(env, io)
             draw_layout(env, io)
     if ti.static(io.world_cfg.dynamic_slots > 0):
         for env, pad in ti.ndrange(n, ti.static(spread(n))):  # a loop of its own compiles in half the time
-            if pad == 0 and io.clock.awake[env] == 1:
-                draw_moving_bodies(env, io)
+            if pad == 0 and io.clock.active[env] == 1:
+                draw_moving_obstacles(env, io)
 
 
 @ti.func
-def clear_bodies(env, io: Bundle[WorldIO]):
+def clear_obstacles(env, io: Bundle[WorldIO]):
     """Empty every slot, so that nothing of the last episode stays."""
     for slot in range(io.world.kind.shape[1]):
-        put_body(env, slot, NONE, ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0]), 0.0, io)
+        put_obstacle(env, slot, NONE, ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0]), 0.0, io)
     io.world.draws[env] = 0
     io.world.unclear_paths[env] = 0
     io.world.faults[env] = 0
@@ -336,7 +336,7 @@ def place_fixed(env, io: Bundle[WorldIO]):
             for j in range(io.path.way_w.shape[2]):
                 io.path.way_w[env, lane, j] = io.fixed.way_w[i, j]
             io.path.length_m[env, lane] = polyline_length(env, lane, io)
-        put_body(env, slot, io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i], io)
+        put_obstacle(env, slot, io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i], io)
         io.scratch.footprint[env, slot] = footprint_of(
             io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i]
         )
@@ -345,12 +345,12 @@ def place_fixed(env, io: Bundle[WorldIO]):
 @quick_launch
 @ti.kernel
 def move_obstacles(io: Bundle[WorldIO]):
-    """Put every moving body of the awake rows where it is at time step * dt, with its velocity; depth
+    """Put every moving obstacle of the active rows where it is at time step * dt, with its velocity; depth
     stays."""
-    n = ti.static(io.clock.awake.shape[0])
+    n = ti.static(io.clock.active.shape[0])
     for env, lane in ti.ndrange(n, ti.static(io.path.n_way.shape[1])):
         slot = first_moving(io.world, io.path) + lane
-        if io.clock.awake[env] == 1 and io.world.kind[env, slot] != NONE:
+        if io.clock.active[env] == 1 and io.world.kind[env, slot] != NONE:
             speed = io.path.speed_m_s[env, lane]
             time_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
             at = path_point(env, lane, io.path.phase_m[env, lane] + speed * time_s, io)

@@ -53,10 +53,10 @@ def during_training(checkpoint: Checkpoint) -> Evaluation | None:
     success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
     if not isinstance(success, float | int) or not isinstance(collision, float | int):
         return None
-    is_twin = config.learner == "twin"
+    is_twin = config.learner == "surrogate"
     where, n = _held_out_in_worlds(config) if is_twin else _held_out(config)
     where += f", seed {config.train.evaluate_seed}"
-    repeated = is_twin and len(config.twin.worlds) * max(1, len(config.train.scenes)) > 1
+    repeated = is_twin and len(config.surrogate.worlds) * max(1, len(config.train.scenes)) > 1
     return Evaluation(where, n, round(success * n), round(collision * n), repeated)
 
 
@@ -70,11 +70,11 @@ def _held_out(config: LearningConfig) -> tuple[str, int]:
 
 
 def _held_out_in_worlds(config: LearningConfig) -> tuple[str, int]:
-    """As ``_held_out``, of a policy over a set of bodies: as many of every world and scene."""
-    worlds = config.twin.worlds
+    """As ``_held_out``, of a policy over a set of obstacles: as many of every world and scene."""
+    worlds = config.surrogate.worlds
     groups = len(worlds) * max(1, len(config.train.scenes))
     each = -(-config.train.evaluate_episodes // groups)
-    return f"the kinematic twin, {' and '.join(map(_word, worlds))}, {scenes_of(config)}", groups * each
+    return f"the kinematic surrogate, {' and '.join(map(_word, worlds))}, {scenes_of(config)}", groups * each
 
 
 def scenes_of(config: LearningConfig) -> str:
@@ -109,26 +109,26 @@ def _own_results(checkpoint: Checkpoint) -> list[Path]:
 
 
 def _rows(file: Path, folder: Path, sha256: str) -> list[Evaluation]:
-    """Rows of the methods that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is
+    """Rows of the agents that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is
     no result."""
     try:
         result = read_json(file, _MAX_BYTES, folder)
-        return [_row(result, m) for m in result["methods"] if m.get("checkpoint", {}).get("sha256") == sha256]
+        return [_row(result, m) for m in result["agents"] if m.get("checkpoint", {}).get("sha256") == sha256]
     except (UserError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(
             f"{file}: is no result of uuv eval ({error!r}); give the run folder that 'uuv eval RUN' printed"
         ) from None
 
 
-def _row(result: dict[str, Any], method: dict[str, Any]) -> Evaluation:
+def _row(result: dict[str, Any], agent: dict[str, Any]) -> Evaluation:
     speed = f", v = {float(result['v_m_s']):g} m/s" if result["D"] else ""
     seeds = ", ".join(str(int(seed)) for seed in result["seeds"])
     where = (
         f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, "
         f"{sensing({**result, 'sensors': _word(result['sensors'])})}, seed {seeds}"
     )
-    k, n = int(method["outcomes"]["success"]), int(method["episodes"])
-    collisions = sum(int(method["outcomes"][name]) for name in COLLIDED)
+    k, n = int(agent["outcomes"]["success"]), int(agent["episodes"])
+    collisions = sum(int(agent["outcomes"][name]) for name in COLLIDED)
     if min(k, collisions) < 0 or k + collisions > n:
         raise ValueError(f"{k} successes and {collisions} collisions of {n} episodes")
     return Evaluation(where, n, k, collisions)
@@ -206,7 +206,7 @@ def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[E
         control_hz=spec["rate"]["control_hz"],
         hold_steps=spec["rate"]["hold_steps"],
         residual=_RESIDUAL if is_residual else _PLAIN,
-        tree=", behaviour tree" if checkpoint.config.features.teacher else "",
+        tree=", behaviour tree" if checkpoint.config.observation.behavior else "",
         graph=_GRAPH if spec["graph"] else "",
     )
 
@@ -237,7 +237,7 @@ def _tank(config: LearningConfig) -> str:
 
 
 def _obstacles(config: LearningConfig) -> str:
-    return f"Resting obstacles S, moving ones D, their speed v: {scenes_of(config)}."
+    return f"Static obstacles S, moving ones D, their speed v: {scenes_of(config)}."
 
 
 def results_text(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
@@ -257,8 +257,8 @@ def results_text(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# README.md of an exported policy over a set of bodies or of a learned forecast: how a stranger drives by it,
-# what it learnt from, how it did, and what it is not for.
+# README.md of an exported policy over a set of obstacles or of a learned forecast: how a stranger drives by
+# it, what it learnt from, how it did, and what it is not for.
 
 
 _CARD = """# {name}
@@ -283,12 +283,14 @@ Trained with uuvtai {version}.
 {limits}
 """
 _SET = (
-    "A policy that drives an underwater vehicle by a wish for a velocity, from tracked bodies and free "
+    "A policy that drives an underwater vehicle by a wish for a velocity, from tracked obstacles and free "
     "distances."
 )
-_FORECAST = "A forecast of tracked moving bodies: a mixture of Gaussians over the places in the next seconds."
+_FORECAST = (
+    "A forecast of tracked moving obstacles: a mixture of Gaussians over the places in the next seconds."
+)
 _HOW_SET = """In a program: `from run_set_policy import load`, `policy = load(folder)`, then {rate:g} times a
-second `said = policy.act(bodies, own)`, and at every control step ({control_hz:g} Hz)
+second `said = policy.act(obstacles, own)`, and at every control step ({control_hz:g} Hz)
 `policy.command(said.wish, flip, yaw_rad, z_m)`. It remembers nothing; the last wish that was carried out is
 among the columns."""
 _HOW_FORECAST = """In a program: `from run_set_policy import load`, `forecast = load(folder)`, then
@@ -315,7 +317,7 @@ numbers are `hull_rule` of `policy_spec.json`, and `command` in `run_set_policy.
 _LIMITS = """- It does not guarantee clearance. Keep a separate safety stop.
 - Columns have to come from the same stack (tracks, map, pose) with the same meaning.
 - It expects the vehicle's inner velocity loop with these limits; it never commands thrusters."""
-_LIMITS_FORECAST = """- Its probabilities are those of bodies as they move in this simulator.
+_LIMITS_FORECAST = """- Its probabilities are those of obstacles as they move in this simulator.
 - Columns have to come from the same tracker with the same meaning."""
 
 

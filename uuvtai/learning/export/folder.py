@@ -47,7 +47,7 @@ from uuvtai.learning.export.graph import (
 )
 from uuvtai.learning.export.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, PolicyError
 from uuvtai.learning.export.spec import ONNX, set_specification, specification, weights_of
-from uuvtai.learning.policy_agent import load_pilot
+from uuvtai.learning.policy_agent import load_agent
 from uuvtai.logs.container import sync_folder
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
 
@@ -94,7 +94,7 @@ def of_set_numpy(
 
 
 def of_torch(decision: ExportedModule, golden: Arrays) -> Agreement:
-    """The networks themselves, one decision at a time without memory, against the pilot that flew the golden
+    """The networks themselves, one decision at a time without memory, against the agent that flew the golden
     mission with its own."""
     tensors = [torch.from_numpy(array) for array in inputs_of(golden, decision.inputs).values()]
     rows = [[tensor[i : i + 1] for tensor in tensors] for i in range(len(tensors[0]))]
@@ -195,8 +195,8 @@ def export(
     RunFolderError where the disk refuses.
     """
     _refuse_place(out, force)
-    driver, rows = _driver_of(checkpoint, name), evaluations_of(checkpoint, evaluations)
-    decision, golden, graph = driver.decision, driver.golden, None
+    exporter, rows = _exporter_of(checkpoint, name), evaluations_of(checkpoint, evaluations)
+    decision, golden, graph = exporter.decision, exporter.golden, None
     if missing := missing_packages():
         note(
             f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', "
@@ -204,11 +204,11 @@ def export(
         )
     else:
         graph = onnx_bytes(decision)
-    spec = driver.spec(graph is not None)
+    spec = exporter.spec(graph is not None)
     files = {
-        WEIGHTS: safetensors.torch.save(driver.weights),
+        WEIGHTS: safetensors.torch.save(exporter.weights),
         GOLDEN: npz_bytes(golden),
-        "README.md": driver.card(spec, checkpoint, rows).encode(),
+        "README.md": exporter.card(spec, checkpoint, rows).encode(),
         "run_policy.py": _source_of(run_policy),
     } | ({} if graph is None else {ONNX: graph})
     if "kind" in spec:
@@ -218,7 +218,7 @@ def export(
 
 
 @dataclass(frozen=True)
-class _Driver:
+class _Exporter:
     """What of a checkpoint goes into a folder."""
 
     decision: ExportedModule
@@ -229,15 +229,15 @@ class _Driver:
     card: Callable[[dict[str, Any], Checkpoint, list[Evaluation]], str]
 
 
-def _driver_of(checkpoint: Checkpoint, name: str) -> _Driver:
+def _exporter_of(checkpoint: Checkpoint, name: str) -> _Exporter:
     """Raises CheckpointError for networks that cannot drive."""
     if (kind := kind_of(checkpoint)) is None:
-        pilot = load_pilot(checkpoint, 1)
-        decision, spec = OneDecision(pilot), functools.partial(specification, checkpoint, pilot, name)
-        return _Driver(decision.eval(), golden_of(pilot), weights_of(pilot), spec, model_card)
+        agent = load_agent(checkpoint, 1)
+        decision, spec = OneDecision(agent), functools.partial(specification, checkpoint, agent, name)
+        return _Exporter(decision.eval(), golden_of(agent), weights_of(agent), spec, model_card)
     decision = module_of(checkpoint, kind)
     spec = functools.partial(set_specification, checkpoint, decision, kind, name)
-    return _Driver(decision.eval(), golden_rows(decision), set_weights(decision), spec, set_card)
+    return _Exporter(decision.eval(), golden_rows(decision), set_weights(decision), spec, set_card)
 
 
 def check(folder: Path, note: Note) -> Export:
@@ -256,7 +256,7 @@ def check(folder: Path, note: Note) -> Export:
 
 
 def _source_of(module: ModuleType) -> bytes:
-    """A driver's own text."""
+    """A exporter's own text."""
     return Path(module.__file__ or "").read_bytes()
 
 

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from uuvtai.common.enums import BODY_WIDTH, COLUMNS, EGO_COLUMNS, N_BODY
+from uuvtai.common.enums import COLUMNS, EGO_COLUMNS, N_OBSTACLE, OBSTACLE_WIDTH
 from uuvtai.common.errors import UserError
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.networks import NUM_ACTIONS, MixtureNet
-from uuvtai.learning.policy_agent import Pilot
+from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.set_networks import SetActor, actor_of, mixture_net_of
 from uuvtai.learning.world_model import N_FEATURES, N_TARGET, deviation
 
@@ -368,17 +368,17 @@ class ExportedModule(nn.Module):
 
 
 class OneDecision(ExportedModule):
-    """``Pilot`` for one decision: outputs by the names of OUTPUTS."""
+    """``PolicyAgent`` for one decision: outputs by the names of OUTPUTS."""
 
     inputs = INPUTS
     fill: Tensor
     """(n_obs,) what counts where a value is not finite"""
 
-    def __init__(self, pilot: Pilot) -> None:
+    def __init__(self, agent: PolicyAgent) -> None:
         super().__init__()
-        self.policy, self.world_model = pilot.policy, pilot.world_model
+        self.policy, self.world_model = agent.policy, agent.world_model
         self.register_buffer(
-            "fill", pilot.policy.observation_norm.mean[: pilot.policy.n_in - N_FEATURES].float()
+            "fill", agent.policy.observation_norm.mean[: agent.policy.n_in - N_FEATURES].float()
         )
 
     @property
@@ -445,7 +445,7 @@ def _quiet() -> Iterator[None]:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Golden pairs: a made-up mission that the pilot answers, step by step with its memory and decision by
+# Golden pairs: a made-up mission that the agent answers, step by step with its memory and decision by
 # decision without.
 
 
@@ -458,18 +458,18 @@ Arrays = dict[str, np.ndarray]
 Row = dict[str, Tensor]
 
 
-def golden_of(pilot: Pilot) -> Arrays:
-    """A mission of T steps and what the pilot (of one row) does in it, and its decisions as pairs for the
+def golden_of(agent: PolicyAgent) -> Arrays:
+    """A mission of T steps and what the agent (of one row) does in it, and its decisions as pairs for the
     graph.
 
     ``obs`` (T, n_obs), ``begins`` (T,): another mission begins here; outputs ``action`` (T, 4), ``value``,
     ``residual`` and ``uncertainty`` (T,). ``pair_<input>`` and ``pair_<output>`` have
     a row per decision. Some values are not finite, as a sensor that fails may give them.
     """
-    obs = _mission(pilot)
+    obs = _mission(agent)
     begins = torch.zeros(len(obs), dtype=torch.bool)
     begins[[0, len(obs) // 2 + 1]] = True
-    decisions, pairs = _flown(pilot, obs, begins)
+    decisions, pairs = _flown(agent, obs, begins)
     found = (
         {"obs": obs, "begins": begins}
         | _stacked(decisions)
@@ -494,64 +494,65 @@ def inputs_of(golden: Arrays, names: Iterable[str] = INPUTS) -> Arrays:
     return {name: golden[f"pair_{name}"] for name in names}
 
 
-def _mission(pilot: Pilot) -> Tensor:
+def _mission(agent: PolicyAgent) -> Tensor:
     """(T, n_obs) observations as training had them: spread like the normaliser's columns, the world model's
     targets step by step."""
     norm, n_obs, hold = (
-        pilot.policy.observation_norm,
-        pilot.policy.n_in - N_FEATURES,
-        pilot.policy.config.hold_steps,
+        agent.policy.observation_norm,
+        agent.policy.n_in - N_FEATURES,
+        agent.policy.config.hold_steps,
     )
     rng, steps = torch.Generator().manual_seed(_SEED), _DECISIONS + hold * (_DECISIONS // 4)
     mean, std = norm.mean[:n_obs].float(), norm.std()[:n_obs].float()
     obs = mean + std * torch.randn(steps, n_obs, generator=rng)
-    if pilot.world_model is not None:
-        change = deviation(pilot.world_model.change_norm.moments) / math.sqrt(hold)
+    if agent.world_model is not None:
+        change = deviation(agent.world_model.change_norm.moments) / math.sqrt(hold)
         obs[1:, :N_TARGET] = change * torch.randn(steps - 1, N_TARGET, generator=rng)
         obs[:, :N_TARGET] = obs[:, :N_TARGET].cumsum(dim=0)
     obs[3, 0], obs[5, n_obs - 1], obs[7, n_obs // 2] = math.nan, math.inf, -math.inf
     return obs
 
 
-def _flown(pilot: Pilot, obs: Tensor, begins: Tensor) -> tuple[list[Row], list[Row]]:
-    """What the pilot says at every step, and inputs and outputs of every decision."""
+def _flown(agent: PolicyAgent, obs: Tensor, begins: Tensor) -> tuple[list[Row], list[Row]]:
+    """What the agent says at every step, and inputs and outputs of every decision."""
     decisions, pairs, age = [], [], 0
     nothing = torch.zeros(obs.shape[1]), torch.zeros(NUM_ACTIONS)
     last = nothing
     for row, is_first in zip(obs, begins.tolist(), strict=True):
         if is_first:
-            pilot.reset(torch.ones(1))
+            agent.reset(torch.ones(1))
             age, last = 0, nothing
-        decisions.append(_outputs_of(pilot, row))
-        if age % pilot.policy.config.hold_steps == 0:
+        decisions.append(_outputs_of(agent, row))
+        if age % agent.policy.config.hold_steps == 0:
             inputs = dict(zip(INPUTS, (row, *last, torch.tensor(age > 0)), strict=True))
-            pairs.append(inputs | _pair_outputs(pilot, decisions[-1]))
-            last = row, pilot.mean_action[0].clone()
+            pairs.append(inputs | _pair_outputs(agent, decisions[-1]))
+            last = row, agent.mean_action[0].clone()
         age += 1
     return decisions, pairs
 
 
-def _outputs_of(pilot: Pilot, obs: Tensor) -> Row:
+def _outputs_of(agent: PolicyAgent, obs: Tensor) -> Row:
     """One control step: outputs under their golden names."""
-    said = pilot.decide(obs[None])
-    pilot.advance()
+    said = agent.decide(obs[None])
+    agent.advance()
     return {name: getattr(said, name)[0].clone() for name in ("action", "value", "residual", "uncertainty")}
 
 
-def _pair_outputs(pilot: Pilot, row: Row) -> Row:
+def _pair_outputs(agent: PolicyAgent, row: Row) -> Row:
     """The same decision under the names of the graph's outputs."""
-    found = {"mean_action": pilot.mean_action[0].clone(), "value": row["value"]}
+    found = {"mean_action": agent.mean_action[0].clone(), "value": row["value"]}
     return found | {"features": torch.stack([row["residual"], row["uncertainty"]])}
 
 
 # ------------------------------------------------------------------------------------------------------------
-# A policy over a set of bodies and a learned forecast as torch modules that become ONNX graphs, their
+# A policy over a set of obstacles and a learned forecast as torch modules that become ONNX graphs, their
 # arrays, and what they say to made-up inputs. Neither remembers anything; no critic is among them.
 
 
 SET_INPUTS = {
-    "bodies": f"(N, n, {BODY_WIDTH}) float32: the nearest moving bodies in any order, any n from 1 on; a row "
-    "of zeros is no body",
+    "obstacles": f"(N, n, {OBSTACLE_WIDTH}) float32: the nearest moving obstacles in any order, any n from 1 "
+    f"on; a row "
+    "of zeros is no obstacle",
     "own": f"(N, {EGO_COLUMNS}) float32: the vehicle, its goal and the free distances around it",
 }
 FORECAST_INPUTS = {
@@ -569,7 +570,7 @@ Example = tuple[tuple[Tensor, ...], dict[str, dict[int, torch.export.Dim]]]
 
 
 class OneWish(ExportedModule):
-    """One decision of a policy over a set of bodies."""
+    """One decision of a policy over a set of obstacles."""
 
     inputs = SET_INPUTS
 
@@ -584,13 +585,13 @@ class OneWish(ExportedModule):
 
     def example(self) -> Example:
         """As in ``ExportedModule``."""
-        rows, bodies = torch.export.Dim("rows", min=1), torch.export.Dim("bodies", min=1)
-        some = torch.zeros(2, N_BODY, BODY_WIDTH), torch.zeros(2, EGO_COLUMNS)
-        return some, {"bodies": {0: rows, 1: bodies}, "own": {0: rows}}
+        rows, obstacles = torch.export.Dim("rows", min=1), torch.export.Dim("obstacles", min=1)
+        some = torch.zeros(2, N_OBSTACLE, OBSTACLE_WIDTH), torch.zeros(2, EGO_COLUMNS)
+        return some, {"obstacles": {0: rows, 1: obstacles}, "own": {0: rows}}
 
-    def forward(self, bodies: Tensor, own: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, obstacles: Tensor, own: Tensor) -> tuple[Tensor, ...]:
         """Shapes as SET_INPUTS says."""
-        return (self.actor(bodies, own),)
+        return (self.actor(obstacles, own),)
 
 
 class OneForecast(ExportedModule):
@@ -623,7 +624,7 @@ _THERE = 0
 
 
 def golden_rows(decision: ExportedModule) -> Arrays:
-    """``pair_<input>`` and ``pair_<output>`` of 64 rows; the first has no body at all."""
+    """``pair_<input>`` and ``pair_<output>`` of 64 rows; the first has no obstacle at all."""
     rng = torch.Generator().manual_seed(_SET_SEED)
     inputs = _forecast_rows(decision, rng) if isinstance(decision, OneForecast) else _set_rows(rng)
     with torch.no_grad():
@@ -641,19 +642,19 @@ def _forecast_rows(decision: ExportedModule, rng: torch.Generator) -> tuple[Tens
 
 
 def _set_rows(rng: torch.Generator) -> tuple[Tensor, ...]:
-    """Of any number of bodies."""
-    bodies = torch.randn(_ROWS, N_BODY, BODY_WIDTH, generator=rng)
+    """Of any number of obstacles."""
+    obstacles = torch.randn(_ROWS, N_OBSTACLE, OBSTACLE_WIDTH, generator=rng)
     own = torch.randn(_ROWS, EGO_COLUMNS, generator=rng)
-    count = torch.randint(1, N_BODY + 1, (_ROWS,), generator=rng)
+    count = torch.randint(1, N_OBSTACLE + 1, (_ROWS,), generator=rng)
     count[0] = 0
-    bodies *= (torch.arange(N_BODY) < count[:, None])[..., None]
-    bodies[..., _THERE] = (torch.arange(N_BODY) < count[:, None]).float()
-    return bodies, own
+    obstacles *= (torch.arange(N_OBSTACLE) < count[:, None])[..., None]
+    obstacles[..., _THERE] = (torch.arange(N_OBSTACLE) < count[:, None]).float()
+    return obstacles, own
 
 
 def kind_of(checkpoint: Checkpoint) -> str | None:
     """One of ``run_policy.KINDS``; None = a policy of one observation vector."""
-    return {"forecaster": "forecast", "twin": "set"}.get(checkpoint.config.learner)
+    return {"forecast_training": "forecast", "surrogate": "set"}.get(checkpoint.config.learner)
 
 
 def module_of(checkpoint: Checkpoint, kind: str) -> ExportedModule:

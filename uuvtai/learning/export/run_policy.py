@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 SPEC, WEIGHTS, GOLDEN = "policy_spec.json", "policy.safetensors", "golden.npz"
-SCHEMA = 1
+SCHEMA = 2
 """of the folder; another one is refused"""
 FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py", "run_set_policy.py")
 """names that the spec may list; nothing else is ever opened"""

@@ -1,9 +1,9 @@
-"""Drive by an exported policy over a set of bodies, or forecast by an exported network, with NumPy alone.
+"""Drive by an exported policy over a set of obstacles, or forecast by an exported network, with NumPy alone.
 ``uuv export`` puts a copy of this file in its folder, beside ``run_policy.py``, which reads the files.
 
     from run_set_policy import load
     policy = load("FOLDER")               # checks the sha256 of every file
-    said = policy.act(bodies, own)        # ten times a second: columns as policy_spec.json says
+    said = policy.act(obstacles, own)        # ten times a second: columns as policy_spec.json says
     command = policy.command(said.wish, flip, yaw_rad, z_m)     # every control step: the hull rule
 
 A forecast is asked by ``futures(columns, speed)``. ``python run_set_policy.py [FOLDER]`` replays the golden
@@ -28,7 +28,7 @@ Arrays = dict[str, np.ndarray]
 Layers = list[tuple[np.ndarray, np.ndarray]]
 
 AT_THERE, AT_DIRECTION = 0, slice(3, 5)
-"""columns: of a body, 1 = there; of the vehicle's own, the unit vector to the goal"""
+"""columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the goal"""
 SUM_SCALE = 0.3
 MOST_WISH = 2.0
 LEAST_M, LOG_BOUNDS = 0.03, (-6.0, math.log(4.0))
@@ -57,9 +57,9 @@ class Futures(NamedTuple):
 
 
 class SetPolicy:
-    """A policy over a set of bodies; it remembers nothing."""
+    """A policy over a set of obstacles; it remembers nothing."""
 
-    inputs = ("bodies", "own")
+    inputs = ("obstacles", "own")
 
     def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
         """``spec`` is policy_spec.json, ``arrays`` policy.safetensors. Raises PolicyError where they do not
@@ -69,27 +69,27 @@ class SetPolicy:
             columns = spec["observation"]
             self.widths = {name: len(columns[name]["columns"]) for name in columns if name != "meaning"}
             self._gain = np.float32(spec["network"]["goal_gain"])
-            self._actor = _encoder(arrays, "actor", self.widths["bodies"], self.widths["own"], 3)
+            self._actor = _encoder(arrays, "actor", self.widths["obstacles"], self.widths["own"], 3)
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
             raise folders.PolicyError(_UNFIT.format(error=error)) from None
         self.work = sum(w.size for layers in self._actor for w, _ in layers)
-        """multiplications of a decision about one body"""
+        """multiplications of a decision about one obstacle"""
 
-    def act(self, bodies: Any, own: Any) -> SetDecision:
-        """Decision for the newest columns: bodies (n, width), any n; own (width,).
+    def act(self, obstacles: Any, own: Any) -> SetDecision:
+        """Decision for the newest columns: obstacles (n, width), any n; own (width,).
 
-        Raises ValueError for other shapes, numbers that are not finite, or a first column of a body that is
-        neither 0 nor 1.
+        Raises ValueError for other shapes, numbers that are not finite, or a first column of an obstacle that
+        is neither 0 nor 1.
         """
-        given = {"bodies": bodies, "own": own}
+        given = {"obstacles": obstacles, "own": own}
         found = self.said({name: np.asarray(value, np.float32)[None] for name, value in given.items()})
         mean = found["mean_wish"][0]
         return SetDecision(np.clip(mean, -MOST_WISH, MOST_WISH), mean)
 
     def said(self, given: Arrays) -> Arrays:
         """Outputs by name for rows of inputs: ``mean_wish`` (N, 3). Raises ValueError as ``act``."""
-        bodies, own = (self._checked(name, given[name]) for name in self.inputs)
-        mean = _pooled(self._actor, bodies, own)
+        obstacles, own = (self._checked(name, given[name]) for name in self.inputs)
+        mean = _pooled(self._actor, obstacles, own)
         mean[:, :2] += self._gain * own[:, AT_DIRECTION]
         return {"mean_wish": mean}
 
@@ -118,21 +118,25 @@ class SetPolicy:
         return np.clip(np.array(out, np.float32), -1.0, 1.0)
 
     def _checked(self, name: str, rows: np.ndarray) -> np.ndarray:
-        """Float32 rows (N, width), of bodies (N, n, width). Raises ValueError."""
-        width, rank = self.widths[name], 3 if name == "bodies" else 2
+        """Float32 rows (N, width), of obstacles (N, n, width). Raises ValueError."""
+        width, rank = self.widths[name], 3 if name == "obstacles" else 2
         rows = np.asarray(rows, np.float32)
         if rows.ndim != rank or rows.shape[-1] != width or 0 in rows.shape:
-            wanted = f"(n, {width}) with a row of zeros for no body" if rank == 3 else f"({width},)"
+            wanted = f"(n, {width}) with a row of zeros for no obstacle" if rank == 3 else f"({width},)"
             raise ValueError(f"{name} must have shape {wanted}, got {rows.shape[1:]}; see {folders.SPEC}")
         if not np.isfinite(rows).all():
-            raise ValueError(f"{name} holds numbers that are not finite; leave out bodies that are not known")
+            raise ValueError(
+                f"{name} holds numbers that are not finite; leave out obstacles that are not known"
+            )
         if rank == 3 and not np.isin(rows[..., AT_THERE], (0.0, 1.0)).all():
-            raise ValueError("bodies: the first column is 1 where there is a body, else all columns are 0")
+            raise ValueError(
+                "obstacles: the first column is 1 where there is an obstacle, else all columns are 0"
+            )
         return rows
 
 
 class TrackForecast:
-    """What a tracked body may do next; it remembers nothing."""
+    """What a tracked obstacle may do next; it remembers nothing."""
 
     inputs = ("columns", "speed")
 
@@ -192,15 +196,17 @@ class TrackForecast:
 # ----------------------------------------------------------------------------------------------------- layers
 
 
-def _encoder(arrays: Arrays, name: str, n_body: int, n_own: int, n_out: int) -> tuple[Layers, Layers, Layers]:
+def _encoder(
+    arrays: Arrays, name: str, n_obstacle: int, n_own: int, n_out: int
+) -> tuple[Layers, Layers, Layers]:
     """Layers of body, own and head of a set encoder; ValueError where they do not fit together."""
     body, own, head = (folders.layers_of(arrays, f"{name}.{part}") for part in ("body", "own", "head"))
     if not (body and own and head):
         raise ValueError(f"layers of {name}")
     pooled = 2 * len(body[-1][1]) + len(own[-1][1])
-    for layers, first, last in ((body, n_body, None), (own, n_own, None), (head, pooled, n_out)):
+    for layers, first, last in ((body, n_obstacle, None), (own, n_own, None), (head, pooled, n_out)):
         if layers[0][0].shape[1] != first or (last is not None and len(layers[-1][1]) != last):
-            raise ValueError(f"{name} is no encoder from {n_body} and {n_own} to {n_out}")
+            raise ValueError(f"{name} is no encoder from {n_obstacle} and {n_own} to {n_out}")
     return body, own, head
 
 
@@ -215,14 +221,14 @@ def _affine(layer: tuple[np.ndarray, np.ndarray], x: np.ndarray) -> np.ndarray:
     return x @ layer[0].T + layer[1]
 
 
-def _pooled(net: tuple[Layers, Layers, Layers], bodies: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(N, n_out) of a set encoder: every body through the same layers, then maximum and sum over those that
-    are there, so that neither their order nor their number matters."""
+def _pooled(net: tuple[Layers, Layers, Layers], obstacles: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """(N, n_out) of a set encoder: every obstacle through the same layers, then maximum and sum over those
+    that are there, so that neither their order nor their number matters."""
     body, side, head = net
-    each = bodies
+    each = obstacles
     for layer in body:
         each = np.maximum(_affine(layer, each), 0)
-    each = each * bodies[..., :1]
+    each = each * obstacles[..., :1]
     mine = own
     for layer in side:
         mine = np.maximum(_affine(layer, mine), 0)
@@ -258,11 +264,11 @@ def replayed(policy: SetPolicy | TrackForecast, golden: Arrays) -> Arrays:
     shape, or that would take minutes."""
     rows = {name: golden[f"pair_{name}"] for name in policy.inputs}
     first = rows[policy.inputs[0]]
-    bodies = first.shape[1] if first.ndim == 3 else 1
+    obstacles = first.shape[1] if first.ndim == 3 else 1
     count = len(first) if first.ndim else 0
     if not 0 < count <= folders.MAX_STEPS or any(len(each) != count for each in rows.values()):
         raise folders.PolicyError(f"{folders.GOLDEN}: has no rows of this policy; export the policy again")
-    if policy.work * bodies * (count + folders.CALLS) > folders.MAX_WORK:
+    if policy.work * obstacles * (count + folders.CALLS) > folders.MAX_WORK:
         raise folders.PolicyError(f"{folders.GOLDEN}: would take minutes to replay; no exported policy does")
     try:
         return policy.said(rows)

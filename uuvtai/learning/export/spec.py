@@ -17,8 +17,8 @@ from uuvtai.common.enums import (
     LEAST_SPEED_M_S,
     LENGTH_M,
     N_BEND,
-    N_BODY,
     N_MODE,
+    N_OBSTACLE,
     N_PAST,
     N_RAY,
     PAST_S,
@@ -39,7 +39,7 @@ from uuvtai.learning.export.graph import (
 )
 from uuvtai.learning.export.run_policy import GOLDEN, SCHEMA, WEIGHTS
 from uuvtai.learning.networks import TIMES_S, ActorCritic, RunningNorm
-from uuvtai.learning.policy_agent import Pilot
+from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
 ONNX = "policy.onnx"
@@ -69,9 +69,9 @@ def origin_of(checkpoint: Checkpoint) -> dict[str, Any]:
     }
 
 
-def specification(checkpoint: Checkpoint, pilot: Pilot, name: str, has_onnx: bool) -> dict[str, Any]:
+def specification(checkpoint: Checkpoint, agent: PolicyAgent, name: str, has_onnx: bool) -> dict[str, Any]:
     """The document without ``files``, which ``export`` adds."""
-    config, policy = checkpoint.config, pilot.policy
+    config, policy = checkpoint.config, agent.policy
     return {
         "schema": SCHEMA,
         "name": name,
@@ -79,23 +79,23 @@ def specification(checkpoint: Checkpoint, pilot: Pilot, name: str, has_onnx: boo
         "observation": {
             "width": policy.n_in - N_FEATURES,
             "meaning": _OBSERVATION,
-            "columns": _columns(checkpoint, pilot),
+            "columns": _columns(checkpoint, agent),
         },
-        "features": _features(pilot),
+        "features": _features(agent),
         "action": checkpoint.manifest.action,
         "action_meaning": "parts of the limits within [-1, 1]; velocities in the body frame, wanted of the "
         "inner velocity loop",
         "rate": _rate(config.episode.control_dt_s, policy.config.hold_steps),
-        "network": _network(pilot),
-        "graph": _graph(pilot) if has_onnx else None,
+        "network": _network(agent),
+        "graph": _graph(agent) if has_onnx else None,
         "golden": {"file": GOLDEN, "tolerance": TOLERANCE},
         "weights": WEIGHTS,
     }
 
 
-def _columns(checkpoint: Checkpoint, pilot: Pilot) -> list[dict[str, Any]]:
+def _columns(checkpoint: Checkpoint, agent: PolicyAgent) -> list[dict[str, Any]]:
     """Every single column with its place, name, unit, frame and what it is scaled by."""
-    norm = pilot.policy.observation_norm
+    norm = agent.policy.observation_norm
     mean, std = norm.mean.tolist(), norm.std().tolist()
     found = []
     for row in checkpoint.manifest.observation_table:
@@ -116,13 +116,13 @@ def _columns(checkpoint: Checkpoint, pilot: Pilot) -> list[dict[str, Any]]:
     return found
 
 
-def _features(pilot: Pilot) -> list[dict[str, Any]]:
+def _features(agent: PolicyAgent) -> list[dict[str, Any]]:
     """The two inputs that the policy makes itself."""
-    norm = pilot.policy.observation_norm
+    norm = agent.policy.observation_norm
     names = ("residual", "uncertainty")
     rows = zip(names, norm.mean[-N_FEATURES:].tolist(), norm.std()[-N_FEATURES:].tolist(), strict=True)
     return [
-        {"name": name, "unit": "1", "mean": mean, "std": std, "used": pilot.world_model is not None}
+        {"name": name, "unit": "1", "mean": mean, "std": std, "used": agent.world_model is not None}
         for name, mean, std in rows
     ]
 
@@ -138,21 +138,21 @@ def _rate(control_dt_s: float, hold_steps: int) -> dict[str, Any]:
     }
 
 
-def _network(pilot: Pilot) -> dict[str, Any]:
+def _network(agent: PolicyAgent) -> dict[str, Any]:
     """What ``run_policy.py`` has to know beside the arrays."""
-    config, teacher = pilot.policy.config, pilot.policy.teacher_slice
+    config, teacher = agent.policy.config, agent.policy.teacher_slice
     return {
         "hidden": list(config.hidden),
         "activation": config.activation,
         "residual_limit": config.residual_limit,
         "teacher_columns": [teacher.start, teacher.stop] if config.residual and teacher else None,
-        "predict_change": pilot.world_model is None or pilot.world_model.config.predict_change,
+        "predict_change": agent.world_model is None or agent.world_model.config.predict_change,
         "clip_observation": config.clip_observation,
     }
 
 
-def _graph(pilot: Pilot) -> dict[str, Any]:
-    names = OneDecision(pilot).outputs
+def _graph(agent: PolicyAgent) -> dict[str, Any]:
+    names = OneDecision(agent).outputs
     return {
         "file": ONNX,
         "opset": OPSET,
@@ -162,7 +162,7 @@ def _graph(pilot: Pilot) -> dict[str, Any]:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What every column of a policy over a set of bodies is, in words, for policy_spec.json
+# What every column of a policy over a set of obstacles is, in words, for policy_spec.json
 # (``surrogate/observation.py`` writes them).
 
 
@@ -170,8 +170,9 @@ MEANING = (
     "float32. Mirrored world: x is turned round where the goal lies at smaller x than the start, y "
     "where it lies at smaller y (flip is -1 there, else 1), so that the goal lies ahead and to the left "
     "at the start; flips do not change during a mission. Each column is the quantity in its unit, "
-    "computed as its meaning says. clip(v, a, b) cuts off to [a, b]. A body is a tracked moving body; "
-    "one row each, at most the nearest ones; a row of zeros is no body. Numbers that are not finite are "
+    "computed as its meaning says. clip(v, a, b) cuts off to [a, b]. An obstacle is a tracked moving "
+    "obstacle; "
+    "one row each, at most the nearest ones; a row of zeros is no obstacle. Numbers that are not finite are "
     "refused."
 )
 MOTION_MEANING = (
@@ -196,31 +197,33 @@ def _pair(name: str, unit: str, meaning: str) -> list[dict[str, str]]:
     return [_column(f"{name}.{axis}", unit, meaning) for axis in "xy"]
 
 
-BODY_COLUMNS = [
-    _column("there", "1", "1 = a body"),
-    *_pair("way", "4 m", "from the vehicle to the body, in metres, / 4"),
-    *_pair("relative_velocity", "m/s", "the body's less the vehicle's"),
-    *_pair("velocity", "m/s", "of the body"),
+OBSTACLE_COLUMNS = [
+    _column("there", "1", "1 = an obstacle"),
+    *_pair("way", "4 m", "from the vehicle to the obstacle, in metres, / 4"),
+    *_pair("relative_velocity", "m/s", "the obstacle's less the vehicle's"),
+    *_pair("velocity", "m/s", "of the obstacle"),
     _column("width", "m", "twice its radius"),
     _column(
-        "water_above", "m", "from the vehicle's depth up to the body's top, where known: clip(v, 0, 1.6)"
+        "water_above", "m", "from the vehicle's depth up to the obstacle's top, where known: clip(v, 0, 1.6)"
     ),
     _column(
-        "water_below", "m", "from the body's bottom up to the vehicle's depth, where known: clip(v, 0, 1.6)"
+        "water_below",
+        "m",
+        "from the obstacle's bottom up to the vehicle's depth, where known: clip(v, 0, 1.6)",
     ),
     _column("unseen", "2 s", "seconds since it was seen, at most 4, / 2"),
     _column(
         "turn", "2 rad/s", "rate of its course, mirrored by flip.x flip.y, clip(v, -3, 3) / 2; 0 = a corner"
     ),
-    *_pair("way_in_1s", "4 m", "from the vehicle now to where the body is forecast in 1 s, / 4"),
+    *_pair("way_in_1s", "4 m", "from the vehicle now to where the obstacle is forecast in 1 s, / 4"),
     *_pair("way_in_2s", "4 m", "the same in 2 s"),
-    _column("gap", "4 m", "distance less the body's radius, at most 8 m, / 4"),
+    _column("gap", "4 m", "distance less the obstacle's radius, at most 8 m, / 4"),
     _column("nearness", "1/m", "1 / (0.3 + max(distance - radius - 0.22, 0))"),
     _column("closest_in", "s", "time of the closest approach on straight lines, clip(v, 0, 3)"),
     _column("closest_gap", "m", "distance then, less radius and 0.22, clip(v, -1, 3)"),
     *_pair("goal_direction", "1", "unit vector from the vehicle to the goal"),
 ]
-"""Columns of a body."""
+"""Columns of a obstacle."""
 OWN_COLUMNS = [
     _column("goal.x", "10 m", "from the vehicle to the goal, / 10"),
     _column("goal.y", "4 m", "the same, / 4"),
@@ -249,7 +252,7 @@ OWN_COLUMNS = [
 
 
 # ------------------------------------------------------------------------------------------------------------
-# policy_spec.json of policies over a set of bodies and of learned forecasts: every column, the hull rule,
+# policy_spec.json of policies over a set of obstacles and of learned forecasts: every column, the hull rule,
 # and what the networks are.
 
 
@@ -283,7 +286,10 @@ def set_specification(
 
 
 def _set_parts(config: LearningConfig) -> dict[str, Any]:
-    columns = {"bodies": {"most": N_BODY, "columns": BODY_COLUMNS}, "own": {"columns": OWN_COLUMNS}}
+    columns = {
+        "obstacles": {"most": N_OBSTACLE, "columns": OBSTACLE_COLUMNS},
+        "own": {"columns": OWN_COLUMNS},
+    }
     dt_s, hold = config.episode.control_dt_s, config.policy.hold_steps
     return {
         "observation": {"meaning": MEANING, **columns},
@@ -295,7 +301,7 @@ def _set_parts(config: LearningConfig) -> dict[str, Any]:
             "decision_hz": 1.0 / dt_s / hold,
         },
         "hull_rule": hull_rule_of(config),
-        "network": {"goal_gain": config.twin.goal_gain},
+        "network": {"goal_gain": config.surrogate.goal_gain},
     }
 
 
@@ -310,7 +316,7 @@ def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
         "turn_gain_1_s": TURN_GAIN,
         "least_speed_m_s": LEAST_SPEED_M_S,
         "z_m": list(config.world.tank.z_m),
-        "gap_m": config.twin.vertical_gap_m,
+        "gap_m": config.surrogate.vertical_gap_m,
     }
 
 
@@ -322,7 +328,7 @@ def _forecast_parts() -> dict[str, Any]:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# The networks of a pilot as float32 arrays under plain names, with everything that they scale by: what
+# The networks of an agent as float32 arrays under plain names, with everything that they scale by: what
 # ``run_policy.py`` computes with.
 
 
@@ -330,11 +336,11 @@ NO_LIMIT = float(torch.finfo(torch.float32).max)
 """of a normaliser that has seen nothing and therefore cuts nothing off"""
 
 
-def weights_of(pilot: Pilot) -> dict[str, Tensor]:
+def weights_of(agent: PolicyAgent) -> dict[str, Tensor]:
     """Arrays of policy and world model, on the host, contiguous."""
-    found = dict(_policy(pilot.policy))
-    if pilot.world_model is not None:
-        found |= dict(_world_model(pilot.world_model))
+    found = dict(_policy(agent.policy))
+    if agent.world_model is not None:
+        found |= dict(_world_model(agent.world_model))
     return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in found.items()}
 
 

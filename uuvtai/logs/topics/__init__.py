@@ -13,9 +13,9 @@ TOPICS: tuple[Topic, ...] = (
     *sensors.CAMERA_ROWS,
     *perception.MAP_ROWS,
     *planning.PLAN_ROWS,
-    *perception.BODY_ROWS,
+    *perception.OBSTACLE_ROWS,
     *motion.STATE_ROWS,
-    *planning.DRIVER_ROWS,
+    *planning.AGENT_ROWS,
     *motion.EVENT_ROWS,
 )
 """no two of one name"""

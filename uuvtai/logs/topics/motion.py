@@ -245,7 +245,7 @@ def _lines(moment: Moment) -> list[bytes]:
         why = f"; voronoi: {fallback}" if fallback else ""
         lines.append(_line(moment, WARNING if fallback else INFO, "uuv.route", found + why))
     if moment.ended:
-        outcome = OUTCOMES[int(moment["referee.outcome"])]
+        outcome = OUTCOMES[int(moment["termination.outcome"])]
         lines.append(_line(moment, INFO, "uuv.episode", f"outcome: {outcome}"))
     return lines
 

@@ -93,9 +93,9 @@ _TRACK = record(
 )
 _TRACKS = record(
     "uuv.Tracks",
-    "Moving bodies that the vehicle believes in.",
+    "Moving obstacles that the vehicle believes in.",
     tracks=array_of(_TRACK),
-    beams=described(array_of(UINT), "beams of the newest scan that a moving body explains"),
+    beams=described(array_of(UINT), "beams of the newest scan that a moving obstacle explains"),
 )
 _HYPOTHESIS = record(
     "uuv.Hypothesis",
@@ -160,15 +160,15 @@ def _tank_lines(tank: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _kinds(moment: Moment) -> list[tuple[int, str]]:
-    """(slot, kind) of the bodies, in the order of scenario.json."""
+    """(slot, kind) of the obstacles, in the order of scenario.json."""
     codes = moment["world.kind"].tolist()
     return [(slot, KIND_NAMES[code]) for slot, code in enumerate(codes) if code in KIND_NAMES]
 
 
 def _scene(moment: Moment) -> bytes:
-    """The true bodies; those that never move come first."""
+    """The true obstacles; those that never move come first."""
     shapes: dict[str, list] = {"spheres": [], "cylinders": [], "cubes": []}
-    n_rest = sum(body["path"] is None for body in moment.header.scenario["bodies"])
+    n_rest = sum(obstacle["path"] is None for obstacle in moment.header.scenario["obstacles"])
     for i, (slot, kind) in enumerate(_kinds(moment)):
         yaw = float(moment["world.yaw"][slot]) if kind == "box" else 0.0
         shape = {
@@ -183,12 +183,12 @@ def _scene(moment: Moment) -> bytes:
 
 
 def _truth(moment: Moment) -> bytes:
-    bodies = []
+    obstacles = []
     for slot, kind in _kinds(moment):
         size = moment["world.size"][slot][_SIZES[kind]].tolist()
         place, motion = moment["world.pos_w"][slot].tolist(), moment["world.vel_w"][slot].tolist()
-        bodies.append(_TRUTH[kind] % (*place, *size, float(moment["world.yaw"][slot]), *motion))
-    return f'{{"obstacles":[{checked(",".join(bodies))}]}}'.encode()
+        obstacles.append(_TRUTH[kind] % (*place, *size, float(moment["world.yaw"][slot]), *motion))
+    return f'{{"obstacles":[{checked(",".join(obstacles))}]}}'.encode()
 
 
 def _tracks(moment: Moment) -> bytes:
@@ -250,12 +250,12 @@ def _read_tracks(data: dict[str, Any]) -> np.ndarray:
     return np.array([(t["x"], t["y"], t["radius"]) for t in data["tracks"]]).reshape(-1, 3)
 
 
-_BODIES = ("world.kind", "world.pos_w", "world.size", "world.yaw")
+_PLACED = ("world.kind", "world.pos_w", "world.size", "world.yaw")
 
-BODY_ROWS = (
+OBSTACLE_ROWS = (
     Topic("/goal", OBSTACLES, SCENE_UPDATE, _goal),
-    Topic("/obstacles", OBSTACLES, SCENE_UPDATE, _scene, _BODIES, note="; truth"),
-    Topic("/obstacles/truth", OBSTACLES, _OBSTACLES, _truth, (*_BODIES, "world.vel_w"), note="; truth"),
+    Topic("/obstacles", OBSTACLES, SCENE_UPDATE, _scene, _PLACED, note="; truth"),
+    Topic("/obstacles/truth", OBSTACLES, _OBSTACLES, _truth, (*_PLACED, "world.vel_w"), note="; truth"),
     Topic(
         "/tracks",
         NEW_SCAN,

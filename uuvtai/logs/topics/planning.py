@@ -131,18 +131,19 @@ _STATUSES = ("IDLE", "RUNNING", "SUCCESS", "FAILURE")  # by the codes of ``tree_
 _ACTION = record(
     "uuv.Action",
     "Surge, sway, heave and yaw rate, each in [-1, 1].",
-    {"policy": FOUR, "teacher": FOUR},
+    {"policy": FOUR, "behavior": FOUR},
     applied=described(FOUR, "what drove the step that led here"),
     asked=described(THREE, "[m/s] velocity that the tree asks for, world"),
     thrust=described(array_of(NUMBER), "[N] of each thruster"),
     given_up=described(
         INT, "number from 1 of the vertical thruster taken for dead; -1 = one is suspected, 0 = none"
     ),
-    leaf=described(STRING, "node of the tree that sets the teacher's action"),
+    leaf=described(STRING, "node of the tree that sets the behaviour tree's action"),
 )
 _SAFETY = record(
     "uuv.Safety",
-    "As the referee judges it, from the truth; path_risk and replan_trigger are the vehicle's own.",
+    "As the termination check looks at it, from the truth; path_risk and replan_trigger are the vehicle's "
+    "own.",
     {"ttc_s": described(NUMBER, "null = nothing closes in")},
     clearance_m=described(NUMBER, "hull to the nearest obstacle or wall"),
     path_risk=NUMBER,
@@ -190,13 +191,13 @@ def _tree_schema(header: EpisodeHeader) -> Schema:
 
 
 def _action(moment: Moment) -> bytes:
-    node = int(moment["teacher.leaf"])
+    node = int(moment["behavior.leaf"])
     leaf = "" if node < 0 else moment.header.nodes[node]
     return (
-        f'{{"policy":{numbers_or_null(moment["driver.action"])},'
-        f'"teacher":{numbers(moment["teacher.action"])},'
-        f'"applied":{numbers(moment["driver.applied"])},'
-        f'"asked":{numbers(moment["teacher.last_vel_w"])},'
+        f'{{"policy":{numbers_or_null(moment["agent.action"])},'
+        f'"behavior":{numbers(moment["behavior.action"])},'
+        f'"applied":{numbers(moment["agent.applied"])},'
+        f'"asked":{numbers(moment["behavior.last_vel_w"])},'
         f'"thrust":{numbers(moment["actuation.thrust_n"])},"given_up":{int(moment["ego.given_up"])},'
         f'"leaf":{json.dumps(leaf)}}}'
     ).encode()
@@ -208,12 +209,12 @@ def _policy(moment: Moment) -> bytes:
         f'"{name}":{number(value)},' for name, value in zip(moment.header.reward_terms, terms, strict=True)
     )
     return (
-        f'{{"value":{number_or_null(moment["driver.value"])},'
-        f'"std":{numbers_or_null(moment["driver.std"])},'
+        f'{{"value":{number_or_null(moment["agent.value"])},'
+        f'"std":{numbers_or_null(moment["agent.std"])},'
         f'"reward":{number(float(np.sum(terms)))},{rewards}'
-        f'"lambda":{number_or_null(moment["driver.distill_lambda"])},'
-        f'"wm_residual":{number_or_null(moment["driver.residual"])},'
-        f'"wm_uncertainty":{number_or_null(moment["driver.uncertainty"])}}}'
+        f'"lambda":{number_or_null(moment["agent.distillation_lambda"])},'
+        f'"wm_residual":{number_or_null(moment["agent.residual"])},'
+        f'"wm_uncertainty":{number_or_null(moment["agent.uncertainty"])}}}'
     ).encode()
 
 
@@ -225,27 +226,27 @@ def _worst_variance(cov: np.ndarray) -> float:
 
 def _evasion(moment: Moment) -> bytes:
     first, hold = (
-        number_or_null(None if moment[f"teacher.{name}"] > _FAR else float(moment[f"teacher.{name}"]))
+        number_or_null(None if moment[f"behavior.{name}"] > _FAR else float(moment[f"behavior.{name}"]))
         for name in ("conflict_s", "hold_conflict_s")
     )
     return (
         f'{{"conflict_s":{first},"hold_conflict_s":{hold},'
-        f'"follow":{numbers(moment["teacher.follow_vel_w"])},'
-        f'"cruise_z":{number(moment["teacher.cruise_z_m"])},'
-        f'"velocity":{numbers(moment["teacher.evade_vel_w"])},'
-        f'"cost":{number(moment["teacher.evade_cost"])},"candidate":{int(moment["teacher.evade_candidate"])},'
-        f'"costs":{numbers(moment["teacher.candidate_cost"])},'
+        f'"follow":{numbers(moment["behavior.follow_vel_w"])},'
+        f'"cruise_z":{number(moment["behavior.cruise_z_m"])},'
+        f'"velocity":{numbers(moment["behavior.evade_vel_w"])},'
+        f'"cost":{number(moment["behavior.evade_cost"])},"candidate":{int(moment["behavior.evade_candidate"])},'
+        f'"costs":{numbers(moment["behavior.candidate_cost"])},'
         f'"position":{numbers(moment["ego.pos_w"])},"own_velocity":{numbers(moment["ego.vel_b"])},'
-        f'"yaw":{number(moment["ego.rpy"][2])},"patience":{number(moment["teacher.patience"])},'
+        f'"yaw":{number(moment["ego.rpy"][2])},"patience":{number(moment["behavior.patience"])},'
         f'"z_variance":{number(moment["ego.z_var"])},'
         f'"place_variance":{number(_worst_variance(moment["ego.pose_cov"]))}}}'
     ).encode()
 
 
 def _safety(moment: Moment) -> bytes:
-    ttc_s = float(moment["referee.ttc_s"])
+    ttc_s = float(moment["termination.ttc_s"])
     return (
-        f'{{"clearance_m":{number(moment["referee.clearance_m"])},'
+        f'{{"clearance_m":{number(moment["termination.clearance_m"])},'
         f'"ttc_s":{number_or_null(None if ttc_s > _FAR else ttc_s)},'
         f'"path_risk":{number(moment["route.path_risk"])},"replan_trigger":"{trigger_of(moment)}"}}'
     ).encode()
@@ -253,7 +254,7 @@ def _safety(moment: Moment) -> bytes:
 
 def _tree(moment: Moment) -> bytes:
     nodes = moment.header.nodes
-    return _tree_text(nodes, tuple(moment["teacher.status"][: len(nodes)].tolist()))
+    return _tree_text(nodes, tuple(moment["behavior.status"][: len(nodes)].tolist()))
 
 
 @functools.lru_cache(maxsize=4096)
@@ -268,14 +269,14 @@ _DECISION = (
 )
 _OWN = ("ego.pos_w", "ego.vel_b", "ego.rpy", "ego.z_var", "ego.pose_cov")
 
-DRIVER_ROWS = (
+AGENT_ROWS = (
     Topic(
         "/action",
         EVERY_STEP,
         _ACTION,
         _action,
         (
-            *("driver.action", "driver.applied", "teacher.action", "teacher.last_vel_w", "teacher.leaf"),
+            *("agent.action", "agent.applied", "behavior.action", "behavior.last_vel_w", "behavior.leaf"),
             *("actuation.thrust_n", "ego.given_up"),
         ),
         lambda data: data.get("leaf", ""),
@@ -287,17 +288,17 @@ DRIVER_ROWS = (
         _policy,
         (
             "reward.term",
-            *(f"driver.{name}" for name in ("value", "std", "distill_lambda", "residual", "uncertainty")),
+            *(f"agent.{name}" for name in ("value", "std", "distillation_lambda", "residual", "uncertainty")),
         ),
         varies="Each term of the reward under its own name ([`reward`](configuration/reward.md)): number",
     ),
-    Topic("/evasion", EVADING, _EVASION, _evasion, (*(f"teacher.{name}" for name in _DECISION), *_OWN)),
+    Topic("/evasion", EVADING, _EVASION, _evasion, (*(f"behavior.{name}" for name in _DECISION), *_OWN)),
     Topic(
         "/safety",
         EVERY_STEP,
         _SAFETY,
         _safety,
-        ("referee.clearance_m", "referee.ttc_s", "route.path_risk", "route.trigger"),
+        ("termination.clearance_m", "termination.ttc_s", "route.path_risk", "route.trigger"),
         lambda data: (data["clearance_m"], data["ttc_s"], data["replan_trigger"]),
         in_picture=True,
         note="; truth",
@@ -307,7 +308,7 @@ DRIVER_ROWS = (
         EVERY_STEP,
         _tree_schema,
         _tree,
-        ("teacher.status",),
+        ("behavior.status",),
         varies="Each node of the behaviour tree by its name: its status as text",
     ),
 )

@@ -20,7 +20,7 @@ from uuvtai.vehicle.messages import KINDS, Mission, PilotNumbers, SensorMessage
 from uuvtai.vehicle.onboard_core import FedPilot, StaleLimits
 from uuvtai.vehicle.sensor_inputs import FedSensors
 
-SCHEMA = 2
+SCHEMA = 3
 SPEC, MEMORY, GOLDEN = "stack.json", "memory.npz", "golden.npz"
 _PAGE = 4096
 
@@ -56,7 +56,7 @@ class CarriedStack:
     def begin(self, mission: Mission, sensors: FedSensors) -> None:
         """Forget everything and take the first step."""
         self._mission = mission
-        for name in ("clock.active", "clock.awake"):
+        for name in ("clock.running", "clock.active"):
             self.views[name][...] = 0
         for tensor, value in zip(self._tensors, (1, mission.seed, mission.episode), strict=False):
             tensor[0] = value

@@ -29,7 +29,7 @@ from uuvtai.vehicle.identify.drive_log import Drive, DriveError, drives_of, refu
 from uuvtai.vehicle.mavlink import EXTRA
 from uuvtai.vehicle.telemetry import AUTOPILOT, NEUTRAL_US, Motors, Senders
 
-ENDINGS = (".bin", ".tlog")
+SUFFIXES = (".bin", ".tlog")
 STEP_S = 0.02
 _HOLE_S = 1.0  # pulses or attitude that are further apart part a log
 _MOST_BYTES = 2 << 30

@@ -20,7 +20,7 @@ from uuvtai.common.presets import preset_names
 from uuvtai.config import VehicleConfig
 from uuvtai.report.figures import Line, curves, png
 from uuvtai.vehicle.identify import model
-from uuvtai.vehicle.identify.ardusub_log import ENDINGS, read_ardusub
+from uuvtai.vehicle.identify.ardusub_log import SUFFIXES, read_ardusub
 from uuvtai.vehicle.identify.drive_log import Drive, DriveError, read_drives
 
 _ROUNDS = 25
@@ -483,7 +483,7 @@ def identify(
 def _drives(
     file: Path, vehicle_cfg: VehicleConfig, truth: bool, system: int | None, note: Callable[[str], None]
 ) -> list[Drive]:
-    if file.suffix.lower() in ENDINGS:
+    if file.suffix.lower() in SUFFIXES:
         if truth:
             raise DriveError(f"{file}: a log of ArduSub's holds no truth; leave --truth out")
         return read_ardusub(file, vehicle_cfg, system, note)
