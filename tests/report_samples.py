@@ -121,7 +121,7 @@ STAGES = (
     "mapping",
     "clearance",
     "planning",
-    "features",
+    "observation",
     "behavior",
     "reward",
     "export",
@@ -131,7 +131,7 @@ PROFILE = {
     "machine": {"cpu": "some processor", "cores": 2, "device": "cpu"},
     "rows": [
         {
-            "num_envs": n, "controller": "bt", "S": 8, "D": 6, "depth_every": 5, "compile_s": 20.0,
+            "num_envs": n, "agent": "bt", "S": 8, "D": 6, "depth_every": 5, "compile_s": 20.0,
             "memory_mb": 0.3 * n,
             "env_steps_per_s": {"step": 90.0 * n, "step_inference": 80.0 * n, "train": None},
             "stages_us_per_env_step": {name: (i + 1.0) * scale for i, name in enumerate(STAGES)},

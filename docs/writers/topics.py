@@ -8,7 +8,7 @@ from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topics import TOPICS
 from uuvtai.report.tables import text_table
 
-_NO_RUN = EpisodeHeader(controller="", config=Config(), config_yaml="", scenario={})
+_NO_RUN = EpisodeHeader(agent="", config=Config(), config_yaml="", scenario={})
 """schemas of its topics have no fields that depend on a run"""
 
 

@@ -158,7 +158,7 @@ def test_what_is_printed_of_one_axis_at_a_time_names_what_changes(capsys):
 def test_a_request_survives_its_json():
     request = asked(
         grid_of(["S=4,8", "behavior.caution=0.5,1"]),
-        overrides=("world.n_dynamic=3", ("features", {"n_track": 4})),
+        overrides=("world.n_dynamic=3", ("observation", {"n_track": 4})),
     )
     assert request_of(json.loads(json.dumps(request.document()))) == request
 

@@ -177,7 +177,7 @@ def test_the_log_tells_what_the_policy_thought(small, trained, tmp_path):
     run_episodes(small.sim, jobs, recorder, agent=note.agent)
     log = recorder.paths[jobs[0]]
     run = read_head(log).metadata["uuv.run"]
-    assert (run["controller"], run["checkpoint_sha256"]) == ("mine", agent.checkpoint.sha256)
+    assert (run["agent"], run["checkpoint_sha256"]) == ("mine", agent.checkpoint.sha256)
     messages = list(read_messages(log, ("/policy", "/action")))
     outputs = [m.data for m in messages if m.topic == "/policy"]
     actions = [m.data for m in messages if m.topic == "/action"]
@@ -238,7 +238,7 @@ def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
         == checkpoint.sha256_of(folder / "checkpoints" / "step_000005" / "manifest.json")
     )
     assert load_agents([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
-    assert observation_of([str(folder)]) == [("features", config.observation.model_dump(mode="json"))]
+    assert observation_of([str(folder)]) == [("observation", config.observation.model_dump(mode="json"))]
 
 
 def test_names_that_are_no_policy(trained, tmp_path):

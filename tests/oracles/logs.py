@@ -111,9 +111,9 @@ def scenario(episode: int = 3) -> dict:
     return scenario_document(config(), described, world="pool", seed=7, episode=episode)
 
 
-def header(controller: str = "bt", episode: int = 3) -> EpisodeHeader:
+def header(agent: str = "bt", episode: int = 3) -> EpisodeHeader:
     return EpisodeHeader(
-        controller=controller,
+        agent=agent,
         config=config(),
         config_yaml="world:\n  n_static: 3\n",
         scenario=scenario(episode),

@@ -268,7 +268,7 @@ def test_the_outcome_follows_from_the_rules(recordings, logs, figures):
     for path in recordings["paper"]:
         run = logs[path].metadata["uuv.run"]
         outcomes.add(figures[path]["safety"]["outcome"])
-        assert figures[path]["safety"]["outcome"] == printed[run["controller"], run["seed"], run["episode"]]
+        assert figures[path]["safety"]["outcome"] == printed[run["agent"], run["seed"], run["episode"]]
     assert outcomes == {"success", "collision", "ttc", "timeout"}
 
 

@@ -16,11 +16,11 @@ from uuvtai.sim.snapshot import capture
 from uuvtai.sim.stages import SimState
 
 KNOWN = {
-    "clock", "mission", "ego", "scan", "echoes", "image", "pose", "tracks", "clusters", "spots",
+    "clock", "mission", "ego", "scan", "echoes", "image", "localization", "tracks", "clusters", "spots",
     "turn_history",
     "forecast",
     "futures", "past", "mixture", "mask", "grid_map", "map_scratch",
-    "clearance", "clearance_memory", "voronoi", "route", "features", "behavior", "table", "baselines",
+    "clearance", "clearance_memory", "voronoi", "route", "observation", "behavior", "table", "baselines",
 }  # fmt: skip
 """Structs of what the vehicle is told, senses, remembers and decides. Every other struct, a new one too,
 counts as truth."""

@@ -27,7 +27,7 @@ SENSED = (
     "grid_map",
     "clearance",
     "route",
-    "features",
+    "observation",
     "behavior",
 )
 """Structs of what the vehicle senses, remembers and decides (clusters are scratch of one scan: slots beyond
@@ -53,7 +53,7 @@ def test_an_episode_is_the_same_in_any_row_and_company(small, monkeypatch, estim
     """Where the vehicle is told its place nothing writes the pose filter's memory."""
     if estimated:
         estimate_pose(monkeypatch, small)
-    looked_at = (*SENSED, "vehicle", "world", "termination", *["pose"] * estimated)
+    looked_at = (*SENSED, "vehicle", "world", "termination", *["localization"] * estimated)
     small.begin([0, 1, 2, 3])
     for _ in range(120):
         small.sim.step()
@@ -71,7 +71,7 @@ def test_an_episode_is_the_same_in_any_row_and_company(small, monkeypatch, estim
 def test_a_reset_touches_only_its_rows(small, monkeypatch, estimated):
     if estimated:
         estimate_pose(monkeypatch, small)
-    looked_at = (*SENSED, "vehicle", "world", "termination", "episode", *["pose"] * estimated)
+    looked_at = (*SENSED, "vehicle", "world", "termination", "episode", *["localization"] * estimated)
     small.begin(list(range(8)))
     for _ in range(40):
         small.sim.step()

@@ -48,7 +48,7 @@ def test_a_stack_touches_nothing_that_makes_an_episode():
         "disturbance",
         "sensors",
         "traffic",
-        "features",
+        "observation",
         "reward",
         "episode",
         "runtime",

@@ -381,7 +381,11 @@ def without(*names):
             "vel_b must have",
         ),
         (
-            lambda kind, name, data: {**data, "controller": "bt+truth"} if name == "uuv.run" else data,
+            lambda kind, name, data: data.replace(b"behavior:", b"teacher:") if name == "config.yaml" else data,
+            "renamed to 'behavior",
+        ),
+        (
+            lambda kind, name, data: {**data, "agent": "bt+truth"} if name == "uuv.run" else data,
             "driven with the truth",
         ),
         (
@@ -412,7 +416,7 @@ def test_a_gap_is_refused_and_a_tree_can_be_named(log, build, tmp_path):
     with pytest.raises(LogError, match="step 30 is missing"):
         replay(rewritten(log, tmp_path / "gap.mcap", one_missing), build=build)
     bare = rewritten(log, tmp_path / "bare.mcap", without("tree.xml"))
-    assert replay(bare, controller="bt", build=build)["equal"]
+    assert replay(bare, tree="bt", build=build)["equal"]
 
 
 def test_exact_images_keep_every_bit(log):

@@ -47,7 +47,7 @@ STACK_SECTIONS = (
 )
 """what a stack preset may set: nothing that a scenario, a sensor, the termination check or the observation's
 columns depend on"""
-_LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
+LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
 MAX_BYTES = 1 << 20
 """of a YAML file"""
 _MAX_EXTENDS = 8
@@ -218,7 +218,7 @@ def load_resolved(path: Path, overrides: Overrides | None = None) -> Config:
     layer.merge(_stack_of(typed))
     layer.merge(typed)
     return _checked(
-        LearningConfig if _LEARNING_SECTIONS & layer.tree.keys() else Config, layer.tree, layer.origin
+        LearningConfig if LEARNING_SECTIONS & layer.tree.keys() else Config, layer.tree, layer.origin
     )
 
 

@@ -72,9 +72,7 @@ def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
 
 def _privilege(name: str) -> str:
     if name == "oracle":
-        return (
-            "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
-        )
+        return "it knows the future and has no inertia; timeout = not reachable. An upper bound, no agent"
     return "it is told where every moving obstacle is and how it moves; what stands still it senses"
 
 
@@ -322,7 +320,7 @@ def show_replay(screen: Screen, found: dict[str, Any]) -> None:
         [row["what"], f"{row['equal_steps']} of {steps}", _place(row["first_difference"])]
         for row in found["agreement"]
     ]
-    title = f"{found['log']}: {found['controller']} in {found['world']}, {steps} steps"
+    title = f"{found['log']}: {found['agent']} in {found['world']}, {steps} steps"
     screen.table(Table(columns, rows, title))
     if found["faults"]["any"]:
         screen.table(

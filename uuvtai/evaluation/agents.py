@@ -75,10 +75,10 @@ class AgentSpec:
             return None if agent is None else PolicyNote(agent, self.own.sha256, None)
         if self.checkpoint is None:
             return None
-        from uuvtai.learning.agents import load_driver
+        from uuvtai.learning.agents import load_trained
         from uuvtai.logs.writer import PolicyNote
 
-        agent = load_driver(self.checkpoint, sim)
+        agent = load_trained(self.checkpoint, sim)
         weight = self.checkpoint.manifest.metrics.get("distillation/lambda")
         return PolicyNote(agent, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
 

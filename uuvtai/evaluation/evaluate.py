@@ -1,4 +1,4 @@
-"""Compare controllers and trained policies on paired scenarios in one run folder: results, logs, pictures,
+"""Compare agents on paired scenarios in one run folder: results, logs, pictures,
 videos."""
 
 from __future__ import annotations

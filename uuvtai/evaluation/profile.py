@@ -236,7 +236,7 @@ printed"""
 def profile(
     config: LearningConfig,
     sizes: list[int],
-    controller: str,
+    agent: str,
     device: str,
     seconds: float,
     density: bool,
@@ -246,7 +246,7 @@ def profile(
     before anything runs."""
     from uuvtai.sim.behavior_tree import read_tree
 
-    tree = read_tree(controller, config.behavior.max_node)
+    tree = read_tree(agent, config.behavior.max_node)
     for n in sizes:
         check_size(config, n, device)
     rows, latency, real_time, device_used = [], [], None, device
@@ -259,7 +259,7 @@ def profile(
         for _ in range(WARM_STEPS):
             batch.step()
         compile_s = time.perf_counter() - begun
-        rows.append(_rate_row(config, batch, controller, seconds, compile_s))
+        rows.append(_rate_row(config, batch, agent, seconds, compile_s))
         if n == 1:
             latency, real_time = latency_rows(batch, config, seconds)
         rows[-1]["env_steps_per_s"] |= _learning_rates(config, sim)
@@ -289,7 +289,7 @@ def _learning_rates(config: LearningConfig, sim: Sim) -> dict[str, float]:
 
 
 def _rate_row(
-    config: Config, batch: SimBatch, controller: str, seconds: float, compile_s: float
+    config: Config, batch: SimBatch, agent: str, seconds: float, compile_s: float
 ) -> dict[str, Any]:
     sim = batch.sim
     step = env_steps_per_s(batch, seconds, lambda: 2 * torch.rand(sim.num_envs, 4, device=sim.device) - 1)
@@ -300,7 +300,7 @@ def _rate_row(
     sim.stage_s = None
     return {
         "num_envs": sim.num_envs,
-        "controller": controller,
+        "agent": agent,
         **config.world.obstacles,
         "depth_every": config.sensors.depth.period_steps,
         "env_steps_per_s": {"step": step, "tree": driven},

@@ -123,14 +123,14 @@ def sweep(
     Raises ConfigError, CheckpointError, RunFolderError, EngineError.
     """
     refuse_place(run_dir)
-    request, agents, checkpoints = resolved(request, watch)
-    keys = check_rows(request, [name for name, _agent in agents])
+    request, named, checkpoints = resolved(request, watch)
+    keys = check_rows(request, [name for name, _agent in named])
     place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
     folder = RunFolder(place, base_config(request), list(request.seeds))
     folder.write_json(
-        REQUEST, {"schema": 1, **request.document(), "agents": agents, "checkpoints": checkpoints}
+        REQUEST, {"schema": 1, **request.document(), "named_agents": named, "checkpoints": checkpoints}
     )
-    return _run_cells(request, agents, keys, engine, folder, watch), folder.path
+    return _run_cells(request, named, keys, engine, folder, watch), folder.path
 
 
 def resume(
@@ -142,20 +142,20 @@ def resume(
     try:
         try:
             document = read_json(place / REQUEST, folder=place)
-            if "agents" not in document:
+            if "named_agents" not in document:
                 raise TypeError("an older version of uuv wrote it; begin the sweep again")
-            request, agents = request_of(document), [_agent_key(agent) for agent in document["agents"]]
+            request, named = request_of(document), [_agent_key(pair) for pair in document["named_agents"]]
             checkpoints = dict(document["checkpoints"])
         except (FileError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise RunFolderError(
                 f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed"
             ) from None
-        agents = [agent for _name, agent in agents]
+        agents = [agent for _name, agent in named]
         refuse_code(place, [*request.agents, *agents], allow_code)
         _refuse_other_policies(place, request, agents, checkpoints, watch)
-        keys = check_rows(request, [name for name, _agent in agents])
+        keys = check_rows(request, [name for name, _agent in named])
         folder.go_on({"rows": len(read_rows(place))})
-        return _run_cells(request, agents, keys, engine, folder, watch), place
+        return _run_cells(request, named, keys, engine, folder, watch), place
     finally:
         folder.release()
 
@@ -164,7 +164,7 @@ def _agent_key(given: Any) -> AgentKey:
     """Of a request on disk. Raises TypeError, ValueError."""
     name, agent = given
     if not (isinstance(name, str) and isinstance(agent, str)):
-        raise TypeError(f"{given!r:.80} is no method")
+        raise TypeError(f"{given!r:.80} is no agent")
     return name, agent
 
 
@@ -198,9 +198,9 @@ def resolved(request: SweepRequest, watch: SweepWatch) -> tuple[SweepRequest, li
 
     agents = tuple(map(_located, request.agents))
     loaded = load_agents(agents, base_config(request).behavior.max_node, watch.note)
-    agents = [(agent.name, name) for agent, name in zip(loaded, agents, strict=True)]
+    named = [(agent.name, name) for agent, name in zip(loaded, agents, strict=True)]
     overrides = (*observation_of(agents), *request.overrides)
-    return replace(request, overrides=overrides, agents=agents), agents, _sha256_of(loaded)
+    return replace(request, overrides=overrides, agents=agents), named, _sha256_of(loaded)
 
 
 def _located(name: str) -> str:
@@ -216,19 +216,19 @@ def _located(name: str) -> str:
 def _sha256_of(agents: Sequence[AgentSpec]) -> dict[str, str]:
     """Of the checkpoints and of the user's own plugins, by the agent's name."""
     found = {agent.name: agent.own or agent.checkpoint for agent in agents}
-    return {name: agent.sha256 for name, agent in found.items() if agent}
+    return {name: source.sha256 for name, source in found.items() if source}
 
 
 def _run_cells(
     request: SweepRequest,
-    agents: Sequence[AgentKey],
+    named: Sequence[AgentKey],
     keys: list[str],
     engine: Engine,
     folder: RunFolder,
     watch: SweepWatch,
 ) -> dict[str, Any]:
     rows = _by_key(folder.path, request.grid)
-    tasks = tasks_of(request, agents, set(rows))
+    tasks = tasks_of(request, named, set(rows))
     watch.start(f"{len(keys)} cells", len(keys), len(rows))
     try:
         with folder.recorded():

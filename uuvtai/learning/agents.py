@@ -186,8 +186,8 @@ def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:
 # ------------------------------------------------------------------------------------------------------------
 
 
-def load_driver(checkpoint: Checkpoint, sim: Sim) -> PolicyAgent | TunedAgent | SetAgent:
-    """Who drives by a checkpoint, whatever learnt it. Raises CheckpointError for one that does not fit."""
+def load_trained(checkpoint: Checkpoint, sim: Sim) -> PolicyAgent | TunedAgent | SetAgent:
+    """The agent of a checkpoint, whatever learned it. Raises CheckpointError for one that does not fit."""
     from uuvtai.envs.vector_env import VectorEnv
 
     learner = checkpoint.config.learner

@@ -69,11 +69,11 @@ class Broadcast(EpisodeReader):
         self,
         viewers: Viewers,
         world: str,
-        controller: str,
+        agent: str,
         depth_images: bool = False,
         policy: PolicyNote | None = None,
     ) -> None:
-        super().__init__(world, controller, policy)
+        super().__init__(world, agent, policy)
         self._viewers, self._depth_images = viewers, depth_images
 
     def sink_for(self, sim: Recordable, row: int, job: RecordedJob) -> LiveEpisode | None:

@@ -387,7 +387,7 @@ class Recording:
 
     @property
     def agent(self) -> str:
-        return self.head.metadata.get("uuv.run", {}).get("controller", "?")
+        return self.head.metadata.get("uuv.run", {}).get("agent", "?")
 
     @property
     def outcome(self) -> str:

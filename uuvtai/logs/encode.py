@@ -169,7 +169,7 @@ each None where there is none."""
 class EpisodeHeader:
     """What is known before the first step; it comes first in the log."""
 
-    controller: str  # name of the agent that drives: 'bt', 'planner', 'straight' or a policy's name
+    agent: str  # name of the agent that drives: 'bt', 'planner', 'straight' or a policy's name
     config: Config
     config_yaml: str  # the same as text
     scenario: dict[str, Any]  # of ``scenario_document``: everything true about the world, in closed form

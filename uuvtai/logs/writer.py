@@ -187,7 +187,7 @@ def _run_metadata(header: EpisodeHeader) -> dict[str, str]:
     return {
         "version": header.version,
         "git_sha": header.git_sha,
-        "controller": header.controller,
+        "agent": header.agent,
         "world": str(scenario["world"]),
         "seed": str(scenario["seed"]),
         "episode": str(scenario["episode"]),
@@ -264,9 +264,9 @@ NO_POLICY: dict[str, Any] = dict.fromkeys(
 class EpisodeReader:
     """Reads chosen episodes out of a running simulator and hands them, step by step, to a sink each."""
 
-    def __init__(self, world: str, controller: str, policy: PolicyNote | None = None) -> None:
+    def __init__(self, world: str, agent: str, policy: PolicyNote | None = None) -> None:
         """``policy``: who drives; None = the simulator's tree."""
-        self._world, self._controller, self._policy = world, controller, policy
+        self._world, self._agent, self._policy = world, agent, policy
         self._sinks: dict[int, EpisodeSink] = {}
         self._applied: dict[int, np.ndarray] = {}
 
@@ -300,7 +300,7 @@ class EpisodeReader:
     def header(self, sim: Recordable, row: int, job: RecordedJob) -> EpisodeHeader:
         described = describe_scenario(lambda name: sim.rows(attrgetter(name)(sim.s), [row])[0])
         return EpisodeHeader(
-            controller=self._controller,
+            agent=self._agent,
             config=sim.config,
             config_yaml=to_yaml(sim.config),
             scenario=scenario_document(sim.config, described, self._world, job.seed, job.episode),
@@ -334,15 +334,15 @@ class EpisodeRecorder(EpisodeReader):
         self,
         folder: Path,
         world: str,
-        controller: str,
+        agent: str,
         jobs: list[Any],
         depth_images: bool = False,
         policy: PolicyNote | None = None,
     ) -> None:
         """``jobs``: each a RecordedJob."""
-        super().__init__(world, controller, policy)
+        super().__init__(world, agent, policy)
         self._depth_images = depth_images
-        self.paths = {job: folder / f"{controller}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
+        self.paths = {job: folder / f"{agent}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
 
     def sink_for(self, sim: Recordable, row: int, job: RecordedJob) -> McapEpisodeLog | None:
         if job not in self.paths:

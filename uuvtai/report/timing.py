@@ -73,7 +73,7 @@ def timing(document: dict[str, Any], command: str = "") -> list[Block]:
 
 _RATES = (
     ENVS,
-    Column("controller", of=lambda row: str(row.get("controller", "-"))),
+    Column("agent", of=lambda row: str(row.get("agent", "-"))),
     Column("S", of=lambda row: str(row.get("S", "-"))),
     Column("D", of=lambda row: str(row.get("D", "-"))),
     *SPEEDS,

@@ -14,7 +14,7 @@ import numpy as np
 
 from uuvtai.common.errors import SettingError
 from uuvtai.config import Config
-from uuvtai.config.loader import ConfigError, parsed_yaml, validated
+from uuvtai.config.loader import LEARNING_SECTIONS, ConfigError, parsed_yaml, validated
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import LogHead, LogMessage, read_head, read_messages
 from uuvtai.logs.topics.sensors import exact_image
@@ -58,12 +58,12 @@ class LogFeed:
     steps: list[LoggedStep] = field(default_factory=list)  # from step 0 on, without a gap
 
 
-def read_feed(path: Path, controller: str | None = None) -> LogFeed:
-    """Read a log; ``controller``: name or file of a tree in place of the one that it holds. Raises LogError
+def read_feed(path: Path, tree: str | None = None) -> LogFeed:
+    """Read a log; ``tree``: name or file of a tree in place of the one that it holds. Raises LogError
     for what cannot be replayed, TreeError and ConfigError for a tree that cannot be read."""
     head = read_head(path)
     try:
-        feed = _begun(path, head, controller)
+        feed = _begun(path, head, tree)
         _FeedReader(feed).run()
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         if isinstance(error, LogError):
@@ -74,7 +74,7 @@ def read_feed(path: Path, controller: str | None = None) -> LogFeed:
     return feed
 
 
-def _begun(path: Path, head: LogHead, controller: str | None) -> LogFeed:
+def _begun(path: Path, head: LogHead, tree: str | None) -> LogFeed:
     config, run = _config(path, head), head.metadata.get("uuv.run", {})
     scenario = head.scenario
     mission = onboard.Mission(
@@ -83,11 +83,11 @@ def _begun(path: Path, head: LogHead, controller: str | None) -> LogFeed:
         seed=int(run["seed"]),
         episode=int(run["episode"]),
     )
-    if run["controller"].endswith("+truth") or config.mapping.stamp > 0:
+    if run["agent"].endswith("+truth") or config.mapping.stamp > 0:
         raise LogError(
             f"{path}: was driven with the truth, which no sensor tells; replay a log without +truth"
         )
-    return LogFeed(path, config, _tree(path, head, controller, config), mission, run)
+    return LogFeed(path, config, _tree(path, head, tree, config), mission, run)
 
 
 def _config(path: Path, head: LogHead) -> Config:
@@ -96,15 +96,15 @@ def _config(path: Path, head: LogHead) -> Config:
     where = f"{path}: config.yaml"
     try:
         given = parsed_yaml(head.attachments["config.yaml"].decode(), where)
-        known = {name: given[name] for name in Config.model_fields if name in given}
-        return validated(known, dict.fromkeys(known, where))
+        driving = {name: given[name] for name in given if name not in LEARNING_SECTIONS}
+        return validated(driving, dict.fromkeys(driving, where))
     except ConfigError as error:
         raise LogError(f"{where} cannot be used here ({error}); record the episode again") from None
 
 
-def _tree(path: Path, head: LogHead, controller: str | None, config: Config) -> FlatTree:
-    if controller is not None:
-        return read_tree(controller, config.behavior.max_node)
+def _tree(path: Path, head: LogHead, tree: str | None, config: Config) -> FlatTree:
+    if tree is not None:
+        return read_tree(tree, config.behavior.max_node)
     if "tree.xml" not in head.attachments:
         raise LogError(
             f"{path}: the log does not hold the tree that drove; name it: uuv replay {path} --agent bt"
@@ -304,14 +304,14 @@ Build = Callable[[LogFeed], onboard.OnboardPilot]
 
 
 def replay(
-    path: Path, faults: Faults | None = None, controller: str | None = None, build: Build | None = None
+    path: Path, faults: Faults | None = None, tree: str | None = None, build: Build | None = None
 ) -> dict[str, Any]:
     """What ``uuv replay --json`` prints. ``build`` makes the pilot (default: one with its own simulator).
 
     Numbers count as equal where they are equal as float32; logs do not keep the sign of a zero. Raises
     LogError, TreeError, ConfigError.
     """
-    feed, faults = read_feed(path, controller), faults or Faults()
+    feed, faults = read_feed(path, tree), faults or Faults()
     told = disturbed(feed.arrivals, faults)
     pilot = (build or built)(feed)
     commands, tick_s = _played(pilot, feed, told)
@@ -319,7 +319,7 @@ def replay(
     return {
         "schema": 1,
         "log": str(path),
-        **{name: feed.run.get(name, "") for name in ("controller", "world", "seed", "episode")},
+        **{name: feed.run.get(name, "") for name in ("agent", "world", "seed", "episode")},
         "steps": len(feed.steps),
         "faults": {**asdict(faults), "any": faults.any},
         "equal": all(row["first_difference"] is None for row in agreement),

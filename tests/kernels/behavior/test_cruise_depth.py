@@ -29,7 +29,7 @@ LOW, HIGH = -1.4, -0.2
 def config(column_share=0.0, **behavior):
     numbers = {"edge_gap_m": 0.2, "depth_choices": 7} | behavior
     prior = {"column_share": column_share}
-    return Config.model_validate({"traffic": POOL, "elevation": prior, "behavior": numbers})
+    return Config.model_validate({"traffic": POOL, "height": prior, "behavior": numbers})
 
 
 @ti.kernel
