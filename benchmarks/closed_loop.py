@@ -38,7 +38,7 @@ _CHANGES = {"world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6}
 
 
 def measure(job: Job) -> list[Row]:
-    """Two rows: by the interfaces, and as ``uuv eval`` plays."""
+    """Two rows: by the interfaces, and as ``uuv eval`` runs."""
     config = load_config("pool", "multibeam", "bluerov2_16v", overrides=_CHANGES)
     tree, count = read_tree("bt"), 2 if job.quick else EPISODES
     water, flown = Sim(config, 1, tree), Sim(config, 1, tree)

@@ -25,7 +25,7 @@ class Job:
     against: str = ""
     """commit to compare with; empty: the last one"""
     policy: str = ""
-    """run folder of the policy that ``parity`` plays"""
+    """run folder of the policy that ``parity`` runs"""
     say: Callable[[str], None] = print
     """shows progress"""
 

@@ -15,7 +15,7 @@ from uuvtai.evaluation.profile import WARM_STEPS, SimBatch
 from uuvtai.sim.sim import Sim
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
-PIECES = (
+PLUGINS = (
     ("NumPy controller", 64, "own_field.py:act", 500.0),
     ("batched torch controller", 1024, "own_torch.py:Pilot", 10_000.0),
 )
@@ -24,7 +24,7 @@ PIECES = (
 
 def measure(job: Job) -> list[Row]:
     """One row a plugin."""
-    return [_row(job, what, 8 if job.quick else n, name, floor) for what, n, name, floor in PIECES]
+    return [_row(job, what, 8 if job.quick else n, name, floor) for what, n, name, floor in PLUGINS]
 
 
 def _row(job: Job, what: str, n_env: int, name: str, floor: float) -> Row:

@@ -53,8 +53,8 @@ def show_agents(screen: Screen, result: dict[str, Any]) -> None:
 
 
 def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
-    """Every two agents on the episodes that both played (``evaluation.results``); nothing where one
-    agent run alone."""
+    """Every two agents on the episodes that both ran (``evaluation.results``); nothing where one
+    agent ran alone."""
     if not pairs:
         return
     screen.line("")

@@ -55,7 +55,7 @@ def warm(shapes: Sequence[Shape], workers: int | None = None) -> list[dict[str, 
 
 
 def compiled(shape: Shape) -> dict[str, Any]:
-    """Play a few steps of a shape in this process, so that all its kernels are compiled and kept."""
+    """Run a few steps of a shape in this process, so that all its kernels are compiled and kept."""
     from uuvtai.envs.vector_env import VectorEnv
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim

@@ -42,7 +42,7 @@ TABLE_MAIN = {
     "curriculum": PrintedRow(0.87, 0.15, 11.41, 15.8),
     "bt": PrintedRow(0.80, 0.10, 14.50, 32.5),
 }
-"""by the names of our presets; 25 episodes a method"""
+"""by the names of our presets; 25 episodes an agent"""
 
 MODERATE = {"S": 8, "D": 9, "v_m_s": 1.5}  # largest values of the conditions over which the paper gives means
 MODERATE_SUCCESS, MODERATE_COLLISION = 0.828, 0.011
@@ -154,14 +154,14 @@ def pooled(agents: Sequence[dict[str, Any]], *outcomes: str) -> Share:
 
 def _design(agents: Sequence[dict[str, Any]], outcomes: Sequence[str]) -> float | None:
     """Of entries that share episodes by their numbers."""
-    won, played = Counter[Hashable](), Counter[Hashable]()
+    won, ran = Counter[Hashable](), Counter[Hashable]()
     for agent in agents:
         ends = ends_of(agent)
         if len(ends) != agent["episodes"]:
             return None
-        played.update(ends.keys())
+        ran.update(ends.keys())
         won.update(key for key, end in ends.items() if end in outcomes)
-    return design_effect([won[key] for key in played], list(played.values()))
+    return design_effect([won[key] for key in ran], list(played.values()))
 
 
 def ends_of(entry: dict[str, Any]) -> dict[Hashable, str]:

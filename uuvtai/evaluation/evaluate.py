@@ -65,7 +65,7 @@ little."""
 
 
 def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
-    """Play every agent's episodes; the ``uuv eval --json`` document and the run folder.
+    """Run every agent's episodes; the ``uuv eval --json`` document and the run folder.
 
     Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError,
     MemoryError, RunFolderError, CheckpointError.
@@ -320,7 +320,7 @@ class AgentRun:
 def run_agent(
     comparison: Comparison, agent: AgentSpec, jobs: list[Job], journal: ResultsJournal, folder: Path
 ) -> AgentRun:
-    """Play one agent's episodes, as far as they are not over; ``folder`` is the run's."""
+    """Run one agent's episodes, as far as they are not over; ``folder`` is the run's."""
     policy, watch = comparison.policies[agent.name], comparison.watch
     dt = comparison.request.config.episode.control_dt_s
     sim = comparison.simulator_for(agent)

@@ -450,7 +450,7 @@ def explain_failures(
     own_code: bool = False,
 ) -> list[Row]:
     """Replay the failed episodes of one agent and explain them; in the order of ``results``. Raises
-    RuntimeError (see ``FailureRecorder.end``). With ``own_code``, the user's, episodes that it plays
+    RuntimeError (see ``FailureRecorder.end``). With ``own_code``, the user's, episodes that it runs
     otherwise this time are left out.
 
     Where a ``agent`` drives, the facts about leaves and actions are those of the tree beside it.

@@ -232,8 +232,8 @@ def _run_cells(
     watch.start(f"{len(keys)} cells", len(keys), len(rows))
     try:
         with folder.recorded():
-            for number, played in engine.run(run_task, tasks):
-                for row in played:
+            for number, done in engine.run(run_task, tasks):
+                for row in done:
                     append_row(folder.path, row)
                     rows[row_key(_label(row, request.grid), row["agent"])] = row
                 watch.note(f"{_words(tasks[number].labels[0])} .. {_words(tasks[number].labels[-1])}: done")

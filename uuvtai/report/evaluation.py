@@ -223,7 +223,7 @@ def _rates_figure(agents: list[AgentSpec], command: str) -> Figure:
 
 
 def _rates_line(place: int, agent: AgentSpec, key: str, colour: str) -> Line:
-    """The one point of an agent; none where it played nothing."""
+    """The one point of an agent; none where it ran none."""
     if agent[f"{key}_rate"] is None:
         return Line(agent["name"], [], [], [], [], colour=colour)
     name, value, (low, high) = agent["name"], agent[f"{key}_rate"], agent[f"{key}_ci95"]

@@ -139,7 +139,7 @@ def _of_evaluation(result: dict[str, Any], origin: str) -> list[PaperItem]:
     privileged = [m["name"] for m in agents if m.get("privileged")]
     note = f" Told the truth, so no competitors: {', '.join(privileged)}." if privileged else ""
     data = evaluation_data(agents)
-    n = f"n = {agents[0]['episodes']} episodes of each method"
+    n = f"n = {agents[0]['episodes']} episodes of each agent"
     found = [
         PaperItem(
             "agents",
