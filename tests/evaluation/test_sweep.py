@@ -241,7 +241,7 @@ def test_only_a_sweeps_folder_is_resumed(tmp_path):
     sweep(asked(GRID), Canned(), tmp_path / "old", Quiet())
     file = tmp_path / "old/sweep_request.json"
     old = json.loads(file.read_text())
-    del old["agents"]
+    del old["named_agents"]
     file.write_text(json.dumps(old | {"controllers": ["bt"], "policies": []}))
     with pytest.raises(RunFolderError, match="an older version of uuv wrote it; begin the sweep again"):
         resume(tmp_path / "old", Canned(), Quiet())

@@ -281,7 +281,7 @@ def test_causes_are_shown_where_there_are_any():
         samples.evaluation_document(samples.agent("best", causes=[samples.CAUSE], explain=[1, 2]))
     )
     assert rows(tables(blocks)[-1]) == [
-        ["unseen above", "2", "100 %", "50 %", "1.7", "-", "0.2", samples.CAUSE["meaning"]]
+        ["undetected above", "2", "100 %", "50 %", "1.7", "-", "0.2", samples.CAUSE["meaning"]]
     ]
 
 
@@ -581,8 +581,8 @@ def test_a_training_and_its_evaluations_are_one_page(tmp_path):
     )
     assert [path.name for path in written.figures] == [
         "training.png",
-        "first_eval_methods.png",
-        "other_eval_methods.png",
+        "first_eval_agents.png",
+        "other_eval_agents.png",
     ]
     text = " ".join(page.words)
     assert "mine is checkpoint step_000005 of the training first." in text

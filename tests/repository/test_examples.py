@@ -263,7 +263,7 @@ def test_what_a_trainer_saved_drives_as_an_own_policy(short, example, tmp_path, 
     with torch.no_grad():
         expected = example(name).play(short, tmp_path)(obs)
     obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
-    agent = load_agents([spec], 64)[0].agent_for(short).pilot
+    agent = load_agents([spec], 64)[0].agent_for(short).agent
     found = agent.decide(torch.from_numpy(obs)).action.numpy()
     np.testing.assert_allclose(found, np.clip(expected, -1, 1), rtol=1e-4, atol=1e-5)
     assert agent.code.marks.hold_steps == example("judge").HOLD_STEPS

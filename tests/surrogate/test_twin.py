@@ -525,7 +525,7 @@ def test_rays_end_at_the_walls(small):
     ("change", "says"),
     [
         (lambda part: part.pop("log_std"), "not those of its config"),
-        (lambda part: part.update({"net.body.0.weight": torch.zeros(9, OBSTACLE_WIDTH)}), "instead of"),
+        (lambda part: part.update({"net.obstacle.0.weight": torch.zeros(9, OBSTACLE_WIDTH)}), "instead of"),
         (lambda part: part.update(log_std=torch.full((3,), float("nan"))), "log_std is not finite"),
     ],
 )

@@ -381,7 +381,9 @@ def without(*names):
             "vel_b must have",
         ),
         (
-            lambda kind, name, data: data.replace(b"behavior:", b"teacher:") if name == "config.yaml" else data,
+            lambda kind, name, data: (
+                data.replace(b"behavior:", b"teacher:") if name == "config.yaml" else data
+            ),
             "renamed to 'behavior",
         ),
         (

@@ -161,7 +161,7 @@ def _design(agents: Sequence[dict[str, Any]], outcomes: Sequence[str]) -> float 
             return None
         ran.update(ends.keys())
         won.update(key for key, end in ends.items() if end in outcomes)
-    return design_effect([won[key] for key in ran], list(played.values()))
+    return design_effect([won[key] for key in ran], list(ran.values()))
 
 
 def ends_of(entry: dict[str, Any]) -> dict[Hashable, str]:

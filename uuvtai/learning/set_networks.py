@@ -146,7 +146,7 @@ def actor_of(checkpoint: Checkpoint) -> SetActor:
     with _refused(checkpoint):
         part = checkpoint.model()["policy"]
         for name, shape in (
-            ("net.body.0.weight", (wide, OBSTACLE_WIDTH)),
+            ("net.obstacle.0.weight", (wide, OBSTACLE_WIDTH)),
             ("net.head.0.weight", (head, 3 * wide)),
         ):
             if tuple(part[name].shape) != shape:

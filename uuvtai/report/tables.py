@@ -207,7 +207,7 @@ _RESULTS = {
     "collision_ci95", "time_mean_s",
     "tts_s", "time_to_success_mean_s", "return_mean", "env_steps", "wall_s", "env_steps_per_s",
     "min_clearance_mean_m",
-    "path_length_mean_m", "replans_per_episode",
+    "path_length_mean_m", "replans_per_episode", "ends",
 }  # fmt: skip
 
 

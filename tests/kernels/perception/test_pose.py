@@ -40,7 +40,7 @@ class Rig:
 
     def __init__(self):
         sizes = {"n_env": N_ENV, "n_ray": SENSORS["harsh"].sonar.n_ray}
-        self.ego, self.pose, self.clock, self.scan = (
+        self.ego, self.localization, self.clock, self.scan = (
             allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
         )
 
@@ -49,7 +49,7 @@ class Rig:
         self.io = io_for(
             LocalizationIO,
             self.ego,
-            self.pose,
+            self.localization,
             self.clock,
             self.scan,
             cfg,
@@ -120,7 +120,7 @@ class Rig:
 
     def state(self):
         return [
-            getattr(self.pose, name).to_numpy() for name in ("mean", "cov", "depth", "depth_cov", "motion")
+            getattr(self.localization, name).to_numpy() for name in ("mean", "cov", "depth", "depth_cov", "motion")
         ]
 
 

@@ -165,7 +165,7 @@ def test_no_critic_and_no_truth_is_exported(kind, whole):
     text = (folder / "policy_spec.json").read_text() + (folder / "README.md").read_text()
     assert "critic" not in text and "truth" not in text
     if kind != "forecast":
-        assert arrays["actor.body.0.weight"].shape[1] == OBSTACLE_WIDTH
+        assert arrays["actor.obstacle.0.weight"].shape[1] == OBSTACLE_WIDTH
         assert arrays["actor.own.0.weight"].shape[1] == EGO_COLUMNS
 
 
@@ -377,7 +377,7 @@ def test_other_weights_with_the_right_sha256_are_exit_3(kind, tmp_path, no_onnx,
     ("kind", "change"),
     [
         ("set", lambda a: a.pop("actor.own.0.bias")),
-        ("set", lambda a: a.update({"actor.body.0.weight": a["actor.body.0.weight"][:, 1:]})),
+        ("set", lambda a: a.update({"actor.obstacle.0.weight": a["actor.obstacle.0.weight"][:, 1:]})),
         ("set", lambda a: a.clear()),
         ("forecast", lambda a: a.update({"said.weight": a["said.weight"][1:]})),
         ("forecast", lambda a: a.pop("spread.bias")),

@@ -199,15 +199,17 @@ class TrackForecast:
 def _encoder(
     arrays: Arrays, name: str, n_obstacle: int, n_own: int, n_out: int
 ) -> tuple[Layers, Layers, Layers]:
-    """Layers of body, own and head of a set encoder; ValueError where they do not fit together."""
-    body, own, head = (folders.layers_of(arrays, f"{name}.{part}") for part in ("body", "own", "head"))
-    if not (body and own and head):
+    """Layers of obstacle, own and head of a set encoder; ValueError where they do not fit together."""
+    obstacle, own, head = (
+        folders.layers_of(arrays, f"{name}.{part}") for part in ("obstacle", "own", "head")
+    )
+    if not (obstacle and own and head):
         raise ValueError(f"layers of {name}")
-    pooled = 2 * len(body[-1][1]) + len(own[-1][1])
-    for layers, first, last in ((body, n_obstacle, None), (own, n_own, None), (head, pooled, n_out)):
+    pooled = 2 * len(obstacle[-1][1]) + len(own[-1][1])
+    for layers, first, last in ((obstacle, n_obstacle, None), (own, n_own, None), (head, pooled, n_out)):
         if layers[0][0].shape[1] != first or (last is not None and len(layers[-1][1]) != last):
             raise ValueError(f"{name} is no encoder from {n_obstacle} and {n_own} to {n_out}")
-    return body, own, head
+    return obstacle, own, head
 
 
 def _linear(arrays: Arrays, name: str) -> tuple[np.ndarray, np.ndarray]:
