@@ -426,7 +426,7 @@ def test_a_closed_environment_stays_closed(small, env):
     [
         ({"world": "pol"}, ConfigError, "pool"),
         ({"sensors": "perfect"}, ConfigError, "paper"),
-        ({"behavior": "oracle"}, ConfigError, "planner"),
+        ({"teacher": "oracle"}, ConfigError, "planner"),
         ({"overrides": {"world.n_dynamics": 3}}, ConfigError, "n_dynamic"),
         ({"num_envs": 0}, ValueError, "at least 1 env"),
         ({"num_envs": 2.0}, TypeError, "num_envs must be an int"),

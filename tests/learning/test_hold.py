@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tests.learning.test_pilot import N_OBS, networks
+from tests.learning.test_policy_agent import N_OBS, networks
 from tests.learning.test_train import config_of, same
 from uuvtai.learning.networks import NUM_ACTIONS
 from uuvtai.learning.policy_agent import PolicyAgent

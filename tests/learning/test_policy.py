@@ -78,7 +78,7 @@ def test_a_residual_policy_without_a_finite_teacher_stays_finite(x):
 
 @pytest.mark.parametrize("teacher_slice", [None, slice(0, 3), slice(5, 9)])
 def test_a_residual_policy_needs_the_teacher_s_columns(teacher_slice):
-    with pytest.raises(ValueError, match=r"features\.behavior=true"):
+    with pytest.raises(ValueError, match=r"observation\.behavior=true"):
         make(teacher_slice=teacher_slice, residual=True)
 
 

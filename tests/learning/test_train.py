@@ -52,7 +52,7 @@ def comparable(metrics):
 
 def test_it_learns_the_task_from_its_teacher_and_says_so():
     teaching = {"batch": 64, "steps": 16, "learning_rate": 3e-3, "schedule": [[0, 1], [1, 0.2]]}
-    trainer = Trainer(PointEnv(), config_of(train={"iterations": 12}, distill=teaching))
+    trainer = Trainer(PointEnv(), config_of(train={"iterations": 12}, distillation=teaching))
     first = trainer.iterate()
     for _ in range(11):
         last = trainer.iterate()
@@ -146,7 +146,9 @@ def test_bad_iterations_in_a_row_are_an_error_that_names_them():
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
-    trainer = Trainer(PointEnv(), config_of(distill={"schedule": [[0, 0]]}, world_model={"enabled": False}))
+    trainer = Trainer(
+        PointEnv(), config_of(distillation={"schedule": [[0, 0]]}, world_model={"enabled": False})
+    )
     trainer.iterate()
     trainer.policy.actor[0].weight.register_hook(lambda gradient: gradient * math.nan)
     before = [p.clone() for p in trainer.policy.actor.parameters()]
@@ -157,7 +159,9 @@ def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
 
 
 def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
-    trainer = Trainer(PointEnv(), config_of(distill={"schedule": [[0, 0]], "critic_warmup_iterations": 1}))
+    trainer = Trainer(
+        PointEnv(), config_of(distillation={"schedule": [[0, 0]], "critic_warmup_iterations": 1})
+    )
     actor, critic = trainer.policy.actor[0].weight.clone(), trainer.policy.critic[0].weight.clone()
     trainer.iterate()
     assert torch.equal(trainer.policy.actor[0].weight, actor)
@@ -167,7 +171,7 @@ def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
 
 
 def test_the_uncertainty_weighs_the_distillation():
-    trainer = Trainer(PointEnv(), config_of(distill={"weighting": "uncertainty"}))
+    trainer = Trainer(PointEnv(), config_of(distillation={"weighting": "uncertainty"}))
     for _ in range(4):
         trainer.iterate()
     weight = trainer.rollout.weight

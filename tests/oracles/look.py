@@ -3,7 +3,7 @@ and hypothesis by hypothesis."""
 
 import numpy as np
 
-from tests.oracles import elevation
+from tests.oracles import height
 from tests.oracles.scenes import quaternions, rotation
 
 SLACK_M = 0.25
@@ -44,11 +44,11 @@ def look(share, present, image, pos, rpy, at, radius, cfg, depth, tank):
     )
     hides, past = away <= ahead - radius - SLACK_M, away >= ahead + SLACK_M
     body = np.flatnonzero(~hides & ~past)
-    z = elevation.heights(tank)
+    z = height.heights(tank)
     if len(body):
         likely, unsure = shown(eye[2] + rays[body, 2] * away[body], body, hides, z, tank)
         weighed = share * likely
-        return elevation.shared(weighed), present, min(doubt, unsure)
+        return height.shared(weighed), present, min(doubt, unsure)
     front = eye + rays * (ahead - radius / 2)
     rows = [np.abs(front[:, 2] - height).argmin() for height in z]
     pitch = abs(front[1, 2] - front[0, 2])
@@ -56,7 +56,7 @@ def look(share, present, image, pos, rpy, at, radius, cfg, depth, tank):
     doubt = min(doubt, np.abs(offs - pitch / 2).min())
     free = (offs < pitch / 2) & past[rows]
     likely = np.append(np.where(free, 1 - cfg.camera_hit_share, 1.0), 1 - cfg.camera_hit_share)
-    return (*elevation.seen_not(share, present, likely), doubt) if free.any() else (share, present, doubt)
+    return (*height.seen_not(share, present, likely), doubt) if free.any() else (share, present, doubt)
 
 
 def shown(heights_m, body, hides, z, tank):

@@ -76,7 +76,7 @@ def small_sweep(agent="bt"):
 
 def test_figures_are_as_wide_as_the_columns(kit):
     names = {path.name for path in kit.figures}
-    assert {"first_methods_1col.pdf", "first_methods_2col.svg", "grid_heat_map_bt_1col.svg"} <= names
+    assert {"first_agents_1col.pdf", "first_agents_2col.svg", "grid_heat_map_bt_1col.svg"} <= names
     assert "run_1_training_2col.pdf" in names
     for path in kit.figures:
         if path.suffix == ".svg":
@@ -88,7 +88,7 @@ def test_figures_are_as_wide_as_the_columns(kit):
 
 
 def test_text_is_of_one_size_and_a_font_that_publishers_take(kit):
-    content = next(path for path in kit.figures if path.name == "first_methods_1col.pdf").read_bytes()
+    content = next(path for path in kit.figures if path.name == "first_agents_1col.pdf").read_bytes()
     assert b"/Type3" not in content and b"STIXGeneral" in content
 
 
@@ -108,7 +108,7 @@ def test_the_numbers_of_every_figure_lie_beside_it(kit):
 
 
 def test_the_table_of_methods_has_n_and_intervals(kit):
-    answer = text_of(kit.folder / "tables/first_methods.tex")
+    answer = text_of(kit.folder / "tables/first_agents.tex")
     assert r"straight & 8 & 37.5 [13.7, 69.4] & 62.5 [30.6, 86.3] & 0 & " in answer
     assert all(
         rule in answer for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\begin{tabular}{lrrrrr}")
@@ -137,7 +137,7 @@ def test_causes_of_failures_are_a_table(tmp_path):
     run = evaluated(tmp_path / "run", samples.agent("bt", causes=[samples.CAUSE], explain=[{}, {}]))
     (item,) = [item for item in items_of(run) if item.name == "causes_bt"]
     assert "n = 2 failures of 8 episodes" in item.caption
-    assert "unseen above & 2 & 100" in latex.tabular(item.table, "")
+    assert "undetected above & 2 & 100" in latex.tabular(item.table, "")
 
 
 def test_one_axis_makes_a_row_a_cell(tmp_path):
@@ -170,7 +170,7 @@ def test_what_a_user_names_is_text_and_no_command(kit):
     assert not list(kit.folder.rglob("*[!A-Za-z0-9_.]*"))
     markdown = text_of(kit.folder / "captions.md")
     assert "\x1b" not in markdown and "<k>" not in re.sub(r"^    .*$", "", markdown, flags=re.M)
-    rows = list(csv.reader(text_of(kit.folder / "tables/first_methods.csv").splitlines()))
+    rows = list(csv.reader(text_of(kit.folder / "tables/first_agents.csv").splitlines()))
     assert len(rows) >= 3
 
 

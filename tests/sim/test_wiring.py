@@ -179,7 +179,7 @@ def first_features(trainer, env):
 
 def test_samples_are_weighed_by_their_own_uncertainty_where_that_is_asked_for():
     trainer, env = trainer_of(
-        distill={"steps": 0, "schedule": [[0, 1], [1, 0.2]], "weighting": "uncertainty"}
+        distillation={"steps": 0, "schedule": [[0, 1], [1, 0.2]], "weighting": "uncertainty"}
     )
     with torch.no_grad():  # or all samples are nearly as uncertain as each other
         trainer.world_model.decoder[-1].weight[N_TARGET:].mul_(300.0)

@@ -52,7 +52,7 @@ def cell_table(cells: list[MapCell], document: dict[str, Any], title: str, **pag
 
 
 def agent_of(cell: MapCell) -> str:
-    return str(cell.get("agent", "policy"))
+    return str(cell["agent"])
 
 
 def axes_of_cells(cells: list[MapCell]) -> list[str]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.bundles import clear, io_for, put
-from tests.oracles import elevation as weighing
+from tests.oracles import height as weighing
 from tests.oracles import look as oracle
 from tests.oracles.depth import camera_position, camera_rays, z_depths
 from tests.oracles.scenes import BOX, CYLINDER, SPHERE, quaternions

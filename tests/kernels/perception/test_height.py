@@ -6,7 +6,7 @@ import pytest
 import taichi as ti
 
 from tests.bundles import clear, io_for, put
-from tests.oracles import elevation as oracle
+from tests.oracles import height as oracle
 from uuvtai.config import EpisodeConfig, HeightConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.kernels.core.simd import LANES

@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from tests.bundles import io_for
 from tests.conftest import set_step
-from tests.oracles import pose as oracle
+from tests.oracles import localization as oracle
 from uuvtai.config import EpisodeConfig, LocalizationConfig, TankConfig, VehicleConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.perception import localization
@@ -120,7 +120,8 @@ class Rig:
 
     def state(self):
         return [
-            getattr(self.localization, name).to_numpy() for name in ("mean", "cov", "depth", "depth_cov", "motion")
+            getattr(self.localization, name).to_numpy()
+            for name in ("mean", "cov", "depth", "depth_cov", "motion")
         ]
 
 

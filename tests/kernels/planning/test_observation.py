@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.bundles import io_for
-from tests.oracles import features as oracle
+from tests.oracles import observation as oracle
 from uuvtai.common import tree_codes as codes
 from uuvtai.config import (
     EpisodeConfig,
@@ -54,7 +54,7 @@ class Stage:
 
     def __init__(self):
         sizes = {"n_env": N_ENV, "n_ray": N_RAY, "n_sector": N_SECTOR, "n_track": N_TRACK}
-        self.features, self.scan = allocate(ObservationState, sizes), allocate(SonarScan, sizes)
+        self.observation, self.scan = allocate(ObservationState, sizes), allocate(SonarScan, sizes)
         self.ego, self.clock = allocate(Proprioception, sizes), allocate(ClockState, sizes)
 
     def run(self, range_m, doppler, hit, yaw, ping_yaw, active=None):
@@ -65,8 +65,10 @@ class Stage:
         self.scan.ping_yaw.from_numpy(ping_yaw.astype(np.float32))
         self.ego.rpy.from_numpy(np.stack([0 * yaw, 0 * yaw, yaw], axis=1).astype(np.float32))
         self.clock.active.from_numpy(np.ones(N_ENV, np.int32) if active is None else active.astype(np.int32))
-        sense_sectors(io_for(ObservationIO, self.features, self.scan, self.ego, self.clock, FEATURES, SONAR))
-        f = self.features
+        sense_sectors(
+            io_for(ObservationIO, self.observation, self.scan, self.ego, self.clock, FEATURES, SONAR)
+        )
+        f = self.observation
         return np.array(
             [x.to_numpy() for x in (f.sector_range_m, f.sector_ttc_s, f.sector_closing_m_s, f.sector_valid)]
         )
@@ -201,7 +203,7 @@ def test_first_columns_are_the_papers_targets_of_the_world_model():
 # ------------------------------------------------------------------------------------------ obstacles and
 # advice
 
-MORE = ObservationConfig(n_track=3, teacher=True)
+MORE = ObservationConfig(n_track=3, behavior=True)
 FORECAST, TRACKING, TANK, RULES = ForecastConfig(), TrackingConfig(), TankConfig(), EpisodeConfig()
 N_FORECAST = 8
 
@@ -222,7 +224,7 @@ class Obstacles:
 
     def __init__(self, stage):
         sizes = {"n_env": N_ENV, "n_track": N_TRACK, "n_forecast": N_FORECAST, "n_height": 16, "n_ray": N_RAY}
-        self.features, self.ego, self.clock = stage.observation, stage.ego, stage.clock
+        self.observation, self.ego, self.clock = stage.observation, stage.ego, stage.clock
         self.tracks, self.forecast = allocate(TrackState, sizes), allocate(ForecastState, sizes)
 
     def run(self, values, active=None):
@@ -235,7 +237,7 @@ class Obstacles:
         write_obstacles(
             io_for(
                 ObservationIO,
-                self.features,
+                self.observation,
                 self.forecast,
                 self.tracks,
                 self.ego,
@@ -417,4 +419,4 @@ def test_what_is_added_stands_behind_the_papers_columns():
     plain, more = placed_columns(FEATURES), placed_columns(MORE)
     assert more[: len(plain)] == plain and len(more) > len(plain)
     assert placed_columns(ObservationConfig(n_track=3))[-1][0].per == "body"
-    assert placed_columns(ObservationConfig(teacher=True))[-1][0].name == "behavior_class"
+    assert placed_columns(ObservationConfig(behavior=True))[-1][0].name == "behavior_class"

@@ -199,7 +199,7 @@ def test_obstacles_move_as_in_closed_form(small, bank):
     checked = 0
     for row in range(small.N):
         arrays = {k: v[row] for k, v in small.arrays("world", "path", "mission").items()}
-        first = bank.body.shape[1] - bank.path.shape[1]
+        first = bank.obstacle.shape[1] - bank.path.shape[1]
         for body in describe_scenario(lambda name, arrays=arrays: arrays[name])["obstacles"]:
             if body["path"]:
                 near = np.array([times[row] - 1e-3, times[row], times[row] + 1e-3])
@@ -236,7 +236,7 @@ def test_the_referee_is_the_simulators(small, bank, config):
             continue
         rows, termination = small.sim.rows, small.sim.s.termination
         seen, outcome = torch.zeros(small.N, 2), torch.zeros(small.N, dtype=torch.int32)
-        motion.check_states(rules, states_of(small.sim), bank.body, bank.path, seen, outcome)
+        motion.check_states(rules, states_of(small.sim), bank.obstacle, bank.path, seen, outcome)
         clearance, ttc, ended = (
             rows(termination.clearance_m),
             rows(termination.ttc_s),
@@ -266,9 +266,9 @@ def test_far_obstacles_are_left_out(config):
 def test_no_obstacle_that_can_come_near_is_left_out(bank, config, slots):
     """Nothing changes where those alone are looked at that were near when the decision began, however the
     hull has moved since; nor where there are more slots than an integer has bits."""
-    rng, count = np.random.default_rng(3), len(bank.body)
+    rng, count = np.random.default_rng(3), len(bank.obstacle)
     rules, changed = bind(SurrogateRules, config), 0
-    body = torch.cat([torch.zeros(count, slots, 8), bank.body], dim=1).contiguous()
+    body = torch.cat([torch.zeros(count, slots, 8), bank.obstacle], dim=1).contiguous()
     for _ in range(200):
         pose, moved = rng.uniform(0, 1, (count, 4)), rng.uniform(-1, 1, (count, 4))
         pose = pose * [20.0, 6.0, -1.6, 30.0]

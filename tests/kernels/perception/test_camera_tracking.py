@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from tests.bundles import io_for, put
-from tests.oracles import spotting as oracle
-from tests.oracles.elevation import prior
+from tests.oracles import camera_tracking as oracle
+from tests.oracles.height import prior
 from tests.oracles.scenes import BOX, CYLINDER, SPHERE, load, quaternions
 from tests.oracles.tracking import predicted
 from uuvtai import state
