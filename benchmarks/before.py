@@ -2,9 +2,9 @@
 
 A refactoring shows here that it is one: 300 steps of 256 vehicles in three worlds, the messages of two
 recorded episodes, four iterations of training in the simulator and in the surrogate, compared bit by bit;
-what only one side has is named. Then steps per CPU second of one thread, the start with warm kernels and the
-writing of logs, in turns (wall time on a shared machine wanders by a third). Both sides run in this
-environment, each with its own package and caches.
+what has another name on the other side is found by its bits, and what only one side has is named. Then steps
+per CPU second of one thread, the start with warm kernels and the writing of logs, in turns (wall time on a
+shared machine wanders by a third). Both sides run in this environment, each with its own package and caches.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ _SMALL = {
     "quick": {"train.num_envs": 64, "surrogate.scenarios": 64},
 }
 """trainings in the simulator and in the surrogate, as small as they go"""
+_OLDER = (("--agent", "--controller"), ("distillation.", "distill."), ("surrogate.", "twin."))
+"""words of our commands and those of trees that do not know them"""
 _PAIRS, _LOGS = 16, 5
 _NO_BYTECODE = "PYTHONDONTWRITEBYTECODE"
 """compiles every module again at every start, on both sides: nobody's start"""
@@ -70,18 +72,17 @@ class Side:
         return json.loads(done.stdout.splitlines()[-1])
 
     def uuv(self, arguments: list[str], run: str) -> Path:
-        """Run a command of the tree's own CLI; the folder that it wrote."""
-        place = self.folder / run
-        command = [sys.executable, "-m", "uuvtai", *arguments, "--run-dir", str(place)]
-        subprocess.run(
-            command,
-            env=self.environment,
-            cwd=self.tree,
-            check=True,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        return place
+        """Run a command of the tree's own CLI, in the words that it knows; the folder that it wrote."""
+        place, quiet = self.folder / run, subprocess.DEVNULL
+        for new, old in (("", ""), *_OLDER):
+            told = [word.replace(new, old) for word in arguments]
+            command = [sys.executable, "-m", "uuvtai", *told, "--run-dir", str(place)]
+            done = subprocess.run(
+                command, env=self.environment, cwd=self.tree, stdout=quiet, stderr=quiet, check=False
+            )
+            if done.returncode == 0:
+                return place
+        raise RuntimeError(f"uuv {' '.join(arguments)} ended with {done.returncode} in {self.tree}")
 
 
 def measure(job: Job) -> list[Row]:
@@ -124,13 +125,23 @@ def checked_out(commit: str, place: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _equal(what: str, ours: dict[str, str], theirs: dict[str, str], commit: str) -> Row:
-    """How many of the names that both sides have are of other bits; those of one side alone are named."""
-    wrong = sorted(name for name in ours.keys() & theirs.keys() if ours[name] != theirs[name])
-    alone = {"here": sorted(ours.keys() - theirs.keys()), commit: sorted(theirs.keys() - ours.keys())}
-    count = len(ours.keys() & theirs.keys())
+    """How many of the names that both sides have are of other bits; those of one side alone are named, but
+    where the other side has their bits under another name."""
+    both = ours.keys() & theirs.keys()
+    wrong = sorted(name for name in both if ours[name] != theirs[name])
+    left: dict[str, list[str]] = {}
+    for name in sorted(theirs.keys() - both):
+        left.setdefault(theirs[name], []).append(name)
+    renamed = {name: left[ours[name]].pop(0) for name in sorted(ours.keys() - both) if left.get(ours[name])}
+    alone = {
+        "here": sorted(ours.keys() - both - renamed.keys()),
+        commit: sorted(theirs.keys() - both - set(renamed.values())),
+    }
+    count = len(both) + len(renamed)
     notes = [f"of {count}" + (f": {', '.join(wrong[:5])}" if wrong else "")]
+    notes += [f"{len(renamed)} of them renamed"] if renamed else []
     notes += [f"only {side}, {len(names)}: {', '.join(names)}" for side, names in alone.items() if names]
-    details = {"differ": wrong, "only": alone}
+    details = {"differ": wrong, "only": alone, "renamed": renamed}
     found = len(wrong) if count else None
     return Row(what, found, "", less_is_better=True, floor=0, note="; ".join(notes), details=details)
 
