@@ -82,7 +82,7 @@ class Side:
             )
             if done.returncode == 0:
                 return place
-        raise RuntimeError(f"uuv {' '.join(arguments)} ended with {done.returncode} in {self.tree}")
+        raise RuntimeError(f"{self.tree}: uuv {' '.join(arguments)} failed")
 
 
 def measure(job: Job) -> list[Row]:
