@@ -8,7 +8,7 @@ import torch
 from uuvtai.config.learning import PolicyConfig, PpoConfig
 from uuvtai.learning import ppo as ppo_module
 from uuvtai.learning.networks import ActorCritic, log_prob
-from uuvtai.learning.ppo import Ppo, adapted_rate, approximate_kl, gae, surrogate_loss, value_loss
+from uuvtai.learning.ppo import Ppo, adapted_rate, approximate_kl, gae, surrogate_loss
 from uuvtai.learning.rollout import Rollout, final_value
 
 FLOAT32 = 1e-5
@@ -85,17 +85,6 @@ def test_the_surrogate_is_clipped_where_it_would_gain(ratio, advantage, loss, sl
     found.sum().backward()
     assert found.item() == pytest.approx(loss, rel=FLOAT32)
     assert log_ratio.grad.item() == pytest.approx(slope, abs=FLOAT32)  # d ratio / d log_ratio = ratio
-
-
-def test_value_errors_by_hand():
-    value, target, old = (
-        torch.tensor([1.0, 3.0, 3.0]),
-        torch.tensor([2.0, 2.0, 4.0]),
-        torch.tensor([1.0, 1.0, 1.0]),
-    )
-    assert value_loss(value, target).tolist() == [1.0, 1.0, 1.0]
-    # clipped to 1 +- 0.5: 1, 1.5, 1.5, whose errors are 1, 0.25, 6.25
-    assert value_loss(value, target, old, 0.5).tolist() == [1.0, 1.0, 6.25]
 
 
 def test_the_divergence_is_that_of_two_gaussians():

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from uuvtai.config.base import Fraction, NonNegative, Positive, PositiveCount, Section
 
+N_AXIS = 11
+"""velocities along surge and along sway of a window of reachable ones"""
+ACCELERATION_M_S2 = 1.7
+"""of the vehicle: cruise speed over the time constant of its velocity"""
+
 
 class DynamicWindowConfig(Section):
     """Dynamic window approach (Fox, Burgard, Thrun 1997)."""
@@ -14,14 +19,10 @@ class DynamicWindowConfig(Section):
     """of the roll-out of a velocity"""
     margin_m: NonNegative = 0.15
     """wanted clearance beyond contact from moving obstacles; closer counts as a collision"""
-    clear_m: Positive = 0.6
-    """clearance beyond the margin from which on more is worth nothing"""
     weight_heading: NonNegative = 2.0
     """of the angle to the wanted velocity, as a share of 180 degrees"""
     weight_clearance: NonNegative = 5.0
-    """of time and distance to what is nearest, as a share"""
-    weight_speed: NonNegative = 1.0
-    """of the speed up to the wanted one, as a share of cruise speed"""
+    """of time and distance to what is nearest, as a share; the speed, as a share of cruise speed, weighs 1"""
 
 
 class PotentialFieldConfig(Section):
@@ -31,12 +32,6 @@ class PotentialFieldConfig(Section):
     """moving obstacles farther away push nobody"""
     gain: NonNegative = 0.1
     """[m^4/s] of the push of a moving obstacle"""
-    static_reach_m: Positive = 0.3
-    """mapped obstacles and walls farther away push nobody"""
-    static_gain: NonNegative = 0.002
-    """[m^4/s] of the push of the nearest mapped obstacle or wall"""
-    least_m: Positive = 0.05
-    """distances count as at least so much: the force stays finite"""
 
 
 class VelocityObstacleConfig(Section):
@@ -60,10 +55,6 @@ class PathIntegralConfig(Section):
     horizon_s: Positive = 2.5
     sigma_m_s: Positive = 0.4
     """standard deviation of the noise on surge and sway"""
-    heave_sigma_m_s: NonNegative = 0.2
-    """the same on heave; 0 = depth is not used to evade"""
-    noise_tau_s: NonNegative = 1.0
-    """correlation time of the noise; 0 = white"""
     temperature: Positive = 0.1
     """lambda: smaller trusts the best sample more"""
     exploration: Fraction = 0.98
@@ -72,10 +63,9 @@ class PathIntegralConfig(Section):
     """wanted clearance beyond contact from moving obstacles"""
     margin_growth_m_s: NonNegative = 0.1
     """the margin grows with prediction time"""
-    weight_track: NonNegative = 1.0
-    """[1/m] mean distance from where the wanted velocity would lead"""
     weight_obstacle: NonNegative = 40.0
-    """[1/m] mean depth of violation of the wanted clearance from moving obstacles"""
+    """[1/m] mean depth of violation of the wanted clearance from moving obstacles; a metre off the wanted way
+    costs 1"""
     weight_static: NonNegative = 40.0
     """[1/m] mean depth of violation of the wanted clearance from mapped obstacles and walls"""
     weight_contact: NonNegative = 10.0
@@ -88,10 +78,6 @@ class BaselinesConfig(Section):
 
     period_steps: PositiveCount = 5
     """control steps between decisions"""
-    acceleration_m_s2: Positive = 1.7
-    """of the vehicle: cruise speed over the time constant of its velocity"""
-    n_axis: PositiveCount = 11
-    """velocities along surge and along sway of a window of reachable ones"""
     heave_m_s: NonNegative = 0.4
     """vertical speed of those that climb or dive; 0 = depth is not used to evade (also in the potential
     field)"""
@@ -109,7 +95,7 @@ class BaselinesConfig(Section):
     @property
     def n_reachable(self) -> int:
         """Velocities tried in the reachable window: the grid at each heave, the wanted velocity, a stop."""
-        return self.n_axis * self.n_axis * (3 if self.heave_m_s > 0 else 1) + 2
+        return N_AXIS * N_AXIS * (3 if self.heave_m_s > 0 else 1) + 2
 
     @property
     def n_trial(self) -> int:

@@ -121,10 +121,9 @@ class BehaviorConfig(Section):
     reached in time; false = at the goal's depth"""
     depth_choices: PositiveCount = 8
     """depths to choose among, from edge to edge"""
-    weight_traffic: NonNegative = 1.0
-    """of the obstacles that are expected but not seen (``traffic``), by the share of them that is level"""
     weight_goal_depth: NonNegative = 0.05
-    """[1/m] of the way to the goal's depth"""
+    """[1/m] of the way to the goal's depth; obstacles that are expected but not seen (``traffic``) cost the
+    share of them that is level"""
     weight_depth_change: NonNegative = 0.1
     """[1/m] of leaving the depth chosen before"""
     return_slope: NonNegative = 0.3

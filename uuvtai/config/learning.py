@@ -39,8 +39,6 @@ class PolicyConfig(Section):
     """control steps that a decision is held: the action, or what a residual policy adds to the tree's newest
     one. Noise drawn anew every 0.02 s averages out before the vehicle has moved; held, it explores, and the
     networks run that much less often"""
-    clip_observation: Positive = 10.0
-    """standard deviations beyond which an observation is cut off"""
 
 
 class PpoConfig(Section):
@@ -56,8 +54,6 @@ class PpoConfig(Section):
     entropy_weight: NonNegative = 0.003
     value_weight: NonNegative = 1.5
     max_grad_norm: Positive = 1.0
-    clip_value: bool = False
-    """also clip the value's change, as some implementations do"""
     target_kl: NonNegative = 0.0
     """0 = fixed learning rate; else the rate follows the KL divergence of every update (as rsl_rl does)"""
     shuffle: bool = False

@@ -56,23 +56,17 @@ class RouteConfig(Section):
     lookahead_m: Positive = 1.0
     risk_horizon_m: Positive = 3.0
     """length of the look-ahead segment for path risk and for the intersection trigger"""
-    stuck_speed_m_s: NonNegative = 0.08
     stuck_s: Positive = 3.0
     safety_range_m: NonNegative = 0.5
     safety_ttc_s: NonNegative = 1.0
-    forecast_clearance_m: NonNegative = 0.35
-    """a forecast closer than this to the look-ahead path is an intersection"""
     reach_speed_m_s: NonNegative = 0.6
     """the vehicle can be anywhere up to this times t along the path when a forecast obstacle is there"""
-    progress_window_m: Positive = 1.5
-    """how far ahead of the last foot the new one is looked for"""
     min_replan_s: NonNegative = 0.4
     """the same trigger does not fire again within this"""
     rrt_clearance_m: NonNegative = 0.1
     """overlay clearance floor of the paper: what the fallback may still cross"""
     rrt_iterations: PositiveCount = 4000
     """budget of the fallback; never wall time, so that results do not depend on the machine"""
-    rrt_range_m: Positive = 1.0
 
 
 class ObservationConfig(Section):

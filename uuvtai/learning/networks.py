@@ -176,6 +176,8 @@ class RunningNorm(nn.Module):
 
 
 NUM_ACTIONS = 4
+CLIP_OBSERVATION = 10.0
+"""standard deviations beyond which an observation is cut off"""
 _MEAN_GAIN, _VALUE_GAIN = (
     0.01,
     1.0,
@@ -245,7 +247,7 @@ class ActorCritic(nn.Module):
         )
         self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
         self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
-        self.observation_norm = RunningNorm(n_in, config.clip_observation)
+        self.observation_norm = RunningNorm(n_in, CLIP_OBSERVATION)
         self.value_norm = RunningNorm(1, math.inf)
 
     def distribution(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

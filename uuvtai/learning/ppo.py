@@ -62,18 +62,6 @@ def surrogate_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip: float
     return -torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
 
 
-def value_loss(
-    value: torch.Tensor, target: torch.Tensor, old_value: torch.Tensor | None = None, clip: float = 0.0
-) -> torch.Tensor:
-    """(B,) squared error of every sample; with ``old_value`` the worse of it and that of the value clipped to
-    old_value +- clip."""
-    error = (value - target).square()
-    if old_value is None:
-        return error
-    clipped = old_value + (value - old_value).clamp(-clip, clip)
-    return torch.maximum(error, (clipped - target).square())
-
-
 def approximate_kl(log_ratio: torch.Tensor) -> torch.Tensor:
     """(B,) samples of KL(old || new) [nat] that are never negative (Schulman 2020, estimator k3)."""
     return torch.expm1(log_ratio) - log_ratio
@@ -102,8 +90,6 @@ class Minibatch:
     """normalised over the valid samples"""
     target: torch.Tensor
     """return in the critic's units"""
-    value: torch.Tensor
-    """of the rollout, in the critic's units"""
     teacher_action: torch.Tensor
     weight: torch.Tensor
     valid: torch.Tensor
@@ -220,7 +206,6 @@ class Ppo:
             prior=flat_valid.new_empty(len(flat_valid), 0) if prior is None else prior,
             advantage=_standardised(advantage, valid).flatten(),
             target=norm(returns.flatten()),
-            value=norm(value.flatten()),
             valid=flat_valid.float(),
             **zero_where_invalid,
         ), metrics
@@ -285,8 +270,7 @@ class Ppo:
         """This block's share of the minibatch's loss by the networks' outputs; its sums are added to ``sums``
         in the order of ``_SUMS``."""
         config, share = self.config, batch.valid / count
-        old_value = batch.value if config.clip_value else None
-        value_error = value_loss(value_out.squeeze(-1), batch.target, old_value, config.clip)
+        value_error = (value_out.squeeze(-1) - batch.target).square()
         loss = config.value_weight * (share * value_error).sum()
         zero = torch.zeros_like(batch.valid)
         policy_loss, kl, clipped, distill = zero, zero, zero, zero

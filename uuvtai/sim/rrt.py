@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float]
 
+RANGE_M = 1.0
+"""longest edge of the tree"""
 _STEP_CELLS = 0.5
 """States along a motion are checked this often [cells]."""
 
@@ -339,5 +341,5 @@ class RouteFallback:
             self.overlay, self.origin, self.config.mapping.cell_m, r.rrt_clearance_m, start_xy
         )
         return plan_rrt(
-            start_xy, goal_xy, grid, r.rrt_iterations, seed, r.rrt_range_m, self.config.voronoi.cost_epsilon_m
+            start_xy, goal_xy, grid, r.rrt_iterations, seed, RANGE_M, self.config.voronoi.cost_epsilon_m
         )

@@ -12,6 +12,7 @@ from tests.command import uuv
 from tests.conftest import launch_one_by_one
 from tests.small_sim import SmallSim
 from uuvtai import state
+from uuvtai.config.baselines import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.dwa import plan_dynamic_window
 from uuvtai.kernels.baselines.io import PathIntegralIO
 from uuvtai.kernels.baselines.mppi import plan_path_integral
@@ -186,7 +187,7 @@ def test_the_dynamic_window_is_what_can_be_reached(scene):
         for track in range(3):
             body(scene, row, track, HERE[:2] + rng.uniform(-1.5, 1.5, 2), rng.uniform(-1, 1, 2))
     found = decide(scene, "dwa")
-    reach = scene.config.baselines.acceleration_m_s2 * scene.config.baselines.dwa.window_s
+    reach = ACCELERATION_M_S2 * scene.config.baselines.dwa.window_s
     assert (np.abs(found[:, :2] - own) <= reach + 1e-5).all()
     assert (np.abs(found[:, :2]) <= 0.6 + 1e-5).all()
     assert len(np.unique(found.round(3), axis=0)) > 2

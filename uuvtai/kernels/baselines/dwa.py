@@ -11,6 +11,7 @@ admissible, the velocity that touches least and latest is driven.
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
+from uuvtai.config.baselines import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.io import DynamicWindowIO
 from uuvtai.kernels.baselines.local_planner import (
     decides,
@@ -22,6 +23,8 @@ from uuvtai.kernels.baselines.local_planner import (
 from uuvtai.kernels.core.geometry import FAR_M, PI, turned_z3
 from uuvtai.kernels.core.stage import Bundle, spread
 
+_CLEAR_M = 0.6
+"""Clearance beyond the margin from which on more is worth nothing."""
 _FORBIDDEN = -100.0
 """Score below that of every admissible velocity."""
 
@@ -77,16 +80,16 @@ def _score(env, wanted, velocity, io: Bundle[DynamicWindowIO]):
         heading = 1.0 - ti.acos(ti.math.clamp(velocity.dot(wanted) / (speed * wanted.norm()), -1.0, 1.0)) * (
             1.0 / PI
         )
-    free = 0.5 + 0.5 * ti.math.clamp(room / ti.static(io.dwa_cfg.clear_m), 0.0, 1.0)
+    free = 0.5 + 0.5 * ti.math.clamp(room / _CLEAR_M, 0.0, 1.0)
     if touch_s < FAR_M:
         free = 0.5 * touch_s / horizon
     out = (
         ti.static(io.dwa_cfg.weight_heading) * heading
         + ti.static(io.dwa_cfg.weight_clearance) * free
-        + ti.static(io.dwa_cfg.weight_speed) * fast * ti.static(1.0 / io.behavior_cfg.cruise_m_s)
+        + fast * ti.static(1.0 / io.behavior_cfg.cruise_m_s)
     )
     # v^2 <= 2 a d with d = v t: in time to come to rest
-    if touch_s < 0.5 * speed * ti.static(1.0 / io.baselines_cfg.acceleration_m_s2):
+    if touch_s < 0.5 * speed * ti.static(1.0 / ACCELERATION_M_S2):
         out = _FORBIDDEN + touch_s + 10.0 * room
     return out
 

@@ -8,6 +8,7 @@ or below leave free water, and those planners that try velocities may try to cli
 import taichi as ti
 
 from uuvtai.config import BaselinesConfig, BehaviorConfig, MappingConfig, TankConfig, VehicleConfig
+from uuvtai.config.baselines import ACCELERATION_M_S2, N_AXIS
 from uuvtai.kernels.core.geometry import turned_z
 from uuvtai.kernels.core.grid import cell_of
 from uuvtai.kernels.core.stage import Const, In
@@ -151,7 +152,7 @@ def reachable_velocity(
 ):
     """World velocity [m/s] of one trial: the grid at each heave, then ``wanted`` (x, y, z [m/s]) and a stop,
     both as near as the window allows."""
-    n, first_extra = ti.static(baselines_cfg.n_axis, baselines_cfg.n_reachable - 2)
+    n, first_extra = ti.static(N_AXIS, baselines_cfg.n_reachable - 2)
     yaw, own = ego.rpy[env][2], ti.Vector([ego.vel_b[env][0], ego.vel_b[env][1]])
     low = window_edge(own, -1.0, window_s, baselines_cfg, vehicle_cfg)
     high = window_edge(own, 1.0, window_s, baselines_cfg, vehicle_cfg)
@@ -177,7 +178,7 @@ def window_edge(
     vehicle_cfg: Const[VehicleConfig],
 ):
     """Surge and sway [m/s] of the window's lower (``side`` -1) or upper (1) corner around one's own."""
-    reach = ti.static(baselines_cfg.acceleration_m_s2 * window_s)
+    reach = ti.static(ACCELERATION_M_S2 * window_s)
     surge, sway = ti.static(vehicle_cfg.max_surge_m_s), ti.static(vehicle_cfg.max_sway_m_s)
     return ti.Vector(
         [

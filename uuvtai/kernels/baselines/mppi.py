@@ -29,6 +29,10 @@ from uuvtai.kernels.core.geometry import turned_z3
 from uuvtai.kernels.core.noise import STREAM_MPPI, episode_key, normal, stream_key
 from uuvtai.kernels.core.stage import Bundle, spread
 
+_HEAVE_SIGMA_M_S = 0.2
+"""Standard deviation of the noise on heave."""
+_NOISE_TAU_S = 1.0
+"""Correlation time of the noise."""
 _PLAIN = 3
 """Trials without noise: the plan, the wanted velocity, a stop."""
 
@@ -94,12 +98,10 @@ def _noise(key, sample, k, before, io: Bundle[PathIntegralIO]):
     """Noise [m/s] of a sample at a time, from that at the time before: a first-order Gauss-Markov sequence of
     constant variance."""
     step_s = ti.static(io.baselines_cfg.period_steps * io.episode_cfg.control_dt_s)
-    keep = ti.static(
-        2.718281828459045 ** (-step_s / io.mppi_cfg.noise_tau_s) if io.mppi_cfg.noise_tau_s > 0 else 0.0
-    )
+    keep = ti.static(2.718281828459045 ** (-step_s / _NOISE_TAU_S))
     fresh = ti.select(k == 0, 1.0, ti.static((1.0 - keep * keep) ** 0.5))
     first = 3 * (sample * ti.static(io.baselines.plan_w.shape[1]) + k)
-    level, heave = ti.static(io.mppi_cfg.sigma_m_s, io.mppi_cfg.heave_sigma_m_s)
+    level, heave = ti.static(io.mppi_cfg.sigma_m_s, _HEAVE_SIGMA_M_S)
     drawn = ti.Vector(
         [level * normal(key, first), level * normal(key, first + 1), heave * normal(key, first + 2)]
     )
@@ -139,7 +141,7 @@ def _cost(env, sample, io: Bundle[PathIntegralIO]):
         off = at - (begin + wanted * ((k + 1) * step_s))
         off[2] = at[2] - begin[2] - wanted[2]  # 1 s of the wanted heave is the way to the goal's depth
         state, touch = _state_cost(env, k, at, here, io)
-        cost += state + ti.static(io.mppi_cfg.weight_track) * off.norm() + _control_cost(base, noise, io)
+        cost += state + off.norm() + _control_cost(base, noise, io)
         is_touching = ti.max(is_touching, touch)
     return cost / n_control + is_touching * ti.static(io.mppi_cfg.weight_contact)
 
@@ -149,7 +151,7 @@ def _control_cost(base, noise, io: Bundle[PathIntegralIO]):
     """lambda (1 - alpha) u Sigma^-1 epsilon."""
     share = ti.static(io.mppi_cfg.temperature * (1.0 - io.mppi_cfg.exploration))
     level = ti.static(1.0 / io.mppi_cfg.sigma_m_s**2)
-    heave = ti.static(1.0 / io.mppi_cfg.heave_sigma_m_s**2 if io.mppi_cfg.heave_sigma_m_s > 0 else 0.0)
+    heave = ti.static(1.0 / _HEAVE_SIGMA_M_S**2)
     return share * (level * (base[0] * noise[0] + base[1] * noise[1]) + heave * base[2] * noise[2])
 
 

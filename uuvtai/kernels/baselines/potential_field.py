@@ -23,6 +23,13 @@ from uuvtai.kernels.baselines.local_planner import (
 )
 from uuvtai.kernels.core.stage import Bundle, spread
 
+_STATIC_REACH_M = 0.3
+"""Mapped obstacles and walls farther away push nobody."""
+_STATIC_GAIN = 0.002
+"""[m^4/s] of the push of the nearest mapped obstacle or wall."""
+_LEAST_M = 0.05
+"""Distances count as at least so much: the force stays finite."""
+
 
 @quick_launch
 @ti.kernel
@@ -58,9 +65,9 @@ def plan_potential_field(io: Bundle[PotentialFieldIO]):
 
 
 @ti.func
-def _firas(distance_m, reach_m, gain, io: Bundle[PotentialFieldIO]):
+def _firas(distance_m, reach_m, gain):
     """Size [m/s] of the push at a distance; 0 from ``reach_m`` on."""
-    near = ti.max(distance_m, ti.static(io.field_cfg.least_m))
+    near = ti.max(distance_m, _LEAST_M)
     return gain * ti.max(1.0 / near - 1.0 / reach_m, 0.0) / (near * near)
 
 
@@ -82,7 +89,6 @@ def _push_of_obstacles(env, io: Bundle[PotentialFieldIO]):
                 apart - ti.static(io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m),
                 ti.static(io.field_cfg.reach_m),
                 ti.static(io.field_cfg.gain),
-                io,
             )
             push += size * ti.Vector([out[0], out[1], ti.select(is_above, -rise, rise)])
     return push
@@ -93,5 +99,5 @@ def _push_of_map(env, io: Bundle[PotentialFieldIO]):
     """From the nearest mapped obstacle or wall, on the level."""
     away = io.behavior.away_w[env]
     room = mapped_m(env, io.ego.pos_w[env], io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
-    size = _firas(room, ti.static(io.field_cfg.static_reach_m), ti.static(io.field_cfg.static_gain), io)
+    size = _firas(room, _STATIC_REACH_M, _STATIC_GAIN)
     return size * ti.Vector([away[0], away[1], 0.0])

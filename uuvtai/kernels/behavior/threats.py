@@ -92,9 +92,7 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
         before = ti.math.clamp(io.behavior.cruise_z_m[env], low, high)
         for choice in range(n):
             z = low + (high - low) * (choice / ti.max(n - 1, 1))
-            cost = ti.static(io.behavior_cfg.weight_traffic) * level_share(
-                z, io.traffic_cfg, io.height_cfg, io.behavior_cfg, io.vehicle_cfg
-            )
+            cost = level_share(z, io.traffic_cfg, io.height_cfg, io.behavior_cfg, io.vehicle_cfg)
             cost += of_goal * ti.abs(z - goal[2])
             cost += of_change * ti.abs(z - before)
             if cost < best_cost:

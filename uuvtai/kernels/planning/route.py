@@ -17,6 +17,9 @@ from uuvtai.state import ClearanceState, MapState, RouteState
 # Where things are along a route: the vehicle's foot, and points ahead of it. Lengths are measured back from
 # the goal (way_left_m).
 
+_WINDOW_M = 1.5
+"""How far ahead of the last foot the new one is looked for."""
+
 
 @ti.func
 def level(v):
@@ -59,16 +62,14 @@ def point_left(route: In[RouteState], env, first, left_m):
 
 
 @ti.func
-def advanced_arc(route: In[RouteState], env, pos_w, route_cfg: Const[RouteConfig]):
-    """Foot of the vehicle: the nearest point of the route from the last foot on, within progress_window_m. It
-    never moves back."""
+def advanced_arc(route: In[RouteState], env, pos_w):
+    """Foot of the vehicle: the nearest point of the route from the last foot on, within _WINDOW_M. It never
+    moves back."""
     arc = route.arc[env]
     first = segment_of(route, env, arc)
     nearest = (pos_w - foot_of(route, env, arc)).norm_sqr()
     out, i = arc, first
-    while i < route.n_way[env] - 1 and route.way_left_m[env, first] - route.way_left_m[env, i] <= ti.static(
-        route_cfg.progress_window_m
-    ):
+    while i < route.n_way[env] - 1 and route.way_left_m[env, first] - route.way_left_m[env, i] <= _WINDOW_M:
         a, along = route.way_w[env, i], route.way_w[env, i + 1] - route.way_w[env, i]
         share = ti.math.clamp((pos_w - a).dot(along) / ti.max(along.norm_sqr(), 1e-12), 0.0, 1.0)
         if i == first:

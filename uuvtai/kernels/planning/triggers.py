@@ -2,12 +2,11 @@
 them is counted per replan.
 
 - initial: there is no route.
-- stuck: slower than stuck_speed_m_s for stuck_s, farther from the goal than its radius.
+- stuck: slower than 0.08 m/s for stuck_s, farther from the goal than its radius.
 - safety: a sonar return nearer than safety_range_m, or range / closing speed below safety_ttc_s.
 - intersection: a point of the look-ahead segment is not traversable any more, or a forecast obstacle comes
-closer
-  to the segment than forecast_clearance_m at a time when the vehicle could be there: the part of the segment
-  within reach_speed_m_s times that time.
+  closer to the segment than 0.35 m at a time when the vehicle could be there: the part of the segment within
+  reach_speed_m_s times that time.
 """
 
 import taichi as ti
@@ -29,6 +28,8 @@ from uuvtai.kernels.planning.io import TriggersIO
 from uuvtai.kernels.planning.medial_axis import is_traversable
 from uuvtai.kernels.planning.route import advanced_arc, cell_on_grid, level, look_along, risk_at
 
+_STUCK_M_S, _FORECAST_CLEARANCE_M = 0.08, 0.35
+
 
 @quick_launch
 @ti.kernel
@@ -40,7 +41,7 @@ def fire_triggers(io: Bundle[TriggersIO]):
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.active[env] == 1:
             if io.route.n_way[env] > 0:
-                io.route.arc[env] = advanced_arc(io.route, env, level(io.ego.pos_w[env]), io.route_cfg)
+                io.route.arc[env] = advanced_arc(io.route, env, level(io.ego.pos_w[env]))
             look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
             _count_stuck(env, io)
             closed = _is_path_closed(env, io)
@@ -52,7 +53,7 @@ def fire_triggers(io: Bundle[TriggersIO]):
 
 @ti.func
 def _count_stuck(env, io: Bundle[TriggersIO]):
-    slow = io.ego.vel_b[env].norm() < ti.static(io.route_cfg.stuck_speed_m_s)
+    slow = io.ego.vel_b[env].norm() < _STUCK_M_S
     away = (io.mission.goal_w[env] - io.ego.pos_w[env]).norm() > ti.static(io.episode_cfg.goal_radius_m)
     io.route.stuck_steps[env] = ti.select(slow and away, io.route.stuck_steps[env] + 1, 0)
 
@@ -138,7 +139,7 @@ def _obstacle_meets_path(env, track, k, io: Bundle[TriggersIO]):
     them is farther from the first one than that: an obstacle beyond reach + cell + limit of it meets none.
     """
     meets = False
-    limit = io.forecast.radius_m[env, track, k] + ti.static(io.route_cfg.forecast_clearance_m)
+    limit = io.forecast.radius_m[env, track, k] + _FORECAST_CLEARANCE_M
     obstacle = io.forecast.pos_w[env, track, k]
     reach = k * ti.static(io.route_cfg.reach_speed_m_s * io.tracking_cfg.forecast_dt_s)
     if (obstacle - io.route.ahead_w[env, 0]).norm() < reach + ti.static(io.mapping_cfg.cell_m) + limit:

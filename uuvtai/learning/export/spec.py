@@ -38,7 +38,7 @@ from uuvtai.learning.export.graph import (
     OneWish,
 )
 from uuvtai.learning.export.run_policy import GOLDEN, SCHEMA, WEIGHTS
-from uuvtai.learning.networks import TIMES_S, ActorCritic, RunningNorm
+from uuvtai.learning.networks import CLIP_OBSERVATION, TIMES_S, ActorCritic, RunningNorm
 from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
@@ -147,7 +147,7 @@ def _network(agent: PolicyAgent) -> dict[str, Any]:
         "residual_limit": config.residual_limit,
         "teacher_columns": [teacher.start, teacher.stop] if config.residual and teacher else None,
         "predict_change": agent.world_model is None or agent.world_model.config.predict_change,
-        "clip_observation": config.clip_observation,
+        "clip_observation": CLIP_OBSERVATION,
     }
 
 
