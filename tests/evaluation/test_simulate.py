@@ -154,7 +154,6 @@ PUBLISHED_DRAG_N = {
     "bluerov2_16v": 8.96,
     "bluerov2_heavy": 8.96,
     "bluerov2_li2020": 14.5,
-    "bluerov2_nmpc2019": 12.64,
     "bluerov2_vonbenzon2022": 59.0,
 }
 """at 0.6 m/s surge"""

@@ -640,7 +640,7 @@ def test_a_method_has_its_colour_in_charts_and_tables(tmp_path):
 def test_every_colour_of_a_line_has_a_lighter_one_for_the_dark():
     from uuvtai.common.colours import PALETTE
 
-    template = (files("uuvtai") / "presets/report/page.html.j2").read_text()
+    template = (files("uuvtai") / "report/page.html.j2").read_text()
     lighter = dict(re.findall(r"--series-(\d+): (#\w{6})", template))
     assert [int(i) for i in lighter] == list(range(len(PALETTE)))
     for i, colour in enumerate(PALETTE):

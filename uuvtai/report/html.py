@@ -81,7 +81,7 @@ def _template() -> Template:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     return environment.from_string(
-        (resources.files("uuvtai") / "presets" / "report" / "page.html.j2").read_text(encoding="utf-8")
+        (resources.files("uuvtai") / "report" / "page.html.j2").read_text(encoding="utf-8")
     )
 
 

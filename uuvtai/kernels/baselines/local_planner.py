@@ -154,8 +154,8 @@ def reachable_velocity(
     both as near as the window allows."""
     n, first_extra = ti.static(N_AXIS, baselines_cfg.n_reachable - 2)
     yaw, own = ego.rpy[env][2], ti.Vector([ego.vel_b[env][0], ego.vel_b[env][1]])
-    low = window_edge(own, -1.0, window_s, baselines_cfg, vehicle_cfg)
-    high = window_edge(own, 1.0, window_s, baselines_cfg, vehicle_cfg)
+    low = window_edge(own, -1.0, window_s, vehicle_cfg)
+    high = window_edge(own, 1.0, window_s, vehicle_cfg)
     cell, layer = trial % (n * n), trial // (n * n)
     share = ti.Vector([ti.cast(cell % n, ti.f32), ti.cast(cell // n, ti.f32)]) / ti.static(max(n - 1, 1))
     level, heave = low + share * (high - low), wanted[2]
@@ -170,13 +170,7 @@ def reachable_velocity(
 
 
 @ti.func
-def window_edge(
-    own,
-    side,
-    window_s: Const[float],
-    baselines_cfg: Const[BaselinesConfig],
-    vehicle_cfg: Const[VehicleConfig],
-):
+def window_edge(own, side, window_s: Const[float], vehicle_cfg: Const[VehicleConfig]):
     """Surge and sway [m/s] of the window's lower (``side`` -1) or upper (1) corner around one's own."""
     reach = ti.static(ACCELERATION_M_S2 * window_s)
     surge, sway = ti.static(vehicle_cfg.max_surge_m_s), ti.static(vehicle_cfg.max_sway_m_s)
