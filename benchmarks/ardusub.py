@@ -68,12 +68,7 @@ class Rig:
     """ArduSubs and their water, moved on by its clock."""
 
     def __init__(
-        self,
-        sim: Sim,
-        binary: str,
-        seed: int = SEED,
-        episode: int = 0,
-        pilot: int | None = None,
+        self, sim: Sim, binary: str, seed: int = SEED, episode: int = 0, pilot: int | None = None
     ) -> None:
         self.water, self._binary = WaterRows(sim, seed, episode), binary
         self._sim, count = sim, sim.num_envs

@@ -66,18 +66,7 @@ def _recorded(case: tuple[str, str, tuple[str, ...], int], folder: Path) -> list
     sensing = ("--sensors", sensors) if sensors else ()
     subprocess.run(
         [
-            *(
-                sys.executable,
-                "-m",
-                "uuvtai",
-                "eval",
-                "--agent",
-                "bt",
-                "--world",
-                world,
-                *sensing,
-                *scene,
-            ),
+            *(sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--world", world, *sensing, *scene),
             *("--episodes", str(count), "--num-envs", str(count), "--record", str(count), "--depth-images"),
             *("--seeds", str(SEED), "--device", "cpu", "--run-dir", str(run_dir), "--json"),
         ],

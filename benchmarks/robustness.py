@@ -272,10 +272,7 @@ class Bench:
             interrupted += code == 128 + number
             wrong += [f"{' '.join(command)}: {what}" for what in wrongs]
         what = f"{count} signals, every command in turn: tracebacks, other exit codes, halves"
-        return [
-            self._row(what, wrong),
-            Row("signals that hit a command at work", interrupted, f"of {count}"),
-        ]
+        return [self._row(what, wrong), Row("signals that hit a command at work", interrupted, f"of {count}")]
 
     def _signal(self, command: list[str], number: int) -> tuple[int, list[str]]:
         out = self.folder / "out"

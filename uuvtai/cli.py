@@ -41,10 +41,7 @@ log_app = typer.Typer(
 # ------------------------------------------------------------------------------------------------------- Run
 
 
-@app.command(
-    "eval",
-    epilog="Example: uuv eval --agent best --world gauntlet -D 9 --speed 1.5 --seeds 7",
-)
+@app.command("eval", epilog="Example: uuv eval --agent best --world gauntlet -D 9 --speed 1.5 --seeds 7")
 @groups.grouped
 def evaluate(
     ctx: typer.Context,
@@ -126,10 +123,7 @@ def sweep(
     output.show(result, lambda screen: show_sweep(screen, result), folder)
 
 
-@app.command(
-    "watch",
-    epilog="Example: uuv watch --world gauntlet --agent bt,dwa --episodes 4",
-)
+@app.command("watch", epilog="Example: uuv watch --world gauntlet --agent bt,dwa --episodes 4")
 @groups.grouped
 def watch_live(
     agents: groups.AgentsOrTreeGroup,
@@ -299,11 +293,7 @@ def presets(
 
 @app.command(epilog="Example: uuv doctor --compile --num-envs 64,256")
 @groups.grouped
-def doctor(
-    output: groups.PlainOutputGroup,
-    warmed: groups.CompileGroup,
-    clean: opt.Clean = False,
-) -> None:
+def doctor(output: groups.PlainOutputGroup, warmed: groups.CompileGroup, clean: opt.Clean = False) -> None:
     """Check the installation, or compile kernels in advance."""
     if not warmed.compile:
         signals.engage()
@@ -466,8 +456,7 @@ def profile(
 
 
 @app.command(
-    "pilot",
-    epilog="Example: uuv pilot --mavlink udp:127.0.0.1:14550 --start 2,3,-0.8 --goal 18,3,-0.8",
+    "pilot", epilog="Example: uuv pilot --mavlink udp:127.0.0.1:14550 --start 2,3,-0.8 --goal 18,3,-0.8"
 )
 @groups.grouped
 def pilot_vehicle(
@@ -494,10 +483,7 @@ def pilot_vehicle(
         raise typer.Exit(GATE)
 
 
-@app.command(
-    "sitl",
-    epilog="Example: uuv sitl --world pool -S 8 -D 6 --speed 0.6 --instances 3",
-)
+@app.command("sitl", epilog="Example: uuv sitl --world pool -S 8 -D 6 --speed 0.6 --instances 3")
 @groups.grouped
 def serve_sitl(
     scene: groups.SitlSceneGroup, served: groups.ServedGroup, output: groups.PlainOutputGroup
@@ -514,10 +500,7 @@ def serve_sitl(
     output.show(found, lambda screen: show_sitl(screen, found))
 
 
-@app.command(
-    "identify",
-    epilog="Example: uuv identify drive.csv --vehicle bluerov2_16v --out mine.yaml",
-)
+@app.command("identify", epilog="Example: uuv identify drive.csv --vehicle bluerov2_16v --out mine.yaml")
 @groups.grouped
 def identify_vehicle(
     file: opt.DriveLogs,
@@ -545,10 +528,7 @@ def identify_vehicle(
     say(f"wrote {target}")
 
 
-@app.command(
-    "replay",
-    epilog="Example: uuv replay runs/first/logs/bt_seed0_episode0.mcap --lose dvl:10:15",
-)
+@app.command("replay", epilog="Example: uuv replay runs/first/logs/bt_seed0_episode0.mcap --lose dvl:10:15")
 @groups.grouped
 def replay_log(
     faults: groups.FaultsGroup,
@@ -568,9 +548,7 @@ def replay_log(
         raise typer.Exit(GATE)
 
 
-@app.command(
-    epilog="Example: uuv simulate --seconds 5 --wrench 10,0,0,0,0,0 --vehicle bluerov2_heavy",
-)
+@app.command(epilog="Example: uuv simulate --seconds 5 --wrench 10,0,0,0,0,0 --vehicle bluerov2_heavy")
 @groups.grouped
 def simulate(
     motion: groups.MotionGroup,

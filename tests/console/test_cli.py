@@ -320,15 +320,9 @@ def test_presets_are_listed_and_shown(capfd):
     assert {"clean", "paper", "nominal", "harsh", "multibeam", "multibeam_image", "ping360"} == set(
         listed["sensors"]
     )
-    assert {
-        "paper",
-        "ppo",
-        "distill_20",
-        "curriculum",
-        "no_risk_scaling",
-        "no_world_model",
-        "smoke",
-    } <= set(listed["train"])
+    assert {"paper", "ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model", "smoke"} <= set(
+        listed["train"]
+    )
     code, out, _ = uuv(capfd, "presets", "show", "gauntlet", "--all")
     assert code == 0
     assert "n_dynamic: 6" in out

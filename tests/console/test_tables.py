@@ -44,10 +44,7 @@ def evaluation():
         samples.agent(name, k, 500 - k, 500, privileged=name == "bt+truth", env_steps_per_s=25123.4)
         for name, k in names.items()
     ]
-    return samples.evaluation_document(*agents) | {
-        "remainder": [],
-        "paired": paired(agents),
-    }
+    return samples.evaluation_document(*agents) | {"remainder": [], "paired": paired(agents)}
 
 
 def explained():

@@ -296,12 +296,7 @@ def test_seeds(make):
     )
     again, _info = envs.reset(seed=np.int64(SEED))
     np.testing.assert_array_equal(again, first)
-    for seed, error in (
-        ([1] * N, TypeError),
-        (1.5, TypeError),
-        ("1", TypeError),
-        (-1, ValueError),
-    ):
+    for seed, error in (([1] * N, TypeError), (1.5, TypeError), ("1", TypeError), (-1, ValueError)):
         with pytest.raises(error, match="seed"):
             envs.reset(seed=seed)
     np.testing.assert_array_equal(envs.reset(seed=SEED)[0], first)

@@ -282,16 +282,7 @@ def test_without_ray_the_error_says_what_to_install(monkeypatch):
 # --------------------------------------------------------------------------------------------- the real thing
 
 HORIZON_S = 8.0
-OPTIONS = [
-    *SmallSim.OPTIONS,
-    "--set",
-    "episode.horizon_steps=400",
-    "-S",
-    "4",
-    "--episodes",
-    "4",
-    "--json",
-]
+OPTIONS = [*SmallSim.OPTIONS, "--set", "episode.horizon_steps=400", "-S", "4", "--episodes", "4", "--json"]
 
 
 def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):

@@ -39,11 +39,7 @@ def networks(n_obs=N_OBS, seed=0, **config):
 
 def state_of(policy, model, n_obs):
     """What a checkpoint holds of them."""
-    return {
-        "policy": policy.state_dict(),
-        "world_model": model.state_dict(),
-        "env": {},
-    }
+    return {"policy": policy.state_dict(), "world_model": model.state_dict(), "env": {}}
 
 
 def flown(policy, model, rows, steps=4):

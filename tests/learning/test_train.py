@@ -71,15 +71,7 @@ def test_it_learns_the_task_from_its_teacher_and_says_so():
     assert set(WALL_TIMES) < set(last)
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        {},
-        {
-            "ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16},
-        },
-    ],
-)
+@pytest.mark.parametrize("more", [{}, {"ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16}}])
 def test_four_iterations_equal_two_and_two_more_after_a_resume(more):
     config = config_of(**more)
     whole = Trainer(PointEnv(), config)

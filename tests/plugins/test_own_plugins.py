@@ -146,11 +146,7 @@ def test_two_rows_never_share_a_name(write):
     [
         (None, "mine.py:act", "mine.py cannot be read (No such file or directory)"),
         ("def act(view:\n", "mine.py:act", "mine.py:1: SyntaxError"),
-        (
-            "x = 1\nprint(y)\n",
-            "mine.py:act",
-            "mine.py:2: NameError: name 'y' is not defined (while --agent",
-        ),
+        ("x = 1\nprint(y)\n", "mine.py:act", "mine.py:2: NameError: name 'y' is not defined (while --agent"),
         ("raise SystemExit(3)\n", "mine.py:act", "mine.py:1: SystemExit: 3"),
         ("def drive(view): ...\n", "mine.py:act", "mine.py has no 'act'; it has drive"),
         (
@@ -618,10 +614,7 @@ def test_the_command_line_tells_in_one_line_and_keeps_the_traceback(write, capfd
         (["reproduce", "--agent", "bt"], "bt: is no plugin of yours"),
         (["reproduce", "--planner", "none.py"], "none.py cannot be read"),
         (["simulate", "--seconds", "1", "--agent", "none.py"], "none.py cannot be read"),
-        (
-            ["simulate", "--seconds", "1", "--agent", "bt", "--wrench", "1,0,0,0,0,0"],
-            "--wrench: not beside",
-        ),
+        (["simulate", "--seconds", "1", "--agent", "bt", "--wrench", "1,0,0,0,0,0"], "--wrench: not beside"),
     ],
 )
 def test_wrong_words_are_refused_before_anything_begins(arguments, says, capfd, tmp_path, monkeypatch):

@@ -32,10 +32,7 @@ def page(tmp_path_factory):
     """A page with everything that a report can hold, with long names."""
     folder = tmp_path_factory.mktemp("browser") / "run"
     long = "a_method_with_a_name_that_is_far_longer_than_any_column_would_like_it_to_be"
-    agents = [
-        samples.agent(long, causes=[samples.CAUSE], explain=[1, 2]),
-        samples.agent("bt"),
-    ]
+    agents = [samples.agent(long, causes=[samples.CAUSE], explain=[1, 2]), samples.agent("bt")]
     verdict = {"claim": "it swims " * 30, "verdict": "holds", "numbers": "3 of 3"}
     blocks = [
         {"kind": "verdicts", "items": [verdict]},

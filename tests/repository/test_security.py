@@ -521,8 +521,7 @@ SHOWN = "pictures/x.png explain/x.png videos/x.webm"
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
-    [*product(READ.split(), FILLS), *product(SHOWN.split(), list(FILLS)[:3])],
+    ("name", "kind"), [*product(READ.split(), FILLS), *product(SHOWN.split(), list(FILLS)[:3])]
 )
 def test_a_report_waits_for_nothing_and_reads_nothing_endless(run, name, kind):
     place(run / name, FILLS[kind])

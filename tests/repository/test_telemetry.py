@@ -143,9 +143,7 @@ def test_the_call_is_made_before_a_session(monkeypatch):
     order = []
     monkeypatch.delenv(graph.VARIABLE, raising=False)
     monkeypatch.setattr(
-        onnxruntime,
-        "disable_telemetry_events",
-        lambda: order.append(f"off {os.environ.get(graph.VARIABLE)}"),
+        onnxruntime, "disable_telemetry_events", lambda: order.append(f"off {os.environ.get(graph.VARIABLE)}")
     )
     monkeypatch.setattr(
         onnxruntime, "InferenceSession", lambda *_arguments, **_words: order.append("session")

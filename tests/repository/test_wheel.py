@@ -54,10 +54,7 @@ def built(tmp_path_factory):
     """(source distribution, wheel made from it), built from a copy of the checkout."""
     place = tmp_path_factory.mktemp("built")
     copy, dist = place / "checkout", place / "dist"
-    for name in [
-        *KEPT,
-        *(path.name for path in ROOT.iterdir() if path.is_file()),
-    ]:
+    for name in [*KEPT, *(path.name for path in ROOT.iterdir() if path.is_file())]:
         source = ROOT / name
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():

@@ -171,11 +171,7 @@ def test_no_speed_is_beyond_the_limits(wanted):
         assert (surge, sway, heave, turn) == STOP
 
 
-@given(
-    SPEEDS,
-    st.tuples(floats(-5, 25), floats(-5, 11), floats(-3, 1)),
-    floats(-math.pi, math.pi),
-)
+@given(SPEEDS, st.tuples(floats(-5, 25), floats(-5, 11), floats(-3, 1)), floats(-math.pi, math.pi))
 @settings(max_examples=500, deadline=None)
 def test_nobody_is_driven_out_of_the_fence(wanted, pos_w, yaw):
     view = changed(pos_w=pos_w, rpy=(0.0, 0.0, yaw))

@@ -570,10 +570,7 @@ class Native:
 
 
 def adopt(
-    bundles: Iterable[Any],
-    memory: Memory,
-    recipe: Callable[[], bytes] | None = None,
-    alone: bool = False,
+    bundles: Iterable[Any], memory: Memory, recipe: Callable[[], bytes] | None = None, alone: bool = False
 ) -> None:
     """Launch kernels on these bundles by machine code of their own from now on, where this machine allows it;
     one line says why where it does not. ``recipe``: what a second process compiles the same by, where much is

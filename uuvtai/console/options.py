@@ -156,8 +156,7 @@ Iterations = Annotated[
 TrainEnvs = Annotated[int | None, Option("--num-envs", help="Parallel environments (train.num_envs).")]
 TrainSeed = Annotated[int | None, Option("--seed", help="Random seed (train.seed).")]
 TrainWorld = Annotated[
-    str | None,
-    _preset("--world", "world", f"World: {_WORLDS}, or a YAML file \\[default: the preset's]."),
+    str | None, _preset("--world", "world", f"World: {_WORLDS}, or a YAML file \\[default: the preset's].")
 ]
 TrainSensors = Annotated[
     str | None,
@@ -194,8 +193,7 @@ ReportPaper = Annotated[
 ]
 Force = Annotated[bool, Option("--force", help="Replace files that are there.")]
 PresetsAction = Annotated[
-    str | None,
-    Argument(metavar="show", help="'show' prints one preset.", autocompletion=lambda: ["show"]),
+    str | None, Argument(metavar="show", help="'show' prints one preset.", autocompletion=lambda: ["show"])
 ]
 PresetName = Annotated[
     str | None,
@@ -231,14 +229,12 @@ LogForce = Annotated[bool, Option("--force", help="Replace the file that --out n
 LogExportOut = Annotated[Path, _out("New or empty folder.")]
 Topics = Annotated[list[str] | None, Option("--topic", help="Only this topic (repeatable).")]
 LogFormat = Annotated[
-    str,
-    parsing.choice("--format", ("json", "csv", "npz"), "JSON (a line a message), CSV or NumPy arrays."),
+    str, parsing.choice("--format", ("json", "csv", "npz"), "JSON (a line a message), CSV or NumPy arrays.")
 ]
 RepairOut = Annotated[Path | None, _out("Repaired file \\[default: NAME.repaired.mcap].")]
 ConvertOut = Annotated[Path | None, _out("New file or folder \\[default: NAME_rosbag2, or NAME.log.mcap].")]
 ConvertFrom = Annotated[
-    str,
-    parsing.choice("--from", ("mcap", "rosbag2"), "A log becomes a ROS 2 bag, or a bag becomes a log."),
+    str, parsing.choice("--from", ("mcap", "rosbag2"), "A log becomes a ROS 2 bag, or a bag becomes a log.")
 ]
 RenderLogs = Annotated[
     list[Path], Argument(metavar="FILE", help="Logs of one episode; a picture shows all trajectories.")
@@ -259,8 +255,7 @@ RenderWidth = Annotated[
 
 TickedTree = Annotated[str, _tree("Tree that drives")]
 ProfilePreset = Annotated[
-    str,
-    _preset("--preset", "train", f"Training preset to time: {parsing.names('train')}, or a YAML file."),
+    str, _preset("--preset", "train", f"Training preset to time: {parsing.names('train')}, or a YAML file.")
 ]
 ProfileSeconds = Annotated[float, Option("--seconds", help="Measured time per batch size \\[s].")]
 Density = Annotated[bool, Option("--density", help="Also loop time against the number of obstacles.")]
@@ -415,8 +410,7 @@ Lose = Annotated[
 FaultSeed = Annotated[int, Option("--fault-seed", help="Seed of --drop and --jitter.")]
 SimulateSeconds = Annotated[float, Option("--seconds", help="Duration \\[s].")]
 SimulateAgent = Annotated[
-    str | None,
-    _agents("Who drives from rest to the goal of world open: bt, another tree, or mine.py:act."),
+    str | None, _agents("Who drives from rest to the goal of world open: bt, another tree, or mine.py:act.")
 ]
 Wrench = Annotated[str | None, Option("--wrench", help="Constant body wrench fx,fy,fz,mx,my,mz [N, N m].")]
 Command = Annotated[

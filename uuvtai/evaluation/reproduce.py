@@ -399,10 +399,7 @@ def _by_preset(main: dict[str, Any], budget: Budget, own: Sequence[str]) -> dict
 
 
 def _claims(
-    root: Path,
-    results: dict[str, Any],
-    by_preset: dict[str, Any],
-    own: Sequence[str],
+    root: Path, results: dict[str, Any], by_preset: dict[str, Any], own: Sequence[str]
 ) -> list[claims.Claim]:
     cells = results["sweep/pool"]["cells"]
     names = list(dict.fromkeys(cell["agent"] for cell in cells))

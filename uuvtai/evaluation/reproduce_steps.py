@@ -92,11 +92,7 @@ def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
             ("eval", *_agents("bt", *own, agent), "--world", "transfer", *at, str(budget.episodes)),
             "eval/transfer",
         ),
-        Step(
-            "scenario A",
-            ("eval", *_agents("bt", *own, *agents), *recorded, "--video"),
-            "eval/scenario_a",
-        ),
+        Step("scenario A", ("eval", *_agents("bt", *own, *agents), *recorded, "--video"), "eval/scenario_a"),
         Step(
             "scenario B",
             ("eval", *_agents("bt", *own, *agents), "-S", "12", "-D", "9", *recorded, "--video"),
@@ -119,16 +115,7 @@ def _train(preset: str, seed: int, budget: Budget) -> tuple[str, ...]:
 
 def _sweep(agent: str, grid: str, episodes: int, *more: str, own: Sequence[str] = ()) -> tuple[str, ...]:
     seed = ("--seeds", str(EVALUATION_SEED))
-    return (
-        "sweep",
-        *_agents("bt", *own, agent),
-        "--grid",
-        grid,
-        "--episodes",
-        str(episodes),
-        *seed,
-        *more,
-    )
+    return ("sweep", *_agents("bt", *own, agent), "--grid", grid, "--episodes", str(episodes), *seed, *more)
 
 
 def _beyond(agent: str, budget: Budget, own: Sequence[str]) -> list[Step]:

@@ -18,13 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.common.enums import COLLIDED, FINAL_OUTCOMES, PLANNERS, REASONS, TRIGGERS
-from uuvtai.common.files import (
-    open_to_append,
-    read_bytes,
-    read_text,
-    refuse_links,
-    truncate,
-)
+from uuvtai.common.files import open_to_append, read_bytes, read_text, refuse_links, truncate
 from uuvtai.common.presets import preset_names
 from uuvtai.common.statistics import (
     bootstrap_interval,

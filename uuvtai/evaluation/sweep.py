@@ -169,11 +169,7 @@ def _agent_key(given: Any) -> AgentKey:
 
 
 def _refuse_other_policies(
-    place: Path,
-    request: SweepRequest,
-    agents: Sequence[str],
-    checkpoints: dict[str, str],
-    watch: SweepWatch,
+    place: Path, request: SweepRequest, agents: Sequence[str], checkpoints: dict[str, str], watch: SweepWatch
 ) -> None:
     """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
     nothing."""

@@ -157,11 +157,7 @@ def _moments(sim: Sim, rows: np.ndarray, path: np.ndarray, now_s: float) -> Trac
     env, track = np.nonzero(there & np.isfinite(np.min(cost, -1)))
     chosen = frame[env, track]
     column = sim.rows(s.mixture.column, envs)[env, track]
-    parts = (
-        column,
-        chosen,
-        _in_frame(obstacles[env, body[env, track], 3:], chosen),
-    )
+    parts = (column, chosen, _in_frame(obstacles[env, body[env, track], 3:], chosen))
     return TrackMoments(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in parts))
 
 

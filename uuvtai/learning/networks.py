@@ -219,11 +219,7 @@ class ActorCritic(nn.Module):
     """
 
     def __init__(
-        self,
-        n_in: int,
-        config: PolicyConfig,
-        teacher_slice: slice | None,
-        generator: torch.Generator,
+        self, n_in: int, config: PolicyConfig, teacher_slice: slice | None, generator: torch.Generator
     ) -> None:
         """``teacher_slice``: columns of x with the teacher's action; ValueError where a residual policy has
         none."""

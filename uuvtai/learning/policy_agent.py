@@ -91,11 +91,7 @@ class PolicyAgent:
         self._action = self._offset if teacher is None else teacher + self._offset
         value, residual, uncertainty = self._said.clone().T
         self.decision = AgentDecision(
-            self._action.clamp(-1.0, 1.0),
-            value,
-            self.policy.log_std.exp(),
-            residual,
-            uncertainty,
+            self._action.clamp(-1.0, 1.0), value, self.policy.log_std.exp(), residual, uncertainty
         )
         return self.decision
 

@@ -33,13 +33,7 @@ class Rollout:
     in x, the leaf of the tree that gave it (-1: none), and the weight of the sample in the distillation.
     """
 
-    def __init__(
-        self,
-        steps: int,
-        num_envs: int,
-        n_in: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
+    def __init__(self, steps: int, num_envs: int, n_in: int, device: torch.device | str = "cpu") -> None:
         """``steps`` = T, ``num_envs`` = N."""
         self.steps, self.num_envs, self.n_in = steps, num_envs, n_in
 

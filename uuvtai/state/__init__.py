@@ -27,13 +27,7 @@ from uuvtai.state.perception import (
     TrackState,
     TurnHistory,
 )
-from uuvtai.state.planning import (
-    ClearanceMemory,
-    ClearanceState,
-    ObservationState,
-    RouteState,
-    VoronoiState,
-)
+from uuvtai.state.planning import ClearanceMemory, ClearanceState, ObservationState, RouteState, VoronoiState
 from uuvtai.state.sensors import (
     DepthImage,
     Proprioception,

@@ -14,14 +14,7 @@ from uuvtai.config import (
 )
 from uuvtai.config.learning import SurrogateConfig
 from uuvtai.kernels.core.stage import Const, In
-from uuvtai.state import (
-    ClearanceState,
-    ClockState,
-    ForecastState,
-    MissionState,
-    Proprioception,
-    TrackState,
-)
+from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState, Proprioception, TrackState
 
 AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL = (
     0,

@@ -354,11 +354,7 @@ def drive_surrogate(
 
 @ti.kernel
 def begin_surrogate(
-    begun: IntVector,
-    mission: FloatMatrix,
-    scenario: IntVector,
-    ego: FloatMatrix,
-    track: AnyTensor,
+    begun: IntVector, mission: FloatMatrix, scenario: IntVector, ego: FloatMatrix, track: AnyTensor
 ):
     """At rest at the start of their scenarios, nothing seen, in the envs where ``begun`` is 1."""
     for env in range(ego.shape[0]):

@@ -14,13 +14,7 @@ from uuvtai.kernels.core.stage import AnyTensor, Bundle
 from uuvtai.state import BehaviorState, MissionState, Proprioception, allocate
 
 N_ENV = 6
-SIZES = {
-    "n_env": N_ENV,
-    "n_track": 1,
-    "n_node": 1,
-    "n_candidate": LANES,
-    "n_tuned": len(TUNED),
-}
+SIZES = {"n_env": N_ENV, "n_track": 1, "n_node": 1, "n_candidate": LANES, "n_tuned": len(TUNED)}
 POOL = {"z_m": [-1.2, -0.4], "height_m": [0.3, 0.5]}
 LOW, HIGH = -1.4, -0.2
 """Edges of the band: 0.2 m off the floor at -1.6 m and off the surface."""

@@ -10,14 +10,7 @@ from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.oracles import small_sonar
 from tests.oracles import tracking as oracle
-from uuvtai.config import (
-    EpisodeConfig,
-    ForecastConfig,
-    HeightConfig,
-    SonarConfig,
-    TankConfig,
-    TrackingConfig,
-)
+from uuvtai.config import EpisodeConfig, ForecastConfig, HeightConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core import kalman
 from uuvtai.kernels.perception import tracking
 from uuvtai.kernels.perception.io import TrackingIO

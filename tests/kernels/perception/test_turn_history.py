@@ -78,10 +78,7 @@ class Stage:
     def turns(self, env):
         """Remembered turns of one env: rows of (x, y, in x, in y, out x, out y, weight)."""
         table = self.read()
-        rows = np.stack(
-            [table[name][env] for name in oracle.TURN_ROWS],
-            -1,
-        )
+        rows = np.stack([table[name][env] for name in oracle.TURN_ROWS], -1)
         return rows[rows[:, 6] > 0]
 
 

@@ -176,11 +176,7 @@ def test_an_observation_of_another_width_is_refused(folder):
 
 @pytest.mark.skipif(bool(missing_packages()), reason="needs the extra uuvtai[export]")
 @pytest.mark.parametrize(
-    "changes",
-    [
-        {"policy__residual": True, "policy__hold_steps": 10},
-        {"world_model__as_features": False},
-    ],
+    "changes", [{"policy__residual": True, "policy__hold_steps": 10}, {"world_model__as_features": False}]
 )
 def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, capfd):
     pytest.importorskip("onnxruntime")
@@ -357,12 +353,7 @@ def test_evaluations_of_something_else_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="does not evaluate this checkpoint"):
         evaluations_of(found, [written(tmp_path / "other", other)])
     for number, broken in enumerate(
-        (
-            result_of(found, k=-3),
-            {"agents": [3]},
-            [],
-            {"agents": [{"checkpoint": {"sha256": found.sha256}}]},
-        )
+        (result_of(found, k=-3), {"agents": [3]}, [], {"agents": [{"checkpoint": {"sha256": found.sha256}}]})
     ):
         with pytest.raises(ConfigError, match="is no result of uuv eval"):
             evaluations_of(found, [written(tmp_path / str(number), broken)])

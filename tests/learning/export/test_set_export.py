@@ -209,10 +209,7 @@ def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp
     ways = small.sim.rows(small.sim.s.mission.goal_w) - small.sim.rows(small.sim.s.mission.start_w)
     for step in range(7):
         action = pilot.decide(torch.zeros(small.N, 1)).action.numpy()
-        yaw, z = (
-            small.sim.rows(small.sim.s.ego.rpy)[:, 2],
-            small.sim.rows(small.sim.s.ego.pos_w)[:, 2],
-        )
+        yaw, z = (small.sim.rows(small.sim.s.ego.rpy)[:, 2], small.sim.rows(small.sim.s.ego.pos_w)[:, 2])
         if step % 5 == 0:
             wishes = [
                 policy.act(obstacles, own).wish

@@ -133,13 +133,7 @@ def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
     )
     doubt = place_doubt(io.ego.pose_cov[env], io.behavior_cfg)
     static_mean, static_contact = static_depths(
-        env,
-        drive,
-        doubt,
-        io.clearance,
-        io.behavior_cfg,
-        io.tank_cfg,
-        io.mapping_cfg,
+        env, drive, doubt, io.clearance, io.behavior_cfg, io.tank_cfg, io.mapping_cfg
     )
     off = _distance_lanes(cx, cy, cz, io.behavior.follow_vel_w[env]) * (
         ti.static(io.behavior_cfg.weight_deviation / io.behavior_cfg.cruise_m_s)

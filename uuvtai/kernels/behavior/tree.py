@@ -253,10 +253,7 @@ def _answer(env, node, io: Bundle[BehaviorIO]):
         usual_m = io.behavior_cfg.emergency_range_m * tuned(env, RANGE, io.behavior)
         near = io.behavior.nearest_m[env] < _port(node, 1, usual_m, io)
         closing = io.behavior.ttc_s[env] < FAR_M
-        holds = ti.cast(
-            io.behavior.ttc_s[env] < _port(node, 0, usual_s, io) or (near and closing),
-            ti.i32,
-        )
+        holds = ti.cast(io.behavior.ttc_s[env] < _port(node, 0, usual_s, io) or (near and closing), ti.i32)
     elif leaf == codes.PREDICTED_CONFLICT:
         usual_s = io.behavior_cfg.conflict_within_s * tuned(env, WITHIN, io.behavior)
         seen = io.behavior.conflict_s[env] <= _port(node, 0, usual_s, io)

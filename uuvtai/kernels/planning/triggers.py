@@ -144,8 +144,7 @@ def _obstacle_meets_path(env, track, k, io: Bundle[TriggersIO]):
     reach = k * ti.static(io.route_cfg.reach_speed_m_s * io.tracking_cfg.forecast_dt_s)
     if (obstacle - io.route.ahead_w[env, 0]).norm() < reach + ti.static(io.mapping_cfg.cell_m) + limit:
         last = ti.min(
-            ti.cast(reach / ti.static(io.mapping_cfg.cell_m), ti.i32) + 1,
-            io.route.n_ahead[env] - 1,
+            ti.cast(reach / ti.static(io.mapping_cfg.cell_m), ti.i32) + 1, io.route.n_ahead[env] - 1
         )
         for j in range(last + 1):
             if (obstacle - io.route.ahead_w[env, j]).norm() < limit:

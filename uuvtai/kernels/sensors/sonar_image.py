@@ -22,12 +22,7 @@ from uuvtai.config.multibeam import (
     pad_beams,
 )
 from uuvtai.kernels.core.geometry import BOX, FAR_M, SPHERE
-from uuvtai.kernels.core.noise import (
-    STREAM_SONAR_HISS,
-    STREAM_SONAR_SPECKLE,
-    normal_pair_lanes,
-    stream_key,
-)
+from uuvtai.kernels.core.noise import STREAM_SONAR_HISS, STREAM_SONAR_SPECKLE, normal_pair_lanes, stream_key
 from uuvtai.kernels.core.simd import LANES, f16x
 from uuvtai.kernels.core.stage import Bundle, spread
 from uuvtai.kernels.sensors.io import SonarIO
