@@ -236,12 +236,10 @@ def agent_names(incomplete: str) -> list[str]:
     trees = preset_names("tree")
     found = _starting(
         [*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle"], last
-    ) + _paths(last, lambda path: path.suffix in (".xml", ".yaml", ".py", ".onnx") or _is_trained(path))
+    ) + _paths(
+        last, lambda path: path.suffix in (".xml", ".yaml", ".py", ".onnx") or (path / "checkpoints").is_dir()
+    )
     return [f"{before}{comma}{name}" for name in found]
-
-
-def _is_trained(path: Path) -> bool:
-    return (path / "checkpoints").is_dir()
 
 
 def files(*suffixes: str) -> Complete:

@@ -628,12 +628,8 @@ def show_simulation(screen: Screen, result: dict[str, Any], title: str, driven: 
     if driven is not None:
         goal = ", ".join(f"{value:.2f}" for value in result["goal"])
         title = f"{title}, {driven.removeprefix('controller:')} drives to ({goal})"
-    rows = []
-    for i in _picked(len(result["t"]), _ROWS):
+    rows, n = [], len(result["t"])
+    for i in sorted({round(i * (n - 1) / (_ROWS - 1)) for i in range(_ROWS)}) if n else []:
         values = [result["t"][i], *result["position"][i], *result["rpy_deg"][i], *result["nu"][i]]
         rows.append([f"{value:.3f}" for value in values])
     screen.table(Table(_STATE, rows, title))
-
-
-def _picked(n: int, wanted: int) -> list[int]:
-    return sorted({round(i * (n - 1) / max(1, wanted - 1)) for i in range(wanted)}) if n else []

@@ -540,7 +540,12 @@ def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
     not), physics = what the oracle cannot reach either. A part may be negative where knowing more did not
     help; ``lost_with_truth`` counts the episodes that the agent won and its ``+truth`` did not.
     """
-    won = {entry["name"]: _won(entry) for entry in entries}
+    won = {
+        entry["name"]: {
+            (one["seed"], one["episode"]) for one in entry["episodes_detail"] if one["outcome"] == "success"
+        }
+        for entry in entries
+    }
     if ORACLE not in won:
         return []
     ceiling = won[ORACLE]
@@ -557,11 +562,3 @@ def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
         for name, own in won.items()
         if (with_truth := won.get(f"{name}+{TRUTH}")) is not None
     ]
-
-
-def _won(entry: dict[str, Any]) -> set[tuple[int, int]]:
-    return {
-        (detail["seed"], detail["episode"])
-        for detail in entry["episodes_detail"]
-        if detail["outcome"] == "success"
-    }

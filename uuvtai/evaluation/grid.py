@@ -46,8 +46,8 @@ class Grid:
     def cells(self) -> list[Cell]:
         """Every cell once; where nothing moves (D = 0) one speed of obstacles stands for all."""
         found = self._alone() if self.one_at_a_time else self._combined()
-        kept: dict[str, Cell] = {repr(sorted(cell.items())): cell for cell in map(_without_speed, found)}
-        return list(kept.values())
+        cells = ({name: v for name, v in cell.items() if name != "v" or cell.get("D") != 0} for cell in found)
+        return list({repr(sorted(cell.items())): cell for cell in cells}.values())
 
     def _combined(self) -> list[Cell]:
         return [
@@ -60,10 +60,6 @@ class Grid:
     def document(self) -> dict[str, Any]:
         """As ``uuv sweep --json`` tells it."""
         return {name: list(values) for name, values in self.axes.items()}
-
-
-def _without_speed(cell: Cell) -> Cell:
-    return {name: value for name, value in cell.items() if name != "v" or cell.get("D") != 0}
 
 
 def grid_of(texts: Sequence[str]) -> Grid:

@@ -142,7 +142,10 @@ def results_page(document: dict[str, Any]) -> str:
         _claim_lines(document),
         _main(document),
         _ceilings(document),
-        _sweeps(document),
+        *(
+            f"## Sweep: {name}\n`{document['commands'][f'sweep/{name}']}`\n\n{_sweep_lines(sweep)}"
+            for name, sweep in document["sweeps"].items()
+        ),
         _timing(document),
         "## Where the paper's figures do not add up\n"
         + "\n".join(f"- {text}" for text in document["inconsistencies"]),
@@ -197,13 +200,6 @@ def _ceilings(document: dict[str, Any]) -> str:
     note = "`bt+truth` is told the true obstacles, `oracle` knows the future: privileged, no agents."
     return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + text_table(
         ["", "success", "collision", "mean time of successes"], rows
-    )
-
-
-def _sweeps(document: dict[str, Any]) -> str:
-    return "\n\n".join(
-        f"## Sweep: {name}\n`{document['commands'][f'sweep/{name}']}`\n\n{_sweep_lines(sweep)}"
-        for name, sweep in document["sweeps"].items()
     )
 
 

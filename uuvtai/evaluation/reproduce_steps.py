@@ -176,7 +176,8 @@ def run_step(step: Step, root: Path) -> None:
     """Run what is not done; what was begun goes on. KeyboardInterrupt, RunFolderError as commands end."""
     place = root / step.folder
     begun = place.exists() and any(place.iterdir())
-    resume = begun and step.resumes and _can_resume(step, place)
+    written = "checkpoints/step_*" if step.command[0] == "train" else "sweep_request.json"
+    resume = begun and step.resumes and any(place.glob(written))
     if begun and not resume:
         shutil.rmtree(place)
     done = launch(step.argv(root, resume))
@@ -208,14 +209,6 @@ def launch(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
         child.communicate()  # it saves what it keeps
         raise
     return subprocess.CompletedProcess(command, child.returncode, printed)
-
-
-def _can_resume(step: Step, place: Path) -> bool:
-    return (
-        any((place / "checkpoints").glob("step_*"))
-        if step.command[0] == "train"
-        else (place / "sweep_request.json").exists()
-    )
 
 
 def _die_with_parent() -> None:

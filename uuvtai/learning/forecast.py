@@ -46,6 +46,9 @@ def scores_of(mixture: Mixture, truth: torch.Tensor) -> dict[str, float]:
     likeliest future is said to be, and how often it is the nearest."""
     last = (mixture.place[:, :, -1] - truth[:, None, -1]).norm(dim=-1)
     likeliest = mixture.log_weight.argmax(-1)
+    nearest = (
+        (mixture.place - truth[:, None]).norm(dim=-1).mean(-1).argmin(-1)
+    )  # by the mean of the whole way
     one = last.gather(1, likeliest[:, None])[:, 0]
     return {
         "nll": float(negative_log_likelihood(mixture, truth).mean()),
@@ -54,13 +57,8 @@ def scores_of(mixture: Mixture, truth: torch.Tensor) -> dict[str, float]:
         "nearest_median_m": float(last.amin(-1).median()),
         "nearest_p90_m": float(last.amin(-1).quantile(0.9)),
         "likeliest_said": float(mixture.log_weight.amax(-1).exp().mean()),
-        "likeliest_right": float((nearest_way(mixture, truth) == likeliest).float().mean()),
+        "likeliest_right": float((nearest == likeliest).float().mean()),
     }
-
-
-def nearest_way(mixture: Mixture, truth: torch.Tensor) -> torch.Tensor:
-    """(n,) which future's whole way is nearest to what came, by its mean distance."""
-    return (mixture.place - truth[:, None]).norm(dim=-1).mean(-1).argmin(-1)
 
 
 # ------------------------------------------------------------------------------------------------------------

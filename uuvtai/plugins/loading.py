@@ -72,7 +72,11 @@ def object_of(spec: PluginSpec) -> Any:
     """The object that the plugin names, its file imported once per content. Raises PluginError, FileError."""
     module = _module(spec)
     if not hasattr(module, spec.name):
-        there = [name for name, value in vars(module).items() if _is_own(value, module)]
+        there = [
+            name
+            for name, value in vars(module).items()
+            if callable(value) and getattr(value, "__module__", "") == module.__name__
+        ]
         raise PluginError(
             f"{spec.option}: {spec.path} has no {spec.name!r}; it has {', '.join(there) or 'no function'}"
         )
@@ -98,10 +102,6 @@ def _module(spec: PluginSpec) -> ModuleType:
             raise failed(error, spec.path, f"while {spec.option} was imported") from error
         _loaded[key] = module
     return _loaded[key]
-
-
-def _is_own(value: Any, module: ModuleType) -> bool:
-    return callable(value) and getattr(value, "__module__", "") == module.__name__
 
 
 def made(found: Any, spec: PluginSpec, about: About) -> Any:

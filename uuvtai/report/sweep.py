@@ -104,21 +104,20 @@ def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
     if varies_alone(document):
         return [
             Paragraph(f"{said} One axis at a time, all else unchanged."),
-            *_each_axis(document, command),
+            *(
+                _axis_figure(
+                    of_axis(axis, document),
+                    axis,
+                    places(axis, document),
+                    place_names(axis, document),
+                    command,
+                )
+                for axis in axes_of(document)
+            ),
             _cells(cells, document, "Every cell"),
         ]
     drawn = _curves(document, command) if len(varying(axes)) < 2 else _maps(document, command)
     return [Paragraph(said), *drawn]
-
-
-def _each_axis(document: dict[str, Any], command: str) -> list[Block]:
-    """Success and collision along every axis; the unchanged condition stands first."""
-    return [
-        _axis_figure(
-            of_axis(axis, document), axis, places(axis, document), place_names(axis, document), command
-        )
-        for axis in axes_of(document)
-    ]
 
 
 def _maps(document: dict[str, Any], command: str) -> list[Block]:

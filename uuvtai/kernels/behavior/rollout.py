@@ -164,7 +164,7 @@ def _future_depths(
     level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
     reach_speed = level_vel.norm() + ti.static(_fastest(behavior_cfg))
     above, below = forecast.above_w[env, track], forecast.below_w[env, track]
-    step_decay = ti.static(_decay(tracking_cfg.forecast_dt_s, behavior_cfg.lag_s)) * ti.exp(
+    step_decay = ti.static(2.718281828459045 ** (-tracking_cfg.forecast_dt_s / behavior_cfg.lag_s)) * ti.exp(
         ti.static(-tracking_cfg.forecast_dt_s / behavior_cfg.lag_s) * (1.0 / drive.slower - 1.0)
     )
     lag_s = behavior_cfg.lag_s * drive.slower
@@ -341,10 +341,6 @@ def place_doubt(pose_cov, behavior_cfg: Const[BehaviorConfig]):
     half, apart = 0.5 * (pose_cov[0] + pose_cov[3]), 0.5 * (pose_cov[0] - pose_cov[3])
     worst = half + ti.sqrt(apart * apart + pose_cov[1] * pose_cov[1])
     return behavior_cfg.place_sigmas * ti.sqrt(ti.max(worst, 0.0))
-
-
-def _decay(dt_s, lag_s):
-    return 2.718281828459045 ** (-dt_s / lag_s)
 
 
 def _fastest(behavior_cfg):

@@ -118,17 +118,12 @@ def level_share(
 ):
     """Share of the expected obstacles that a vehicle at ``z`` [m] would touch, were it at the same place."""
     low, high = ti.static(traffic_cfg.z_m)
-    reach = ti.static(_reach_m(traffic_cfg, behavior_cfg, vehicle_cfg))
+    reach = ti.static(0.25 * sum(traffic_cfg.height_m) + vehicle_cfg.hull_radius_m + behavior_cfg.contact_m)
     blur = ti.static(0.5 * _BLUR_M)
     above = ti.min(high + blur, z + reach)
     below = ti.max(low - blur, z - reach)
     share = ti.math.clamp((above - below) * ti.static(1.0 / (high - low + 2 * blur)), 0.0, 1.0)
     return height_cfg.column_share + (1.0 - height_cfg.column_share) * share
-
-
-def _reach_m(traffic_cfg, behavior_cfg, vehicle_cfg):
-    """[m] an obstacle's centre nearer than this in height touches the hull."""
-    return 0.25 * sum(traffic_cfg.height_m) + vehicle_cfg.hull_radius_m + behavior_cfg.contact_m
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -80,7 +80,9 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[LocalizationIO]):
             + ti.static(io.localization_cfg.wall_sigma_m**2)
         )
         doubt = form3(place_cov, nx, ny, lever)
-        near = r + io.localization_cfg.gate_sigmas * ti.sqrt(along) < ti.static(surest_range(io.sensors_cfg))
+        near = r + io.localization_cfg.gate_sigmas * ti.sqrt(along) < ti.static(
+            io.sensors_cfg.sonar.max_range_m - io.sensors_cfg.sonar.range_jitter_m
+        )
         fits = e * e < ti.static(io.localization_cfg.gate_sigmas**2) * (var + doubt)
         good = beams.hit * ti.select(near & fits, 1.0, 0.0)
         n = ti.max(beside(good), 1.0)
@@ -122,7 +124,9 @@ def add_dopplers(env, fix: Out[Any], kept, speed, speed_cov, io: Bundle[Localiza
             good[i] = ti.cast((kept[packet] >> i) & 1, ti.f32)
             doppler[i] = io.scan.doppler_m_s[env, packet * LANES + i]
         slip = doppler + speed[0] * ahead + speed[1] * left
-        swing = ti.static(doppler_variance(io.sensors_cfg)) + form2(speed_cov, ahead, left)
+        swing = ti.static(doppler_variance(io.sensors_cfg)) + (
+            speed_cov[0] * ahead * ahead + 2.0 * speed_cov[1] * ahead * left + speed_cov[2] * left * left
+        )
         still = good * ti.select(
             slip * slip < ti.static(io.localization_cfg.gate_sigmas**2) * swing, 1.0, 0.0
         )
@@ -192,12 +196,6 @@ def range_variance(range_m, io: Bundle[LocalizationIO]):
     )
 
 
-def surest_range(sensors_cfg):
-    """[m] beyond which errors push returns out of the sonar's reach: of such walls only the returns that came
-    out too short are seen. Plain Python."""
-    return sensors_cfg.sonar.max_range_m - sensors_cfg.sonar.range_jitter_m
-
-
 def middle_sigma(sensors_cfg):
     """[m] standard deviation of a range half as long as the sonar's reach; plain Python."""
     sonar = sensors_cfg.sonar
@@ -257,12 +255,6 @@ def form3(cov, a, b, c):
     """h'P h of h = (a, b, c) in lanes, P by its upper triangle."""
     across = 2.0 * (cov[1] * a * b + cov[2] * a * c + cov[4] * b * c)
     return cov[0] * a * a + cov[3] * b * b + cov[5] * c * c + across
-
-
-@ti.func
-def form2(cov, a, b):
-    """h'P h of h = (a, b) in lanes, P by its upper triangle."""
-    return cov[0] * a * a + 2.0 * cov[1] * a * b + cov[2] * b * b
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -150,67 +150,32 @@ def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
 @ti.func
 def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
     """Average with the same turn seen before; else a new one in the place of the oldest."""
-    n_packet = ti.static(io.turn_history.turn.shape[2])
+    turn, n_packet = ti.static(io.turn_history.turn, io.turn_history.turn.shape[2])
     slot, weight = io.turn_history.next_slot[env], 1.0
     known = 0
     for packet in range(n_packet):
         for lane in range(LANES):
-            if known == 0 and io.turn_history.turn[env, WEIGHT, packet][lane] > 0.0:
-                off = (
-                    ti.Vector(
-                        [
-                            io.turn_history.turn[env, TURN_X, packet][lane],
-                            io.turn_history.turn[env, TURN_Y, packet][lane],
-                        ]
-                    )
-                    - pos
-                )
-                alike_in = (
-                    io.turn_history.turn[env, IN_X, packet][lane] * d0[0]
-                    + io.turn_history.turn[env, IN_Y, packet][lane] * d0[1]
-                    > _ALIKE_COS
-                )
-                alike_out = (
-                    io.turn_history.turn[env, OUT_X, packet][lane] * d1[0]
-                    + io.turn_history.turn[env, OUT_Y, packet][lane] * d1[1]
-                    > _ALIKE_COS
-                )
-                if alike_in and alike_out and off.norm_sqr() < ti.static(_SAME_M**2):
+            if known == 0 and turn[env, WEIGHT, packet][lane] > 0.0:
+                off = ti.Vector([turn[env, TURN_X, packet][lane], turn[env, TURN_Y, packet][lane]]) - pos
+                came = turn[env, IN_X, packet][lane] * d0[0] + turn[env, IN_Y, packet][lane] * d0[1]
+                went = turn[env, OUT_X, packet][lane] * d1[0] + turn[env, OUT_Y, packet][lane] * d1[1]
+                if came > _ALIKE_COS and went > _ALIKE_COS and off.norm_sqr() < ti.static(_SAME_M**2):
                     known, slot = 1, packet * LANES + lane
     packet, lane = slot // LANES, slot % LANES
     if known == 1:
-        weight = ti.min(io.turn_history.turn[env, WEIGHT, packet][lane] + 1.0, _MOST_WEIGHT)
+        weight = ti.min(turn[env, WEIGHT, packet][lane] + 1.0, _MOST_WEIGHT)
     else:
         io.turn_history.next_slot[env] = (slot + 1) % ti.static(LANES * n_packet)
     keep, gain = 1.0 - 1.0 / weight, 1.0 / weight
-    came = (
-        keep
-        * known
-        * ti.Vector(
-            [io.turn_history.turn[env, IN_X, packet][lane], io.turn_history.turn[env, IN_Y, packet][lane]]
-        )
-        + gain * d0
-    )
-    went = (
-        keep
-        * known
-        * ti.Vector(
-            [io.turn_history.turn[env, OUT_X, packet][lane], io.turn_history.turn[env, OUT_Y, packet][lane]]
-        )
-        + gain * d1
-    )
-    came, went = came.normalized(), went.normalized()
-    io.turn_history.turn[env, TURN_X, packet][lane] = (
-        keep * io.turn_history.turn[env, TURN_X, packet][lane] * known + gain * pos[0]
-    )
-    io.turn_history.turn[env, TURN_Y, packet][lane] = (
-        keep * io.turn_history.turn[env, TURN_Y, packet][lane] * known + gain * pos[1]
-    )
-    io.turn_history.turn[env, IN_X, packet][lane] = came[0]
-    io.turn_history.turn[env, IN_Y, packet][lane] = came[1]
-    io.turn_history.turn[env, OUT_X, packet][lane] = went[0]
-    io.turn_history.turn[env, OUT_Y, packet][lane] = went[1]
-    io.turn_history.turn[env, WEIGHT, packet][lane] = weight
+    before = ti.Vector([turn[env, IN_X, packet][lane], turn[env, IN_Y, packet][lane]])
+    d_in = (keep * known * before + gain * d0).normalized()
+    after = ti.Vector([turn[env, OUT_X, packet][lane], turn[env, OUT_Y, packet][lane]])
+    d_out = (keep * known * after + gain * d1).normalized()
+    turn[env, TURN_X, packet][lane] = keep * turn[env, TURN_X, packet][lane] * known + gain * pos[0]
+    turn[env, TURN_Y, packet][lane] = keep * turn[env, TURN_Y, packet][lane] * known + gain * pos[1]
+    turn[env, IN_X, packet][lane], turn[env, IN_Y, packet][lane] = d_in[0], d_in[1]
+    turn[env, OUT_X, packet][lane], turn[env, OUT_Y, packet][lane] = d_out[0], d_out[1]
+    turn[env, WEIGHT, packet][lane] = weight
 
 
 @ti.func

@@ -64,12 +64,6 @@ def thrust_limits(cfg):
 
 
 @ti.func
-def lag_kept(dt_s, tau_s):
-    """Share of the distance to a constant command that a first-order lag still has to go after dt (exact)."""
-    return ti.exp(-dt_s / tau_s)
-
-
-@ti.func
 def thrust_of_rpm(rpm, vehicle_cfg: Const[VehicleConfig]):
     """Thrust [N] at a rotor speed [rpm]."""
     forward, reverse = ti.static(vehicle_cfg.thrust_forward, vehicle_cfg.thrust_reverse)
@@ -188,7 +182,7 @@ def _move(first, lanes: Const[int], dt, n_substep, io: Bundle[DynamicsIO]):
     geometry = ti.Matrix(
         [[io.allocation.wrench_of_thrust[axis, i] for i in range(n_thruster)] for axis in range(6)]
     )
-    kept = lag_kept(0.5 * dt, io.vehicle_cfg.rotor_tau_s)
+    kept = ti.exp(-(0.5 * dt) / io.vehicle_cfg.rotor_tau_s)
     for _ in range(n_substep):
         for lane in range(lanes):
             _advance(lane, fleet, geometry, kept, dt, io)

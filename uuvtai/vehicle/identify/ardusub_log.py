@@ -159,7 +159,8 @@ def _times(heard: _Heard, path: Path) -> np.ndarray:
 
 def _rows(times: np.ndarray, grid: _LogTimes, heard: _Heard) -> np.ndarray:
     """(n, 10) as ``drives_of`` wants them, without rotor speeds."""
-    angle, rate = _unwound(heard.angle).at(times), heard.rate.at(times)
+    unwound = np.unwrap(heard.angle.values, axis=0).ravel().tolist()  # without jumps of a turn
+    angle, rate = _Readings(heard.angle.time_s, unwound).at(times), heard.rate.at(times)
     if _velocity(heard) is heard.dvl:
         velocity = grid.near(heard.dvl)
     else:
@@ -198,11 +199,6 @@ class _LogTimes:
         row = np.minimum(np.searchsorted(self.rows, place), len(self.rows) - 1)
         read = self.rows[row] == place
         return row[read], read, (known - (self.first + STEP_S * place))[read]
-
-
-def _unwound(series: _Readings) -> _Readings:
-    """Angles without jumps of a turn."""
-    return _Readings(series.time_s, np.unwrap(series.values, axis=0).ravel().tolist())
 
 
 def _to_body(velocity: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -234,7 +234,7 @@ def mean_wrench(drive: Drive, vehicle_cfg: VehicleConfig, lags_s: np.ndarray) ->
     one as the vehicle's own lag has it, or straight, whatever ``lags_s`` says."""
     if drive.is_asked:
         lag = drive.dt_s / lags_s[:, None, None]
-        risen = _risen(drive)
+        risen = np.diff(drive.rpm, axis=0) if drive.command == "line" else np.zeros_like(drive.rpm[:-1])
         off = _behind(drive, risen, lags_s)
         speeds = (
             drive.rpm[:-1] + (instant - 1 / lag) * risen + np.exp(-instant * lag) * (off + risen / lag)
@@ -253,11 +253,6 @@ def mean_wrench(drive: Drive, vehicle_cfg: VehicleConfig, lags_s: np.ndarray) ->
         for row, weight in enumerate(weights):
             found[row] += weight * pushed
     return found
-
-
-def _risen(drive: Drive) -> np.ndarray:
-    """(n - 1, thrusters) [rpm] by how much the command rises during each step."""
-    return np.diff(drive.rpm, axis=0) if drive.command == "line" else np.zeros_like(drive.rpm[:-1])
 
 
 def _behind(drive: Drive, risen: np.ndarray, lags_s: np.ndarray) -> np.ndarray:
