@@ -1,23 +1,33 @@
 """Bundles for tests of single stages: made of the parts at hand, once for the same parts (a kernel is
 compiled anew for another bundle)."""
 
+from dataclasses import is_dataclass
+
 import numpy as np
 
+from uuvtai.config import Config
+from uuvtai.config.base import Section
 from uuvtai.sim.stages import bind
 
 _made = {}
 
 
 def io_for(bundle, *parts):
-    """The bundle with these structs and sections; what is not given is None, and a kernel that touches it
-    does not compile."""
+    """The bundle with these structs and sections, those of a config, or those that a test's stage has as
+    attributes; what is not given is None, and a kernel that touches it does not compile."""
+    parts = [each for part in parts for each in _structs_of(part)]
     key = (bundle, *map(id, parts))
-    if key not in _made:
-        _made[key] = (
-            bind(bundle, *parts, partial=True),
-            parts,
-        )  # the parts stay alive: their identities are the key
+    if key not in _made:  # the parts stay alive: their identities are the key
+        _made[key] = bind(bundle, *parts, partial=True), parts
     return _made[key][0]
+
+
+def _structs_of(part):
+    if isinstance(part, Config):
+        return [getattr(part, name) for name in type(part).model_fields]
+    if is_dataclass(part) or isinstance(part, Section):
+        return [part]
+    return [value for value in vars(part).values() if is_dataclass(value)]
 
 
 def clear(*structs):

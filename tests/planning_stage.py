@@ -107,25 +107,7 @@ def plan(envs=range(N_ENV), config=CONFIG):
     queue[: len(envs)] = list(envs)
     s.route.queue.from_numpy(queue)
     s.route.n_queue[None] = len(envs)
-    plan_routes(
-        io_for(
-            VoronoiIO,
-            s.voronoi,
-            s.route,
-            s.clearance,
-            s.grid_map,
-            s.mask,
-            s.mission,
-            s.ego,
-            s.clock,
-            config.voronoi,
-            config.quiet,
-            config.route,
-            config.clearance,
-            config.mapping,
-            maps.TANK,
-        )
-    )
+    plan_routes(io_for(VoronoiIO, s, config))
     return s.route
 
 

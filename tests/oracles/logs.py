@@ -35,60 +35,23 @@ TERMS = ("alive", "progress", "clearance", "ttc")
 NODES = ("Root", "Emergency", "Back off", "Evade", "Follow", "Follow")
 START, GOAL = (2.0, 1.5, -0.8), (17.0, 4.5, -0.8)
 
+_CIRCLE = {
+    "shape": "circle", "center": [8.0, 3.0], "radius_m": -1.2, "length_m": 2 * math.pi * 1.2, "phase_m": 0.7,
+    "speed_m_s": 0.6,
+}  # fmt: skip
+_LINE = {
+    "shape": "polyline", "corners": [[12.0, 1.0], [12.5, 5.0]],
+    "length_m": 2 * math.dist((12.0, 1.0), (12.5, 5.0)), "phase_m": 1.0, "speed_m_s": 0.6,
+}  # fmt: skip
 OBSTACLES = [
-    {
-        "slot": 0,
-        "kind": "cylinder",
-        "position": [6.0, 3.6, -0.8],
-        "size": [0.35, 0.35, 0.8],
-        "yaw": 0.0,
-        "path": None,
-    },
-    {
-        "slot": 1,
-        "kind": "box",
-        "position": [10.0, 1.5, -0.8],
-        "size": [0.5, 0.3, 0.8],
-        "yaw": 0.6,
-        "path": None,
-    },
-    {
-        "slot": 2,
-        "kind": "cylinder",
-        "position": [13.5, 4.6, -0.8],
-        "size": [0.25, 0.25, 0.8],
-        "yaw": 0.0,
-        "path": None,
-    },
-    {
-        "slot": 4,
-        "kind": "sphere",
-        "position": [8.5, 3.0, -0.8],
-        "size": [0.22, 0.22, 0.22],
-        "yaw": 0.0,
-        "path": {
-            "shape": "circle",
-            "center": [8.0, 3.0],
-            "radius_m": -1.2,
-            "length_m": 2 * math.pi * 1.2,
-            "phase_m": 0.7,
-            "speed_m_s": 0.6,
-        },
-    },
-    {
-        "slot": 5,
-        "kind": "cylinder",
-        "position": [12.0, 1.5, -0.7],
-        "size": [0.2, 0.2, 0.2],
-        "yaw": 0.0,
-        "path": {
-            "shape": "polyline",
-            "corners": [[12.0, 1.0], [12.5, 5.0]],
-            "length_m": 2 * math.dist((12.0, 1.0), (12.5, 5.0)),
-            "phase_m": 1.0,
-            "speed_m_s": 0.6,
-        },
-    },
+    {"slot": slot, "kind": kind, "position": position, "size": size, "yaw": yaw, "path": path}
+    for slot, kind, position, size, yaw, path in (
+        (0, "cylinder", [6.0, 3.6, -0.8], [0.35, 0.35, 0.8], 0.0, None),
+        (1, "box", [10.0, 1.5, -0.8], [0.5, 0.3, 0.8], 0.6, None),
+        (2, "cylinder", [13.5, 4.6, -0.8], [0.25, 0.25, 0.8], 0.0, None),
+        (4, "sphere", [8.5, 3.0, -0.8], [0.22, 0.22, 0.22], 0.0, _CIRCLE),
+        (5, "cylinder", [12.0, 1.5, -0.7], [0.2, 0.2, 0.2], 0.0, _LINE),
+    )
 ]
 
 

@@ -168,50 +168,12 @@ def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
 
 
 def assess(stage, cfg=CFG.behavior, sonar=CFG.sensors.sonar):
-    threats.assess_threats(
-        io_for(
-            ThreatsIO,
-            stage.t,
-            stage.route,
-            stage.forecast,
-            stage.futures,
-            stage.tracks,
-            stage.scan,
-            stage.clearance,
-            stage.ego,
-            stage.mission,
-            stage.clock,
-            cfg,
-            sonar,
-            CFG.height,
-            CFG.traffic,
-            CFG.vehicle,
-            CFG.tracking,
-            TANK,
-            CFG.mapping,
-            CFG.episode,
-            CFG.fast,
-        )
-    )
+    rest = (CFG.height, CFG.traffic, CFG.vehicle, CFG.tracking, TANK, CFG.mapping, CFG.episode, CFG.fast)
+    threats.assess_threats(io_for(ThreatsIO, stage, cfg, sonar, *rest))
 
 
 def plan(stage):
-    avoidance.plan_evasion(
-        io_for(
-            EvasionIO,
-            stage.t,
-            stage.forecast,
-            stage.futures,
-            stage.clearance,
-            stage.ego,
-            stage.clock,
-            CFG.behavior,
-            CFG.vehicle,
-            CFG.tracking,
-            TANK,
-            CFG.mapping,
-        )
-    )
+    avoidance.plan_evasion(io_for(EvasionIO, stage, CFG))
 
 
 def decide(stage):
@@ -221,24 +183,8 @@ def decide(stage):
 
 
 def tick(stage, sonar=CFG.sensors.sonar):
-    tree.tick_tree(
-        io_for(
-            BehaviorIO,
-            stage.t,
-            stage.baselines,
-            stage.table,
-            stage.route,
-            stage.ego,
-            stage.mission,
-            stage.clock,
-            CFG.behavior,
-            sonar,
-            CFG.vehicle,
-            TANK,
-            CFG.episode,
-        ),
-        stage.action,
-    )
+    parts = (CFG.behavior, sonar, CFG.vehicle, TANK, CFG.episode)
+    tree.tick_tree(io_for(BehaviorIO, stage, *parts), stage.action)
     ti.sync()
 
 

@@ -153,9 +153,7 @@ class Rig:
     def look(self):
         """Draw the image and follow what it shows; returns the memory afterwards."""
         self.load()
-        io = io_for(
-            DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, CAMERA, TANK
-        )
+        io = io_for(DepthIO, self, CAMERA, TANK)
         depth_camera.cast_depth(io)
         return self.follow()
 
@@ -164,20 +162,7 @@ class Rig:
             io_for(CameraTrackingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK)
         )
         camera_tracking.follow_spots(
-            io_for(
-                CameraTrackingIO,
-                self.tracks,
-                self.spots,
-                self.image,
-                self.scan,
-                self.clock,
-                CFG,
-                CAMERA,
-                SONAR,
-                ELEVATION,
-                TRACKING,
-                RULES,
-            )
+            io_for(CameraTrackingIO, self, CFG, CAMERA, SONAR, ELEVATION, TRACKING, RULES)
         )
         self.memory = {name: field.to_numpy() for name, field in vars(self.tracks).items()}
         return self.memory

@@ -72,21 +72,7 @@ class Stage:
         put(self.tracks, **fields)
 
     def predict(self):
-        prediction.forecast_tracks(
-            io_for(
-                ForecastIO,
-                self.forecast,
-                self.tracks,
-                self.turn_history,
-                self.clusters,
-                self.image,
-                self.clock,
-                self.cfg,
-                TRACKING,
-                TANK,
-                RULES,
-            )
-        )
+        prediction.forecast_tracks(io_for(ForecastIO, self, self.cfg, TRACKING, TANK, RULES))
         return self.forecast.pos_w.to_numpy().astype(float), self.forecast.radius_m.to_numpy().astype(float)
 
 

@@ -46,18 +46,7 @@ class Rig:
 
     def begin(self, voyage, cfg):
         self.voyage, self.cfg, self.pings = voyage, cfg, {}
-        self.io = io_for(
-            LocalizationIO,
-            self.ego,
-            self.localization,
-            self.clock,
-            self.scan,
-            cfg,
-            voyage.sensors,
-            voyage.tank,
-            RULES,
-            VEHICLE,
-        )
+        self.io = io_for(LocalizationIO, self, cfg, voyage.sensors, voyage.tank, RULES, VEHICLE)
         self.clock.active.fill(1)
         set_step(self.clock, 0)
         self.ego.pos_w.from_numpy(voyage.pos[0].astype(np.float32))

@@ -234,22 +234,7 @@ class Obstacles:
             getattr(getattr(self, struct), field).from_numpy(array)
         self.clock.active.from_numpy(np.ones(N_ENV, np.int32) if active is None else active.astype(np.int32))
         obs = torch.full((N_ENV, observation_width(MORE)), -7.0)
-        write_obstacles(
-            io_for(
-                ObservationIO,
-                self.observation,
-                self.forecast,
-                self.tracks,
-                self.ego,
-                self.clock,
-                MORE,
-                FORECAST,
-                TRACKING,
-                TANK,
-                RULES,
-            ),
-            obs,
-        )
+        write_obstacles(io_for(ObservationIO, self, MORE, FORECAST, TRACKING, TANK, RULES), obs)
         return obs.numpy()
 
 

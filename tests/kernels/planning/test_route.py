@@ -19,48 +19,11 @@ REST_STEPS = round(R.min_replan_s / DT)
 
 
 def fire():
-    s, c = stage(), CONFIG
-    triggers.fire_triggers(
-        io_for(
-            TriggersIO,
-            s.route,
-            s.clearance,
-            s.grid_map,
-            s.mask,
-            s.forecast,
-            s.scan,
-            s.ego,
-            s.mission,
-            s.clock,
-            c.route,
-            c.sensors.sonar,
-            c.voronoi,
-            c.tracking,
-            c.mapping,
-            maps.TANK,
-            c.episode,
-            c.clearance,
-        )
-    )
+    triggers.fire_triggers(io_for(TriggersIO, stage(), CONFIG))
 
 
 def follow():
-    s, c = stage(), CONFIG
-    route.follow_route(
-        io_for(
-            RouteIO,
-            s.route,
-            s.clearance,
-            s.grid_map,
-            s.ego,
-            s.mission,
-            s.clock,
-            c.route,
-            c.clearance,
-            c.mapping,
-            maps.TANK,
-        )
-    )
+    route.follow_route(io_for(RouteIO, stage(), CONFIG))
 
 
 def load(env, corners):

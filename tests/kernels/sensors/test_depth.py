@@ -64,9 +64,7 @@ class Rig:
         depth_camera.reset_depth(io_for(DepthIO, self.image, self.clock))
 
     def shoot(self, config=CLEAN, tank=TANK):
-        io = io_for(
-            DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank
-        )
+        io = io_for(DepthIO, self, config, tank)
         depth_camera.cast_depth(io)
         return self.image.depth_m.to_numpy()
 

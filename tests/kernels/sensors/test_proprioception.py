@@ -71,19 +71,7 @@ class Rig:
 
     def sense(self, sensors, step, names=READINGS):
         set_step(self.clock, step)
-        proprioception.sense_proprioception(
-            io_for(
-                ProprioceptionIO,
-                self.ego,
-                self.memory,
-                self.vehicle,
-                self.episode,
-                self.clock,
-                sensors,
-                BODY,
-                RULES,
-            )
-        )
+        proprioception.sense_proprioception(io_for(ProprioceptionIO, self, sensors, BODY, RULES))
         return {name: getattr(self.ego, name).to_numpy() for name in names}
 
     def find(self, sensors, step):

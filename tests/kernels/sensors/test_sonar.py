@@ -88,21 +88,7 @@ class Rig:
         tank=TANK,
         names=("range_m", "doppler_m_s", "intensity", "hit", "fresh", "ping_step"),
     ):
-        sonar.cast_sonar(
-            io_for(
-                SonarIO,
-                self.scan,
-                self.memory,
-                self.ego,
-                self.vehicle,
-                self.world,
-                self.episode,
-                self.clock,
-                config,
-                tank,
-                RULES,
-            )
-        )
+        sonar.cast_sonar(io_for(SonarIO, self, config, tank, RULES))
         return {name: getattr(self.scan, name).to_numpy() for name in names}
 
 

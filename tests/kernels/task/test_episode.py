@@ -66,17 +66,7 @@ class Court:
         self.world.vel_w[env, slot], self.world.yaw[env, slot] = vel, yaw
 
     def judge(self):
-        io = io_for(
-            EpisodeIO,
-            self.termination,
-            self.clock,
-            self.vehicle,
-            self.world,
-            self.mission,
-            VEHICLE,
-            TANK,
-            RULES,
-        )
+        io = io_for(EpisodeIO, self, VEHICLE, TANK, RULES)
         episode.check_termination(io)
         return {name: field.to_numpy() for name, field in vars(self.termination).items()}
 
