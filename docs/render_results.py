@@ -411,8 +411,7 @@ def _cells(root: Path, name: str) -> Cells:
 
 def _cell(row: dict[str, str]) -> Document:
     outcomes = {end: int(row.pop(column)) for column, end in _COUNTS.items()}
-    ends = {name: row.pop(name, "") for name in ("agent", "ends")}
-    ends = {name: text for name, text in ends.items() if text}
+    ends = {name: text for name in ("agent", "ends") if (text := row.pop(name, ""))}
     return {name: _value(text) for name, text in row.items()} | ends | {"outcomes": outcomes}
 
 

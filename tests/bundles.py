@@ -27,7 +27,7 @@ def _structs_of(part):
         return [getattr(part, name) for name in type(part).model_fields]
     if is_dataclass(part) or isinstance(part, Section):
         return [part]
-    return [value for value in vars(part).values() if is_dataclass(value)]
+    return [value for value in vars(part).values() if type(value).__module__.startswith("uuvtai.state")]
 
 
 def clear(*structs):

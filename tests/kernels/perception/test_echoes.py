@@ -190,18 +190,8 @@ def test_the_pose_filter_uses_a_beam_once():
     ego, state, clock, scan = (
         allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
     )
-    io = io_for(
-        LocalizationIO,
-        ego,
-        state,
-        clock,
-        scan,
-        LocalizationConfig(),
-        SENSORS,
-        POND,
-        EpisodeConfig(),
-        VehicleConfig(),
-    )
+    rest = (LocalizationConfig(), SENSORS, POND, EpisodeConfig(), VehicleConfig())
+    io = io_for(LocalizationIO, ego, state, clock, scan, *rest)
     clock.active.fill(1)
     ego.pos_w.from_numpy(np.array([[9.0, 4.0, -0.8]], np.float32))
     ego.specific_force_b.from_numpy(np.array([[0.0, 0.0, 9.81]], np.float32))

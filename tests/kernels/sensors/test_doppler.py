@@ -144,18 +144,8 @@ def test_walls_tell_the_place_and_not_the_speed():
     ego, state, clock, scan = (
         allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
     )
-    io = io_for(
-        LocalizationIO,
-        ego,
-        state,
-        clock,
-        scan,
-        LocalizationConfig(),
-        sensors,
-        tank,
-        EpisodeConfig(),
-        VehicleConfig(),
-    )
+    rest = (LocalizationConfig(), sensors, tank, EpisodeConfig(), VehicleConfig())
+    io = io_for(LocalizationIO, ego, state, clock, scan, *rest)
     clock.active.fill(1)
     ego.pos_w.from_numpy(np.array([[10.0, 3.0, -0.8]], np.float32))
     ego.specific_force_b.from_numpy(np.array([[0.0, 0.0, 9.81]], np.float32))

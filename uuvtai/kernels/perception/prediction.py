@@ -102,10 +102,8 @@ def learn_turn(env, track, io: Bundle[ForecastIO]):
             begin, kind = ti.Vector([now[0], now[1]]), 1
         if io.turn_history.leg_step[env, track] >= 0 and time < _LONGEST_S:
             speed, leg_speed = ti.sqrt(now[2] ** 2 + now[3] ** 2), ti.sqrt(leg[2] ** 2 + leg[3] ** 2)
-            course, leg_course = (
-                ti.Vector([now[2] / speed, now[3] / speed]),
-                ti.Vector([leg[2] / leg_speed, leg[3] / leg_speed]),
-            )
+            course = ti.Vector([now[2] / speed, now[3] / speed])
+            leg_course = ti.Vector([leg[2] / leg_speed, leg[3] / leg_speed])
             if course.dot(leg_course) < _TURNED_COS:
                 way = 0.5 * time * (speed + leg_speed)
                 begin, kind = place_turn(
@@ -182,12 +180,11 @@ def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
 def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
     """An obstacle that was expected to turn and has gone straight on past the place, in the last ``moved``
     [m], takes one off its weight."""
+    edge = ti.static(-io.forecast_cfg.passed_m)
     for packet in range(io.turn_history.turn.shape[2]):
         along, across = offsets(env, packet, pos, course, io.turn_history)
         for lane in ti.static(range(LANES)):
-            behind = (
-                along[lane] < -io.forecast_cfg.passed_m and along[lane] + moved >= -io.forecast_cfg.passed_m
-            )
+            behind = along[lane] < edge and along[lane] + moved >= edge
             if (
                 behind
                 and across[lane] < ti.static(0.5 * io.forecast_cfg.across_m)
@@ -203,12 +200,11 @@ def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
 def offsets(env, packet, pos, course, turn_history: In[TurnHistory]):
     """Lanes: how far ahead along the course a remembered turn lies, and how far aside; FAR_M aside for those
     on another course."""
-    dx, dy = turn_history.turn[env, TURN_X, packet] - pos[0], turn_history.turn[env, TURN_Y, packet] - pos[1]
+    turn = ti.static(turn_history.turn)
+    dx, dy = turn[env, TURN_X, packet] - pos[0], turn[env, TURN_Y, packet] - pos[1]
     along = dx * course[0] + dy * course[1]
     aside = dx * course[1] - dy * course[0]
-    alike = (
-        turn_history.turn[env, IN_X, packet] * course[0] + turn_history.turn[env, IN_Y, packet] * course[1]
-    )
+    alike = turn[env, IN_X, packet] * course[0] + turn[env, IN_Y, packet] * course[1]
     weight = turn_history.turn[env, WEIGHT, packet]
     across = f16x(FAR_M)
     for lane in ti.static(range(LANES)):
@@ -231,13 +227,9 @@ def next_turn(env, pos, course, turn_history: In[TurnHistory], forecast_cfg: Con
                 gap, slot = along[lane], packet * LANES + lane
     out = course
     if gap < FAR_M:
-        gap = ti.max(gap, 0.0)
-        out = ti.Vector(
-            [
-                turn_history.turn[env, OUT_X, slot // LANES][slot % LANES],
-                turn_history.turn[env, OUT_Y, slot // LANES][slot % LANES],
-            ]
-        )
+        gap, packet, lane = ti.max(gap, 0.0), slot // LANES, slot % LANES
+        turn = ti.static(turn_history.turn)
+        out = ti.Vector([turn[env, OUT_X, packet][lane], turn[env, OUT_Y, packet][lane]])
     return gap, out
 
 
@@ -368,10 +360,8 @@ def reset_forecast(io: Bundle[ForecastIO]):
             forget_turns(env, io)
             for track in range(io.forecast.radius_m.shape[1]):
                 clear_forecast(env, track, io)
-                io.forecast.turn_m[env, track], io.forecast.turn_out_w[env, track] = (
-                    FAR_M,
-                    ti.Vector([0.0, 0.0]),
-                )
+                io.forecast.turn_m[env, track] = FAR_M
+                io.forecast.turn_out_w[env, track] = ti.Vector([0.0, 0.0])
                 for k in range(io.forecast.pos_w.shape[2]):
                     io.forecast.pos_w[env, track, k] = ti.Vector([0.0, 0.0])
 
