@@ -158,13 +158,13 @@ def _has_baseline(used: Collection[int]) -> bool:
 
 def _plan_by_baseline(stages: Stages, used: Collection[int]) -> None:
     if codes.DYNAMIC_WINDOW in used:
-        dwa.plan_dynamic_window(stages.dynamic_window)
+        dwa.plan_dynamic_window(stages.local_planner)
     if codes.POTENTIAL_FIELD in used:
-        potential_field.plan_potential_field(stages.potential_field)
+        potential_field.plan_potential_field(stages.local_planner)
     if codes.VELOCITY_OBSTACLE in used:
-        velocity_obstacle.plan_velocity_obstacle(stages.velocity_obstacle)
+        velocity_obstacle.plan_velocity_obstacle(stages.local_planner)
     if codes.PATH_INTEGRAL in used:
-        mppi.plan_path_integral(stages.path_integral)
+        mppi.plan_path_integral(stages.local_planner)
 
 
 def observe(stages: Stages, observation_cfg: ObservationConfig, out: torch.Tensor) -> None:

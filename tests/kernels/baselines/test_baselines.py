@@ -14,7 +14,7 @@ from tests.small_sim import SmallSim
 from uuvtai import state
 from uuvtai.config.baselines import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.dwa import plan_dynamic_window
-from uuvtai.kernels.baselines.io import PathIntegralIO
+from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.mppi import plan_path_integral
 from uuvtai.kernels.baselines.potential_field import plan_potential_field
 from uuvtai.kernels.baselines.velocity_obstacle import plan_velocity_obstacle
@@ -23,10 +23,10 @@ from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.setup import array_sizes
 
 PLANNERS = {
-    "dwa": (plan_dynamic_window, "dynamic_window"),
-    "potential_field": (plan_potential_field, "potential_field"),
-    "velocity_obstacle": (plan_velocity_obstacle, "velocity_obstacle"),
-    "mppi": (plan_path_integral, "path_integral"),
+    "dwa": plan_dynamic_window,
+    "potential_field": plan_potential_field,
+    "velocity_obstacle": plan_velocity_obstacle,
+    "mppi": plan_path_integral,
 }
 HERE = np.array([8.0, 3.0, -0.8])
 OPEN_M = 1e6
@@ -68,8 +68,7 @@ def body(scene, row, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
 
 def decide(scene, name):
     """Velocities [m/s] that a planner chooses, shape (n, 3)."""
-    kernel, noun = PLANNERS[name]
-    kernel(getattr(scene.sim.io, noun))
+    PLANNERS[name](scene.sim.io.local_planner)
     ti.sync()
     return scene.views["baselines.vel_w"].astype(float)
 
@@ -259,7 +258,7 @@ def test_mppi_is_the_same_in_a_batch_of_another_size(scene):
         parts[noun] = state.allocate(kind, sizes)
         for name in names:
             getattr(parts[noun], name).from_numpy(np.repeat(scene.views[f"{noun}.{name}"][:1], 64, 0))
-    io = io_for(PathIntegralIO, *parts.values(), scene.config)
+    io = io_for(LocalPlannerIO, *parts.values(), scene.config)
     for step in (0, 5):
         scene.views["clock.step"][:] = step
         parts["clock"].step.from_numpy(np.full(64, step, np.int32))
@@ -295,7 +294,7 @@ def test_nothing_of_them_runs_under_another_tree(small, monkeypatch):
     """Kernels are launched, and their arrays written, only where the tree has their leaf."""
     launched = []
     launch_one_by_one(monkeypatch, small.sim)
-    for name, (kernel, _noun) in PLANNERS.items():
+    for name, kernel in PLANNERS.items():
         monkeypatch.setattr(
             f"uuvtai.sim.stack.{name}.{kernel.__name__}", lambda io, name=name: launched.append(name)
         )

@@ -12,11 +12,11 @@ import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
 from uuvtai.config.baselines import ACCELERATION_M_S2
-from uuvtai.kernels.baselines.io import DynamicWindowIO
+from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.local_planner import (
     decides,
     mapped_m,
-    nearest_body_m,
+    nearest_obstacle_m,
     reachable_velocity,
     wanted_velocity,
 )
@@ -31,45 +31,26 @@ _FORBIDDEN = -100.0
 
 @quick_launch
 @ti.kernel
-def plan_dynamic_window(io: Bundle[DynamicWindowIO]):
+def plan_dynamic_window(io: Bundle[LocalPlannerIO]):
     """Velocity of best score for the rows that decide in this step."""
     n, n_trial = ti.static(io.clock.active.shape[0], io.baselines_cfg.n_reachable)
+    window_s = ti.static(io.dwa_cfg.window_s)
     for env, trial in ti.ndrange(n, n_trial):
-        if decides(env, io.clock, io.baselines_cfg):
-            io.baselines.score[env, trial] = _score(env, _wanted(env, io), _trial(env, trial, io), io)
+        if decides(env, io):
+            io.baselines.score[env, trial] = _score(
+                env, wanted_velocity(env, io), reachable_velocity(env, trial, window_s, io), io
+            )
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and decides(env, io.clock, io.baselines_cfg):
+        if pad == 0 and decides(env, io):
             best = 0
             for trial in range(1, n_trial):
                 if io.baselines.score[env, trial] >= io.baselines.score[env, best]:
                     best = trial
-            io.baselines.vel_w[env] = _trial(env, best, io)
+            io.baselines.vel_w[env] = reachable_velocity(env, best, window_s, io)
 
 
 @ti.func
-def _wanted(env, io: Bundle[DynamicWindowIO]):
-    return wanted_velocity(
-        env, io.ego, io.mission, io.behavior, io.baselines_cfg, io.tank_cfg, io.behavior_cfg, io.vehicle_cfg
-    )
-
-
-@ti.func
-def _trial(env, trial, io: Bundle[DynamicWindowIO]):
-    return reachable_velocity(
-        env,
-        trial,
-        _wanted(env, io),
-        io.ego,
-        ti.static(io.dwa_cfg.window_s),
-        io.baselines_cfg,
-        io.tank_cfg,
-        io.behavior_cfg,
-        io.vehicle_cfg,
-    )
-
-
-@ti.func
-def _score(env, wanted, velocity, io: Bundle[DynamicWindowIO]):
+def _score(env, wanted, velocity, io: Bundle[LocalPlannerIO]):
     """Weighted sum of the three shares in [0, 1]; far below 0 where the velocity is not admissible."""
     room, touch_s = _rolled_out(env, velocity, io)
     horizon = ti.static(io.dwa_cfg.horizon_s)
@@ -95,7 +76,7 @@ def _score(env, wanted, velocity, io: Bundle[DynamicWindowIO]):
 
 
 @ti.func
-def _rolled_out(env, velocity, io: Bundle[DynamicWindowIO]):
+def _rolled_out(env, velocity, io: Bundle[LocalPlannerIO]):
     """(smallest distance [m] beyond the wanted clearance, time [s] until it is below 0, FAR_M = never).
 
     A mapped obstacle that is too near already counts only where it comes nearer.
@@ -105,17 +86,15 @@ def _rolled_out(env, velocity, io: Bundle[DynamicWindowIO]):
         min(io.forecast.radius_m.shape[2] - 1, round(io.dwa_cfg.horizon_s / io.tracking_cfg.forecast_dt_s))
     )
     pos, own = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
-    here = mapped_m(env, pos, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
+    here = mapped_m(env, pos, io)
     wanted_static = ti.min(ti.static(io.baselines_cfg.static_margin_m), here)
     room, touch_s, decay = FAR_M, FAR_M, 1.0
     for k in range(1, n_sample + 1):
         decay *= ti.static(2.718281828459045 ** (-io.tracking_cfg.forecast_dt_s / io.behavior_cfg.lag_s))
         settle = lag * (1.0 - decay)
         at = pos + own * settle + velocity * (k * dt - settle)
-        free = nearest_body_m(env, k, at, io.forecast, io.baselines_cfg, io.behavior_cfg) - ti.static(
-            io.dwa_cfg.margin_m
-        )
-        mapped = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg) - wanted_static
+        free = nearest_obstacle_m(env, k, at, io) - ti.static(io.dwa_cfg.margin_m)
+        mapped = mapped_m(env, at, io) - wanted_static
         smaller = ti.min(free, mapped)
         room = ti.min(room, smaller)
         if smaller < 0.0 and touch_s == FAR_M:

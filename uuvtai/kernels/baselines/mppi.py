@@ -16,12 +16,12 @@ Random numbers are a function of start and goal, step, sample and time: the same
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.kernels.baselines.io import PathIntegralIO
+from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.local_planner import (
     decides,
     edge_stopped,
     mapped_m,
-    nearest_body_m,
+    nearest_obstacle_m,
     speed_limited,
     wanted_velocity,
 )
@@ -45,35 +45,28 @@ _NEGLIGIBLE = 16.0
 
 @quick_launch
 @ti.kernel
-def plan_path_integral(io: Bundle[PathIntegralIO]):
+def plan_path_integral(io: Bundle[LocalPlannerIO]):
     """One iteration of MPPI for the rows that decide in this step."""
     n, n_sample = ti.static(io.clock.active.shape[0], io.mppi_cfg.n_sample)
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and decides(env, io.clock, io.baselines_cfg):
+        if pad == 0 and decides(env, io):
             _shift(env, io)
     for env, sample in ti.ndrange(n, n_sample):
-        if decides(env, io.clock, io.baselines_cfg):
+        if decides(env, io):
             io.baselines.score[env, sample] = _cost(env, sample, io)
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and decides(env, io.clock, io.baselines_cfg):
+        if pad == 0 and decides(env, io):
             _average(env, io)
             first = io.baselines.plan_w[env, 0]
-            first[2] = edge_stopped(first[2], io.ego.pos_w[env][2], io.tank_cfg, io.baselines_cfg)
+            first[2] = edge_stopped(first[2], io.ego.pos_w[env][2], io)
             io.baselines.vel_w[env] = first
 
 
 @ti.func
-def _wanted(env, io: Bundle[PathIntegralIO]):
-    return wanted_velocity(
-        env, io.ego, io.mission, io.behavior, io.baselines_cfg, io.tank_cfg, io.behavior_cfg, io.vehicle_cfg
-    )
-
-
-@ti.func
-def _shift(env, io: Bundle[PathIntegralIO]):
+def _shift(env, io: Bundle[LocalPlannerIO]):
     """The last plan, one decision later; in a new episode the wanted velocity."""
     n_control = ti.static(io.baselines.plan_w.shape[1])
-    wanted = _wanted(env, io)
+    wanted = wanted_velocity(env, io)
     for k in range(n_control):
         if io.clock.step[env] == 0:
             io.baselines.plan_w[env, k] = wanted
@@ -82,7 +75,7 @@ def _shift(env, io: Bundle[PathIntegralIO]):
 
 
 @ti.func
-def _key(env, io: Bundle[PathIntegralIO]):
+def _key(env, io: Bundle[LocalPlannerIO]):
     """Of this decision's random numbers. The vehicle knows where it starts and where it is to go, not which
     episode that is."""
     start, goal = io.mission.start_w[env], io.mission.goal_w[env]
@@ -94,7 +87,7 @@ def _key(env, io: Bundle[PathIntegralIO]):
 
 
 @ti.func
-def _noise(key, sample, k, before, io: Bundle[PathIntegralIO]):
+def _noise(key, sample, k, before, io: Bundle[LocalPlannerIO]):
     """Noise [m/s] of a sample at a time, from that at the time before: a first-order Gauss-Markov sequence of
     constant variance."""
     step_s = ti.static(io.baselines_cfg.period_steps * io.episode_cfg.control_dt_s)
@@ -109,7 +102,7 @@ def _noise(key, sample, k, before, io: Bundle[PathIntegralIO]):
 
 
 @ti.func
-def _base(env, sample, k, wanted, io: Bundle[PathIntegralIO]):
+def _base(env, sample, k, wanted, io: Bundle[LocalPlannerIO]):
     """Velocity [m/s] around which a sample spreads."""
     out = io.baselines.plan_w[env, k]
     if sample == 1 or (sample >= _PLAIN and sample % _FRESH == 0):
@@ -120,22 +113,22 @@ def _base(env, sample, k, wanted, io: Bundle[PathIntegralIO]):
 
 
 @ti.func
-def _cost(env, sample, io: Bundle[PathIntegralIO]):
+def _cost(env, sample, io: Bundle[LocalPlannerIO]):
     """Cost of one sample: of its states, and of the control's share that the theory asks for."""
     n_control = ti.static(io.baselines.plan_w.shape[1])
     step_s, lag = ti.static(
         io.baselines_cfg.period_steps * io.episode_cfg.control_dt_s, io.behavior_cfg.lag_s
     )
     decay = ti.static(2.718281828459045 ** (-step_s / lag))
-    wanted, key, yaw = _wanted(env, io), _key(env, io), io.ego.rpy[env][2]
+    wanted, key, yaw = wanted_velocity(env, io), _key(env, io), io.ego.rpy[env][2]
     begin, at, own = io.ego.pos_w[env], io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], yaw)
-    here = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
+    here = mapped_m(env, at, io)
     cost, noise, is_touching = 0.0, ti.Vector([0.0, 0.0, 0.0]), 0.0
     for k in range(n_control):
         noise = _noise(key, sample, k, noise, io)
         base = _base(env, sample, k, wanted, io)
-        command = speed_limited(base + noise, yaw, io.behavior_cfg, io.vehicle_cfg)
-        command[2] = edge_stopped(command[2], at[2], io.tank_cfg, io.baselines_cfg)
+        command = speed_limited(base + noise, yaw, io)
+        command[2] = edge_stopped(command[2], at[2], io)
         at += command * step_s + (own - command) * (lag * (1.0 - decay))
         own = command + (own - command) * decay
         off = at - (begin + wanted * ((k + 1) * step_s))
@@ -147,7 +140,7 @@ def _cost(env, sample, io: Bundle[PathIntegralIO]):
 
 
 @ti.func
-def _control_cost(base, noise, io: Bundle[PathIntegralIO]):
+def _control_cost(base, noise, io: Bundle[LocalPlannerIO]):
     """lambda (1 - alpha) u Sigma^-1 epsilon."""
     share = ti.static(io.mppi_cfg.temperature * (1.0 - io.mppi_cfg.exploration))
     level = ti.static(1.0 / io.mppi_cfg.sigma_m_s**2)
@@ -156,15 +149,15 @@ def _control_cost(base, noise, io: Bundle[PathIntegralIO]):
 
 
 @ti.func
-def _state_cost(env, k, at, here, io: Bundle[PathIntegralIO]):
+def _state_cost(env, k, at, here, io: Bundle[LocalPlannerIO]):
     """(cost of being at a place after k + 1 decisions, whether something is touched there)."""
     time = (k + 1) * ti.static(io.baselines_cfg.period_steps * io.episode_cfg.control_dt_s)
     sample = ti.min(
         ti.cast(time * ti.static(1.0 / io.tracking_cfg.forecast_dt_s) + 0.5, ti.i32),
         ti.static(io.forecast.radius_m.shape[2] - 1),
     )
-    free = nearest_body_m(env, sample, at, io.forecast, io.baselines_cfg, io.behavior_cfg)
-    mapped = mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
+    free = nearest_obstacle_m(env, sample, at, io)
+    mapped = mapped_m(env, at, io)
     margin = ti.static(io.mppi_cfg.margin_m) + ti.static(io.mppi_cfg.margin_growth_m_s) * time
     cost = ti.static(io.mppi_cfg.weight_obstacle) * ti.max(margin - free, 0.0)
     cost += ti.static(io.mppi_cfg.weight_static) * ti.max(
@@ -174,10 +167,10 @@ def _state_cost(env, k, at, here, io: Bundle[PathIntegralIO]):
 
 
 @ti.func
-def _average(env, io: Bundle[PathIntegralIO]):
+def _average(env, io: Bundle[LocalPlannerIO]):
     """The plan becomes the weighted mean of the samples."""
     n_sample, n_control = ti.static(io.mppi_cfg.n_sample, io.baselines.plan_w.shape[1])
-    wanted, key, yaw = _wanted(env, io), _key(env, io), io.ego.rpy[env][2]
+    wanted, key, yaw = wanted_velocity(env, io), _key(env, io), io.ego.rpy[env][2]
     least = io.baselines.score[env, 0]
     for sample in range(1, n_sample):
         least = ti.min(least, io.baselines.score[env, sample])
@@ -193,6 +186,4 @@ def _average(env, io: Bundle[PathIntegralIO]):
                 noise = _noise(key, sample, k, noise, io)
                 io.baselines.change_w[env, k] += weight * (_base(env, sample, k, wanted, io) + noise)
     for k in range(n_control):
-        io.baselines.plan_w[env, k] = speed_limited(
-            io.baselines.change_w[env, k] / total, yaw, io.behavior_cfg, io.vehicle_cfg
-        )
+        io.baselines.plan_w[env, k] = speed_limited(io.baselines.change_w[env, k] / total, yaw, io)

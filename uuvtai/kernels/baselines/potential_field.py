@@ -11,7 +11,7 @@ that is known to be above or below pushes down or up too.
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.kernels.baselines.io import PotentialFieldIO
+from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.local_planner import (
     apart_m,
     decides,
@@ -33,35 +33,19 @@ _LEAST_M = 0.05
 
 @quick_launch
 @ti.kernel
-def plan_potential_field(io: Bundle[PotentialFieldIO]):
+def plan_potential_field(io: Bundle[LocalPlannerIO]):
     """Velocity along the sum of pull and pushes for the rows that decide in this step."""
     n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and decides(env, io.clock, io.baselines_cfg):
-            pull = wanted_velocity(
-                env,
-                io.ego,
-                io.mission,
-                io.behavior,
-                io.baselines_cfg,
-                io.tank_cfg,
-                io.behavior_cfg,
-                io.vehicle_cfg,
-            )
+        if pad == 0 and decides(env, io):
+            pull = wanted_velocity(env, io)
             force = pull + _push_of_obstacles(env, io) + _push_of_map(env, io)
             heave = ti.static(io.baselines_cfg.heave_m_s)
             if ti.static(heave > 0):
-                force[2] = edge_stopped(
-                    ti.math.clamp(force[2], -heave, heave),
-                    io.ego.pos_w[env][2],
-                    io.tank_cfg,
-                    io.baselines_cfg,
-                )
+                force[2] = edge_stopped(ti.math.clamp(force[2], -heave, heave), io.ego.pos_w[env][2], io)
             else:
                 force[2] = pull[2]
-            io.baselines.vel_w[env] = speed_limited(
-                force, io.ego.rpy[env][2], io.behavior_cfg, io.vehicle_cfg
-            )
+            io.baselines.vel_w[env] = speed_limited(force, io.ego.rpy[env][2], io)
 
 
 @ti.func
@@ -72,14 +56,14 @@ def _firas(distance_m, reach_m, gain):
 
 
 @ti.func
-def _push_of_obstacles(env, io: Bundle[PotentialFieldIO]):
+def _push_of_obstacles(env, io: Bundle[LocalPlannerIO]):
     pos, push = io.ego.pos_w[env], ti.Vector([0.0, 0.0, 0.0])
     for track in range(ti.static(io.forecast.radius_m.shape[1])):
         radius = io.forecast.radius_m[env, track, 0]
         if radius >= 0:
             off = ti.Vector([pos[0], pos[1]]) - io.forecast.pos_w[env, track, 0]
             middle = ti.max(off.norm(), 1.0e-6)
-            gap = free_water_m(env, track, pos[2], io.forecast, io.baselines_cfg)
+            gap = free_water_m(env, track, pos[2], io)
             apart = apart_m(middle - radius, gap)
             # the obstacle's surface is ``apart`` away, most of it on the level or most of it up or down
             rise = ti.select(gap > 0.0, gap / ti.max(apart, 1.0e-6), 0.0)
@@ -95,9 +79,9 @@ def _push_of_obstacles(env, io: Bundle[PotentialFieldIO]):
 
 
 @ti.func
-def _push_of_map(env, io: Bundle[PotentialFieldIO]):
+def _push_of_map(env, io: Bundle[LocalPlannerIO]):
     """From the nearest mapped obstacle or wall, on the level."""
     away = io.behavior.away_w[env]
-    room = mapped_m(env, io.ego.pos_w[env], io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
+    room = mapped_m(env, io.ego.pos_w[env], io)
     size = _firas(room, _STATIC_REACH_M, _STATIC_GAIN)
     return size * ti.Vector([away[0], away[1], 0.0])

@@ -12,7 +12,7 @@ one that collides last is driven (the paper leaves that to the designer).
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.kernels.baselines.io import VelocityObstacleIO
+from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.local_planner import (
     decides,
     free_water_m,
@@ -32,59 +32,38 @@ _MAP_STEP_S = 0.1
 
 @quick_launch
 @ti.kernel
-def plan_velocity_obstacle(io: Bundle[VelocityObstacleIO]):
+def plan_velocity_obstacle(io: Bundle[LocalPlannerIO]):
     """Velocity of least cost for the rows that decide in this step."""
     n, n_trial = ti.static(io.clock.active.shape[0], io.baselines_cfg.n_reachable)
+    window_s = ti.static(io.obstacle_cfg.window_s)
     for env, trial in ti.ndrange(n, n_trial):
-        if decides(env, io.clock, io.baselines_cfg):
-            io.baselines.score[env, trial] = _cost(env, _trial(env, trial, io), io)
+        if decides(env, io):
+            io.baselines.score[env, trial] = _cost(env, reachable_velocity(env, trial, window_s, io), io)
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and decides(env, io.clock, io.baselines_cfg):
+        if pad == 0 and decides(env, io):
             best = n_trial - 1
             for back in range(1, n_trial):
                 trial = n_trial - 1 - back
                 if io.baselines.score[env, trial] < io.baselines.score[env, best]:
                     best = trial
-            io.baselines.vel_w[env] = _trial(env, best, io)
+            io.baselines.vel_w[env] = reachable_velocity(env, best, window_s, io)
 
 
 @ti.func
-def _wanted(env, io: Bundle[VelocityObstacleIO]):
-    return wanted_velocity(
-        env, io.ego, io.mission, io.behavior, io.baselines_cfg, io.tank_cfg, io.behavior_cfg, io.vehicle_cfg
-    )
-
-
-@ti.func
-def _trial(env, trial, io: Bundle[VelocityObstacleIO]):
-    return reachable_velocity(
-        env,
-        trial,
-        _wanted(env, io),
-        io.ego,
-        ti.static(io.obstacle_cfg.window_s),
-        io.baselines_cfg,
-        io.tank_cfg,
-        io.behavior_cfg,
-        io.vehicle_cfg,
-    )
-
-
-@ti.func
-def _cost(env, velocity, io: Bundle[VelocityObstacleIO]):
+def _cost(env, velocity, io: Bundle[LocalPlannerIO]):
     """Difference from the wanted velocity [m/s]; in a cone far more, and the more the sooner it collides."""
     hit_s = _map_hit_s(env, velocity, io)
     for track in range(ti.static(io.forecast.radius_m.shape[1])):
         if io.forecast.radius_m[env, track, 0] >= 0:
             hit_s = ti.min(hit_s, _obstacle_hit_s(env, track, velocity, io))
-    out = (velocity - _wanted(env, io)).norm()
+    out = (velocity - wanted_velocity(env, io)).norm()
     if hit_s < FAR_M:
         out = _FORBIDDEN + out - 10.0 * hit_s
     return out
 
 
 @ti.func
-def _obstacle_hit_s(env, track, velocity, io: Bundle[VelocityObstacleIO]):
+def _obstacle_hit_s(env, track, velocity, io: Bundle[LocalPlannerIO]):
     """Time [s] at which a velocity meets an obstacle's grown outline within the horizon; FAR_M = outside its
     cone.
 
@@ -119,31 +98,29 @@ def _obstacle_hit_s(env, track, velocity, io: Bundle[VelocityObstacleIO]):
 
 
 @ti.func
-def _passes(env, track, z, heave, first_s, last_s, io: Bundle[VelocityObstacleIO]):
+def _passes(env, track, z, heave, first_s, last_s, io: Bundle[LocalPlannerIO]):
     """Whether the hull is clear above or below the obstacle from ``first_s`` to ``last_s``: free water has no
     corners, so both ends decide."""
     needed = ti.static(io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m + io.obstacle_cfg.margin_m)
-    first = free_water_m(env, track, z + heave * first_s, io.forecast, io.baselines_cfg)
-    last = free_water_m(env, track, z + heave * last_s, io.forecast, io.baselines_cfg)
+    first = free_water_m(env, track, z + heave * first_s, io)
+    last = free_water_m(env, track, z + heave * last_s, io)
     return ti.min(first, last) > needed
 
 
 @ti.func
-def _map_hit_s(env, velocity, io: Bundle[VelocityObstacleIO]):
+def _map_hit_s(env, velocity, io: Bundle[LocalPlannerIO]):
     """Time [s] at which a velocity comes too near to a mapped obstacle or wall, and nearer than now; FAR_M =
     never."""
     n_sample = ti.static(max(1, round(io.obstacle_cfg.static_horizon_s / _MAP_STEP_S)))
     pos, own = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
     lag = ti.static(io.behavior_cfg.lag_s)
-    here = mapped_m(env, pos, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg)
+    here = mapped_m(env, pos, io)
     wanted = ti.min(ti.static(io.baselines_cfg.static_margin_m), here)
     out = FAR_M
     for k in range(1, n_sample + 1):
         time = k * _MAP_STEP_S
         settle = lag * (1.0 - ti.exp(-time / lag))
         at = pos + own * settle + velocity * (time - settle)
-        if out == FAR_M and (
-            mapped_m(env, at, io.clearance, io.mapping_cfg, io.tank_cfg, io.behavior_cfg) < wanted
-        ):
+        if out == FAR_M and (mapped_m(env, at, io) < wanted):
             out = time
     return out
