@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from uuvtai.compile import parallel
+from uuvtai.compile import runtime
 from uuvtai.compile.cache import key_of, key_with
 from uuvtai.compile.launch import native
-from uuvtai.compile.parallel import Companion, compilers
+from uuvtai.compile.runtime import Companion, compilers
 from uuvtai.config import Config
 from uuvtai.config.loader import load_training
 from uuvtai.envs.warm_up import calls_of, understood, wake
@@ -69,7 +69,7 @@ def test_its_keys_are_those_that_the_first_process_looks_for(small, another):
 
 def test_it_ends_when_its_pipe_closes():
     done = subprocess.run(
-        [sys.executable, "-m", parallel.PROGRAM], input=b"", capture_output=True, timeout=120, check=False
+        [sys.executable, "-m", runtime.PROGRAM], input=b"", capture_output=True, timeout=120, check=False
     )
     assert (done.returncode, done.stdout) == (0, b"")
 
@@ -82,7 +82,7 @@ sys.stdin.buffer.read()
 """
 ASKER = """
 import os, pathlib, time
-from uuvtai.compile import parallel as companion
+from uuvtai.compile import runtime as companion
 companion.PROGRAM = "sleeper"
 one = companion.Companion()
 one.ask(b"recipe")

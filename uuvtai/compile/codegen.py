@@ -55,7 +55,7 @@ from uuvtai.compile.launch import (
     written,
 )
 from uuvtai.compile.memory import Memory
-from uuvtai.compile.parallel import Companion
+from uuvtai.compile.runtime import Companion
 
 RUNTIME_TYPE = (
     "{ %struct.PreallocatedMemoryChunk, %struct.PreallocatedMemoryChunk, i8* (i8*, i64, i64)*, void (i8*)*, "

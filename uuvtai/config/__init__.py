@@ -9,13 +9,6 @@ from __future__ import annotations
 from pydantic import model_validator
 
 from uuvtai.config.base import Section
-from uuvtai.config.baselines import (
-    BaselinesConfig,
-    DynamicWindowConfig,
-    PathIntegralConfig,
-    PotentialFieldConfig,
-    VelocityObstacleConfig,
-)
 from uuvtai.config.behavior import BehaviorConfig, FastConfig, SlowConfig
 from uuvtai.config.perception import (
     CameraTrackingConfig,
@@ -25,7 +18,18 @@ from uuvtai.config.perception import (
     MappingConfig,
     TrackingConfig,
 )
-from uuvtai.config.planning import ClearanceConfig, ObservationConfig, QuietConfig, RouteConfig, VoronoiConfig
+from uuvtai.config.planning import (
+    BaselinesConfig,
+    ClearanceConfig,
+    DynamicWindowConfig,
+    ObservationConfig,
+    PathIntegralConfig,
+    PotentialFieldConfig,
+    QuietConfig,
+    RouteConfig,
+    VelocityObstacleConfig,
+    VoronoiConfig,
+)
 from uuvtai.config.sensors import (
     DepthConfig,
     DvlConfig,

@@ -27,9 +27,8 @@ from uuvtai.state.behavior import BaselineStructs, BehaviorStructs
 from uuvtai.state.perception import PerceptionStructs
 from uuvtai.state.planning import PlanningStructs
 from uuvtai.state.sensors import SensorStructs
-from uuvtai.state.task import TaskStructs
 from uuvtai.state.vehicle import VehicleStructs
-from uuvtai.state.world import WorldStructs
+from uuvtai.state.world import TaskStructs, WorldStructs
 
 STAGES = (
     "dynamics", "world", "proprioception", "sonar", "localization", "depth", "tracking",

@@ -36,9 +36,19 @@ from uuvtai.state.sensors import (
     SonarMemory,
     SonarScan,
 )
-from uuvtai.state.task import ClockState, EpisodeState, MissionState, RewardState, TerminationState
 from uuvtai.state.vehicle import ActuationState, Allocation, CurrentState, VehicleParams, VehicleState
-from uuvtai.state.world import FixedTable, PathState, ScenarioScratch, SceneState, WorldState
+from uuvtai.state.world import (
+    ClockState,
+    EpisodeState,
+    FixedTable,
+    MissionState,
+    PathState,
+    RewardState,
+    ScenarioScratch,
+    SceneState,
+    TerminationState,
+    WorldState,
+)
 
 __all__ = [
     "PACKET",

@@ -12,7 +12,7 @@ from tests.command import uuv
 from tests.conftest import launch_one_by_one
 from tests.small_sim import SmallSim
 from uuvtai import state
-from uuvtai.config.baselines import ACCELERATION_M_S2
+from uuvtai.config.planning import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.dwa import plan_dynamic_window
 from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.mppi import plan_path_integral

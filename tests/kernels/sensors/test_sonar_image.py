@@ -25,8 +25,8 @@ from uuvtai.config.multibeam import (
 )
 from uuvtai.kernels.core.stage import Bundle
 from uuvtai.kernels.sensors import sonar, sonar_image
-from uuvtai.kernels.sensors.cfar import cfar_factor, level_beside
 from uuvtai.kernels.sensors.io import SonarIO
+from uuvtai.kernels.sensors.sonar import cfar_factor, level_beside
 from uuvtai.logs.encode import EpisodeHeader, Moment
 from uuvtai.logs.topics.sensors import SONAR_ROWS, logged_image
 from uuvtai.state import (

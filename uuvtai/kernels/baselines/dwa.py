@@ -11,7 +11,7 @@ admissible, the velocity that touches least and latest is driven.
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.config.baselines import ACCELERATION_M_S2
+from uuvtai.config.planning import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.local_planner import (
     decides,

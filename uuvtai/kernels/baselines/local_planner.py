@@ -7,7 +7,7 @@ or below leave free water, and those planners that try velocities may try to cli
 
 import taichi as ti
 
-from uuvtai.config.baselines import ACCELERATION_M_S2, N_AXIS
+from uuvtai.config.planning import ACCELERATION_M_S2, N_AXIS
 from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.core.geometry import turned_z
 from uuvtai.kernels.core.grid import cell_of
