@@ -7,6 +7,7 @@ import pytest
 import taichi as ti
 import torch
 
+from tests.bundles import io_for
 from uuvtai.common.errors import UserError
 from uuvtai.config import FastConfig, SlowConfig
 from uuvtai.config.behavior import (
@@ -23,8 +24,9 @@ from uuvtai.config.behavior import (
 )
 from uuvtai.config.loader import load_config, load_training, with_stack
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.rollout import tuned
-from uuvtai.kernels.core.stage import AnyTensor, In
+from uuvtai.kernels.core.stage import AnyTensor, Bundle
 from uuvtai.learning import checkpoint
 from uuvtai.learning.agents import TunedAgent, load_tuned, tuned_sections
 from uuvtai.learning.checkpoint import CheckpointError
@@ -121,9 +123,9 @@ def ends(sim, log_factor=None):
 
 
 @ti.kernel
-def _factors_of_calm(out: AnyTensor, behavior: In[BehaviorState]):
+def _factors(out: AnyTensor, io: Bundle[BehaviorIO]):
     for env in out:
-        out[env] = tuned(env, HYSTERESIS, behavior)
+        out[env] = tuned(env, HYSTERESIS, io)
 
 
 def test_what_holds_follows_from_the_speed_of_the_obstacles():
@@ -133,7 +135,7 @@ def test_what_holds_follows_from_the_speed_of_the_obstacles():
     factors[:, HYSTERESIS] = np.log([4.0, 0.25])
     behavior.tuned.from_numpy(factors)
     behavior.alert.from_numpy(np.array([-1.0, 0.0, 0.5, 1.0], np.float32))
-    _factors_of_calm(out, behavior)
+    _factors(out, io_for(BehaviorIO, behavior))
     assert out == pytest.approx([4.0, 4.0, 1.0, 0.25]), "nothing tracked, slow, between, fast"
 
 

@@ -136,8 +136,8 @@ def plan(stages: Stages, config: Config, by_voronoi: bool) -> None:
 
 def choose(stages: Stages, used: Collection[int], action: torch.Tensor) -> None:
     """The behaviour tree's choice, into ``action``; ``used``: codes of its leaves."""
-    threats.assess_threats(stages.threats)
-    avoidance.plan_evasion(stages.evasion)
+    threats.assess_threats(stages.behavior)
+    avoidance.plan_evasion(stages.behavior)
     if _has_baseline(used):
         _plan_by_baseline(stages, used)
     tree.tick_tree(stages.behavior, action)

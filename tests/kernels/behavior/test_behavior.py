@@ -15,7 +15,7 @@ from uuvtai import state
 from uuvtai.config import BehaviorConfig, Config
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.behavior import avoidance, threats, tree
-from uuvtai.kernels.behavior.io import BehaviorIO, EvasionIO, ThreatsIO
+from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
 from uuvtai.sim.behavior_tree import load_tree, parse_tree, read_tree
@@ -169,11 +169,11 @@ def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
 
 def assess(stage, cfg=CFG.behavior, sonar=CFG.sensors.sonar):
     rest = (CFG.height, CFG.traffic, CFG.vehicle, CFG.tracking, TANK, CFG.mapping, CFG.episode, CFG.fast)
-    threats.assess_threats(io_for(ThreatsIO, stage, cfg, sonar, *rest))
+    threats.assess_threats(io_for(BehaviorIO, stage, cfg, sonar, *rest))
 
 
 def plan(stage):
-    avoidance.plan_evasion(io_for(EvasionIO, stage, CFG))
+    avoidance.plan_evasion(io_for(BehaviorIO, stage, CFG))
 
 
 def decide(stage):

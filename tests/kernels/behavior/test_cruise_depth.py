@@ -7,7 +7,7 @@ import taichi as ti
 from tests.bundles import io_for
 from uuvtai.config import Config
 from uuvtai.config.behavior import TUNED
-from uuvtai.kernels.behavior.io import ThreatsIO
+from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.threats import choose_depth, level_share
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import AnyTensor, Bundle
@@ -27,13 +27,13 @@ def config(column_share=0.0, **behavior):
 
 
 @ti.kernel
-def _shares(z: AnyTensor, out: AnyTensor, io: Bundle[ThreatsIO]):
+def _shares(z: AnyTensor, out: AnyTensor, io: Bundle[BehaviorIO]):
     for i in z:
-        out[i] = level_share(z[i], io.traffic_cfg, io.height_cfg, io.behavior_cfg, io.vehicle_cfg)
+        out[i] = level_share(z[i], io)
 
 
 @ti.kernel
-def _choose(out: AnyTensor, io: Bundle[ThreatsIO]):
+def _choose(out: AnyTensor, io: Bundle[BehaviorIO]):
     for env in range(N_ENV):
         out[env] = choose_depth(env, io)
 
@@ -54,7 +54,7 @@ class Stage:
         self.mission.goal_w.from_numpy(goal.astype(np.float32))
         self.behavior.cruise_z_m.from_numpy((n + np.asarray(before_z)).astype(np.float32))
         out = np.zeros(N_ENV, np.float32)
-        _choose(out, io_for(ThreatsIO, *vars(self).values(), *sections(cfg)))
+        _choose(out, io_for(BehaviorIO, *vars(self).values(), *sections(cfg)))
         return out
 
 
@@ -76,7 +76,7 @@ def test_expected_share_is_that_of_a_drawn_population(column_share):
     column = rng.random((200_000, 1)) < column_share
     drawn = ((np.abs(centre - z) < half + 0.17 + 0.1) | column).mean(0)
     out, cfg = np.zeros_like(z), config(column_share)
-    _shares(z, out, io_for(ThreatsIO, *sections(cfg)))
+    _shares(z, out, io_for(BehaviorIO, *sections(cfg)))
     np.testing.assert_allclose(out, drawn, atol=0.07)
     assert out.max() > 0.99 and out.min() < 0.25 + 0.75 * column_share
 

@@ -5,7 +5,7 @@ import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
 from uuvtai.config.behavior import BURST, CHANGE, CONTACT, DEVIATION, HEAVE, MEAN, PEAK, STATIC, TEMPERATURE
-from uuvtai.kernels.behavior.io import EvasionIO
+from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.rollout import (
     depth_band,
     drive_of,
@@ -22,7 +22,7 @@ from uuvtai.kernels.core.stage import Bundle, Const, spread
 
 @quick_launch
 @ti.kernel
-def plan_evasion(io: Bundle[EvasionIO]):
+def plan_evasion(io: Bundle[BehaviorIO]):
     """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is
     as good as the best one."""
     n, lanes = ti.static(io.clock.active.shape[0], n_lane())
@@ -32,7 +32,7 @@ def plan_evasion(io: Bundle[EvasionIO]):
             cx, cy, cz = candidate_lanes(env, packet * lanes, lanes, io)
             burst_s = ti.select(
                 packet * lanes >= io.behavior_cfg.first_burst,
-                io.behavior_cfg.burst_s * tuned(env, BURST, io.behavior),
+                io.behavior_cfg.burst_s * tuned(env, BURST, io),
                 FAR_M,
             )
             cost = cost_lanes(env, cx, cy, cz, burst_s, io)
@@ -43,14 +43,14 @@ def plan_evasion(io: Bundle[EvasionIO]):
             index, best_cost, mean = _chosen(env, io)
             cx, cy, cz = filled(mean[0], lanes), filled(mean[1], lanes), filled(mean[2], lanes)
             cost = cost_lanes(env, cx, cy, cz, FAR_M, io)
-            good = cost[0] <= best_cost + io.behavior_cfg.temperature * tuned(env, TEMPERATURE, io.behavior)
+            good = cost[0] <= best_cost + io.behavior_cfg.temperature * tuned(env, TEMPERATURE, io)
             io.behavior.evade_vel_w[env] = ti.select(good, mean, candidate(env, index, io))
             io.behavior.evade_candidate[env] = ti.select(good, -1, index)
             io.behavior.evade_cost[env] = ti.select(good, cost[0], best_cost)
 
 
 @ti.func
-def candidate_lanes(env, first, lanes: Const[int], io: Bundle[EvasionIO]):
+def candidate_lanes(env, first, lanes: Const[int], io: Bundle[BehaviorIO]):
     """World velocities (lanes x, y, z [m/s]) of as many candidates from ``first`` on."""
     velocities = ti.Matrix.zero(ti.f32, 3, lanes)
     for lane in range(lanes):
@@ -59,7 +59,7 @@ def candidate_lanes(env, first, lanes: Const[int], io: Bundle[EvasionIO]):
 
 
 @ti.func
-def candidate(env, index, io: Bundle[EvasionIO]):
+def candidate(env, index, io: Bundle[BehaviorIO]):
     """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route
     is among them.
 
@@ -86,9 +86,7 @@ def candidate(env, index, io: Bundle[EvasionIO]):
         out = follow
     elif index > n_level + 2 and index < ti.static(io.behavior_cfg.n_held):
         nth = index - n_level - 3
-        heave = (
-            ti.select(nth % 2 == 0, 1.0, -1.0) * io.behavior_cfg.heave_m_s * tuned(env, HEAVE, io.behavior)
-        )
+        heave = ti.select(nth % 2 == 0, 1.0, -1.0) * io.behavior_cfg.heave_m_s * tuned(env, HEAVE, io)
         heave = edge_limited(env, heave, io)
         turn = ti.static(TWO_PI / io.behavior_cfg.n_heave_heading) * (nth // 2)
         out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, io)
@@ -96,7 +94,7 @@ def candidate(env, index, io: Bundle[EvasionIO]):
 
 
 @ti.func
-def _towards(env, turn, share, heave, io: Bundle[EvasionIO]):
+def _towards(env, turn, share, heave, io: Bundle[BehaviorIO]):
     """World velocity at an angle from the follow direction, at a share of the speed possible there."""
     follow = io.behavior.follow_vel_w[env]
     heading = ti.atan2(follow[1], follow[0]) + turn
@@ -107,15 +105,15 @@ def _towards(env, turn, share, heave, io: Bundle[EvasionIO]):
 
 
 @ti.func
-def edge_limited(env, heave, io: Bundle[EvasionIO]):
+def edge_limited(env, heave, io: Bundle[BehaviorIO]):
     """Heave [m/s] that stops at the band's edges instead of running into floor or surface."""
-    low, high = depth_band(edge_gap(env, io.ego, io.behavior_cfg), io.tank_cfg)
+    low, high = depth_band(edge_gap(env, io), io)
     own_z = io.ego.pos_w[env][2]
     return ti.math.clamp(heave, ti.min(low - own_z, 0.0), ti.max(high - own_z, 0.0))
 
 
 @ti.func
-def speed_limit(angle, io: Bundle[EvasionIO]):
+def speed_limit(angle, io: Bundle[BehaviorIO]):
     """Fastest level speed in a direction of the body frame: surge and sway are limited one by one, so
     diagonals are faster."""
     along = ti.abs(ti.cos(angle)) / ti.static(io.vehicle_cfg.max_surge_m_s)
@@ -124,29 +122,23 @@ def speed_limit(angle, io: Bundle[EvasionIO]):
 
 
 @ti.func
-def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
+def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[BehaviorIO]):
     """Cost of a packet of commanded velocities. Violations count by depth: a flat penalty drives straight on
     when every candidate is bad."""
-    drive = drive_of(env, cx, cy, cz, burst_s, io.ego, io.behavior, io.behavior_cfg)
-    peak, mean, contact, _ = obstacle_depths(
-        env, drive, io.forecast, io.futures, io.behavior_cfg, io.tracking_cfg, io.tank_cfg
-    )
-    doubt = place_doubt(io.ego.pose_cov[env], io.behavior_cfg)
-    static_mean, static_contact = static_depths(
-        env, drive, doubt, io.clearance, io.behavior_cfg, io.tank_cfg, io.mapping_cfg
-    )
+    drive = drive_of(env, cx, cy, cz, burst_s, io)
+    peak, mean, contact, _ = obstacle_depths(env, drive, io)
+    doubt = place_doubt(env, io)
+    static_mean, static_contact = static_depths(env, drive, doubt, io)
     off = _distance_lanes(cx, cy, cz, io.behavior.follow_vel_w[env]) * (
-        ti.static(io.behavior_cfg.weight_deviation / io.behavior_cfg.cruise_m_s)
-        * tuned(env, DEVIATION, io.behavior)
+        ti.static(io.behavior_cfg.weight_deviation / io.behavior_cfg.cruise_m_s) * tuned(env, DEVIATION, io)
     )
     change = _distance_lanes(cx, cy, cz, io.behavior.last_vel_w[env]) * (
-        ti.static(io.behavior_cfg.weight_change / io.behavior_cfg.cruise_m_s)
-        * tuned(env, CHANGE, io.behavior)
+        ti.static(io.behavior_cfg.weight_change / io.behavior_cfg.cruise_m_s) * tuned(env, CHANGE, io)
     )
-    of_peak = io.behavior_cfg.weight_peak * tuned(env, PEAK, io.behavior)
-    of_mean = io.behavior_cfg.weight_mean * tuned(env, MEAN, io.behavior)
-    of_contact = io.behavior_cfg.weight_contact * tuned(env, CONTACT, io.behavior)
-    of_static = io.behavior_cfg.weight_static * tuned(env, STATIC, io.behavior)
+    of_peak = io.behavior_cfg.weight_peak * tuned(env, PEAK, io)
+    of_mean = io.behavior_cfg.weight_mean * tuned(env, MEAN, io)
+    of_contact = io.behavior_cfg.weight_contact * tuned(env, CONTACT, io)
+    of_static = io.behavior_cfg.weight_static * tuned(env, STATIC, io)
     moving = peak * of_peak + mean * of_mean
     touching = contact * of_contact + static_contact * ti.static(io.behavior_cfg.weight_static_contact)
     return moving + touching + static_mean * of_static + off + change
@@ -161,7 +153,7 @@ def _distance_lanes(cx, cy, cz, velocity):
 
 
 @ti.func
-def _chosen(env, io: Bundle[EvasionIO]):
+def _chosen(env, io: Bundle[BehaviorIO]):
     """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost /
     temperature)."""
     n_used = ti.static(io.behavior_cfg.n_candidate)
@@ -171,7 +163,7 @@ def _chosen(env, io: Bundle[EvasionIO]):
             best_cost = io.behavior.candidate_cost[env, index]
             best = index
     total, mean = 0.0, ti.Vector([0.0, 0.0, 0.0])
-    sharpness = ti.static(1.0 / io.behavior_cfg.temperature) / tuned(env, TEMPERATURE, io.behavior)
+    sharpness = ti.static(1.0 / io.behavior_cfg.temperature) / tuned(env, TEMPERATURE, io)
     for index in range(n_used):
         excess = (io.behavior.candidate_cost[env, index] - best_cost) * sharpness
         if excess < 12.0:

@@ -1,4 +1,4 @@
-"""What each stage of this room reads and writes."""
+"""What the behavior tree, its threats and its evasion read and write."""
 
 from __future__ import annotations
 
@@ -34,44 +34,11 @@ from uuvtai.state import (
 
 
 @dataclass(frozen=True, eq=False)
-class EvasionIO:
-    """The evasive velocity of least cost."""
-
-    behavior: Out[BehaviorState]
-    clearance: In[ClearanceState]
-    clock: In[ClockState]
-    ego: In[Proprioception]
-    forecast: In[ForecastState]
-    futures: In[FutureState]
-    mapping_cfg: Const[MappingConfig]
-    tank_cfg: Const[TankConfig]
-    behavior_cfg: Const[BehaviorConfig]
-    tracking_cfg: Const[TrackingConfig]
-    vehicle_cfg: Const[VehicleConfig]
-
-
-@dataclass(frozen=True, eq=False)
 class BehaviorIO:
-    """The behaviour tree and its action."""
+    """What is dangerous now, the evasive velocity of least cost, the behaviour tree and its action."""
 
     behavior: Out[BehaviorState]
     baselines: In[BaselineState]
-    clock: In[ClockState]
-    ego: In[Proprioception]
-    mission: In[MissionState]
-    route: In[RouteState]
-    table: In[TreeTable]
-    episode_cfg: Const[EpisodeConfig]
-    sonar_cfg: Const[SonarConfig]
-    behavior_cfg: Const[BehaviorConfig]
-    vehicle_cfg: Const[VehicleConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class ThreatsIO:
-    """What is dangerous now."""
-
-    behavior: Out[BehaviorState]
     clearance: In[ClearanceState]
     clock: In[ClockState]
     ego: In[Proprioception]
@@ -80,14 +47,15 @@ class ThreatsIO:
     mission: In[MissionState]
     route: In[RouteState]
     scan: In[SonarScan]
+    table: In[TreeTable]
     tracks: In[TrackState]
-    height_cfg: Const[HeightConfig]
+    behavior_cfg: Const[BehaviorConfig]
     episode_cfg: Const[EpisodeConfig]
     fast_cfg: Const[FastConfig]
+    height_cfg: Const[HeightConfig]
     mapping_cfg: Const[MappingConfig]
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
-    behavior_cfg: Const[BehaviorConfig]
     tracking_cfg: Const[TrackingConfig]
     traffic_cfg: Const[TrafficConfig]
     vehicle_cfg: Const[VehicleConfig]
@@ -95,8 +63,6 @@ class ThreatsIO:
 
 @dataclass(frozen=True, eq=False)
 class BehaviorStages:
-    """Bundles of this room, by the noun of their stage."""
+    """The bundle of this room, by the noun of its stages."""
 
-    threats: ThreatsIO
-    evasion: EvasionIO
     behavior: BehaviorIO

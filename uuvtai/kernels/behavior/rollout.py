@@ -9,36 +9,26 @@ from typing import Any
 
 import taichi as ti
 
-from uuvtai.config import BehaviorConfig, MappingConfig, TankConfig, TrackingConfig, VehicleConfig
 from uuvtai.config.behavior import CAUTION, CLOSING, DOUBT, GROWTH, HORIZON, LAG, STATIC_MARGIN, VERTICAL
+from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.simd import filled
-from uuvtai.kernels.core.stage import Const, In, Out
-from uuvtai.state import BehaviorState, ClearanceState, ForecastState, FutureState, Proprioception
+from uuvtai.kernels.core.stage import Bundle, Const, Out
 
 _SLACK_S = 1.0e-3
 """the last sample is within the horizon, however times are rounded"""
 
 
 @ti.func
-def tuned(env, number, behavior: In[BehaviorState]):
+def tuned(env, number, io: Bundle[BehaviorIO]):
     """Factor on one of the config's numbers in this row and at this time (``tuned_numbers``)."""
-    share, log_factor = ti.max(behavior.alert[env], 0.0), behavior.tuned[env, number]
+    share, log_factor = ti.max(io.behavior.alert[env], 0.0), io.behavior.tuned[env, number]
     return ti.exp((1.0 - share) * log_factor[0] + share * log_factor[1])
 
 
 @ti.func
-def drive_of(
-    env,
-    cx,
-    cy,
-    cz,
-    burst_s,
-    ego: In[Proprioception],
-    behavior: In[BehaviorState],
-    behavior_cfg: Const[BehaviorConfig],
-):
+def drive_of(env, cx, cy, cz, burst_s, io: Bundle[BehaviorIO]):
     """A packet of commanded velocities (lanes x, y, z [m/s]) from where the vehicle is, and what it is judged
     by: the struct ``drive`` of ``obstacle_depths``."""
     return ti.Struct(
@@ -46,30 +36,22 @@ def drive_of(
         y=cy,
         z=cz,
         burst_s=burst_s,
-        pos=ego.pos_w[env],
-        vel=turned_z3(ego.vel_b[env], ego.rpy[env][2]),
-        gap=edge_gap(env, ego, behavior_cfg),
-        caution=behavior_cfg.caution * tuned(env, CAUTION, behavior) * behavior.patience[env],
-        growth_m_s=behavior_cfg.margin_growth_m_s * tuned(env, GROWTH, behavior),
-        closing_s=behavior_cfg.closing_s * tuned(env, CLOSING, behavior) * behavior.patience[env],
-        horizon_s=behavior_cfg.horizon_s * tuned(env, HORIZON, behavior) + _SLACK_S,
-        slower=tuned(env, LAG, behavior),
-        vertical=behavior_cfg.vertical_weight * tuned(env, VERTICAL, behavior),
-        doubt=behavior_cfg.obstacle_growth * tuned(env, DOUBT, behavior) - 1.0,
-        static_margin_m=behavior_cfg.static_margin_m * tuned(env, STATIC_MARGIN, behavior),
+        pos=io.ego.pos_w[env],
+        vel=turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2]),
+        gap=edge_gap(env, io),
+        caution=io.behavior_cfg.caution * tuned(env, CAUTION, io) * io.behavior.patience[env],
+        growth_m_s=io.behavior_cfg.margin_growth_m_s * tuned(env, GROWTH, io),
+        closing_s=io.behavior_cfg.closing_s * tuned(env, CLOSING, io) * io.behavior.patience[env],
+        horizon_s=io.behavior_cfg.horizon_s * tuned(env, HORIZON, io) + _SLACK_S,
+        slower=tuned(env, LAG, io),
+        vertical=io.behavior_cfg.vertical_weight * tuned(env, VERTICAL, io),
+        doubt=io.behavior_cfg.obstacle_growth * tuned(env, DOUBT, io) - 1.0,
+        static_margin_m=io.behavior_cfg.static_margin_m * tuned(env, STATIC_MARGIN, io),
     )
 
 
 @ti.func
-def obstacle_depths(
-    env,
-    drive,
-    forecast: In[ForecastState],
-    futures: In[FutureState],
-    behavior_cfg: Const[BehaviorConfig],
-    tracking_cfg: Const[TrackingConfig],
-    tank_cfg: Const[TankConfig],
-):
+def obstacle_depths(env, drive, io: Bundle[BehaviorIO]):
     """How deep each commanded velocity violates the wanted clearance from the forecast obstacles.
 
     ``drive``: struct of the velocities (lanes x, y, z [m/s]), which are commanded for ``burst_s`` [s], then
@@ -83,21 +65,19 @@ def obstacle_depths(
     them (``above_w``, ``below_w``) adds to the distance.
     """
     found = _no_depths(drive)
-    for track in range(ti.static(forecast.radius_m.shape[1])):
-        near = forecast.radius_m[env, track, 0] >= 0
-        if near and _within_reach(env, track, drive, forecast, behavior_cfg, tracking_cfg):
+    for track in range(ti.static(io.forecast.radius_m.shape[1])):
+        near = io.forecast.radius_m[env, track, 0] >= 0
+        if near and _within_reach(env, track, drive, io):
             left, obstacle = 1.0, _no_depths(drive)
-            for nth in range(ti.static(futures.share.shape[2] + 1)):
-                future = ti.static(futures.share.shape[2]) - 1 - nth  # the forecast itself comes last: -1
+            for nth in range(ti.static(io.futures.share.shape[2] + 1)):
+                future = ti.static(io.futures.share.shape[2]) - 1 - nth  # the forecast itself comes last: -1
                 likely = left
                 if future >= 0:
-                    likely = futures.share[env, track, future]
-                if likely > ti.static(behavior_cfg.least_share):
+                    likely = io.futures.share[env, track, future]
+                if likely > ti.static(io.behavior_cfg.least_share):
                     left -= likely
-                    one = _future_depths(
-                        env, track, future, drive, forecast, futures, behavior_cfg, tracking_cfg, tank_cfg
-                    )
-                    _take_future(found, obstacle, one, likely, behavior_cfg)
+                    one = _future_depths(env, track, future, drive, io)
+                    _take_future(found, obstacle, one, likely, io)
             for i in ti.static(range(drive.x.n)):
                 found.peak[i] = ti.max(found.peak[i], obstacle.peak[i])
                 found.contact[i] = ti.max(found.contact[i], obstacle.contact[i])
@@ -105,12 +85,12 @@ def obstacle_depths(
 
 
 @ti.func
-def _take_future(found: Out[Any], obstacle: Out[Any], one, likely, behavior_cfg: Const[BehaviorConfig]):
+def _take_future(found: Out[Any], obstacle: Out[Any], one, likely, io: Bundle[BehaviorIO]):
     """Add the depths of ``one`` future, as ``likely`` as it is, to those of its body and of all."""
     found.mean += likely * one.mean
     obstacle.peak += likely * one.peak
     obstacle.contact += likely * one.contact
-    if likely >= ti.static(behavior_cfg.evade_probability):
+    if likely >= ti.static(io.behavior_cfg.evade_probability):
         for i in ti.static(range(one.first.n)):
             found.first[i] = ti.min(found.first[i], one.first[i])
 
@@ -123,52 +103,35 @@ def _no_depths(drive):
 
 
 @ti.func
-def _within_reach(
-    env,
-    track,
-    drive,
-    forecast: In[ForecastState],
-    behavior_cfg: Const[BehaviorConfig],
-    tracking_cfg: Const[TrackingConfig],
-):
+def _within_reach(env, track, drive, io: Bundle[BehaviorIO]):
     """Whether an obstacle can come so near within the horizon that any of its futures counts for any lane."""
-    first, second = forecast.pos_w[env, track, 0], forecast.pos_w[env, track, 1]
-    n = ti.static(_samples(forecast.radius_m.shape[2], behavior_cfg, tracking_cfg))
-    time = ti.static((n - 1) * tracking_cfg.forecast_dt_s)
-    closing = (second - first).norm() * ti.static(1.05 / tracking_cfg.forecast_dt_s)
-    closing += ti.Vector([drive.vel[0], drive.vel[1]]).norm() + ti.static(_fastest(behavior_cfg))
-    told = forecast.radius_m[env, track, n - 1]
-    bound = told + ti.max(drive.doubt, 0.0) * ti.max(told - forecast.radius_m[env, track, 0], 0.0)
-    bound += ti.static(behavior_cfg.hull_reach_m)
-    bound += _wanted_m(time, drive, behavior_cfg) + closing * (time + drive.closing_s)
+    first, second = io.forecast.pos_w[env, track, 0], io.forecast.pos_w[env, track, 1]
+    n = ti.static(_samples(io.forecast.radius_m.shape[2], io.behavior_cfg, io.tracking_cfg))
+    time = ti.static((n - 1) * io.tracking_cfg.forecast_dt_s)
+    closing = (second - first).norm() * ti.static(1.05 / io.tracking_cfg.forecast_dt_s)
+    closing += ti.Vector([drive.vel[0], drive.vel[1]]).norm() + ti.static(_fastest(io.behavior_cfg))
+    told = io.forecast.radius_m[env, track, n - 1]
+    bound = told + ti.max(drive.doubt, 0.0) * ti.max(told - io.forecast.radius_m[env, track, 0], 0.0)
+    bound += ti.static(io.behavior_cfg.hull_reach_m)
+    bound += _wanted_m(time, drive, io) + closing * (time + drive.closing_s)
     return (first - ti.Vector([drive.pos[0], drive.pos[1]])).norm_sqr() < bound * bound
 
 
 @ti.func
-def _future_depths(
-    env,
-    track,
-    future,
-    drive,
-    forecast: In[ForecastState],
-    futures: In[FutureState],
-    behavior_cfg: Const[BehaviorConfig],
-    tracking_cfg: Const[TrackingConfig],
-    tank_cfg: Const[TankConfig],
-):
+def _future_depths(env, track, future, drive, io: Bundle[BehaviorIO]):
     """The lanes' depths for one future of one obstacle; -1 = its forecast."""
-    n_sample = ti.static(_samples(forecast.radius_m.shape[2], behavior_cfg, tracking_cfg))
-    dt = ti.static(tracking_cfg.forecast_dt_s)
-    low, high = depth_band(drive.gap, tank_cfg)
+    n_sample = ti.static(_samples(io.forecast.radius_m.shape[2], io.behavior_cfg, io.tracking_cfg))
+    dt = ti.static(io.tracking_cfg.forecast_dt_s)
+    low, high = depth_band(drive.gap, io)
     found = _no_depths(drive)
     level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
-    reach_speed = level_vel.norm() + ti.static(_fastest(behavior_cfg))
-    above, below = forecast.above_w[env, track], forecast.below_w[env, track]
-    step_decay = ti.static(2.718281828459045 ** (-tracking_cfg.forecast_dt_s / behavior_cfg.lag_s)) * ti.exp(
-        ti.static(-tracking_cfg.forecast_dt_s / behavior_cfg.lag_s) * (1.0 / drive.slower - 1.0)
-    )
-    lag_s = behavior_cfg.lag_s * drive.slower
-    decay, rest, before = 1.0, 1.0, forecast.pos_w[env, track, 0]
+    reach_speed = level_vel.norm() + ti.static(_fastest(io.behavior_cfg))
+    above, below = io.forecast.above_w[env, track], io.forecast.below_w[env, track]
+    step_decay = ti.static(
+        2.718281828459045 ** (-io.tracking_cfg.forecast_dt_s / io.behavior_cfg.lag_s)
+    ) * ti.exp(ti.static(-io.tracking_cfg.forecast_dt_s / io.behavior_cfg.lag_s) * (1.0 / drive.slower - 1.0))
+    lag_s = io.behavior_cfg.lag_s * drive.slower
+    decay, rest, before = 1.0, 1.0, io.forecast.pos_w[env, track, 0]
     for k in range(1, n_sample):
         # exp(-t / tau) by one factor a sample: settle = A(t), gain = B(t) - B(t - T), and the
         # velocity is v0 decay + c (rest - decay), the derivative of x(t)
@@ -176,63 +139,59 @@ def _future_depths(
         time = k * dt
         over = ti.max(time - drive.burst_s, 0.0)
         if over > 0.0:
-            rest = ti.exp(over * ti.static(-1.0 / behavior_cfg.lag_s) / drive.slower)
+            rest = ti.exp(over * ti.static(-1.0 / io.behavior_cfg.lag_s) / drive.slower)
         settle = lag_s * (1.0 - decay)
         gain = time - settle - over + lag_s * (1.0 - rest)
-        obstacle, wanted = forecast.pos_w[env, track, k], _wanted_m(time, drive, behavior_cfg)
+        obstacle, wanted = io.forecast.pos_w[env, track, k], _wanted_m(time, drive, io)
         if future >= 0:
-            obstacle = futures.pos_w[env, track, future, k]
-            wanted -= ti.static(1.0 - behavior_cfg.future_margin) * (wanted - behavior_cfg.contact_m)
+            obstacle = io.futures.pos_w[env, track, future, k]
+            wanted -= ti.static(1.0 - io.behavior_cfg.future_margin) * (wanted - io.behavior_cfg.contact_m)
         obstacle_vel = (obstacle - before) / dt
         before = obstacle
         start = level + level_vel * settle - obstacle
         drift = level_vel * decay - obstacle_vel
-        told = forecast.radius_m[env, track, k]
-        radius = told + drive.doubt * (told - forecast.radius_m[env, track, 0])
-        bound = _bound_m(
-            radius, wanted, gain, drive.closing_s * (reach_speed + obstacle_vel.norm()), behavior_cfg
-        )
+        told = io.forecast.radius_m[env, track, k]
+        radius = told + drive.doubt * (told - io.forecast.radius_m[env, track, 0])
+        bound = _bound_m(radius, wanted, gain, drive.closing_s * (reach_speed + obstacle_vel.norm()), io)
         if told >= 0 and time <= drive.horizon_s and start.norm_sqr() < bound * bound:
             z = ti.math.clamp(drive.z * gain + (drive.pos[2] + drive.vel[2] * settle), low, high)
             gap = ti.max(ti.min(above - z, z - below), 0.0) * drive.vertical
             free = _free_lanes(
-                drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, drive.closing_s, behavior_cfg
+                drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, drive.closing_s, io
             )
-            _deepen(found, wanted, free, time, n_sample - 1, behavior_cfg)
+            _deepen(found, wanted, free, time, n_sample - 1, io)
     return found
 
 
 @ti.func
-def _bound_m(radius, wanted, gain, reserve, behavior_cfg: Const[BehaviorConfig]):
+def _bound_m(radius, wanted, gain, reserve, io: Bundle[BehaviorIO]):
     """Distance [m] of ``start`` beyond which no lane's depth is above 0: however c is chosen, a lane comes no
     nearer than |start| - fastest x gain, and what closing takes off is at most ``reserve`` [m]."""
-    bound = radius + ti.static(behavior_cfg.hull_reach_m) + wanted
-    bound += ti.static(_fastest(behavior_cfg)) * gain
+    bound = radius + ti.static(io.behavior_cfg.hull_reach_m) + wanted
+    bound += ti.static(_fastest(io.behavior_cfg)) * gain
     return bound + reserve
 
 
 @ti.func
-def _deepen(found: Out[Any], wanted, free, time, n_ahead: Const[int], behavior_cfg: Const[BehaviorConfig]):
+def _deepen(found: Out[Any], wanted, free, time, n_ahead: Const[int], io: Bundle[BehaviorIO]):
     """Take one sample of one obstacle into the lanes' largest and mean depths and first violations."""
     for i in ti.static(range(free.n)):
         depth = ti.max(wanted - free[i], 0.0)
         found.peak[i] = ti.max(found.peak[i], depth)
         found.mean[i] += depth * ti.static(1.0 / n_ahead)
-        found.contact[i] = ti.max(found.contact[i], ti.static(behavior_cfg.contact_m) - free[i])
+        found.contact[i] = ti.max(found.contact[i], ti.static(io.behavior_cfg.contact_m) - free[i])
         found.first[i] = ti.min(found.first[i], ti.select(depth > 0.0, time, FAR_M))
 
 
 @ti.func
-def _wanted_m(time, drive, behavior_cfg: Const[BehaviorConfig]):
+def _wanted_m(time, drive, io: Bundle[BehaviorIO]):
     """Clearance [m] wanted ``time`` [s] ahead: it grows as the forecast's error does."""
-    margin = behavior_cfg.margin_m + drive.growth_m_s * time
-    return behavior_cfg.contact_m + drive.caution * margin
+    margin = io.behavior_cfg.margin_m + drive.growth_m_s * time
+    return io.behavior_cfg.contact_m + drive.caution * margin
 
 
 @ti.func
-def _free_lanes(
-    cx, cy, gap, start, drift, gain, share, radius, closing_s, behavior_cfg: Const[BehaviorConfig]
-):
+def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, closing_s, io: Bundle[BehaviorIO]):
     """Surface-to-surface distance less closing_s times the closing speed, per lane; ``gap`` = weighted free
     water above or below.
 
@@ -247,36 +206,26 @@ def _free_lanes(
     distance = ti.sqrt(beyond * beyond + gap * gap + 1.0e-8)
     approach = -(dx * (cx * share + drift[0]) + dy * (cy * share + drift[1])) / middle
     closing = ti.max(approach, 0.0) * ti.select(gap > 0.0, beyond / distance, 1.0)
-    return distance + within - ti.static(behavior_cfg.hull_reach_m) - closing_s * closing
+    return distance + within - ti.static(io.behavior_cfg.hull_reach_m) - closing_s * closing
 
 
 @ti.func
-def static_depths(
-    env,
-    drive,
-    doubt,
-    clearance: In[ClearanceState],
-    behavior_cfg: Const[BehaviorConfig],
-    tank_cfg: Const[TankConfig],
-    mapping_cfg: Const[MappingConfig],
-):
+def static_depths(env, drive, doubt, io: Bundle[BehaviorIO]):
     """How deep each commanded velocity of ``drive_of`` violates the wanted static clearance, ``doubt`` [m]
     (of ``place_doubt``) more than is mapped: lanes mean depth and largest depth below contact [m]."""
     mean, contact = filled(0.0, drive.x.n), filled(0.0, drive.x.n)
-    n_sample = ti.static(max(1, round(behavior_cfg.static_horizon_s / behavior_cfg.static_dt_s)))
-    touch = ti.static(behavior_cfg.hull_reach_m + behavior_cfg.contact_m)
+    n_sample = ti.static(max(1, round(io.behavior_cfg.static_horizon_s / io.behavior_cfg.static_dt_s)))
+    touch = ti.static(io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m)
     for k in range(1, n_sample + 1):
-        time = k * ti.static(behavior_cfg.static_dt_s)
-        settle = settling(time, drive.slower, behavior_cfg)
+        time = k * ti.static(io.behavior_cfg.static_dt_s)
+        settle = settling(time, drive.slower, io)
         over = ti.max(time - drive.burst_s, 0.0)
-        gain = time - settle - over + settling(over, drive.slower, behavior_cfg)
+        gain = time - settle - over + settling(over, drive.slower, io)
         free = clearance_lanes(
             env,
             drive.x * gain + (drive.pos[0] + drive.vel[0] * settle),
             drive.y * gain + (drive.pos[1] + drive.vel[1] * settle),
-            clearance,
-            tank_cfg,
-            mapping_cfg,
+            io,
         )
         for i in ti.static(range(drive.x.n)):
             below = touch + doubt - free[i]
@@ -286,61 +235,62 @@ def static_depths(
 
 
 @ti.func
-def settling(time, slower, behavior_cfg: Const[BehaviorConfig]):
+def settling(time, slower, io: Bundle[BehaviorIO]):
     """A(t) [s] of the module's text, with ``slower`` times the lag."""
-    rate = ti.static(1.0 / behavior_cfg.lag_s) / slower
-    return behavior_cfg.lag_s * slower * (1.0 - ti.exp(-time * rate))
+    rate = ti.static(1.0 / io.behavior_cfg.lag_s) / slower
+    return io.behavior_cfg.lag_s * slower * (1.0 - ti.exp(-time * rate))
 
 
 @ti.func
-def clearance_lanes(
-    env, x, y, clearance: In[ClearanceState], tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]
-):
+def clearance_lanes(env, x, y, io: Bundle[BehaviorIO]):
     """Mapped clearance [m] of the cells that hold the lanes' positions; positions off the grid take its
     border, which is 0."""
-    x0, y0 = ti.static(grid_origin(tank_cfg, mapping_cfg.cell_m))
-    n_row, n_col = ti.static(clearance.clearance_m.shape[1], clearance.clearance_m.shape[2])
-    at_col = (x - x0) * ti.static(1.0 / mapping_cfg.cell_m)
-    at_row = (y - y0) * ti.static(1.0 / mapping_cfg.cell_m)
+    x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
+    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
+    at_col = (x - x0) * ti.static(1.0 / io.mapping_cfg.cell_m)
+    at_row = (y - y0) * ti.static(1.0 / io.mapping_cfg.cell_m)
     out = filled(0.0, x.n)
     for i in ti.static(range(x.n)):
         row = ti.math.clamp(ti.cast(ti.floor(at_row[i]), ti.i32), 0, n_row - 1)
         col = ti.math.clamp(ti.cast(ti.floor(at_col[i]), ti.i32), 0, n_col - 1)
-        out[i] = clearance.clearance_m[env, row, col]
+        out[i] = io.clearance.clearance_m[env, row, col]
     return out
 
 
 @ti.func
-def held_heave(error_m, behavior_cfg: Const[BehaviorConfig], vehicle_cfg: Const[VehicleConfig]):
+def held_heave(error_m, io: Bundle[BehaviorIO]):
     """Vertical speed [m/s] that corrects a depth error [m]."""
-    top = ti.static(vehicle_cfg.max_heave_m_s)
-    return ti.math.clamp(error_m * ti.static(behavior_cfg.depth_gain), -top, top)
+    top = ti.static(io.vehicle_cfg.max_heave_m_s)
+    return ti.math.clamp(error_m * ti.static(io.behavior_cfg.depth_gain), -top, top)
 
 
 @ti.func
-def edge_gap(env, ego: In[Proprioception], behavior_cfg: Const[BehaviorConfig]):
+def edge_gap(env, io: Bundle[BehaviorIO]):
     """[m] to keep from floor and surface: the less sure of the own z, and with a dead vertical thruster, the
     more."""
-    least = ti.select(ego.given_up[env] != 0, behavior_cfg.lost_edge_gap_m, 0.0)
-    return ti.max(behavior_cfg.edge_gap_m, least) + behavior_cfg.edge_sigmas * ti.sqrt(ego.z_var[env])
+    least = ti.select(io.ego.given_up[env] != 0, io.behavior_cfg.lost_edge_gap_m, 0.0)
+    return ti.max(io.behavior_cfg.edge_gap_m, least) + io.behavior_cfg.edge_sigmas * ti.sqrt(
+        io.ego.z_var[env]
+    )
 
 
 @ti.func
-def depth_band(gap, tank_cfg: Const[TankConfig]):
+def depth_band(gap, io: Bundle[BehaviorIO]):
     """(lowest, highest) own z [m] that the behaviour tree steers for, ``gap`` [m] off floor and surface."""
-    floor, top = ti.static(tank_cfg.z_m)
-    gap = ti.min(gap, ti.static(0.5 * (tank_cfg.z_m[1] - tank_cfg.z_m[0])))
+    floor, top = ti.static(io.tank_cfg.z_m)
+    gap = ti.min(gap, ti.static(0.5 * (io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0])))
     return floor + gap, top - gap
 
 
 @ti.func
-def place_doubt(pose_cov, behavior_cfg: Const[BehaviorConfig]):
+def place_doubt(env, io: Bundle[BehaviorIO]):
     """[m] by which the clearance from walls and mapped obstacles may be smaller than the map says: the less
-    sure the own place is in its worst direction (``pose_cov``: upper triangle of x, y, heading), the larger.
+    sure the own place is in its worst direction, the larger.
     """
-    half, apart = 0.5 * (pose_cov[0] + pose_cov[3]), 0.5 * (pose_cov[0] - pose_cov[3])
-    worst = half + ti.sqrt(apart * apart + pose_cov[1] * pose_cov[1])
-    return behavior_cfg.place_sigmas * ti.sqrt(ti.max(worst, 0.0))
+    cov = io.ego.pose_cov[env]
+    half, apart = 0.5 * (cov[0] + cov[3]), 0.5 * (cov[0] - cov[3])
+    worst = half + ti.sqrt(apart * apart + cov[1] * cov[1])
+    return io.behavior_cfg.place_sigmas * ti.sqrt(ti.max(worst, 0.0))
 
 
 def _fastest(behavior_cfg):

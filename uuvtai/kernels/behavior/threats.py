@@ -6,9 +6,8 @@ import math
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.config import BehaviorConfig, HeightConfig, SonarConfig, TrafficConfig, VehicleConfig
 from uuvtai.config.behavior import ARRIVAL, DEPTH_CHANGE, GOAL_DEPTH, HEADING_RANGE, HYSTERESIS, SLOPE, TTC
-from uuvtai.kernels.behavior.io import ThreatsIO
+from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.rollout import (
     depth_band,
     drive_of,
@@ -22,7 +21,7 @@ from uuvtai.kernels.core.beams import beam_bearing, range_rate
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3, wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, centre_of
 from uuvtai.kernels.core.simd import filled, n_lane
-from uuvtai.kernels.core.stage import Bundle, Const, spread
+from uuvtai.kernels.core.stage import Bundle, spread
 
 # ------------------------------------------------------------------------------------------------------------
 # Where a vehicle may drive whose sonar is a fan ahead: not where it has not looked. A ring looks everywhere,
@@ -40,32 +39,34 @@ def widest_way(sonar_cfg, behavior_cfg):
 
 
 @ti.func
-def sight_share(off, sonar_cfg: Const[SonarConfig], behavior_cfg: Const[BehaviorConfig]):
+def sight_share(off, io: Bundle[BehaviorIO]):
     """Share of the speed at which a way may be driven that lies ``off`` [rad] from ahead."""
     share = 1.0
-    if ti.static(not sonar_cfg.is_ring):
-        edge, wide = ti.static(edge_of_sight(sonar_cfg), widest_way(sonar_cfg, behavior_cfg))
+    if ti.static(not io.sonar_cfg.is_ring):
+        edge, wide = ti.static(edge_of_sight(io.sonar_cfg), widest_way(io.sonar_cfg, io.behavior_cfg))
         inside = edge - ti.abs(wrapped_angle(off))
         share = ti.math.clamp(inside / ti.static(max(edge - wide, 1.0e-3)), 0.0, 1.0)
     return share
 
 
 @ti.func
-def sweep_share(age_s, sonar_cfg: Const[SonarConfig], behavior_cfg: Const[BehaviorConfig]):
+def sweep_share(age_s, io: Bundle[BehaviorIO]):
     """Share of the cruising speed that a mechanical beam allows, ``age_s`` after the start: what it has not
     looked at for long may have changed. None in the first sweep."""
     share = 1.0
-    if ti.static(sonar_cfg.mechanical):
-        allowed = ti.static(min(behavior_cfg.sweep_way_m / sonar_cfg.sweep_s / behavior_cfg.cruise_m_s, 1.0))
-        share = ti.select(age_s < ti.static(sonar_cfg.sweep_s), 0.0, allowed)
+    if ti.static(io.sonar_cfg.mechanical):
+        allowed = ti.static(
+            min(io.behavior_cfg.sweep_way_m / io.sonar_cfg.sweep_s / io.behavior_cfg.cruise_m_s, 1.0)
+        )
+        share = ti.select(age_s < ti.static(io.sonar_cfg.sweep_s), 0.0, allowed)
     return share
 
 
 @ti.func
-def kept_in_sight(turn, way, sonar_cfg: Const[SonarConfig], behavior_cfg: Const[BehaviorConfig]):
+def kept_in_sight(turn, way, io: Bundle[BehaviorIO]):
     """Angle to turn by, next to ``turn``, after which a way that lies ``way`` [rad] from ahead is well in
     sight."""
-    wide = ti.static(widest_way(sonar_cfg, behavior_cfg))
+    wide = ti.static(widest_way(io.sonar_cfg, io.behavior_cfg))
     return wrapped_angle(way + ti.math.clamp(wrapped_angle(turn - way), -wide, wide))
 
 
@@ -79,28 +80,28 @@ _BLUR_M = 0.1
 
 
 @ti.func
-def choose_depth(env, io: Bundle[ThreatsIO]):
+def choose_depth(env, io: Bundle[BehaviorIO]):
     """Set ``cruise_z_m``: the cheapest of ``depth_choices`` depths from edge to edge."""
-    low, high = depth_band(edge_gap(env, io.ego, io.behavior_cfg), io.tank_cfg)
+    low, high = depth_band(edge_gap(env, io), io)
     goal, pos = io.mission.goal_w[env], io.ego.pos_w[env]
     wanted = ti.math.clamp(goal[2], low, high)
     if ti.static(io.behavior_cfg.free_depth):
         best_cost, best = FAR_M, wanted
-        of_goal = io.behavior_cfg.weight_goal_depth * tuned(env, GOAL_DEPTH, io.behavior)
-        of_change = io.behavior_cfg.weight_depth_change * tuned(env, DEPTH_CHANGE, io.behavior)
+        of_goal = io.behavior_cfg.weight_goal_depth * tuned(env, GOAL_DEPTH, io)
+        of_change = io.behavior_cfg.weight_depth_change * tuned(env, DEPTH_CHANGE, io)
         n = ti.static(io.behavior_cfg.depth_choices)
         before = ti.math.clamp(io.behavior.cruise_z_m[env], low, high)
         for choice in range(n):
             z = low + (high - low) * (choice / ti.max(n - 1, 1))
-            cost = level_share(z, io.traffic_cfg, io.height_cfg, io.behavior_cfg, io.vehicle_cfg)
+            cost = level_share(z, io)
             cost += of_goal * ti.abs(z - goal[2])
             cost += of_change * ti.abs(z - before)
             if cost < best_cost:
                 best_cost, best = cost, z
         away = ti.Vector([goal[0] - pos[0], goal[1] - pos[1]]).norm()
         radius = ti.static(io.episode_cfg.goal_radius_m)
-        slope = io.behavior_cfg.return_slope * tuned(env, SLOPE, io.behavior)
-        share = io.behavior_cfg.arrival_depth_share * tuned(env, ARRIVAL, io.behavior)
+        slope = io.behavior_cfg.return_slope * tuned(env, SLOPE, io)
+        share = io.behavior_cfg.arrival_depth_share * tuned(env, ARRIVAL, io)
         off = share * radius + slope * ti.max(away - radius, 0.0)
         io.behavior.cruise_z_m[env] = best
         if io.ego.given_up[env] == 0:
@@ -109,21 +110,17 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def level_share(
-    z,
-    traffic_cfg: Const[TrafficConfig],
-    height_cfg: Const[HeightConfig],
-    behavior_cfg: Const[BehaviorConfig],
-    vehicle_cfg: Const[VehicleConfig],
-):
+def level_share(z, io: Bundle[BehaviorIO]):
     """Share of the expected obstacles that a vehicle at ``z`` [m] would touch, were it at the same place."""
-    low, high = ti.static(traffic_cfg.z_m)
-    reach = ti.static(0.25 * sum(traffic_cfg.height_m) + vehicle_cfg.hull_radius_m + behavior_cfg.contact_m)
+    low, high = ti.static(io.traffic_cfg.z_m)
+    reach = ti.static(
+        0.25 * sum(io.traffic_cfg.height_m) + io.vehicle_cfg.hull_radius_m + io.behavior_cfg.contact_m
+    )
     blur = ti.static(0.5 * _BLUR_M)
     above = ti.min(high + blur, z + reach)
     below = ti.max(low - blur, z - reach)
     share = ti.math.clamp((above - below) * ti.static(1.0 / (high - low + 2 * blur)), 0.0, 1.0)
-    return height_cfg.column_share + (1.0 - height_cfg.column_share) * share
+    return io.height_cfg.column_share + (1.0 - io.height_cfg.column_share) * share
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -139,7 +136,7 @@ _NEARER_M = 0.2
 
 @quick_launch
 @ti.kernel
-def assess_threats(io: Bundle[ThreatsIO]):
+def assess_threats(io: Bundle[BehaviorIO]):
     """Fill the blackboard, and decide which envs must plan an evasion in this step."""
     n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
@@ -152,7 +149,7 @@ def assess_threats(io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def _sense_contact(env, io: Bundle[ThreatsIO]):
+def _sense_contact(env, io: Bundle[BehaviorIO]):
     """Smallest time to contact and nearest return. Two neighbouring beams must agree on a time, so that one
     outlier is no emergency."""
     n_ray = ti.static(io.scan.range_m.shape[1])
@@ -180,7 +177,7 @@ def _sense_contact(env, io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def _beam_ttc(env, beam, io: Bundle[ThreatsIO]):
+def _beam_ttc(env, beam, io: Bundle[BehaviorIO]):
     """Time until what the beam hit reaches the hull's contact distance; FAR_M where it does not approach."""
     closing = -range_rate(env, beam, io.scan, io.tracks, io.sonar_cfg)
     out = FAR_M
@@ -197,13 +194,13 @@ def _beam_ttc(env, beam, io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def _read_clearance(env, io: Bundle[ThreatsIO]):
+def _read_clearance(env, io: Bundle[BehaviorIO]):
     """Mapped clearance here, the way out of it, and the smallest one up to the look-ahead point; both less
     what the own place is not sure of."""
     pos = io.ego.pos_w[env]
     n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
     cell = _held_cell(pos, n_row, n_col, io)
-    doubt = place_doubt(io.ego.pose_cov[env], io.behavior_cfg)
+    doubt = place_doubt(env, io)
     io.behavior.clearance_m[env] = io.clearance.clearance_m[env, cell[0], cell[1]] - doubt
     away = ti.Vector([0.0, 0.0])
     if io.clearance.site_row[env, cell[0], cell[1]] >= 0:
@@ -240,7 +237,7 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def _room_to(env, here, there, doubt, io: Bundle[ThreatsIO]):
+def _room_to(env, here, there, doubt, io: Bundle[BehaviorIO]):
     """Smallest mapped clearance [m] on the straight way to a place, the own one included, less ``doubt``."""
     n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
     smallest = io.behavior.clearance_m[env]
@@ -251,7 +248,7 @@ def _room_to(env, here, there, doubt, io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def _held_cell(pos, n_row, n_col, io: Bundle[ThreatsIO]):
+def _held_cell(pos, n_row, n_col, io: Bundle[BehaviorIO]):
     cell = cell_of(pos, io.tank_cfg, ti.static(io.mapping_cfg.cell_m))
     return ti.Vector([ti.math.clamp(cell[0], 0, n_row - 1), ti.math.clamp(cell[1], 0, n_col - 1)])
 
@@ -262,7 +259,7 @@ def _unit(v):
 
 
 @ti.func
-def _follow_velocity(env, io: Bundle[ThreatsIO]):
+def _follow_velocity(env, io: Bundle[BehaviorIO]):
     """Level velocity towards the point that is steered for, slower in narrow places; zero without a route."""
     level = io.behavior.steer_w[env]
     room = (
@@ -276,34 +273,31 @@ def _follow_velocity(env, io: Bundle[ThreatsIO]):
         io.behavior_cfg.sideslip_clearance_m
     ):  # across the way the hull is wider: let it turn first
         share *= 1.0 - 0.6 * sideways
-    share *= sight_share(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2], io.sonar_cfg, io.behavior_cfg)
+    share *= sight_share(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2], io)
     age_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
-    share *= sweep_share(age_s, io.sonar_cfg, io.behavior_cfg)
+    share *= sweep_share(age_s, io)
     io.behavior.speed_share[env] = ti.select(io.route.n_way[env] > 0, share, 0.0)
     wanted = _unit(level) * cruising_speed(
         ti.static(io.behavior_cfg.cruise_m_s),
         io.behavior.speed_share[env],
         io.behavior.path_clearance_m[env],
-        io.behavior_cfg,
-        io.vehicle_cfg,
+        io,
     )
     io.behavior.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], io.behavior.follow_vel_w[env][2]])
 
 
 @ti.func
-def cruising_speed(
-    top_m_s, share, room_m, behavior_cfg: Const[BehaviorConfig], vehicle_cfg: Const[VehicleConfig]
-):
+def cruising_speed(top_m_s, share, room_m, io: Bundle[BehaviorIO]):
     """[m/s] along the route: a ``share`` of the wanted speed, and in narrow places, where the nose lies along
     the way and no diagonal of the body is faster, no more than the nose drives ahead."""
     speed = top_m_s * share
-    if room_m <= ti.static(behavior_cfg.heading_clearance_m):
-        speed = ti.min(speed, ti.static(vehicle_cfg.max_surge_m_s))
+    if room_m <= ti.static(io.behavior_cfg.heading_clearance_m):
+        speed = ti.min(speed, ti.static(io.vehicle_cfg.max_surge_m_s))
     return speed
 
 
 @ti.func
-def _note_speeds(env, io: Bundle[ThreatsIO]):
+def _note_speeds(env, io: Bundle[BehaviorIO]):
     """Take the track that is surely the fastest into ``alert``; while none moves it stays as it is."""
     fastest = -1.0
     for track in range(ti.static(io.tracks.alive.shape[1])):
@@ -322,7 +316,7 @@ def _note_speeds(env, io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def _note_waiting(env, io: Bundle[ThreatsIO]):
+def _note_waiting(env, io: Bundle[BehaviorIO]):
     """Count the time in which the vehicle does not come on along its way, and what patience it leaves."""
     vel, way = turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2]), _unit(io.behavior.steer_w[env])
     slow = 1.0 - ti.Vector([vel[0], vel[1]]).dot(way) / io.behavior_cfg.waiting_m_s
@@ -334,7 +328,7 @@ def _note_waiting(env, io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def _foresee_conflict(env, io: Bundle[ThreatsIO]):
+def _foresee_conflict(env, io: Bundle[BehaviorIO]):
     """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change
     of depth; and a stop.
 
@@ -347,17 +341,15 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         _note_waiting(env, io)
         pos = io.ego.pos_w[env]
         follow = io.behavior.follow_vel_w[env]
-        heave = held_heave(choose_depth(env, io) - pos[2], io.behavior_cfg, io.vehicle_cfg)
+        heave = held_heave(choose_depth(env, io) - pos[2], io)
         # lanes 0 to 2: follow at this depth, follow and change depth, stop; the others repeat lane 0
         lanes = ti.static(max(n_lane(), 3))
         cz = filled(0.0, lanes)
         cz[1] = heave
         cx, cy = filled(follow[0], lanes), filled(follow[1], lanes)
         cx[2], cy[2] = 0.0, 0.0
-        drive = drive_of(env, cx, cy, cz, FAR_M, io.ego, io.behavior, io.behavior_cfg)
-        peak, _, _, first = obstacle_depths(
-            env, drive, io.forecast, io.futures, io.behavior_cfg, io.tracking_cfg, io.tank_cfg
-        )
+        drive = drive_of(env, cx, cy, cz, FAR_M, io)
+        peak, _, _, first = obstacle_depths(env, drive, io)
         climbs = peak[1] <= peak[0] + 1.0e-3
         io.behavior.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
         io.behavior.conflict_s[env] = ti.select(climbs, first[1], first[0])
@@ -370,20 +362,20 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         if io.behavior.conflict_s[env] < FAR_M:
             io.behavior.hysteresis_steps[env] = 0
         quiet_s = io.behavior.hysteresis_steps[env] * ti.static(io.episode_cfg.control_dt_s)
-        urgent = io.behavior.ttc_s[env] < io.behavior_cfg.emergency_ttc_s * tuned(env, TTC, io.behavior)
+        urgent = io.behavior.ttc_s[env] < io.behavior_cfg.emergency_ttc_s * tuned(env, TTC, io)
         if (
             io.behavior.conflict_s[env] < FAR_M
             or urgent
             or (
                 io.behavior.evading_steps[env] > 0
-                and quiet_s <= io.behavior_cfg.hysteresis_s * tuned(env, HYSTERESIS, io.behavior) + 0.2
+                and quiet_s <= io.behavior_cfg.hysteresis_s * tuned(env, HYSTERESIS, io) + 0.2
             )
         ):
             io.behavior.want_evade[env] = 1
 
 
 @ti.func
-def _nearest_obstacle(env, pos, io: Bundle[ThreatsIO]):
+def _nearest_obstacle(env, pos, io: Bundle[BehaviorIO]):
     """(distance [m] from the hull to the nearest forecast obstacle, horizontal way [m] to the one that needs
     to be looked at).
 
@@ -391,7 +383,7 @@ def _nearest_obstacle(env, pos, io: Bundle[ThreatsIO]):
     """
     nearest, need, way = (
         FAR_M,
-        io.behavior_cfg.heading_range_m * tuned(env, HEADING_RANGE, io.behavior),
+        io.behavior_cfg.heading_range_m * tuned(env, HEADING_RANGE, io),
         ti.Vector([0.0, 0.0]),
     )
     for track in range(ti.static(io.forecast.radius_m.shape[1])):

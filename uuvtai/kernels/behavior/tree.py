@@ -249,16 +249,16 @@ def _answer(env, node, io: Bundle[BehaviorIO]):
     dt = ti.static(io.episode_cfg.control_dt_s)
     holds = 0
     if leaf == codes.EMERGENCY_TTC:
-        usual_s = io.behavior_cfg.emergency_ttc_s * tuned(env, TTC, io.behavior)
-        usual_m = io.behavior_cfg.emergency_range_m * tuned(env, RANGE, io.behavior)
+        usual_s = io.behavior_cfg.emergency_ttc_s * tuned(env, TTC, io)
+        usual_m = io.behavior_cfg.emergency_range_m * tuned(env, RANGE, io)
         near = io.behavior.nearest_m[env] < _port(node, 1, usual_m, io)
         closing = io.behavior.ttc_s[env] < FAR_M
         holds = ti.cast(io.behavior.ttc_s[env] < _port(node, 0, usual_s, io) or (near and closing), ti.i32)
     elif leaf == codes.PREDICTED_CONFLICT:
-        usual_s = io.behavior_cfg.conflict_within_s * tuned(env, WITHIN, io.behavior)
+        usual_s = io.behavior_cfg.conflict_within_s * tuned(env, WITHIN, io)
         seen = io.behavior.conflict_s[env] <= _port(node, 0, usual_s, io)
         lately = io.behavior.evading_steps[env] > 0 and io.behavior.hysteresis_steps[env] * dt <= _port(
-            node, 1, io.behavior_cfg.hysteresis_s * tuned(env, HYSTERESIS, io.behavior), io
+            node, 1, io.behavior_cfg.hysteresis_s * tuned(env, HYSTERESIS, io), io
         )
         holds = ti.cast(seen or lately, ti.i32)
     elif leaf == codes.ROUTE_BLOCKED:
@@ -300,14 +300,12 @@ def _wanted_velocity(env, leaf, node, io: Bundle[BehaviorIO]):
         out = io.behavior.follow_vel_w[env]
         if io.table.param[node][0] >= 0.0:
             left, room = io.behavior.speed_share[env], io.behavior.path_clearance_m[env]
-            usual = cruising_speed(io.behavior_cfg.cruise_m_s, left, room, io.behavior_cfg, io.vehicle_cfg)
-            asked = cruising_speed(io.table.param[node][0], left, room, io.behavior_cfg, io.vehicle_cfg)
+            usual = cruising_speed(io.behavior_cfg.cruise_m_s, left, room, io)
+            asked = cruising_speed(io.table.param[node][0], left, room, io)
             share = asked / ti.max(usual, 1.0e-6)
             out[0], out[1] = share * out[0], share * out[1]
         if _port(node, 1, 1.0, io) < 0.5:
-            out[2] = held_heave(
-                io.mission.goal_w[env][2] - io.ego.pos_w[env][2], io.behavior_cfg, io.vehicle_cfg
-            )
+            out[2] = held_heave(io.mission.goal_w[env][2] - io.ego.pos_w[env][2], io)
     elif leaf == codes.EVADE:
         out = io.behavior.evade_vel_w[env]
     elif leaf == codes.BACK_OFF:
@@ -333,9 +331,7 @@ def _wanted_velocity(env, leaf, node, io: Bundle[BehaviorIO]):
         ahead = io.mission.goal_w[env] - io.ego.pos_w[env]
         level = ti.Vector([ahead[0], ahead[1]])
         speed = _port(node, 0, ti.static(io.behavior_cfg.cruise_m_s), io) / ti.max(level.norm(), 1.0e-6)
-        out = ti.Vector(
-            [level[0] * speed, level[1] * speed, held_heave(ahead[2], io.behavior_cfg, io.vehicle_cfg)]
-        )
+        out = ti.Vector([level[0] * speed, level[1] * speed, held_heave(ahead[2], io)])
     return out
 
 
@@ -408,5 +404,5 @@ def _turn(env, leaf, velocity, heading, yaw, room, io: Bundle[BehaviorIO]):
     if ti.static(not io.sonar_cfg.is_ring) and leaf == codes.FOLLOW_ROUTE:
         steer = io.behavior.steer_w[env]
         way = wrapped_angle(ti.atan2(steer[1], steer[0]) - yaw)
-        turn = kept_in_sight(turn, way, io.sonar_cfg, io.behavior_cfg)
+        turn = kept_in_sight(turn, way, io)
     return turn
