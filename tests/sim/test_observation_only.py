@@ -203,7 +203,7 @@ def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
 
     honest, leaking = (
         height.bound_heights,
-        dataclasses.replace(watched.sim.io.heights, ego=watched.sim.s.vehicle),
+        dataclasses.replace(watched.sim.io.tracking, ego=watched.sim.s.vehicle),
     )
     monkeypatch.setattr("uuvtai.sim.stack.height.bound_heights", lambda _io: honest(leaking))
     _, differing, _ = compared(watched)

@@ -106,18 +106,18 @@ def track(stages: Stages, config: Config, privileged: bool) -> None:
     else:
         tracking.track_obstacles(stages.tracking)
         if config.camera_tracking.use_camera:  # where the fan misses an obstacle
-            camera_tracking.scan_columns(stages.camera_tracking)
-            camera_tracking.follow_spots(stages.camera_tracking)
+            camera_tracking.scan_columns(stages.tracking)
+            camera_tracking.follow_spots(stages.tracking)
         if config.height.use_camera:  # where the fan does not show how high it is
-            camera_tracking.look_at_obstacles(stages.look)
-    prediction.learn_turns(stages.forecast)
-    prediction.forecast_tracks(stages.forecast)
+            camera_tracking.look_at_obstacles(stages.tracking)
+    prediction.learn_turns(stages.tracking)
+    prediction.forecast_tracks(stages.tracking)
     if config.forecast.learned or config.forecast.keep_columns:
-        prediction_network.remember_past(stages.past)
-        prediction_network.describe_motion(stages.past)
+        prediction_network.remember_past(stages.tracking)
+        prediction_network.describe_motion(stages.tracking)
     if config.forecast.learned:
-        prediction_network.mix_futures(stages.mixture)
-    height.bound_heights(stages.heights)
+        prediction_network.mix_futures(stages.tracking)
+    height.bound_heights(stages.tracking)
 
 
 def draw_map(stages: Stages, config: Config) -> None:
@@ -185,9 +185,9 @@ def forget(stages: Stages, config: Config) -> None:
     if config.sensors.localization == "estimated":
         localization.reset_pose(stages.localization)
     tracking.reset_tracks(stages.tracking)
-    prediction.reset_forecast(stages.forecast)
+    prediction.reset_forecast(stages.tracking)
     if config.forecast.learned or config.forecast.keep_columns:
-        prediction_network.reset_past(stages.past)
+        prediction_network.reset_past(stages.tracking)
     mapping.reset_map(stages.mapping)
     route.reset_route(stages.route)
     tree.reset_behavior(stages.behavior)

@@ -20,7 +20,7 @@ from uuvtai.config import (
     TrackingConfig,
 )
 from uuvtai.kernels.perception import camera_tracking
-from uuvtai.kernels.perception.io import CameraTrackingIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.sensors import depth_camera
 from uuvtai.kernels.sensors.io import DepthIO
 
@@ -159,11 +159,9 @@ class Rig:
 
     def follow(self):
         camera_tracking.scan_columns(
-            io_for(CameraTrackingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK)
+            io_for(TrackingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK)
         )
-        camera_tracking.follow_spots(
-            io_for(CameraTrackingIO, self, CFG, CAMERA, SONAR, ELEVATION, TRACKING, RULES)
-        )
+        camera_tracking.follow_spots(io_for(TrackingIO, self, CFG, CAMERA, SONAR, ELEVATION, TRACKING, RULES))
         self.memory = {name: field.to_numpy() for name, field in vars(self.tracks).items()}
         return self.memory
 

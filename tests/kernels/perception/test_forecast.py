@@ -9,7 +9,7 @@ from tests.oracles import turn_history as habit_oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import prediction
-from uuvtai.kernels.perception.io import ForecastIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import (
     ClockState,
     ClusterState,
@@ -65,14 +65,14 @@ class Stage:
         self.clock.active.fill(1)
         self.clusters.fresh.fill(1)
         self.image.fresh.fill(0)
-        prediction.reset_forecast(io_for(ForecastIO, self.forecast, self.turn_history, self.clock))
+        prediction.reset_forecast(io_for(TrackingIO, self.forecast, self.turn_history, self.clock))
         return self
 
     def put(self, **fields):
         put(self.tracks, **fields)
 
     def predict(self):
-        prediction.forecast_tracks(io_for(ForecastIO, self, self.cfg, TRACKING, TANK, RULES))
+        prediction.forecast_tracks(io_for(TrackingIO, self, self.cfg, TRACKING, TANK, RULES))
         return self.forecast.pos_w.to_numpy().astype(float), self.forecast.radius_m.to_numpy().astype(float)
 
 
@@ -157,7 +157,7 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
     assert (then[active == 1][:, [0, 3, 4]] > 0).all()
     np.testing.assert_array_equal(then[active == 0], first[active == 0])
     stage.clock.active.fill(1)
-    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.turn_history, stage.clock))
+    prediction.reset_forecast(io_for(TrackingIO, stage.forecast, stage.turn_history, stage.clock))
     assert (stage.forecast.radius_m.to_numpy() < 0).all()
     assert (stage.forecast.pos_w.to_numpy() == 0).all()
 

@@ -10,9 +10,9 @@ from tests.oracles import height as oracle
 from uuvtai.config import EpisodeConfig, HeightConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.kernels.core.simd import LANES
-from uuvtai.kernels.core.stage import Const, In, Out
+from uuvtai.kernels.core.stage import AnyTensor, Bundle
 from uuvtai.kernels.perception import height
-from uuvtai.kernels.perception.io import HeightsIO, TrackingIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.tracking import prune_tracks
 from uuvtai.state import ClockState, ForecastState, Proprioception, SonarScan, TrackState, allocate
 
@@ -42,39 +42,22 @@ BOUND_TOLERANCE = 1e-5
 
 
 @ti.kernel
-def weigh(
-    what: ti.types.ndarray(),  # pyright: ignore
-    own: ti.types.ndarray(),  # pyright: ignore
-    dt: ti.f32,
-    tracks: Out[TrackState],
-    cfg: Const[HeightConfig],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-):
+def weigh(what: AnyTensor, own: AnyTensor, dt: ti.f32, io: Bundle[TrackingIO]):
     """Apply what[env, track] to every track, seen from own[env, 3]."""
     for env, track in ti.ndrange(N_ENV, N_TRACK):
         eye = ti.Vector([own[env, 0], own[env, 1], own[env, 2]])
         if what[env, track] == BEGIN:
-            height.begin_height(env, track, tracks, cfg)
+            height.begin_height(env, track, io.tracks, io.height_cfg)
         elif what[env, track] == HIT:
-            height.weigh_seen(env, track, eye, tracks, cfg, sonar, tank)
+            height.weigh_seen(env, track, eye, io)
         else:
-            height.weigh_unseen(env, track, eye, dt, tracks, cfg, sonar, tank)
+            height.weigh_unseen(env, track, eye, dt, io)
 
 
 @ti.kernel
-def prune(
-    dt: ti.f32,
-    tracks: Out[TrackState],
-    scan: In[SonarScan],
-    tracking: Const[TrackingConfig],
-    cfg: Const[HeightConfig],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
+def prune(dt: ti.f32, io: Bundle[TrackingIO]):
     for env in range(N_ENV):
-        prune_tracks(env, dt, io_for(TrackingIO, tracks, scan, tracking, cfg, sonar, tank, rules))
+        prune_tracks(env, dt, io)
 
 
 class Stage:
@@ -108,19 +91,12 @@ class Stage:
         put(self.scan, ping_pos_w=self.own)
 
     def weigh(self, what, dt=0.06):
-        weigh(
-            np.broadcast_to(what, (N_ENV, N_TRACK)).astype(np.int32),
-            self.own.astype(np.float32),
-            dt,
-            self.tracks,
-            CFG,
-            SONAR,
-            TANK,
-        )
+        what = np.broadcast_to(what, (N_ENV, N_TRACK)).astype(np.int32)
+        weigh(what, self.own.astype(np.float32), dt, io_for(TrackingIO, self.tracks, CFG, SONAR, TANK))
 
     def bound(self, cfg=CFG):
         """(above_w, below_w) as the kernel writes them."""
-        height.bound_heights(io_for(HeightsIO, self.forecast, self.tracks, self.ego, self.clock, cfg, TANK))
+        height.bound_heights(io_for(TrackingIO, self.forecast, self.tracks, self.ego, self.clock, cfg, TANK))
         return self.forecast.above_w.to_numpy().astype(float), self.forecast.below_w.to_numpy().astype(float)
 
     def set_share(self, share):
@@ -394,7 +370,7 @@ def scan_for(stage, range_m):
 def pruned(stage, count, cfg=CFG, dt=0.06):
     for k in range(1, count + 1):
         put(stage.scan, ping_step=np.full(N_ENV, 3 * k))
-        prune(dt, stage.tracks, stage.scan, TRACKING, cfg, SONAR, TANK, RULES)
+        prune(dt, io_for(TrackingIO, stage, TRACKING, cfg, SONAR, TANK, RULES))
     return stage.tracks.alive.to_numpy()[:, :3]
 
 
@@ -447,7 +423,7 @@ def test_memory_can_be_switched_off(stage):
     assert pruned(stage, round(TRACKING.hidden_s / 0.06) - 1, FORGETFUL).all()
     np.testing.assert_allclose(stage.present[:, :3], 0.95)
     put(stage.scan, ping_step=np.full(N_ENV, round(TRACKING.hidden_s / RULES.control_dt_s) + 1))
-    prune(0.06, stage.tracks, stage.scan, TRACKING, FORGETFUL, SONAR, TANK, RULES)
+    prune(0.06, io_for(TrackingIO, stage, TRACKING, FORGETFUL, SONAR, TANK, RULES))
     assert not stage.tracks.alive.to_numpy()[:, :3].any()
 
 

@@ -12,7 +12,7 @@ from tests.oracles.scenes import BOX, CYLINDER, SPHERE, quaternions
 from uuvtai.config import DepthConfig, EpisodeConfig, HeightConfig, TankConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import camera_tracking
-from uuvtai.kernels.perception.io import LookIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import ClockState, DepthImage, TrackState, allocate
 
 N_ENV, N_TRACK = 12, 3
@@ -105,7 +105,7 @@ class Rig:
     def look(self):
         """(shares, presences) after the kernel."""
         camera_tracking.look_at_obstacles(
-            io_for(LookIO, self.tracks, self.image, self.clock, CFG, CAMERA, TANK, RULES)
+            io_for(TrackingIO, self.tracks, self.image, self.clock, CFG, CAMERA, TANK, RULES)
         )
         return self.tracks.height.to_numpy()[:, :, 0].astype(float), self.tracks.present.to_numpy().astype(
             float

@@ -11,7 +11,7 @@ from uuvtai.common.errors import UserError
 from uuvtai.config import Config
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import prediction_network
-from uuvtai.kernels.perception.io import MixtureIO, PastIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.learning.networks import TIMES_S, MixtureNet, mirrored
 from uuvtai.sim.forecast_weights import SHAPES, SPREADS, packed_weights, put_weights, read_weights
 from uuvtai.state import (
@@ -72,7 +72,7 @@ class Stage:
             self.tracks,
             CFG,
         )
-        return io_for(PastIO, *structs)
+        return io_for(TrackingIO, *structs)
 
     def swim(self, places, velocity):
         """Every body at a place (n_env, n_track, 2), on a velocity, for a scan."""
@@ -94,7 +94,7 @@ class Stage:
 
     def mix(self):
         structs = (self.forecast, self.futures, self.mixture, self.clock, CFG)
-        prediction_network.mix_futures(io_for(MixtureIO, *structs))
+        prediction_network.mix_futures(io_for(TrackingIO, *structs))
         return self.futures.share.to_numpy(), self.futures.pos_w.to_numpy(), self.forecast.pos_w.to_numpy()
 
 

@@ -9,9 +9,9 @@ from tests.bundles import clear, io_for
 from tests.oracles import turn_history as oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig
 from uuvtai.kernels.core.simd import LANES
-from uuvtai.kernels.core.stage import In
+from uuvtai.kernels.core.stage import Bundle
 from uuvtai.kernels.perception import prediction
-from uuvtai.kernels.perception.io import ForecastIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import ClockState, ClusterState, ForecastState, TrackState, TurnHistory, allocate
 
 N_ENV, N_TRACK, PERIOD = 6, 5, 3
@@ -45,7 +45,7 @@ class Stage:
         self.tracks.moving.fill(1)
         self.tracks.alive.fill(1)
         self.step = 0
-        prediction.reset_forecast(io_for(ForecastIO, self.forecast, self.turn_history, self.clock))
+        prediction.reset_forecast(io_for(TrackingIO, self.forecast, self.turn_history, self.clock))
         return self
 
     def put(self, **fields):
@@ -67,7 +67,7 @@ class Stage:
             **{"age": self.step, **fields},
         )
         prediction.learn_turns(
-            io_for(ForecastIO, self.turn_history, self.tracks, self.clusters, self.clock, CONFIG, RULES)
+            io_for(TrackingIO, self.turn_history, self.tracks, self.clusters, self.clock, CONFIG, RULES)
         )
 
     def read(self):
@@ -271,10 +271,10 @@ def test_only_awake_rows_learn_and_forget(stage):
         stage.watch(state, alive=alive)
     assert [len(stage.turns(env)) for env in range(N_ENV)] == list(active)
     stage.clock.active.from_numpy((1 - active).astype(np.int32))
-    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.turn_history, stage.clock))
+    prediction.reset_forecast(io_for(TrackingIO, stage.forecast, stage.turn_history, stage.clock))
     assert [len(stage.turns(env)) for env in range(N_ENV)] == list(active)
     stage.clock.active.fill(1)
-    prediction.reset_forecast(io_for(ForecastIO, stage.forecast, stage.turn_history, stage.clock))
+    prediction.reset_forecast(io_for(TrackingIO, stage.forecast, stage.turn_history, stage.clock))
     assert (stage.read()["leg_step"] == -1).all()
     for name, value in stage.read().items():
         assert name == "leg_step" or (value == 0).all(), f"{name} keeps a trace of the last episode"
@@ -292,9 +292,9 @@ def test_coasting_equals_the_oracle(stage, shape):
     seconds = rng.choice([0.06, 0.5], n).astype(np.float32)
 
     @ti.kernel
-    def coast(tracks: In[TrackState], memory: In[TurnHistory]):
+    def coast(io: Bundle[TrackingIO]):
         for i in range(n):
-            out[i] = prediction.coasted(i % N_ENV, 0, mean[i], time[i], memory, tracks, CONFIG, tank)
+            out[i] = prediction.coasted(i % N_ENV, 0, mean[i], time[i], io)
 
     course, speed = rng.uniform(-np.pi, np.pi, n), rng.uniform(0.2, 3, n)
     high = [19, 5] if shape == "rectangle" else [15, 15]
@@ -320,7 +320,7 @@ def test_coasting_equals_the_oracle(stage, shape):
     mean.from_numpy(x)
     time.from_numpy(seconds)
     stage.put(radius_m=0.25)
-    coast(stage.tracks, stage.turn_history)
+    coast(io_for(TrackingIO, stage.tracks, stage.turn_history, CONFIG, tank))
     got, table, turned = out.to_numpy(), stage.read(), 0
     for i in range(n):
         turns = oracle_turns(table, i % N_ENV)

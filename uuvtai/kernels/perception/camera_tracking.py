@@ -16,7 +16,7 @@ from uuvtai.kernels.core.kalman import born, corrected, position_variance
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
 from uuvtai.kernels.core.stage import Bundle, spread
 from uuvtai.kernels.perception.height import COLUMN, begin_height, heights, weigh_camera
-from uuvtai.kernels.perception.io import CameraTrackingIO, LookIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.sensor_model import NO_RETURN_SHARE, pinhole, wall_lanes
 from uuvtai.kernels.perception.track_filter import bearing_vector
 from uuvtai.kernels.perception.tracking import clear_track
@@ -37,7 +37,7 @@ _NEWLY_SEEN_S = 0.15
 
 @quick_launch
 @ti.kernel
-def scan_columns(io: Bundle[CameraTrackingIO]):
+def scan_columns(io: Bundle[TrackingIO]):
     """Horizontal distance of the nearest thing in every column of a fresh image, FAR_M = none within range,
     height band and walls."""
     n, n_packet = ti.static(io.clock.active.shape[0], io.depth_cfg.cols // LANES)
@@ -50,7 +50,7 @@ def scan_columns(io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def eye_of(env, io: Bundle[CameraTrackingIO]):
+def eye_of(env, io: Bundle[TrackingIO]):
     """(position [m, world], body to world) of the camera when the image was taken, as estimated."""
     rpy = io.image.shot_rpy[env]
     R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
@@ -60,7 +60,7 @@ def eye_of(env, io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def column_distances(env, first_col, io: Bundle[CameraTrackingIO]):
+def column_distances(env, first_col, io: Bundle[TrackingIO]):
     """(nearest thing, nearest thing in the first or last row looked at): horizontal distances [m] of sixteen
     columns, FAR_M = none."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
@@ -111,7 +111,7 @@ def column_distances(env, first_col, io: Bundle[CameraTrackingIO]):
 
 @quick_launch
 @ti.kernel
-def follow_spots(io: Bundle[CameraTrackingIO]):
+def follow_spots(io: Bundle[TrackingIO]):
     """Gather columns to spots and correct the moving tracks that they show."""
     n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
@@ -120,7 +120,7 @@ def follow_spots(io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def take_spots(env, io: Bundle[CameraTrackingIO]):
+def take_spots(env, io: Bundle[TrackingIO]):
     """A spot ends where the distance jumps, and at the image's edge."""
     eye, R_wb = eye_of(env, io)
     first, near, edge, before = 0, FAR_M, FAR_M, FAR_M
@@ -139,7 +139,7 @@ def take_spots(env, io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def bearing_of(col, R_wb, io: Bundle[CameraTrackingIO]):
+def bearing_of(col, R_wb, io: Bundle[TrackingIO]):
     """[rad] world bearing of a place in the image, ``col`` in columns, at the height of the optical axis."""
     focal, _, middle_col = ti.static(pinhole(io.depth_cfg))
     left = (middle_col - col) / focal
@@ -147,7 +147,7 @@ def bearing_of(col, R_wb, io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[CameraTrackingIO]):
+def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[TrackingIO]):
     """Match one spot with a track and correct that; a spot that is nobody's begins a track.
 
     The spot: columns first..last; ``near`` [m] its smallest horizontal distance, ``edge`` [m] that in the
@@ -173,7 +173,7 @@ def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[CameraTrackingI
 
 
 @ti.func
-def match_of(env, seen, along, late, io: Bundle[CameraTrackingIO]):
+def match_of(env, seen, along, late, io: Bundle[TrackingIO]):
     """(track that most easily is what shows at ``seen`` [m], its centre minus where it is expected [m]); -1
     where none is within reach.
 
@@ -195,7 +195,7 @@ def match_of(env, seen, along, late, io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def is_off_fan(seen, env, io: Bundle[CameraTrackingIO]):
+def is_off_fan(seen, env, io: Bundle[TrackingIO]):
     """1 where the sonar's beams towards a place met nothing near it: what is there lies above or below the
     fan."""
     own = io.scan.ping_pos_w[env]
@@ -215,7 +215,7 @@ def is_off_fan(seen, env, io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def is_wanted(env, track, io: Bundle[CameraTrackingIO]):
+def is_wanted(env, track, io: Bundle[TrackingIO]):
     """1 for a track that moves, or was begun by the camera, and that neither the sonar saw lately nor this
     image already."""
     moving = io.tracks.alive[env, track] == 1 and (
@@ -228,7 +228,7 @@ def is_wanted(env, track, io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def reach_of(env, track, io: Bundle[CameraTrackingIO]):
+def reach_of(env, track, io: Bundle[TrackingIO]):
     """[m] how far from its place a track may be found: as far as it went unseen, if it has turned, within
     bounds."""
     seen = ti.max(io.tracks.seen_step[env, track], io.tracks.spot_step[env, track])
@@ -242,7 +242,7 @@ def reach_of(env, track, io: Bundle[CameraTrackingIO]):
 
 
 @ti.func
-def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[CameraTrackingIO]):
+def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[TrackingIO]):
     """Correct position, and by it velocity; what surprises has turned: its velocity is opened up first."""
     across = ti.Vector([-along[1], along[0]])
     mean, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
@@ -281,7 +281,7 @@ def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[CameraTra
 
 
 @ti.func
-def begin_spotted(env, at, along, radius, late, height, io: Bundle[CameraTrackingIO]):
+def begin_spotted(env, at, along, radius, late, height, io: Bundle[TrackingIO]):
     """A track of an obstacle that only the camera has seen yet, in a free slot, unless one is there already.
     It rests until it is seen again."""
     slot = -1
@@ -346,7 +346,7 @@ _PAST = 2
 
 @quick_launch
 @ti.kernel
-def look_at_obstacles(io: Bundle[LookIO]):
+def look_at_obstacles(io: Bundle[TrackingIO]):
     """Weigh the heights of every moving track in the view of a fresh image."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
@@ -363,7 +363,7 @@ def look_at_obstacles(io: Bundle[LookIO]):
 
 
 @ti.func
-def look_at(env, track, at, io: Bundle[LookIO]):
+def look_at(env, track, at, io: Bundle[TrackingIO]):
     """One track, expected at ``at`` [m, world, horizontal]."""
     focal, _, middle_col = ti.static(pinhole(io.depth_cfg))
     rpy = io.image.shot_rpy[env]
@@ -392,7 +392,7 @@ def look_at(env, track, at, io: Bundle[LookIO]):
 
 
 @ti.func
-def column_ends(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
+def column_ends(env, col, ahead, radius, eye_z, R_wb, io: Bundle[TrackingIO]):
     """What one column of pixels shows of an obstacle ``ahead`` [m] of the camera.
 
     (lowest, highest) z of its pixels, low > high where there are none; and whether it goes on unseen at its
@@ -424,7 +424,7 @@ def column_ends(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
 
 
 @ti.func
-def shown_heights(ends, cut, io: Bundle[LookIO]):
+def shown_heights(ends, cut, io: Bundle[TrackingIO]):
     """Likelihood per hypothesis of an obstacle that shows between ends[0] and ends[1] and goes on beyond an
     edge where ``cut``."""
     step = ti.static((io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0]) / COLUMN)
@@ -449,7 +449,7 @@ def shown_heights(ends, cut, io: Bundle[LookIO]):
 
 
 @ti.func
-def missing_heights(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
+def missing_heights(env, col, ahead, radius, eye_z, R_wb, io: Bundle[TrackingIO]):
     """Likelihood per hypothesis of an obstacle that does not show: less where the camera sees past the place
     of its middle."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))

@@ -14,12 +14,12 @@ import math
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.config import HeightConfig, SonarConfig, TankConfig
+from uuvtai.config import HeightConfig, TankConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
 from uuvtai.kernels.core.stage import Bundle, Const, In, Out, spread
-from uuvtai.kernels.perception.io import HeightsIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import TrackState
 
 COLUMN = LANES - 1
@@ -74,97 +74,54 @@ def half_height(env, track, tracks: In[TrackState], height_cfg: Const[HeightConf
 
 
 @ti.func
-def in_fan(
-    env,
-    track,
-    own,
-    half,
-    tracks: In[TrackState],
-    height_cfg: Const[HeightConfig],
-    sonar_cfg: Const[SonarConfig],
-    tank_cfg: Const[TankConfig],
-):
+def in_fan(env, track, own, half, io: Bundle[TrackingIO]):
     """Per hypothesis the probability that a beam from ``own`` [m, world] hits the obstacle where it is
     expected.
 
     ``half`` = its half height [m], guessed: large for hits and small for misses, so that neither says more
     than it knows. Soft at the fan's edge.
     """
-    mean = tracks.state[env, track]
+    mean = io.tracks.state[env, track]
     away = ti.Vector([mean[0] - own[0], mean[1] - own[1]]).norm()
-    opening = ti.static(math.tan(math.radians(sonar_cfg.vertical_half_aperture_deg)))
-    reach = half + opening * ti.max(away - 0.5 * tracks.radius_m[env, track], 0.0)
-    at = heights(tank_cfg)
+    opening = ti.static(math.tan(math.radians(io.sonar_cfg.vertical_half_aperture_deg)))
+    reach = half + opening * ti.max(away - 0.5 * io.tracks.radius_m[env, track], 0.0)
+    at = heights(io.tank_cfg)
     out = f16x(0.0)
     for i in ti.static(range(LANES)):
         out[i] = ti.math.clamp(
-            (reach - ti.abs(at[i] - own[2])) * ti.static(0.5 / height_cfg.edge_m) + 0.5, 0.0, 1.0
+            (reach - ti.abs(at[i] - own[2])) * ti.static(0.5 / io.height_cfg.edge_m) + 0.5, 0.0, 1.0
         )
     out[COLUMN] = 1.0
     return out
 
 
 @ti.func
-def weigh_seen(
-    env,
-    track,
-    own,
-    tracks: Out[TrackState],
-    height_cfg: Const[HeightConfig],
-    sonar_cfg: Const[SonarConfig],
-    tank_cfg: Const[TankConfig],
-):
+def weigh_seen(env, track, own, io: Bundle[TrackingIO]):
     """The sonar at ``own`` hit it: it is there, and within the fan."""
-    likely = in_fan(
-        env,
-        track,
-        own,
-        half_height(env, track, tracks, height_cfg) + height_cfg.edge_m,
-        tracks,
-        height_cfg,
-        sonar_cfg,
-        tank_cfg,
-    )
-    weighed = tracks.height[env, track, 0] * ti.max(likely, _LEAST)
-    tracks.height[env, track, 0] = shared(weighed)
-    tracks.present[env, track] = _WELL_THERE
+    half = half_height(env, track, io.tracks, io.height_cfg)
+    likely = in_fan(env, track, own, half + io.height_cfg.edge_m, io)
+    weighed = io.tracks.height[env, track, 0] * ti.max(likely, _LEAST)
+    io.tracks.height[env, track, 0] = shared(weighed)
+    io.tracks.present[env, track] = _WELL_THERE
 
 
 @ti.func
-def weigh_unseen(
-    env,
-    track,
-    own,
-    dt,
-    tracks: Out[TrackState],
-    height_cfg: Const[HeightConfig],
-    sonar_cfg: Const[SonarConfig],
-    tank_cfg: Const[TankConfig],
-):
+def weigh_unseen(env, track, own, dt, io: Bundle[TrackingIO]):
     """Beams from ``own`` went through where it is expected: it is above or below the fan, or elsewhere.
 
     The less surely the filter knows where it is, the less it says that beams through the middle of that place
     met nothing; and neighbouring scans say the same again, so only one in ``evidence_s`` counts in full.
     """
-    radius = tracks.radius_m[env, track]
-    spread_var = largest_position_variance(tracks.cov[env, track], 0.0)
-    sure = ti.static(height_cfg.hit_share) * radius * radius / (radius * radius + spread_var)
-    hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / height_cfg.evidence_s), 1.0)
-    likely = in_fan(
-        env,
-        track,
-        own,
-        height_cfg.least_half_height_m - height_cfg.edge_m,
-        tracks,
-        height_cfg,
-        sonar_cfg,
-        tank_cfg,
-    )
-    weighed = tracks.height[env, track, 0] * ti.max(1.0 - likely * hit, _LEAST)
+    radius = io.tracks.radius_m[env, track]
+    spread_var = largest_position_variance(io.tracks.cov[env, track], 0.0)
+    sure = ti.static(io.height_cfg.hit_share) * radius * radius / (radius * radius + spread_var)
+    hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / io.height_cfg.evidence_s), 1.0)
+    likely = in_fan(env, track, own, io.height_cfg.least_half_height_m - io.height_cfg.edge_m, io)
+    weighed = io.tracks.height[env, track, 0] * ti.max(1.0 - likely * hit, _LEAST)
     total = weighed.sum()
-    tracks.height[env, track, 0] = shared(weighed)
-    there = tracks.present[env, track] * total
-    tracks.present[env, track] = there / (there + 1.0 - tracks.present[env, track])
+    io.tracks.height[env, track, 0] = shared(weighed)
+    there = io.tracks.present[env, track] * total
+    io.tracks.present[env, track] = there / (there + 1.0 - io.tracks.present[env, track])
 
 
 @ti.func
@@ -181,7 +138,7 @@ def weigh_camera(env, track, likely, missing, tracks: Out[TrackState]):
 
 @quick_launch
 @ti.kernel
-def bound_heights(io: Bundle[HeightsIO]):
+def bound_heights(io: Bundle[TrackingIO]):
     """Free water above and below the own height: ``above_w`` is the lowest edge of what may be above,
     ``below_w`` the highest edge of what may be below; both are the own height where the obstacle may be level
     with the vehicle, and for tracks that do not move.
@@ -201,7 +158,7 @@ def bound_heights(io: Bundle[HeightsIO]):
 
 
 @ti.func
-def free_water(env, track, own_z, io: Bundle[HeightsIO]):
+def free_water(env, track, own_z, io: Bundle[TrackingIO]):
     """(lowest edge above, highest edge below) [m] of the hypotheses that hold more than ``tail_share``."""
     at, share = heights(io.tank_cfg), io.tracks.height[env, track, 0]
     half = half_height(env, track, io.tracks, io.height_cfg)

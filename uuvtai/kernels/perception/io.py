@@ -53,76 +53,6 @@ class EchoesIO:
 
 
 @dataclass(frozen=True, eq=False)
-class ForecastIO:
-    """Where obstacles will be: arcs, and legs between the turns that they were seen to take."""
-
-    forecast: Out[ForecastState]
-    turn_history: Out[TurnHistory]
-    clock: In[ClockState]
-    clusters: In[ClusterState]
-    image: In[DepthImage]
-    tracks: In[TrackState]
-    episode_cfg: Const[EpisodeConfig]
-    forecast_cfg: Const[ForecastConfig]
-    tank_cfg: Const[TankConfig]
-    tracking_cfg: Const[TrackingConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class PastIO:
-    """Where each track was and where it turned, as columns for a network."""
-
-    mixture: Out[MixtureState]
-    past: Out[PastState]
-    clock: In[ClockState]
-    clusters: In[ClusterState]
-    forecast: In[ForecastState]
-    turn_history: In[TurnHistory]
-    tracks: In[TrackState]
-    episode_cfg: Const[EpisodeConfig]
-    forecast_cfg: Const[ForecastConfig]
-    tank_cfg: Const[TankConfig]
-    behavior_cfg: Const[BehaviorConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class MixtureIO:
-    """What a network says that the obstacles may do."""
-
-    forecast: Out[ForecastState]
-    futures: Out[FutureState]
-    mixture: Out[MixtureState]
-    clock: In[ClockState]
-    behavior_cfg: Const[BehaviorConfig]
-    tracking_cfg: Const[TrackingConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class HeightsIO:
-    """How high forecast obstacles may reach."""
-
-    forecast: Out[ForecastState]
-    clock: In[ClockState]
-    ego: In[Proprioception]
-    tracks: In[TrackState]
-    height_cfg: Const[HeightConfig]
-    tank_cfg: Const[TankConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class LookIO:
-    """What the camera shows of the tracks' heights."""
-
-    tracks: Out[TrackState]
-    clock: In[ClockState]
-    image: In[DepthImage]
-    depth_cfg: Const[DepthConfig]
-    height_cfg: Const[HeightConfig]
-    episode_cfg: Const[EpisodeConfig]
-    tank_cfg: Const[TankConfig]
-
-
-@dataclass(frozen=True, eq=False)
 class MappingIO:
     """Both layers of the occupancy map, from the fan and the depth image."""
 
@@ -157,36 +87,28 @@ class LocalizationIO:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraTrackingIO:
-    """Obstacles that only the camera sees."""
-
-    spots: Out[SpotState]
-    tracks: Out[TrackState]
-    clock: In[ClockState]
-    image: In[DepthImage]
-    scan: In[SonarScan]
-    depth_cfg: Const[DepthConfig]
-    height_cfg: Const[HeightConfig]
-    episode_cfg: Const[EpisodeConfig]
-    sonar_cfg: Const[SonarConfig]
-    camera_tracking_cfg: Const[CameraTrackingConfig]
-    tank_cfg: Const[TankConfig]
-    tracking_cfg: Const[TrackingConfig]
-
-
-@dataclass(frozen=True, eq=False)
 class TrackingIO:
-    """Obstacles followed from ping to ping."""
+    """Obstacles: followed from ping to ping and by the camera, how high they reach, where they will be."""
 
     clusters: Out[ClusterState]
     echoes: Out[EchoState]
+    forecast: Out[ForecastState]
+    futures: Out[FutureState]
+    mixture: Out[MixtureState]
+    past: Out[PastState]
+    spots: Out[SpotState]
     tracks: Out[TrackState]
+    turn_history: Out[TurnHistory]
     clock: In[ClockState]
-    turn_history: In[TurnHistory]
+    ego: In[Proprioception]
+    image: In[DepthImage]
     scan: In[SonarScan]
-    height_cfg: Const[HeightConfig]
+    behavior_cfg: Const[BehaviorConfig]
+    camera_tracking_cfg: Const[CameraTrackingConfig]
+    depth_cfg: Const[DepthConfig]
     episode_cfg: Const[EpisodeConfig]
     forecast_cfg: Const[ForecastConfig]
+    height_cfg: Const[HeightConfig]
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
     tracking_cfg: Const[TrackingConfig]
@@ -200,10 +122,4 @@ class PerceptionStages:
     echoes: EchoesIO
     localization: LocalizationIO
     tracking: TrackingIO
-    camera_tracking: CameraTrackingIO
-    look: LookIO
-    forecast: ForecastIO
-    past: PastIO
-    mixture: MixtureIO
-    heights: HeightsIO
     mapping: MappingIO

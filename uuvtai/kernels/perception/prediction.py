@@ -11,7 +11,7 @@ from uuvtai.kernels.core.geometry import FAR_M, turned_z
 from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.simd import LANES, f16x
 from uuvtai.kernels.core.stage import Bundle, Const, In, spread
-from uuvtai.kernels.perception.io import ForecastIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import TrackState, TurnHistory
 
 # ------------------------------------------------------------------------------------------------------------
@@ -63,7 +63,7 @@ _MOST_WEIGHT = 4.0
 
 
 @ti.func
-def forget_turns(env, io: Bundle[ForecastIO]):
+def forget_turns(env, io: Bundle[TrackingIO]):
     io.turn_history.next_slot[env] = 0
     for packet in range(io.turn_history.turn.shape[2]):
         io.turn_history.turn[env, TURN_X, packet] = ti.zero(io.turn_history.turn[env, TURN_X, packet])
@@ -84,7 +84,7 @@ def forget_turns(env, io: Bundle[ForecastIO]):
 
 
 @ti.func
-def learn_turn(env, track, io: Bundle[ForecastIO]):
+def learn_turn(env, track, io: Bundle[TrackingIO]):
     """Where a track is on a straight leg: remember the turn since its last one, and forget a turn that it
     went past."""
     if io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0:
@@ -117,7 +117,7 @@ def learn_turn(env, track, io: Bundle[ForecastIO]):
 
 
 @ti.func
-def on_straight_leg(env, track, io: Bundle[ForecastIO]):
+def on_straight_leg(env, track, io: Bundle[TrackingIO]):
     """Whether course and speed are known well and the course does not turn."""
     mean, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
     rate, rate_var = io.tracks.turn_rate[env, track], io.tracks.turn_cov[env, track][4]
@@ -126,7 +126,7 @@ def on_straight_leg(env, track, io: Bundle[ForecastIO]):
 
 
 @ti.func
-def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
+def place_turn(env, p0, d0, p1, d1, way, io: Bundle[TrackingIO]):
     """Remember the turn between two legs, unless they do not meet. Returns where the second leg began as far
     as is known, and its ``run_kind``."""
     # With a = (L + u) / 2 and b = (L - u) / 2 the legs' ends p0 + a d0 and p1 - b d1 differ by p0 - p1 + L
@@ -146,7 +146,7 @@ def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
 
 
 @ti.func
-def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
+def store_turn(env, pos, d0, d1, io: Bundle[TrackingIO]):
     """Average with the same turn seen before; else a new one in the place of the oldest."""
     turn, n_packet = ti.static(io.turn_history.turn, io.turn_history.turn.shape[2])
     slot, weight = io.turn_history.next_slot[env], 1.0
@@ -177,7 +177,7 @@ def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
 
 
 @ti.func
-def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
+def drop_passed(env, pos, course, moved, io: Bundle[TrackingIO]):
     """An obstacle that was expected to turn and has gone straight on past the place, in the last ``moved``
     [m], takes one off its weight."""
     edge = ti.static(-io.forecast_cfg.passed_m)
@@ -213,22 +213,22 @@ def offsets(env, packet, pos, course, turn_history: In[TurnHistory]):
 
 
 @ti.func
-def next_turn(env, pos, course, turn_history: In[TurnHistory], forecast_cfg: Const[ForecastConfig]):
+def next_turn(env, pos, course, io: Bundle[TrackingIO]):
     """(distance [m] to the nearest remembered turn ahead, course after it); FAR_M = none."""
     gap, slot = FAR_M, 0
-    for packet in range(turn_history.turn.shape[2]):
-        along, across = offsets(env, packet, pos, course, turn_history)
+    for packet in range(io.turn_history.turn.shape[2]):
+        along, across = offsets(env, packet, pos, course, io.turn_history)
         for lane in ti.static(range(LANES)):
             meets = (
-                across[lane] < forecast_cfg.across_m + forecast_cfg.across_slope * along[lane]
-                and along[lane] > -forecast_cfg.overdue_m
+                across[lane] < io.forecast_cfg.across_m + io.forecast_cfg.across_slope * along[lane]
+                and along[lane] > -io.forecast_cfg.overdue_m
             )
             if meets and along[lane] < gap:
                 gap, slot = along[lane], packet * LANES + lane
     out = course
     if gap < FAR_M:
         gap, packet, lane = ti.max(gap, 0.0), slot // LANES, slot % LANES
-        turn = ti.static(turn_history.turn)
+        turn = ti.static(io.turn_history.turn)
         out = ti.Vector([turn[env, OUT_X, packet][lane], turn[env, OUT_Y, packet][lane]])
     return gap, out
 
@@ -257,15 +257,7 @@ def wall_ahead(pos, course, radius, tank_cfg: Const[TankConfig]):
 
 
 @ti.func
-def next_event(
-    env,
-    pos,
-    course,
-    radius,
-    turn_history: In[TurnHistory],
-    forecast_cfg: Const[ForecastConfig],
-    tank_cfg: Const[TankConfig],
-):
+def next_event(env, pos, course, radius, io: Bundle[TrackingIO]):
     """(distance [m] to the next turn on a straight course, course after it): a remembered one, or the wall if
     that comes first.
 
@@ -273,10 +265,10 @@ def next_event(
     loops do, whose next leg goes anywhere into the tank.
     """
     gap, out = FAR_M, course
-    if ti.static(forecast_cfg.use_turn_history):
-        gap, out = next_turn(env, pos, course, turn_history, forecast_cfg)
-    if ti.static(forecast_cfg.use_reflection):
-        far = ti.max(wall_ahead(pos, course, radius, tank_cfg), 0.0)
+    if ti.static(io.forecast_cfg.use_turn_history):
+        gap, out = next_turn(env, pos, course, io)
+    if ti.static(io.forecast_cfg.use_reflection):
+        far = ti.max(wall_ahead(pos, course, radius, io.tank_cfg), 0.0)
         if far < gap:
             gap, out = far, -course
     return gap, out
@@ -311,29 +303,12 @@ def expected_turn_rate(
 
 
 @ti.func
-def coasted(
-    env,
-    track,
-    mean,
-    time,
-    turn_history: In[TurnHistory],
-    tracks: In[TrackState],
-    forecast_cfg: Const[ForecastConfig],
-    tank_cfg: Const[TankConfig],
-):
+def coasted(env, track, mean, time, io: Bundle[TrackingIO]):
     """Mean (x, y, vx, vy) of an unseen obstacle on a straight leg after ``time`` [s]: it turns where
     obstacles turn."""
     speed = ti.max(ti.sqrt(mean[2] ** 2 + mean[3] ** 2), 1e-6)
     course, way = ti.Vector([mean[2] / speed, mean[3] / speed]), speed * time
-    gap, out = next_event(
-        env,
-        ti.Vector([mean[0], mean[1]]),
-        course,
-        tracks.radius_m[env, track],
-        turn_history,
-        forecast_cfg,
-        tank_cfg,
-    )
+    gap, out = next_event(env, ti.Vector([mean[0], mean[1]]), course, io.tracks.radius_m[env, track], io)
     before = ti.min(gap, way)
     after = way - before
     late = course
@@ -352,7 +327,7 @@ MOST_LEGS = 6
 
 @quick_launch
 @ti.kernel
-def reset_forecast(io: Bundle[ForecastIO]):
+def reset_forecast(io: Bundle[TrackingIO]):
     """Know no turn history and expect nothing in the active rows."""
     n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
@@ -368,7 +343,7 @@ def reset_forecast(io: Bundle[ForecastIO]):
 
 @quick_launch
 @ti.kernel
-def learn_turns(io: Bundle[ForecastIO]):
+def learn_turns(io: Bundle[TrackingIO]):
     """Watch how the tracks move, after each tracked scan."""
     n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
@@ -379,7 +354,7 @@ def learn_turns(io: Bundle[ForecastIO]):
 
 @quick_launch
 @ti.kernel
-def forecast_tracks(io: Bundle[ForecastIO]):
+def forecast_tracks(io: Bundle[TrackingIO]):
     """From now to the horizon, for the moving tracks of the active rows; the others get a negative radius.
 
     The radius grows by ``growth_sigmas`` standard deviations of the predicted position along its worst axis,
@@ -403,13 +378,13 @@ def forecast_tracks(io: Bundle[ForecastIO]):
 
 
 @ti.func
-def clear_forecast(env, track, io: Bundle[ForecastIO]):
+def clear_forecast(env, track, io: Bundle[TrackingIO]):
     for k in range(io.forecast.radius_m.shape[2]):
         io.forecast.radius_m[env, track, k] = -1.0
 
 
 @ti.func
-def follow_arc(env, track, io: Bundle[ForecastIO]):
+def follow_arc(env, track, io: Bundle[TrackingIO]):
     """Constant speed and turn rate: steps along the chords of the arc."""
     mean, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
     late = (io.clock.step[env] - io.tracks.scan_step[env]) * io.episode_cfg.control_dt_s
@@ -430,7 +405,7 @@ def follow_arc(env, track, io: Bundle[ForecastIO]):
 
 
 @ti.func
-def follow_legs(env, track, changed, io: Bundle[ForecastIO]):
+def follow_legs(env, track, changed, io: Bundle[TrackingIO]):
     """Constant speed on straight legs, from turn to turn; the search for the first turn is kept until
     something has ``changed``."""
     mean, cov, radius = io.tracks.state[env, track], io.tracks.cov[env, track], io.tracks.radius_m[env, track]
@@ -438,7 +413,7 @@ def follow_legs(env, track, changed, io: Bundle[ForecastIO]):
     course = ti.Vector([mean[2], mean[3]]) / speed
     gap, out = io.forecast.turn_m[env, track], io.forecast.turn_out_w[env, track]
     if changed:
-        gap, out = next_event(env, pos, course, radius, io.turn_history, io.forecast_cfg, io.tank_cfg)
+        gap, out = next_event(env, pos, course, radius, io)
         io.forecast.turn_m[env, track] = gap
         io.forecast.turn_out_w[env, track] = out
     legs = 0
@@ -449,7 +424,7 @@ def follow_legs(env, track, changed, io: Bundle[ForecastIO]):
             pos += gap * course
             way -= gap
             course = out
-            gap, out = next_event(env, pos, course, radius, io.turn_history, io.forecast_cfg, io.tank_cfg)
+            gap, out = next_event(env, pos, course, radius, io)
             legs += 1
         pos += way * course
         gap -= way

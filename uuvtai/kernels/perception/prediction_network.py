@@ -31,13 +31,13 @@ from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import Bundle, spread
-from uuvtai.kernels.perception.io import MixtureIO, PastIO
+from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.prediction import IN_X, IN_Y, OUT_X, OUT_Y, WEIGHT, next_turn, wall_ahead
 
 
 @quick_launch
 @ti.kernel
-def mix_futures(io: Bundle[MixtureIO]):
+def mix_futures(io: Bundle[TrackingIO]):
     """In decision steps: the likeliest future of every track that has a forecast becomes its forecast, the
     others are its futures, with their probabilities."""
     n, n_track = ti.static(io.clock.active.shape[0], io.forecast.radius_m.shape[1])
@@ -53,7 +53,7 @@ def mix_futures(io: Bundle[MixtureIO]):
 
 
 @ti.func
-def _think(env, track, io: Bundle[MixtureIO]):
+def _think(env, track, io: Bundle[TrackingIO]):
     """Columns to what the network says: two hidden layers of rectified units."""
     n_packet = ti.static(N_HIDDEN // LANES)
     for packet in range(n_packet):
@@ -84,7 +84,7 @@ def _think(env, track, io: Bundle[MixtureIO]):
 
 
 @ti.func
-def _tell(env, track, io: Bundle[MixtureIO]):
+def _tell(env, track, io: Bundle[TrackingIO]):
     """What was said as probabilities and places in the world."""
     most, total, likeliest = io.mixture.said[env, track, 0], 0.0, 0
     for future in range(1, N_MODE):
@@ -112,7 +112,7 @@ def _tell(env, track, io: Bundle[MixtureIO]):
 
 
 @ti.func
-def _place_at(env, track, future, ahead_s, io: Bundle[MixtureIO]):
+def _place_at(env, track, future, ahead_s, io: Bundle[TrackingIO]):
     """Where a future is after a time, in the track's frame and per speed [s]: between two anchors, or on from
     the last two."""
     after = ti.math.clamp(ti.cast(ti.ceil(ahead_s * ti.static(1.0 / ANCHOR_S) - 1.0e-4), ti.i32), 1, ANCHORS)
@@ -143,7 +143,7 @@ _BACK_COS = -0.9
 
 @quick_launch
 @ti.kernel
-def reset_past(io: Bundle[PastIO]):
+def reset_past(io: Bundle[TrackingIO]):
     """Remember nothing in the active rows."""
     n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
@@ -159,7 +159,7 @@ def reset_past(io: Bundle[PastIO]):
 
 @quick_launch
 @ti.kernel
-def remember_past(io: Bundle[PastIO]):
+def remember_past(io: Bundle[TrackingIO]):
     """After each tracked scan: where the tracks are, and where they turned. A new track remembers nothing."""
     n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
@@ -172,7 +172,7 @@ def remember_past(io: Bundle[PastIO]):
 
 @quick_launch
 @ti.kernel
-def describe_motion(io: Bundle[PastIO]):
+def describe_motion(io: Bundle[TrackingIO]):
     """In decision steps: the columns of every track that has a forecast."""
     n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
@@ -192,7 +192,7 @@ def describe_motion(io: Bundle[PastIO]):
 
 
 @ti.func
-def _forget(env, track, io: Bundle[PastIO]):
+def _forget(env, track, io: Bundle[TrackingIO]):
     io.past.past_count[env, track], io.past.bend_count[env, track] = 0, 0
     io.past.past_step[env, track] = 0
     for i in range(io.past.past_w.shape[2]):
@@ -202,7 +202,7 @@ def _forget(env, track, io: Bundle[PastIO]):
 
 
 @ti.func
-def _remember(env, track, io: Bundle[PastIO]):
+def _remember(env, track, io: Bundle[TrackingIO]):
     now = io.tracks.scan_step[env]
     gone = (now - io.past.past_step[env, track]) * io.episode_cfg.control_dt_s
     count = io.past.past_count[env, track]
@@ -228,14 +228,14 @@ def _scaled(length_m):
 
 
 @ti.func
-def _put_place(env, track, column, off, course, io: Bundle[PastIO]):
+def _put_place(env, track, column, off, course, io: Bundle[TrackingIO]):
     """Two columns: a place, given from the track's own in the world, in the track's frame."""
     io.mixture.column[env, track, column] = _scaled(off.dot(course))
     io.mixture.column[env, track, column + 1] = _scaled(course[0] * off[1] - course[1] * off[0])
 
 
 @ti.func
-def _put_motion(env, track, speed, course, io: Bundle[PastIO]):
+def _put_motion(env, track, speed, course, io: Bundle[TrackingIO]):
     """How it moves, how well that is known, and how long it has gone straight."""
     dt, cov, turn_var = (
         io.episode_cfg.control_dt_s,
@@ -266,7 +266,7 @@ def _put_motion(env, track, speed, course, io: Bundle[PastIO]):
 
 
 @ti.func
-def _put_ahead(env, track, place, course, io: Bundle[PastIO]):
+def _put_ahead(env, track, place, course, io: Bundle[TrackingIO]):
     """Walls on four sides, the next remembered turn, what turns this water has seen, the forecast."""
     radius, left = io.tracks.radius_m[env, track], ti.Vector([-course[1], course[0]])
     at = ti.static(N_MOTION)
@@ -274,7 +274,7 @@ def _put_ahead(env, track, place, course, io: Bundle[PastIO]):
     io.mixture.column[env, track, at + 1] = _scaled(wall_ahead(place, -course, radius, io.tank_cfg))
     io.mixture.column[env, track, at + 2] = _scaled(wall_ahead(place, left, radius, io.tank_cfg))
     io.mixture.column[env, track, at + 3] = _scaled(wall_ahead(place, -left, radius, io.tank_cfg))
-    gap, out = next_turn(env, place, course, io.turn_history, io.forecast_cfg)
+    gap, out = next_turn(env, place, course, io)
     known = gap < FAR_M
     io.mixture.column[env, track, at + 4] = _scaled(gap)
     io.mixture.column[env, track, at + 5] = ti.select(known, out.dot(course), 0.0)
@@ -289,7 +289,7 @@ def _put_ahead(env, track, place, course, io: Bundle[PastIO]):
 
 
 @ti.func
-def _put_behind(env, track, place, course, io: Bundle[PastIO]):
+def _put_behind(env, track, place, course, io: Bundle[TrackingIO]):
     """Turns of this track, and where it was."""
     first = ti.static(N_MOTION + N_AHEAD + 2 * len(AHEAD_STEPS))
     for i in range(N_BEND):
@@ -307,7 +307,7 @@ def _put_behind(env, track, place, course, io: Bundle[PastIO]):
 
 
 @ti.func
-def _turns_seen(env, io: Bundle[PastIO]):
+def _turns_seen(env, io: Bundle[TrackingIO]):
     """How many of the remembered turns of this water are turns back, and how many are others."""
     back, aside = 0.0, 0.0
     for packet in range(io.turn_history.turn.shape[2]):

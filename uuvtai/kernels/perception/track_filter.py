@@ -3,7 +3,7 @@ tracking stage)."""
 
 import taichi as ti
 
-from uuvtai.config import ForecastConfig, TrackingConfig, TrafficConfig
+from uuvtai.config import TrafficConfig
 from uuvtai.kernels.core.geometry import FAR_M, wrapped_angle
 from uuvtai.kernels.core.kalman import (
     AT,
@@ -12,11 +12,10 @@ from uuvtai.kernels.core.kalman import (
     position_variance,
     velocity_variance,
 )
-from uuvtai.kernels.core.stage import Bundle, Const, In
+from uuvtai.kernels.core.stage import Bundle, Const
 from uuvtai.kernels.perception.clustering import ARC
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.prediction import BEGIN_SEEN, next_turn
-from uuvtai.state import TrackState
 
 # ------------------------------------------------------------------------------------------------------------
 # What a cluster says about an obstacle of known radius: where its centre is, how surely, how well it fits a
@@ -357,14 +356,14 @@ def turn_back_rate(env, track, dt, io: Bundle[TrackingIO]):
     if speed > _SLOWEST_M_S:
         turn = FAR_M + 0.0
         if ti.static(io.forecast_cfg.use_turn_history):
-            turn, _ = next_turn(env, pos, course, io.turn_history, io.forecast_cfg)
+            turn, _ = next_turn(env, pos, course, io)
         if turn >= FAR_M:
             begun, known = 0.0, io.turn_history.run_kind[env, track] >= BEGIN_SEEN
             if io.turn_history.run_kind[env, track] > 0:
                 begun = ti.max((pos - io.turn_history.run_from_w[env, track]).dot(course), 0.0)
             first = ti.max(longer_share(begun, known, io.traffic_cfg), _LEAST_SHARE)
             last = ti.max(longer_share(begun + speed * dt, known, io.traffic_cfg), _LEAST_SHARE)
-            straight = straight_share(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg)
+            straight = straight_share(env, track, io)
             rate = straight * ti.log(first / last) / ti.max(dt, 1.0e-3)
     return rate
 
@@ -384,22 +383,16 @@ def longer_share(way_m, known, traffic_cfg: Const[TrafficConfig]):
 
 
 @ti.func
-def straight_share(
-    env,
-    track,
-    tracks: In[TrackState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking_cfg: Const[TrackingConfig],
-):
+def straight_share(env, track, io: Bundle[TrackingIO]):
     """Probability that the obstacle goes straight rather than in a circle
-    (``turn_history.expected_turn_rate``)."""
+    (``io.turn_history.expected_turn_rate``)."""
     share = 1.0
-    if ti.static(forecast_cfg.use_turn_rate and tracking_cfg.turn_rate_sigma_rad_s > 0):
-        rate, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
+    if ti.static(io.forecast_cfg.use_turn_rate and io.tracking_cfg.turn_rate_sigma_rad_s > 0):
+        rate, var = io.tracks.turn_rate[env, track], io.tracks.turn_cov[env, track][4]
         if var > 0.0:
-            turns = ti.sqrt(var) * ti.static(1.0 / tracking_cfg.turn_rate_sigma_rad_s)
+            turns = ti.sqrt(var) * ti.static(1.0 / io.tracking_cfg.turn_rate_sigma_rad_s)
             turns *= ti.exp(ti.min(0.5 * rate * rate / var, 20.0))
-            share = forecast_cfg.straight_odds / (forecast_cfg.straight_odds + turns)
+            share = io.forecast_cfg.straight_odds / (io.forecast_cfg.straight_odds + turns)
     return share
 
 

@@ -95,15 +95,7 @@ def prune_tracks(env, dt, io: Bundle[TrackingIO]):
             remembered = ti.static(io.height_cfg.memory_s > 0) and io.tracks.moving[env, track] == 1
             if io.tracks.misses[env, track] == 0:
                 if remembered:
-                    weigh_seen(
-                        env,
-                        track,
-                        io.scan.ping_pos_w[env],
-                        io.tracks,
-                        io.height_cfg,
-                        io.sonar_cfg,
-                        io.tank_cfg,
-                    )
+                    weigh_seen(env, track, io.scan.ping_pos_w[env], io)
             elif is_double(env, track, io):
                 clear_track(env, track, io.tracks)
             else:
@@ -122,9 +114,7 @@ def is_forgotten(env, track, sight, dt, io: Bundle[TrackingIO]):
     """1 where a moving obstacle is hardly where it is expected any more: seen through within the fan, or
     unseen for long."""
     if sight == SEEN_THROUGH:
-        weigh_unseen(
-            env, track, io.scan.ping_pos_w[env], dt, io.tracks, io.height_cfg, io.sonar_cfg, io.tank_cfg
-        )
+        weigh_unseen(env, track, io.scan.ping_pos_w[env], dt, io)
     io.tracks.present[env, track] *= ti.exp(-dt * ti.static(1.0 / max(io.height_cfg.memory_s, 1e-3)))
     return ti.cast(io.tracks.present[env, track] < io.height_cfg.gone_share, ti.i32)
 
@@ -596,16 +586,7 @@ def moved_on(env, track, dt, io: Bundle[TrackingIO]):
     unseen = io.tracks.moving[env, track] == 1 and io.tracks.misses[env, track] > 0
     if unseen and expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) == 0.0:
         if ti.static(io.forecast_cfg.use_coasting):
-            mean = coasted(
-                env,
-                track,
-                io.tracks.state[env, track],
-                dt,
-                io.turn_history,
-                io.tracks,
-                io.forecast_cfg,
-                io.tank_cfg,
-            )
+            mean = coasted(env, track, io.tracks.state[env, track], dt, io)
         if ti.static(io.forecast_cfg.use_turning_back):
             if sight_of(env, track, io) == SEEN_THROUGH:  # what is hidden may be level
                 rate = turn_back_rate(env, track, dt, io)
