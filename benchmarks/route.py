@@ -15,7 +15,7 @@ from uuvtai.common.enums import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
 from uuvtai.kernels.planning import route, voronoi
-from uuvtai.kernels.planning.io import RouteIO, VoronoiIO
+from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.sim import rrt
 from uuvtai.sim.stages import bind
 
@@ -34,7 +34,7 @@ def measure(job: Job) -> list[Row]:
     found = _maps(n_env, config)
     s = _structs(n_env, config, found)
 
-    io = bind(VoronoiIO, *s.values(), config)
+    io = bind(RouteIO, *s.values(), config)
 
     def ours():
         voronoi.plan_routes(io)

@@ -10,7 +10,7 @@ from tests.bundles import io_for
 from tests.oracles.voronoi import clearance_of
 from uuvtai import state
 from uuvtai.config import Config
-from uuvtai.kernels.planning.io import RouteIO, VoronoiIO
+from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.sim.setup import load_bounds
 
 N_ENV = 8
@@ -107,7 +107,7 @@ def plan(envs=range(N_ENV), config=CONFIG):
     queue[: len(envs)] = list(envs)
     s.route.queue.from_numpy(queue)
     s.route.n_queue[None] = len(envs)
-    plan_routes(io_for(VoronoiIO, s, config))
+    plan_routes(io_for(RouteIO, s, config))
     return s.route
 
 

@@ -13,7 +13,7 @@ from tests.kernels.planning.test_voronoi import STRICT, wall
 from tests.oracles.voronoi import clearance_of, line_points
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, way_of
 from uuvtai.common import enums as codes
-from uuvtai.kernels.planning.io import RouteIO, VoronoiIO
+from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.sim import rrt
 
 pytest.importorskip("ompl")
@@ -117,7 +117,7 @@ def serve(s, config=CONFIG, seed=1):
     fallback = rrt.RouteFallback(config)
     parts = (s.route, s.clearance, s.grid_map, s.mask, s.mission, s.ego, s.clock, config)
     return fallback.serve(
-        SimpleNamespace(route=io_for(RouteIO, *parts), voronoi=io_for(VoronoiIO, *parts)),
+        SimpleNamespace(route=io_for(RouteIO, *parts), voronoi=io_for(RouteIO, *parts)),
         lambda env: seed + env,
         lambda field, envs=slice(None): field.to_numpy()[envs],
         lambda field: int(field[None]),

@@ -286,7 +286,7 @@ class RouteFallback:
         envs = sorted(read(route.failed)[:n_failed].tolist())
         starts, goals = (read(field, envs)[:, :2].tolist() for field in (ego.pos_w, mission.goal_w))
         for env, start, goal in zip(envs, starts, goals, strict=True):
-            overlay_clearance(stages.voronoi, self.overlay, env)
+            overlay_clearance(stages.route, self.overlay, env)
             corners = self.plan((start[0], start[1]), (goal[0], goal[1]), seed_of(env))
             if corners is None:
                 keep_route(stages.route, env)
@@ -311,10 +311,10 @@ class RouteFallback:
 
         ends = [read(field, envs)[:, :2] - self.origin for field in (io.ego.pos_w, io.mission.goal_w)]
         obstacles, radius = (
-            read(f, envs) for f in (stages.triggers.forecast.pos_w, stages.triggers.forecast.radius_m)
+            read(f, envs) for f in (stages.route.forecast.pos_w, stages.route.forecast.radius_m)
         )
         for i, env in enumerate(envs):
-            overlay_clearance(stages.voronoi, self.overlay, env)
+            overlay_clearance(stages.route, self.overlay, env)
             moves = radius[i, :, 0] >= 0
             asked = PlanRequest(
                 env,

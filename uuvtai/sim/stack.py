@@ -129,9 +129,9 @@ def draw_map(stages: Stages, config: Config) -> None:
 
 def plan(stages: Stages, config: Config, by_voronoi: bool) -> None:
     """Which envs want a route; ``by_voronoi``: plan them, else they wait for the host's planner."""
-    triggers.fire_triggers(stages.triggers)
+    triggers.fire_triggers(stages.route)
     if by_voronoi:
-        voronoi.plan_routes(stages.voronoi)
+        voronoi.plan_routes(stages.route)
 
 
 def choose(stages: Stages, used: Collection[int], action: torch.Tensor) -> None:

@@ -10,7 +10,7 @@ from tests.oracles import route as oracle
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, stage, way_of
 from uuvtai.common import enums as codes
 from uuvtai.kernels.planning import route, triggers
-from uuvtai.kernels.planning.io import RouteIO, TriggersIO
+from uuvtai.kernels.planning.io import RouteIO
 
 POSITION_M = 2e-5
 """float32 at 20 m resolves 1e-6 m; lengths are sums of a hundred such steps."""
@@ -19,7 +19,7 @@ REST_STEPS = round(R.min_replan_s / DT)
 
 
 def fire():
-    triggers.fire_triggers(io_for(TriggersIO, stage(), CONFIG))
+    triggers.fire_triggers(io_for(RouteIO, stage(), CONFIG))
 
 
 def follow():

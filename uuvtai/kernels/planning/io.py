@@ -75,26 +75,10 @@ class ObservationIO:
 
 @dataclass(frozen=True, eq=False)
 class RouteIO:
-    """The route ahead: where to aim, what is left, what it risks."""
+    """When to plan again, the planner, and the route ahead: where to aim, what is left, what it risks."""
 
     route: Out[RouteState]
-    clearance: In[ClearanceState]
-    clock: In[ClockState]
-    ego: In[Proprioception]
-    grid_map: In[MapState]
-    mission: In[MissionState]
-    clearance_cfg: Const[ClearanceConfig]
-    mapping_cfg: Const[MappingConfig]
-    route_cfg: Const[RouteConfig]
-    tank_cfg: Const[TankConfig]
-    voronoi_cfg: Const[VoronoiConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class TriggersIO:
-    """When to plan again."""
-
-    route: Out[RouteState]
+    voronoi: Out[VoronoiState]
     clearance: In[ClearanceState]
     clock: In[ClockState]
     ego: In[Proprioception]
@@ -107,30 +91,11 @@ class TriggersIO:
     clearance_cfg: Const[ClearanceConfig]
     episode_cfg: Const[EpisodeConfig]
     mapping_cfg: Const[MappingConfig]
+    quiet_cfg: Const[QuietConfig]
     route_cfg: Const[RouteConfig]
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
     tracking_cfg: Const[TrackingConfig]
-    voronoi_cfg: Const[VoronoiConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class VoronoiIO:
-    """The route planner."""
-
-    route: Out[RouteState]
-    voronoi: Out[VoronoiState]
-    clearance: In[ClearanceState]
-    clock: In[ClockState]
-    ego: In[Proprioception]
-    grid_map: In[MapState]
-    mask: In[GridMask]
-    mission: In[MissionState]
-    clearance_cfg: Const[ClearanceConfig]
-    mapping_cfg: Const[MappingConfig]
-    quiet_cfg: Const[QuietConfig]
-    route_cfg: Const[RouteConfig]
-    tank_cfg: Const[TankConfig]
     voronoi_cfg: Const[VoronoiConfig]
 
 
@@ -140,6 +105,4 @@ class PlanningStages:
 
     clearance: ClearanceIO
     observation: ObservationIO
-    triggers: TriggersIO
-    voronoi: VoronoiIO
     route: RouteIO

@@ -8,12 +8,11 @@ the eight around a cell; a diagonal step needs both cells beside it (no corner i
 
 import taichi as ti
 
-from uuvtai.config import MappingConfig, VoronoiConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin, heap_after_pop, heap_after_push, top_cell
-from uuvtai.kernels.core.stage import Bundle, Const, In, Out
-from uuvtai.kernels.planning.io import VoronoiIO
-from uuvtai.state import ClearanceState, ClockState, GridMask, MapState, RouteState
+from uuvtai.kernels.core.stage import Bundle, In, Out
+from uuvtai.kernels.planning.io import RouteIO
+from uuvtai.state import ClockState, RouteState
 
 # bits of VoronoiState.cell; bits 4 to 6 hold the direction of the next cell towards the goal
 KNOWN = 1
@@ -53,18 +52,18 @@ def step_of(direction):
 
 
 @ti.func
-def bits_at(slot, row, col, io: Bundle[VoronoiIO]):
+def bits_at(slot, row, col, io: Bundle[RouteIO]):
     return ti.cast(io.voronoi.cell[slot, row, col], ti.i32)
 
 
 @ti.func
-def next_direction(slot, row, col, io: Bundle[VoronoiIO]):
+def next_direction(slot, row, col, io: Bundle[RouteIO]):
     """Direction of the next cell towards the goal."""
     return bits_at(slot, row, col, io) >> _NEXT_SHIFT & 7
 
 
 @ti.func
-def on_skeleton(slot, env, row, col, io: Bundle[VoronoiIO]):
+def on_skeleton(slot, env, row, col, io: Bundle[RouteIO]):
     """True for skeleton cells; found out once per plan and kept. The cell must be traversable (so it is not
     at the grid's edge)."""
     bits = bits_at(slot, row, col, io)
@@ -77,7 +76,7 @@ def on_skeleton(slot, env, row, col, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _is_medial(env, row, col, io: Bundle[VoronoiIO]):
+def _is_medial(env, row, col, io: Bundle[RouteIO]):
     """True on a plateau and where a neighbour's nearest site is far from the own one."""
     # The integer medial axis (Hesselink and Roerdink 2008, IEEE PAMI 30): where the nearest site jumps by
     # more than a threshold from one cell to the next, the two cells lie on either side of the axis.
@@ -97,7 +96,7 @@ def _is_medial(env, row, col, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _step_is_open(slot, row, col, step, io: Bundle[VoronoiIO]):
+def _step_is_open(slot, row, col, step, io: Bundle[RouteIO]):
     """True where a step may be made: the cell is traversable, and so are both beside a diagonal step."""
     is_open = io.voronoi.weight[slot, row + step[0], col + step[1]] > 0
     if step[0] != 0 and step[1] != 0:
@@ -110,7 +109,7 @@ def _step_is_open(slot, row, col, step, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def join_skeleton(slot, env, start, goal, io: Bundle[VoronoiIO]):
+def join_skeleton(slot, env, start, goal, io: Bundle[RouteIO]):
     """Join both ends to the skeleton: one way uphill in clearance, and eight straight ways, so that the
     search chooses the side."""
     for joint in range(18):
@@ -133,7 +132,7 @@ def join_skeleton(slot, env, start, goal, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _uphill(slot, env, row, col, io: Bundle[VoronoiIO]):
+def _uphill(slot, env, row, col, io: Bundle[RouteIO]):
     """Direction of the open neighbour with the largest clearance, -1 on a summit."""
     best, best_m = -1, io.clearance.clearance_m[env, row, col]
     for k in range(8):
@@ -153,7 +152,7 @@ def _estimate(cost, row, col, start_row, start_col, floor_weight):
 
 
 @ti.func
-def search_cells(slot, env, start, goal, everywhere, io: Bundle[VoronoiIO]):
+def search_cells(slot, env, start, goal, everywhere, io: Bundle[RouteIO]):
     """Cheapest way from the goal back to the start (so that the next cell leads to the goal), along the
     skeleton or ``everywhere``.
 
@@ -188,7 +187,7 @@ def search_cells(slot, env, start, goal, everywhere, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _size_after_expansion(slot, env, size, row, col, start, everywhere, floor_weight, io: Bundle[VoronoiIO]):
+def _size_after_expansion(slot, env, size, row, col, start, everywhere, floor_weight, io: Bundle[RouteIO]):
     """Offer a cell to its eight neighbours as their next; returns the heap's new size."""
     n_col = ti.static(io.voronoi.cost.shape[2])
     here, weight = io.voronoi.cost[slot, row, col], io.voronoi.weight[slot, row, col]
@@ -230,29 +229,20 @@ more than this."""
 
 
 @ti.func
-def occupancy(grid_map: In[MapState], env, row, col, voronoi_cfg: Const[VoronoiConfig]):
+def occupancy(env, row, col, io: Bundle[RouteIO]):
     """Occupancy in [0, 1] of the layer that routes avoid."""
-    value = grid_map.static_occ[env, row, col]
-    if ti.static(voronoi_cfg.use == "fused"):
-        value = ti.max(value, grid_map.dynamic_occ[env, row, col])
+    value = io.grid_map.static_occ[env, row, col]
+    if ti.static(io.voronoi_cfg.use == "fused"):
+        value = ti.max(value, io.grid_map.dynamic_occ[env, row, col])
     return value
 
 
 @ti.func
-def is_traversable(
-    clearance: In[ClearanceState],
-    grid_map: In[MapState],
-    mask: In[GridMask],
-    env,
-    row,
-    col,
-    voronoi_cfg: Const[VoronoiConfig],
-    mapping_cfg: Const[MappingConfig],
-):
+def is_traversable(env, row, col, io: Bundle[RouteIO]):
     """True where a route may pass. The map may be newer than the clearance, so both are asked."""
-    wide = clearance.clearance_m[env, row, col] >= ti.static(voronoi_cfg.min_clearance_m - _SLACK_M)
-    free = occupancy(grid_map, env, row, col, voronoi_cfg) < ti.static(mapping_cfg.occupied)
-    return wide and free and mask.outside[row, col] == 0
+    wide = io.clearance.clearance_m[env, row, col] >= ti.static(io.voronoi_cfg.min_clearance_m - _SLACK_M)
+    free = occupancy(env, row, col, io) < ti.static(io.mapping_cfg.occupied)
+    return wide and free and io.mask.outside[row, col] == 0
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -320,7 +310,7 @@ _GAIN = 1.0e-4
 
 
 @ti.func
-def chord_cost(slot, a, b, bound, io: Bundle[VoronoiIO]):
+def chord_cost(slot, a, b, bound, io: Bundle[RouteIO]):
     """Cost [cells / m] of the straight line a to b, cell by cell; FAR_M where it leaves the traversable cells
     or exceeds ``bound``."""
     # Cell by cell along a line (Amanatides and Woo 1987, A fast voxel traversal algorithm): ``to_col``,
@@ -373,7 +363,7 @@ def chord_cost(slot, a, b, bound, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def path_cells(slot, start, goal, io: Bundle[VoronoiIO]):
+def path_cells(slot, start, goal, io: Bundle[RouteIO]):
     """Write the cells from start to goal; returns how many (at least 2: both ends may be the same cell), 0
     where they do not fit."""
     n_col, room = ti.static(io.voronoi.cost.shape[2], io.voronoi.path_cell.shape[1])
@@ -395,7 +385,7 @@ def path_cells(slot, start, goal, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _point(slot, i, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
+def _point(slot, i, n_cell, start_at, goal_at, io: Bundle[RouteIO]):
     """Position of the path's i-th cell: its centre, but the ends lie where the vehicle and the goal are."""
     n_col = ti.static(io.voronoi.cost.shape[2])
     cell = io.voronoi.path_cell[slot, i]
@@ -404,14 +394,14 @@ def _point(slot, i, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _cost_to_go(slot, i, io: Bundle[VoronoiIO]):
+def _cost_to_go(slot, i, io: Bundle[RouteIO]):
     n_col = ti.static(io.voronoi.cost.shape[2])
     cell = io.voronoi.path_cell[slot, i]
     return io.voronoi.cost[slot, cell // n_col, cell % n_col]
 
 
 @ti.func
-def _cells_cost(slot, i, j, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
+def _cells_cost(slot, i, j, n_cell, start_at, goal_at, io: Bundle[RouteIO]):
     """Cost of going along the cells from path index i to j. At the ends the way to the cell's centre is
     added: an upper bound."""
     cost = _cost_to_go(slot, i, io) - _cost_to_go(slot, j, io)
@@ -423,13 +413,13 @@ def _cells_cost(slot, i, j, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _detour(slot, at, io: Bundle[VoronoiIO]):
+def _detour(slot, at, io: Bundle[RouteIO]):
     row, col = ti.cast(ti.floor(at[1]), ti.i32), ti.cast(ti.floor(at[0]), ti.i32)
     return (at - ti.Vector([col + 0.5, row + 0.5])).norm() * io.voronoi.weight[slot, row, col]
 
 
 @ti.func
-def straightened_cost(slot, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
+def straightened_cost(slot, n_cell, start_at, goal_at, io: Bundle[RouteIO]):
     """Choose for every node of the path (every fourth cell) the best continuation by dynamic programming from
     the goal; total cost."""
     # Backwards from the goal: J(n) = min over spans s of cost(n, n + s) + J(n + s), where s = 0 stands for
@@ -467,7 +457,7 @@ def _next_span(span, longest):
 
 
 @ti.func
-def count_of_waypoints(slot, env, n_cell, start_at, goal_at, spacing, write, io: Bundle[VoronoiIO]):
+def count_of_waypoints(slot, env, n_cell, start_at, goal_at, spacing, write, io: Bundle[RouteIO]):
     """Go along the chosen chords and cells; returns the number of waypoints, and writes them where ``write``
     is 1."""
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))

@@ -5,13 +5,12 @@ import taichi as ti
 
 from uuvtai.common.enums import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.compile.launch import quick_launch
-from uuvtai.config import ClearanceConfig, MappingConfig, RouteConfig, TankConfig
 from uuvtai.kernels.core.geometry import wrapped_angle
 from uuvtai.kernels.core.grid import cell_of
-from uuvtai.kernels.core.stage import Bundle, Const, FloatMatrix, In, Out, spread
+from uuvtai.kernels.core.stage import Bundle, FloatMatrix, In, spread
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.kernels.planning.medial_axis import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
-from uuvtai.state import ClearanceState, MapState, RouteState
+from uuvtai.state import RouteState
 
 # ------------------------------------------------------------------------------------------------------------
 # Where things are along a route: the vehicle's foot, and points ahead of it. Lengths are measured back from
@@ -82,24 +81,22 @@ def advanced_arc(route: In[RouteState], env, pos_w):
 
 
 @ti.func
-def look_along(
-    route: Out[RouteState], env, pos_w, route_cfg: Const[RouteConfig], mapping_cfg: Const[MappingConfig]
-):
+def look_along(env, pos_w, io: Bundle[RouteIO]):
     """Fill ``ahead_w``: points of the route one cell apart, from the foot to risk_horizon_m ahead or the
     goal. No route: own place."""
-    route.ahead_w[env, 0] = pos_w
-    route.n_ahead[env] = 1
-    if route.n_way[env] > 0:
-        left = left_of_foot(route, env)
-        length = ti.min(left, ti.static(route_cfg.risk_horizon_m))
-        count = ti.cast(ti.ceil(length / ti.static(mapping_cfg.cell_m) - 1e-3), ti.i32) + 1
-        route.n_ahead[env] = ti.min(count, ti.static(route.ahead_w.shape[1]))
-        i = segment_of(route, env, route.arc[env])
-        for k in range(route.n_ahead[env]):
+    io.route.ahead_w[env, 0] = pos_w
+    io.route.n_ahead[env] = 1
+    if io.route.n_way[env] > 0:
+        left = left_of_foot(io.route, env)
+        length = ti.min(left, ti.static(io.route_cfg.risk_horizon_m))
+        count = ti.cast(ti.ceil(length / ti.static(io.mapping_cfg.cell_m) - 1e-3), ti.i32) + 1
+        io.route.n_ahead[env] = ti.min(count, ti.static(io.route.ahead_w.shape[1]))
+        i = segment_of(io.route, env, io.route.arc[env])
+        for k in range(io.route.n_ahead[env]):
             point, i_found = point_left(
-                route, env, i, left - ti.min(k * ti.static(mapping_cfg.cell_m), length)
+                io.route, env, i, left - ti.min(k * ti.static(io.mapping_cfg.cell_m), length)
             )
-            route.ahead_w[env, k] = point
+            io.route.ahead_w[env, k] = point
             i = i_found
 
 
@@ -108,24 +105,20 @@ def look_along(
 
 
 @ti.func
-def cell_on_grid(
-    pos_w, clearance: In[ClearanceState], tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]
-):
+def cell_on_grid(pos_w, io: Bundle[RouteIO]):
     """(row, col), off-grid positions held at the edge."""
-    cell = cell_of(pos_w, tank_cfg, mapping_cfg.cell_m)
-    n_row, n_col = ti.static(clearance.clearance_m.shape[1:])
+    cell = cell_of(pos_w, io.tank_cfg, io.mapping_cfg.cell_m)
+    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1:])
     return ti.Vector([ti.math.clamp(cell[0], 0, n_row - 1), ti.math.clamp(cell[1], 0, n_col - 1)])
 
 
 @ti.func
-def risk_at(
-    env, cell, clearance: In[ClearanceState], grid_map: In[MapState], clearance_cfg: Const[ClearanceConfig]
-):
+def risk_at(env, cell, io: Bundle[RouteIO]):
     """R: alpha_m M^s + alpha_d M^d + alpha_delta / (clearance + eps)."""
-    occupied = ti.static(clearance_cfg.risk_static) * grid_map.static_occ[env, cell[0], cell[1]]
-    moving = ti.static(clearance_cfg.risk_dynamic) * grid_map.dynamic_occ[env, cell[0], cell[1]]
-    room = clearance.clearance_m[env, cell[0], cell[1]] + ti.static(clearance_cfg.risk_epsilon_m)
-    return occupied + moving + ti.static(clearance_cfg.risk_clearance) / room
+    occupied = ti.static(io.clearance_cfg.risk_static) * io.grid_map.static_occ[env, cell[0], cell[1]]
+    moving = ti.static(io.clearance_cfg.risk_dynamic) * io.grid_map.dynamic_occ[env, cell[0], cell[1]]
+    room = io.clearance.clearance_m[env, cell[0], cell[1]] + ti.static(io.clearance_cfg.risk_epsilon_m)
+    return occupied + moving + ti.static(io.clearance_cfg.risk_clearance) / room
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -198,11 +191,11 @@ def follow_route(io: Bundle[RouteIO]):
 @ti.func
 def _look_again(env, io: Bundle[RouteIO]):
     """What lies ahead on a route planned since, and its mean risk."""
-    look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
+    look_along(env, level(io.ego.pos_w[env]), io)
     risk = 0.0
     for k in range(io.route.n_ahead[env]):
-        cell = cell_on_grid(io.route.ahead_w[env, k], io.clearance, io.tank_cfg, io.mapping_cfg)
-        risk += risk_at(env, cell, io.clearance, io.grid_map, io.clearance_cfg)
+        cell = cell_on_grid(io.route.ahead_w[env, k], io)
+        risk += risk_at(env, cell, io)
     io.route.path_risk[env] = risk / io.route.n_ahead[env]
 
 
@@ -276,7 +269,7 @@ def _route_cost(env, n_way, io: Bundle[RouteIO]):
         a, along = io.route.way_w[env, i], io.route.way_w[env, i + 1] - io.route.way_w[env, i]
         pieces = ti.cast(ti.ceil(along.norm() / ti.static(0.5 * io.mapping_cfg.cell_m)), ti.i32)
         for k in range(pieces):  # type: ignore[arg-type]
-            cell = cell_on_grid(a + along * ((k + 0.5) / pieces), io.clearance, io.tank_cfg, io.mapping_cfg)
+            cell = cell_on_grid(a + along * ((k + 0.5) / pieces), io)
             room = ti.max(
                 io.clearance.clearance_m[env, cell[0], cell[1]], ti.static(io.voronoi_cfg.cost_epsilon_m)
             )

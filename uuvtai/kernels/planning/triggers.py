@@ -24,7 +24,7 @@ from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.beams import range_rate
 from uuvtai.kernels.core.simd import LANES, i16x
 from uuvtai.kernels.core.stage import Bundle, spread
-from uuvtai.kernels.planning.io import TriggersIO
+from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.kernels.planning.medial_axis import is_traversable
 from uuvtai.kernels.planning.route import advanced_arc, cell_on_grid, level, look_along, risk_at
 
@@ -33,7 +33,7 @@ _STUCK_M_S, _FORECAST_CLEARANCE_M = 0.08, 0.35
 
 @quick_launch
 @ti.kernel
-def fire_triggers(io: Bundle[TriggersIO]):
+def fire_triggers(io: Bundle[RouteIO]):
     """Move the foot along the route, look along it, find the triggers that hold, and queue the envs that plan
     in this step, in any order."""
     n = ti.static(io.clock.active.shape[0])
@@ -42,7 +42,7 @@ def fire_triggers(io: Bundle[TriggersIO]):
         if pad == 0 and io.clock.active[env] == 1:
             if io.route.n_way[env] > 0:
                 io.route.arc[env] = advanced_arc(io.route, env, level(io.ego.pos_w[env]))
-            look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
+            look_along(env, level(io.ego.pos_w[env]), io)
             _count_stuck(env, io)
             closed = _is_path_closed(env, io)
             holding = _held_triggers(env, closed, io)
@@ -52,14 +52,14 @@ def fire_triggers(io: Bundle[TriggersIO]):
 
 
 @ti.func
-def _count_stuck(env, io: Bundle[TriggersIO]):
+def _count_stuck(env, io: Bundle[RouteIO]):
     slow = io.ego.vel_b[env].norm() < _STUCK_M_S
     away = (io.mission.goal_w[env] - io.ego.pos_w[env]).norm() > ti.static(io.episode_cfg.goal_radius_m)
     io.route.stuck_steps[env] = ti.select(slow and away, io.route.stuck_steps[env] + 1, 0)
 
 
 @ti.func
-def _held_triggers(env, closed, io: Bundle[TriggersIO]):
+def _held_triggers(env, closed, io: Bundle[RouteIO]):
     """Bit set (bit = code - 1) of the triggers that hold and are not static; ``closed``: the path is."""
     dt = ti.static(io.episode_cfg.control_dt_s)
     bits = 0
@@ -83,7 +83,7 @@ def _held_triggers(env, closed, io: Bundle[TriggersIO]):
 
 
 @ti.func
-def _is_return_near(env, io: Bundle[TriggersIO]):
+def _is_return_near(env, io: Bundle[RouteIO]):
     """True where a return is near or will soon be reached."""
     near = 0
     for packet in range(ti.static(io.scan.range_m.shape[1] // LANES)):
@@ -102,23 +102,21 @@ def _is_return_near(env, io: Bundle[TriggersIO]):
 
 
 @ti.func
-def _is_path_closed(env, io: Bundle[TriggersIO]):
+def _is_path_closed(env, io: Bundle[RouteIO]):
     """True where a point of the look-ahead segment lies in a cell that is not traversable; the segment's mean
     risk on the way, for the same cells hold both."""
     closed, risk = False, 0.0
     for k in range(io.route.n_ahead[env]):
-        cell = cell_on_grid(io.route.ahead_w[env, k], io.clearance, io.tank_cfg, io.mapping_cfg)
-        if not is_traversable(
-            io.clearance, io.grid_map, io.mask, env, cell[0], cell[1], io.voronoi_cfg, io.mapping_cfg
-        ):
+        cell = cell_on_grid(io.route.ahead_w[env, k], io)
+        if not is_traversable(env, cell[0], cell[1], io):
             closed = True
-        risk += risk_at(env, cell, io.clearance, io.grid_map, io.clearance_cfg)
+        risk += risk_at(env, cell, io)
     io.route.path_risk[env] = risk / io.route.n_ahead[env]
     return closed
 
 
 @ti.func
-def _path_meets_forecast(env, io: Bundle[TriggersIO]):
+def _path_meets_forecast(env, io: Bundle[RouteIO]):
     """True where an obstacle comes too close to the part of the look-ahead segment that the vehicle can have
     reached by then."""
     meets = False
@@ -132,7 +130,7 @@ def _path_meets_forecast(env, io: Bundle[TriggersIO]):
 
 
 @ti.func
-def _obstacle_meets_path(env, track, k, io: Bundle[TriggersIO]):
+def _obstacle_meets_path(env, track, k, io: Bundle[RouteIO]):
     """The same for one obstacle at forecast step k.
 
     Points of the segment lie a cell apart, so those with an arc up to reach + one cell are looked at. None of
@@ -153,7 +151,7 @@ def _obstacle_meets_path(env, track, k, io: Bundle[TriggersIO]):
 
 
 @ti.func
-def _serve(env, holding, io: Bundle[TriggersIO]):
+def _serve(env, holding, io: Bundle[RouteIO]):
     """Ask for a plan, count the first trigger in the order of priority, and let all that hold rest."""
     io.route.fired[env] = holding
     io.route.trigger[env] = TRIGGER_NONE

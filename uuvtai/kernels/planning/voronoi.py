@@ -21,7 +21,7 @@ from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.simd import filled, n_lane
 from uuvtai.kernels.core.stage import Bundle, FloatMatrix, spread
-from uuvtai.kernels.planning.io import VoronoiIO
+from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.kernels.planning.medial_axis import (
     FOUND,
     MAX_WIDENINGS,
@@ -41,7 +41,7 @@ from uuvtai.kernels.planning.medial_axis import (
 
 @quick_launch
 @ti.kernel
-def plan_routes(io: Bundle[VoronoiIO]):
+def plan_routes(io: Bundle[RouteIO]):
     """Plan for the queued envs; those for which it fails are listed in ``route.failed`` and keep their old
     route."""
     n = ti.static(io.voronoi.cost.shape[0])
@@ -55,7 +55,7 @@ def plan_routes(io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _plan(slot, env, io: Bundle[VoronoiIO]):
+def _plan(slot, env, io: Bundle[RouteIO]):
     """Plan for one env in a slot of the scratch memory; why it failed is kept and counted."""
     start_w = ti.cast(ti.Vector([io.ego.pos_w[env][0], io.ego.pos_w[env][1]]), ti.f32)
     goal_w = ti.cast(ti.Vector([io.mission.goal_w[env][0], io.mission.goal_w[env][1]]), ti.f32)
@@ -74,21 +74,21 @@ def _plan(slot, env, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _grid_position(pos_w, io: Bundle[VoronoiIO]):
+def _grid_position(pos_w, io: Bundle[RouteIO]):
     """(x, y) in cells from the grid's outer corner."""
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
     return (pos_w - ti.Vector([x0, y0], dt=ti.f32)) / ti.static(io.mapping_cfg.cell_m)
 
 
 @ti.func
-def _cell(pos_w, io: Bundle[VoronoiIO]):
+def _cell(pos_w, io: Bundle[RouteIO]):
     """(row, col)."""
     at = _grid_position(pos_w, io)
     return ti.Vector([ti.cast(ti.floor(at[1]), ti.i32), ti.cast(ti.floor(at[0]), ti.i32)])
 
 
 @ti.func
-def _weigh_cells(slot, env, io: Bundle[VoronoiIO]):
+def _weigh_cells(slot, env, io: Bundle[RouteIO]):
     """Weight of every cell, and forget the slot's last search."""
     lanes = ti.static(n_lane())
     for row in range(io.voronoi.weight.shape[1]):
@@ -97,9 +97,7 @@ def _weigh_cells(slot, env, io: Bundle[VoronoiIO]):
             room, is_open = filled(1.0, lanes), filled(0.0, lanes)
             for i in ti.static(range(lanes)):
                 room[i] = io.clearance.clearance_m[env, row, first + i]
-                if is_traversable(
-                    io.clearance, io.grid_map, io.mask, env, row, first + i, io.voronoi_cfg, io.mapping_cfg
-                ):
+                if is_traversable(env, row, first + i, io):
                     is_open[i] = 1.0
             weight = 1.0 / ti.math.clamp(
                 room,
@@ -113,7 +111,7 @@ def _weigh_cells(slot, env, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _endpoint_reason(slot, start_w, goal_w, io: Bundle[VoronoiIO]):
+def _endpoint_reason(slot, start_w, goal_w, io: Bundle[RouteIO]):
     """FAIL_NONE where both ends are traversable."""
     reason = FAIL_NONE
     if _weight_at(slot, _cell(start_w, io), io) <= 0:
@@ -124,7 +122,7 @@ def _endpoint_reason(slot, start_w, goal_w, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _weight_at(slot, cell, io: Bundle[VoronoiIO]):
+def _weight_at(slot, cell, io: Bundle[RouteIO]):
     """Weight of a cell that may lie off the grid (0 there)."""
     n_row, n_col = ti.static(io.voronoi.weight.shape[1:])
     weight = ti.cast(0.0, ti.f32)
@@ -134,7 +132,7 @@ def _weight_at(slot, cell, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _search_reason(slot, env, start, goal, io: Bundle[VoronoiIO]):
+def _search_reason(slot, env, start, goal, io: Bundle[RouteIO]):
     """Search the skeleton, then everything; why nothing was found."""
     status, attempt, reason = NOT_FOUND, 0, FAIL_NONE
     while status == NOT_FOUND and attempt < 2:
@@ -153,14 +151,14 @@ def _search_reason(slot, env, start, goal, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _forget_search(slot, io: Bundle[VoronoiIO]):
+def _forget_search(slot, io: Bundle[RouteIO]):
     for row in range(io.voronoi.cell.shape[1]):
         for col in range(io.voronoi.cell.shape[2]):
             io.voronoi.cell[slot, row, col] = ti.cast(0, ti.u8)
 
 
 @ti.func
-def _write_reason(slot, env, start_w, goal_w, io: Bundle[VoronoiIO]):
+def _write_reason(slot, env, start_w, goal_w, io: Bundle[RouteIO]):
     """Turn the search's result into waypoints; FAIL_BUDGET where they do not fit."""
     room = ti.static(io.route.way_w.shape[1])
     start_at, goal_at = _grid_position(start_w, io), _grid_position(goal_w, io)
@@ -184,12 +182,12 @@ def _write_reason(slot, env, start_w, goal_w, io: Bundle[VoronoiIO]):
 
 
 @ti.kernel
-def overlay_clearance(io: Bundle[VoronoiIO], out: FloatMatrix, env: int):
+def overlay_clearance(io: Bundle[RouteIO], out: FloatMatrix, env: int):
     """Clearance (n_row, n_col) [m] of one env for the host's fallback: 0 where occupied or outside."""
     for row, col in ti.ndrange(out.shape[0], out.shape[1]):
         room = io.clearance.clearance_m[env, row, col]
         if (
-            occupancy(io.grid_map, env, row, col, io.voronoi_cfg) >= ti.static(io.mapping_cfg.occupied)
+            occupancy(env, row, col, io) >= ti.static(io.mapping_cfg.occupied)
             or io.mask.outside[row, col] == 1
         ):
             room = 0.0
