@@ -1,5 +1,4 @@
-"""Bundles for tests of single stages: made of the parts at hand, once for the same parts (a kernel is
-compiled anew for another bundle)."""
+"""Bundles for tests of single stages, made once for the same parts: another bundle compiles anew."""
 
 from dataclasses import is_dataclass
 
@@ -38,7 +37,8 @@ def clear(*structs):
 
 
 def put(struct, **fields):
-    """Values into fields by name, in their own types."""
+    """Values into fields by name, in their own types; one value for all is enough."""
     for name, value in fields.items():
         field = getattr(struct, name)
-        field.from_numpy(np.asarray(value).astype(field.to_numpy().dtype))
+        old = field.to_numpy()
+        field.from_numpy(np.broadcast_to(np.asarray(value).astype(old.dtype), old.shape).copy())

@@ -19,8 +19,7 @@ def run_cli(*arguments):
 
 def uuv(capfd, *arguments):
     """(exit code, stdout, stderr)"""
-    code = run_cli(*arguments)
-    return code, *capfd.readouterr()
+    return run_cli(*arguments), *capfd.readouterr()
 
 
 class Quiet:
@@ -37,8 +36,7 @@ class Quiet:
 
 
 def read_by_viewer(log):
-    """What the viewer's own reader finds in a log: @mcap/core with its decompressor, ajv and the official
-    Foxglove schemas."""
+    """What a log holds by @mcap/core with its decompressor, ajv and the official Foxglove schemas."""
     folder, node = Path(__file__).parent / "js", shutil.which("node")
     if node is None or not (folder / "node_modules").is_dir():
         pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")

@@ -1,5 +1,4 @@
-"""Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of
-the whole stack."""
+"""Fixtures shared by the tests: one Taichi runtime, one small simulator for every test of the whole stack."""
 
 import atexit
 import gc
@@ -34,8 +33,7 @@ def pytest_collection_finish():
 
 @pytest.fixture(scope="session", autouse=True)
 def interrupts():
-    """Interrupts are heard, also where the tests run in the background of a shell, which has its children
-    ignore them."""
+    """Heard also where the tests run in the background of a shell, which has its children ignore them."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

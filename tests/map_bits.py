@@ -29,8 +29,7 @@ def put_layers(grid_map, static, dynamic, occupied):
 
 
 def put_map(grid_map, state, occupied, confident):
-    """Everything that a map remembers; ``state`` has static, dynamic, free_scans, dynamic_scans, seen and
-    depth_hit [n_env, row, col]."""
+    """``state``: static, dynamic, free_scans, dynamic_scans, seen and depth_hit [n_env, row, col]."""
     put_layers(grid_map, state["static"], state["dynamic"], occupied)
     grid_map.dynamic_scans.from_numpy(np.ascontiguousarray(state["dynamic_scans"], np.uint8))
     grid_map.held.from_numpy(words(state["dynamic_scans"] > 0))

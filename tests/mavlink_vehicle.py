@@ -1,5 +1,4 @@
-"""A submarine made with pymavlink, for tests: it speaks by UDP, obeys modes and arming, and keeps what it was
-told. Beside it a ground station, and a pilot that wants what it is told to want."""
+"""A submarine of pymavlink on UDP that obeys modes and arming; a ground station; an obedient pilot."""
 
 import math
 import socket

@@ -39,10 +39,8 @@ def run(plant: Plant, cases: list[dict], substeps: int, n_sample: int) -> dict:
     nu = np.array([c.get("nu", [0] * 6) for c in cases], dtype=float)
     plant.write(v.vel_b, nu[:, :3])
     plant.write(v.rate_b, nu[:, 3:])
-    buoyancy, weight = (
-        plant.params.buoyancy_n.to_numpy(),
-        plant.params.mass_kg.to_numpy() * plant.config.vehicle.gravity_m_s2,
-    )
+    buoyancy = plant.params.buoyancy_n.to_numpy()
+    weight = plant.params.mass_kg.to_numpy() * plant.config.vehicle.gravity_m_s2
     plant.write(plant.params.buoyancy_n, np.where([c.get("neutral", False) for c in cases], weight, buoyancy))
     samples = []
     for _ in range(n_sample):

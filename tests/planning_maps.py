@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tests.oracles.voronoi import clearance_of, traversable
 from uuvtai.config import TankConfig
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 
@@ -50,8 +51,7 @@ def scene(rng, n_obstacle=12):
 
 
 def maze(rng):
-    """Baffles that touch the walls, alternating sides or at random, with a passage of random width at the
-    free end."""
+    """Baffles that touch the walls, in turn or at random, with a passage of random width at the end."""
     occ = np.zeros(SHAPE, bool)
     n, alternate = rng.integers(2, 11), rng.random() < 0.5
     for i, x in enumerate(np.linspace(1.5, 18.5, n) + rng.uniform(-0.2, 0.2, n)):
@@ -63,8 +63,7 @@ def maze(rng):
 
 
 def gaps(rng):
-    """Walls across the tank with one or two gaps about as wide as the vehicle needs: some pass, some do
-    not."""
+    """Walls across the tank with one or two gaps about as wide as the vehicle: some pass, some do not."""
     occ = np.zeros(SHAPE, bool)
     for x in np.sort(rng.uniform(2.0, 18.0, rng.integers(1, 5))):
         wall = np.abs(x - X) <= rng.choice([0.06, 0.3])
@@ -75,10 +74,7 @@ def gaps(rng):
 
 
 def random_map(seed):
-    """(occupied, start_w, goal_w): start and goal anywhere in the traversable set of the kind of map that
-    ``seed`` draws."""
-    from tests.oracles.voronoi import clearance_of, traversable
-
+    """(occupied, start_w, goal_w) anywhere in the traversable set of the kind that ``seed`` draws."""
     rng = np.random.default_rng(seed)
     while True:
         occ = (scene, maze, gaps)[seed % 3](rng)

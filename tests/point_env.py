@@ -1,5 +1,4 @@
-"""A task without a simulator: points that must reach the origin, with the interface of ``VectorEnv`` and the
-same rules of resetting."""
+"""A task without a simulator: points that must reach the origin, with ``VectorEnv``'s rules of resetting."""
 
 import torch
 
@@ -10,8 +9,7 @@ CONTROL_DT_S, GOAL_M, EDGE_M, HORIZON = 0.2, 0.3, 3.0, 60
 
 
 class PointEnv:
-    """Action (N, 4): velocity in x, y and two that do nothing. The teacher heads for the origin; node 1 of
-    its tree acts far, 2 near."""
+    """Action (N, 4): velocity in x, y, two idle. The teacher heads home; its node 1 acts far, 2 near."""
 
     num_actions = 4
     num_obs = 24
@@ -31,11 +29,8 @@ class PointEnv:
     def reset(self, seed=None):
         self._seed = self._seed if seed is None else seed
         self._episode = torch.arange(self.num_envs)
-        self._pos, self._steps, self._return = (
-            torch.zeros(self.num_envs, 2),
-            torch.zeros(self.num_envs, dtype=torch.int32),
-            torch.zeros(self.num_envs),
-        )
+        self._pos, self._steps = torch.zeros(self.num_envs, 2), torch.zeros(self.num_envs, dtype=torch.int32)
+        self._return = torch.zeros(self.num_envs)
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
         self.info = {"final_obs": self._obs()}
         return self._obs(), self._tell(
@@ -51,11 +46,8 @@ class PointEnv:
         terms = torch.stack(
             [before - distance + 3.0 * success - 3.0 * out, -0.01 * action.square().sum(1)], 1
         )
-        reward, terminated, truncated = (
-            terms.sum(1),
-            success | out,
-            (self._steps >= HORIZON) & ~success & ~out,
-        )
+        reward, terminated = terms.sum(1), success | out
+        truncated = (self._steps >= HORIZON) & ~success & ~out
         self._return += reward
         outcome = torch.where(success, 1, torch.where(out, 4, torch.where(truncated, 5, 0))).to(torch.int32)
         self.info = {
@@ -105,10 +97,6 @@ class PointEnv:
         behavior = torch.cat([-self._pos / distance.clamp(min=0.1), torch.zeros(self.num_envs, 2)], 1)
         leaf = torch.where(distance[:, 0] > 1.0, 1, 2).to(torch.int32)
         return self.info | {
-            "teacher_action": behavior,
-            "leaf": leaf,
-            "outcome": outcome,
-            "reward_terms": terms,
-            "seed": self._seed * torch.ones_like(leaf),
-            "episode": self._episode,
-        }
+            "teacher_action": behavior, "leaf": leaf, "outcome": outcome, "reward_terms": terms,
+            "seed": self._seed * torch.ones_like(leaf), "episode": self._episode,
+        }  # fmt: skip

@@ -49,8 +49,7 @@ def noise_sweep():
 
 
 def robustness_sweep():
-    """One axis at a time around a condition, two agents; one axis has lists for values, one is of the
-    scene."""
+    """One axis at a time, two agents; one axis has lists for values, one is of the scene."""
     scene = {"S": 8, "D": 6, "v_m_s": 0.6}
     places = [
         {},
@@ -84,26 +83,18 @@ def agent(name, k_success=6, k_collision=2, n=8, **more):
         for i in range(n)
     ]
     found = {
-        "return_mean": 3.0,
-        "min_clearance_mean_m": 0.3,
-        "path_length_mean_m": 8.0,
-        "replans_per_episode": 12.0,
-        "env_steps_per_s": 600.0,
-    }
+        "return_mean": 3.0, "min_clearance_mean_m": 0.3, "path_length_mean_m": 8.0,
+        "replans_per_episode": 12.0, "env_steps_per_s": 600.0,
+    }  # fmt: skip
     return {"name": name, **rates(k_success, k_collision, n), **found, "episodes_detail": detail, **more}
 
 
 def evaluation_document(*agents):
     """An evaluation of these agents."""
     scene = {
-        "world": "pool",
-        "S": 8,
-        "D": 6,
-        "v_m_s": 0.6,
-        "sensors": "paper",
-        "seeds": [0],
+        "world": "pool", "S": 8, "D": 6, "v_m_s": 0.6, "sensors": "paper", "seeds": [0],
         "episodes_per_seed": 8,
-    }
+    }  # fmt: skip
     return {"schema": 1, **scene, "agents": list(agents or (agent("straight", 3, 5), agent("bt")))}
 
 
@@ -115,17 +106,9 @@ CAUSE = {
 }  # fmt: skip
 
 STAGES = (
-    "dynamics",
-    "sonar",
-    "depth",
-    "mapping",
-    "clearance",
-    "planning",
-    "observation",
-    "behavior",
-    "reward",
+    "dynamics", "sonar", "depth", "mapping", "clearance", "planning", "observation", "behavior", "reward",
     "export",
-)
+)  # fmt: skip
 PROFILE = {
     "schema": 1,
     "machine": {"cpu": "some processor", "cores": 2, "device": "cpu"},
@@ -167,8 +150,7 @@ def metrics(n=30, offset=0.0):
 
 
 def write_run(folder, argv=("uuv", "eval"), config="seed: 0\n", **files):
-    """A run folder: run.json, config.yaml and these documents by path (``__`` stands for a slash, lists
-    become JSON lines)."""
+    """A run folder of documents by path (``__`` stands for a slash, lists become JSON lines)."""
     folder.mkdir(parents=True, exist_ok=True)
     record = {
         "schema": 1, "argv": list(argv), "started": "2026-01-01T00:00:00+0000", "status": "finished",

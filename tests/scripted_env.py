@@ -1,5 +1,4 @@
-"""An environment that follows a script and writes down what it was told: what the trainer learns from can be
-worked out by hand."""
+"""An environment that follows a script and keeps what it was told: what is learnt can be worked out."""
 
 from typing import NamedTuple
 
@@ -39,8 +38,7 @@ class ScriptedEnv:
     reward_terms = ("script",)
 
     def __init__(self, script):
-        """``script``: for every env the steps of its episodes and how each ends, in turn; after the last one
-        it goes on for ever."""
+        """``script``: per env the steps of its episodes and how each ends; after the last it goes on."""
         self.script, self.num_envs, self.device = script, len(script), torch.device("cpu")
         self.observation_table = (
             ObservationColumn("targets", slice(0, N_TARGET), "1", "none", "follow the action"),
@@ -52,11 +50,8 @@ class ScriptedEnv:
     def reset(self, seed=None):
         n = self.num_envs
         self._targets = torch.sin(torch.arange(n * N_TARGET).float()).view(n, N_TARGET)
-        self._episode, self._age, self._t = (
-            torch.zeros(n, dtype=torch.int64),
-            torch.zeros(n, dtype=torch.int64),
-            0,
-        )
+        self._episode, self._age = torch.zeros(n, dtype=torch.int64), torch.zeros(n, dtype=torch.int64)
+        self._t = 0
         self.log.clear()
         return self._obs(), self._info() | {
             "outcome": torch.zeros(n, dtype=torch.int32),

@@ -29,8 +29,7 @@ OVERRIDES = {"world.dynamic_capacity": 9}
 
 
 def play(sim: Sim, steps: int) -> dict[str, str]:
-    """SHA-256 of every array after so many steps of the tree's driving, with resets in between; scratch does
-    not count."""
+    """SHA-256 of every array but scratch after so many steps of the tree, with resets in between."""
     numbers = torch.arange(sim.num_envs, dtype=torch.int32)
     seeds = torch.full_like(numbers, 77001)
     sim.observe()

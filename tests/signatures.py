@@ -1,5 +1,4 @@
-"""What every Taichi function says that it reads and writes, what it does, and whom it calls: read off the
-source."""
+"""What every Taichi function reads, writes, does and calls: read off the source."""
 
 import ast
 import dataclasses
@@ -87,8 +86,7 @@ def is_kernel(node):
 
 @cache
 def functions():
-    """(module, name) -> Function, of all kernel files. Not made at import: every process of the gate imports
-    every file."""
+    """(module, name) -> Function of all kernel files; not made at import, which every process does."""
     found = {}
     for path in FILES:
         tree = ast.parse(path.read_text())
@@ -134,8 +132,7 @@ def written(function):
 
 
 def handed(function):
-    """(root, mark of the parameter that takes it, called name, line) of every struct or section that a
-    function passes on."""
+    """(root, mark of its parameter, called name, line) of every struct or section that is passed on."""
     for node in ast.walk(function.node):
         if not (
             isinstance(node, ast.Call)

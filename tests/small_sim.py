@@ -1,5 +1,4 @@
-"""The small simulator that serves every test of the whole stack: its kernels are compiled once
-(``tests/warm.py`` does so before the tests begin)."""
+"""The small simulator for every test of the whole stack; ``tests/warm.py`` compiles it before they begin."""
 
 import torch
 
@@ -22,16 +21,9 @@ class SmallSim:
     """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py``
     compiles them beforehand)"""
     TRAIN = (
-        "train",
-        "smoke",
-        *OPTIONS,
-        "--set",
-        "episode.horizon_steps=400",
-        "--set",
-        "distillation.batch=32",
-        "--set",
-        "world_model.batch=32",
-    )
+        "train", "smoke", *OPTIONS, "--set", "episode.horizon_steps=400", "--set", "distillation.batch=32",
+        "--set", "world_model.batch=32",
+    )  # fmt: skip
 
     def __init__(self, sensors="paper"):
         from uuvtai.config.loader import load_config
@@ -65,8 +57,7 @@ class SmallSim:
         return ScenarioBank(*rows, torch.zeros(self.N, dtype=torch.int32), ("pool",))
 
     def arrays(self, *nouns):
-        """NumPy copies of every array of these structs but scratch, which keeps what earlier tests left in
-        it, by 'struct.field'."""
+        """NumPy copies of every array of these structs but scratch, by 'struct.field'."""
         memory = self.sim.memory()
         views = memory.views(memory.read())
         return {name: view.copy() for name, view in views.items() if name.partition(".")[0] in nouns}

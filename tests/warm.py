@@ -19,8 +19,7 @@ STEPS = 6
 
 
 def main(what: str) -> None:
-    """The small simulator with its own sensors, and with those that have no errors (``test_log_alone``), then
-    the first one in the shape for a GPU (``test_cuda``); or the one vehicle alone (``test_ping360``)."""
+    """The small simulator with and without sensor errors, and for a GPU; or the one vehicle (``one``)."""
     start_taichi("cpu")
     if what == "one":
         return play_alone(sim_with_one_beam())

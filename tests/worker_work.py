@@ -1,5 +1,4 @@
-"""Work for processes side by side that needs no simulator; in a module of its own, so that other processes
-can import it."""
+"""Work for processes side by side without a simulator, in a module that other processes can import."""
 
 import os
 import time

@@ -1,5 +1,4 @@
-"""SIGINT and SIGTERM: heard from the first line on, alike, without a traceback, and nothing half-written
-stays."""
+"""SIGINT and SIGTERM: heard from the first line on, without a traceback, and nothing half-written stays."""
 
 import json
 import os
@@ -117,25 +116,29 @@ except signals.Interrupted:
 @pytest.mark.parametrize("call", [1, 150])
 def test_a_signal_within_a_write_loses_no_message(tmp_path, call):
     """The first chunk, and a later one."""
-    process = started(tmp_path, program=_WITHIN_A_WRITE.format(call=call))
-    out, err = process.communicate(timeout=60)
+    out, err = started(tmp_path, program=_WITHIN_A_WRITE.format(call=call)).communicate(timeout=60)
     (part,) = tmp_path.glob("cut.mcap.*.part")
-    found = repair(part)
-    assert found.messages == int(out) > 0, err
+    assert repair(part).messages == int(out) > 0, err
 
 
 @pytest.mark.parametrize("number", BOTH)
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("eval", "--episodes", "4", "--run-dir", "run"), ("train", "smoke", "--run-dir", "run"),
+        ("eval", "--episodes", "4", "--run-dir", "run"),
+        ("train", "smoke", "--run-dir", "run"),
         ("simulate", "--seconds", "1"),
-        ("sweep", "--grid", "D=0,3", "--run-dir", "run"), ("profile",), ("report", "nowhere"),
+        ("sweep", "--grid", "D=0,3", "--run-dir", "run"),
+        ("profile",),
+        ("report", "nowhere"),
         ("export", "nowhere", "--out", "out"),
-        ("presets",), ("doctor",), ("presets", "show", "bt"), ("log", "info", "nowhere.mcap"),
+        ("presets",),
+        ("doctor",),
+        ("presets", "show", "bt"),
+        ("log", "info", "nowhere.mcap"),
         ("reproduce", "--run-dir", "run"),
     ],
-)  # fmt: skip
+)
 def test_a_command_that_begins_ends_at_once_and_leaves_nothing(tmp_path, arguments, number):
     process = started(
         tmp_path, *arguments, environment=os.environ | {"PYTHONPATH": ENVIRONMENT["PYTHONPATH"]}
@@ -216,9 +219,8 @@ def test_the_second_one_does_not_wait_for_compiled_code(tmp_path, number):
     assert process.stdout.readline() == "now\n"
     time.sleep(0.3)
     begun = time.monotonic()
-    process.send_signal(
-        signal.SIGWINCH
-    )  # PyDLL's sleep ends with any signal that has a handler; this one has none
+    # PyDLL's sleep ends with any signal that has a handler; this one has none
+    process.send_signal(signal.SIGWINCH)
     for _ in range(2):
         process.send_signal(number)
         time.sleep(0.1)

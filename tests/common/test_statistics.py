@@ -21,7 +21,6 @@ from uuvtai.evaluation.results import paired
 
 @pytest.mark.parametrize(
     ("k", "n", "low", "high"),
-    # Newcombe 1998, table I (method 3, Wilson without continuity correction)
     [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0000, 0.1611), (1, 29, 0.0061, 0.1718)],
 )
 def test_wilson_matches_published_table(k, n, low, high):
@@ -155,8 +154,7 @@ def test_normal_p_of_known_quantiles():
 def test_bootstrap_interval_of_known_samples():
     assert bootstrap_interval([3.0]) is None
     assert bootstrap_interval([2.5] * 7) == (2.5, 2.5)
-    rng = np.random.default_rng(0)
-    values = list(rng.normal(10.0, 2.0, 400))
+    values = list(np.random.default_rng(0).normal(10.0, 2.0, 400))
     low, high = bootstrap_interval(values)
     half = 1.96 * np.std(values) / 20  # the normal approximation, good for 400 samples
     assert (low, high) == pytest.approx((np.mean(values) - half, np.mean(values) + half), abs=0.1 * half)

@@ -27,8 +27,7 @@ def test_a_lost_worker_costs_its_task_once_more(tmp_path):
 
 
 def test_what_only_waited_is_not_counted_as_lost(tmp_path):
-    """Each of the first tasks kills its worker once; the last one, which waits meanwhile, must not use up its
-    attempts."""
+    """The first tasks kill their worker once each; the last, which waits, must not use up its attempts."""
     places = [str(tmp_path / name) for name in "abcde"]
     assert sorted(LocalEngine(1).run(worker_work.fall_once, places)) == list(enumerate("abcde"))
 
@@ -109,11 +108,7 @@ def test_a_signal_that_comes_while_a_process_starts_leaves_no_traceback(tmp_path
     program.write_text(_SIGNALLED_WHILE_ONE_STARTS.format(name=number.name))
     environment = os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])}
     done = subprocess.run(
-        [sys.executable, str(program)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=environment,
+        [sys.executable, str(program)], capture_output=True, text=True, timeout=120, env=environment,
         check=False,
-    )
+    )  # fmt: skip
     assert (done.returncode, done.stderr) == (128 + number, "")

@@ -105,12 +105,8 @@ def test_warm_makes_what_another_process_finds(capfd):
 def test_one_vehicle_has_no_idle_items():
     """Loops of many rows are padded until every core has a part; one row has one thread."""
     assert [spread(n, inner) for n, inner in ((1, 1), (1, 16), (8, 1), (1024, 1), (1024, 16))] == [
-        1,
-        1,
-        512,
-        8,
-        1,
-    ]
+        1, 1, 512, 8, 1,
+    ]  # fmt: skip
 
 
 def test_sizes_are_known_before_taichi_has_started():

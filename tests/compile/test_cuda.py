@@ -1,5 +1,4 @@
-"""The shape of kernels for a GPU, as far as a CPU can tell: the same bits, the sizes, the numbers that the
-host asks for."""
+"""The shape of kernels for a GPU, as far as a CPU can tell: the same bits, sizes, and numbers by the host."""
 
 import os
 
@@ -33,10 +32,8 @@ def test_a_gpus_numbers_are_told_at_once(small):
     memory = DevicesMemory(sim)
     for field in (sim.s.route.n_failed, sim.s.termination.outcome, sim.s.route.failed):
         assert memory.tensor(field).numpy().tolist() == sim._memory.live(field).tolist()
-    outcome, kept = (
-        sim._memory.live(sim.s.termination.outcome),
-        sim._memory.live(sim.s.termination.outcome).copy(),
-    )
+    outcome = sim._memory.live(sim.s.termination.outcome)
+    kept = sim._memory.live(sim.s.termination.outcome).copy()
     failed = sim._memory.live(sim.s.route.n_failed)
     counts = HostCounts(memory, sim.s.termination.outcome, SmallSim.N)
     try:

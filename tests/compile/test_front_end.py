@@ -74,9 +74,8 @@ def test_a_source_is_parsed_once_and_serves_kernels_of_other_arguments(monkeypat
     short, long = ti.field(ti.f32, 2), ti.field(ti.i32, 3)
     load(short, np.array([1.0, 2.0], np.float32))
     monkeypatch.setattr(ast, "parse", lambda *_: pytest.fail("parsed again"))
-    load(
-        long, np.array([3, 4, 5], np.int32)
-    )  # Taichi takes the parameters out of a kernel's tree when it compiles
+    # Taichi takes the parameters out of a kernel's tree when it compiles
+    load(long, np.array([3, 4, 5], np.int32))
     monkeypatch.undo()
     assert short.to_numpy().tolist() == [1.0, 2.0] and long.to_numpy().tolist() == [3, 4, 5]
 

@@ -37,8 +37,7 @@ def fields():
 
 @pytest.mark.parametrize("new", [torch.zeros, lambda n: np.zeros(n, np.float32)], ids=["torch", "numpy"])
 def test_each_launch_works_on_what_it_is_given(fields, new):
-    """Again and again the same objects, then another field, constant, array, number one by one, then the
-    first again."""
+    """The same objects again, then another field, constant, array, number one by one, then the first."""
     first, other = new(N), new(N)
     ramp = np.arange(N)
     for turn in range(1, 4):

@@ -278,8 +278,7 @@ os.write(1, told.encode())
 
 
 def begun(place, what="whole", crowd=0):
-    """A process that launches the kernel by what is in ``place``, or makes it; or its ``crowd`` of children
-    that do so at once, who need not all import what it has."""
+    """A process (or its ``crowd`` of children at once) that launches what is in ``place``, or makes it."""
     environment = {**os.environ, "UUV_NATIVE_CACHE": str(place), "UUV_NUM_THREADS": "1"}
     command = [sys.executable, "-c", _PROCESS, what, str(crowd)]
     return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
@@ -486,7 +485,6 @@ def test_the_folder_is_bounded_and_what_is_used_stays(store):
         store.put(K[number], CODE)
         os.utime(store.folder / f"{K[number]}.kernel", (number, number))
     assert store.get(K[0]) == CODE  # used: newest now
-    size = (store.folder / f"{K[0]}.kernel").stat().st_size
-    assert store.bound(3 * size) == 3
+    assert store.bound(3 * (store.folder / f"{K[0]}.kernel").stat().st_size) == 3
     assert [p.stem for p in sorted(store.files())] == [K[0], K[4], K[5]]
     assert store.clear() == 3 and sorted(p.name for p in store.folder.iterdir()) == sorted(theirs)

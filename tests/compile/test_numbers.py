@@ -1,5 +1,4 @@
-"""Numbers of the config are arguments of kernels: another threshold compiles nothing, and gives the bits that
-it gave as a constant of the code."""
+"""Numbers of the config are arguments of kernels: another compiles nothing, and gives a constant's bits."""
 
 import dataclasses
 import json
@@ -185,12 +184,8 @@ def parts():
 def test_every_section_has_its_places():
     places = dict(sections_in(parts()))
     assert {
-        "behavior_cfg",
-        "sonar_cfg",
-        "all_cfg",
-        "all_cfg.behavior",
-        "all_cfg.sensors.sonar",
-    } <= places.keys()
+        "behavior_cfg", "sonar_cfg", "all_cfg", "all_cfg.behavior", "all_cfg.sensors.sonar",
+    } <= places.keys()  # fmt: skip
     assert places["behavior_cfg"] is places["all_cfg.behavior"]
 
 

@@ -6,6 +6,7 @@ import yaml
 from uuvtai.common.presets import preset_names
 from uuvtai.config import Config, loader
 from uuvtai.config.loader import ConfigError, load_config, load_training, to_yaml, validated, with_stack
+from uuvtai.learning.distillation import piecewise_linear
 
 
 def write(folder, text, name="mine.yaml"):
@@ -141,19 +142,12 @@ def test_paper_is_the_table_to_the_letter():
     assert (c.policy.hidden, c.policy.activation, c.ppo.rollout_steps) == ((256, 256), "elu", 64)
     assert (c.ppo.learning_rate, c.ppo.epochs, c.ppo.minibatches, c.ppo.clip) == (3e-4, 6, 4, 0.2)
     assert (c.ppo.gamma, c.ppo.gae_lambda, c.ppo.entropy_weight, c.ppo.value_weight, c.ppo.max_grad_norm) == (
-        0.99,
-        0.95,
-        0.003,
-        1.5,
-        1.0,
-    )
+        0.99, 0.95, 0.003, 1.5, 1.0,
+    )  # fmt: skip
     assert (c.distillation.batch, c.distillation.steps, c.distillation.learning_rate) == (1024, 2, 1.5e-4)
     assert (c.world_model.latent, c.world_model.hidden, c.world_model.batch, c.world_model.steps) == (
-        64,
-        (128, 128),
-        2048,
-        2,
-    )
+        64, (128, 128), 2048, 2,
+    )  # fmt: skip
     assert (
         c.world_model.learning_rate,
         c.world_model.reconstruction_weight,
@@ -166,28 +160,18 @@ def test_paper_is_the_table_to_the_letter():
     assert c.world_model.error_unit == "decoder"
     assert c.sensors == load_config("pool", "paper").sensors
     assert (c.voronoi.use, c.clearance.inflate_m, c.route.rrt_clearance_m, c.tracking.horizon_s) == (
-        "fused",
-        0.08,
-        0.1,
-        2.5,
-    )
+        "fused", 0.08, 0.1, 2.5,
+    )  # fmt: skip
     assert not any(
         c.forecast.model_dump()[switch]
         for switch in (
-            "use_turn_rate",
-            "use_turn_history",
-            "use_reflection",
-            "use_coasting",
-            "use_turning_back",
+            "use_turn_rate", "use_turn_history", "use_reflection", "use_coasting", "use_turning_back",
         )
-    )
+    )  # fmt: skip
 
 
 def test_the_paper_schedule_meets_the_equation():
-    """lambda_t: 1 up to 800, 0.2 (1 - (t - 800) / 800) up to 1600, then 0 (paper, equation of the staged
-    schedule)."""
-    from uuvtai.learning.distillation import piecewise_linear
-
+    """lambda_t: 1 up to 800, 0.2 (1 - (t - 800) / 800) up to 1600, then 0 (paper)."""
     points = load_training("paper").distillation.schedule
     for t in (0, 400, 800, 801, 1000, 1199, 1500, 1600, 2000):
         expected = 1.0 if t <= 800 else 0.2 * (1 - (t - 800) / 800) if t <= 1600 else 0.0
@@ -207,8 +191,7 @@ def test_the_rows_that_build_on_the_papers_training_have_the_defaults_stack():
 
 
 def test_a_stack_is_one_word_wherever_a_config_is_made(tmp_path):
-    """By --set and by make's overrides; below what is set itself, above the presets; a null takes it off
-    again."""
+    """Below what is set itself, above the presets; a null takes it off again."""
     found = load_config("pool", overrides=["stack=paper"])
     assert (
         found == load_config("pool", overrides={"stack": "paper"}) == with_stack(load_config("pool"), "paper")
@@ -333,16 +316,20 @@ _ROUND = "{kind: cylinder, radius_m: 0.2, "
         ("world:\n  tank:\n    x_m: [0, 2000]", r"w\.yaml:2: world\.tank: .*2000 x 6 x 1\.6 m.*in metres"),
         ("world: {tank: {x_m: [0, 600], y_m: [0, 400]}}", r"40,000 m\^2"),
         ("world: {tank: {z_m: [-160, 0]}}", r"depth of 100 m"),
-        (f"world:\n  fixed:\n  - {_BOX}\n  - {_ROUND}x_m: 50, y_m: 2}}",
-         r"w\.yaml:4: world\.fixed\.1: \(50, 2\) is"),
+        (
+            f"world:\n  fixed:\n  - {_BOX}\n  - {_ROUND}x_m: 50, y_m: 2}}",
+            r"w\.yaml:4: world\.fixed\.1: \(50, 2\) is",
+        ),
         (f"world: {{fixed: [{_ROUND}x_m: 5, y_m: -0.1}}]}}", r"world\.fixed\.0: .*outside the tank"),
         (f"world: {{fixed: [{_ROUND}x_m: 5, y_m: 2, z_m: 1}}]}}", r"fixed\.0\.z_m: 1 is outside the water"),
-        (f"world: {{fixed: [{_ROUND}x_m: 5, y_m: 2, path: [{{x_m: 5, y_m: 2}}, {{x_m: 5, y_m: 20}}]}}]}}",
-         r"world\.fixed\.0\.path\.1: \(5, 20\) is outside"),
+        (
+            f"world: {{fixed: [{_ROUND}x_m: 5, y_m: 2, path: [{{x_m: 5, y_m: 2}}, {{x_m: 5, y_m: 20}}]}}]}}",
+            r"world\.fixed\.0\.path\.1: \(5, 20\) is outside",
+        ),
         ("world: {fixed: [{kind: cylinder, radius_m: 40, x_m: 5, y_m: 2}]}", r"fixed\.0: is larger than"),
         ("mapping: {cell_m: 0.001}\nworld: {n_static: 1}", r"w\.yaml:1: mapping\.cell_m: .* cells"),
     ],
-)  # fmt: skip
+)
 def test_a_world_is_checked_before_anything_is_allocated(tmp_path, text, told):
     (tmp_path / "w.yaml").write_text(text)
     with pytest.raises(ConfigError, match=told):
@@ -390,7 +377,7 @@ _SMALL = {
         ({"vehicle.linear_damping": [4.0, 6.0, 6000.0, 0.1, 0.1, 0.1]}, "heave .* would diverge"),
         ({"vehicle.mass_kg": 0.01, "vehicle.added_mass": [0] * 6}, "heave .* would diverge"),
     ],
-)  # fmt: skip
+)
 def test_a_vehicle_that_cannot_be_integrated_is_refused(changes, told):
     if told is None:
         load_config("pool", overrides=changes)

@@ -1,5 +1,4 @@
-"""The command line as a newcomer meets it: results, exit codes, and one clear message for everything
-wrong."""
+"""The command line as a newcomer meets it: results, exit codes, one clear message for everything wrong."""
 
 import ast
 import errno
@@ -186,8 +185,7 @@ def test_a_command_refuses_a_nonsense_thread_count(tmp_path):
 
 
 def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluation):
-    """A run folder, a vehicle and an agent whose names look like markup: in titles, cells and lines of every
-    table."""
+    """Names of run folder, vehicle and agent that look like markup, in every table."""
     folder, document, _ = evaluation
     odd = json.loads(json.dumps(document))
     odd["world"] = odd["sensors"] = "[/x]"
@@ -272,24 +270,15 @@ def test_every_refusal_of_the_package_is_of_one_type():
     """Modules whose errors reach the user raise nothing plain: a plain one would be told as a bug of ours."""
     root = Path(uuvtai.__file__).parent
     plain = {
-        "ValueError",
-        "RuntimeError",
-        "MemoryError",
-        "OverflowError",
-        "FloatingPointError",
-        "OSError",
+        "ValueError", "RuntimeError", "MemoryError", "OverflowError", "FloatingPointError", "OSError",
         "KeyError",
-    }
+    }  # fmt: skip
     found = {}
     for path in [
-        *root.glob("evaluation/*.py"),
-        *root.glob("report/*.py"),
-        root / "sim/behavior_tree.py",
-        root / "sim/setup.py",
-        root / "compile/runtime.py",
-        root / "common/statistics.py",
+        *root.glob("evaluation/*.py"), *root.glob("report/*.py"), root / "sim/behavior_tree.py",
+        root / "sim/setup.py", root / "compile/runtime.py", root / "common/statistics.py",
         root / "learning/runner.py",
-    ]:
+    ]:  # fmt: skip
         raised = [
             node.exc.func.id
             for node in ast.walk(ast.parse(path.read_text()))
@@ -337,9 +326,8 @@ def test_presets_are_listed_and_shown(capfd):
 
 def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        default_cfg(), "offline_cache_file_path", str(tmp_path)
-    )  # a killed test may have left its lock in the real one
+    # a killed test may have left its lock in the real one
+    monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))
     code, out, _ = uuv(capfd, "doctor", "--json")
     found = json.loads(out)
     assert code == 0, found
@@ -348,8 +336,7 @@ def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
 
 
 def test_doctor_finds_the_lock_of_a_killed_process(tmp_path, monkeypatch):
-    """With it Taichi neither reads nor writes its cache: each start takes a minute, and only a warning says
-    so."""
+    """With it Taichi neither reads nor writes its cache: each start takes a minute, with one warning."""
     monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))
     lock = tmp_path / "ticache.lock"
     lock.touch()
@@ -436,8 +423,7 @@ def test_eval_prints_one_document_with_every_documented_key(evaluation):
 
 
 def messages_of(log):
-    """(topic, time, content) of every message of a recorded episode: sensors, maps, tracks, routes, commands,
-    truth."""
+    """(topic, time, content) of every message of a recorded episode."""
     with log.open("rb") as file:
         return [
             (channel.topic, message.log_time, message.data)
@@ -543,8 +529,7 @@ CHUNK = 0x06
 
 
 def _opcodes(part: Path) -> set[int]:
-    """Opcodes of the records that lie whole in an unfinished log: after the magic, each is a byte, eight
-    bytes of length, content."""
+    """Opcodes of whole records of an unfinished log: each a byte, eight bytes of length, content."""
     data, at, found = part.read_bytes(), 8, set()
     while at + 9 <= len(data):
         end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
@@ -560,8 +545,7 @@ def _parts_with_messages(folder: Path) -> list[Path]:
 
 
 def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path, capfd):
-    """The same sizes and rules as ``evaluation``, whose kernels are compiled by now: a compiling process does
-    not listen."""
+    """The kernels are compiled by ``evaluation``: a compiling process does not listen."""
     folder = tmp_path / "run"
     process = subprocess.Popen(
         [sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "400", "--seeds", "3",
@@ -578,7 +562,6 @@ def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path,
     assert "interrupted" in err
     assert "Traceback" not in err
     assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
-    part = _parts_with_messages(folder)[0]
-    code, out, err = uuv(capfd, "log", "repair", part)
+    code, out, err = uuv(capfd, "log", "repair", _parts_with_messages(folder)[0])
     assert code == 0, err
     assert "messages recovered" in out

@@ -1,5 +1,4 @@
-"""The command line answers quickly: what help, completion and light commands import, and what completion
-offers."""
+"""The command line answers quickly: what help, completion and light commands import, what is offered."""
 
 import os
 import re
@@ -113,8 +112,7 @@ def test_a_wrong_word_is_refused_at_once_and_the_right_one_named(
 
 
 def completed(words, cwd, shell="bash"):
-    """What the shell is offered after these words, the last of which is being typed; and the modules that it
-    took."""
+    """What the shell is offered after these words, the last half-typed; and the modules that it took."""
     program = (
         "import sys\nfrom uuvtai.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)"
     )
@@ -143,27 +141,23 @@ def runs(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    ("words", "offers"),
-    [
-        (["ev"], ["eval"]),
-        (["eval", "--world", "ga"], ["gauntlet"]),
-        (["eval", "--world", "mi"], ["mixed", "mine.yaml"]),
-        (["eval", "--sensors", "n"], ["nominal"]),
-        (["train", "curr"], ["curriculum"]),
-        (["profile", "--agent", "pl"], ["planner"]),
-        (["profile", "--agent", "mi"], ["mine.xml"]),
-        (["sweep", "--grid", "cau"], ["caution"]),
-        (["eval", "--agent", "bt,str"], ["bt,straight", "bt,straight+truth"]),
-        (["eval", "--agent", "runs/f"], ["runs/first", "runs/first_eval/"]),
-        (["train", "--resume", "runs/"], ["runs/first", "runs/first_eval"]),
-        (["presets", "show", "bt", "--run", "runs/"], ["runs/first/", "runs/first_eval"]),
-        (["eval", "--device", ""], ["auto", "cpu", "cuda"]),
-        (["presets", "show", "gau"], ["gauntlet"]),
-        (["presets", "show", "train/p"], ["train/paper", "train/ppo"]),
-    ],
-    ids=" ".join,
-)
+@pytest.mark.parametrize(("words", "offers"), [
+    (["ev"], ["eval"]),
+    (["eval", "--world", "ga"], ["gauntlet"]),
+    (["eval", "--world", "mi"], ["mixed", "mine.yaml"]),
+    (["eval", "--sensors", "n"], ["nominal"]),
+    (["train", "curr"], ["curriculum"]),
+    (["profile", "--agent", "pl"], ["planner"]),
+    (["profile", "--agent", "mi"], ["mine.xml"]),
+    (["sweep", "--grid", "cau"], ["caution"]),
+    (["eval", "--agent", "bt,str"], ["bt,straight", "bt,straight+truth"]),
+    (["eval", "--agent", "runs/f"], ["runs/first", "runs/first_eval/"]),
+    (["train", "--resume", "runs/"], ["runs/first", "runs/first_eval"]),
+    (["presets", "show", "bt", "--run", "runs/"], ["runs/first/", "runs/first_eval"]),
+    (["eval", "--device", ""], ["auto", "cpu", "cuda"]),
+    (["presets", "show", "gau"], ["gauntlet"]),
+    (["presets", "show", "train/p"], ["train/paper", "train/ppo"]),
+], ids=" ".join)  # fmt: skip
 def test_the_shell_is_offered_names_and_folders(words, offers, runs):
     found, modules = completed(words, runs)
     assert found == offers

@@ -1,5 +1,4 @@
-"""Tables of the command line at 80, 100 and 120 columns: columns go before cells are cut, and what is left
-out is said."""
+"""Tables at 80, 100 and 120 columns: columns go before cells are cut, and what is left out is said."""
 
 import io
 import re
@@ -9,20 +8,9 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from tests import report_samples as samples
+from uuvtai.console import views
 from uuvtai.console.doctor import show_checks
 from uuvtai.console.screen import Screen
-from uuvtai.console.views import (
-    sentences,
-    show_agents,
-    show_causes,
-    show_export,
-    show_log,
-    show_pairs,
-    show_presets,
-    show_profile,
-    show_simulation,
-    show_sweep,
-)
 from uuvtai.evaluation.results import paired
 from uuvtai.report.reproduction import claim_table
 from uuvtai.report.tables import PAGE, TERMINAL, Cell, Column, Table, markdown, sensing
@@ -86,33 +74,27 @@ CLAIMS = {
     "claims": [{"text": "word " * 30, "theirs": "82.8 %", "ours": "96.5 % [95.1, 97.5]", "verdict": "holds"}],
 }
 SHOWS = {
-    "eval": (lambda s: show_agents(s, evaluation()), ["agent", "success [95 %]", "collision [95 %]"]),
-    "pairs": (lambda s: show_pairs(s, evaluation()["paired"]), ["a : b", "only a", "only b", "(McNemar)"]),
-    "causes": (lambda s: show_causes(s, explained()), ["cause", "n"]),
-    "simulate": (lambda s: show_simulation(s, simulated(), "bluerov2"), ["t s", "x m", "y m", "z m"]),
-    "sweep": (
-        lambda s: show_sweep(s, samples.robustness_sweep()),
-        ["changed", "agent", "success [95 %]", "collision [95 %]"],
-    ),
-    "profile": (lambda s: show_profile(s, PROFILE), ["us per env-step", "65536 env"]),
-    "export": (lambda s: show_export(s, Exported), ["engine"]),
-    "log": (lambda s: show_log(s, LOG, "x" * 200 + ".mcap"), ["topic", "messages", "Hz"]),
+    "eval": (lambda s: views.show_agents(s, evaluation()), ["agent", "success [95 %]", "collision [95 %]"]),
+    "pairs": (lambda s: views.show_pairs(s, evaluation()["paired"]),
+        ["a : b", "only a", "only b", "(McNemar)"]),
+    "causes": (lambda s: views.show_causes(s, explained()), ["cause", "n"]),
+    "simulate": (lambda s: views.show_simulation(s, simulated(), "bluerov2"), ["t s", "x m", "y m", "z m"]),
+    "sweep": (lambda s: views.show_sweep(s, samples.robustness_sweep()),
+        ["changed", "agent", "success [95 %]", "collision [95 %]"]),
+    "profile": (lambda s: views.show_profile(s, PROFILE), ["us per env-step", "65536 env"]),
+    "export": (lambda s: views.show_export(s, Exported), ["engine"]),
+    "log": (lambda s: views.show_log(s, LOG, "x" * 200 + ".mcap"), ["topic", "messages", "Hz"]),
     "doctor": (lambda s: show_checks(s, CHECKS), []),
     "claims": (lambda s: s.table(claim_table(CLAIMS)), ["claim", "the paper", "here", "verdict"]),
-    "presets": (show_presets, ["gauntlet", "policy"]),
-}
+    "presets": (views.show_presets, ["gauntlet", "policy"]),
+}  # fmt: skip
 PROFILE = samples.PROFILE | {
     "rows": [samples.PROFILE["rows"][0] | {"num_envs": 4**i} for i in range(9)],
     "real_time": {
-        "p50_ms": 1.0,
-        "p99_ms": 2.0,
-        "max_ms": 3.0,
-        "budget_ms": 20.0,
-        "within": True,
-        "late": 0,
+        "p50_ms": 1.0, "p99_ms": 2.0, "max_ms": 3.0, "budget_ms": 20.0, "within": True, "late": 0,
         "steps": 500,
     },
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -129,7 +111,7 @@ def test_no_cell_is_cut_and_the_essential_columns_are_there(name, width):
 @pytest.mark.parametrize("width", WIDTHS)
 def test_rates_of_an_evaluation_stand_whole_in_one_line(width):
     result = evaluation()
-    lines = shown(lambda s: show_agents(s, result), width).splitlines()
+    lines = shown(lambda s: views.show_agents(s, result), width).splitlines()
     for m in result["agents"]:
         o = m["outcomes"]
         (row,) = [
@@ -140,7 +122,7 @@ def test_rates_of_an_evaluation_stand_whole_in_one_line(width):
 
 def test_a_wider_terminal_shows_more_and_what_is_left_out_is_said():
     result = evaluation()
-    found = {width: shown(lambda s: show_agents(s, result), width) for width in (*WIDTHS, 200)}
+    found = {width: shown(lambda s: views.show_agents(s, result), width) for width in (*WIDTHS, 200)}
     assert "steps/s" in found[200].split("left out")[0] and "left out" not in found[200]
     for width in WIDTHS:
         before, _, after = found[width].partition("left out, for want of room: ")
@@ -155,18 +137,14 @@ def test_wide_shows_every_column(name):
     text = shown(SHOWS[name][0], 80, wide=True)
     assert "left out" not in text and "…" not in text
     heads = {
-        "eval": "steps/s",
-        "simulate": "r rad/s",
-        "profile": "64 env",
-        "causes": "chance",
-        "log": "schema",
+        "eval": "steps/s", "simulate": "r rad/s", "profile": "64 env", "causes": "chance", "log": "schema",
         "export": "p99 ms",
-    }
+    }  # fmt: skip
     assert heads.get(name, "") in text
 
 
 def test_a_file_is_wide(capsys):
-    show_agents(Screen(), evaluation())
+    views.show_agents(Screen(), evaluation())
     out = capsys.readouterr().out
     assert "steps/s" in out and "left out" not in out
 
@@ -194,10 +172,10 @@ def test_what_a_file_brought_along_is_no_markup_and_steers_nothing():
 def test_heat_maps_come_in_pieces_where_they_are_wider_than_the_terminal():
     speeds = [0.1 * i for i in range(1, 16)]
     document = samples.sweep_document(axes={"S": [4, 8], "D": [6], "v_m_s": speeds})
-    text = shown(lambda s: show_sweep(s, document), 80)
+    text = shown(lambda s: views.show_sweep(s, document), 80)
     assert max(map(len, text.splitlines())) <= 80 and "…" not in text
     assert text.count("bt: collision") == 2
-    whole = shown(lambda s: show_sweep(s, document), 80, wide=True)
+    whole = shown(lambda s: views.show_sweep(s, document), 80, wide=True)
     assert whole.count("bt: collision") == 1 and max(map(len, whole.splitlines())) > 100
     for said in (text, whole):
         rates = re.findall(r"\d+ %", said)
@@ -211,12 +189,12 @@ def test_long_values_of_an_axis_are_not_cut():
         for s in axes["S"]
         for v in axes["sensors.localization"]
     ]
-    text = shown(lambda s: show_sweep(s, {"world": "pool", "axes": axes, "cells": cells}), 80)
+    text = shown(lambda s: views.show_sweep(s, {"world": "pool", "axes": axes, "cells": cells}), 80)
     assert "dead_reckoning_with_drift" in text and "…" not in text
 
 
 def test_every_preset_has_a_sentence():
-    for kind, found in sentences().items():
+    for kind, found in views.sentences().items():
         for name, said in found.items():
             assert said.endswith(".") and 15 < len(said) < 250 and not said.startswith(("#", "<")), (
                 f"{kind}/{name}: {said}"

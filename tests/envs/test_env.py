@@ -1,5 +1,4 @@
-"""The environment: automatic resets, numbering of episodes, ends, zero copy, the table, and what it
-refuses."""
+"""The environment: automatic resets, numbering, ends, zero copy, the table, and what it refuses."""
 
 import subprocess
 import sys
@@ -50,8 +49,7 @@ def test_reset_begins_the_episodes_of_the_seed(env):
 
 
 def test_an_episode_that_ends_is_followed_by_its_rows_next_one_in_the_same_step(env):
-    """Drive into a wall until a row ends: final observation, outcome and sums are the old episode's, the
-    observation is the new one's."""
+    """Final observation, outcome and sums are the old episode's, the observation is the new one's."""
     env.reset(seed=SEED)
     total, steps, last = np.zeros(N), 0, torch.zeros(0)
     ended = torch.zeros(N, dtype=torch.bool)
@@ -66,11 +64,8 @@ def test_an_episode_that_ends_is_followed_by_its_rows_next_one_in_the_same_step(
     row, going = int(ended.nonzero()[0]), ~ended
     assert going.any(), "some rows must go on to compare with"
     obs, info = obs.clone(), {name: value.clone() for name, value in info.items()}
-    assert (
-        OUTCOMES[info["outcome"][row]] in ("collision", "ttc", "out_of_tank")
-        and terminated[row]
-        and not truncated[row]
-    )
+    assert OUTCOMES[info["outcome"][row]] in ("collision", "ttc", "out_of_tank") and terminated[row]
+    assert not truncated[row]
     assert (info["outcome"][going] == 0).all()
     assert info["episode"].tolist() == [i + N if ended[i] else i for i in range(N)]
     assert info["episode_steps"].tolist() == [steps] * N
@@ -126,19 +121,12 @@ def test_without_autoreset_an_ended_row_rests_until_its_reset(env):
         assert truncated.tolist() == [i == 2 for i in range(N)] and reward[2] != 0
         last = obs[2].clone()
         obs, reward, _terminated, truncated, info = resting.step(full([0.5, 0, 0, 0]))
-        assert (
-            truncated[2]
-            and reward[2] == 0
-            and torch.equal(obs[2], last)
-            and OUTCOMES[info["outcome"][2]] == "timeout"
-        )
+        assert truncated[2] and reward[2] == 0 and torch.equal(obs[2], last)
+        assert OUTCOMES[info["outcome"][2]] == "timeout"
         resting.reset(mask=truncated.clone())
         _obs, reward, _terminated, truncated, info = resting.step(full([0.5, 0, 0, 0]))
-        assert (
-            not truncated.any()
-            and info["episode"][2] == N + 2
-            and info["episode_steps"].tolist() == [1 if i == 2 else 3 for i in range(N)]
-        )
+        assert not truncated.any() and info["episode"][2] == N + 2
+        assert info["episode_steps"].tolist() == [1 if i == 2 else 3 for i in range(N)]
 
 
 def test_every_row_goes_on_through_its_own_episodes(env):
@@ -161,16 +149,14 @@ def test_a_masked_reset_leaves_the_others_alone(env):
     obs, info = env.reset(seed=40, mask=mask)
     others = mask == 0
     assert torch.equal(obs[others], before[others]) and not torch.equal(obs[1], before[1])
-    assert info["seed"].tolist() == [40 if m else SEED for m in mask] and info["episode"].tolist() == list(
-        range(N)
-    )
+    assert info["seed"].tolist() == [40 if m else SEED for m in mask]
+    assert info["episode"].tolist() == list(range(N))
     *_rest, info = env.step(full([0, 0, 0, 0]))
     assert info["episode_steps"].tolist() == [1 if m else 6 for m in mask]
 
 
 def test_the_same_actions_give_the_same_rollout(env):
-    generator = torch.Generator().manual_seed(0)
-    actions = 2 * torch.rand(60, N, 4, generator=generator) - 1
+    actions = 2 * torch.rand(60, N, 4, generator=torch.Generator().manual_seed(0)) - 1
 
     def rollout():
         env.reset(seed=SEED)
@@ -192,8 +178,7 @@ def test_the_same_actions_give_the_same_rollout(env):
 
 
 def test_teacher_action_drives_as_the_tree_does(env):
-    """Following info["teacher_action"] is what the simulator does on its own; another action leaves the
-    teacher's choice apart."""
+    """Following it is what the simulator does alone; another action leaves the teacher's choice apart."""
 
     def paths(follow):
         _obs, info = env.reset(seed=SEED)
@@ -257,17 +242,13 @@ def test_reward_terms_are_the_reward_and_sum_up_over_the_episode(env):
         total[truncated] = 0
     named = dict(zip(env.reward_terms, terms.T, strict=True))
     weights = env.config.reward
-    assert (
-        (named["alive"] == weights.alive).all()
-        and (named["effort"] < 0).all()
-        and (named["path_distance"] < 0).all()
-    )
+    assert (named["alive"] == weights.alive).all() and (named["effort"] < 0).all()
+    assert (named["path_distance"] < 0).all()
     assert env.outcomes == OUTCOMES and not named["success"].any()
 
 
 def test_leaf_is_the_node_whose_action_is_told(env):
-    """The straight tree has one leaf, which acts in every step; the teacher's acting leaves are actions of
-    the tree."""
+    """The straight tree has one leaf, acting in every step; the teacher's leaves are actions of the tree."""
     _obs, info = env.reset(seed=SEED)
     seen = set()
     for _ in range(30):
@@ -292,8 +273,7 @@ def test_columns_find_every_group(env):
 
 
 def test_obstacles_and_advice_stand_behind_the_paper_observation(small, env, monkeypatch):
-    """Switched on by the config alone: what was there stays as it was, the tree's action is the one that is
-    told."""
+    """Switched on by the config: what was there stays, and the tree's action is the one that is told."""
     plain = VectorEnv(small.sim, seed=SEED)
     wanted = [plain.reset()[0].clone(), *(plain.step(full([0.6, 0, 0, 0.05]))[0].clone() for _ in range(80))]
     more = small.config.observation.model_copy(update={"n_track": 2, "behavior": True})
@@ -301,11 +281,8 @@ def test_obstacles_and_advice_stand_behind_the_paper_observation(small, env, mon
     with VectorEnv(small.sim, seed=SEED) as shown:
         assert shown.observation_sha256 != plain.observation_sha256
         assert list(shown.columns)[-4:] == [
-            "teacher_action",
-            "behavior_conflict",
-            "behavior_evade_cost",
-            "behavior_class",
-        ]
+            "teacher_action", "behavior_conflict", "behavior_evade_cost", "behavior_class",
+        ]  # fmt: skip
         obs, info = shown.reset()
         seen = 0
         for step, paper in enumerate(wanted):
@@ -320,8 +297,7 @@ def test_obstacles_and_advice_stand_behind_the_paper_observation(small, env, mon
             obs, *_rest, info = shown.step(full([0.6, 0, 0, 0.05]))
         assert seen > 0, "no obstacle was ever tracked"
         obs = obs.clone()
-        arrays = shown.capture()
-        assert torch.equal(shown.restore(arrays)[0], obs)
+        assert torch.equal(shown.restore(shown.capture())[0], obs)
 
 
 def test_fingerprint_tells_observations_apart(env):
@@ -349,8 +325,7 @@ def test_fingerprint_tells_observations_apart(env):
 
 def test_gradients_do_not_leak_into_the_simulator(env):
     env.reset(seed=SEED)
-    action = full([0.1, 0, 0, 0]).requires_grad_()
-    obs, reward, *_rest = env.step(action * 2)
+    obs, reward, *_rest = env.step(full([0.1, 0, 0, 0]).requires_grad_() * 2)
     assert not obs.requires_grad and not reward.requires_grad and not env.sim.action.requires_grad
 
 

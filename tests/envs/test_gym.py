@@ -1,5 +1,4 @@
-"""Gymnasium's interfaces: the checkers of Gymnasium, Stable-Baselines3 and TorchRL, and conformance in three
-autoreset modes."""
+"""Gymnasium's interfaces: checkers of Gymnasium, Stable-Baselines3 and TorchRL, three autoreset modes."""
 
 import hashlib
 import subprocess
@@ -107,10 +106,8 @@ def test_make_vec_gives_the_batch(registered):
     envs = gymnasium.make_vec(ENV_ID, num_envs=16, world="maze", autoreset_mode="NextStep")
     assert isinstance(envs, UuvVectorEnv) and envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     assert registered == [("maze", 16, None, None, None, "cpu", "bt")]
-    assert (
-        UuvVectorEnv.__bases__ == (gymnasium.vector.VectorEnv,)
-        and "autoreset_mode" not in UuvVectorEnv.metadata
-    )
+    assert UuvVectorEnv.__bases__ == (gymnasium.vector.VectorEnv,)
+    assert "autoreset_mode" not in UuvVectorEnv.metadata
 
 
 # ------------------------------------------------------------------------------------------------ conformance
@@ -118,13 +115,10 @@ def test_make_vec_gives_the_batch(registered):
 
 def test_spaces_hold_what_comes(make):
     envs = make()
-    assert envs.action_space.shape == (N, 4) and envs.single_action_space == gymnasium.spaces.Box(
-        -1, 1, (4,), np.float32
-    )
-    assert (
-        envs.single_observation_space.shape == (envs.native.num_obs,)
-        and envs.observation_space.dtype == np.float32
-    )
+    assert envs.action_space.shape == (N, 4)
+    assert envs.single_action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+    assert envs.single_observation_space.shape == (envs.native.num_obs,)
+    assert envs.observation_space.dtype == np.float32
     obs, _info = envs.reset(seed=SEED)
     assert obs in envs.observation_space
     for action in random_actions(60):
@@ -138,9 +132,8 @@ def test_every_bound_is_of_a_column(small):
     assert set(bounds(small.config)) <= {column.name for column, _first, _width in placed_columns(everything)}
     table = VectorEnv(small.sim).observation_table
     space, places = observation_space(table, small.config), {column.name: column.slice for column in table}
-    assert (space.high[places["sector_range"]] == small.config.sensors.sonar.max_range_m).all() and np.isinf(
-        space.low[places["goal"]]
-    ).all()
+    assert (space.high[places["sector_range"]] == small.config.sensors.sonar.max_range_m).all()
+    assert np.isinf(space.low[places["goal"]]).all()
 
 
 def test_the_docs_list_the_columns(small):
@@ -168,20 +161,14 @@ def test_same_step_tells_the_end_beside_the_next_beginning(make):
     for key in ("_final_obs", "_final_info"):
         np.testing.assert_array_equal(info[key], ended)
     final = info["final_info"]
-    assert (
-        all((final[key] == ended).all() for key in final if key.startswith("_"))
-        and {"_outcome", "_episode_return"} <= final.keys()
-    )
+    assert all((final[key] == ended).all() for key in final if key.startswith("_"))
+    assert {"_outcome", "_episode_return"} <= final.keys()
     assert [envs.native.outcomes[code] for code in final["outcome"][ended]] == ["timeout", "timeout"]
-    assert (final["episode_steps"][ended] == envs.native.config.episode.horizon_steps).all() and reward[
-        2
-    ] != 0
+    assert (final["episode_steps"][ended] == envs.native.config.episode.horizon_steps).all()
+    assert reward[2] != 0
     assert [value is None for value in info["final_obs"]] == (~ended).tolist()
-    assert (
-        (info["outcome"] == 0).all()
-        and (info["episode_steps"] == np.where(ended, 0, 2)).all()
-        and info["_outcome"].all()
-    )
+    assert (info["outcome"] == 0).all() and (info["episode_steps"] == np.where(ended, 0, 2)).all()
+    assert info["_outcome"].all()
     assert info["episode_number"].tolist() == [row + N * ended[row] for row in range(N)]
 
 
@@ -194,12 +181,8 @@ def test_next_step_ignores_the_action_after_an_end(make):
     goal = envs.native.columns["goal"]
     assert np.abs(obs[2, goal] - first[2, goal]).max() < 0.2, "the last observation of the episode that ended"
     obs, reward, terminated, truncated, info = envs.step(FORWARD)
-    assert (
-        reward[2] == 0
-        and not terminated.any()
-        and not truncated.any()
-        and info["episode_steps"].tolist() == [0 if i == 2 else 2 for i in range(N)]
-    )
+    assert reward[2] == 0 and not terminated.any() and not truncated.any()
+    assert info["episode_steps"].tolist() == [0 if i == 2 else 2 for i in range(N)]
     assert info["episode_number"][2] == N + 2 and np.abs(obs[2, goal] - first[2, goal]).max() > 0.2
     *_rest, info = envs.step(FORWARD)
     assert info["episode_steps"].tolist() == [1 if i == 2 else 3 for i in range(N)]
@@ -222,8 +205,7 @@ def test_disabled_leaves_resets_to_the_user(make):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_every_mode_plays_the_same_episodes(make, mode):
-    """Row by row, observations and rewards are those of the environment underneath, which begins episodes in
-    the same step."""
+    """Rows are those of the environment underneath, which begins episodes in the same step."""
     envs, per_row = make(autoreset_mode=mode), [[] for _ in range(N)]
     actions = random_actions(40)
 
@@ -283,17 +265,11 @@ def test_seeds(make):
     other, _info = make().reset()
     assert not np.array_equal(drawn, other), "without a seed the first episodes are random"
     first, info = envs.reset(seed=SEED)
-    assert (
-        info["seed"].tolist() == [SEED] * N
-        and info["episode_number"].tolist() == list(range(N))
-        and envs.np_random_seed == SEED
-    )
+    assert info["seed"].tolist() == [SEED] * N and info["episode_number"].tolist() == list(range(N))
+    assert envs.np_random_seed == SEED
     second, info = envs.reset()
-    assert (
-        info["seed"].tolist() == [SEED] * N
-        and info["episode_number"].tolist() == list(range(N, 2 * N))
-        and not np.array_equal(first, second)
-    )
+    assert info["seed"].tolist() == [SEED] * N and info["episode_number"].tolist() == list(range(N, 2 * N))
+    assert not np.array_equal(first, second)
     again, _info = envs.reset(seed=np.int64(SEED))
     np.testing.assert_array_equal(again, first)
     for seed, error in (([1] * N, TypeError), (1.5, TypeError), ("1", TypeError), (-1, ValueError)):
@@ -391,11 +367,8 @@ def test_a_held_action_is_so_many_steps_in_one(make):
     assert (info["episode_steps"] == 20).all()
     near_horizon(held.native, [6], steps_left=2)
     _obs, reward, _terminated, truncated, info = held.step(actions[0])
-    assert (
-        truncated[6]
-        and info["final_info"]["episode_steps"][6] == held.native.config.episode.horizon_steps
-        and info["episode_steps"][6] == 0
-    )
+    assert truncated[6] and info["final_info"]["episode_steps"][6] == held.native.config.episode.horizon_steps
+    assert info["episode_steps"][6] == 0
     assert np.isfinite(reward).all()
 
 
@@ -455,13 +428,8 @@ def test_the_single_env_plays_the_first_row(small):
     for action in actions[:, 0]:
         obs, reward, terminated, truncated, info = env.step(action)
         answer.append((obs, reward))
-    assert (
-        truncated
-        and not terminated
-        and info["outcome"] == "timeout"
-        and not info["is_success"]
-        and obs in env.observation_space
-    )
+    assert truncated and not terminated and info["outcome"] == "timeout" and not info["is_success"]
+    assert obs in env.observation_space
     with pytest.raises(RuntimeError, match=r"end of the episode: call reset\(\)"):
         env.step(actions[0, 0])
     assert env.reset()[1]["episode_number"] == N

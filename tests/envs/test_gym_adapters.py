@@ -1,5 +1,4 @@
-"""The batch as Stable-Baselines3 and rsl_rl want it: ends, last observations, time-outs, seeds, and what is
-refused."""
+"""The batch for Stable-Baselines3 and rsl_rl: ends, last observations, time-outs, seeds, refusals."""
 
 import numpy as np
 import pytest
@@ -90,17 +89,12 @@ def test_rsl_rl_gets_time_outs_apart(batch, adapter_of):
     _obs, _reward, ended, extras = adapter.step(torch.zeros(N, 4))
     assert not ended.any() and extras["log"] == {} and torch.equal(before, kept)
     obs, reward, ended, extras = adapter.step(torch.zeros(N, 4))
-    assert (
-        ended.tolist() == [i == 5 for i in range(N)]
-        and extras["time_outs"].tolist() == ended.float().tolist()
-    )
+    assert ended.tolist() == [i == 5 for i in range(N)]
+    assert extras["time_outs"].tolist() == ended.float().tolist()
     assert set(extras["log"]) == {"/episode_return", "/is_success"} and extras["log"]["/is_success"] == 0
     assert adapter.episode_length_buf.tolist() == [0 if i == 5 else 2 for i in range(N)]
-    assert (
-        obs.batch_size == (N,)
-        and torch.equal(obs["policy"], adapter.get_observations()["policy"])
-        and reward.shape == (N,)
-    )
+    assert obs.batch_size == (N,) and torch.equal(obs["policy"], adapter.get_observations()["policy"])
+    assert reward.shape == (N,)
     with pytest.raises(RuntimeError, match="init_at_random_ep_len=False"):
         adapter.episode_length_buf = torch.zeros(N)
 

@@ -1,5 +1,4 @@
-"""Ceilings in ``uuv eval``: rows in the document and on the screen, marked as privileged, on paired
-episodes."""
+"""Ceilings in ``uuv eval``: privileged rows in document and on screen, on paired episodes."""
 
 import json
 
@@ -110,10 +109,8 @@ def test_scenarios_are_those_that_are_played_in_any_batch(small):
     assert not small.sim.rows(small.sim.s.clock.running).any()
     small.begin([4, 2], seed=SEED)
     starts = small.sim.rows(small.sim.s.mission.start_w)
-    assert (
-        found[Job(SEED, 4)]["start"] == starts[0].tolist()
-        and found[Job(SEED, 2)]["start"] == starts[1].tolist()
-    )
+    assert found[Job(SEED, 4)]["start"] == starts[0].tolist()
+    assert found[Job(SEED, 2)]["start"] == starts[1].tolist()
     assert len(found[Job(SEED, 4)]["obstacles"]) == 14
 
 
@@ -122,8 +119,5 @@ def test_a_tree_of_the_users_own_may_have_a_plus_in_its_name(tmp_path):
     file.write_text('<root BTCPP_format="4"><BehaviorTree ID="t"><DriveStraight/></BehaviorTree></root>')
     plain, answer = load_agents([str(file), f"{file}+truth"], 64)
     assert (plain.name, plain.privileged, answer.name, answer.privileged) == (
-        "mine+yours",
-        False,
-        "mine+yours+truth",
-        True,
-    )
+        "mine+yours", False, "mine+yours+truth", True,
+    )  # fmt: skip

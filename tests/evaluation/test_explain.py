@@ -9,23 +9,13 @@ import pytest
 from tests.command import Quiet
 from tests.oracles import hull as hull_reference
 from tests.oracles import sonar as sonar_reference
+from uuvtai.cli import main
 from uuvtai.config import Config, TankConfig
-from uuvtai.evaluation import failure_facts
+from uuvtai.console.screen import Screen
+from uuvtai.console.views import show_causes
+from uuvtai.evaluation import failure_causes, failure_facts
 from uuvtai.evaluation.episodes import EpisodeResult, jobs_of, run_episodes
-from uuvtai.evaluation.failure_causes import (
-    CAUSES,
-    REMARKS,
-    Explanation,
-    Killer,
-    Row,
-    chosen_for_recording,
-    explain,
-    explain_failures,
-    failures,
-    record_worst,
-    table_of,
-    timeout_label,
-)
+from uuvtai.evaluation.evaluate import Request, compare
 from uuvtai.evaluation.failure_facts import (
     WINDOW_S,
     CoarseHistory,
@@ -53,8 +43,7 @@ def at(x, y, z):
 
 
 class Story:
-    """Four seconds of a vehicle at rest; a sphere comes from ahead at 1 m/s, seen and foreseen, and touches
-    the nose at the end."""
+    """A vehicle at rest for 4 s; a sphere seen from ahead comes at 1 m/s and touches the nose at the end."""
 
     def __init__(self, speed=1.0, radius=0.2, rise=0.0, end_s=END_S, gap=0.05):
         self.t = np.round(np.arange(end_s - min(4.0, end_s - 0.1), end_s + 0.05, 0.1), 3)
@@ -142,7 +131,7 @@ class Story:
         )
 
     def explained(self, outcome="collision"):
-        return explain(outcome, self.history(), self.obstacles(), self.config)
+        return failure_causes.explain(outcome, self.history(), self.obstacles(), self.config)
 
 
 def corridor(story, half_gap=0.32):
@@ -268,16 +257,12 @@ TIMEOUTS = {
     "no_progress": {},
 }
 QUIET = {
-    "no_route_share": 0.0,
-    "progress_m": 0.2,
-    "waiting_share": 0.1,
-    "evading_share": 0.1,
-    "driven_m": 4.0,
-}
+    "no_route_share": 0.0, "progress_m": 0.2, "waiting_share": 0.1, "evading_share": 0.1, "driven_m": 4.0,
+}  # fmt: skip
 
 
 def test_every_label_has_a_story():
-    assert set(STORIES) | set(TIMEOUTS) == set(CAUSES)
+    assert set(STORIES) | set(TIMEOUTS) == set(failure_causes.CAUSES)
 
 
 @pytest.mark.parametrize("label", STORIES)
@@ -290,7 +275,7 @@ def test_a_story_gets_its_label(label):
 
 @pytest.mark.parametrize("label", TIMEOUTS)
 def test_a_timeout_gets_its_label(label):
-    assert timeout_label(QUIET | TIMEOUTS[label]) == label
+    assert failure_causes.timeout_label(QUIET | TIMEOUTS[label]) == label
 
 
 @pytest.mark.parametrize(
@@ -298,20 +283,16 @@ def test_a_timeout_gets_its_label(label):
     [
         (lambda: below(0.25), "failed_evasion"),  # the fan still holds its edge at the end
         (lambda: Story().turn(1.3), "failed_evasion"),  # long ago, and the forecasts since were right
-        (
-            lambda: change(Story().turn(1.1), foreseen_vel=_learnt_turn(1.1)),
-            "failed_evasion",
-        ),  # the forecast knew of the turn
+        # the forecast knew of the turn
+        (lambda: change(Story().turn(1.1), foreseen_vel=_learnt_turn(1.1)), "failed_evasion"),
         (lambda: Story(end_s=2.1), "failed_evasion"),  # old enough not to have started in danger
         (lambda: change(at_depth(-1.5), vel_valid=np.zeros(41)), "velocity_lost"),
         (lambda: change(at_depth(-1.5), vel_valid=np.full(41, 2)), "hit_floor"),  # heave is known
         (lambda: change(hit_static(), vel_valid=np.where(np.arange(41) < 35, 0, 1)), "hit_static"),  # again
         (lambda: hit_static(moving_m=0.9), "evaded_into_static"),
         (lambda: hit_static(moving_m=1.1), "hit_static"),
-        (
-            lambda: lately(Story(), 0.6, "leaf", "FollowRoute"),
-            "failed_evasion",
-        ),  # the last chance was 0.5 s before the end
+        # the last chance was 0.5 s before the end
+        (lambda: lately(Story(), 0.6, "leaf", "FollowRoute"), "failed_evasion"),
         (lambda: with_second(Story(speed=5.0), y=1.5), "obstacle_too_fast"),
         (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, 0.04])), "hit_floor"),
         (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, -0.06])), "hit_floor"),  # the safe way
@@ -363,7 +344,7 @@ REMARKABLE = {
 
 
 def test_every_remark_has_its_story_and_a_plain_one_has_none():
-    assert set(REMARKABLE) == set(REMARKS)
+    assert set(REMARKABLE) == set(failure_causes.REMARKS)
     assert Story().explained().remarks == []
     for remark, make in REMARKABLE.items():
         assert remark in make().explained().remarks, remark
@@ -372,9 +353,8 @@ def test_every_remark_has_its_story_and_a_plain_one_has_none():
 
 def test_a_start_in_danger_says_what_it_would_be_otherwise():
     assert Story(end_s=1.5).explained().remarks[0] == "else failed_evasion"
-    assert (
-        Story(end_s=0.2).explained().label == "no_escape_at_start"
-    )  # too short for every interval that is looked at
+    # too short for every interval that is looked at
+    assert Story(end_s=0.2).explained().label == "no_escape_at_start"
 
 
 def test_a_forgotten_obstacle_and_a_seen_corner_are_told():
@@ -392,12 +372,9 @@ def test_a_forgotten_obstacle_and_a_seen_corner_are_told():
     )
     assert change(story, coarse=far).explained().facts["turns_in_reach_before"] == 1
     above = CoarseHistory(
-        np.array([0.0, END_S]),
-        np.stack([at(0, 0, 0.7), at(0, 0, 0.7)]),
-        np.ones(2),
-        np.ones(2, bool),
+        np.array([0.0, END_S]), np.stack([at(0, 0, 0.7), at(0, 0, 0.7)]), np.ones(2), np.ones(2, bool),
         ["", ""],
-    )
+    )  # fmt: skip
     assert change(story, coarse=above).explained().facts["turns_in_reach_before"] == 0
 
 
@@ -433,9 +410,11 @@ def test_a_scan_is_compared_with_the_moment_of_its_ping():
     late = replace(
         story.history(), ping_age_s=np.full(story.n, 0.2), range_m=story.scan() + 0.2 * (np.arange(256) == 0)
     )
-    assert explain("collision", late, story.obstacles(), CONFIG).facts["seen_ago_s"] == 0.0
+    assert failure_causes.explain("collision", late, story.obstacles(), CONFIG).facts["seen_ago_s"] == 0.0
     unchanged = replace(late, ping_age_s=np.zeros(story.n))
-    assert explain("collision", unchanged, story.obstacles(), CONFIG).facts["seen_ago_s"] is None
+    assert (
+        failure_causes.explain("collision", unchanged, story.obstacles(), CONFIG).facts["seen_ago_s"] is None
+    )
 
 
 def test_timeout_facts_from_the_coarse_history():
@@ -482,9 +461,8 @@ def test_hull_gaps_equal_the_reference():
     np.testing.assert_allclose(gap, expected, atol=HULL_TOLERANCE_M)
     step = 1e-4
     pushed, _, _ = failure_facts.hull_gaps(pos, axis, kind, obstacle + step * normal, size, yaw, 0.17, 0.10)
-    np.testing.assert_allclose(
-        (pushed - gap) / step, 1.0, atol=0.02
-    )  # moving an obstacle along the normal opens the gap
+    # moving an obstacle along the normal opens the gap
+    np.testing.assert_allclose((pushed - gap) / step, 1.0, atol=0.02)
     assert np.abs(along).max() <= 0.10 + 1e-9
 
 
@@ -566,9 +544,8 @@ def test_candidates_respect_the_limits_of_the_body_axes():
     across = command[:, 1] * np.cos(0.7) - command[:, 0] * np.sin(0.7)
     assert np.abs(along).max() == pytest.approx(CONFIG.vehicle.max_surge_m_s)
     assert np.abs(across).max() == pytest.approx(CONFIG.vehicle.max_sway_m_s)
-    assert np.hypot(along, across).max() == pytest.approx(
-        np.hypot(0.6, 0.6), abs=1e-6
-    )  # diagonals are the fastest
+    # diagonals are the fastest
+    assert np.hypot(along, across).max() == pytest.approx(np.hypot(0.6, 0.6), abs=1e-6)
     assert set(np.round(command[:, 2], 6)) == {0.0, 0.4, -0.4}
 
 
@@ -584,19 +561,17 @@ def test_obstacles_go_straight_on_after_the_end():
 
 def row(label, episode, closing=None, **facts):
     result = EpisodeResult(1, episode, "collision", 3.0, 0.0, 0.05, 1.0, {}, {}, {}, np.zeros(1), np.zeros(1))
-    return Row(result, Explanation(label, Killer("sphere", closing_m_s=closing), facts))
+    return failure_causes.Row(
+        result, failure_causes.Explanation(label, failure_causes.Killer("sphere", closing_m_s=closing), facts)
+    )
 
 
 def test_the_table_counts_sorts_and_names_the_worst():
     rows = [
-        row("late_reaction", 0, 0.2),
-        row("late_reaction", 1, 0.9),
-        row("undetected_above", 2),
-        row("late_reaction", 3, 0.5),
-        row("hit_wall", 4),
-        row("late_reaction", 5, 0.1),
-    ]
-    table = table_of(rows)
+        row("late_reaction", 0, 0.2), row("late_reaction", 1, 0.9), row("undetected_above", 2),
+        row("late_reaction", 3, 0.5), row("hit_wall", 4), row("late_reaction", 5, 0.1),
+    ]  # fmt: skip
+    table = failure_causes.table_of(rows)
     assert [(entry["label"], entry["count"]) for entry in table] == [
         ("late_reaction", 4),
         ("hit_wall", 1),
@@ -604,8 +579,8 @@ def test_the_table_counts_sorts_and_names_the_worst():
     ]
     assert table[0]["examples"] == [[1, 1], [1, 3], [1, 0]]
     assert sum(entry["share"] for entry in table) == pytest.approx(1.0)
-    assert table[0]["meaning"] == CAUSES["late_reaction"]
-    assert table_of([]) == []
+    assert table[0]["meaning"] == failure_causes.CAUSES["late_reaction"]
+    assert failure_causes.table_of([]) == []
 
 
 def test_what_is_typical_of_a_label():
@@ -614,7 +589,7 @@ def test_what_is_typical_of_a_label():
     rows = [row("late_reaction", 0, **unknown), row("late_reaction", 1, **known), row("stuck", 2, goal_m=2.0)]
     rows[0].explanation.remarks.extend(["static near", "turned lately"])
     rows[1].explanation.remarks.append("turned lately")
-    late, stuck = table_of(rows)
+    late, stuck = failure_causes.table_of(rows)
     assert (late["knew_share"], late["evading_median_s"], late["last_chance_median_s"]) == (0.5, 2.0, 1.25)
     assert late["undetected_median_s"] == pytest.approx((WINDOW_S + 0.1) / 2)
     assert late["remarks"] == {"turned lately": 2, "static near": 1}
@@ -632,9 +607,9 @@ def test_recordings_go_round_the_labels():
         row("undetected_above", 2),
         row("late_reaction", 3, 0.5),
     ]
-    assert [r.result.episode for r in chosen_for_recording(rows, 3)] == [1, 2, 3]
-    assert [r.result.episode for r in chosen_for_recording(rows, 99)] == [1, 2, 3, 0]
-    assert chosen_for_recording(rows, 0) == [] == chosen_for_recording([], 3)
+    assert [r.result.episode for r in failure_causes.chosen_for_recording(rows, 3)] == [1, 2, 3]
+    assert [r.result.episode for r in failure_causes.chosen_for_recording(rows, 99)] == [1, 2, 3, 0]
+    assert failure_causes.chosen_for_recording(rows, 0) == [] == failure_causes.chosen_for_recording([], 3)
 
 
 @pytest.fixture(scope="module")
@@ -643,19 +618,18 @@ def played(small):
     small.sim.use_tree(small.trees["straight"])
     small.sim.set_scenes([(8, 9, 1.5)])
     results, _ = run_episodes(small.sim, jobs_of([7], 12))
-    rows = explain_failures(small.sim, results)
-    yield small, results, rows
+    yield small, results, failure_causes.explain_failures(small.sim, results)
     small.sim.set_scenes()
     small.sim.use_tree(small.trees["bt"])
 
 
 def test_a_replay_ends_as_the_episode_did_and_explains_every_failure(played):
     _, results, rows = played
-    failed = failures(results)
+    failed = failure_causes.failures(results)
     assert len(failed) >= 6
     assert [row.result for row in rows] == failed
     for row in rows:
-        assert row.explanation.label in CAUSES
+        assert row.explanation.label in failure_causes.CAUSES
         assert row.document()["outcome"] == row.result.outcome
         json.dumps(row.document(), allow_nan=False)
 
@@ -676,14 +650,16 @@ def test_the_killer_is_what_the_referee_saw(played):
 
 def test_a_replay_that_ends_differently_is_an_error(played):
     small, results, _ = played
-    wrong = replace(failures(results)[0], time_s=failures(results)[0].time_s + 0.04)
+    wrong = replace(
+        failure_causes.failures(results)[0], time_s=failure_causes.failures(results)[0].time_s + 0.04
+    )
     small.sim.use_tree(small.trees["straight"])
     with pytest.raises(RuntimeError, match="instead of"):
-        explain_failures(small.sim, [wrong])
+        failure_causes.explain_failures(small.sim, [wrong])
 
 
 def test_nothing_failed_means_nothing_is_replayed(small):
-    assert explain_failures(small.sim, []) == []
+    assert failure_causes.explain_failures(small.sim, []) == []
 
 
 def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
@@ -691,7 +667,7 @@ def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
     shortest = min(rows, key=lambda row: row.result.time_s)
     notes = []
     small.sim.use_tree(small.trees["straight"])
-    paths = record_worst(small.sim, [shortest], tmp_path, "pool", "straight", notes.append)
+    paths = failure_causes.record_worst(small.sim, [shortest], tmp_path, "pool", "straight", notes.append)
     stem = (
         f"{shortest.explanation.label}_straight_seed{shortest.result.seed}_episode{shortest.result.episode}"
     )
@@ -703,19 +679,13 @@ def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
 @pytest.fixture
 def request_of(small, tmp_path, monkeypatch):
     """A request for a short comparison that runs on the session's simulator."""
-    from uuvtai.evaluation.evaluate import Request
-
     monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_: small.sim)
 
     def build(**options):
         asked = {
-            "agents": ["straight"],
-            "seeds": [3],
-            "episodes": 6,
-            "num_envs": small.N,
-            "explain": True,
+            "agents": ["straight"], "seeds": [3], "episodes": 6, "num_envs": small.N, "explain": True,
             "explain_record": 0,
-        }
+        }  # fmt: skip
         return Request(
             config=small.config, world="pool", sensors="paper", run_dir=tmp_path / "run", **(asked | options)
         )
@@ -725,8 +695,6 @@ def request_of(small, tmp_path, monkeypatch):
 
 
 def test_a_comparison_carries_its_causes(request_of):
-    from uuvtai.evaluation.evaluate import compare
-
     result, folder = compare(request_of(explain_record=1), Quiet())
     agent = result["agents"][0]
     failed = [d for d in agent["episodes_detail"] if d["outcome"] != "success"]
@@ -742,16 +710,12 @@ def test_a_comparison_carries_its_causes(request_of):
 
 
 def test_without_explain_the_document_has_no_causes(request_of):
-    from uuvtai.evaluation.evaluate import compare
-
     result, folder = compare(request_of(explain=False), Quiet())
     assert not {"causes", "explain"} & set(result["agents"][0])
     assert not (folder / "eval/explain.json").exists()
 
 
 def test_an_interrupted_explanation_leaves_the_results(request_of, monkeypatch):
-    from uuvtai.evaluation.evaluate import compare
-
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -771,8 +735,6 @@ def test_an_interrupted_explanation_leaves_the_results(request_of, monkeypatch):
     ],
 )
 def test_bad_combinations_are_one_message(capfd, arguments, says):
-    from uuvtai.cli import main
-
     with pytest.raises(SystemExit) as left:
         main(["eval", *arguments])
     assert left.value.code == 2
@@ -780,10 +742,7 @@ def test_bad_combinations_are_one_message(capfd, arguments, says):
 
 
 def test_the_table_is_printed_and_no_failure_is_said(capfd):
-    from uuvtai.console.screen import Screen
-    from uuvtai.console.views import show_causes
-
-    causes_found = table_of(
+    causes_found = failure_causes.table_of(
         [row("late_reaction", 0, 0.2, forecast_error_m=0.1, seen_ago_s=0.0, evading_s=0.4, last_chance_s=0.5)]
     )
     agent = {"name": "bt", "episodes": 9, "explain": [{}], "causes": causes_found}
@@ -795,8 +754,6 @@ def test_the_table_is_printed_and_no_failure_is_said(capfd):
 
 
 def test_help_names_the_default_that_markup_would_swallow(capfd):
-    from uuvtai.cli import main
-
     with pytest.raises(SystemExit):
         main(["eval", "--help"])
     out = capfd.readouterr().out

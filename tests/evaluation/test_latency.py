@@ -1,5 +1,4 @@
-"""The paper's timing table, on a simulator that is a list of what its stages take: what each row is a mean
-of."""
+"""The paper's timing table on a simulator that is a list of times: what each row is a mean of."""
 
 import pytest
 import torch

@@ -8,36 +8,21 @@ import pytest
 from tests.oracles.world import path_position
 from uuvtai.common.obstacle_motion import path_positions
 from uuvtai.config import Config, DisturbanceConfig
-from uuvtai.evaluation import failure_facts
-from uuvtai.evaluation.oracle import (
-    CELL_M,
-    MOVES,
-    Obstacle,
-    Termination,
-    earliest_arrival,
-    lattice_of,
-    level_excess,
-    obstacles_of,
-    rounding_m,
-    upright_excess,
-)
+from uuvtai.evaluation import failure_facts, oracle
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
 
 CONFIG = Config()
 TOP_SPEED = math.hypot(0.6, 0.6)
-STEP_S = CELL_M / TOP_SPEED
+STEP_S = oracle.CELL_M / TOP_SPEED
 GOAL_M = 1.0
 
 
 def line(a, b, speed, phase=0.0):
     """Path document of an obstacle that goes back and forth."""
     return {
-        "shape": "polyline",
-        "corners": [list(a), list(b)],
-        "length_m": 2 * math.dist(a, b),
-        "phase_m": phase,
+        "shape": "polyline", "corners": [list(a), list(b)], "length_m": 2 * math.dist(a, b), "phase_m": phase,
         "speed_m_s": speed,
-    }
+    }  # fmt: skip
 
 
 def obstacle(kind, position, size, path=None, yaw=0.0):
@@ -53,7 +38,7 @@ def scenario(start, goal, *obstacles):
 
 
 def arrival(start, goal, *obstacles, config=CONFIG):
-    return earliest_arrival(scenario(start, goal, *obstacles), config).time_s
+    return oracle.earliest_arrival(scenario(start, goal, *obstacles), config).time_s
 
 
 # -------------------------------------------------------------------------------------------------- obstacles
@@ -86,7 +71,7 @@ def test_many_positions_of_a_path_are_those_of_one_by_one(path):
 
 
 def test_obstacles_move_with_the_speed_of_their_path():
-    moving, still = obstacles_of(
+    moving, still = oracle.obstacles_of(
         scenario((2, 2, -0.8), (9, 2, -0.8), column(5, 1, path=line((5, 1), (5, 5), 0.5)), column(7, 2)),
         np.arange(0.1, 12.0, 0.5),
     )
@@ -99,13 +84,16 @@ def test_obstacles_move_with_the_speed_of_their_path():
 @pytest.mark.parametrize(("name", "kind"), [("sphere", SPHERE), ("cylinder", CYLINDER), ("box", BOX)])
 def test_distances_are_those_of_the_hindsight(name, kind):
     """``hindsight.hull_gaps`` is tested against the kernel; a capsule without length is our ball."""
-    rng = np.random.default_rng(3)
-    points = rng.uniform([3, 1, -1.6], [7, 5, 0], (500, 3))
+    points = np.random.default_rng(3).uniform([3, 1, -1.6], [7, 5, 0], (500, 3))
     at, size, yaw = np.array([5.0, 3.0, -0.9]), np.array([0.4, 0.4 if kind != BOX else 0.7, 0.3]), 0.6
-    shape = Obstacle(name, size, yaw, at[None], np.zeros((1, 2)))
+    shape = oracle.Obstacle(name, size, yaw, at[None], np.zeros((1, 2)))
     off = points - at
-    ox, oy = level_excess(shape, off[:, 0], off[:, 1])
-    gaps = np.sqrt(ox**2 + oy**2 + upright_excess(shape, off[:, 2]) ** 2) - rounding_m(shape) - 0.17
+    ox, oy = oracle.level_excess(shape, off[:, 0], off[:, 1])
+    gaps = (
+        np.sqrt(ox**2 + oy**2 + oracle.upright_excess(shape, off[:, 2]) ** 2)
+        - oracle.rounding_m(shape)
+        - 0.17
+    )
     axis = np.tile([1.0, 0.0, 0.0], (500, 1))
     expected, _, _ = failure_facts.hull_gaps(
         points, axis, np.array([kind]), np.tile(at, (500, 1, 1)), size[None], np.array([yaw]), 0.17, 0.0
@@ -114,25 +102,18 @@ def test_distances_are_those_of_the_hindsight(name, kind):
 
 
 def test_the_referee_forbids_what_closes_too_fast_and_lets_flee():
-    """A column of radius 0.25 m comes at 1.5 m/s along -x: standing needs 0.27 m (0.18 s x 1.5), fleeing at
-    0.85 m/s 0.117 m."""
+    """A column (0.25 m) comes at 1.5 m/s: standing needs 0.27 m (0.18 s x 1.5), fleeing at 0.85 0.117 m."""
     start = (6.0, 3.0, -0.8)
-    grid = lattice_of(np.array(start), CONFIG)
-    moves = {tuple(move): index for index, move in enumerate(MOVES)}
+    grid = oracle.lattice_of(np.array(start), CONFIG)
+    moves = {tuple(move): index for index, move in enumerate(oracle.MOVES)}
     for gap, may_stay, may_flee, may_approach in (
-        (0.09, 0, 0, 0),
-        (0.2, 0, 1, 0),
-        (0.35, 1, 1, 0),
-        (0.5, 1, 1, 1),
-    ):
-        coming = Obstacle(
-            "cylinder",
-            np.array([0.25, 0.25, 0.8]),
-            0.0,
-            np.array([[6.0 + 0.42 + gap, 3.0, -0.8]]),
+        (0.09, 0, 0, 0), (0.2, 0, 1, 0), (0.35, 1, 1, 0), (0.5, 1, 1, 1),
+    ):  # fmt: skip
+        coming = oracle.Obstacle(
+            "cylinder", np.array([0.25, 0.25, 0.8]), 0.0, np.array([[6.0 + 0.42 + gap, 3.0, -0.8]]),
             np.array([[-1.5, 0.0]]),
-        )
-        blocked = Termination(grid, [], CONFIG).blocked([coming], 0, np.ones_like(grid.inside))[
+        )  # fmt: skip
+        blocked = oracle.Termination(grid, [], CONFIG).blocked([coming], 0, np.ones_like(grid.inside))[
             (slice(None), *grid.start)
         ]
         found = [not blocked[moves[move]] for move in ((0, 0), (-1, 0), (1, 0))]
@@ -183,15 +164,13 @@ def test_a_low_wall_is_passed_above():
 
 
 def test_the_oracle_waits_for_a_door_that_a_obstacle_blocks():
-    """The door is 1.2 m wide; a column creeps out of its middle at 2 cm/s and leaves room at its side from
-    9.5 to 11 s on (by hand)."""
+    """A column creeps out of a 1.2 m door at 2 cm/s and leaves room from 9.5 to 11 s on (by hand)."""
     start, goal = (6.0, 3.0, -0.8), (12.0, 3.0, -0.8)
     door = (
         obstacle("box", (8, 1.2, -0.8), (0.1, 1.2, 0.8)),
         obstacle("box", (8, 4.8, -0.8), (0.1, 1.2, 0.8)),
     )
-    free = arrival(start, goal, *door)
-    assert free == pytest.approx(5.0 / TOP_SPEED, abs=2 * STEP_S)
+    assert arrival(start, goal, *door) == pytest.approx(5.0 / TOP_SPEED, abs=2 * STEP_S)
     rest_s = 3.0 / TOP_SPEED
     waited = arrival(start, goal, *door, column(8.0, 3.0, path=line((8.0, 3.0), (8.0, 6.0), 0.02)))
     assert 9.5 + rest_s - 0.6 <= waited <= 11.0 + rest_s + 0.6

@@ -24,18 +24,12 @@ def alone(finding):
 
 def entry(success, n=100, collision=0, time_s=10.0, **more):
     outcomes = {
-        "success": success,
-        "collision": collision,
-        "ttc": 0,
-        "out_of_tank": 0,
+        "success": success, "collision": collision, "ttc": 0, "out_of_tank": 0,
         "timeout": n - success - collision,
-    }
+    }  # fmt: skip
     return {
-        "episodes": n,
-        "outcomes": outcomes,
-        "time_mean_s": time_s,
-        "time_to_success_mean_s": time_s,
-    } | more
+        "episodes": n, "outcomes": outcomes, "time_mean_s": time_s, "time_to_success_mean_s": time_s,
+    } | more  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -90,8 +84,7 @@ def test_a_ratio_is_tested_on_its_logarithm():
 
 
 def test_holm_decides_over_the_whole_list():
-    """Four tests at 0.01, 0.02, 0.03, 0.04: alone each would decide, together only the first does (4 x 0.01,
-    then 3 x 0.02)."""
+    """Of 0.01, 0.02, 0.03, 0.04 only the first decides together (4 x 0.01, then 3 x 0.02)."""
     found = [claims.Claim(str(p), "", "", HOLDS, p) for p in (0.03, 0.01, None, 0.04, 0.02)]
     answer = claims.judged(found)
     assert [c.verdict for c in answer] == [OPEN, HOLDS, HOLDS, OPEN, OPEN]
@@ -199,14 +192,9 @@ def test_claims_of_the_sweep_take_the_papers_conditions():
 
 def test_claims_of_timing():
     rows = {
-        "WM encoder": 0.02,
-        "WM dynamics": 0.02,
-        "WM decoder": 0.02,
-        "PPO policy": 0.1,
-        "Mapping update": 1.0,
-        "Global planner": 1.0,
-        "Full loop": 3.0,
-    }
+        "WM encoder": 0.02, "WM dynamics": 0.02, "WM decoder": 0.02, "PPO policy": 0.1, "Mapping update": 1.0,
+        "Global planner": 1.0, "Full loop": 3.0,
+    }  # fmt: skip
     profile = {
         "paper_latency": [{"component": name, "mean_ms": ms} for name, ms in rows.items()],
         "real_time": {"p99_ms": 4.0},
@@ -256,10 +244,8 @@ def minimal():
 
 def test_the_page_tells_p_values_and_an_evaluation_seed_that_was_tuned_on():
     text = results_page(minimal())
-    assert (
-        "| it holds | 1 | 2 | holds | < 0.0001 | < 0.0001 |" in text
-        and "| untested | 1 | 2 | does not hold | - | - |" in text
-    )
+    assert "| it holds | 1 | 2 | holds | < 0.0001 | < 0.0001 |" in text
+    assert "| untested | 1 | 2 | does not hold | - | - |" in text
     assert "seed, 90007, was never trained or tuned on" in text
     assert "seed, 90001, was looked at while tuning" in results_page(minimal() | {"seed": 90001})
     assert reproduce_steps.EVALUATION_SEED not in reproduce_steps.RETIRED_SEEDS
@@ -335,8 +321,7 @@ def printed(arguments):
 
 @pytest.fixture(autouse=True)
 def pages(monkeypatch):
-    """How the run stood whenever a page was made; it would be drawn from run folders that stand-ins do not
-    write."""
+    """How the run stood whenever a page was made; stand-ins write no run folders to draw one from."""
     states = []
 
     def page(folders):

@@ -1,5 +1,4 @@
-"""An evaluation that is interrupted or killed goes on where it was, and ends as if nobody had disturbed
-it."""
+"""An evaluation that is interrupted or killed goes on, and ends as if nobody had disturbed it."""
 
 import json
 from pathlib import Path
@@ -43,20 +42,15 @@ class Watch:
 
 @pytest.fixture(scope="module")
 def ask(small, tmp_path_factory):
-    """Requests of the session's simulator: nothing is compiled. The blind oracle drives, twice: its
-    episodes are short."""
+    """Requests of the session's simulator; the blind oracle drives, twice: its episodes are short."""
     second = tmp_path_factory.mktemp("trees") / "second.xml"
     second.write_text(preset_path("tree", "straight").read_text())
 
     def request(folder, **others):
         given = {
-            "agents": ["straight", str(second)],
-            "episodes": EPISODES,
-            "seeds": [77],
-            "num_envs": 2,
-            "device": "cpu",
-            "record": 2,
-        }
+            "agents": ["straight", str(second)], "episodes": EPISODES, "seeds": [77], "num_envs": 2,
+            "device": "cpu", "record": 2,
+        }  # fmt: skip
         return Request(config=small.config, world="pool", sensors="paper", run_dir=folder, **given | others)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -32,14 +32,9 @@ def run(config, **kwargs):
 def mixed():
     """One run with every input but a command."""
     return run(
-        raw(),
-        seconds=2.0,
-        wrench=(5, 2, 0, 0, 0, 0.3),
-        current=(0.1, -0.2, 0.05),
-        initial_rpy_deg=(10, -15, 100),
-        initial_velocity=(0.3, 0, -0.1, 0.1, 0, 0.2),
-        neutral=True,
-    )
+        raw(), seconds=2.0, wrench=(5, 2, 0, 0, 0, 0.3), current=(0.1, -0.2, 0.05),
+        initial_rpy_deg=(10, -15, 100), initial_velocity=(0.3, 0, -0.1, 0.1, 0, 0.2), neutral=True,
+    )  # fmt: skip
 
 
 def test_document_has_the_documented_shape(mixed):
@@ -58,15 +53,9 @@ def test_first_sample_is_the_initial_state(mixed):
 
 def test_all_inputs_act_as_in_the_oracle(mixed):
     want = oracle.simulate(
-        oracle.Body().neutral(),
-        2.0,
-        dt=5e-3,
-        wrench=[5, 2, 0, 0, 0, 0.3],
-        current=[0.1, -0.2, 0.05],
-        rpy_deg=(10, -15, 100),
-        nu=[0.3, 0, -0.1, 0.1, 0, 0.2],
-        sample_s=0.02,
-    )
+        oracle.Body().neutral(), 2.0, dt=5e-3, wrench=[5, 2, 0, 0, 0, 0.3], current=[0.1, -0.2, 0.05],
+        rpy_deg=(10, -15, 100), nu=[0.3, 0, -0.1, 0.1, 0, 0.2], sample_s=0.02,
+    )  # fmt: skip
     assert np.abs(np.array(mixed["position"]) - want["position"]).max() < F32_POSITION_M
     assert np.abs(np.array(mixed["nu"]) - want["nu"]).max() < F32_POSITION_M
     assert np.abs(np.array(mixed["rpy_deg"]) - want["rpy_deg"]).max() < 0.1
@@ -80,8 +69,7 @@ def test_command_drives_the_inner_loop():
 
 
 def test_double_precision_process():
-    """Without a runtime the function starts Taichi in double precision; 0.01 s agrees with RK4 far below
-    single precision."""
+    """Taichi starts in double precision; 0.01 s agrees with RK4 far below single precision."""
     code = (
         "import json, sys\nfrom uuvtai.config.loader import load_config\n"
         "from uuvtai.evaluation.simulate import Trial, simulate\n"

@@ -1,5 +1,4 @@
-"""Sweeps: cells of a grid, tasks, engines that lose workers, and folders that survive a kill at any
-moment."""
+"""Sweeps: cells, tasks, engines that lose workers, and folders that survive a kill at any moment."""
 
 import json
 import subprocess
@@ -126,8 +125,7 @@ def test_one_simulator_serves_every_scene():
 
 
 def test_other_axes_make_configs_of_their_own():
-    request = asked(grid_of(["behavior.caution=0.5,2", "D=0,6"]))
-    tasks = tasks_of(request, [("bt", "bt")], set())
+    tasks = tasks_of(asked(grid_of(["behavior.caution=0.5,2", "D=0,6"])), [("bt", "bt")], set())
     assert [task.config.behavior.caution for task in tasks] == [0.5, 2.0]
     assert tasks[1].labels == (
         {"S": 8, "D": 0, "v_m_s": None, "behavior.caution": 2},
@@ -140,11 +138,8 @@ def test_one_axis_at_a_time_tells_what_is_unchanged(tmp_path):
         {"D": (3,), "sensors": ("harsh",), "disturbance.current_m_s": ([0.1, 0.0, 0.0],)}, one_at_a_time=True
     )
     document, folder = sweep(asked(grid), Canned(), tmp_path / "run", Quiet())
-    assert document["one_at_a_time"] and document["unchanged"] == {
-        "D": 6,
-        "sensors": None,
-        "disturbance.current_m_s": [0.0, 0.0, 0.0],
-    }
+    assert document["one_at_a_time"]
+    assert document["unchanged"] == {"D": 6, "sensors": None, "disturbance.current_m_s": [0.0, 0.0, 0.0]}
     assert json.loads((folder / "sweep.json").read_text())["unchanged"] == document["unchanged"]
 
 
@@ -180,8 +175,7 @@ def row(label, agent):
 
 
 class Canned:
-    """An engine that knows the rows already and stops after some tasks as if it had been killed, or somebody
-    had pressed Ctrl-C."""
+    """An engine that knows the rows already and stops after some tasks as if killed, or by Ctrl-C."""
 
     def __init__(self, stop_after=None, error=KeyboardInterrupt):
         self.stop_after, self.error, self.ran = stop_after, error, []
@@ -229,8 +223,7 @@ def test_a_policy_that_was_trained_on_is_refused(tmp_path):
     place = tmp_path / "run"
     sweep(asked(GRID), Canned(), place, Quiet())
     file = place / "sweep_request.json"
-    document = json.loads(file.read_text())
-    file.write_text(json.dumps(document | {"checkpoints": {"mine": "0" * 64}}))
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"checkpoints": {"mine": "0" * 64}}))
     with pytest.raises(RunFolderError, match="mine has changed since this sweep began"):
         resume(place, Canned(), Quiet())
 
@@ -287,10 +280,8 @@ OPTIONS = [*SmallSim.OPTIONS, "--set", "episode.horizon_steps=400", "-S", "4", "
 
 def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
     """To the last digit, also after SIGKILL."""
-    place, command = (
-        tmp_path / "sweep",
-        ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--agent", "bt", *OPTIONS],
-    )
+    place = tmp_path / "sweep"
+    command = ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--agent", "bt", *OPTIONS]
     child = subprocess.Popen(
         [sys.executable, "-m", "uuvtai", *command, "--run-dir", str(place)],
         stdout=subprocess.DEVNULL,

@@ -1,5 +1,4 @@
-"""Checkpoints: the same state back to the last bit, whatever kills the writer, and a clear refusal of
-everything else."""
+"""Checkpoints: the same state to the last bit, whatever kills the writer; all else is clearly refused."""
 
 import json
 import subprocess
@@ -9,6 +8,7 @@ import textwrap
 import numpy as np
 import pytest
 import torch
+import zstandard
 from safetensors.torch import save as safetensors_bytes
 
 from uuvtai.config.loader import load_training
@@ -94,11 +94,8 @@ def test_state_comes_back_to_the_last_bit(tmp_path):
     state = found.state(like=state_of(0))
     assert_same({name: state[name] for name in expected}, expected)
     assert sorted(p.name for p in path.iterdir()) == [
-        "manifest.json",
-        "model.safetensors",
-        "simulator.zst",
-        "training.safetensors",
-    ]
+        "manifest.json", "model.safetensors", "simulator.zst", "training.safetensors",
+    ]  # fmt: skip
 
 
 def test_what_cannot_be_kept_is_named(tmp_path):
@@ -193,8 +190,6 @@ def test_a_stream_unfolds_to_what_is_expected_and_no_more(tmp_path, size, says):
 
 def test_a_bomb_stays_small(tmp_path):
     """A terabyte of zeros in a few kilobytes cannot be expanded: the reader stops at the size it knows."""
-    import zstandard
-
     with (tmp_path / "s.zst").open("wb") as file, zstandard.ZstdCompressor().stream_writer(file) as stream:
         for _ in range(64):
             stream.write(bytes(1 << 20))
@@ -244,8 +239,7 @@ KILLED = """
 
 
 def test_sigkill_at_any_file_operation_leaves_the_newest_verified_checkpoint_usable(tmp_path, monkeypatch):
-    """The writer is killed at its 1st, 4th, 7th, ... file operation while two more checkpoints are written
-    over three older ones."""
+    """Killed at its 1st, 4th, 7th, ... operation while two more are written over three older ones."""
     from tests.repository.test_architecture import ROOT
 
     monkeypatch.setattr("os.fsync", lambda _descriptor: None)

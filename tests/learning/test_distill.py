@@ -1,5 +1,4 @@
-"""Distillation: loss, weights and errors on hand-computed numbers; teacher batches teach by their strength
-and skip what is not finite."""
+"""Distillation by hand-computed numbers; batches teach by their strength and skip what is not finite."""
 
 import math
 
@@ -8,24 +7,14 @@ import torch
 from torch import nn
 
 from uuvtai.config.learning import DistillationConfig
-from uuvtai.learning.distillation import (
-    MAX_WEIGHT_RATIO,
-    LeafErrors,
-    TeacherBatches,
-    check_weighting,
-    distillation_loss,
-    imitation_error,
-    sample_weight,
-    weights_of,
-)
+from uuvtai.learning import distillation
 
 FLOAT32 = 1e-6
 """a handful of float32 operations on numbers near one"""
 
 
 class LinearPolicy(nn.Module):
-    """Smallest thing with a mean: four actions linear in two inputs, and a critic that distillation must not
-    touch."""
+    """Four actions linear in two inputs, and a critic that distillation must not touch."""
 
     def __init__(self):
         super().__init__()
@@ -48,39 +37,38 @@ def lesson():
 def test_the_error_is_the_squared_norm_over_the_four_actions():
     mean = torch.tensor([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5]])
     behavior = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -0.5]])
-    assert imitation_error(mean, behavior).tolist() == [5.0, 1.0]
-    assert float(distillation_loss(mean, behavior, torch.tensor([0.5, 1.5]))) == pytest.approx(
+    assert distillation.imitation_error(mean, behavior).tolist() == [5.0, 1.0]
+    assert float(distillation.distillation_loss(mean, behavior, torch.tensor([0.5, 1.5]))) == pytest.approx(
         (0.5 * 5 + 1.5 * 1) / 2
     )
 
 
 def test_weights_have_mean_one_and_bounds():
     signal = torch.tensor([1.0, 2.0, 3.0])
-    assert torch.allclose(sample_weight(signal), torch.tensor([0.5, 1.0, 1.5]), atol=FLOAT32)
-    wild = torch.cat([torch.full((999,), 1e-3), torch.tensor([1e9])])
-    weight = sample_weight(wild)
+    assert torch.allclose(distillation.sample_weight(signal), torch.tensor([0.5, 1.0, 1.5]), atol=FLOAT32)
+    weight = distillation.sample_weight(torch.cat([torch.full((999,), 1e-3), torch.tensor([1e9])]))
     assert float(weight.mean()) == pytest.approx(1.0, abs=1e-5)
-    assert float(weight.max() / weight.min()) == pytest.approx(MAX_WEIGHT_RATIO**2)
+    assert float(weight.max() / weight.min()) == pytest.approx(distillation.MAX_WEIGHT_RATIO**2)
 
 
 def test_weights_survive_zeros_and_what_is_not_finite():
-    assert sample_weight(torch.zeros(4)).tolist() == [1.0] * 4
-    weight = sample_weight(torch.tensor([1.0, math.nan, 3.0, math.inf]))
+    assert distillation.sample_weight(torch.zeros(4)).tolist() == [1.0] * 4
+    weight = distillation.sample_weight(torch.tensor([1.0, math.nan, 3.0, math.inf]))
     assert torch.isfinite(weight).all()
     assert weight[1] == weight[3] and weight[0] < weight[1] < weight[2]
 
 
 def test_weighting_by_name():
     uncertainty = torch.tensor([1.0, 3.0])
-    assert weights_of("none", uncertainty).tolist() == [1.0, 1.0]
-    assert weights_of("uncertainty", uncertainty).tolist() == [0.5, 1.5]
+    assert distillation.weights_of("none", uncertainty).tolist() == [1.0, 1.0]
+    assert distillation.weights_of("uncertainty", uncertainty).tolist() == [0.5, 1.5]
 
 
 def test_a_weighting_needs_its_signal():
-    check_weighting("none", False)
-    check_weighting("uncertainty", True)
+    distillation.check_weighting("none", False)
+    distillation.check_weighting("uncertainty", True)
     with pytest.raises(ValueError, match=r"world_model\.enabled=true"):
-        check_weighting("uncertainty", False)
+        distillation.check_weighting("uncertainty", False)
 
 
 def test_teacher_batches_teach_the_mean_and_leave_the_critic(lesson):
@@ -88,10 +76,10 @@ def test_teacher_batches_teach_the_mean_and_leave_the_critic(lesson):
     policy = LinearPolicy()
     critic = policy.critic.weight.clone()
     policy.critic(x).sum().backward()  # a gradient that PPO left behind
-    batches = TeacherBatches(policy, DistillationConfig(batch=64, steps=300, learning_rate=1e-2))
-    before = imitation_error(policy.distribution(x)[0], behavior).mean()
+    batches = distillation.TeacherBatches(policy, DistillationConfig(batch=64, steps=300, learning_rate=1e-2))
+    before = distillation.imitation_error(policy.distribution(x)[0], behavior).mean()
     batches.update(x, behavior, weight, 1.0, generator)
-    after = imitation_error(policy.distribution(x)[0], behavior).mean()
+    after = distillation.imitation_error(policy.distribution(x)[0], behavior).mean()
     assert after < 0.01 * before
     assert torch.equal(policy.critic.weight, critic)
 
@@ -101,7 +89,7 @@ def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
 
     def moved(strength):
         policy = LinearPolicy()
-        TeacherBatches(policy, DistillationConfig(batch=64, steps=1)).update(
+        distillation.TeacherBatches(policy, DistillationConfig(batch=64, steps=1)).update(
             x, behavior, weight, strength, torch.Generator().manual_seed(0)
         )
         return (policy.actor.weight - 0.1).detach()
@@ -110,7 +98,7 @@ def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
     assert torch.allclose(moved(0.2), 0.2 * moved(1.0), rtol=1e-2, atol=1e-9)
     state = generator.get_state()
     policy = LinearPolicy()
-    TeacherBatches(policy, DistillationConfig()).update(x, behavior, weight, 0.0, generator)
+    distillation.TeacherBatches(policy, DistillationConfig()).update(x, behavior, weight, 0.0, generator)
     assert torch.equal(generator.get_state(), state)
     assert torch.equal(policy.actor.weight, torch.full((4, 2), 0.1))
 
@@ -118,7 +106,7 @@ def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
 def test_a_batch_that_is_not_finite_changes_nothing_and_is_counted(lesson):
     x, _teacher, weight, generator = lesson
     policy = LinearPolicy()
-    batches = TeacherBatches(policy, DistillationConfig(batch=64, steps=2))
+    batches = distillation.TeacherBatches(policy, DistillationConfig(batch=64, steps=2))
     batches.update(x, torch.full((500, 4), math.nan), weight, 1.0, generator)
     assert batches.skipped == 2
     assert torch.equal(policy.actor.weight, torch.full((4, 2), 0.1))
@@ -131,7 +119,7 @@ def test_teacher_batches_go_on_from_their_state(lesson):
         policy, generator = LinearPolicy(), torch.Generator().manual_seed(7)
         state = None
         for _ in range(parts):
-            batches = TeacherBatches(policy, DistillationConfig(batch=32, steps=4 // parts))
+            batches = distillation.TeacherBatches(policy, DistillationConfig(batch=32, steps=4 // parts))
             if state is not None:
                 batches.load_state_dict(state)
             batches.update(x, behavior, weight, 0.7, generator)
@@ -142,7 +130,7 @@ def test_teacher_batches_go_on_from_their_state(lesson):
 
 
 def test_errors_by_leaf():
-    errors = LeafErrors(("Root", "Evade", "Follow", "Evade"), torch.device("cpu"))
+    errors = distillation.LeafErrors(("Root", "Evade", "Follow", "Evade"), torch.device("cpu"))
     errors.add(torch.tensor([1.0, 2.0, 3.0, 6.0]), torch.tensor([1, 2, 3, -1], dtype=torch.int32))
     errors.add(torch.tensor([4.0, math.nan]), torch.tensor([2, 2], dtype=torch.int32))
     found = errors.take()

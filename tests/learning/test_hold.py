@@ -1,5 +1,4 @@
-"""A decision held for several control steps is one transition: rewards add up, endings are kept, the next
-episode is the tree's."""
+"""A decision held for several steps is one transition: rewards add up, endings are kept."""
 
 from types import SimpleNamespace
 
@@ -17,8 +16,7 @@ N = 3
 
 
 class Scripted:
-    """An env that pays 1, 2, 3, ... and ends row 1 in its second step; the teacher says the number of the
-    step."""
+    """An env that pays 1, 2, 3, ... and ends row 1 in its second step; the teacher says the step's number."""
 
     def __init__(self):
         self.steps, self.actions = 0, []

@@ -1,5 +1,4 @@
-"""Learning what obstacles will do: what is learnt from, likelihood and scores, resuming; and the forecast in
-the whole simulator."""
+"""Learning what obstacles will do: samples, likelihood, scores, resuming; and the whole simulator."""
 
 import copy
 import math
@@ -27,12 +26,9 @@ from uuvtai.sim.forecast_weights import packed_weights, read_weights
 from uuvtai.surrogate.world import scenario_rows
 
 SMALL = {
-    "train.num_envs": 8,
-    "train.iterations": 4,
-    "forecast_training.memory": 1024,
-    "forecast_training.minibatches": 20,
-    "forecast_training.minibatch": 64,
-}
+    "train.num_envs": 8, "train.iterations": 4, "forecast_training.memory": 1024,
+    "forecast_training.minibatches": 20, "forecast_training.minibatch": 64,
+}  # fmt: skip
 
 
 def made_up(seed, n=400):
@@ -47,8 +43,7 @@ def made_up(seed, n=400):
         * torch.where(torch.rand(n, generator=generator) < 0.5, 1.0, -1.0)[:, None]
     )
     truth = torch.stack([way, torch.zeros_like(way)], -1)
-    frame = torch.cat([torch.zeros(n, 4), columns[:, :1]], -1)
-    return TrackMoments(columns, frame, truth)
+    return TrackMoments(columns, torch.cat([torch.zeros(n, 4), columns[:, :1]], -1), truth)
 
 
 @pytest.fixture

@@ -1,5 +1,4 @@
-"""Running statistics: merging is exact, rows that are not finite leave no trace, and scaling can be
-undone."""
+"""Running statistics: merging is exact, rows that are not finite leave no trace, scaling is undone."""
 
 import math
 
@@ -74,9 +73,8 @@ def test_scaling_and_its_inverse(samples):
     norm.update(samples)
     y = norm(samples)
     assert y.dtype == torch.float32
-    assert torch.allclose(
-        y.double().mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-3
-    )  # float32 holds 1000 +- 50 to 6e-5
+    # float32 holds 1000 +- 50 to 6e-5
+    assert torch.allclose(y.double().mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-3)
     assert torch.allclose(y.std(0, correction=0), torch.ones(3), atol=1e-3)
     assert torch.allclose(norm.inverse(y), samples, rtol=FLOAT32, atol=FLOAT32)
     out = torch.empty_like(samples)

@@ -1,5 +1,4 @@
-"""Policy: densities against torch.distributions, the teacher at birth, values that statistics do not change,
-and no hidden state."""
+"""Policy: densities against torch.distributions, the teacher at birth, values, no hidden state."""
 
 import math
 
@@ -45,9 +44,8 @@ def test_a_step_is_a_draw_from_the_distribution(x):
     assert not any(tensor.requires_grad for tensor in step)
     many = policy.act(x[:1].expand(40_000, -1), torch.Generator().manual_seed(3))
     spread = many.action - many.mean
-    assert torch.allclose(
-        spread.std(0), torch.full((4,), 0.6), rtol=0.02
-    )  # 0.35 % is one standard error of 40,000
+    # 0.35 % is one standard error of 40,000
+    assert torch.allclose(spread.std(0), torch.full((4,), 0.6), rtol=0.02)
     assert float(spread.mean(0).abs().max()) < 0.015  # five standard errors
     again = policy.act(x, torch.Generator().manual_seed(9))
     assert all(torch.equal(a, b) for a, b in zip(step, again, strict=True))
@@ -98,9 +96,8 @@ def test_learning_returns_changes_the_statistics_but_no_value(x):
     before = policy.value(x)
     for returns in (torch.linspace(-50.0, 300.0, 40)[:, None], torch.linspace(900.0, 1000.0, 400)[:, None]):
         policy.learn_returns(moments_of(returns))
-        assert torch.allclose(
-            policy.value(x), before, rtol=1e-4, atol=1e-3
-        )  # in parts of returns of 1000 in float32
+        # in parts of returns of 1000 in float32
+        assert torch.allclose(policy.value(x), before, rtol=1e-4, atol=1e-3)
     assert float(policy.value_norm.mean) > 800
     normalised = policy.critic(policy.observation_norm(x)).squeeze(-1)
     assert torch.allclose(policy.value_norm(before), normalised, atol=1e-4)

@@ -1,5 +1,4 @@
-"""A policy driving: the same decisions in any batch, memory per row, and checkpoints that do not fit are
-refused."""
+"""A policy driving: equal in any batch, memory per row, and checkpoints that do not fit are refused."""
 
 import itertools
 import json
@@ -16,6 +15,7 @@ from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.networks import ActorCritic
 from uuvtai.learning.policy_agent import CHUNK, PolicyAgent, load_agent
 from uuvtai.learning.world_model import WorldModel
+from uuvtai.logs.reader import read_head, read_messages
 from uuvtai.logs.writer import EpisodeRecorder
 
 N_OBS = 60
@@ -25,10 +25,8 @@ def networks(n_obs=N_OBS, seed=0, **config):
     """A policy and a world model that have seen a batch and act decidedly."""
     learning = load_training("smoke", [(f"policy.{key}", value) for key, value in config.items()])
     rng = torch.Generator().manual_seed(seed)
-    policy, model = (
-        ActorCritic(n_obs + 2, learning.policy, None, rng),
-        WorldModel(n_obs, learning.world_model, rng),
-    )
+    policy = ActorCritic(n_obs + 2, learning.policy, None, rng)
+    model = WorldModel(n_obs, learning.world_model, rng)
     policy.observation_norm.update(3.0 * torch.randn(500, n_obs + 2, generator=rng))
     model.observation_norm.update(3.0 * torch.randn(500, n_obs, generator=rng))
     model.change_norm.update(torch.randn(500, 24, generator=rng))
@@ -44,8 +42,7 @@ def state_of(policy, model, n_obs):
 
 def flown(policy, model, rows, steps=4):
     """Decisions of a pilot over some steps for the given rows of one fixed stream of observations."""
-    rng = torch.Generator().manual_seed(1)
-    stream = 3.0 * torch.randn(steps, 300, N_OBS, generator=rng)
+    stream = 3.0 * torch.randn(steps, 300, N_OBS, generator=torch.Generator().manual_seed(1))
     pilot, out = PolicyAgent(policy, model, len(rows)), []
     for obs in stream:
         decision = pilot.decide(obs[rows])
@@ -63,8 +60,7 @@ def test_a_row_does_not_depend_on_its_batch_to_the_last_bit(threads):
     torch.set_num_threads(threads)
     try:
         for rows in ([0], [7, 3], list(range(CHUNK, CHUNK + 50)), list(range(299, 0, -1))):
-            found = flown(policy, model, rows)
-            assert torch.equal(found, expected[:, rows])
+            assert torch.equal(flown(policy, model, rows), expected[:, rows])
     finally:
         torch.set_num_threads(before)
     assert expected[:, :, :4].std() > 0.1, "the actions do depend on the observations"
@@ -87,8 +83,7 @@ def test_memory_is_reset_by_row_and_deciding_again_changes_nothing():
 
 
 def test_what_it_thinks_of_the_world_model_is_about_its_own_last_action():
-    """Residual and uncertainty are those of the prediction from the last observation and the action chosen
-    there."""
+    """By the prediction from the last observation and the action chosen there."""
     policy, model = networks()
     with torch.no_grad():
         model.decoder[-1].weight.mul_(100.0)  # or an untrained prediction would hardly depend on the action
@@ -116,9 +111,8 @@ def test_actions_are_means_within_the_limits_and_nan_does_not_spread():
     assert torch.isfinite(found).all()
     assert (found.abs() <= 1).all()
     x = torch.cat([obs[:1], torch.zeros(1, 2)], 1)
-    assert torch.allclose(
-        found[0], policy.distribution(x)[0][0].clamp(-1, 1), atol=1e-5
-    )  # other shapes sum in another order
+    # other shapes sum in another order
+    assert torch.allclose(found[0], policy.distribution(x)[0][0].clamp(-1, 1), atol=1e-5)
 
 
 # --------------------------------------------------------------------------------------------- in a simulator
@@ -165,8 +159,6 @@ def test_episodes_do_not_depend_on_order_or_neighbours(small, trained, monkeypat
 
 
 def test_the_log_tells_what_the_policy_thought(small, trained, tmp_path):
-    from uuvtai.logs.reader import read_head, read_messages
-
     agent, note = agent_of(trained[0], small)
     jobs = jobs_of([21], 1)
     recorder = EpisodeRecorder(tmp_path, "pool", agent.name, jobs, policy=note)

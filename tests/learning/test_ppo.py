@@ -132,14 +132,9 @@ def fill(rollout, policy, seed=0):
         step = policy.act(x, generator)
         reward = -step.action.square().sum(-1) + x[:, 0]
         rollout.add(
-            x,
-            step,
-            reward,
-            terminated,
-            ended,
-            final_value(policy, x + 1, terminated, ended),
+            x, step, reward, terminated, ended, final_value(policy, x + 1, terminated, ended),
             torch.zeros_like(step.action),
-        )
+        )  # fmt: skip
     rollout.close(policy.value(torch.randn(rollout.num_envs, N_IN, generator=generator)).detach())
     return rollout
 
@@ -158,25 +153,15 @@ def test_next_values_are_those_of_the_true_next_observation():
         final = final_value(policy, x[3], terminated, ended)
         assert final.tolist() == pytest.approx([0.0, policy.value(x[3])[1].item(), 0.0], abs=FLOAT32)
         rollout.add(
-            x[t],
-            policy.act(x[t], generator),
-            torch.zeros(3),
-            terminated,
-            ended,
-            final,
-            torch.zeros(3, 4),
+            x[t], policy.act(x[t], generator), torch.zeros(3), terminated, ended, final, torch.zeros(3, 4),
             weight=torch.ones(3),
-        )
+        )  # fmt: skip
     rollout.close(policy.value(x[2]).detach())
     with torch.no_grad():
         expected = [
-            policy.value(x[1])[0],
-            policy.value(x[3])[1],
+            policy.value(x[1])[0], policy.value(x[3])[1], 0.0, policy.value(x[2])[0], policy.value(x[3])[1],
             0.0,
-            policy.value(x[2])[0],
-            policy.value(x[3])[1],
-            0.0,
-        ]
+        ]  # fmt: skip
     assert rollout.flat("next_value").tolist() == pytest.approx([float(v) for v in expected], abs=FLOAT32)
     assert rollout.leaf.unique().tolist() == [-1]
 
@@ -219,8 +204,7 @@ def test_minibatches_cover_every_sample_once(minibatches, shuffle):
 
 
 def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):
-    """One epoch of one minibatch, in passes of 7 rows, against the textbook formulas on the whole of it and
-    torch's own Adam."""
+    """One minibatch in passes of 7 rows against the textbook formulas on the whole, and torch's Adam."""
     monkeypatch.setattr(ppo_module, "CACHE_ROWS", 7)
     ppo = make_ppo(epochs=1, minibatches=1, entropy_weight=0.01, normalise_values=False)
     reference = make_policy()
@@ -253,9 +237,8 @@ def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):
     assert metrics["train/policy_loss"] == pytest.approx(policy_loss.item(), abs=FLOAT32)
     assert metrics["train/value_loss"] == pytest.approx(value_error.item(), rel=FLOAT32)
     assert metrics["train/distill_loss"] == pytest.approx(distill.item(), rel=FLOAT32)
-    assert metrics["train/approx_kl"] == pytest.approx(
-        0.0, abs=FLOAT32
-    )  # the ratio of the first minibatch is one
+    # the ratio of the first minibatch is one
+    assert metrics["train/approx_kl"] == pytest.approx(0.0, abs=FLOAT32)
     assert metrics["train/clip_fraction"] == 0.0
 
 
@@ -277,8 +260,7 @@ def test_metrics_have_their_names_and_statistics_follow_the_rollout():
 
 
 def test_values_keep_their_meaning_while_their_statistics_move():
-    """Pop-Art: an update that hardly steps leaves every value where it was, however far off the returns
-    are."""
+    """Pop-Art: an update that hardly steps leaves every value, however far off the returns are."""
     ppo = make_ppo(learning_rate=1e-12, epochs=1, minibatches=1, normalise_observations=False)
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
     for reward in (0.0, 50.0):
@@ -395,8 +377,7 @@ def test_a_rollout_of_nothing_but_nan_leaves_a_finite_policy():
     ppo = make_ppo()
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
     rollout.reward.fill_(math.nan)
-    metrics = ppo.update(rollout)
-    assert metrics["train/invalid_samples"] == T * N
+    assert ppo.update(rollout)["train/invalid_samples"] == T * N
     assert torch.isfinite(weights(ppo.policy)).all()
 
 
@@ -409,8 +390,7 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
 
     ppo.policy.log_std.register_hook(poisoned)
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
-    metrics = ppo.update(rollout)
-    assert metrics["train/skipped_updates"] == 2
+    assert ppo.update(rollout)["train/skipped_updates"] == 2
     assert (ppo.updates, ppo.skipped) == (2, 2)
     assert torch.isfinite(weights(ppo.policy)).all()
     assert all(
@@ -422,8 +402,7 @@ def test_a_loss_that_is_not_finite_changes_nothing():
     ppo = make_ppo(normalise_values=False)
     before = weights(ppo.policy)
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
-    metrics = ppo.update(rollout, distillation_weight=math.nan)
-    assert metrics["train/skipped_updates"] == 8
+    assert ppo.update(rollout, distillation_weight=math.nan)["train/skipped_updates"] == 8
     assert torch.equal(weights(ppo.policy), before)
 
 
@@ -440,8 +419,7 @@ def test_what_cannot_be_learned_from_is_refused():
 
 
 class PointTask:
-    """A point in the plane of four axes: the action moves it, the reward is minus its distance from the
-    origin, episodes end by time."""
+    """A point in the plane: the action moves it, the reward is minus its distance, time ends episodes."""
 
     n, length, speed = 64, 16, 0.25
 
@@ -474,14 +452,9 @@ def play(policy, ppo, task, generator, rollouts):
             step = policy.act(x, generator)
             final, reward, ended = task.step(step.action)
             rollout.add(
-                x,
-                step,
-                reward,
-                never,
-                ended,
-                final_value(policy, final, never, ended),
+                x, step, reward, never, ended, final_value(policy, final, never, ended),
                 torch.zeros(task.n, 4),
-            )
+            )  # fmt: skip
         rollout.close(policy.value(task.place).detach())
         means.append(float(rollout.reward.mean()))
         if ppo is not None:

@@ -40,8 +40,7 @@ def test_lines_are_readable_while_the_run_goes_on(tmp_path):
 
 
 def test_events_are_read_in_the_order_of_the_resumes(tmp_path, monkeypatch):
-    """A name ends in how many files its process had opened before, and names are sorted as text: 10 before
-    9."""
+    """A name ends in a count, and names are sorted as text: 10 before 9."""
     monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(9))
     record(tmp_path, 0, (1, 2))
     record(tmp_path, 1, (2, 3))
@@ -59,12 +58,8 @@ def test_a_resumed_run_forgets_what_came_after_its_checkpoint(tmp_path, cut_off)
     assert [row["rollout/ep_rew_mean"] for row in read_metrics(tmp_path)] == [1.0, 2.0, 30.0, 40.0, 50.0]
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [(e.step, e.value) for e in events.Scalars("rollout/ep_rew_mean")] == [
-        (1, 1.0),
-        (2, 2.0),
-        (3, 30.0),
-        (4, 40.0),
-        (5, 50.0),
-    ]
+        (1, 1.0), (2, 2.0), (3, 30.0), (4, 40.0), (5, 50.0),
+    ]  # fmt: skip
 
 
 def test_a_last_line_that_was_cut_off_is_lost_alone(tmp_path):

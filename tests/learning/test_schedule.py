@@ -28,8 +28,7 @@ def test_one_point_is_a_constant():
     ("iteration", "value"), [(0, 1.0), (799, 1.0), (800, 0.2), (1200, 0.1), (1600, 0.0), (1700, 0.0)]
 )
 def test_the_paper_s_schedule(iteration, value):
-    """Equation of lambda_t: 1 until 800, then from 0.2 down to 0 at 1600 of 1200 iterations, which a run
-    never reaches."""
+    """lambda_t: 1 until 800, then 0.2 down to 0 at 1600, which a run of 1200 iterations never reaches."""
     assert piecewise_linear(DistillationConfig().schedule, iteration / 1200) == pytest.approx(
         value, abs=1e-12
     )

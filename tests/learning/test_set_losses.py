@@ -1,5 +1,4 @@
-"""Losses of a policy over a set of obstacles, by pieces on several threads: gradients of the whole minibatch,
-whatever the number of threads."""
+"""Losses of a policy over a set, by pieces on threads: gradients of the whole, for any number of threads."""
 
 import pytest
 import torch

@@ -1,5 +1,4 @@
-"""The trainer: learns, goes on bit for bit from its state, and neither spreads nor hides what is not
-finite."""
+"""The trainer learns, goes on bit for bit, and neither spreads nor hides what is not finite."""
 
 import math
 from pathlib import Path
@@ -144,8 +143,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
     trainer.iterate()
     trainer.policy.actor[0].weight.register_hook(lambda gradient: gradient * math.nan)
     before = [p.clone() for p in trainer.policy.actor.parameters()]
-    metrics = trainer.iterate()
-    assert metrics["train/skipped_updates"] == 4
+    assert trainer.iterate()["train/skipped_updates"] == 4
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.policy.actor.parameters(), strict=True))
     assert trainer.guard.bad_in_a_row == 1
 

@@ -1,5 +1,4 @@
-"""A training run: its folder, going on bit for bit, interrupts that save, failures that are marked,
-evaluations that leave no trace."""
+"""A training run: its folder, going on bit for bit, interrupts, failures, evaluations without a trace."""
 
 import json
 import os
@@ -13,7 +12,7 @@ import torch
 
 from tests.point_env import PointEnv
 from tests.small_sim import SmallSim
-from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.config.loader import ConfigError, load_config, load_training
 from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.evaluation.evaluate import evaluate_now
 from uuvtai.learning import checkpoint
@@ -206,8 +205,6 @@ def test_a_run_that_cannot_go_on_says_why_and_loses_nothing(points, tmp_path, mo
 
 
 def test_an_evaluation_is_no_training_run(tmp_path):
-    from uuvtai.config.loader import load_config
-
     RunFolder(tmp_path / "run", load_config("pool"), [0])
     with pytest.raises(ConfigError, match="is no training run"):
         train(TrainRequest(resume=tmp_path / "run"), Quiet())

@@ -1,5 +1,4 @@
-"""World model: losses against a NumPy oracle, each switch, units, learning, resume, NaN, and memory of the
-online features."""
+"""World model: losses against NumPy, switches, units, learning, resume, NaN, memory of online features."""
 
 import copy
 import math
@@ -39,8 +38,7 @@ def generator(seed=0):
 
 
 def transitions(seed=0, steps=STEPS, n_env=N_ENV, unit=1.0):
-    """obs, action, next_obs of a system whose targets follow the action, with noise ten times stronger where
-    column 24 is positive."""
+    """obs, action, next_obs: targets follow the action, with tenfold noise where column 24 is positive."""
     gen = generator(seed)
     obs = torch.randn(steps, n_env, N_OBS, generator=gen)
     action = torch.rand(steps, n_env, 4, generator=gen) * 2 - 1
@@ -94,11 +92,9 @@ def test_losses_are_those_of_the_oracle(switches):
 
 
 def test_prediction_is_the_decoders_in_si_units():
-    """Likelihoods of the same targets in the decoder's unit and in SI units differ by the logarithm of the
-    units."""
+    """Likelihoods in the decoder's unit and in SI differ by the logarithm of the units."""
     for config in (SMALL, SMALL.model_copy(update={"predict_change": False})):
-        plain = config.model_copy(update={"beta_nll": 0.0})
-        model, _, _ = trained(2, plain)
+        model, _, _ = trained(2, config.model_copy(update={"beta_nll": 0.0}))
         obs, action, next_obs = (part[0] for part in transitions(1))
         predicted = model.predict(obs, action)
         nll = (
@@ -113,8 +109,7 @@ def test_prediction_is_the_decoders_in_si_units():
 
 @pytest.mark.parametrize("stopped", [True, False])
 def test_no_gradient_reaches_the_encoder_through_the_target_when_it_is_stopped(stopped):
-    """With dynamics that ignore their input, the target's encoding is the only way from the latent loss to
-    the encoder."""
+    """With dynamics that ignore their input the target is the only way from the loss to the encoder."""
     config = SMALL.model_copy(update={"reconstruction_weight": 0.0, "stop_target_gradient": stopped})
     model = WorldModel(N_OBS, config, generator())
     with torch.no_grad():
@@ -157,8 +152,7 @@ def test_it_learns_the_change_and_where_it_is_uncertain():
 
 
 def test_features_do_not_depend_on_units():
-    """Lengths in eighths of a metre: exact in binary, so that only roundings of roots and logarithms
-    differ."""
+    """Lengths in eighths of a metre are exact in binary: only roots and logarithms differ."""
     metres, _, _ = trained(3)
     eighths, _, _ = trained(3, data=transitions(unit=8.0))
     obs, action, next_obs = (part[0] for part in transitions(5))
@@ -182,8 +176,7 @@ def test_residual_is_the_error_in_deviations_of_the_change():
 
 
 def test_in_the_decoders_unit_the_uncertainty_is_the_papers_to_the_letter():
-    """sigma_t = mean(exp(log variance)) as the decoder says it, whatever the targets' one-step changes
-    are."""
+    """sigma_t = mean(exp(log variance)) as the decoder says it, whatever the one-step changes are."""
     for switches in (
         {},
         {"normalise_targets": False},
@@ -200,8 +193,7 @@ def test_in_the_decoders_unit_the_uncertainty_is_the_papers_to_the_letter():
 
 
 def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the_cap():
-    """A decoder that says "0.2 m give or take" of targets that change by 0.01 m: sigma_t is 0.04 in its own
-    unit, 400 in changes."""
+    """ "0.2 m" of targets that change by 0.01 m: sigma_t is 0.04 in its own unit, 400 in changes."""
     scales = {}
     for unit in ("decoder", "change"):
         config = SMALL.model_copy(
@@ -218,10 +210,8 @@ def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the
             model.features(torch.zeros(5, N_OBS), torch.zeros(5, 4), torch.zeros(5, N_OBS))[:, 1]
         )
         scales[unit] = uncertainty.scale
-    assert (
-        scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02)
-        and scales["change"] == UncertaintyConfig().max_scale
-    )
+    assert scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02)
+    assert scales["change"] == UncertaintyConfig().max_scale
 
 
 # --------------------------------------------------------------------------------------------- random, resume
@@ -336,9 +326,8 @@ def test_true_variance_gives_one_and_nominal_coverage():
 
 def test_coverage_of_four_residuals():
     zero = torch.zeros(4)
-    inside = coverage(
-        zero, zero, torch.tensor([0.5, -0.7, 1.5, 3.0]), torch.tensor([0.5, 0.9])
-    )  # |z| < 0.674, 1.645
+    # |z| < 0.674, 1.645
+    inside = coverage(zero, zero, torch.tensor([0.5, -0.7, 1.5, 3.0]), torch.tensor([0.5, 0.9]))
     assert inside.tolist() == [0.25, 0.75]
     with pytest.raises(ValueError, match="between 0 and 1"):
         coverage(zero, zero, zero, torch.tensor([0.5, 1.0]))

@@ -1,5 +1,4 @@
-"""Episodes served while they run: an independent client gets what the log gets, also one that comes late; the
-clock is kept, and what cannot be served is refused."""
+"""Episodes served while they run: a client gets what the log gets, late ones too; refusals; the clock."""
 
 import contextlib
 import importlib.util
@@ -14,6 +13,7 @@ from typing import NamedTuple
 
 import pytest
 from foxglove.websocket import ServerListener
+from mcap.reader import make_reader
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
@@ -126,8 +126,6 @@ def test_a_viewer_gets_what_the_log_gets(small, server, tmp_path):
 
 def logged_messages(path):
     """(topic, time_ns, data) of a log's messages, as they lie in the file."""
-    from mcap.reader import make_reader
-
     with path.open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
             yield SimpleNamespace(topic=channel.topic, time_ns=message.log_time, data=message.data)
@@ -173,13 +171,20 @@ def test_other_protocols_are_turned_away(server):
 @pytest.mark.parametrize(
     ("origin", "is_let_in"),
     [
-        (None, True), ("http://localhost:5173", True), ("http://127.0.0.1", True), ("file://", True),
-        ("https://app.foxglove.dev", True), ("https://evil.example", False), ("null", False),
-        ("http://localhost.evil.example", False), ("http://127.0.0.1.evil.example:8765", False),
-        ("http://[", False), ("https://app.foxglove.dev.evil.example", False),
+        (None, True),
+        ("http://localhost:5173", True),
+        ("http://127.0.0.1", True),
+        ("file://", True),
+        ("https://app.foxglove.dev", True),
+        ("https://evil.example", False),
+        ("null", False),
+        ("http://localhost.evil.example", False),
+        ("http://127.0.0.1.evil.example:8765", False),
+        ("http://[", False),
+        ("https://app.foxglove.dev.evil.example", False),
         ("http://localhost@evil.example", False),
     ],
-)  # fmt: skip
+)
 def test_a_web_page_of_elsewhere_is_turned_away(origin, is_let_in):
     with ViewerServer(port=0, origins=["https://app.foxglove.dev"]) as server:
         if is_let_in:

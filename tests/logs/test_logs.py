@@ -1,5 +1,4 @@
-"""Episode logs: every message against its schema with independent readers, what survives a kill, hostile
-files, export."""
+"""Episode logs: messages against schemas with independent readers, kills, hostile files, export."""
 
 import base64
 import dataclasses
@@ -50,35 +49,18 @@ CLOSED_FORM_M = 2e-6
 """float32 rounding of positions up to 20 m"""
 
 SCHEMAS = {
-    "/tf": "foxglove.FrameTransforms",
-    "/pose": "foxglove.PoseInFrame",
-    "/pose_estimate": "foxglove.PoseInFrame",
-    "/pose_covariance": "uuv.PoseCovariance",
-    "/sensors/imu": "uuv.ImuReading",
-    "/sensors/dvl": "uuv.DvlReading",
-    "/sensors/pressure": "uuv.PressureReading",
-    "/sonar/scan": "foxglove.LaserScan",
-    "/sonar/doppler": "uuv.SonarDoppler",
-    "/sonar/image": "foxglove.CompressedImage",
-    "/camera/line": "uuv.DepthLine",
-    "/camera/depth": "foxglove.CompressedImage",
-    "/camera/exact": "uuv.DepthExact",
-    "/map/static": "foxglove.Grid",
-    "/map/dynamic": "foxglove.Grid",
-    "/map/clearance": "foxglove.Grid",
-    "/map/risk": "foxglove.Grid",
-    "/plan": "foxglove.SceneUpdate",
-    "/plan/info": "uuv.Plan",
-    "/goal": "foxglove.SceneUpdate",
-    "/obstacles": "foxglove.SceneUpdate",
-    "/obstacles/truth": "uuv.Obstacles",
-    "/state": "uuv.State",
-    "/action": "uuv.Action",
-    "/policy": "uuv.Policy",
-    "/safety": "uuv.Safety",
-    "/tree": "uuv.Tree",
-    "/log": "foxglove.Log",
-}
+    "/tf": "foxglove.FrameTransforms", "/pose": "foxglove.PoseInFrame",
+    "/pose_estimate": "foxglove.PoseInFrame", "/pose_covariance": "uuv.PoseCovariance",
+    "/sensors/imu": "uuv.ImuReading", "/sensors/dvl": "uuv.DvlReading",
+    "/sensors/pressure": "uuv.PressureReading", "/sonar/scan": "foxglove.LaserScan",
+    "/sonar/doppler": "uuv.SonarDoppler", "/sonar/image": "foxglove.CompressedImage",
+    "/camera/line": "uuv.DepthLine", "/camera/depth": "foxglove.CompressedImage",
+    "/camera/exact": "uuv.DepthExact", "/map/static": "foxglove.Grid", "/map/dynamic": "foxglove.Grid",
+    "/map/clearance": "foxglove.Grid", "/map/risk": "foxglove.Grid", "/plan": "foxglove.SceneUpdate",
+    "/plan/info": "uuv.Plan", "/goal": "foxglove.SceneUpdate", "/obstacles": "foxglove.SceneUpdate",
+    "/obstacles/truth": "uuv.Obstacles", "/state": "uuv.State", "/action": "uuv.Action",
+    "/policy": "uuv.Policy", "/safety": "uuv.Safety", "/tree": "uuv.Tree", "/log": "foxglove.Log",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +86,7 @@ def strict_json(text):
 
 
 def messages(path):
-    """[(topic, schema, time_ns, publish_ns, data)] as the official Python reader sees them, checksums
-    verified."""
+    """[(topic, schema, time_ns, publish_ns, data)] by the official Python reader, checksums verified."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         return [
@@ -182,18 +163,9 @@ def test_how_sure_the_pose_is_stands_beside_how_far_off_it_is(log_path, snaps):
 def test_rates(log_path):
     counts = {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
     every_step = [
-        "/tf",
-        "/pose",
-        "/pose_estimate",
-        "/pose_covariance",
-        "/sonar/scan",
-        "/sonar/doppler",
-        "/state",
-        "/action",
-        "/policy",
-        "/safety",
-        "/tree",
-    ]
+        "/tf", "/pose", "/pose_estimate", "/pose_covariance", "/sonar/scan", "/sonar/doppler", "/state",
+        "/action", "/policy", "/safety", "/tree",
+    ]  # fmt: skip
     assert {counts[topic] for topic in every_step} == {N_STEP + 1}
     assert {counts[topic] for topic in ("/obstacles", "/obstacles/truth", "/goal", "/camera/line")} == {
         N_STEP // 5 + 1
@@ -227,14 +199,8 @@ def test_metadata_and_attachments_come_first_and_the_result_last(log_path):
     head = read_head(log_path)
     run, result = head.metadata["uuv.run"], head.metadata["uuv.result"]
     assert {
-        "version",
-        "git_sha",
-        "seed",
-        "episode",
-        "config_sha256",
-        "checkpoint_sha256",
-        "frames",
-    } <= run.keys()
+        "version", "git_sha", "seed", "episode", "config_sha256", "checkpoint_sha256", "frames",
+    } <= run.keys()  # fmt: skip
     assert run["config_sha256"] == hashlib.sha256(head.attachments["config.yaml"]).hexdigest()
     assert {"outcome", "return", "time_s", "min_clearance_m", "replans"} <= result.keys()
     assert (result["outcome"], result["replans"], float(result["return"])) == ("success", "3", 12.5)
@@ -300,12 +266,8 @@ def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, sna
         )
         assert (grid["pose"]["position"]["x"], grid["pose"]["position"]["y"]) == episode.ORIGIN
         assert [(f["name"], f["offset"], f["type"]) for f in grid["fields"]] == [
-            ("red", 0, 1),
-            ("green", 1, 1),
-            ("blue", 2, 1),
-            ("alpha", 3, 1),
-            ("value", 4, 7),
-        ]
+            ("red", 0, 1), ("green", 1, 1), ("blue", 2, 1), ("alpha", 3, 1), ("value", 4, 7),
+        ]  # fmt: skip
         assert grid["row_stride"] == grid["column_count"] * grid["cell_stride"]
     red = np.frombuffer(base64.b64decode(by_topic(log_path, "/map/dynamic")[-1]["data"]), np.uint8).reshape(
         *episode.SHAPE, 8
@@ -369,9 +331,8 @@ def test_frames_chain_from_the_world_to_a_level_sonar_and_an_optical_camera(log_
     level = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
     np.testing.assert_allclose(rotation["base"] @ rotation["sonar"], level, atol=1e-6)
     np.testing.assert_allclose(rotation["camera"] @ [0, 0, 1], [1, 0, 0], atol=1e-12)  # depth along body x
-    np.testing.assert_allclose(
-        rotation["camera"] @ [1, 0, 0], [0, -1, 0], atol=1e-12
-    )  # image right = body right
+    # image right = body right
+    np.testing.assert_allclose(rotation["camera"] @ [1, 0, 0], [0, -1, 0], atol=1e-12)
 
 
 def _matrix(q):
@@ -536,8 +497,7 @@ def test_the_map_lies_where_the_kernels_put_it(world):
 
 
 def test_schemas_keep_to_what_the_viewers_parse(log_path):
-    """Lichtblick's parser: one plain type per property, or a choice of numbers; lists of numbers, strings,
-    booleans or objects."""
+    """Lichtblick's: one plain type per property or a choice of numbers; flat lists."""
 
     def check(schema, where):
         assert schema["type"] == "object", where
@@ -570,10 +530,8 @@ def test_the_viewers_own_reader_decodes_everything(log_path):
     found = read_by_viewer(log_path)
     assert found["unlikeOfficial"] == []
     assert found["counts"] == {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
-    assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == [
-        "config.yaml",
-        "scenario.json",
-    ]
+    assert found["metadata"] == ["uuv.run", "uuv.result"]
+    assert found["attachments"] == ["config.yaml", "scenario.json"]
 
 
 def test_the_layout_shows_only_topics_that_exist():
@@ -659,9 +617,8 @@ def test_sigkill_loses_at_most_one_percent(tmp_path, maps, kill_at):
     assert saved.path == tmp_path / "a.repaired.mcap"
     assert part.read_bytes() == before
     assert saved.messages >= 0.99 * sent
-    assert (
-        len(messages(saved.path)) == saved.messages
-    )  # the official reader agrees, with indexes and checksums
+    # the official reader agrees, with indexes and checksums
+    assert len(messages(saved.path)) == saved.messages
     head = read_head(saved.path)
     assert next(iter(head.metadata)) == "uuv.run" and "uuv.result" not in head.metadata
     assert head.metadata["uuv.repair"]["messages"] == str(saved.messages)
@@ -834,16 +791,12 @@ def test_a_folder_that_cannot_be_made(tmp_path):
 # ---------------------------------------------------------------------------------------------- other writers
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        {"use_chunking": False},
-        {"compression": CompressionType.LZ4},
-        {"compression": CompressionType.NONE, "enable_data_crcs": True},
-        {"index_types": IndexType.NONE, "repeat_channels": False, "use_statistics": False},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("words", [
+    {"use_chunking": False},
+    {"compression": CompressionType.LZ4},
+    {"compression": CompressionType.NONE, "enable_data_crcs": True},
+    {"index_types": IndexType.NONE, "repeat_channels": False, "use_statistics": False},
+], ids=str)  # fmt: skip
 def test_records_of_other_writers_are_read(tmp_path, words):
     """Small messages, and one of 24.9 MB, as a raw image of 3840 x 2160 pixels has."""
     path = tmp_path / "a.mcap"

@@ -15,7 +15,7 @@ from uuvtai.logs import video as film
 from uuvtai.logs.drawing import PICTURE_TOPICS, load_recording
 from uuvtai.logs.picture import paint_picture, picture
 from uuvtai.logs.topics.perception import Layer
-from uuvtai.logs.video import FrameArtist, video
+from uuvtai.logs.video import SMALL, FrameArtist, video
 
 N_STEP = 60
 DURATION_S = N_STEP * episode.DT
@@ -59,8 +59,7 @@ def test_a_png_is_a_png(folder, logs):
     ],
 )
 def test_a_video_is_what_its_name_says(folder, logs, capfd, name, container, codec):
-    """Container, codec, size, rate and length by FFmpeg; what a frame shows by its pixels; nothing on
-    stderr."""
+    """Container, codec, size, rate and length by FFmpeg; pixels; nothing on stderr."""
     fps, speed = 10.0, 2.0
     out = video(logs[0], folder / name, fps=fps, speed=speed, width_px=640)
     assert capfd.readouterr().err == ""
@@ -88,8 +87,7 @@ def test_an_mp4_can_be_played_while_it_loads(folder, logs):
 
 
 def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
-    """Pillow counts: 15 frames a second are no whole hundredths, and the rare colours must not melt into the
-    frequent ones."""
+    """15 frames a second are no whole hundredths; rare colours must not melt into frequent ones."""
     with Image.open(video(logs[0], folder / "t.gif", fps=15.0, speed=4.0)) as image:
         durations, seen = [], set()
         for i in range(image.n_frames):
@@ -143,8 +141,6 @@ def test_a_cut_file_is_seen(tmp_path, logs):
 
 def test_videos_of_a_run_folder_are_small(folder, logs):
     """A second of an episode takes less than 60 kB, so a page holds three minutes of episodes."""
-    from uuvtai.logs.video import SMALL
-
     assert video(logs[0], folder / "small.webm", **SMALL).stat().st_size < 60_000 * DURATION_S + 60_000
 
 
@@ -176,11 +172,9 @@ def test_a_method_has_one_colour_wherever_it_is_shown():
 
 
 def test_other_methods_take_what_is_free_in_their_order():
-    names = ["bt", "a", "b", "c"]
-    found = agent_colours(names)
-    assert len(set(found.values())) == 4 and agent_colours(["bt", "a"]) == {
-        name: found[name] for name in ("bt", "a")
-    }
+    found = agent_colours(["bt", "a", "b", "c"])
+    assert len(set(found.values())) == 4
+    assert agent_colours(["bt", "a"]) == {name: found[name] for name in ("bt", "a")}
     many = agent_colours([f"m{i}" for i in range(20)])
     assert set(many.values()) <= set(PALETTE) and len(set(many.values())) == 7
 

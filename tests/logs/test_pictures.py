@@ -69,8 +69,7 @@ def test_picture_has_what_it_should_where_it_should(folder, bt, straight):
     assert has(around(image, place(episode.GOAL), 5), ink.GOAL)
     for name, log in (("bt", bt), ("straight", straight)):
         path = load_recording(log, PICTURE_TOPICS).positions
-        middle = path[len(path) // 4]
-        assert has(around(image, place(middle), 2), INKS[name])
+        assert has(around(image, place(path[len(path) // 4]), 2), INKS[name])
     assert has(around(image, place((1.0, 5.0)), 1), ink.WATER, 1)
     assert has(around(image, place((0.0, 3.0)), 2), ink.INK)
     assert (image[5, 5] == 255).all()

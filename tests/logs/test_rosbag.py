@@ -185,31 +185,19 @@ def odometry(covariance=0.0, turned=1):
 def imu(turned, unknown):
     covariance = np.full(9, -1.0 if unknown else 0.0)
     return ROS(
-        "sensor_msgs/msg/Imu",
-        header=ROS.header(10**18, "base_link"),
-        orientation=ROS.quaternion(turned, 0, 0, 0),
-        orientation_covariance=covariance,
-        angular_velocity=ROS.vector(0, 0, 0.1),
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=ROS.vector(0, 0, 9.8),
-        linear_acceleration_covariance=np.zeros(9),
-    )
+        "sensor_msgs/msg/Imu", header=ROS.header(10**18, "base_link"),
+        orientation=ROS.quaternion(turned, 0, 0, 0), orientation_covariance=covariance,
+        angular_velocity=ROS.vector(0, 0, 0.1), angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=ROS.vector(0, 0, 9.8), linear_acceleration_covariance=np.zeros(9),
+    )  # fmt: skip
 
 
 def scan(ranges, shine=(), least=0.75, most=20.0):
     return ROS(
-        "sensor_msgs/msg/LaserScan",
-        header=ROS.header(10**18, "sonar_link"),
-        angle_min=0.0,
-        angle_max=6.28,
-        angle_increment=0.1,
-        time_increment=0.0,
-        scan_time=0.0,
-        range_min=least,
-        range_max=most,
-        ranges=np.array(ranges, np.float32),
-        intensities=np.array(shine, np.float32),
-    )
+        "sensor_msgs/msg/LaserScan", header=ROS.header(10**18, "sonar_link"), angle_min=0.0, angle_max=6.28,
+        angle_increment=0.1, time_increment=0.0, scan_time=0.0, range_min=least, range_max=most,
+        ranges=np.array(ranges, np.float32), intensities=np.array(shine, np.float32),
+    )  # fmt: skip
 
 
 def grid(width, height, value=-1):
@@ -220,13 +208,9 @@ def grid(width, height, value=-1):
     )
     head = ROS.header(10**18, "map")
     info = ROS(
-        "nav_msgs/msg/MapMetaData",
-        map_load_time=head.stamp,
-        resolution=0.1,
-        width=width,
-        height=height,
+        "nav_msgs/msg/MapMetaData", map_load_time=head.stamp, resolution=0.1, width=width, height=height,
         origin=pose,
-    )
+    )  # fmt: skip
     cells = np.full(width * height, value, np.int8)
     return ROS("nav_msgs/msg/OccupancyGrid", header=head, info=info, data=cells)
 
@@ -299,27 +283,15 @@ T0 = 10**18
 CLOCKS = {
     # (topic, logged at, stamped) in the order of the file -> times in the log, stamps, what is said
     "in order": ([("/a", T0, T0), ("/a", T0 + 3 * S, T0 + S)], [0, 3], [0, 1], {}),
-    "topic after topic": (
-        [("/a", T0 + 5 * S, T0 + 5 * S), ("/b", T0, T0), ("/b", T0 + 7 * S, T0 + 6 * S)],
-        [5, 0, 7],
-        [5, 0, 6],
-        {},
-    ),
-    "a clock of the device's own": (
-        [("/a", T0, 7 * S), ("/a", T0 + S, 8 * S), ("/b", T0 + 2 * S, T0 + S)],
-        [0, 1, 2],
-        [0, 1, 1],
-        {"/a": 2},
-    ),
+    "topic after topic": ([("/a", T0 + 5 * S, T0 + 5 * S), ("/b", T0, T0), ("/b", T0 + 7 * S, T0 + 6 * S)],
+        [5, 0, 7], [5, 0, 6], {}),
+    "a clock of the device's own": ([("/a", T0, 7 * S), ("/a", T0 + S, 8 * S), ("/b", T0 + 2 * S, T0 + S)],
+        [0, 1, 2], [0, 1, 1], {"/a": 2}),
     "no stamp": ([("/a", T0, 0), ("/a", T0 + S, 0), ("/b", T0 + S, T0)], [0, 1, 1], [0, 1, 0], {"/a": 2}),
     "from the future": ([("/a", T0, T0 + 99 * S), ("/a", T0 + S, T0 + S)], [0, 1], [0, 1], {"/a": 1}),
-    "measured before the first was logged": (
-        [("/a", T0, T0 - S // 9), ("/b", T0 + S, T0)],
-        [0, 1],
-        [0, 0],
-        {},
-    ),
-}
+    "measured before the first was logged": ([("/a", T0, T0 - S // 9), ("/b", T0 + S, T0)], [0, 1], [0, 0],
+        {}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CLOCKS)
@@ -364,17 +336,9 @@ def test_info_of_a_log_of_others(name, tmp_path, capfd):
 
 
 RANGES = {
-    3.0: (3.0, True),
-    0.75: (0.75, True),
-    20.0: (20.0, True),
-    -INF: (0.75, True),
-    INF: (20.0, False),
-    NAN: (0.0, False),
-    0.3: (0.0, False),
-    0.0: (0.0, False),
-    -1.0: (0.0, False),
-    25.0: (0.0, False),
-}
+    3.0: (3.0, True), 0.75: (0.75, True), 20.0: (20.0, True), -INF: (0.75, True), INF: (20.0, False),
+    NAN: (0.0, False), 0.3: (0.0, False), 0.0: (0.0, False), -1.0: (0.0, False), 25.0: (0.0, False),
+}  # fmt: skip
 """of a sonar from 0.75 to 20 m: (range, whether it is a return) in a log"""
 
 

@@ -17,6 +17,7 @@ from tests.command import Quiet
 from uuvtai.common import signals
 from uuvtai.common.errors import UserError
 from uuvtai.config.loader import load_config, load_resolved
+from uuvtai.evaluation import evaluate
 from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place, write_atomic
 
 
@@ -159,8 +160,6 @@ def test_what_is_no_run_folder_is_left_as_it_is(tmp_path):
 
 def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
     """Of 25 pairs of evaluations that began in one folder all 50 succeeded, and their files were mixed."""
-    from uuvtai.evaluation import evaluate
-
     made = []
     monkeypatch.setattr(
         evaluate, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0]
@@ -236,15 +235,11 @@ def test_what_a_kill_left_half_written_is_swept_when_the_run_goes_on(tmp_path):
     assert not left.exists() and all(file.exists() for file in theirs)
 
 
-@pytest.mark.parametrize(
-    ("received", "raised", "left", "status", "code"),
-    [
-        ([], RuntimeError, RuntimeError, "failed", 1),
-        ([], KeyboardInterrupt, KeyboardInterrupt, "interrupted", 130),
-        ([15], RuntimeError, KeyboardInterrupt, "interrupted", 143),
-    ],
-    ids=["error", "interrupt", "interrupt that compiled code made an error of"],
-)
+@pytest.mark.parametrize(("received", "raised", "left", "status", "code"), [
+    ([], RuntimeError, RuntimeError, "failed", 1),
+    ([], KeyboardInterrupt, KeyboardInterrupt, "interrupted", 130),
+    ([15], RuntimeError, KeyboardInterrupt, "interrupted", 143),
+], ids=["error", "interrupt", "interrupt that compiled code made an error of"])  # fmt: skip
 def test_how_a_recorded_run_ends(tmp_path, monkeypatch, received, raised, left, status, code):
     monkeypatch.setattr(signals, "_received", received)
     folder = RunFolder(tmp_path / "run", load_config("pool"), [0])

@@ -16,8 +16,7 @@ def thrust_of_rpm(rpm, cfg):
 def control(
     cfg, gains, dt, command, integral, vel, rate, rpy, wrench_of_thrust, thrust_of_wrench, vel_valid=1
 ):
-    """(thrusts (n,) wanted after the limits, new integral (4,)) of the velocity loop; ``vel_valid`` 2 = heave
-    alone."""
+    """(thrusts (n,) after the limits, new integral (4,)) of the velocity loop; ``vel_valid`` 2 = heave."""
     known = {0: [0, 0, 0, 1], 1: [1, 1, 1, 1], 2: [0, 0, 1, 1]}[vel_valid]
     vel = np.where(known[:3], vel, command[:3])
     mass = np.array([cfg.mass_kg] * 3) + np.array(cfg.added_mass[:3])
@@ -33,10 +32,8 @@ def control(
     force = np.cross(rate, mass * vel) + drag[:3] - net * up
     moment = np.cross(rate, inertia * rate) + np.cross(vel, mass * vel) + np.array([0, 0, drag[3]])
     error = command - np.array([*vel, rate[2]])
-    kp, ki = (
-        np.array([*gains.velocity_gain, gains.yaw_rate_gain]),
-        np.array([*gains.velocity_integral, gains.yaw_rate_integral]),
-    )
+    kp = np.array([*gains.velocity_gain, gains.yaw_rate_gain])
+    ki = np.array([*gains.velocity_integral, gains.yaw_rate_integral])
     limit = np.array([*gains.max_force_n, gains.max_moment_n_m])
     asked = np.array([*force, moment[2]]) + kp * error + integral
     given = np.clip(asked, -limit, limit)

@@ -1,5 +1,4 @@
-"""NumPy float64 oracle of the evasion's roll-outs and costs: one candidate, one obstacle and one sample at a
-time."""
+"""NumPy float64 oracle of the evasion's roll-outs and costs: one candidate, obstacle, sample at a time."""
 
 import numpy as np
 
@@ -101,16 +100,14 @@ def static_depths(pos, vel, command, clearance, origin, cell_m, cfg, burst_s=np.
 
 
 def level_velocity(angle, share, yaw, cfg, vehicle):
-    """(x, y) [m/s] towards a world bearing at a share of the speed that surge and sway, limited one by one,
-    allow there."""
+    """(x, y) [m/s] towards a world bearing at a share of the speed that surge and sway allow there."""
     body = np.array([np.cos(angle - yaw) / vehicle.max_surge_m_s, np.sin(angle - yaw) / vehicle.max_sway_m_s])
     top = min(cfg.evade_m_s, 1 / np.abs(body).max())
     return top * share * np.array([np.cos(angle), np.sin(angle)])
 
 
 def candidates(follow, last, yaw, own_z, cfg, vehicle, tank):
-    """(velocities [n, 3], durations [n]) in their order: level, stop, last, follow, climbing and diving,
-    padding, dashes."""
+    """(velocities [n, 3], durations [n]): level, stop, last, follow, climbs and dives, padding, dashes."""
     ahead, heave = np.arctan2(follow[1], follow[0]), follow[2]
     low, high = depth_band(tank, cfg)
     up, down = min(cfg.heave_m_s, max(high - own_z, 0.0)), max(-cfg.heave_m_s, min(low - own_z, 0.0))
@@ -139,8 +136,7 @@ def candidates(follow, last, yaw, own_z, cfg, vehicle, tank):
 
 
 def cost(pos, vel, command, burst_s, follow, last, forecast, clearance, origin, cell_m, cfg, tank, dt_s):
-    """(cost of one command, how near any of its samples is to a case or cell that float32 may decide
-    otherwise [m])."""
+    """(cost of one command, how near any sample is to a case that float32 may decide otherwise [m])."""
     peak, mean, contact, _, doubt = obstacle_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s)
     static_mean, static_contact, border = static_depths(
         pos, vel, command, clearance, origin, cell_m, cfg, burst_s
@@ -152,8 +148,7 @@ def cost(pos, vel, command, burst_s, follow, last, forecast, clearance, origin, 
 
 
 def mean_velocity(velocities, costs, temperature):
-    """Mean of the velocities weighted by exp(-cost / temperature); what weighs less than exp(-12) is left
-    out."""
+    """Mean of velocities weighted by exp(-cost / temperature); weights below exp(-12) are left out."""
     excess = (costs - costs.min()) / temperature
     weight = np.where(excess < 12, np.exp(-excess), 0.0)
     return weight @ velocities / weight.sum()

@@ -133,8 +133,7 @@ def explained(seen, scan, split_m, n_ray):
 
 
 def corrected(track, offset, along, cut, cut_high, cfg):
-    """Correct a track by what was seen ``offset`` from its place; returns how near the case is to being taken
-    for a turn (or not)."""
+    """Correct a track by what was seen ``offset`` off; how near the case is to being taken for a turn."""
     H = np.zeros((2, 5))
     H[:, :2] = along, (-along[1], along[0])
     loose = track.radius**2 * np.array([cut_high, cut])
@@ -156,21 +155,13 @@ def begun(seen, along, radius, height, step, cfg, tracking):
     place, speed_var = seen + radius * along, tracking.birth_speed_sigma_m_s**2
     P = np.diag([cfg.sigma_m**2, cfg.sigma_m**2, speed_var, speed_var, 0.0])
     return Track(
-        np.append(place, [0.0, 0.0, 0.0]),
-        P,
-        radius,
-        tracking.min_radius_m**2 / 4,
-        0,
-        step,
-        step,
-        PRESENT,
+        np.append(place, [0.0, 0.0, 0.0]), P, radius, tracking.min_radius_m**2 / 4, 0, step, step, PRESENT,
         height,
-    )
+    )  # fmt: skip
 
 
 def follow(tracks, n_track, near, edge, view, scan, step, scan_step, cfg, depth, sonar, tracking, dt_s):
-    """Bring ``tracks`` {slot: Track} up to one image's columns; returns (what was done with each spot,
-    doubt)."""
+    """Bring ``tracks`` {slot: Track} up to one image's columns; (what was done with each spot, doubt)."""
     late, eye, n_col = (step - scan_step) * dt_s, view.eye(depth), len(near)
     spots, doubt = spots_of(near, cfg.split_m)
     done, doubts = [], [doubt]

@@ -1,5 +1,4 @@
-"""A CFAR detector in NumPy, cell by cell, apart from the product's: the nearest cell of each beam that stands
-above the cells around it, above what side lobes bring, and above the least level."""
+"""A CFAR detector in NumPy, cell by cell: the nearest above its surroundings, side lobes, least level."""
 
 import math
 
@@ -9,8 +8,7 @@ from uuvtai.config import multibeam
 
 
 def side_lobe_level(heard, sonar_cfg):
-    """(n_ray, n_bin) what each beam hears by its side lobes: power of other bearings times the pattern's mean
-    over lobes and nulls."""
+    """(n_ray, n_bin) heard by side lobes: power of other bearings times the pattern's mean over them."""
     off = sonar_cfg.beam_step_rad * np.abs(np.arange(len(heard))[:, None] - np.arange(len(heard))[None])
     half = math.sin(math.radians(0.5 * multibeam.BEAM_DEG))
     nulls = multibeam.HALF_POWER * np.abs(np.sin(off)) / half

@@ -1,9 +1,4 @@
-"""Redo the evasions of a log from its messages alone: candidates, the choice among them by their costs, and
-their costs.
-
-Written from scenario.json's ``formulas`` (candidates, evasion_cost, evasion_choice) as an outsider would, in
-float64; it knows the file and nothing of uuvtai.
-"""
+"""Redo the evasions of a log from its messages and scenario.json's ``formulas`` alone, in float64."""
 
 import math
 from types import SimpleNamespace
@@ -83,8 +78,7 @@ def mean_of_the_best(log, own, velocities):
 
 
 def costs(log, own, velocities, lasts):
-    """(n,) costs of velocities from the logged tracks, and from the clearance of the decision's own step
-    where that is logged; elsewhere without what stands still."""
+    """(n,) costs by the logged tracks, and by the clearance of the decision's own step where it is logged."""
     t = log.config["behavior"]
     peak, mean, contact = moving_depths(log, own, velocities, lasts)
     static_mean, static_contact = static_depths(log, own, velocities, lasts)

@@ -1,5 +1,4 @@
-"""NumPy float64 oracle of the clean depth camera: every surface of every obstacle on its own, nearest one
-seen from outside."""
+"""NumPy float64 oracle of the clean depth camera: every surface on its own, nearest seen from outside."""
 
 import numpy as np
 
@@ -19,8 +18,7 @@ def camera_position(scene, env, depth):
 
 
 def z_depths(scene, env, tank, rays, eye):
-    """z-depth [n] along rays from ``eye``, without the limit of range; the eye is outside every obstacle and
-    inside the walls."""
+    """z-depth [n] along rays from ``eye``, without the limit of range; it is outside every obstacle."""
     best = walls(eye, rays, tank)
     for body in np.flatnonzero(scene["kind"][env]):
         kind, size, yaw = scene["kind"][env, body], scene["size"][env, body], scene["yaw"][env, body]

@@ -19,13 +19,8 @@ def cross_matrix(a):
 def euler_rotation(roll, pitch, yaw):
     """R_wb of Z-Y-X angles [rad]."""
     cr, sr, cp, sp, cy, sy = (
-        np.cos(roll),
-        np.sin(roll),
-        np.cos(pitch),
-        np.sin(pitch),
-        np.cos(yaw),
-        np.sin(yaw),
-    )
+        np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw),
+    )  # fmt: skip
     z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
@@ -100,8 +95,7 @@ def nu_dot(body, rotation, nu, wrench, current_w):
 def simulate(
     body, seconds, dt=1e-3, wrench=None, current=(0, 0, 0), rpy_deg=(0, 0, 0), nu=None, sample_s=None
 ):
-    """RK4 trajectory: arrays position (n, 3), rpy_deg (n, 3), nu (n, 6), sampled every ``sample_s`` (default:
-    only start and end)."""
+    """RK4: position (n, 3), rpy_deg (n, 3), nu (n, 6) every ``sample_s`` (default: start and end)."""
     wrench = np.zeros(6) if wrench is None else wrench if callable(wrench) else np.asarray(wrench, float)
     current = np.asarray(current, float)
     x = (

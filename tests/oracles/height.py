@@ -1,8 +1,4 @@
-"""NumPy float64 oracle of the height hypotheses: one obstacle and one hypothesis at a time.
-
-Hypotheses 0 .. 14 are centres in the middle of fifteen equal slices of the water, 15 is an obstacle through
-the full water column.
-"""
+"""NumPy float64 oracle of heights: 0 .. 14 = middles of fifteen slices of the water, 15 = all of it."""
 
 import numpy as np
 
@@ -24,8 +20,7 @@ def prior(cfg):
 
 
 def hit_probability(own_z, away_m, radius_m, half_m, cfg, sonar, tank):
-    """Per hypothesis: 1 where an obstacle of this half height reaches ``edge_m`` into the fan, 0 where as
-    much is missing, linear between."""
+    """Per hypothesis: 1 where it reaches ``edge_m`` into the fan, 0 where as much is missing."""
     fan = np.tan(np.radians(sonar.vertical_half_aperture_deg)) * max(away_m - radius_m / 2, 0)
     overlap = np.array([fan + half_m - abs(z - own_z) for z in heights(tank)])
     return np.append(np.interp(overlap, [-cfg.edge_m, cfg.edge_m], [0, 1]), 1.0)
@@ -38,8 +33,7 @@ def shared(weighed):
 
 
 def after_hit(share, own, place, radius_m, cfg, sonar, tank):
-    """(shares, presence) after the sonar at ``own`` (x, y, z) has hit the body expected at ``place``: a hit
-    tells little near the edge."""
+    """(shares, presence) after ``own`` (x, y, z) hit ``place``: a hit tells little near the edge."""
     half = max(radius_m, cfg.half_height_m) + cfg.edge_m
     likely = hit_probability(own[2], np.hypot(*(place - own[:2])), radius_m, half, cfg, sonar, tank)
     weighed = share * np.maximum(likely, LEAST)
@@ -47,8 +41,7 @@ def after_hit(share, own, place, radius_m, cfg, sonar, tank):
 
 
 def after_miss(share, present, own, place, place_cov, radius_m, dt_s, cfg, sonar, tank):
-    """(shares, presence) after beams from ``own`` went through the place where the body is expected, ``dt_s``
-    after the last such scan."""
+    """(shares, presence) after beams from ``own`` passed through ``place``, ``dt_s`` after the last scan."""
     half = cfg.least_half_height_m - cfg.edge_m
     inside = hit_probability(own[2], np.hypot(*(place - own[:2])), radius_m, half, cfg, sonar, tank)
     sure = cfg.hit_share * radius_m**2 / (radius_m**2 + np.linalg.eigvalsh(place_cov).max())
@@ -57,15 +50,13 @@ def after_miss(share, present, own, place, place_cov, radius_m, dt_s, cfg, sonar
 
 
 def seen_not(share, present, likely):
-    """Bayes' rule for what did not show: ``likely`` = its probability per hypothesis where the body is there,
-    1 where it is not."""
+    """Bayes' rule for what did not show; ``likely`` = its probability per hypothesis if there, else 1."""
     joint = present * share * likely
     return shared(joint), joint.sum() / (joint.sum() + 1 - present)
 
 
 def free_water(share, own_z, radius_m, cfg, tank):
-    """(lowest edge above, highest edge below) [m] of the obstacles that may be there, no farther than the own
-    height; infinite = none."""
+    """(lowest edge above, highest edge below) [m] of obstacles that may be there, else the own height."""
     half = max(radius_m, cfg.half_height_m)
     above, below = np.inf, -np.inf
     if share[N_SLICE] > cfg.column_tail_share:

@@ -1,5 +1,4 @@
-"""Float64 oracle of hull distances: the capsule's axis sampled densely, exact distance of a point to each
-solid."""
+"""Float64 oracle of hull distances: the capsule's axis sampled densely, each solid's exact distance."""
 
 import numpy as np
 
@@ -9,8 +8,7 @@ SPHERE, CYLINDER, BOX = 1, 2, 3
 def point_distances(
     points: np.ndarray, kind: int, pos: np.ndarray, size: np.ndarray, yaw: float
 ) -> np.ndarray:
-    """Distances [m] of points (n, 3) to a solid's surface; 0 inside cylinders and boxes, negative inside
-    spheres."""
+    """Distances [m] of points (n, 3) to a solid; 0 inside cylinders and boxes, negative inside spheres."""
     q = points - pos
     if kind == SPHERE:
         return np.linalg.norm(q, axis=1) - size[0]

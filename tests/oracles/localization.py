@@ -101,10 +101,8 @@ class Filter:
         self.cov[range(3, N), range(3, N)] = (
             0.01, 0.01, sensors.imu.heading_drift_rad_s**2, sensors.dvl.scale_error**2, bias, bias,
         )  # fmt: skip
-        self.depth, self.depth_cov = (
-            np.array([start[2], 0, 0, 0]),
-            np.diag([0, 0.01, sensors.pressure.sigma_m**2, bias]),
-        )
+        self.depth = np.array([start[2], 0, 0, 0])
+        self.depth_cov = np.diag([0, 0.01, sensors.pressure.sigma_m**2, bias])
 
     def seed(self, mean, cov, depth, depth_cov):
         """Go on from what another filter has."""
@@ -124,8 +122,8 @@ class Filter:
         return (noise + (cfg.jump_share * jump) ** 2) * self.dt**2 + cfg.accel_density * self.dt
 
     def move(self, roll, pitch, imu_yaw, before, now):
-        """One step between two readings (acceleration ahead, left, upwards, yaw rate), level; the body, with
-        the accelerometer's errors that are known by now, leans by ``roll`` and ``pitch``."""
+        """One step between two readings (acceleration ahead, left, up, yaw rate); the body leans by roll and
+        pitch."""
         dt, share, jump = self.dt, self.cfg.newest_share, now - before
         accel, angle = share * now[:3] + (1 - share) * before[:3], 0.5 * dt * (now[3] + before[3])
         bias = np.array([self.mean[7], self.mean[8], self.depth[3]])
@@ -172,8 +170,7 @@ class Filter:
         self.depth, self.depth_cov = taken(self.depth, self.depth_cov, h, residual, r)
 
     def scan(self, ping_pos, ping_yaw, ping_vel, late, range_m, doppler, hit):
-        """Takes a scan in, ``ping_vel`` the level velocity taken for the ping's; returns how near the nearest
-        beam came to a gate's edge (0 = on it)."""
+        """Takes a scan in, ``ping_vel`` = level velocity; how near the nearest beam came to a gate's edge."""
         sonar, cfg = self.sensors.sonar, self.cfg
         bearing = 2 * np.pi * np.arange(len(range_m)) / len(range_m)
         own = np.stack([np.cos(bearing), np.sin(bearing)], 1)
@@ -226,8 +223,7 @@ class Filter:
 
 
 class Voyage:
-    """Truth and readings of ``n`` vehicles that steer for another velocity now and then; what the newest
-    reading tells of a step's mean acceleration is as unsure as the filter supposes."""
+    """Truth and readings of ``n`` vehicles that steer for another velocity now and then."""
 
     def __init__(self, n, steps, sensors, cfg, tank, dt, rng, obstacles=None):
         self.sensors, self.tank, self.rng, self.obstacles = sensors, tank, rng, obstacles
@@ -236,10 +232,8 @@ class Voyage:
         turn = rng.uniform(0.5, 1.5, n), rng.uniform(0, 6.28, n)
         rate = 0.6 * np.sin(turn[0] * t + turn[1])
         self.yaw = rng.uniform(-np.pi, np.pi, n) - 0.6 / turn[0] * np.cos(turn[0] * t + turn[1])
-        self.roll, self.pitch = (
-            0.05 * np.sin(t + rng.uniform(0, 6, n)),
-            0.08 * np.sin(2 * t + rng.uniform(0, 6, n)),
-        )
+        self.roll = 0.05 * np.sin(t + rng.uniform(0, 6, n))
+        self.pitch = 0.08 * np.sin(2 * t + rng.uniform(0, 6, n))
         self.vel, self.pos, accel = (np.zeros((steps, n, 3)) for _ in range(3))
         self.vel[0] = 0.1 * rng.normal(size=(n, 3))
         self.pos[0] = [*mid, -0.8] + rng.uniform(-1, 1, (n, 3)) * [1.5, 0.5, 0.0]
@@ -249,10 +243,8 @@ class Voyage:
             jump = accel[k] - accel[k - 1]
             between = accel[k] + (cfg.newest_share - 1 + cfg.jump_share * rng.normal(size=(n, 3))) * jump
             between += np.sqrt(cfg.accel_density / dt) * rng.normal(size=(n, 3))
-            before, push = (
-                rotated(self.yaw[k - 1], self.vel[k - 1]),
-                rotated((self.yaw[k] + self.yaw[k - 1]) / 2, dt * between),
-            )
+            before = rotated(self.yaw[k - 1], self.vel[k - 1])
+            push = rotated((self.yaw[k] + self.yaw[k - 1]) / 2, dt * between)
             self.pos[k] = self.pos[k - 1] + dt * (before + push / 2)
             self.vel[k] = rotated(-self.yaw[k], before + push)
         imu, dvl, p = sensors.imu, sensors.dvl, sensors.pressure
@@ -287,10 +279,8 @@ class Voyage:
         r, normal = wall(self.tank, at, u)
         r = np.where(-np.sum(normal * u, -1) < sonar.grazing_cosine, np.inf, r)
         for x, y, radius in () if self.obstacles is None else self.obstacles:
-            along, across = (
-                np.sum((np.array([x, y]) - at) * u, -1),
-                u[..., 0] * (y - at[..., 1]) - u[..., 1] * (x - at[..., 0]),
-            )
+            along = np.sum((np.array([x, y]) - at) * u, -1)
+            across = u[..., 0] * (y - at[..., 1]) - u[..., 1] * (x - at[..., 0])
             met = (np.abs(across) < radius) & (along > 0)
             r = np.where(met, np.minimum(r, along - np.sqrt(np.maximum(radius**2 - across**2, 0))), r)
         ghost = rng.random(r.shape) < sonar.ghost

@@ -120,8 +120,7 @@ def wall_ranges(tank, x, y, ux, uy):
 
 
 def outline_ranges(body, yaw, rel, slope, ux, uy):
-    """[m] to the horizontal outline of an obstacle whose centre lies at ``rel`` (n, 3) from the sonar; inf
-    where a beam misses it."""
+    """[m] to the horizontal outline of an obstacle at ``rel`` (n, 3) from the sonar; inf = missed."""
     size, far = body["size"], np.hypot(rel[:, 0], rel[:, 1])
     if body["kind"] == "box":
         c, s = math.cos(yaw), math.sin(yaw)
@@ -130,10 +129,8 @@ def outline_ranges(body, yaw, rel, slope, ux, uy):
             middle = (rel[:, 0] * axis_x + rel[:, 1] * axis_y)[:, None]
             with np.errstate(divide="ignore"):
                 one, other = (np.add(middle, side * half) / (ux * axis_x + uy * axis_y) for side in (-1, 1))
-            enter, leave = (
-                np.maximum(enter, np.minimum(one, other)),
-                np.minimum(leave, np.maximum(one, other)),
-            )
+            enter = np.maximum(enter, np.minimum(one, other))
+            leave = np.minimum(leave, np.maximum(one, other))
     else:
         squared = np.full(len(rel), size[0] ** 2)
         if body["kind"] == "sphere":
@@ -170,8 +167,7 @@ def recast(log):
 
 
 def sonar_figures(log, gate_m):
-    """Residuals of every return that lies within ``gate_m`` of the recast one; the others, and wrong hits and
-    misses, count as edges."""
+    """Residuals of returns within ``gate_m`` of the recast; others, wrong hits and misses are edges."""
     true_range, true_doppler, moves = recast(log)
     answer, hit = log.column("/sonar/scan", "ranges"), log.column("/sonar/scan", "intensities") > 0
     reach = log.config["sensors"]["sonar"]["max_range_m"]
@@ -222,11 +218,8 @@ class Mapper:
 
     def __init__(self, log):
         self.log, self.tank = log, log.scenario["tank"]
-        self.m, self.sonar, self.depth = (
-            log.config["mapping"],
-            log.config["sensors"]["sonar"],
-            log.config["sensors"]["depth"],
-        )
+        self.m, self.sonar = log.config["mapping"], log.config["sensors"]["sonar"]
+        self.depth = log.config["sensors"]["depth"]
         self.tracking = log.config["tracking"]
         first = log.messages["/map/static"][0][1]
         self.cell = first["cell_size"]["x"]
@@ -339,8 +332,7 @@ class Mapper:
         self.depth_mark = np.zeros_like(self.depth_mark)
 
     def slip(self, b):
-        """[m/s] along every beam: the error of the own velocity by which the known walls would move; a prior
-        keeps it small."""
+        """[m/s] along every beam: the own velocity's error by which known walls move, under a prior."""
         near = (
             wall_gap(self.tank, b.x + b.range * b.ux, b.y + b.range * b.uy)
             < self.tracking["wall_margin_m"] + 2 * b.spread
@@ -430,8 +422,7 @@ def map_figures(log, same):
 
 
 def clearance_figures(log, mapper, redone):
-    """/map/clearance against the distance transform of the logged map of its time, where there is one, and of
-    the redone map always."""
+    """/map/clearance against the distance transform of the logged map of its time and of the redone one."""
     maps = {
         log.step(time): (grid_values(data), grid_values(other))
         for (time, data), (_, other) in layer_pairs(log)
@@ -474,8 +465,7 @@ def layer_pairs(log):
 
 
 def camera_figures(log, same_m):
-    """Pixels of every third image against the depth at which a ray marched through the true world meets
-    something."""
+    """Pixels of every third image against the depth at which a ray marched through the true world hits."""
     truth, depth = vehicle(log), log.config["sensors"]["depth"]
     focal = depth["cols"] / 2 / math.tan(math.radians(depth["fov_deg"] / 2))
     error, rise = [], []
@@ -505,12 +495,9 @@ def camera_figures(log, same_m):
 
 
 def marched(log, start, unit, time):
-    """[m] along unit vectors to the nearest obstacle or side wall: as far as nothing can be, again and
-    again."""
-    along, obstacles = (
-        np.zeros(len(unit)),
-        [(body, obstacle_motion(body, np.array([time]))[0][0]) for body in log.scenario["obstacles"]],
-    )
+    """[m] along unit vectors to the nearest obstacle or side wall: as far as nothing can be, repeatedly."""
+    along = np.zeros(len(unit))
+    obstacles = [(body, obstacle_motion(body, np.array([time]))[0][0]) for body in log.scenario["obstacles"]]
     for _ in range(100):
         point = start + along[:, None] * unit
         room = wall_gap(log.scenario["tank"], point[:, 0], point[:, 1])
@@ -542,8 +529,7 @@ def core_distance(body, q):
 
 
 def hull_distance(hull, body, rel, axis):
-    """[m] from the hull's surface to an obstacle; rel (n, 3) = hull's centre seen from the body's. Ternary
-    search along the hull's axis."""
+    """[m] from hull to obstacle; rel (n, 3) = hull's centre from the body's. Ternary search on its axis."""
     rel, axis = rel @ own_axes(body).T, axis @ own_axes(body).T
     low, high = np.full(len(rel), -hull["hull_half_length_m"]), np.full(len(rel), hull["hull_half_length_m"])
     for _ in range(40):
@@ -554,8 +540,7 @@ def hull_distance(hull, body, rel, axis):
 
 
 def threats(log):
-    """(clearance [m] to obstacles and side walls, time to collision [s] with inf = none, whether a closing
-    speed is at its threshold)."""
+    """(clearance [m], time to collision [s] with inf = none, whether a closing speed is at its threshold)."""
     truth, hull, rules = vehicle(log), log.config["vehicle"], log.config["episode"]
     times = np.arange(len(truth.pos)) * log.dt
     axis, spin = truth.R[:, :, 0], np.cross(truth.rates, truth.R[:, :, 0])
@@ -584,11 +569,8 @@ def threats(log):
 def outcome(log, clearance, ttc):
     """(name, step) of the first rule that holds."""
     truth, tank, hull, rules = (
-        vehicle(log),
-        log.scenario["tank"],
-        log.config["vehicle"],
-        log.config["episode"],
-    )
+        vehicle(log), log.scenario["tank"], log.config["vehicle"], log.config["episode"],
+    )  # fmt: skip
     z_low, z_high = tank["z_m"]
     for step in range(1, len(truth.pos)):
         x, y, z = truth.pos[step]
@@ -649,12 +631,9 @@ def obstacle_error(log):
 def figures(log, gate_m=0.15, same=1e-3):
     """Every comparison with what the log says."""
     return {
-        "sonar": sonar_figures(log, gate_m),
-        "camera": camera_figures(log, 2e-3),
-        "map": map_figures(log, same),
-        "safety": safety_figures(log),
-        "obstacles": obstacle_error(log),
-    }
+        "sonar": sonar_figures(log, gate_m), "camera": camera_figures(log, 2e-3),
+        "map": map_figures(log, same), "safety": safety_figures(log), "obstacles": obstacle_error(log),
+    }  # fmt: skip
 
 
 if __name__ == "__main__":

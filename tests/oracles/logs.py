@@ -1,5 +1,4 @@
-"""A synthetic episode for the tests of logs and pictures: plain NumPy, no simulator. A vehicle passes static
-and moving obstacles."""
+"""A synthetic episode for tests of logs: a vehicle passes static and moving obstacles; plain NumPy."""
 
 from __future__ import annotations
 
@@ -11,16 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from uuvtai.common.enums import (
-    FAIL_DISCONNECTED,
-    FAIL_NONE,
-    OUTCOMES,
-    PLANNER_RRT,
-    PLANNER_VORONOI,
-    TRIGGER_INITIAL,
-    TRIGGER_NONE,
-    TRIGGER_STUCK,
-)
+from uuvtai.common import enums
 from uuvtai.common.obstacle_motion import obstacle_positions
 from uuvtai.config import Config, SensorsConfig, SonarConfig
 from uuvtai.logs.encode import EpisodeHeader
@@ -56,21 +46,16 @@ OBSTACLES = [
 
 
 def config() -> Config:
-    """With an image in which ranges are detected beside Doppler, which no run has, so that every topic is
-    there."""
+    """With an image in which ranges are detected beside Doppler, so that every topic is there."""
     sonar = SonarConfig(image_bins=24).model_copy(update={"detector": "so"})
     return Config().model_copy(update={"sensors": SensorsConfig().model_copy(update={"sonar": sonar})})
 
 
 def scenario(episode: int = 3) -> dict:
     described = {
-        "start": list(START),
-        "start_yaw": 0.2,
-        "goal": list(GOAL),
-        "layout_draws": 1,
-        "faults": 0,
+        "start": list(START), "start_yaw": 0.2, "goal": list(GOAL), "layout_draws": 1, "faults": 0,
         "obstacles": OBSTACLES,
-    }
+    }  # fmt: skip
     return scenario_document(config(), described, world="pool", seed=7, episode=episode)
 
 
@@ -89,8 +74,7 @@ def header(agent: str = "bt", episode: int = 3) -> EpisodeHeader:
 def snapshots(
     n_step: int, sway: float = 1.0, outcome: str = "success", maps: bool = True
 ) -> Iterator[dict[str, Any]]:
-    """Values of steps 0 .. n_step; the vehicle drives from start to goal with a sideways swing of ``sway``
-    metres. Without ``maps`` none is handed over."""
+    """Values of steps 0 .. n_step; the vehicle drives to the goal and swings by ``sway`` metres sideways."""
     rng = np.random.default_rng(0)
     static, dynamic = np.zeros(SHAPE, np.float32), np.zeros(SHAPE, np.float32)
     for step in range(n_step + 1):
@@ -104,7 +88,7 @@ def snapshots(
         due = maps and (step % 25 == 0 or step == n_step)
         yield {
             "clock.step": np.int32(step),
-            "termination.outcome": np.int32(OUTCOMES.index(outcome if step == n_step else "running")),
+            "termination.outcome": np.int32(enums.OUTCOMES.index(outcome if step == n_step else "running")),
             **_truth(step, pos, yaw, obstacles, ranges.min(), rng),
             **_sensed(step, pos, yaw, ranges, hit, rng),
             **_tracked(obstacles, which),
@@ -112,6 +96,12 @@ def snapshots(
             **_driven(step),
             **(layers(static, dynamic) if due else {}),
         }
+
+
+def _single(values: dict[str, Any]) -> dict[str, Any]:
+    """In the types of the simulator's arrays: float32 and int32."""
+    found = {name: np.asarray(value) for name, value in values.items()}
+    return {name: v.astype(np.float32 if v.dtype.kind == "f" else np.int32)[()] for name, v in found.items()}
 
 
 def _truth(
@@ -125,134 +115,92 @@ def _truth(
     """Slot 3 is empty."""
     later = np.array([obstacle_positions(body, np.array([step * DT + 1e-3]))[0] for body in OBSTACLES])
     sizes = np.array([body["size"] for body in OBSTACLES])
-    return {
-        "vehicle.pos_w": pos.astype(np.float32),
-        "vehicle.quat_wb": _quaternion(0.02, -0.03, yaw),
-        "sonar_image.heard": np.zeros((1, 16), np.float32),
-        "vehicle.vel_b": np.array([0.5, 0.02, 0.0], np.float32),
-        "vehicle.rate_b": rng.normal(0, 0.01, 3).astype(np.float32),
-        "current.vel_w": np.zeros(3, np.float32),
-        "vehicle.rpm": rng.normal(500, 20, 6).astype(np.float32),
-        "actuation.thrust_n": rng.normal(2, 0.1, 6).astype(np.float32),
+    return _single({
+        "vehicle.pos_w": pos, "vehicle.quat_wb": _quaternion(0.02, -0.03, yaw),
+        "sonar_image.heard": np.zeros((1, 16)), "vehicle.vel_b": [0.5, 0.02, 0.0],
+        "vehicle.rate_b": rng.normal(0, 0.01, 3), "current.vel_w": np.zeros(3),
+        "vehicle.rpm": rng.normal(500, 20, 6), "actuation.thrust_n": rng.normal(2, 0.1, 6),
         "termination.clearance_m": np.float32(max(nearest_m - 0.17, 0.01)),
-        "termination.ttc_s": np.float32(1e6 if step % 3 else 2.3),
-        "world.kind": np.array([2, 3, 2, 0, 1, 2], np.int32),
-        "world.pos_w": np.insert(obstacles, 3, 0.0, axis=0).astype(np.float32),
-        "world.vel_w": np.insert((later - obstacles) / 1e-3, 3, 0.0, axis=0).astype(np.float32),
-        "world.size": np.insert(sizes, 3, 0.0, axis=0).astype(np.float32),
-        "world.yaw": np.array([0, 0.6, 0, 0, 0, 0], np.float32),
-    }
+        "termination.ttc_s": 1e6 if step % 3 else 2.3, "world.kind": [2, 3, 2, 0, 1, 2],
+        "world.pos_w": np.insert(obstacles, 3, 0.0, axis=0),
+        "world.vel_w": np.insert((later - obstacles) / 1e-3, 3, 0.0, axis=0),
+        "world.size": np.insert(sizes, 3, 0.0, axis=0), "world.yaw": [0, 0.6, 0, 0, 0, 0],
+    })  # fmt: skip
 
 
 def _sensed(
     step: int, pos: np.ndarray, yaw: float, ranges: np.ndarray, hit: np.ndarray, rng: np.random.Generator
 ) -> dict[str, Any]:
     camera = config().sensors.depth
-    return {
-        "ego.pos_w": (pos + 0.01).astype(np.float32),
-        "ego.rpy": np.array([0.02, -0.03, yaw], np.float32),
-        "ego.vel_b": np.array([0.5, 0.02, 0.0], np.float32),
-        "ego.vel_valid": np.int32(1),
-        "ego.rate_b": np.zeros(3, np.float32),
-        "ego.depth_m": -pos[2].astype(np.float32),
-        "ego.imu_rpy": np.array([0.02, -0.03, yaw - 0.01], np.float32),
-        "ego.specific_force_b": np.array([0.1, -0.2, 9.8], np.float32),
-        "ego.dvl_b": np.array([0.51, 0.01, 0.02], np.float32),
-        "ego.given_up": np.int32(0),
-        "ego.dvl_fresh": np.int32(step % 5 == 0),
-        "ego.pose_cov": np.array([4e-4, -1e-4, 2e-5, 9e-4, -3e-5, 4e-6], np.float32),
-        "ego.z_var": np.float32(2.5e-5),
-        "scan.fresh": np.int32(1),
-        "scan.ping_step": np.int32(step),
-        "scan.range_m": ranges,
-        "scan.doppler_m_s": rng.normal(-0.3, 0.05, N_RAY).astype(np.float32),
-        "scan.intensity": rng.uniform(0.01, 1, N_RAY).astype(np.float32),
-        "scan.hit": hit.astype(np.int32),
-        "scan.new_from": np.int32(0),
-        "scan.new_count": np.int32(0),
-        "scan.ping_vel_b": np.array([0.5, 0.02, 0.0], np.float32),
-        "image.fresh": np.int32(step % 5 == 0),
-        "image.shot_rpy": np.array([0.02, -0.03, yaw], np.float32),
-        "image.depth_m": rng.uniform(0.5, 10, (camera.rows, camera.cols)).astype(np.float32),
-    }
+    return _single({
+        "ego.pos_w": pos + 0.01, "ego.rpy": [0.02, -0.03, yaw], "ego.vel_b": [0.5, 0.02, 0.0],
+        "ego.vel_valid": 1, "ego.rate_b": np.zeros(3), "ego.depth_m": -pos[2],
+        "ego.imu_rpy": [0.02, -0.03, yaw - 0.01], "ego.specific_force_b": [0.1, -0.2, 9.8],
+        "ego.dvl_b": [0.51, 0.01, 0.02], "ego.given_up": 0, "ego.dvl_fresh": step % 5 == 0,
+        "ego.pose_cov": [4e-4, -1e-4, 2e-5, 9e-4, -3e-5, 4e-6], "ego.z_var": 2.5e-5,
+        "scan.fresh": 1, "scan.ping_step": step, "scan.range_m": ranges,
+        "scan.doppler_m_s": rng.normal(-0.3, 0.05, N_RAY), "scan.intensity": rng.uniform(0.01, 1, N_RAY),
+        "scan.hit": hit, "scan.new_from": 0, "scan.new_count": 0, "scan.ping_vel_b": [0.5, 0.02, 0.0],
+        "image.fresh": step % 5 == 0, "image.shot_rpy": [0.02, -0.03, yaw],
+        "image.depth_m": rng.uniform(0.5, 10, (camera.rows, camera.cols)),
+    })  # fmt: skip
 
 
 def _tracked(obstacles: np.ndarray, which: np.ndarray) -> dict[str, Any]:
     """The two that move, in slots 0 and 2; slot 1 is dead, slot 3 rests."""
-    state = np.zeros((4, 4), np.float32)
+    state = np.zeros((4, 4))
     state[[0, 2], :2] = obstacles[3:, :2]
-    return {
-        "tracks.alive": np.array([1, 0, 1, 1], np.int32),
-        "tracks.moving": np.array([1, 1, 1, 0], np.int32),
-        "tracks.state": state,
-        "tracks.z_m": np.array([obstacles[3, 2], 0, obstacles[4, 2], 0], np.float32),
-        "tracks.radius_m": np.array([0.22, 0, 0.2, 0.5], np.float32),
-        "tracks.cov": np.outer([1.0, 0.0, 2.0, 1.0], np.arange(1, 11) * 1e-3).astype(np.float32),
-        "tracks.turn_rate": np.array([0.3, 0, 0, 0], np.float32),
-        "tracks.turn_cov": np.outer([1.0, 0, 0, 0], [1e-3, 0, 0, 0, 0.04]).astype(np.float32),
-        "tracks.present": np.array([0.95, 0, 0.6, 0.95], np.float32),
-        "forecast.above_w": np.array([1e6, 0, -0.4, 0], np.float32),
-        "forecast.below_w": np.array([-1.0, 0, -1e6, 0], np.float32),
-        "futures.share": np.array([[0.0, 0.0], [0, 0], [0.1, 0.25], [0, 0]], np.float32),
-        "futures.pos_w": np.arange(4 * 2 * 3 * 2, dtype=np.float32).reshape(4, 2, 3, 2),
-        "forecast.pos_w": -np.arange(4 * 3 * 2, dtype=np.float32).reshape(4, 3, 2),
-        "forecast.radius_m": np.outer([0.3, -1, 0.2, -1], np.ones(3)).astype(np.float32),
-        "tracks.beam_track": np.select([which == 3, which == 4], [0, 2], -1).astype(np.int32),
-    }
+    return _single({
+        "tracks.alive": [1, 0, 1, 1], "tracks.moving": [1, 1, 1, 0], "tracks.state": state,
+        "tracks.z_m": [obstacles[3, 2], 0, obstacles[4, 2], 0], "tracks.radius_m": [0.22, 0, 0.2, 0.5],
+        "tracks.cov": np.outer([1.0, 0.0, 2.0, 1.0], np.arange(1, 11) * 1e-3),
+        "tracks.turn_rate": [0.3, 0, 0, 0],
+        "tracks.turn_cov": np.outer([1.0, 0, 0, 0], [1e-3, 0, 0, 0, 0.04]),
+        "tracks.present": [0.95, 0, 0.6, 0.95],
+        "forecast.above_w": [1e6, 0, -0.4, 0], "forecast.below_w": [-1.0, 0, -1e6, 0],
+        "futures.share": [[0.0, 0.0], [0, 0], [0.1, 0.25], [0, 0]],
+        "futures.pos_w": np.arange(4.0 * 2 * 3 * 2).reshape(4, 2, 3, 2),
+        "forecast.pos_w": -np.arange(4.0 * 3 * 2).reshape(4, 3, 2),
+        "forecast.radius_m": np.outer([0.3, -1, 0.2, -1], np.ones(3)),
+        "tracks.beam_track": np.select([which == 3, which == 4], [0, 2], -1),
+    })  # fmt: skip
 
 
 def _planned(step: int, pos: np.ndarray, ahead: np.ndarray) -> dict[str, Any]:
     """A new route every 200 steps, the second one by RRT."""
-    return {
-        "route.way_w": np.linspace(pos[:2], GOAL[:2], 64).astype(np.float32),
-        "route.n_way": np.int32(40),
-        "route.plan_step": np.int32(step - step % 200),
-        "route.planner": np.int32(PLANNER_RRT if step == 200 else PLANNER_VORONOI),
-        "route.fallback_reason": np.int32(FAIL_DISCONNECTED if step == 200 else FAIL_NONE),
-        "route.trigger": np.int32(
-            TRIGGER_NONE if step % 200 else (TRIGGER_INITIAL if step == 0 else TRIGGER_STUCK)
-        ),
-        "route.lookahead_w": np.array([*ahead[:2], -0.8], np.float32),
-        "route.path_risk": np.float32(0.4),
-    }
+    begun = enums.TRIGGER_STUCK if step else enums.TRIGGER_INITIAL
+    return _single({
+        "route.way_w": np.linspace(pos[:2], GOAL[:2], 64), "route.n_way": 40,
+        "route.plan_step": step - step % 200,
+        "route.planner": enums.PLANNER_RRT if step == 200 else enums.PLANNER_VORONOI,
+        "route.fallback_reason": enums.FAIL_DISCONNECTED if step == 200 else enums.FAIL_NONE,
+        "route.trigger": enums.TRIGGER_NONE if step % 200 else begun,
+        "route.lookahead_w": [*ahead[:2], -0.8], "route.path_risk": 0.4,
+    })  # fmt: skip
 
 
 def _driven(step: int) -> dict[str, Any]:
     """By a tree, which evades in the last 30 of every 100 steps."""
     follows = step % 100 < 70
     outputs = ("action", "value", "std", "distillation_lambda", "residual", "uncertainty")
-    return {
-        "behavior.action": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-        "behavior.status": np.array(
-            [2, 3, 0, 3, 2, 0, 9, 9] if follows else [1, 3, 0, 1, 0, 0, 9, 9], np.int32
-        ),
-        "behavior.leaf": np.int32(4 if follows else 3),
-        "behavior.want_evade": np.int32(not follows and step % 5 == 0),
-        "behavior.conflict_s": np.float32(1e6 if step % 2 else 0.9),
-        "behavior.hold_conflict_s": np.float32(1e6),
-        "behavior.follow_vel_w": np.array([0.6, 0.1, 0.0], np.float32),
-        "behavior.cruise_z_m": np.float32(-0.2),
-        "behavior.evade_vel_w": np.array([0.1, 0.6, 0.2], np.float32),
-        "behavior.patience": np.float32(1.0),
-        "behavior.evade_cost": np.float32(2.5),
-        "behavior.evade_candidate": np.int32(-1 if step % 2 else 17),
-        "behavior.candidate_cost": np.arange(160, dtype=np.float32),
-        "behavior.last_vel_w": np.array([0.2, 0.5, -0.1], np.float32),
-        "reward.term": np.array([0.01, 0.02, -0.001, 0.0], np.float32),
-        "agent.applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-        **{f"agent.{name}": None for name in outputs},
-    }
+    return _single({
+        "behavior.action": [0.8, 0.0, 0.1, -0.2],
+        "behavior.status": [2, 3, 0, 3, 2, 0, 9, 9] if follows else [1, 3, 0, 1, 0, 0, 9, 9],
+        "behavior.leaf": 4 if follows else 3, "behavior.want_evade": not follows and step % 5 == 0,
+        "behavior.conflict_s": 1e6 if step % 2 else 0.9, "behavior.hold_conflict_s": 1e6,
+        "behavior.follow_vel_w": [0.6, 0.1, 0.0], "behavior.cruise_z_m": -0.2,
+        "behavior.evade_vel_w": [0.1, 0.6, 0.2], "behavior.patience": 1.0, "behavior.evade_cost": 2.5,
+        "behavior.evade_candidate": -1 if step % 2 else 17, "behavior.candidate_cost": np.arange(160.0),
+        "behavior.last_vel_w": [0.2, 0.5, -0.1], "reward.term": [0.01, 0.02, -0.001, 0.0],
+        "agent.applied": [0.8, 0.0, 0.1, -0.2],
+    }) | {f"agent.{name}": None for name in outputs}  # fmt: skip
 
 
 def result(n_step: int, outcome: str = "success") -> SimpleNamespace:
     return SimpleNamespace(
-        outcome=outcome,
-        episode_return=12.5,
-        time_s=n_step * DT,
-        min_clearance_m=0.31,
-        replans={"initial": 1, "stuck": 2},
-        planned_by={"voronoi": 2, "rrt": 1},
-    )
+        outcome=outcome, episode_return=12.5, time_s=n_step * DT, min_clearance_m=0.31,
+        replans={"initial": 1, "stuck": 2}, planned_by={"voronoi": 2, "rrt": 1},
+    )  # fmt: skip
 
 
 def layers(static: np.ndarray, dynamic: np.ndarray) -> dict[str, np.ndarray]:

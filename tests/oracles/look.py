@@ -1,5 +1,4 @@
-"""NumPy float64 oracle of what a depth image says about the height of one tracked obstacle, pixel by pixel
-and hypothesis by hypothesis."""
+"""NumPy float64 oracle of what a depth image says of a track's height, by pixels and hypotheses."""
 
 import numpy as np
 
@@ -14,8 +13,7 @@ LEAST = 0.05
 
 
 def column_through(pos, rpy, at, depth):
-    """(rays [rows, 3] with body-x component 1, camera [3], distance ahead [m], column, how near the next
-    column is [pixel])."""
+    """(rays [rows, 3] with body-x 1, camera [3], distance ahead [m], column, next column [pixel])."""
     attitude = rotation(quaternions(np.array([rpy]))[0])
     eye = pos + attitude @ np.array(depth.offset_b_m)
     ahead = (at - eye[:2]) @ [np.cos(rpy[2]), np.sin(rpy[2])]
@@ -32,8 +30,7 @@ def column_through(pos, rpy, at, depth):
 
 
 def look(share, present, image, pos, rpy, at, radius, cfg, depth, tank):
-    """(shares, presence, doubt) after an image [rows, cols]; ``doubt`` = how near anything is to being
-    decided otherwise by float32."""
+    """(shares, presence, doubt) after an image [rows, cols]; ``doubt``: how near float32 is to differing."""
     rays, eye, ahead, col, doubt = column_through(pos, rpy, at, depth)
     doubt = min(doubt, abs(ahead - radius - SLACK_M), abs(depth.max_range_m - SLACK_M - ahead))
     if not radius + SLACK_M < ahead < depth.max_range_m - SLACK_M or not 0 <= col < depth.cols:

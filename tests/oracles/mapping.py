@@ -44,8 +44,7 @@ class MapOracle:
         return min(p[0] - t.x_m[0], t.x_m[1] - p[0], p[1] - t.y_m[0], t.y_m[1] - p[1])
 
     def wall_range(self, pos, unit):
-        """Range of the wall along a beam from inside, by bisection of ``gap`` (no formula shared with the
-        kernel)."""
+        """Range of the wall along a beam from inside, by bisection of ``gap``: no formula of the kernel's."""
         low, high = 0.0, 100.0
         for _ in range(80):
             middle = 0.5 * (low + high)
@@ -79,8 +78,7 @@ class MapOracle:
         return max(proved, 0.0) / self.cell
 
     def free_water(self, pos, yaw, scan, doubtful):
-        """Cells whose centre lies in the triangle between two neighbouring beams, both as long as the smaller
-        of their reaches."""
+        """Cells in the triangle between two neighbouring beams, both as long as the smaller reach."""
         reach = np.array(
             [self.reach(float(r), hit) for r, hit in zip(scan["range"], scan["hit"], strict=True)]
         )
@@ -107,8 +105,7 @@ class MapOracle:
         return free & ~self.outside
 
     def near_static(self, static, cell, r):
-        """(whether a statically occupied cell is within reach of this return, whether the reach is
-        doubtful)."""
+        """(a statically occupied cell is within reach of this return, the reach is doubtful)."""
         extent = (2 * math.pi / self.sonar.n_ray * r + self.error(r)) / self.cell
         reach = min(4, 1 + int(extent))
         near = static[
@@ -249,8 +246,6 @@ class MapOracle:
 def rotation(roll, pitch, yaw):
     """R_wb of yaw-pitch-roll angles."""
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    Rz, Ry = (
-        np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]),
-        np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]),
-    )
+    Rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    Ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     return Rz @ Ry @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])

@@ -9,8 +9,7 @@ from tests.oracles.turn_history import expected_turn_rate
 
 
 def sectors(range_m, doppler_m_s, hit, turned, n_sector, max_range_m, ttc_cap_s):
-    """(range, ttc, closing, valid), each (n_sector,): beams binned by their bearing after a turn of
-    ``turned`` [rad] since."""
+    """(range, ttc, closing, valid), each (n_sector,): beams by bearing after a turn of ``turned`` [rad]."""
     n_ray = len(range_m)
     position = np.arange(n_ray) * n_sector / n_ray - turned * n_sector / (2 * np.pi)
     sector = np.floor(position + 0.5).astype(int) % n_sector
@@ -57,8 +56,7 @@ def observation(values):
 
 
 def closest_approach(pos, radius, own, vel, dt):
-    """(distance to the surface, time) at the closest approach of two points that move straight between
-    samples; pos (n, 2)."""
+    """(distance to the surface, time) of two points that move straight between samples; pos (n, 2)."""
     t = dt * np.arange(len(pos))
     away = pos - own - np.outer(t, vel)
     course = np.diff(away, axis=0)
@@ -71,17 +69,13 @@ def closest_approach(pos, radius, own, vel, dt):
 
 
 def obstacles(v, n_obstacle, forecast_cfg, tracking, tank, rules):
-    """Columns of the moving obstacles of one env, closest approach first, as arrays (n_obstacle, width);
-    ``v`` by 'struct.array'."""
+    """Columns of one env's moving obstacles, closest first, as (n_obstacle, width); ``v``: 'struct.array'."""
     yaw, own = v["ego.rpy"][2], v["ego.pos_w"]
     vel = (rotation_wb(*v["ego.rpy"]) @ v["ego.vel_b"])[:2]
     rows = []
     for track in np.flatnonzero(v["forecast.radius_m"][:, 0] >= 0):
-        pos, radius, state = (
-            v["forecast.pos_w"][track],
-            v["forecast.radius_m"][track],
-            v["tracks.state"][track],
-        )
+        pos, radius = v["forecast.pos_w"][track], v["forecast.radius_m"][track]
+        state = v["tracks.state"][track]
         gap, time = closest_approach(pos, radius, own[:2], vel, tracking.forecast_dt_s)
         rate, rate_var = v["tracks.turn_rate"][track], v["tracks.turn_cov"][track, 4]
         water = np.array([v["forecast.above_w"][track] - own[2], own[2] - v["forecast.below_w"][track]])
@@ -101,16 +95,9 @@ def obstacles(v, n_obstacle, forecast_cfg, tracking, tank, rules):
     rows = sorted(rows, key=lambda row: row["obstacle_closest"][0])[:n_obstacle]
     widths = {"obstacle_position": 2, "obstacle_velocity": 2, "obstacle_free_water": 2}
     names = (
-        "valid",
-        "position",
-        "velocity",
-        "turn_rate",
-        "radius",
-        "free_water",
-        "age",
-        "closest",
+        "valid", "position", "velocity", "turn_rate", "radius", "free_water", "age", "closest",
         "closest_time",
-    )
+    )  # fmt: skip
     out = {f"obstacle_{name}": np.zeros((n_obstacle, widths.get(f"obstacle_{name}", 1))) for name in names}
     for slot, row in enumerate(rows):
         for name, value in row.items():

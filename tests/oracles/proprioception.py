@@ -17,8 +17,7 @@ def specific_force(quat, acc_b, gravity):
 
 
 def zeroed_depth(start_z, z, bias, noise):
-    """[n] depth of a pressure sensor that was set to the start's depth when it was read first; z, noise [n],
-    first = start."""
+    """[n] depth of a pressure sensor set to the start's depth at first; z, noise [n], first = start."""
     raw = -np.asarray(z) + bias + np.asarray(noise)
     return raw - (raw[0] + start_z)
 

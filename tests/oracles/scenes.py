@@ -69,8 +69,7 @@ def rotation(q):
 
 
 class Caster:
-    """One scene compiled to a MuJoCo model; the tank is one big geom seen from the inside (no floor or
-    surface within reach)."""
+    """One scene compiled to a MuJoCo model; the tank is one big geom seen from the inside."""
 
     def __init__(self, scene, env, tank):
         spec = mujoco.MjSpec()
@@ -100,8 +99,7 @@ class Caster:
         mujoco.mj_kinematics(self.model, self.data)
 
     def distances(self, start, rays):
-        """Distance in units of each ray's own length [n] for rays [n, 3] from one point; NOTHING_M = nothing
-        met."""
+        """Distance in units of each ray's length [n] for rays [n, 3] from one point; NOTHING_M = none."""
         length = np.linalg.norm(rays, axis=1)
         n = len(rays)
         geom, found = np.zeros(n, np.int32), np.zeros(n)
@@ -113,8 +111,7 @@ class Caster:
 
 
 def envelope(cast, rays, jitter):
-    """(lowest, highest) distance over a ray and its neighbours turned by ``jitter`` [rad] in both directions
-    across it."""
+    """(lowest, highest) distance over a ray and its neighbours turned by ``jitter`` [rad] across it."""
     across = np.cross(rays, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     upward = np.cross(across, rays / np.linalg.norm(rays, axis=1, keepdims=True))
@@ -143,15 +140,11 @@ def load(scene, vehicle, world):
 def one_obstacle_scene(n_env, n_obstacle, pos, **body):
     """The same level vehicle at ``pos`` with heading 0 and at most one obstacle in every env."""
     scene = {
-        "pos": np.tile(np.asarray(pos, float), (n_env, 1)),
-        "quat": np.tile([1.0, 0.0, 0.0, 0.0], (n_env, 1)),
-        "vel_b": np.zeros((n_env, 3)),
-        "kind": np.zeros((n_env, n_obstacle), int),
-        "obstacle_pos": np.zeros((n_env, n_obstacle, 3)),
-        "obstacle_vel": np.zeros((n_env, n_obstacle, 3)),
-        "size": np.ones((n_env, n_obstacle, 3)),
-        "yaw": np.zeros((n_env, n_obstacle)),
-    }
+        "pos": np.tile(np.asarray(pos, float), (n_env, 1)), "quat": np.tile([1.0, 0.0, 0.0, 0.0], (n_env, 1)),
+        "vel_b": np.zeros((n_env, 3)), "kind": np.zeros((n_env, n_obstacle), int),
+        "obstacle_pos": np.zeros((n_env, n_obstacle, 3)), "obstacle_vel": np.zeros((n_env, n_obstacle, 3)),
+        "size": np.ones((n_env, n_obstacle, 3)), "yaw": np.zeros((n_env, n_obstacle)),
+    }  # fmt: skip
     for name, value in body.items():
         scene[name][:, 0] = value
     return scene

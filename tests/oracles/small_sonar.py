@@ -18,13 +18,10 @@ def cast(pos, yaw, vel_w, centre, obstacle_vel, radius, half, obstacle_yaw, tank
     u = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     to_body = np.stack([_circle(pos, u, centre, radius), _box(pos, u, centre, half, obstacle_yaw)])
     to_body = np.where(radius[:, None, :] > 0, to_body[0], to_body[1])
-    none = np.full(
-        (*to_body.shape[:2], 1), np.inf
-    )  # an obstacle that is never hit, so that there may be none
-    to_body, obstacle_vel = (
-        np.concatenate([to_body, none], -1),
-        np.concatenate([obstacle_vel, np.zeros((len(pos), 1, 2))], 1),
-    )
+    # an obstacle that is never hit, so that there may be none
+    none = np.full((*to_body.shape[:2], 1), np.inf)
+    to_body = np.concatenate([to_body, none], -1)
+    obstacle_vel = np.concatenate([obstacle_vel, np.zeros((len(pos), 1, 2))], 1)
     nearest = to_body.argmin(axis=-1)
     to_nearest = np.take_along_axis(to_body, nearest[..., None], -1)[..., 0]
     to_wall = _walls(pos, u, tank)

@@ -1,5 +1,4 @@
-"""NumPy float64 oracle of the clean sonar, written from the rules on the design page: segments and
-quadratics, no spans."""
+"""NumPy float64 oracle of the clean sonar by the design page's rules: segments, quadratics, no spans."""
 
 import numpy as np
 
@@ -15,8 +14,7 @@ def beam_headings(quat, n_ray):
 
 
 def sonar_scan(scene, env, tank, n_ray, aperture_deg, turn=0.0):
-    """(range [n_ray], cosine of incidence, index of the body hit or WALL), without the limit of range;
-    bearings off by ``turn`` [rad]."""
+    """(range [n_ray], cosine, index of the body hit or WALL), without limit; bearings off by ``turn``."""
     pos = scene["pos"][env]
     bearing = beam_headings(scene["quat"][env], n_ray) + turn
     u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
@@ -26,11 +24,8 @@ def sonar_scan(scene, env, tank, n_ray, aperture_deg, turn=0.0):
     for body in np.flatnonzero(scene["kind"][env]):
         r, c = obstacle_hits(scene, env, body, pos, u, slope)
         nearer = r < best
-        best, cosine, who = (
-            np.where(nearer, r, best),
-            np.where(nearer, c, cosine),
-            np.where(nearer, body, who),
-        )
+        best, cosine = np.where(nearer, r, best), np.where(nearer, c, cosine)
+        who = np.where(nearer, body, who)
     return best, cosine, who
 
 
@@ -48,8 +43,7 @@ def wall_hits(start, u, tank):
 
 
 def obstacle_hits(scene, env, body, pos, u, slope):
-    """(range, cosine) where beams enter one obstacle's horizontal outline and the vertical gap allows it,
-    else inf."""
+    """(range, cosine) where beams enter an outline and the vertical gap allows it, else inf."""
     kind, size = scene["kind"][env, body], scene["size"][env, body]
     rel = scene["obstacle_pos"][env, body] - pos
     if kind == BOX:
@@ -75,8 +69,7 @@ def circle_entry(centre, radius_squared, u):
 
 
 def box_entry(centre, half, yaw, u):
-    """First crossing of a yawed rectangle from outside: nearest of its four edges, and only if the start is
-    not inside."""
+    """First crossing of a yawed rectangle from outside: nearest of its four edges."""
     c, s = np.cos(yaw), np.sin(yaw)
     axes = np.array([[c, s], [-s, c]])
     best, cosine = np.full(len(u), np.inf), np.zeros(len(u))

@@ -21,8 +21,7 @@ _WALL, _FLOOR, _SURFACE = -1, -2, -3
 
 
 class Seen:
-    """What rays meet: range [m], cosine of incidence, and which surface (an obstacle's number, or below
-    0)."""
+    """What rays meet: range [m], cosine of incidence, which surface (an obstacle's number, or below 0)."""
 
     def __init__(self, n: int) -> None:
         self.range_m, self.cosine, self.surface = np.full(n, np.inf), np.zeros(n), np.full(n, -9)
@@ -36,8 +35,7 @@ class Seen:
 
 
 def cast_rays(scenario: dict[str, Any], time_s: float, start: np.ndarray, unit: np.ndarray) -> Seen:
-    """What rays (n, 3) from a place (3,) [m] within the tank meet at a time: obstacles, side walls, floor and
-    surface of ``scenario.json``."""
+    """What rays (n, 3) from a place (3,) [m] in the tank of ``scenario.json`` meet at a time."""
     seen = Seen(len(unit))
     _meet_tank(seen, scenario["tank"], start, unit)
     for number, body in enumerate(scenario["obstacles"]):
@@ -117,8 +115,7 @@ def _meet_prism(
 def echo_power(
     scenario: dict[str, Any], time_s: float, start: np.ndarray, yaw: float, sonar_cfg: SonarConfig, n_bin: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(bearings (m,) [rad] from ahead, power (m, n_bin)): mean power that comes back from each bearing and
-    range, elevations folded; no pattern across yet. Bins part ``max_range_m`` equally."""
+    """(bearings (m,) [rad] from ahead, mean power (m, n_bin)) of each range bin, elevations folded."""
     bearing, edges = heard_bearings(sonar_cfg), elevations()
     az, el = (grid.ravel() for grid in np.meshgrid(bearing + yaw, edges, indexing="ij"))
     unit = np.column_stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
@@ -132,8 +129,7 @@ def echo_power(
 
 
 def _folded(bins: np.ndarray, surface: np.ndarray, power: np.ndarray, n_bin: int) -> np.ndarray:
-    """Power (n, n_bin) of rays (n, elevations): what two neighbouring rays meet of one surface lies evenly
-    between their ranges. ``bins``: of each ray, ``n_bin`` = beyond the last."""
+    """Power (n, n_bin) of rays (n, elevations), even between neighbours; ``bins``: ``n_bin`` = beyond."""
     half = 0.25 * (power[:, 1:] + power[:, :-1])
     one, other = bins[:, :-1], bins[:, 1:]
     same = surface[:, 1:] == surface[:, :-1]

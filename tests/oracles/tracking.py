@@ -99,12 +99,10 @@ def labelled(scan, cfg, sonar, tank):
 
 
 def velocity_error(u, still, cfg, sonar, valid):
-    """(error of the own velocity that explains the walls' Doppler, its largest standard deviation afterwards;
-    0 for a valid reading)."""
+    """(own velocity's error that explains the walls' Doppler, its largest standard deviation after)."""
     sigma = max(sonar.doppler_sigma_m_s, 0.01)
-    trust = (
-        cfg.own_speed_sigma_m_s if valid else 1.0
-    )  # m/s: a held reading may be off by the vehicle's whole speed
+    # m/s: a held reading may be off by the vehicle's whole speed
+    trust = cfg.own_speed_sigma_m_s if valid else 1.0
     information = u.T @ u / sigma**2 + np.eye(2) / trust**2
     left = np.linalg.inv(information)
     return left @ (u.T @ still) / sigma**2, 0.0 if valid else np.sqrt(np.linalg.eigvalsh(left).max())
@@ -189,8 +187,7 @@ def cluster_from(beams, steps, scan, still, slip, cfg, sonar):
 
 
 def arc(x, dt):
-    """State (x, y, vx, vy, turn rate) after dt: along the chord of the middle course, then with the velocity
-    turned."""
+    """State (x, y, vx, vy, turn rate) after dt: along the chord of the middle course, velocity turned."""
     mid, late = turned(x[2:4], 0.5 * dt * x[4]), turned(x[2:4], dt * x[4])
     return np.array([x[0] + dt * mid[0], x[1] + dt * mid[1], *late, x[4]])
 
@@ -219,8 +216,7 @@ def turned(v, angle):
 
 
 def missing_of(c, radius, radius_var, cfg, sonar):
-    """[m] that a cluster with two free edges is narrower than its body on one side; 0 where noise explains
-    it."""
+    """[m] a cluster with two free edges is narrower than its body on one side; 0 where noise explains it."""
     edge = 0.25 * 2 * np.pi / sonar.n_ray * c.range_m
     seen = (c.range_m + ARC * radius) * np.sin(np.pi / sonar.n_ray * c.span)
     short = radius - seen - cfg.partial_sigmas * np.sqrt(radius_var + edge**2 + 0.02**2)
@@ -229,10 +225,8 @@ def missing_of(c, radius, radius_var, cfg, sonar):
 
 def centre_variances(c, radius, radius_var, cfg, sonar):
     missing = missing_of(c, radius, radius_var, cfg, sonar)
-    radial, cross = (
-        c.range_var + ARC**2 * radius_var,
-        (0.25 * 2 * np.pi / sonar.n_ray * c.range_m) ** 2 + 0.02**2,
-    )
+    radial = c.range_var + ARC**2 * radius_var
+    cross = (0.25 * 2 * np.pi / sonar.n_ray * c.range_m) ** 2 + 0.02**2
     radial, cross = radial + missing**2, cross + missing**2
     if c.hidden:
         radial, cross = radial + (0.3 * radius) ** 2, cross + (0.5 * radius) ** 2 + radius_var

@@ -1,5 +1,4 @@
-"""NumPy float64 oracle of the turn history: a list of turns per env, one track at a time. Written from the
-description of the method."""
+"""NumPy float64 oracle of the turn history: lists of turns per env, one track at a time, by description."""
 
 from dataclasses import dataclass
 
@@ -23,8 +22,7 @@ def unit(v):
 
 
 def expected_turn_rate(rate, rate_var, cfg, tracking):
-    """Two models of one track: no turn rate, or one from the filter's prior; by Bayes' rule with the
-    densities of 0."""
+    """No turn rate, or one from the filter's prior: by Bayes' rule with the densities of 0."""
     if not cfg.use_turn_rate or rate_var == 0:
         return 0.0
     prior = np.exp(0.0) / tracking.turn_rate_sigma_rad_s
@@ -39,8 +37,7 @@ def is_straight(x, P, rate, rate_var):
 
 
 def corner(p0, d0, p1, d1, way):
-    """(corner, misfit, way before it, way after it): least squares of p0 + a d0 = p1 - b d1 with a + b =
-    way."""
+    """(corner, misfit, way before, way after): least squares of p0 + a d0 = p1 - b d1 with a + b = way."""
     # unknown: s = a - b; p1 - p0 = way / 2 (d0 + d1) + s / 2 (d0 - d1)
     s = np.linalg.lstsq(0.5 * (d0 - d1)[:, None], p1 - p0 - 0.5 * way * (d0 + d1), rcond=None)[0][0]
     a, b = 0.5 * (way + s), 0.5 * (way - s)
@@ -49,8 +46,7 @@ def corner(p0, d0, p1, d1, way):
 
 
 def learn(turns, next_slot, leg, leg_time, x, now, cfg):
-    """A track on a straight leg at state x; ``leg`` is its last straight state at ``leg_time`` [s] or None.
-    Returns the next slot."""
+    """``leg``: (last straight state, time [s]) of a track now straight at x, or None. The next slot."""
     if leg is None or now - leg_time >= LONGEST_S:
         return next_slot
     d0, d1 = unit(leg[2:]), unit(x[2:])

@@ -1,5 +1,4 @@
-"""NumPy / SciPy float64 oracles of the planner: clearance with sites, the traversable set, exact least cost
-on the full grid."""
+"""NumPy / SciPy float64 oracles of the planner: clearance, sites, traversable set, exact least cost."""
 
 from itertools import pairwise
 
@@ -13,8 +12,7 @@ SLACK_M = 1e-5
 
 
 def clearance_of(blocked, cell_m, max_m):
-    """(clearance [m], site row, site col) of a grid of blocked cells; sites are -1 where clearance saturates
-    at ``max_m``."""
+    """(clearance [m], site row, site col) of blocked cells; sites are -1 where it saturates at ``max_m``."""
     distance, (site_row, site_col) = distance_transform_edt(~blocked, return_indices=True)
     far = distance * cell_m >= max_m
     return np.minimum(distance * cell_m, max_m), np.where(far, -1, site_row), np.where(far, -1, site_col)
@@ -68,8 +66,7 @@ def line_cost(way_w, clearance_m, epsilon_m, origin, cell_m, step_m=0.005):
 
 
 def hopped_cost(way_w, clearance_m, epsilon_m, origin, cell_m):
-    """The paper's sum as written: segments (here bounded by the cell), each with the clearance at its first
-    point."""
+    """The paper's sum as written: segments (here a cell at most) with the clearance at their first point."""
     total = 0.0
     for a, b in pairwise(way_w):
         n = max(1, int(np.ceil(np.linalg.norm(b - a) / cell_m)))

@@ -1,5 +1,4 @@
-"""Independent float64 checks of scenarios: gaps between plan views, free space on a fine grid, positions
-along paths."""
+"""Independent float64 checks of scenarios: gaps between plan views, free space, positions along paths."""
 
 import math
 from itertools import pairwise
@@ -33,14 +32,12 @@ def plan_distances(points, kind, pos, size, yaw):
 
 
 def gap(a, b):
-    """Smallest distance between the plan views of two obstacles (kind, pos, size, yaw) [m], within 1 mm above
-    the exact one."""
+    """Smallest distance between plan views (kind, pos, size, yaw) [m], up to 1 mm above the exact one."""
     return float(min(plan_distances(outline(*a), *b).min(), plan_distances(outline(*b), *a).min()))
 
 
 def keeps_gap(a, b, least):
-    """Whether two obstacles' plan views lie this far apart [m]; outlines are drawn only where circles around
-    the obstacles do not."""
+    """Whether two obstacles' plan views lie this far apart [m]; circles around them tell first."""
     reach = sum(math.hypot(*size[:2]) if kind == BOX else size[0] for kind, _, size, _ in (a, b))
     return math.dist(a[1][:2], b[1][:2]) - reach >= least or gap(a, b) >= least
 
@@ -54,8 +51,7 @@ def wall_distances(points, tank):
 
 
 def is_joined(start, goal, obstacles, tank, clearance):
-    """Whether start and goal lie in one region of cells (8 neighbours) whose centre has the clearance, less
-    half a cell's diagonal."""
+    """Whether start and goal lie in one region (8 neighbours) with the clearance, less half a diagonal."""
     cols = np.arange(tank.x_m[0] + GRID_M / 2, tank.x_m[1], GRID_M)
     rows = np.arange(tank.y_m[0] + GRID_M / 2, tank.y_m[1], GRID_M)
     points = np.stack(np.meshgrid(cols, rows), axis=-1)

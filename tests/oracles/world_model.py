@@ -35,11 +35,8 @@ def losses(model, obs, action, next_obs):
         target, std = next_obs[:, :24] - obs[:, :24], np.sqrt(change.m2.numpy() / change.count.item())
         middle = 0.0
     else:
-        target, std, middle = (
-            next_obs[:, :24],
-            np.sqrt(norm.m2.numpy() / norm.count.item())[:24],
-            norm.mean.numpy()[:24],
-        )
+        target, std = next_obs[:, :24], np.sqrt(norm.m2.numpy() / norm.count.item())[:24]
+        middle = norm.mean.numpy()[:24]
     if config.normalise_targets:
         target = (target - middle) / std
     error = (target - mean) ** 2

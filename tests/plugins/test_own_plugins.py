@@ -342,9 +342,8 @@ def test_an_exception_names_the_line_where_her_code_was(sim, write):
     with pytest.raises(PluginError) as refused:
         stepped(sim, "mine.py:act")
     told = str(refused.value)
-    assert (
-        told.startswith("mine.py:4: KeyError: ") and "no column 'gaol'; there are goal, heading_error" in told
-    )
+    assert told.startswith("mine.py:4: KeyError: ")
+    assert "no column 'gaol'; there are goal, heading_error" in told
     assert told.endswith("(--agent mine.py:act)") and isinstance(refused.value.__cause__, KeyError)
     write("def act(view): ...\ndef reset(rows):\n    raise ValueError('no')\n", "other.py")
     with pytest.raises(PluginError, match=r"other.py:3: ValueError: no \(in reset of --agent other.py:act\)"):
@@ -672,11 +671,9 @@ def expected_of(sim):
     return (1e-3 * sim.observation.sum(1, keepdim=True)).clamp(-1, 1).expand(-1, 4)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{"rows": 1}, {"rows": 3}, {"dtype": np.float64}, {"opset": 11}, {"rows": 1, "dtype": np.float64}],
-    ids=str,
-)
+@pytest.mark.parametrize("changes", [
+    {"rows": 1}, {"rows": 3}, {"dtype": np.float64}, {"opset": 11}, {"rows": 1, "dtype": np.float64},
+], ids=str)  # fmt: skip
 def test_a_graph_of_another_trainer_drives(sim, tmp_path, monkeypatch, changes):
     monkeypatch.chdir(tmp_path)
     Path("model.onnx").write_bytes(graph_of(**changes))
@@ -725,11 +722,16 @@ def test_weights_beside_a_graph_are_read(sim, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("location", "length", "says"),
     [
-        ("../secret", None, "in no other folder"), ("/etc/passwd", None, "in no other folder"),
-        ("sub/w", None, "in no other folder"), ("..", None, "in no other folder"), ("", None, "in no other"),
-        ("link", None, "is a link"), ("short", None, "not whole in short"), ("w", 4, "not whole in w"),
+        ("../secret", None, "in no other folder"),
+        ("/etc/passwd", None, "in no other folder"),
+        ("sub/w", None, "in no other folder"),
+        ("..", None, "in no other folder"),
+        ("", None, "in no other"),
+        ("link", None, "is a link"),
+        ("short", None, "not whole in short"),
+        ("w", 4, "not whole in w"),
     ],
-)  # fmt: skip
+)
 def test_weights_of_elsewhere_are_not_read(tmp_path, monkeypatch, location, length, says):
     monkeypatch.chdir(tmp_path)
     graph, weights = split(graph_of(), location, length)

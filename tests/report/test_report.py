@@ -1,5 +1,4 @@
-"""The report: layout of heat maps, figures that follow the page's colours, and a page that says everything
-and trusts nothing."""
+"""The report: layout of heat maps, colours of figures, a page that says everything and trusts nothing."""
 
 import csv
 import hashlib
@@ -21,7 +20,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from tests import report_samples as samples
-from uuvtai.common.colours import contrast, ink_on, shade
+from uuvtai.common.colours import PALETTE, agent_colours, contrast, ink_on, shade
 from uuvtai.common.errors import UserError
 from uuvtai.config.loader import ConfigError
 from uuvtai.console.screen import print_heat_maps
@@ -133,11 +132,8 @@ def test_heat_maps_in_the_terminal_are_coloured_where_colours_are_shown():
 def test_a_cell_without_episodes_is_a_dash():
     document = samples.sweep_document(axes={"S": [4], "D": [3], "v_m_s": [0.2, 0.4]})
     document["cells"][0] |= {
-        "success_rate": None,
-        "collision_rate": None,
-        "success_ci95": None,
-        "time_to_success_mean_s": None,
-    }
+        "success_rate": None, "collision_rate": None, "success_ci95": None, "time_to_success_mean_s": None,
+    }  # fmt: skip
     assert "-" in printed(document, 120)
     assert "0 %" in printed(document, 120)
     hover = drawn(heat_map(pivot(document["cells"], document["axes"]), "success_rate", "x"))[1]
@@ -249,8 +245,7 @@ def figures(blocks):
 
 
 def test_methods_are_shown_with_counts_intervals_and_both_times():
-    blocks = evaluation(samples.evaluation_document())
-    first = tables(blocks)[0]
+    first = tables(evaluation(samples.evaluation_document()))[0]
     assert rows(first)[1] == [
         "bt",
         "6/8 = 75.0 % [40.9, 92.9]",
@@ -297,10 +292,8 @@ def test_a_sweep_over_two_axes_is_two_heat_maps_a_method():
 
 
 def test_a_sweep_over_one_axis_is_curves_with_intervals():
-    document = samples.noise_sweep()
-    blocks = sweep(document)
-    figure = figures(blocks)["sweep_sensors"]
-    hover = drawn(figure.panels[0])[1]
+    blocks = sweep(samples.noise_sweep())
+    hover = drawn(figures(blocks)["sweep_sensors"].panels[0])[1]
     assert hover["interval-1-3"].splitlines()[:2] == [
         "best, sensors = harsh",
         "success 12/16 = 75.0 % [50.5, 89.8]",
@@ -468,8 +461,7 @@ def test_everything_from_files_is_escaped(evil):
     page = Reader(written.page.read_text())
     assert not page.of("script") and not page.of("b")
     assert not [key for _, attributes in page.tags for key in attributes if key.startswith("on")]
-    text = "".join(page.words)
-    assert text.count("alert(1)") > 5, "as words they are there"
+    assert "".join(page.words).count("alert(1)") > 5, "as words they are there"
     assert [path.name for path in written.figures] == ["agents.png"]
 
 
@@ -511,11 +503,8 @@ def test_the_data_of_a_figure_can_be_had_as_csv(tmp_path):
     assert rows == ["heat_map_bt.csv"]
     assert len(cells) == 75
     assert (cells[-1]["S"], cells[-1]["v_m_s"], cells[-1]["success"], cells[-1]["success_rate"]) == (
-        "12",
-        "3.0",
-        "1",
-        "0.0625",
-    )
+        "12", "3.0", "1", "0.0625",
+    )  # fmt: skip
     assert data.csv() == 'name,value\n"a, b",0.1\n"""c""",\n'
 
 
@@ -561,8 +550,7 @@ def test_a_damaged_cell_of_one_of_several_runs_names_its_folder(tmp_path):
 
 
 def test_a_training_and_its_evaluations_are_one_page(tmp_path):
-    """The checkpoint's sha256 says which training an evaluation is of; figures of two folders do not
-    overwrite each other."""
+    """The checkpoint's sha256 tells the training; figures of two folders are kept apart."""
     trained = samples.write_run(tmp_path / "first", metrics=samples.metrics(5))
     manifest = trained / "checkpoints/step_000005/manifest.json"
     manifest.parent.mkdir(parents=True)
@@ -609,8 +597,6 @@ def test_pairs_of_methods_are_told_with_p_and_interval():
 
 
 def test_a_method_has_its_colour_in_charts_and_tables(tmp_path):
-    from uuvtai.common.colours import agent_colours
-
     names = ["straight", "planner", "bt", "mine"]
     colours = agent_colours(names)
     document = samples.evaluation_document(*map(samples.agent, names))
@@ -632,13 +618,11 @@ def test_a_method_has_its_colour_in_charts_and_tables(tmp_path):
         for span in Reader(report([tmp_path]).page.read_text()).of("span")
         if span.get("class") == "swatch"
     ]
-    assert len(swatches) == 2 * len(names) and all(
-        colours[name] in style for name, style in zip(names, swatches[: len(names)], strict=True)
-    )
+    assert len(swatches) == 2 * len(names)
+    assert all(colours[name] in style for name, style in zip(names, swatches[: len(names)], strict=True))
 
 
 def test_every_colour_of_a_line_has_a_lighter_one_for_the_dark():
-    from uuvtai.common.colours import PALETTE
 
     template = (files("uuvtai") / "report/page.html.j2").read_text()
     lighter = dict(re.findall(r"--series-(\d+): (#\w{6})", template))
@@ -667,10 +651,8 @@ def test_a_page_of_many_videos_stays_below_ten_megabytes(tmp_path):
     for some in (runs[:1], runs):
         page = report(some, tmp_path / f"page_of_{len(some)}.html").page
         assert 7e6 < page.stat().st_size < 10e6
-        assert (
-            "Left out to keep this page small" in page.read_text()
-            and "videos/bt_seed0_episode" in page.read_text()
-        )
+        assert "Left out to keep this page small" in page.read_text()
+        assert "videos/bt_seed0_episode" in page.read_text()
 
 
 # ----------------------------------------------------------------------------------------------- reproduction
@@ -712,11 +694,8 @@ def test_a_reproduction_composes_verdicts_tables_and_runs(tmp_path):
     written = report([folder])
     page = Reader(written.page.read_text())
     assert [path.stem for path in written.figures] == [
-        "trade_off",
-        "grid_heat_map_bt",
-        "noise_sweep_sensors",
-        "training",
-    ]
+        "trade_off", "grid_heat_map_bt", "noise_sweep_sensors", "training",
+    ]  # fmt: skip
     assert [item["class"] for item in page.of("li")] == ["holds", "fails"]
     assert "a (2 seeds)" in page.words
 

@@ -77,8 +77,7 @@ def test_there_is_something_to_check():
     "path", [p for p in KERNELS.rglob("*.py") if room_of(p) in STACK], ids=lambda p: f"{room_of(p)}.{p.stem}"
 )
 def test_the_stack_never_names_the_truth(path):
-    """Nor is it handed any: a bundle is a file of its room, and what is imported comes from the stack's
-    rooms."""
+    """Nor is it handed any: a bundle is a file of its room, imports come from the stack's rooms."""
     assert not names_in(path) & TRUTH
     for module in imports_of(path):
         parts = module.split(".")
@@ -87,8 +86,7 @@ def test_the_stack_never_names_the_truth(path):
 
 
 def test_what_knows_the_truth_writes_nothing_that_the_stack_reads_but_readings():
-    """Simulated instruments, the clock and the mission are what the vehicle may know; the oracles say what
-    they are."""
+    """Instruments, clock and mission are what the vehicle may know."""
     known = {
         kind
         for name in BUNDLES
@@ -299,14 +297,11 @@ def test_the_tree_in_contributing_shows_every_folder():
     real = {
         f"{p.name}/"
         for p in [
-            *PACKAGE.iterdir(),
-            *KERNELS.iterdir(),
-            *(PACKAGE / "learning").iterdir(),
-            *(PACKAGE / "vehicle").iterdir(),
-            *(PACKAGE / "logs").iterdir(),
+            *PACKAGE.iterdir(), *KERNELS.iterdir(), *(PACKAGE / "learning").iterdir(),
+            *(PACKAGE / "vehicle").iterdir(), *(PACKAGE / "logs").iterdir(),
         ]
         if p.is_dir() and p.name[0] != "_"
-    }
+    }  # fmt: skip
     assert drawn == real, (
         f"CONTRIBUTING's tree lacks {sorted(real - drawn)} and still shows {sorted(drawn - real)}"
     )
@@ -339,8 +334,7 @@ def module_of(path):
 
 @cache
 def nodes():
-    """Module -> nodes of its syntax tree. Not made at import: every process of the gate imports every
-    file."""
+    """Module -> nodes of its syntax tree; not made at import, which every process of the gate does."""
     return {module_of(path): nodes_of(path) for path in sorted(PACKAGE.rglob("*.py"))}
 
 

@@ -1,5 +1,4 @@
-"""What runs elsewhere (GitHub's machines, a container, a contributor's hooks) agrees with this checkout,
-which cannot run it."""
+"""What runs elsewhere (GitHub, a container, a contributor's hooks) agrees with this checkout."""
 
 import os
 import re
@@ -74,8 +73,7 @@ def test_the_lock_has_what_the_project_wants(python):
 
 
 def test_ci_runs_the_gate_on_every_python_that_is_promised():
-    job = WORKFLOW["jobs"]["test"]
-    assert job["strategy"]["matrix"]["python"] == PYTHONS
+    assert WORKFLOW["jobs"]["test"]["strategy"]["matrix"]["python"] == PYTHONS
     assert 'requires-python = ">=3.10,<3.14"' in PROJECT
     runs = [step.get("run", "") for step in steps_of("test")]
     assert runs[-1] == ".ci/run" and "bootstrap.py test" in (ROOT / runs[-1]).read_text()

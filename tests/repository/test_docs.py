@@ -1,5 +1,4 @@
-"""The documentation: the site builds without a warning, no page is missing, what readers are told to type
-works, the tutorial runs."""
+"""The documentation: builds without a warning, no page missing, what readers type works, the tutorial."""
 
 import ast
 import importlib
@@ -22,6 +21,7 @@ from tests.command import uuv
 from uuvtai.config.learning import LearningConfig
 from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.logs.topics import TOPICS
+from uuvtai.sim.stages import STAGES
 
 ROOT = Path(__file__).parents[2]
 PROSE = sorted(
@@ -47,8 +47,7 @@ NUMBERS = {"N", "K", "S"}
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The site's folder. Broken internal links and anchors are warnings of Sphinx, and warnings are errors
-    here."""
+    """The site's folder. Broken internal links are warnings of Sphinx, and warnings are errors here."""
     pytest.importorskip("myst_parser", reason="the extra docs is not installed")
     folder = tmp_path_factory.mktemp("site")
     shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("reference", "__pycache__"))
@@ -76,14 +75,10 @@ def test_the_site_builds_without_a_warning_and_lacks_no_page(site):
 def test_the_page_of_the_python_api_has_what_programs_use(site):
     page = (site / "extend.html").read_text() + (site / "logs.html").read_text()
     for name in (
-        "uuvtai.make",
-        "uuvtai.envs.vector_env.VectorEnv.step",
-        "uuvtai.envs.gymnasium.UuvVectorEnv.step",
-        "uuvtai.envs.gymnasium.UuvEnv.step",
-        "uuvtai.learning.policy_agent.PolicyAgent.act",
-        "uuvtai.learning.export.run_policy.Policy.act",
-        "uuvtai.logs.reader.read_messages",
-    ):
+        "uuvtai.make", "uuvtai.envs.vector_env.VectorEnv.step", "uuvtai.envs.gymnasium.UuvVectorEnv.step",
+        "uuvtai.envs.gymnasium.UuvEnv.step", "uuvtai.learning.policy_agent.PolicyAgent.act",
+        "uuvtai.learning.export.run_policy.Policy.act", "uuvtai.logs.reader.read_messages",
+    ):  # fmt: skip
         described = page.partition(f'id="{name}"')[2].partition('id="uuvtai.')[0]
         assert "<p>" in described, f"{name} has no text"
 
@@ -106,8 +101,7 @@ def test_the_site_is_whole_and_quiet_on_every_screen(site):
 
 
 def test_generated_pages_are_not_committed():
-    ignored = (ROOT / ".gitignore").read_text().splitlines()
-    assert {"docs/reference/", "site/"} <= set(ignored)
+    assert {"docs/reference/", "site/"} <= set((ROOT / ".gitignore").read_text().splitlines())
 
 
 def test_every_command_tells_its_options():
@@ -160,8 +154,6 @@ def test_what_a_help_text_says_is_no_markup():
 
 
 def test_every_stage_of_the_simulator_is_told():
-    from uuvtai.sim.stages import STAGES
-
     assert tuple(stages.FILES) == STAGES
 
 
@@ -185,8 +177,7 @@ def variants(usage):
 
 
 def fault(words, whole=True):
-    """What is wrong with the words after ``uuv``; None = they can be parsed. In passing (not ``whole``)
-    arguments may be missing."""
+    """What is wrong with the words after ``uuv``, or None. In passing (not ``whole``) arguments may miss."""
     command = commands.app()
     if {"--install-completion", "--show-completion"} & set(words):
         return None  # parsing them does what they say: the first writes into the reader's shell
@@ -369,8 +360,7 @@ def test_the_tables_of_the_python_page_are_those_of_the_environment(small):
 
 
 def test_the_tutorial_runs():
-    """In a process of its own, whose simulator has the sizes of the small one: ``tests/warm.py`` has compiled
-    its kernels."""
+    """In a process of its own with the small simulator's sizes (compiled by ``tests/warm.py``)."""
     nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
     client = pytest.importorskip("nbclient", reason="nbclient is not installed")
     notebook = nbformat.read(NOTEBOOK, as_version=4)

@@ -1,5 +1,4 @@
-"""The examples: every script runs, on the session's simulator and with short episodes, and gives the result
-that it promises."""
+"""The examples: every script runs on the session's simulator and gives what it promises."""
 
 import importlib
 from pathlib import Path
@@ -178,10 +177,8 @@ def test_custom_world_can_be_placed(taichi_runtime):
 def test_custom_vehicle_follows_its_command(taichi_runtime, example):
     module = example("custom_vehicle")
     head, *rows = module.main(start_taichi("cpu")).splitlines()
-    assert head.split()[-2:] == ["4.0", "s"] and [row.split()[0] for row in rows] == [
-        "bluerov2",
-        "heavy_pack",
-    ]
+    assert head.split()[-2:] == ["4.0", "s"]
+    assert [row.split()[0] for row in rows] == ["bluerov2", "heavy_pack"]
     speeds = np.array([[float(value) for value in row.split()[1:]] for row in rows])
     assert (np.abs(speeds[:, -1] - 0.6) < 0.02).all() and not np.array_equal(*speeds)
     ours, theirs = (load_config("open", vehicle=name).vehicle for name in reversed(module.VEHICLES))
@@ -201,9 +198,8 @@ def test_custom_reward_changes_the_terms_it_names(small, example, monkeypatch):
         assert was * float(careful[i]) == pytest.approx(now * float(default[i]), rel=1e-4, abs=1e-6 * was)
         assert (was != now) == (name in weights)
     rows = module.table({"default": default, "careful": careful}, names).splitlines()
-    assert len(rows) == len(names) + 2 and float(rows[-1].split()[1]) == pytest.approx(
-        float(default.sum()), abs=0.01
-    )
+    assert len(rows) == len(names) + 2
+    assert float(rows[-1].split()[1]) == pytest.approx(float(default.sum()), abs=0.01)
 
 
 def test_custom_tree_stands_beside_the_shipped_ones(short, example):

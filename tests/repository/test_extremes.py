@@ -1,5 +1,4 @@
-"""Every config key at its extremes: accepted, with sizes that can be told, or refused in words; nothing
-overflows."""
+"""Every config key at its extremes: accepted with sizes told, or refused in words; no overflow."""
 
 import math
 
@@ -12,25 +11,9 @@ from uuvtai.config.loader import _checked, load_config, load_training
 from uuvtai.sim.setup import array_sizes, check_size, memory_bytes
 
 EXTREMES = (
-    0,
-    -1,
-    5e-324,
-    1e-300,
-    1e-6,
-    1e300,
-    1e18,
-    math.nan,
-    math.inf,
-    2**31,
-    2**31 - 1,
-    2**63,
-    -(2**63),
-    10**400,
-    "",
-    [],
-    True,
-    False,
-)
+    0, -1, 5e-324, 1e-300, 1e-6, 1e300, 1e18, math.nan, math.inf, 2**31, 2**31 - 1, 2**63, -(2**63), 10**400,
+    "", [], True, False,
+)  # fmt: skip
 TREE = load_training("curriculum").model_dump(mode="json")
 
 
@@ -59,8 +42,7 @@ def candidates(value):
 
 
 def changed(tree, key, value):
-    """The tree with another value at a dotted key; all else is shared with the old one, for thousands are
-    made."""
+    """The tree with another value at a dotted key; all else is shared, for thousands are made."""
     name, _, rest = key.partition(".")
     return tree | {name: changed(tree[name], rest, value) if rest else value}
 

@@ -104,11 +104,8 @@ def test_the_viewers_own_reader_decodes_every_message_against_its_schema(recordi
         }
         assert found["counts"] == counts and len(counts) >= 22
         assert found["unlikeOfficial"] == []
-        assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == [
-            "config.yaml",
-            "scenario.json",
-            "tree.xml",
-        ]
+        assert found["metadata"] == ["uuv.run", "uuv.result"]
+        assert found["attachments"] == ["config.yaml", "scenario.json", "tree.xml"]
 
 
 def test_what_describes_the_run_comes_before_data_and_loads(recordings, logs, tmp_path):
@@ -117,8 +114,7 @@ def test_what_describes_the_run_comes_before_data_and_loads(recordings, logs, tm
             kinds = [type(record) for record in StreamReader(file, emit_chunks=True).records]
         ahead = kinds[: kinds.index(Chunk)]
         assert ahead.count(Metadata) == 1 and ahead.count(Attachment) == 3
-        text = yaml.safe_dump(log.config)
-        (tmp_path / "config.yaml").write_text(text)
+        (tmp_path / "config.yaml").write_text(yaml.safe_dump(log.config))
         sensors = "clean" if path in recordings["clean"] else "paper"
         overrides = {**SmallSim.CHANGES, "episode.horizon_steps": HORIZON}
         assert load_resolved(tmp_path / "config.yaml") == load_config("pool", sensors, overrides=overrides)
@@ -139,9 +135,8 @@ def test_every_topic_comes_at_its_rate(logs):
             range(0, last + 1, log.config["sensors"]["depth"]["period_steps"])
         )
         replans = log.steps("/plan")
-        assert (
-            len(replans) == int(log.metadata["uuv.result"]["replans"]) and log.steps("/plan/info") == replans
-        )
+        assert len(replans) == int(log.metadata["uuv.result"]["replans"])
+        assert log.steps("/plan/info") == replans
         assert log.steps("/log") == sorted([*replans, last])
         due, newest = [], -math.inf
         for step in range(last + 1):
@@ -166,11 +161,8 @@ def test_the_script_imports_only_general_libraries():
 def test_clean_scans_are_recast_from_the_true_obstacles(recordings, figures):
     for path in recordings["clean"]:
         found = figures[path]["sonar"]
-        assert (
-            found["beams"] > 40_000
-            and found["returns_of_moving_obstacles"] > 500
-            and found["no_return_is_max_range"]
-        )
+        assert found["beams"] > 40_000 and found["returns_of_moving_obstacles"] > 500
+        assert found["no_return_is_max_range"]
         assert found["fitting_share"] >= FIT_SHARE
         assert found["range_within_2_mm"] >= FIT_SHARE and found["range_max_m"] < 0.15
         assert found["doppler_within_1e_3"] >= FIT_SHARE
@@ -237,11 +229,8 @@ def test_the_map_cannot_be_redone_without(spoil, long_log):
 
 def test_clearance_and_risk_follow_from_the_map(figures):
     for found in (each["map"]["clearance"] for each in figures.values()):
-        assert (
-            found["grids_with_their_map"] > 0
-            and found["max_error_m"] < DISTANCE_M
-            and found["risk_max_error"] < DISTANCE_M
-        )
+        assert found["grids_with_their_map"] > 0 and found["max_error_m"] < DISTANCE_M
+        assert found["risk_max_error"] < DISTANCE_M
         assert found["agreeing_share_from_scans"] >= AGREEMENT_EACH
 
 
@@ -254,11 +243,8 @@ def test_hull_clearance_and_time_to_collision_follow_at_every_step(figures):
 
 def test_the_outcome_follows_from_the_rules(recordings, logs, figures):
     for found in (each["safety"] for each in figures.values()):
-        assert (
-            found["outcome"] == found["outcome_told"]
-            and found["ends_at_the_last_step"]
-            and found["time_error_s"] < 1e-6
-        )
+        assert found["outcome"] == found["outcome_told"] and found["ends_at_the_last_step"]
+        assert found["time_error_s"] < 1e-6
     printed = {
         (agent["name"], str(entry["seed"]), str(entry["episode"])): entry["outcome"]
         for agent in recordings["printed"]["agents"]

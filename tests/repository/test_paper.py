@@ -1,5 +1,4 @@
-"""docs/paper.md says what the code does: every difference between the defaults and the preset ``paper``, with
-both values."""
+"""docs/paper.md says what the code does: every difference of the preset ``paper``, both values."""
 
 import json
 import re
@@ -95,19 +94,11 @@ def test_the_papers_own_numbers_are_the_presets():
     c = load_training("paper")
     v, e, sonar, camera = c.vehicle, c.episode, c.sensors.sonar, c.sensors.depth
     assert (v.gravity_m_s2, v.water_density_kg_m3, v.volume_m3, v.buoyancy_height_m) == (
-        9.81,
-        997.0,
-        0.0113459,
-        0.01,
-    )
+        9.81, 997.0, 0.0113459, 0.01,
+    )  # fmt: skip
     assert v.added_mass == (5.5, 12.7, 14.57, 0.12, 0.12, 0.12) and v.linear_damping == (
-        4.03,
-        6.22,
-        5.18,
-        0.07,
-        0.07,
-        0.07,
-    )
+        4.03, 6.22, 5.18, 0.07, 0.07, 0.07,
+    )  # fmt: skip
     assert v.quadratic_damping == (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
     assert (v.rotor_tau_s, v.rotor_max_rpm, v.thrust_scale, len(v.thrusters)) == (0.01, 3900.0, 1.0, 6)
     assert (e.control_dt_s, e.substeps, e.horizon_steps) == (0.02, 2, 3000)
@@ -115,9 +106,6 @@ def test_the_papers_own_numbers_are_the_presets():
     assert (sonar.n_ray, sonar.max_range_m) == (256, 12.0)
     assert (camera.cols, camera.rows, camera.fov_deg, camera.max_range_m) == (128, 72, 90.0, 10.0)
     assert (c.clearance.inflate_m, c.route.rrt_clearance_m, c.mapping.stamp, c.tracking.horizon_s) == (
-        0.08,
-        0.1,
-        0.0,
-        2.5,
-    )
+        0.08, 0.1, 0.0, 2.5,
+    )  # fmt: skip
     assert (c.disturbance, c.sensors.localization) == (LearningConfig().disturbance, "truth")

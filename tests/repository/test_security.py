@@ -802,18 +802,9 @@ def test_chunks_that_unfold(here, command, capfd):
 
 def test_names_of_attachments_and_topics_stay_inside(here, capfd):
     names = [
-        "../../evil",
-        "/tmp/evil_absolute",
-        "..\\..\\evil",
-        "a/../../b",
-        "..",
-        ".",
-        "",
-        "\0x",
-        "C:\\evil",
-        "~/.bashrc",
-        "x\n--flag",
-    ]
+        "../../evil", "/tmp/evil_absolute", "..\\..\\evil", "a/../../b", "..", ".", "", "\0x", "C:\\evil",
+        "~/.bashrc", "x\n--flag",
+    ]  # fmt: skip
     file = McapFile(here / "a.mcap")
     for name in names:
         file.add_attachment(name, "text/plain", b"x")
@@ -915,11 +906,8 @@ def test_a_config_within_a_log_is_yaml_without_tags(here, text, capfd):
 def test_names_in_a_log_cannot_steer_the_terminal(here, capfd):
     file = McapFile(here / "a.mcap")
     for topic in (
-        "/\x1b]52;c;ZXZpbA==\x07",
-        "/[link=file:///etc/passwd]x[/link]",
-        "/[/nothing]",
-        "/\x9b31m\u202e",
-    ):
+        "/\x1b]52;c;ZXZpbA==\x07", "/[link=file:///etc/passwd]x[/link]", "/[/nothing]", "/\x9b31m\u202e",
+    ):  # fmt: skip
         file.add_message(
             file.add_channel(topic, file.add_schema("\x1b[2J", "jsonschema", b"{}")), 0, b"not json"
         )

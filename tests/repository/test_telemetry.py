@@ -1,5 +1,4 @@
-"""ONNX Runtime reports nothing to its makers: off by variable and by call, in one place; nothing is left
-outside the folder."""
+"""ONNX Runtime reports nothing to its makers: off by variable and by call; no file is left outside."""
 
 import ast
 import os
@@ -79,14 +78,9 @@ def watched(work, home):
     }
     code = WATCHED.replace("WORK", textwrap.indent(work, "    ").strip())
     done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=home,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
+        [sys.executable, "-c", code], cwd=home, env=environment, capture_output=True, text=True, timeout=300,
         check=False,
-    )
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -169,8 +163,7 @@ def test_one_place_imports_onnx_runtime():
 
 
 def test_only_versions_that_were_checked_are_installed():
-    """1.29 to 1.32 read the variable, versions before have no telemetry; a newer one has to be looked at
-    first."""
+    """1.29 to 1.32 read the variable, older ones have no telemetry, newer ones must be looked at."""
     wanted = re.findall(r'"(onnxruntime[^"]*)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     assert wanted == ["onnxruntime>=1.20,<1.33"]
 

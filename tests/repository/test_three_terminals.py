@@ -18,7 +18,7 @@ from uuvtai.vehicle.onboard import ImuReading, Mission, PositionFix
 from uuvtai.vehicle.pilot_log import LinkLog
 from uuvtai.vehicle.safety import STOP, SafeAction, SafeDecision, SafetyLimits
 from uuvtai.vehicle.sitl import Instance, ServingNotes, SimulatedOperator, SitlPlan, SitlPort, WaterRows
-from uuvtai.vehicle.telemetry import Heard
+from uuvtai.vehicle.telemetry import Heard, Intake
 
 HERE = LinkPlace("127.0.0.1", 0, False)
 ROW = 2
@@ -101,8 +101,7 @@ def test_before_it_tells_its_time_heartbeats_alone_are_heard(followed):
     endpoint, sub, wall = followed
     sub.silent |= {"ATTITUDE"}
     sub.speak()
-    heard = endpoint.receive()
-    assert len(heard) == 2, "its own and the operator's"
+    assert len(endpoint.receive()) == 2, "its own and the operator's"
     wall.now_s += 0.25
     assert endpoint.now() == pytest.approx(0.25), "our clock counts"
     sub.silent -= {"ATTITUDE"}
@@ -336,8 +335,6 @@ def test_what_the_pilot_says_it_waits_for():
 
 def test_ids_that_are_others_are_named():
     """A vehicle and a ground station that are there, but are not the ones that were typed."""
-    from uuvtai.vehicle.telemetry import Intake
-
     intake = Intake(link_config(), (0.0, 0.0, 0.0), 0.0)
     intake.take("HEARTBEAT", 3, 1, {"type": 12, "autopilot": 3, "base_mode": 0, "custom_mode": 0}, 1.0)
     intake.take("HEARTBEAT", 254, 190, {"type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0}, 1.0)
@@ -375,6 +372,5 @@ def test_what_the_water_says():
 
 
 def test_the_water_says_that_ardusub_comes_from_another_water():
-    notes = ServingNotes(1, 9012, 0.0)
-    said = notes.look(served(counts={"reset": 1}, joined_late=True), 1.0)
+    said = ServingNotes(1, 9012, 0.0).look(served(counts={"reset": 1}, joined_late=True), 1.0)
     assert len(said) == 2 and "restart it, and the pilot" in said[1]

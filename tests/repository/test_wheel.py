@@ -1,5 +1,4 @@
-"""What a user installs: the wheel made from the source distribution, in an environment of its own, in any
-folder, without a network."""
+"""The wheel of the source distribution in an environment of its own, anywhere, without a network."""
 
 import json
 import os
@@ -71,45 +70,25 @@ def built(tmp_path_factory):
     )
     (sdist,) = dist.glob("*.tar.gz")
     run(
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "--quiet",
-        "--no-deps",
-        "--no-build-isolation",
-        "--no-index",
-        "-w",
-        dist,
-        sdist,
-        cwd=place,
-    )
+        sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index",
+        "-w", dist, sdist, cwd=place,
+    )  # fmt: skip
     (stepper,) = dist.glob("*.whl")
     return sdist, stepper
 
 
 @pytest.fixture(scope="module")
 def installed(built, tmp_path_factory):
-    """(packages, interpreter) of a fresh environment with the wheel, lent what it needs by the tests' own; no
-    network there."""
+    """(packages, interpreter) of an environment with the wheel, lent the rest; no network there."""
     place = tmp_path_factory.mktemp("installed")
     run(sys.executable, "-m", "venv", "--without-pip", place)
     python = next(place.glob("*/python"), None) or place / "Scripts" / "python.exe"
     own = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
     (own / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
     run(
-        python,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        "--ignore-installed",
-        built[1],
-        env=clean(),
-        cwd=place,
-    )
+        python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", built[1],
+        env=clean(), cwd=place,
+    )  # fmt: skip
     (own / "no_network.py").write_text(NO_NETWORK)
     (own / "no_network.pth").write_text("import no_network\n")
     return own, python
@@ -122,8 +101,7 @@ def clean(**more):
 
 @pytest.fixture
 def uuv(installed, tmp_path):
-    """Run ``uuv`` of the wheel in an empty folder; its stdout. Fails where anything reached for the
-    network."""
+    """Run ``uuv`` of the wheel in an empty folder; its stdout. Fails where anything asked the network."""
     own, python = installed
 
     def call(*arguments, **more):
@@ -155,15 +133,9 @@ def test_the_source_distribution_can_be_tested_and_carries_no_litter(built):
     with tarfile.open(built[0]) as packed:
         names = {name.partition("/")[2] for name in packed.getnames()}
     wanted = {
-        "LICENSE",
-        "README.md",
-        "CHANGELOG.md",
-        "CONTRIBUTING.md",
-        "pyproject.toml",
-        "bootstrap.py",
-        "tests/conftest.py",
-        ".ci/run",
-    }
+        "LICENSE", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "pyproject.toml", "bootstrap.py",
+        "tests/conftest.py", ".ci/run",
+    }  # fmt: skip
     assert names >= wanted | MODULES | PRESETS | {
         "tests/oracles/world.py",
         "examples/judge.py",
@@ -198,8 +170,7 @@ def test_the_examples_are_a_users_by_one_command_and_none_of_hers_is_overwritten
 
 
 def test_who_reaches_for_the_network_is_found_out(installed, tmp_path):
-    """What the other tests rely on: name look-ups and connections fail and are written down, though their
-    errors be swallowed."""
+    """Look-ups and connections fail and are written down, even if the errors are swallowed."""
     own, python = installed
     tries = (
         "s.create_connection(('192.0.2.1', 9), 1)",

@@ -1,5 +1,4 @@
-"""Capture and restore: a run that goes on from captured arrays is the run that was never stopped, bit for
-bit."""
+"""Capture and restore: a run that goes on from captured arrays never stopped, bit for bit."""
 
 import numpy as np
 import pytest
@@ -27,8 +26,7 @@ def env(small):
 
 
 def driven(env, first, last):
-    """Everything that ``step`` returns, from step ``first`` to ``last``: tree or noise drives, some clocks
-    run out."""
+    """Everything that ``step`` returns, ``first`` to ``last``: tree or noise drives, some clocks run out."""
     out = []
     for step in range(first, last):
         noise = 2 * torch.rand(N, 4, generator=torch.Generator().manual_seed(step)) - 1
@@ -56,8 +54,7 @@ def run(env):
     """(captured arrays, what the uninterrupted run showed after the capture)."""
     env.reset(seed=SEED)
     driven(env, 0, BEFORE)
-    arrays = env.capture()
-    return arrays, driven(env, BEFORE, BEFORE + AFTER)
+    return env.capture(), driven(env, BEFORE, BEFORE + AFTER)
 
 
 def test_a_restored_run_is_the_uninterrupted_one(env, run):
@@ -87,15 +84,11 @@ def test_views_show_every_layout_as_taichi_does(small):
     """One array of each layout that ``state.array`` knows, in both directions."""
     memory, s = small.sim.memory(), small.sim.s
     fields = {
-        "route.n_queue": s.route.n_queue,
-        "clock.step": s.clock.step,
-        "vehicle.quat_wb": s.vehicle.quat_wb,
-        "tracks.height": s.tracks.height,
-        "scan.range_m": s.scan.range_m,
-        "clearance.site_row": s.clearance.site_row,
-        "grid_map.dynamic_occ": s.grid_map.dynamic_occ,
+        "route.n_queue": s.route.n_queue, "clock.step": s.clock.step, "vehicle.quat_wb": s.vehicle.quat_wb,
+        "tracks.height": s.tracks.height, "scan.range_m": s.scan.range_m,
+        "clearance.site_row": s.clearance.site_row, "grid_map.dynamic_occ": s.grid_map.dynamic_occ,
         "grid_map.free_scans": s.grid_map.free_scans,
-    }
+    }  # fmt: skip
     views = memory.views(memory.read(), scratch=True)
     rng = np.random.default_rng(0)
     before = {name: views[name].copy() for name in fields}
@@ -129,14 +122,9 @@ def test_rows_are_what_a_kernel_copies(small):
 def test_put_writes_what_taichi_reads_and_refuses_what_does_not_fit(small):
     s, put = small.sim.s, small.sim.memory().put
     fields = [
-        s.table.n_node,
-        s.table.kind,
-        s.table.param,
-        s.mask.outside,
-        s.mask.outside_bits,
-        s.allocation.wrench_of_thrust,
-        s.scene.n_static,
-    ]
+        s.table.n_node, s.table.kind, s.table.param, s.mask.outside, s.mask.outside_bits,
+        s.allocation.wrench_of_thrust, s.scene.n_static,
+    ]  # fmt: skip
     for number, field in enumerate(fields):
         before = np.asarray(field[None]) if field.shape == () else copied_by_taichi(field)
         before = before.astype(np.int32) if field.shape == () else before
@@ -152,8 +140,7 @@ def test_put_writes_what_taichi_reads_and_refuses_what_does_not_fit(small):
 
 
 def test_views_do_not_overlap(small):
-    """Every byte of every array belongs to it alone, and the padding of arrays in lanes lies inside the
-    block."""
+    """Every byte of an array is its own, and the padding of arrays in lanes lies in the block."""
     memory = small.sim.memory()
     content = np.zeros(memory.n_bytes, np.uint8)
     total = 0
@@ -174,28 +161,20 @@ def edited_setting(arrays, old, new):
 BROKEN = {
     "missing": (lambda a: without(a, "sim.grid_map.seen"), "lacks 'grid_map.seen'.*give what capture"),
     "missing tensor": (lambda a: without(a, "env.obs"), "lacks 'obs'"),
-    "unknown": (
-        lambda a: a | {"sim.vehicle.name": np.zeros(3)},
-        "holds 'vehicle.name', which this version does not know",
-    ),
-    "shape": (
-        lambda a: a | {"sim.vehicle.pos_w": np.zeros((3, 3), np.float32)},
-        r"'vehicle.pos_w' is float32 \(3, 3\), but float32 \(8, 3\) is",
-    ),
+    "unknown": (lambda a: a | {"sim.vehicle.name": np.zeros(3)},
+        "holds 'vehicle.name', which this version does not know"),
+    "shape": (lambda a: a | {"sim.vehicle.pos_w": np.zeros((3, 3), np.float32)},
+        r"'vehicle.pos_w' is float32 \(3, 3\), but float32 \(8, 3\) is"),
     "dtype": (lambda a: a | {"env.obs": a["env.obs"].astype(np.float64)}, "'obs' is float64"),
     "no array": (lambda a: a | {"env.reward": [0.0] * N}, "'reward' is a list"),
-    "other config": (
-        lambda a: edited_setting(a, b'"horizon_steps": 3000', b'"horizon_steps": 2999'),
-        "episode.horizon_steps was 2999, is 3000",
-    ),
-    "other number of envs": (
-        lambda a: edited_setting(a, b'"num_envs": 8', b'"num_envs": 9'),
-        "num_envs was 9, is 8",
-    ),
+    "other config": (lambda a: edited_setting(a, b'"horizon_steps": 3000', b'"horizon_steps": 2999'),
+        "episode.horizon_steps was 2999, is 3000"),
+    "other number of envs": (lambda a: edited_setting(a, b'"num_envs": 8', b'"num_envs": 9'),
+        "num_envs was 9, is 8"),
     "other tree": (lambda a: edited_setting(a, b'"EmergencyTtc"', b'"Emergency"'), "tree.*EmergencyTtc"),
     "no setting": (lambda a: without(a, "setting"), "lacks 'setting'"),
     "damaged setting": (lambda a: a | {"setting": a["setting"][:40]}, "cannot be read"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BROKEN)

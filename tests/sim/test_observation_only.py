@@ -1,5 +1,4 @@
-"""The stack decides by observations alone: with every truth array poisoned from tracking to the teacher not
-one bit of it changes."""
+"""The stack decides by observations alone: poisoned truth from tracking to the teacher changes no bit."""
 
 import dataclasses
 
@@ -8,7 +7,7 @@ import pytest
 import torch
 
 from tests.conftest import configure, estimate_pose, launch_one_by_one
-from uuvtai.kernels.perception import localization
+from uuvtai.kernels.perception import height, localization
 from uuvtai.kernels.planning import observation
 from uuvtai.kernels.sensors import proprioception
 from uuvtai.sim import stack
@@ -74,8 +73,7 @@ class Poison:
             self.off()
 
         def seed_of(env):
-            """The fallback planner's random numbers come from the episode's key: a random number is no
-            knowledge."""
+            """The fallback planner's random numbers come from the episode's key, which is no knowledge."""
             poisoned = int(self.arrays["episode.key"][env])
             self.arrays["episode.key"][env] = self.kept["episode.key"][env]
             seed = planned_with(env)
@@ -91,8 +89,7 @@ class Poison:
 
 @pytest.fixture
 def watched(small, monkeypatch):
-    """The session's simulator, writing observations with all the columns there are: only their kernels are
-    compiled for it."""
+    """The session's simulator, writing observations with all columns: only their kernels are compiled."""
     launch_one_by_one(monkeypatch, small.sim)
     columns = small.config.observation.model_copy(update={"n_track": 4, "behavior": True})
     configure(monkeypatch, small.sim, small.config.model_copy(update={"observation": columns}))
@@ -106,8 +103,7 @@ def watched(small, monkeypatch):
 
 
 def driven(small, poison=None):
-    """(actions, observations, all arrays that a later step depends on) of an episode in every row, two of
-    them begun anew on the way."""
+    """(actions, observations, arrays that a later step reads) of an episode per row, two begun anew."""
     with pytest.MonkeyPatch.context() as patch:
         if poison:
             poison.during(small.sim, patch)
@@ -123,11 +119,9 @@ def driven(small, poison=None):
 
 
 def compared(small):
-    """(undisturbed actions, what differs from them under the poison, truth that somebody wrote between
-    tracking and teacher)."""
-    driven(
-        small
-    )  # slots beyond what is counted keep what an earlier episode left: both runs follow equal ones
+    """(undisturbed actions, what differs under poison, truth written between tracking and teacher)."""
+    # slots beyond what is counted keep what an earlier episode left: both runs follow equal ones
+    driven(small)
     actions, observations, arrays = driven(small)
     poison = Poison(small.sim)
     others = driven(small, poison)
@@ -136,28 +130,17 @@ def compared(small):
         not torch.equal(observations, others[1])
     )
     assert actions.abs().mean() > 0.1 and observations.isfinite().all(), "they drive, and see something"
-    assert (
-        arrays["tracks.moving"].any()
-        and arrays["route.n_way"].all()
-        and (arrays["grid_map.static_occ"] > 0.5).any()
-    )
+    assert arrays["tracks.moving"].any() and arrays["route.n_way"].all()
+    assert (arrays["grid_map.static_occ"] > 0.5).any()
     return actions, differing, poison.written
 
 
 def test_every_struct_is_known_or_truth():
     assert {f.name for f in dataclasses.fields(SimState)} >= KNOWN
     assert {
-        "world",
-        "vehicle",
-        "params",
-        "current",
-        "path",
-        "episode",
-        "termination",
-        "reward",
-        "ego_memory",
+        "world", "vehicle", "params", "current", "path", "episode", "termination", "reward", "ego_memory",
         "sonar_memory",
-    } <= TRUTH
+    } <= TRUTH  # fmt: skip
 
 
 def test_no_decision_observation_or_memory_depends_on_the_truth(watched):
@@ -199,7 +182,6 @@ def test_the_poison_reaches_whoever_reads_the_truth(watched):
 
 def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
     """With exact sensors the estimate equals the truth: nothing but the poison tells them apart."""
-    from uuvtai.kernels.perception import height
 
     honest, leaking = (
         height.bound_heights,

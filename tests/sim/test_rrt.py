@@ -1,5 +1,4 @@
-"""OMPL's RRT as the fallback: repeatable whatever ran before, safe, and taking over in every case in which
-Voronoi fails."""
+"""OMPL's RRT as the fallback: repeatable whatever ran before, safe, whenever Voronoi fails."""
 
 from itertools import pairwise
 from types import SimpleNamespace
@@ -103,8 +102,7 @@ def test_straightening_never_costs_more():
     occ = cluttered(5)
     start, goal = (1.0, 3.0), (19.0, 3.0)
     grid = grid_of(occ, start)
-    is_valid = grid.checker((start, goal))
-    raw = rrt.solve_rrt(start, goal, grid, is_valid, 4000, 11, 1.0)
+    raw = rrt.solve_rrt(start, goal, grid, grid.checker((start, goal)), 4000, 11, 1.0)
     assert raw is not None
     own = [
         sum(grid.line_cost(a, b, 0.1) for a, b in pairwise(p))
@@ -163,11 +161,8 @@ def test_rrt_takes_over(reason):
         assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() <= config.route.spacing_m * (1 + 2e-4)
         clearance = s.clearance.clearance_m.to_numpy()[env]
         assert (clearance[crossed_cells(way)] >= FLOOR_M - EDGE_M).all()
-        assert (
-            s.route.planner[env] == codes.PLANNER_RRT
-            and s.route.planned_by[env, 1] == 1
-            and s.route.kept[env] == 0
-        )
+        assert s.route.planner[env] == codes.PLANNER_RRT and s.route.planned_by[env, 1] == 1
+        assert s.route.kept[env] == 0
     assert s.route.n_way[0] == 0
 
 

@@ -11,25 +11,18 @@ import torch
 from tests.conftest import estimate_pose, launch_one_by_one
 from tests.small_sim import SmallSim
 from uuvtai.common.errors import DivergenceError
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config.loader import load_config
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.sim.setup import check_size, memory_bytes
 from uuvtai.sim.sim import Sim
 
 ROOT = Path(__file__).resolve().parents[2]
 
 SENSED = (
-    "ego",
-    "scan",
-    "image",
-    "tracks",
-    "turn_history",
-    "forecast",
-    "grid_map",
-    "clearance",
-    "route",
-    "observation",
-    "behavior",
-)
+    "ego", "scan", "image", "tracks", "turn_history", "forecast", "grid_map", "clearance", "route",
+    "observation", "behavior",
+)  # fmt: skip
 """Structs of what the vehicle senses, remembers and decides (clusters are scratch of one scan: slots beyond
 their count are stale)."""
 
@@ -84,8 +77,7 @@ def test_a_reset_touches_only_its_rows(small, monkeypatch, estimated):
 
 
 def test_the_camera_is_asked_about_heights_only_if_the_config_says_so(small, monkeypatch):
-    """The kernels that read this section of the config are left out: nothing is compiled again for the
-    switch."""
+    """The kernels that read this section are left out: nothing is compiled for the switch."""
     asked, sim = [], small.sim
     launch_one_by_one(monkeypatch, sim)
     small.begin([0])
@@ -150,8 +142,6 @@ def test_scene_is_data(small):
 
 
 def test_another_kind_of_runtime_in_one_process_is_refused():
-    from uuvtai.compile.runtime import start_taichi
-
     with pytest.raises(RuntimeError, match="already runs"):
         start_taichi("cpu", precision="f64")
     with pytest.raises(ValueError, match="unknown device"):
@@ -159,8 +149,6 @@ def test_another_kind_of_runtime_in_one_process_is_refused():
 
 
 def test_absurd_sizes_are_refused_before_anything_is_allocated():
-    from uuvtai.sim.setup import check_size, memory_bytes
-
     config = load_config("pool")
     with pytest.raises(ValueError, match="at least 1 env"):
         check_size(config, 0, "cpu")

@@ -1,5 +1,4 @@
-"""A stack as a row of its own: which simulator it gets, that it meets the same episodes, and its entry in the
-table."""
+"""A stack as a row of its own: which simulator it gets, the same episodes, its entry in the table."""
 
 import json
 
@@ -20,11 +19,8 @@ def test_a_stacks_name_is_an_agent_with_its_own_config_and_tree(tmp_path):
     assert (paper.name, paper.privileged, paper.tree.types) == ("paper", False, bt.tree.types)
     assert paper.document() == {"stack": {"preset": "paper", "tree": "bt"}}
     assert paper.config_of(config).voronoi.use == "fused" == with_truth.config_of(config).voronoi.use
-    assert (with_truth.name, with_truth.privileged, own.name) == (
-        "paper+truth",
-        True,
-        "mine",
-    ) and own.tree.types != bt.tree.types
+    assert (with_truth.name, with_truth.privileged, own.name) == ("paper+truth", True, "mine")
+    assert own.tree.types != bt.tree.types
 
 
 def test_an_agent_that_is_neither_preset_nor_file_is_refused():
@@ -42,25 +38,16 @@ def test_a_stack_touches_nothing_that_makes_an_episode():
     other = with_stack(config, "paper")
     same = set(type(config).model_fields) - set(STACK_SECTIONS)
     assert {
-        "world",
-        "vehicle",
-        "actuation",
-        "disturbance",
-        "sensors",
-        "traffic",
-        "observation",
-        "reward",
-        "episode",
-        "runtime",
-    } == same
+        "world", "vehicle", "actuation", "disturbance", "sensors", "traffic", "observation", "reward",
+        "episode", "runtime",
+    } == same  # fmt: skip
     assert all(getattr(other, name) == getattr(config, name) for name in same)
     assert any(getattr(other, name) != getattr(config, name) for name in STACK_SECTIONS)
 
 
 @pytest.fixture(scope="module")
 def compared(small, tmp_path_factory):
-    """The session's simulator stands for both, which would take minutes to compile: what each row asked for
-    is kept."""
+    """The session's simulator stands for both, to compile none: what each row asked for is kept."""
     asked = []
     request = Request(
         config=small.config, world="pool", sensors="paper", agents=["bt", "paper"], seeds=[5],
@@ -95,8 +82,7 @@ def test_bt_and_paper_are_two_rows_of_one_table(compared):
 
 
 def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
-    """One simulator drew both here; that scenarios are the same is
-    ``test_a_stack_touches_nothing_that_makes_an_episode``."""
+    """Here one simulator; scenarios: ``test_a_stack_touches_nothing_that_makes_an_episode``."""
     _, folder = compared
     assert sorted(log.name for log in (folder / "logs").iterdir()) == [
         "bt_seed5_episode0.mcap",

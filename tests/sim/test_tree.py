@@ -21,19 +21,7 @@ from uuvtai.console.screen import Screen
 from uuvtai.console.views import show_tree
 from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.tree import tick_with_given_statuses
-from uuvtai.sim.behavior_tree import (
-    CONTROLS,
-    DECORATORS,
-    LEAVES,
-    FlatTree,
-    TreeError,
-    load_tree,
-    node_use,
-    parse_tree,
-    read_tree,
-    tree_dot,
-    tree_text,
-)
+from uuvtai.sim import behavior_tree
 
 N_BOARD = 20
 """Random blackboards per tree: one env each."""
@@ -54,7 +42,7 @@ def xml(body: str, extra: str = "") -> str:
 
 
 def test_flattening_is_preorder_with_ends_and_parents():
-    flat = parse_tree(
+    flat = behavior_tree.parse_tree(
         xml(
             '<Fallback name="top"><Sequence><HasRoute/><FollowRoute '
             'speed_m_s="0.4"/></Sequence><Inverter><Hold/></Inverter></Fallback>'
@@ -70,7 +58,7 @@ def test_flattening_is_preorder_with_ends_and_parents():
 
 
 def test_subtrees_are_put_in_place():
-    flat = parse_tree(
+    flat = behavior_tree.parse_tree(
         xml(
             '<Sequence><SubTree ID="go" _autoremap="true"/><SubTree ID="go"/></Sequence>',
             '<BehaviorTree ID="go"><Hold/></BehaviorTree>',
@@ -80,8 +68,8 @@ def test_subtrees_are_put_in_place():
 
 
 def test_explicit_elements_are_the_same_as_compact_ones():
-    compact = parse_tree(xml('<Sequence><Stuck seconds="2"/><Unstick/></Sequence>'))
-    explicit = parse_tree(
+    compact = behavior_tree.parse_tree(xml('<Sequence><Stuck seconds="2"/><Unstick/></Sequence>'))
+    explicit = behavior_tree.parse_tree(
         xml('<Control ID="Sequence"><Condition ID="Stuck" seconds="2"/><Action ID="Unstick"/></Control>')
     )
     assert compact == explicit
@@ -128,26 +116,25 @@ def test_explicit_elements_are_the_same_as_compact_ones():
     ],
 )
 def test_bad_trees_are_refused_with_the_place_and_the_reason(text, words):
-    with pytest.raises(TreeError) as error:
-        parse_tree(text, "t.xml")
+    with pytest.raises(behavior_tree.TreeError) as error:
+        behavior_tree.parse_tree(text, "t.xml")
     for word in words:
         assert word in str(error.value)
 
 
 def test_unknown_or_missing_files_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="bt"):
-        read_tree("bt2")
+        behavior_tree.read_tree("bt2")
     with pytest.raises(ConfigError, match="no such file"):
-        read_tree(str(tmp_path / "gone.xml"))
+        behavior_tree.read_tree(str(tmp_path / "gone.xml"))
     path = tmp_path / "mine.xml"
     path.write_text(xml("<Hold/>"))
-    assert read_tree(str(path)).types == ("Hold",)
+    assert behavior_tree.read_tree(str(path)).types == ("Hold",)
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_open_in_groot(name):
-    """Groot 2 needs format 4, a main tree that exists, and every custom leaf in the palette with its kind and
-    ports."""
+    """Groot 2 needs format 4, a main tree, and every custom leaf in the palette with kind and ports."""
     assert set(preset_names("tree")) >= set(PRESETS)
     root = ET.parse(preset_path("tree", name)).getroot()
     assert root.attrib["BTCPP_format"] == "4"
@@ -158,25 +145,25 @@ def test_presets_open_in_groot(name):
     }
     wanted = {
         (leaf, "Action" if spec.kind == codes.ACTION else "Condition", spec.ports)
-        for leaf, spec in LEAVES.items()
+        for leaf, spec in behavior_tree.LEAVES.items()
     }
     assert palette == wanted
     text = preset_path("tree", name).read_text()
     assert with_palette(text) == text
     used = {node.tag for tree in root.findall("BehaviorTree") for node in tree.iter()} - {"BehaviorTree"}
-    assert used <= {*LEAVES, *CONTROLS, *DECORATORS}
-    assert len(read_tree(name, BehaviorConfig().max_node).kind) <= BehaviorConfig().max_node
+    assert used <= {*behavior_tree.LEAVES, *behavior_tree.CONTROLS, *behavior_tree.DECORATORS}
+    assert len(behavior_tree.read_tree(name, BehaviorConfig().max_node).kind) <= BehaviorConfig().max_node
 
 
 @pytest.mark.parametrize("width", [80, 100, 120])
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_use_of_a_long_evaluation_fits_the_terminal(name, width):
-    flat = read_tree(name)
+    flat = behavior_tree.read_tree(name)
     ticks, acted = np.full((1000, 64), 99_999), np.full((1000, 64), 77_777)
-    used = node_use(ticks, acted, len(flat.kind))
+    used = behavior_tree.node_use(ticks, acted, len(flat.kind))
     nodes = [{"type": kind, **vars(use)} for kind, use in zip(flat.types, used, strict=True)]
     console = Console(file=io.StringIO(), width=width)
-    show_tree(Screen(False, console), tree_text(flat), nodes)
+    show_tree(Screen(False, console), behavior_tree.tree_text(flat), nodes)
     lines = console.file.getvalue().splitlines()
     assert max(map(len, lines)) <= width and "episodes" in lines[0]
     rows = [line for line in lines if "100.0 %" in line]
@@ -187,21 +174,21 @@ def test_the_use_of_a_long_evaluation_fits_the_terminal(name, width):
 
 
 def test_text_and_dot_name_every_node_and_its_use():
-    flat = read_tree("bt")
+    flat = behavior_tree.read_tree("bt")
     ticks = np.zeros((4, 64), int)
     ticks[:, 0], ticks[:1, 1] = 10, 7
     acted = np.zeros((4, 64), int)
     acted[0, flat.types.index("FollowRoute")] = 5
-    use = node_use(ticks, acted, len(flat.kind))
+    use = behavior_tree.node_use(ticks, acted, len(flat.kind))
     assert use[0].share == 1.0 and use[1].share == 0.25 and use[1].ticks == 7
-    text, dot = tree_text(flat), tree_dot(flat, use)
+    text, dot = behavior_tree.tree_text(flat), behavior_tree.tree_dot(flat, use)
     assert len(text.splitlines()) == len(flat.kind)
     for node in flat.names:
         assert node in text
     assert dot.count("->") >= len(flat.kind) - 1 and "25.0 %" in dot
-    assert node_use(np.zeros((0, 64)), np.zeros((0, 64)), 2)[1].ticks == 0
-    quoted = parse_tree(xml("<Hold name='a \"b\"'/>"))
-    assert '\\"b\\"' in tree_dot(quoted)
+    assert behavior_tree.node_use(np.zeros((0, 64)), np.zeros((0, 64)), 2)[1].ticks == 0
+    quoted = behavior_tree.parse_tree(xml("<Hold name='a \"b\"'/>"))
+    assert '\\"b\\"' in behavior_tree.tree_dot(quoted)
 
 
 # ----------------------------------------------------------------------------------------------------- engine
@@ -215,7 +202,7 @@ def engine():
 
 def begin(engine, flat):
     behavior, table = engine
-    load_tree(table, flat)
+    behavior_tree.load_tree(table, flat)
     for array in (behavior.status, behavior.running_child, behavior.ticks):
         array.fill(0)
 
@@ -227,7 +214,7 @@ def tick(engine, answers):
     return behavior.status.to_numpy(), behavior.leaf.to_numpy()
 
 
-def random_tree(rng) -> FlatTree:
+def random_tree(rng) -> behavior_tree.FlatTree:
     """A tree of at most MAX_NODE nodes, made as nested lists and flattened here, without the reader."""
     kind, end, parent = [], [], []
 
@@ -249,14 +236,13 @@ def random_tree(rng) -> FlatTree:
 
     grow(-1, 0)
     n = len(kind)
-    return FlatTree(
+    return behavior_tree.FlatTree(
         ("",) * n, ("",) * n, tuple(kind), tuple(end), tuple(parent), (-1,) * n, ((-1.0,) * 4,) * n
     )
 
 
 def test_engine_equals_py_trees_node_by_node(engine):
-    """250 random trees x 20 blackboards x 6 ticks: every node's status, every tick count and the acting leaf
-    are equal."""
+    """250 random trees x 20 blackboards x 6 ticks: status, tick count and acting leaf."""
     rng = np.random.default_rng(7)
     compared = 0
     for _ in range(N_TREE):
@@ -284,7 +270,7 @@ def test_engine_equals_py_trees_node_by_node(engine):
 
 def walk(engine, body, answers_by_type):
     """Statuses of env 0 after each tick; answers by leaf type."""
-    flat = parse_tree(xml(body))
+    flat = behavior_tree.parse_tree(xml(body))
     begin(engine, flat)
     rows = []
     for answers in answers_by_type:
@@ -319,10 +305,13 @@ def test_priority_halts_what_ran_below(engine):
 
 
 def test_tree_that_does_not_fit_is_refused(engine):
-    with pytest.raises(TreeError, match="do not fit"):
-        load_tree(engine[1], parse_tree(xml("<Sequence>" + "<Hold/>" * (MAX_NODE + 1) + "</Sequence>")))
+    with pytest.raises(behavior_tree.TreeError, match="do not fit"):
+        behavior_tree.load_tree(
+            engine[1],
+            behavior_tree.parse_tree(xml("<Sequence>" + "<Hold/>" * (MAX_NODE + 1) + "</Sequence>")),
+        )
 
 
 def test_leaf_codes_are_distinct():
-    used = sorted(leaf.code for leaf in LEAVES.values())
+    used = sorted(leaf.code for leaf in behavior_tree.LEAVES.values())
     assert all(a < b for a, b in pairwise(used))

@@ -1,5 +1,4 @@
-"""What the trainer learns from, against hand computations on a scripted environment: losses as the optimiser
-sees them, samples, labels."""
+"""What the trainer learns from, by hand on a scripted environment: losses, samples, labels."""
 
 import copy
 
@@ -38,20 +37,16 @@ def watch_gradients(ppo):
 
 
 def trainer_of(script=SCRIPT, **sections):
-    """(trainer, env): one epoch of one minibatch, no teacher batches, values as they are; the running
-    uncertainty is the newest one."""
+    """(trainer, env): one epoch, one minibatch, no teacher batches; the running uncertainty is the newest."""
     own = {
         "ppo": {
-            "rollout_steps": STEPS,
-            "epochs": 1,
-            "minibatches": 1,
-            "normalise_values": False,
+            "rollout_steps": STEPS, "epochs": 1, "minibatches": 1, "normalise_values": False,
             "entropy_weight": 0.01,
         },
         "distillation": {"steps": 0, "schedule": [[0, 1], [1, 0.2]]},
         "uncertainty": {"ema": 1.0, "max_scale": 50.0},
         "train": {"iterations": ITERATIONS},
-    }
+    }  # fmt: skip
     env = ScriptedEnv(script)
     merged = {name: own.get(name, {}) | sections.get(name, {}) for name in {**own, **sections}}
     trainer = Trainer(env, config_of(**merged))
@@ -72,8 +67,7 @@ def close(found, expected):
 
 
 def residual_and_uncertainty(model, obs, action, next_obs):
-    """Both (T, N), from the paper's equations, each error and variance in the running deviation of that
-    target's change."""
+    """Both (T, N) by the paper's equations, in the running deviation of each target's change."""
     with torch.no_grad():
         predicted = model.predict(obs, action)
     unit = (model.change_norm.m2 / model.change_norm.count).sqrt().float()
@@ -98,8 +92,7 @@ def advantages(rollout, gamma=0.99, lam=0.95):
 
 
 def gradients(policy, rollout, distilled):
-    """Of the actor and of log_std by the textbook; ``distilled`` (T, N) is what each sample's imitation error
-    is multiplied by."""
+    """Of the actor and of log_std by the textbook; ``distilled`` (T, N) multiplies imitation errors."""
     policy = copy.deepcopy(policy)
     advantage = advantages(rollout)
     mean, log_std = policy.distribution(rollout.x)
@@ -112,8 +105,7 @@ def gradients(policy, rollout, distilled):
 
 
 def seen_by_the_optimiser(trainer):
-    """The same gradients as they came to PPO's optimiser in the newest iteration, before their norm is
-    cut."""
+    """The gradients as PPO's optimiser got them in the newest iteration, before their norm is cut."""
     of_actor = (tensor.flatten() for name, tensor in trainer.seen.items() if name.startswith("actor."))
     return torch.cat([trainer.seen["log_std"], *of_actor])
 
@@ -128,8 +120,7 @@ def learned_once(trainer, env):
 
 @pytest.mark.parametrize("gain", [0.0, 0.8])
 def test_the_distillation_is_weighed_by_lambda_times_the_scale_of_the_uncertainty(gain):
-    """The gradient of the whole loss; with lambda alone, with no distillation or with the residual in sigma's
-    place it is another."""
+    """The whole loss's gradient; by lambda alone, without, or by the residual it is another."""
     trainer, env = trainer_of(uncertainty={"ema": 1.0, "gain": gain, "max_scale": 50.0})
     policy, model, moments = learned_once(trainer, env)
     residual, sigma = residual_and_uncertainty(
@@ -284,8 +275,7 @@ ENDS_AT = 7
 
 
 def test_rates_count_every_ending_by_what_it_was():
-    """A collision, a stop for the time to collision and leaving the tank are collisions; the env that goes on
-    is no episode."""
+    """Stops for the time to collision and leaving the tank are collisions; what goes on is no episode."""
     endings = ["success"] * 4 + ["timeout"] * 2 + ["collision", "ttc", "out_of_tank", None]
     trainer, _ = trainer_of([[(STEPS + ENDS_AT, how)] if how else [] for how in endings])
     metrics = trainer.iterate()

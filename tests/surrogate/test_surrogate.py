@@ -39,17 +39,10 @@ SOON_S = 0.6
 """obstacles that hit within it are near enough for the surrogate to look at"""
 FLOAT_TOL = 2e-5
 SMALL = {
-    "train.num_envs": 16,
-    "ppo.rollout_steps": 8,
-    "ppo.minibatches": 2,
-    "surrogate.obstacle_hidden": 8,
-    "surrogate.head_hidden": 8,
-    "train.evaluate_episodes": 8,
-    "train.scenes": [[8, 6, 0.6]],
-    "surrogate.worlds": ["pool"],
-    "train.iterations": 4,
-    "surrogate.warm_start_waves": 0,
-}
+    "train.num_envs": 16, "ppo.rollout_steps": 8, "ppo.minibatches": 2, "surrogate.obstacle_hidden": 8,
+    "surrogate.head_hidden": 8, "train.evaluate_episodes": 8, "train.scenes": [[8, 6, 0.6]],
+    "surrogate.worlds": ["pool"], "train.iterations": 4, "surrogate.warm_start_waves": 0,
+}  # fmt: skip
 
 
 @ti.kernel
@@ -85,8 +78,7 @@ def threats(
     path: AnyTensor,
     out: FloatMatrix,
 ):
-    """Clearance and time to collision after hulls (x, y, z, t) have moved by (x, y, z, t), of the obstacles
-    that were found near before, or of all."""
+    """Clearance and time to collision after hulls moved by (x, y, z, t), of near or of all obstacles."""
     for i in range(pose.shape[0]):
         before = ti.Vector([pose[i, k] for k in ti.static(range(3))])
         after = before + ti.Vector([moved[i, k] for k in ti.static(range(3))])
@@ -225,8 +217,7 @@ def states_of(sim):
 
 
 def test_the_referee_is_the_simulators(small, bank, config):
-    """Clearance, time to collision and verdict of the same states, along rides straight to the goal and
-    through whatever is in the way."""
+    """Clearance, time to collision and verdict, along rides through whatever is in the way."""
     small.sim.use_tree(small.trees["straight"])
     small.begin(range(small.N), seed=5)
     rules, compared, verdicts = bind(SurrogateRules, config), 0, set()
@@ -284,8 +275,7 @@ def test_no_obstacle_that_can_come_near_is_left_out(bank, config, slots):
 
 
 def free_m(x, y, obstacles, tank):
-    """Along 24 rays, in float64, each ray against each obstacle: what the surrogate looks up by
-    directions."""
+    """Along 24 rays, in float64, each ray against each obstacle."""
     angle = np.arange(N_RAY) * 2 * np.pi / N_RAY
     u = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     with np.errstate(divide="ignore"):
@@ -342,8 +332,7 @@ def test_rewards_by_hand(config):
 
 
 def watched(far_m, steps, is_seen=1, count=4000, radius_m=None, track=None):
-    """Tracks (count, 9) of obstacles so far ahead that go across at 1 m/s, on a circle where it has a
-    radius."""
+    """Tracks (count, 9) of far obstacles that go across at 1 m/s, on a circle where they have a radius."""
     at = torch.tensor([[far_m, 0.0, 0.0, 1.0]]).repeat(count, 1)
     track = torch.zeros(count, 1, TRACK_WIDTH) if track is None else track
     watch(at, is_seen, steps, radius_m or 0.0, track)

@@ -1,5 +1,4 @@
-"""Flights with one to three faults each: no order outside the limits, nothing that moves the vehicle while
-it is held, nothing old that drives it, and the operator obeyed at the next heartbeat."""
+"""Flights with faults: no order beyond limits, none while held or by old data, the operator obeyed."""
 
 import random
 from types import SimpleNamespace

@@ -1,5 +1,4 @@
-"""The stack on a vehicle that speaks MAVLink: the bytes, the meaning of what comes, every failsafe against a
-vehicle made with pymavlink, and strangers who send anything."""
+"""The stack on MAVLink: bytes, meaning, every failsafe against pymavlink's vehicle, and strangers."""
 
 import dataclasses
 import json
@@ -265,13 +264,8 @@ def test_a_sector_counts_as_mavlink_says(distance, hits):
 def test_rangefinders_around_the_hull_are_a_ring():
     intake = Intake(CONFIG, START, 0.0)
     ranger = {
-        "time_boot_ms": 0,
-        "min_distance": 20,
-        "max_distance": 1200,
-        "type": 1,
-        "id": 0,
-        "covariance": 0,
-    }
+        "time_boot_ms": 0, "min_distance": 20, "max_distance": 1200, "type": 1, "id": 0, "covariance": 0,
+    }  # fmt: skip
     assert taken(intake, "DISTANCE_SENSOR", orientation=0, current_distance=500, **ranger) == []
     for turn, distance in ((1, 300), (7, 1200), (25, 80)):
         taken(intake, "DISTANCE_SENSOR", orientation=turn, current_distance=distance, **ranger)
@@ -465,11 +459,8 @@ def test_it_arms_takes_guided_and_drives(flight):
     assert (last.vx, last.yaw_rate) == (pytest.approx(0.3), pytest.approx(-0.1))
     assert_within(one.sub.told)
     assert {type(message) for message in one.pilot.fed} == {
-        ImuReading,
-        DvlReading,
-        PressureReading,
-        SonarPing,
-    }
+        ImuReading, DvlReading, PressureReading, SonarPing,
+    }  # fmt: skip
     assert one.loop.document()["driven_in"] == "GUIDED"
 
 
@@ -508,8 +499,7 @@ def test_where_guided_is_refused_it_drives_by_sticks(flight):
 @pytest.mark.parametrize(("given", "mode"), [({"modes": (9,)}, 19), ({"obeys": False}, 19)])
 def test_a_vehicle_that_refuses_is_left_alone(flight, given, mode):
     one = flight(**given)
-    decision = one.run(16, dt=0.1)
-    assert decision.action.name == "HAND_BACK" and one.sub.mode == mode
+    assert one.run(16, dt=0.1).action.name == "HAND_BACK" and one.sub.mode == mode
     before = len(one.sub.moved_by())
     assert 5 <= before <= 11
     one.run(5)
@@ -588,8 +578,7 @@ def test_the_goal_ends_the_flight(flight):
     one = flight()
     one.run(4)
     one.pilot.pos_w = (GOAL[0] - 0.5, GOAL[1], GOAL[2])
-    command = one.loop.step(one.now_s)
-    assert one.loop._farewell(one.now_s, command) == "goal reached"
+    assert one.loop._farewell(one.now_s, one.loop.step(one.now_s)) == "goal reached"
     one.run(3, farewell="goal reached")
     document = one.loop.document()
     assert one.sub.mode == 2 and document["reached"] and document["safe"]
@@ -789,13 +778,8 @@ def test_what_makes_no_sense_is_refused(capfd, words, says):
 def test_the_command_flies_and_tells(capfd, monkeypatch, tmp_path, words):
     monkeypatch.setattr(control_loop, "warmed", lambda config, tree, mission: WishfulPilot())
     place = [
-        "--mavlink",
-        f"udp:127.0.0.1:{free_port()}",
-        "--seconds",
-        "0.2",
-        "--log",
-        str(tmp_path / "a.mcap"),
-    ]
+        "--mavlink", f"udp:127.0.0.1:{free_port()}", "--seconds", "0.2", "--log", str(tmp_path / "a.mcap"),
+    ]  # fmt: skip
     code, out, err = uuv(capfd, *BASE[:1], *BASE[3:], *place, *words)
     assert code == 0 and "dry run: no order that moves the vehicle is sent" in err
     if words:

@@ -27,8 +27,7 @@ def test_what_was_felt_is_summed():
 
 
 def test_an_old_pose_is_what_motion_leads_back_to():
-    """Found at 0.4 s: the velocity and the accelerometer's error were others. At 0.1 s the vehicle then was
-    elsewhere and had another velocity: that of motion with constant acceleration backwards."""
+    """Found at 0.4 s, the place and velocity of 0.1 s are those of constant acceleration backwards."""
     sums, then = MotionSums(), pose()
     noted = sums.noted()
     sums.correct(

@@ -1,5 +1,4 @@
-"""A log fed to the pilot decides what was decided: bit for bit undisturbed, finite and with a reason to stop
-where messages are lost, late or nonsense."""
+"""A log fed to the pilot decides what was decided; with losses finite, with a reason to stop."""
 
 import dataclasses
 import json
@@ -143,8 +142,7 @@ def test_the_same_once_a_thruster_is_taken_for_dead(small, build, tmp_path):
 
 
 def test_late_readings_are_carried_to_now(small, build, monkeypatch, tmp_path):
-    """Also the first ones: a start without a pressure is none at the surface. The logged vehicle drives its
-    own way, so the estimates may be compared."""
+    """Also the first: a start without pressure is none at the surface. Estimates may be compared."""
     estimate_pose(monkeypatch, small)
     feed = read_feed(recorded(small, tmp_path))
     usual, _ = commands(feed, build)
@@ -167,11 +165,9 @@ def test_late_readings_are_carried_to_now(small, build, monkeypatch, tmp_path):
     [(0.06, 0.1), (0.1, 0.2), (0.16, 0.4), (0.2, 0.4), (0.3, 3.0), (0.6, 3.0), (1.24, 3.0)],
 )
 def test_an_estimated_position_does_not_run_away(small, build, monkeypatch, tmp_path, late_s, most_m):
-    """All is late by the same: corrections that readings on their way had not met yet were made once for
-    each of them, and grew to 87 m."""
+    """Corrections still under way were made once per reading, and grew to 87 m."""
     estimate_pose(monkeypatch, small)
-    feed = read_feed(recorded(small, tmp_path, steps=400))
-    assert farthest(feed, build, late_s) < most_m
+    assert farthest(read_feed(recorded(small, tmp_path, steps=400)), build, late_s) < most_m
 
 
 @pytest.mark.parametrize(("late_s", "most_m"), [(0.06, 0.05), (0.1, 0.1), (0.2, 0.3)])
@@ -239,8 +235,7 @@ def test_a_dead_sensor_stops_the_vehicle_with_a_reason(log, build, sensor, limit
     left = disturbed(feed.arrivals, Faults(outages=(Outage(sensor, 0.2, 9.0),))).arrivals
     found, _ = commands(feed, build, left)
     stopped = [command for command in found if command.held]
-    first_s = stopped[0].time_s
-    assert 0.2 + limit_s - 0.04 <= first_s <= 0.2 + limit_s + 0.04
+    assert 0.2 + limit_s - 0.04 <= stopped[0].time_s <= 0.2 + limit_s + 0.04
     assert len(stopped) == len(found) - stopped[0].step
     assert all(not command.action.any() and not command.velocity.any() for command in stopped)
     assert all(command.held[0].startswith(f"{sensor}: ") for command in stopped)

@@ -8,22 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uuvtai.vehicle.safety import (
-    FENCE_RATE_HZ,
-    RULES,
-    STOP,
-    SafeAction,
-    SafetyLimits,
-    SafetyMemory,
-    VehicleView,
-    allowed,
-    bounded,
-    decide,
-    outside_m,
-)
+from uuvtai.vehicle import safety
 
-LIMITS = SafetyLimits(box_m=(0.0, 0.0, 20.0, 6.0), depth_m=(0.2, 1.4))
-FINE = VehicleView(
+LIMITS = safety.SafetyLimits(box_m=(0.0, 0.0, 20.0, 6.0), depth_m=(0.2, 1.4))
+FINE = safety.VehicleView(
     now_s=100.0,
     wanted=(0.3, 0.1, 0.05, 0.2),
     held=(),
@@ -38,7 +26,7 @@ FINE = VehicleView(
     stalled_s=0.0,
     lost_command="",
 )
-DRIVE, HOLD, SURFACE, HAND_BACK = SafeAction
+DRIVE, HOLD, SURFACE, HAND_BACK = safety.SafeAction
 NAN = math.nan
 
 
@@ -48,10 +36,10 @@ def changed(**values):
 
 def after(view, seconds, memory=None):
     """The decision when a view has lasted so long, a tenth of a second at a time, and what is remembered."""
-    memory, decision = memory or SafetyMemory(), None
+    memory, decision = memory or safety.SafetyMemory(), None
     for tick in range(round(10 * seconds) + 1):
         now = view.now_s + 0.1 * tick
-        decision, memory = decide(dataclasses.replace(view, now_s=now), memory, LIMITS)
+        decision, memory = safety.decide(dataclasses.replace(view, now_s=now), memory, LIMITS)
     return decision, memory
 
 
@@ -59,7 +47,7 @@ def test_all_is_well():
     decision, memory = after(FINE, 120)
     assert decision.action == DRIVE and decision.reasons == ()
     assert decision.velocity == pytest.approx(FINE.wanted)
-    assert memory == SafetyMemory()
+    assert memory == safety.SafetyMemory()
 
 
 LOST = {"imu": 0.02, "dvl": 0.1, "pressure": 0.1, "sonar": 0.1}
@@ -111,19 +99,20 @@ def test_what_goes_wrong_ends_in_its_action(name, values, actions):
         decision, _ = after(changed(**values), seconds)
         assert decision.action == action
         if action != DRIVE:
-            assert decision.velocity == STOP and decision.reasons[0].startswith(f"{name}: ")
-    best, grave = DRIVE, max(step for _, step in next(rule for rule in RULES if rule.name == name).actions)
+            assert decision.velocity == safety.STOP and decision.reasons[0].startswith(f"{name}: ")
+    best = DRIVE
+    grave = max(step for _, step in next(rule for rule in safety.RULES if rule.name == name).actions)
     assert max(actions.values()) == grave > best, "the gravest action of the rule is tried"
 
 
 def test_every_rule_is_tried():
-    assert {name for name, _, _ in WRONG} == {rule.name for rule in RULES}
+    assert {name for name, _, _ in WRONG} == {rule.name for rule in safety.RULES}
 
 
 def test_holding_ends_with_its_reason_and_counts_anew():
     lost = changed(operator_age_s=5.0)
     _, memory = after(lost, 29)
-    decision, memory = decide(changed(now_s=129.2), memory, LIMITS)
+    decision, memory = safety.decide(changed(now_s=129.2), memory, LIMITS)
     assert decision.action == DRIVE and memory.since_s == {}
     decision, _ = after(dataclasses.replace(lost, now_s=129.3), 29, memory)
     assert decision.action == HOLD
@@ -136,14 +125,15 @@ def test_holding_ends_with_its_reason_and_counts_anew():
 def test_surfacing_and_handing_back_are_for_good(values, seconds, action):
     first, memory = after(changed(**values), seconds)
     decision, memory = after(changed(now_s=200.0), 10, memory)
-    assert decision.action == action and decision.reasons == first.reasons and decision.velocity == STOP
+    assert decision.action == action and decision.reasons == first.reasons
+    assert decision.velocity == safety.STOP
 
 
 def test_the_gravest_action_counts_and_an_operator_who_takes_over_outweighs_surfacing():
     low = {"battery_v": 12.0}
     _, memory = after(changed(**low), 6)
     taken = changed(**low, now_s=106.1, lost_command="the mode is MANUAL now")
-    decision, _ = decide(taken, memory, LIMITS)
+    decision, _ = safety.decide(taken, memory, LIMITS)
     assert decision.action == HAND_BACK and decision.reasons == ("command lost: the mode is MANUAL now",)
     both, _ = after(changed(operator_age_s=3.0, sensor_age_s=LOST | {"sonar": 2.0}), 0)
     assert both.action == HOLD and len(both.reasons) == 2
@@ -164,18 +154,18 @@ SPEEDS = st.tuples(ANY, ANY, ANY, ANY)
 @given(SPEEDS)
 @settings(max_examples=300, deadline=None)
 def test_no_speed_is_beyond_the_limits(wanted):
-    surge, sway, heave, turn = bounded(wanted, LIMITS)
+    surge, sway, heave, turn = safety.bounded(wanted, LIMITS)
     assert math.hypot(surge, sway) <= LIMITS.speed_m_s * (1 + 1e-9)
     assert abs(heave) <= LIMITS.heave_m_s and abs(turn) <= LIMITS.yaw_rate_rad_s
     if not all(map(math.isfinite, wanted)):
-        assert (surge, sway, heave, turn) == STOP
+        assert (surge, sway, heave, turn) == safety.STOP
 
 
 @given(SPEEDS, st.tuples(floats(-5, 25), floats(-5, 11), floats(-3, 1)), floats(-math.pi, math.pi))
 @settings(max_examples=500, deadline=None)
 def test_nobody_is_driven_out_of_the_fence(wanted, pos_w, yaw):
     view = changed(pos_w=pos_w, rpy=(0.0, 0.0, yaw))
-    surge, sway, heave, _ = allowed(wanted, view, LIMITS)
+    surge, sway, heave, _ = safety.allowed(wanted, view, LIMITS)
     assert math.hypot(surge, sway) <= LIMITS.speed_m_s * (1 + 1e-9) and abs(heave) <= LIMITS.heave_m_s
     velocity = (
         math.cos(yaw) * surge - math.sin(yaw) * sway,
@@ -184,15 +174,15 @@ def test_nobody_is_driven_out_of_the_fence(wanted, pos_w, yaw):
     )
     low, high = (0.0, 0.0, -1.4), (20.0, 6.0, -0.2)
     for axis in range(3):
-        assert velocity[axis] <= FENCE_RATE_HZ * max(high[axis] - pos_w[axis], 0.0) + 1e-9
-        assert -velocity[axis] <= FENCE_RATE_HZ * max(pos_w[axis] - low[axis], 0.0) + 1e-9
+        assert velocity[axis] <= safety.FENCE_RATE_HZ * max(high[axis] - pos_w[axis], 0.0) + 1e-9
+        assert -velocity[axis] <= safety.FENCE_RATE_HZ * max(pos_w[axis] - low[axis], 0.0) + 1e-9
 
 
 def test_in_the_open_the_wish_is_kept():
-    assert allowed((0.3, -0.2, 0.1, 0.5), changed(rpy=(0.0, 0.0, 1.1)), LIMITS) == pytest.approx(
+    assert safety.allowed((0.3, -0.2, 0.1, 0.5), changed(rpy=(0.0, 0.0, 1.1)), LIMITS) == pytest.approx(
         (0.3, -0.2, 0.1, 0.5)
     )
-    fast = allowed((3.0, 4.0, 9.0, -9.0), FINE, LIMITS)
+    fast = safety.allowed((3.0, 4.0, 9.0, -9.0), FINE, LIMITS)
     assert fast == pytest.approx((0.3, 0.4, 0.3, -0.8)), "the direction is kept"
 
 
@@ -207,4 +197,4 @@ def test_in_the_open_the_wish_is_kept():
     ],
 )
 def test_how_far_outside(pos_w, out):
-    assert outside_m(pos_w, LIMITS) == pytest.approx(out)
+    assert safety.outside_m(pos_w, LIMITS) == pytest.approx(out)

@@ -1,5 +1,4 @@
-"""Our water behind ArduSub's JSON interface: the bytes, lockstep with lost and doubled packets and
-restarts of either side, axes and thrusters, and sensors that the pilot on MAVLink understands."""
+"""Our water behind ArduSub's JSON interface: bytes, lockstep, restarts, axes, sensors the pilot knows."""
 
 import json
 import math
@@ -18,7 +17,9 @@ from tests.command import uuv
 from tests.mavlink_vehicle import START, free_port, link_config
 from uuvtai.common import signals
 from uuvtai.common.errors import SettingError
+from uuvtai.compile import launch
 from uuvtai.config.loader import load_config
+from uuvtai.kernels.vehicle import dynamics
 from uuvtai.vehicle import sitl
 from uuvtai.vehicle.mavlink import LinkError, LinkPlace, MavCodec
 from uuvtai.vehicle.onboard import DvlReading, SonarPing
@@ -105,10 +106,18 @@ def test_turning_over_the_axes_turns_attitudes_over():
 @pytest.mark.parametrize(
     "data",
     [
-        b"", b"\x1a", GOLDEN_PACKET[:-1], GOLDEN_PACKET + b"\0", packet(1, magic=1), packet(1, rate=0),
-        packet(1, rate=65535), packet(1, (1500,) * 32), packet(1, magic=29569), b"\xff" * 40,
+        b"",
+        b"\x1a",
+        GOLDEN_PACKET[:-1],
+        GOLDEN_PACKET + b"\0",
+        packet(1, magic=1),
+        packet(1, rate=0),
+        packet(1, rate=65535),
+        packet(1, (1500,) * 32),
+        packet(1, magic=29569),
+        b"\xff" * 40,
     ],
-)  # fmt: skip
+)
 def test_what_is_no_packet(data):
     assert frame_of(data) is None
 
@@ -226,8 +235,7 @@ def test_the_vehicle_is_held_until_a_thruster_turns():
 
 
 def test_sensors_speak_as_the_real_ones_and_the_pilot_understands():
-    water = StillWater()
-    one = Instance(CONFIG, water, 0)
+    one = Instance(CONFIG, StillWater(), 0)
     said = [order for count in range(400) for order in one.answer(packet(count), 0.0)[1]]
     assert Counter(order.kind for order in said) == {
         "VISION_POSITION_DELTA": 11, "OBSTACLE_DISTANCE": 11, "DISTANCE_SENSOR": 11
@@ -257,8 +265,7 @@ def test_a_sensor_that_has_lost_the_bottom_says_nothing():
 
 
 def pulses(**asked):
-    """Channels of ArduSub's frame VECTORED for roll, pitch, yaw, throttle, forward, lateral in parts of a
-    full stick: PWM = 1500 + 400 x thrust."""
+    """Channels of frame VECTORED, roll to lateral in parts of a full stick: PWM = 1500 + 400 x thrust."""
     factors = [
         (0, 0, 1, 0, -1, 1), (0, 0, -1, 0, -1, -1), (0, 0, -1, 0, 1, 1), (0, 0, 1, 0, 1, -1),
         (1, 0, 0, -1, 0, 0), (-1, 0, 0, -1, 0, 0),
@@ -296,12 +303,18 @@ def water(small):
 @pytest.mark.parametrize(
     ("asked", "index", "sign"),
     [
-        ({"forward": 0.3}, 0, 1), ({"forward": -0.3}, 0, -1), ({"lateral": 0.3}, 1, 1),
+        ({"forward": 0.3}, 0, 1),
+        ({"forward": -0.3}, 0, -1),
+        ({"lateral": 0.3}, 1, 1),
         ({"lateral": -0.3}, 1, -1),
-        ({"throttle": 0.3}, 2, -1), ({"throttle": -0.3}, 2, 1), ({"yaw": 0.2}, 5, 1), ({"yaw": -0.2}, 5, -1),
-        ({"roll": 0.5}, 3, 1), ({"roll": -0.5}, 3, -1),
+        ({"throttle": 0.3}, 2, -1),
+        ({"throttle": -0.3}, 2, 1),
+        ({"yaw": 0.2}, 5, 1),
+        ({"yaw": -0.2}, 5, -1),
+        ({"roll": 0.5}, 3, 1),
+        ({"roll": -0.5}, 3, -1),
     ],
-)  # fmt: skip
+)
 def test_what_ardusub_asks_for_is_what_the_vehicle_does(water, asked, index, sign):
     """In ArduSub's axes: ahead, right and down; roll right side down, turn to starboard."""
     water.begin(2)
@@ -311,14 +324,11 @@ def test_what_ardusub_asks_for_is_what_the_vehicle_does(water, asked, index, sig
     motion = np.array([vel[0], -vel[1], -vel[2], rate[0], -rate[1], -rate[2]])
     rest = motion - np.array([0, 0, -0.02, 0, 0, 0])  # it floats up a little
     assert sign * rest[index] > 0.01
-    others = np.delete(rest, [index, 4])
-    assert np.abs(others).max() < 0.5 * abs(rest[index]) + 0.02
+    assert np.abs(np.delete(rest, [index, 4])).max() < 0.5 * abs(rest[index]) + 0.02
 
 
 def test_a_step_is_a_step_of_the_simulators_own_dynamics(small, water):
     """And no other row moves by a bit."""
-    from uuvtai.kernels.vehicle import dynamics
-
     for row in (2, 5):
         water.begin(row)
     before = small.arrays("vehicle")
@@ -338,8 +348,6 @@ def test_a_step_is_a_step_of_the_simulators_own_dynamics(small, water):
 
 def test_a_step_is_launched_again_without_another_look(water, monkeypatch):
     """A kernel looks at arguments that it has not seen, by identity: 10 ms instead of 0.1."""
-    from uuvtai.compile import launch
-
     looked = []
     first = launch._first
     monkeypatch.setattr(launch, "_first", lambda *given: looked.append(given) or first(*given))

@@ -35,8 +35,7 @@ OPEN_M = 1e6
 
 @pytest.fixture
 def scene(small):
-    """The session's simulator, every row alike: at rest at ``HERE``, nose along x, wanted 0.6 m/s along x,
-    open water. Nothing is compiled but the planners; whatever is changed is put back."""
+    """The session's simulator: at rest at ``HERE``, nose along x, wanted 0.6 m/s along x, open water."""
     memory = small.sim.memory()
     before = memory.read().copy()
     views = memory.views(memory.read(), scratch=True)
@@ -74,8 +73,8 @@ def decide(scene, name):
 
 
 def drive(scene, name, around):
-    """Places (4 s, one per decision, x, y, z) [m] of row 0, driven by a planner from rest at ``HERE``;
-    ``around(time_s)`` puts down what is near."""
+    """Places (4 s, one per decision, x, y, z) [m] of row 0 from rest; ``around(time_s)`` puts what is
+    there."""
     dt, lag = scene.config.baselines.period_steps * 0.02, scene.config.behavior.lag_s
     at, speed, places, decay = HERE.copy(), np.zeros(3), [], np.exp(-dt / lag)
     for k in range(40):
@@ -159,12 +158,8 @@ def test_a_velocity_obstacle_is_left(scene):
         for row in range(scene.n):
             for track in range(2):
                 case = (
-                    place[row, track],
-                    vel[row, track],
-                    reach,
-                    config.horizon_s,
-                    scene.config.behavior.lag_s,
-                )
+                    place[row, track], vel[row, track], reach, config.horizon_s, scene.config.behavior.lag_s,
+                )  # fmt: skip
                 assert not in_cone(found[row], *case, slack=1e-3)
                 inside += in_cone(np.array([0.6, 0.0, 0.0]), *case, slack=0.0)
     assert inside > 10, "the wanted velocity was often in a cone"
@@ -210,8 +205,7 @@ def test_the_potential_field_pushes_away_and_only_within_reach(scene):
 
 
 def test_mppi_is_the_same_in_any_row_and_beside_any_others(scene):
-    """Its random numbers come from start, goal and step; inactive rows or do not decide keep what they
-    have."""
+    """Random numbers come from start, goal and step; rows that do not decide keep what they have."""
 
     def drama(rows, others):
         scene.views["forecast.radius_m"][:] = -1

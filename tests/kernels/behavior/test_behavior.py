@@ -9,6 +9,7 @@ import pytest
 import taichi as ti
 import torch
 
+from tests import bundles
 from tests.bundles import io_for
 from tests.oracles import behavior as oracle
 from uuvtai import state
@@ -56,19 +57,10 @@ N_SAMPLE = round(CFG.tracking.horizon_s / CFG.tracking.forecast_dt_s) + 1
 TIMES = np.arange(N_SAMPLE) * CFG.tracking.forecast_dt_s
 CELL = CFG.mapping.cell_m
 SIZES = {
-    "n_env": N_ENV,
-    "n_node": CFG.behavior.max_node,
-    "n_candidate": CFG.behavior.n_candidate,
-    "n_track": N_TRACK,
-    "n_forecast": N_SAMPLE,
-    "n_future": 2,
-    "n_height": 16,
-    "n_ray": N_RAY,
-    "n_ahead": 16,
-    "n_tuned": len(TUNED),
-    "n_row": grid_shape(TANK, CELL)[0],
-    "n_col": grid_shape(TANK, CELL)[1],
-}
+    "n_env": N_ENV, "n_node": CFG.behavior.max_node, "n_candidate": CFG.behavior.n_candidate,
+    "n_track": N_TRACK, "n_forecast": N_SAMPLE, "n_future": 2, "n_height": 16, "n_ray": N_RAY, "n_ahead": 16,
+    "n_tuned": len(TUNED), "n_row": grid_shape(TANK, CELL)[0], "n_col": grid_shape(TANK, CELL)[1],
+}  # fmt: skip
 COST_TOLERANCE = 5e-3
 """Costs are up to 60: float32 positions of 20 m (2e-6 m) times weights of 30 per metre and some hundred
 summed terms; and the kernel's distances are 1e-4 m too long at a mantle (a term under its root), which the
@@ -79,19 +71,11 @@ in float32; such candidates are not compared."""
 OPEN_M = FAR_M
 """Height of free water that nothing bounds."""
 STRUCTS = {
-    "t": state.BehaviorState,
-    "route": state.RouteState,
-    "forecast": state.ForecastState,
-    "futures": state.FutureState,
-    "tracks": state.TrackState,
-    "scan": state.SonarScan,
-    "clearance": state.ClearanceState,
-    "ego": state.Proprioception,
-    "clock": state.ClockState,
-    "mission": state.MissionState,
-    "table": state.TreeTable,
-    "baselines": state.BaselineState,
-}
+    "t": state.BehaviorState, "route": state.RouteState, "forecast": state.ForecastState,
+    "futures": state.FutureState, "tracks": state.TrackState, "scan": state.SonarScan,
+    "clearance": state.ClearanceState, "ego": state.Proprioception, "clock": state.ClockState,
+    "mission": state.MissionState, "table": state.TreeTable, "baselines": state.BaselineState,
+}  # fmt: skip
 
 
 class Sizes(dict):
@@ -111,8 +95,7 @@ def stage():
 @pytest.fixture
 def scene(stage):
     """Every env alike: at (5, 3), facing +x, at rest, open water, look-ahead 1 m ahead, nothing around."""
-    stage.clock.active.fill(1)
-    stage.clock.step.fill(0)
+    bundles.put(stage.clock, active=1, step=0)
     fill(stage.ego.pos_w, (5.0, 3.0, -0.8))
     fill(stage.ego.vel_b, (0, 0, 0))
     fill(stage.ego.rpy, (0, 0, 0))
@@ -120,23 +103,12 @@ def scene(stage):
     stage.ego.given_up.fill(0)
     fill(stage.mission.goal_w, (15.0, 3.0, -0.8))
     fill(stage.route.lookahead_w, (6.0, 3.0, -0.8))
-    stage.route.n_way.fill(10)
-    stage.route.n_ahead.fill(0)
-    stage.route.stuck_steps.fill(0)
-    stage.forecast.radius_m.fill(-1.0)
-    stage.forecast.pos_w.fill(0.0)
-    stage.forecast.above_w.fill(-0.8)
-    stage.forecast.below_w.fill(-0.8)
+    bundles.put(stage.route, n_way=10, n_ahead=0, stuck_steps=0)
+    bundles.put(stage.forecast, radius_m=-1.0, pos_w=0.0, above_w=-0.8, below_w=-0.8)
     stage.futures.share.fill(0.0)
     stage.tracks.alive.fill(0)
-    stage.scan.fresh.fill(1)
-    stage.scan.hit.fill(0)
-    stage.scan.range_m.fill(12.0)
-    stage.scan.doppler_m_s.fill(0.0)
-    stage.scan.ping_yaw.fill(0.0)
-    stage.clearance.clearance_m.fill(2.0)
-    stage.clearance.site_row.fill(-1)
-    stage.clearance.site_col.fill(-1)
+    bundles.put(stage.scan, fresh=1, hit=0, range_m=12.0, doppler_m_s=0.0, ping_yaw=0.0)
+    bundles.put(stage.clearance, clearance_m=2.0, site_row=-1, site_col=-1)
     use(stage, "bt")
     tree.reset_behavior(io_for(BehaviorIO, stage.t, stage.table, stage.mission, stage.clock))
     return stage
@@ -159,8 +131,7 @@ def use(stage, name):
 
 
 def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
-    """A forecast obstacle in straight motion, at any height but the free water from ``below`` to ``above``
-    (default: level with -0.8 m)."""
+    """A forecast obstacle in straight motion, at any height but the water from ``below`` to ``above``."""
     put(stage.forecast.pos_w, np.asarray(pos) + np.outer(TIMES, vel), env, track)
     put(stage.forecast.radius_m, radius, env, track)
     put(stage.forecast.above_w, above, env, track)
@@ -203,8 +174,7 @@ def step(stage, count=1):
 
 
 def test_packets_equal_the_scalar_oracle(scene):
-    """Costs of all candidates over random obstacles, heights, maps and motions; how depth is changed; and
-    what is made of the costs."""
+    """Costs of all candidates over random scenes; how depth is changed; what is made of the costs."""
     rng = np.random.default_rng(3)
     bests = []
     for _ in range(2):
@@ -235,14 +205,12 @@ def test_packets_equal_the_scalar_oracle(scene):
             np.testing.assert_allclose(chosen[env], taken[0], atol=1e-3)
             assert price[env] == pytest.approx(taken[1], abs=COST_TOLERANCE)
             bests.append(best)
-    assert (
-        max(bests) >= CFG.behavior.first_burst and (np.array(bests) < 36).any()
-    )  # dashes and level ones have both been best
+    # dashes and level ones have both been best
+    assert max(bests) >= CFG.behavior.first_burst and (np.array(bests) < 36).any()
 
 
 def random_scene(scene, rng):
-    """Own motion, follow and last velocities, maps, and obstacles that may be level, above, below, or on both
-    sides of the free water."""
+    """Random motion, velocities, maps, and obstacles level, above, below, or on both sides of free water."""
     put(scene.ego.pos_w, rng.uniform([3, 1.5, -1.3], [17, 4.5, -0.3], (N_ENV, 3)))
     put(scene.ego.vel_b, rng.uniform(-0.4, 0.4, (N_ENV, 3)))
     put(scene.ego.rpy, np.c_[np.zeros((N_ENV, 2)), rng.uniform(-3, 3, N_ENV)])
@@ -266,10 +234,8 @@ def random_scene(scene, rng):
     put(scene.futures.pos_w, start[:, :, None, None] + way)
     put(scene.futures.share, rng.choice([0.0, 0.015, 0.1, 0.3], (N_ENV, N_TRACK, 2)))
     own_z, kind = pos[:, 2:], rng.integers(0, 4, (N_ENV, N_TRACK))
-    above, below = (
-        own_z + rng.uniform(0, 0.8, (N_ENV, N_TRACK)),
-        own_z - rng.uniform(0, 0.8, (N_ENV, N_TRACK)),
-    )
+    above = own_z + rng.uniform(0, 0.8, (N_ENV, N_TRACK))
+    below = own_z - rng.uniform(0, 0.8, (N_ENV, N_TRACK))
     put(scene.forecast.above_w, np.choose(kind, [own_z, above, OPEN_M, above]))
     put(scene.forecast.below_w, np.choose(kind, [own_z, -OPEN_M, below, below]))
 
@@ -310,19 +276,13 @@ class View:
 
     def depths(self, command):
         return oracle.obstacle_depths(
-            self.pos,
-            self.vel,
-            np.asarray(command, float),
-            self.forecast,
-            CFG.behavior,
-            TANK,
+            self.pos, self.vel, np.asarray(command, float), self.forecast, CFG.behavior, TANK,
             CFG.tracking.forecast_dt_s,
-        )
+        )  # fmt: skip
 
 
 def test_follow_changes_depth_only_where_that_comes_no_nearer(scene):
-    """Against the oracle: peaks with and without the heave towards the goal decide, and the conflict is that
-    of what is chosen."""
+    """Peaks with and without the heave towards the goal decide; the conflict is the chosen one's."""
     rng = np.random.default_rng(5)
     low, high = oracle.depth_band(TANK, CFG.behavior)
     heaves, held, seen = 0, 0, 0
@@ -350,11 +310,8 @@ def test_follow_changes_depth_only_where_that_comes_no_nearer(scene):
             taken = changing if changing[0] <= level[0] + 1e-3 else level
             assert follow[env, 2] == pytest.approx(heave if taken is changing else 0.0, abs=1e-5)
             assert conflict[env] == (pytest.approx(taken[3], abs=1e-3) if np.isfinite(taken[3]) else FAR_M)
-            heaves, held, seen = (
-                heaves + (taken is changing),
-                held + (taken is level),
-                seen + np.isfinite(taken[3]),
-            )
+            heaves, held = heaves + (taken is changing), held + (taken is level)
+            seen += np.isfinite(taken[3])
     assert min(heaves, held, seen) > 5
 
 
@@ -371,8 +328,7 @@ def test_open_water_is_travelled_at_cruise_speed(scene):
 
 
 def test_head_on_obstacle_is_evaded_with_room(scene):
-    """The follow velocity would be hit; the evasive velocity keeps more than contact over the whole
-    horizon."""
+    """The follow velocity would be hit; the evasive one keeps more than contact over the horizon."""
     body(scene, 0, 0, (7.2, 3.05), (-0.6, 0.0))
     decide(scene)
     assert acting(scene) == ["Evade"] + ["FollowRoute"] * (N_ENV - 1)
@@ -392,8 +348,7 @@ def test_head_on_obstacle_is_evaded_with_room(scene):
 
 def test_evasion_stays_off_the_wall(scene):
     """With a wall on one side the body is passed on the other."""
-    rows = np.arange(SIZES["n_row"])
-    low_wall = (rows * CELL - 2.0)[:, None].clip(0, 2)
+    low_wall = (np.arange(SIZES["n_row"]) * CELL - 2.0)[:, None].clip(0, 2)
     put(scene.clearance.clearance_m, np.broadcast_to(low_wall, scene.clearance.clearance_m.shape[1:]))
     for env, offset in enumerate((0.1, -0.1)):
         put(scene.ego.pos_w, (5.0, 2.2, -0.8), env)
@@ -436,8 +391,7 @@ def closing_beams(scene, env, beams, range_m=0.45, speed=0.6):
 
 
 def test_sensed_emergency_backs_off_from_it(scene):
-    """Two neighbouring beams agree: retreat from them. One alone is an outlier. Turned since the ping: still
-    the same place."""
+    """Two neighbouring beams agree: retreat. One alone is an outlier. Turned since: still the same place."""
     left = N_RAY // 4
     closing_beams(scene, 0, (left, left + 1))
     closing_beams(scene, 1, (left,))
@@ -463,13 +417,8 @@ def test_the_less_sure_of_its_place_the_nearer_are_walls(scene):
     c, s = np.cos(turn), np.sin(turn)
     zero, worst, best = 0 * sigma, sigma**2, (0.3 * sigma) ** 2
     cov = [
-        c * c * worst + s * s * best,
-        c * s * (worst - best),
-        zero,
-        s * s * worst + c * c * best,
-        zero,
-        zero,
-    ]
+        c * c * worst + s * s * best, c * s * (worst - best), zero, s * s * worst + c * c * best, zero, zero,
+    ]  # fmt: skip
     put(scene.ego.pose_cov, np.stack(cov, 1))
     assess(scene)
     for found in (scene.t.clearance_m, scene.t.path_clearance_m):
@@ -500,8 +449,7 @@ def test_stuck_creeps_to_the_end_of_its_time(scene):
     assert acting(scene)[:2] == ["Unstick", "FollowRoute"]
     assert scene.t.last_vel_w.to_numpy()[0, 0] > 0.9 * CFG.behavior.unstick_m_s
     scene.route.stuck_steps.fill(0)
-    lasts = round(CFG.behavior.unstick_s / CFG.episode.control_dt_s)
-    step(scene, lasts - 2)
+    step(scene, round(CFG.behavior.unstick_s / CFG.episode.control_dt_s) - 2)
     assert acting(scene)[0] == "Unstick"
     step(scene, 4)
     assert acting(scene)[0] == "FollowRoute"
@@ -524,9 +472,8 @@ def test_yardsticks_do_not_avoid_obstacles(scene):
         use(scene, name)
         decide(scene)
         assert acting(scene) == [leaf] * N_ENV
-    assert (
-        scene.action[0, 1] > 0.99 and scene.action[0, 2] == 1.0 and scene.action[0, 3] > 0.9
-    )  # to port, up, turning there
+    # to port, up, turning there
+    assert scene.action[0, 1] > 0.99 and scene.action[0, 2] == 1.0 and scene.action[0, 3] > 0.9
 
 
 def test_depth_goes_to_the_goals_but_not_towards_a_obstacle(scene):
@@ -561,8 +508,7 @@ def corridor(scene, half_width):
 
 
 def test_climbs_or_dives_past_what_fills_the_way(scene):
-    """In a corridor something faster than the vehicle comes: over it if it is known to be below, under it if
-    above, not beyond the band."""
+    """Something faster comes: over it if it is below, under it if above, not beyond the band."""
     corridor(scene, 0.5)
     top = TANK.z_m[1] - CFG.behavior.edge_gap_m - 0.05
     for env, (above, below) in enumerate(((OPEN_M, -0.8), (-0.8, -OPEN_M), (OPEN_M, top), (-0.8, -0.8))):
@@ -624,8 +570,7 @@ def test_what_is_far_enough_below_is_no_conflict(scene):
 
 
 def test_stopping_is_safe_beside_the_path_of_a_obstacle(scene):
-    """Something passes ahead: stop. It comes here: stopping helps nothing. A tree may ask for the next second
-    only."""
+    """It passes ahead: stop. It comes here: stopping does not help. A tree may ask for one second."""
     body(scene, 0, 0, (6.3, 5.0), (0.0, -0.9))
     body(scene, 1, 0, (6.6, 3.0), (-0.9, 0.0))
     body(scene, 2, 0, (7.6, 3.0), (-0.9, 0.0))
@@ -641,8 +586,7 @@ def test_stopping_is_safe_beside_the_path_of_a_obstacle(scene):
 
 
 def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene):
-    """Obstacles beyond the reach of every velocity are left out of the roll-out: following reaches farther
-    than evading here."""
+    """What no velocity reaches is not rolled out: following reaches farther than evading here."""
     body(scene, 0, 0, (6.7, 3.0), (0.0, 0.0))
     assess(scene)
     sooner = scene.t.conflict_s.to_numpy()[0]
@@ -651,8 +595,7 @@ def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene)
 
 
 def test_a_dash_gets_out_of_the_way_in_a_narrow_place(scene):
-    """Something crosses fast, and the water beside its path is soon at an end: only a short dash clears the
-    one and stops at the other."""
+    """Only a short dash clears what crosses fast and stops before the end of the water beside its path."""
     x = grid_origin(TANK, CELL)[0] + (np.arange(SIZES["n_col"]) + 0.5) * CELL
     put(
         scene.clearance.clearance_m,
@@ -683,8 +626,7 @@ def test_candidates_fill_whole_packets():
 
 
 def test_actions_point_along_the_wanted_velocity(scene):
-    """At any attitude the action, scaled by the limits and turned into the world, is parallel to the
-    velocity, never beyond a limit."""
+    """At any attitude the scaled action is parallel to the velocity in the world, within its limits."""
     rng = np.random.default_rng(1)
     for _ in range(5):
         rpy = rng.uniform([-0.2, -0.2, -3.1], [0.2, 0.2, 3.1], (N_ENV, 3))
@@ -733,8 +675,7 @@ def blocks(scene, env, *ways, clearance_m=0.2):
 
 
 def route_ahead(scene, way, lookahead):
-    """Own place off the borders of cells, points of the route at ``way`` [n, 2] from there, 0.1 m apart, and
-    the look-ahead point."""
+    """Own place off the borders of cells, points of the route at ``way`` [n, 2] from there, look-ahead."""
     own = np.array([5.05, 3.03])
     fill(scene.ego.pos_w, (*own, -0.8))
     put(scene.route.ahead_w, own + way)
@@ -743,8 +684,7 @@ def route_ahead(scene, way, lookahead):
 
 
 def test_round_a_corner_a_nearer_point_of_the_route_is_steered_for(scene):
-    """The route goes up and then right: the farthest of its points at 0.6, 0.4 and 0.2 m is taken if only the
-    straight way is narrow."""
+    """The farthest of the points at 0.6, 0.4 and 0.2 m is taken if only the straight way is narrow."""
     up, right = np.minimum(np.arange(16), 4), np.maximum(np.arange(16) - 4, 0)
     route_ahead(scene, 0.1 * np.stack([right, up], 1), (1.0, 0.4))
     put(scene.route.n_ahead, 5, 3)
@@ -783,8 +723,7 @@ def test_where_every_way_is_narrow_the_widest_is_steered_for(scene):
 
 
 def test_a_narrow_way_is_entered_lengthwise(scene):
-    """Across the way, 0.4 of the speed is left; head or tail along it, all of what the clearance here allows
-    (0.5 + 0.5 x 0.13 / 0.6)."""
+    """Across the way 0.4 of the speed is left; along it what clearance allows (0.5 + 0.5 x 0.13 / 0.6)."""
     turned = np.radians([0, 90, 180, 30, -90, 90])
     put(scene.ego.rpy, np.stack([0 * turned, 0 * turned, turned], 1))
     scene.clearance.clearance_m.fill(0.45)
@@ -801,8 +740,7 @@ def test_a_narrow_way_is_entered_lengthwise(scene):
 
 
 def test_who_is_looked_at(scene):
-    """Above and below before level ones (which count as 1 m farther), the nearest first, nobody beyond 3 m,
-    nobody from narrow places."""
+    """Above and below before level ones (1 m farther), the nearest first, nobody beyond 3 m or if narrow."""
     reach = 0.2 + CFG.behavior.hull_reach_m
     still, over, under = (0.0, 0.0), {"above": -0.3, "below": -OPEN_M}, {"above": OPEN_M, "below": -1.3}
     cases = [
@@ -846,8 +784,7 @@ def turns(
     speed=0.5,
     room_m=2.0,
 ):
-    """[degree] that the nose is told to turn by, with the blackboard set by hand: bearings of the gaze and of
-    the velocity, None = none."""
+    """[degree] that the nose is told to turn by; bearings of the gaze and of the velocity, None = none."""
     for name, degrees, length in (("heading_w", gaze, 1.5), (way_of, way, speed)):
         field = getattr(scene.t, name)
         at = np.array(
@@ -876,21 +813,16 @@ degrees."""
 def test_following_the_nose_looks_at_the_obstacle(scene):
     """Whatever the way; without one, along the way; the shorter way round."""
     found = turns(
-        scene,
-        "<FollowRoute/>",
-        yaw=[0, 0, 0, 170, 0, 0],
-        gaze=[20, -30, None, -170, 120, -120],
+        scene, "<FollowRoute/>", yaw=[0, 0, 0, 170, 0, 0], gaze=[20, -30, None, -170, 120, -120],
         way=[0, 90, 10, 0, 0, 0],
-    )
+    )  # fmt: skip
     np.testing.assert_allclose(found, [20, -30, 10, 20, MOST_DEG, -MOST_DEG], atol=ANGLE_TOLERANCE)
-    np.testing.assert_allclose(
-        np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T), 0.5, atol=1e-6
-    )  # the way itself stays
+    # the way itself stays
+    np.testing.assert_allclose(np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T), 0.5, atol=1e-6)
 
 
 def test_with_a_fan_ahead_it_turns_before_it_drives(scene):
-    """The way lies ahead, to the side, or behind, of a fan of 65 degrees to either side and a margin of 20:
-    full speed up to 45, none beyond 65, and the nose turns until the way is 45 degrees off."""
+    """Full speed up to 45 degrees off, none beyond 65, and the nose turns until the way is 45 degrees off."""
     fan = CFG.sensors.sonar.model_copy(update={"horizontal_aperture_deg": 130.0})
     way = np.resize([0.0, 40.0, 55.0, 70.0, 180.0, -55.0], N_ENV)
     ahead = np.stack([np.cos(np.radians(way)), np.sin(np.radians(way)), 0 * way], 1)
@@ -936,16 +868,13 @@ def test_in_danger_a_diagonal_goes_along_the_way_near_the_gaze(scene):
     )
     np.testing.assert_allclose(again, wanted, atol=ANGLE_TOLERANCE)
     narrow = turns(scene, "<Evade/>", 0, None, [20, 100, 150, 200, -20, 0], "evade_vel_w", room_m=0.3)
-    np.testing.assert_allclose(
-        narrow[:5], [-25, -35, 15, -25, 25], atol=ANGLE_TOLERANCE
-    )  # no tail first: any diagonal is as good
+    # no tail first: any diagonal is as good
+    np.testing.assert_allclose(narrow[:5], [-25, -35, 15, -25, 25], atol=ANGLE_TOLERANCE)
 
 
 def test_backing_off_the_nose_keeps_to_the_diagonal_near_the_gaze(scene):
-    """The threat, ahead, is what is looked at: its retreat goes straight back, the nose 25 degrees towards
-    the nearest diagonal."""
-    scene.t.threat_bearing.fill(0.0)
-    scene.t.clearance_m.fill(2.0)
+    """The retreat goes straight back, the nose 25 degrees towards the nearest diagonal."""
+    bundles.put(scene.t, threat_bearing=0.0, clearance_m=2.0)
     np.testing.assert_allclose(
         np.abs(turns(scene, "<BackOff/>", gaze=[0, 0, 0, 5, 5, 5])),
         [25, 25, 25, 30, 30, 30],
@@ -954,8 +883,7 @@ def test_backing_off_the_nose_keeps_to_the_diagonal_near_the_gaze(scene):
 
 
 def test_in_narrow_places_tail_first_is_as_slim(scene):
-    """Following the route below 0.6 m of clearance, the nearer of nose and tail turns along the way; else the
-    nose."""
+    """Following the route below 0.6 m of clearance, the nearer of nose and tail turns along the way."""
     way = [150, -150, 30, 80, 100, 180]
     nose = np.clip(way, -MOST_DEG, MOST_DEG)
     tail = turns(scene, "<FollowRoute/>", way=way, room_m=0.59)
@@ -972,8 +900,7 @@ def test_in_narrow_places_tail_first_is_as_slim(scene):
 
 
 def test_yardsticks_look_at_nobody(scene):
-    """A route followed without guarding the depth, and straight driving: the nose goes along the way,
-    whatever is beside it."""
+    """Without guarding the depth, and driving straight, the nose goes along the way."""
     way, gaze = [0, 10, 20, -10, 30, 0], [30, -30, 90, 180, 0, -5]
     np.testing.assert_allclose(
         turns(scene, '<FollowRoute depth_guard="0"/>', gaze=gaze, way=way), way, atol=ANGLE_TOLERANCE
@@ -995,12 +922,10 @@ def contents(struct):
 
 
 def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
-    """Row 0 gives the same bits whatever its neighbours do; inactive rows keep theirs; a reset forgets the
-    last episode."""
+    """Row 0 gives the same bits whatever its neighbours do; inactive rows keep theirs; a reset forgets."""
 
     def drama(scene, others):
-        scene.clock.active.fill(1)
-        scene.clock.step.fill(0)
+        bundles.put(scene.clock, active=1, step=0)
         scene.forecast.radius_m.fill(-1.0)
         tree.reset_behavior(io_for(BehaviorIO, scene.t, scene.table, scene.mission, scene.clock))
         body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
@@ -1029,6 +954,5 @@ def test_counts_say_who_acted(scene):
     decide(scene)
     step(scene, 4)
     acted, ticks = scene.t.acted.to_numpy(), scene.t.ticks.to_numpy()
-    follow = scene.tree.types.index("FollowRoute")
-    assert acted[0, follow] == 5 and acted[0].sum() == 5
+    assert acted[0, scene.tree.types.index("FollowRoute")] == 5 and acted[0].sum() == 5
     assert ticks[0, 0] == 5 and ticks[0, scene.tree.types.index("BackOff")] == 0

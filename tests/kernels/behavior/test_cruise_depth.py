@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from uuvtai.config import Config
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.behavior.io import BehaviorIO
@@ -47,9 +47,7 @@ class Stage:
         """Depth to steer for of vehicles at -0.8 m whose goals lie so far ahead."""
         cfg = cfg or config()
         n = np.zeros(N_ENV, np.float32)
-        self.ego.z_var.fill(sigma_m**2)
-        self.ego.given_up.fill(given_up)
-        self.ego.pos_w.from_numpy(np.stack([n + 4, n + 3, n - 0.8], 1))
+        put(self.ego, z_var=sigma_m**2, given_up=given_up, pos_w=np.stack([n + 4, n + 3, n - 0.8], 1))
         goal = np.stack([n + 4 + np.float32(away_m), n + 3, n + np.asarray(goal_z, np.float32)], 1)
         self.mission.goal_w.from_numpy(goal.astype(np.float32))
         self.behavior.cruise_z_m.from_numpy((n + np.asarray(before_z)).astype(np.float32))
@@ -69,8 +67,7 @@ def stage():
 
 @pytest.mark.parametrize("column_share", [0.0, 0.5])
 def test_expected_share_is_that_of_a_drawn_population(column_share):
-    """Obstacles with centres anywhere in the band and half heights of 0.2 m on average; the band's ends are
-    soft by 0.05 m, which moves no share by more than that over the band's length."""
+    """Half heights of 0.2 m on average; the band's ends are soft by 0.05 m, no share moves by more."""
     rng, z = np.random.default_rng(7), np.linspace(-1.5, -0.1, 15).astype(np.float32)
     centre, half = rng.uniform(-1.2, -0.4, (200_000, 1)), rng.uniform(0.15, 0.25, (200_000, 1))
     column = rng.random((200_000, 1)) < column_share

@@ -17,8 +17,7 @@ ANGLE_TOL = 4e-7
 
 @ti.kernel
 def compare(kinds: ti.template(), rows: ti.template(), out: ti.template()):
-    """Of obstacles 2 i and 2 i + 1: their distance; and the first against a ring around the second's
-    centre."""
+    """Of obstacles 2 i and 2 i + 1: their distance; the first against a ring around the second's centre."""
     for i in out:
         a = footprint_row(2 * i, kinds, rows)
         b = footprint_row(2 * i + 1, kinds, rows)
@@ -46,10 +45,8 @@ def test_distances_between_obstacles_and_from_rings():
         [rng.uniform(0, 2.5, (2 * N, 2)), rng.uniform(0.05, 0.8, (2 * N, 2)), rng.uniform(-7, 7, (2 * N, 1))]
     )
     kinds = rng.choice([CYLINDER, BOX], 2 * N)
-    rows[:2] = [
-        [1, 1, 1.0, 0.05, 0.0],
-        [1, 1, 1.0, 0.05, np.pi / 2],
-    ]  # a cross: no corner of one lies in the other
+    # a cross: no corner of one lies in the other
+    rows[:2] = [[1, 1, 1.0, 0.05, 0.0], [1, 1, 1.0, 0.05, np.pi / 2]]
     kinds[:2] = BOX
     rows = rows.astype(np.float32)
     fields = ti.field(ti.i32, 2 * N), ti.field(ti.f32, (2 * N, 5)), ti.Vector.field(3, ti.f32, N)

@@ -57,11 +57,8 @@ def measure(
 def measured():
     """f(hulls (n, 6), kinds (n,), obstacles (n, 7)) -> (n, 10) of ``measure``, n <= N."""
     fields = (
-        ti.field(ti.f32, (N, 7)),
-        ti.field(ti.f32, (N, 6)),
-        ti.field(ti.i32, N),
-        ti.field(ti.f32, (N, 10)),
-    )
+        ti.field(ti.f32, (N, 7)), ti.field(ti.f32, (N, 6)), ti.field(ti.i32, N), ti.field(ti.f32, (N, 10)),
+    )  # fmt: skip
 
     def run(hulls, kinds, obstacles):
         for field, values in zip(fields, (obstacles, hulls, kinds), strict=False):
@@ -86,10 +83,8 @@ def random_scenes(seed, level=False):
     size[kinds != BOX, 1] = size[kinds != BOX, 0]
     size[kinds == SPHERE, 2] = size[kinds == SPHERE, 0]
     yaw = rng.uniform(-7, 7, (N, 1))
-    hulls, obstacles = (
-        np.hstack([pos, axis]).astype(np.float32),
-        np.hstack([center, size, yaw]).astype(np.float32),
-    )
+    hulls = np.hstack([pos, axis]).astype(np.float32)
+    obstacles = np.hstack([center, size, yaw]).astype(np.float32)
     return hulls, kinds, obstacles
 
 
@@ -130,11 +125,8 @@ def test_closing_speed_is_the_rate_at_which_clearance_shrinks(measured):
     hulls, obstacles = hulls.astype(float), obstacles.astype(float)
     got = measured(hulls, kinds, obstacles)
     rng = np.random.default_rng(4)
-    vel, rate, obstacle_vel = (
-        rng.uniform(-0.6, 0.6, (200, 3)),
-        rng.uniform(-1, 1, (200, 3)),
-        rng.uniform(-1, 1, (200, 3)),
-    )
+    vel, rate = rng.uniform(-0.6, 0.6, (200, 3)), rng.uniform(-1, 1, (200, 3))
+    obstacle_vel = rng.uniform(-1, 1, (200, 3))
     dt = 1e-3
     checked = 0
     for i in range(200):
@@ -186,5 +178,4 @@ def test_side_walls_floor_and_surface(measured):
 
 def test_a_position_that_is_not_finite_is_outside(measured):
     hulls = np.array([[np.nan, 3, -0.8, 1, 0, 0], [5, 3, np.nan, 1, 0, 0], [5, np.inf, -0.8, 1, 0, 0]])
-    got = measured(hulls, np.array([SPHERE] * 3), np.ones((3, 7)))
-    assert not got[:, 8:].any()
+    assert not measured(hulls, np.array([SPHERE] * 3), np.ones((3, 7)))[:, 8:].any()

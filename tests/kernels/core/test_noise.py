@@ -1,5 +1,4 @@
-"""Random numbers: equal to plain integer arithmetic, equal in lanes, uniform, normal, and independent between
-streams."""
+"""Random numbers: as plain integer arithmetic, equal in lanes, uniform, normal, independent streams."""
 
 import math
 import re
@@ -129,8 +128,7 @@ def test_normals_have_the_moments_of_a_normal(drawn, lanes):
 
 
 def test_both_normals_of_a_pair_are_normal_and_independent(pairs):
-    """Kolmogorov-Smirnov: sqrt(N) D exceeds 2.5 once in 100,000; squares of independent normals are
-    uncorrelated too."""
+    """Kolmogorov-Smirnov: sqrt(N) D exceeds 2.5 once in 100,000; squares are uncorrelated too."""
     one, other = pairs(3, 4, 5, 6)
     cdf = (np.arange(N) + 0.5) / N
     for gauss in (one, other):
@@ -143,8 +141,7 @@ def test_both_normals_of_a_pair_are_normal_and_independent(pairs):
 
 
 def test_every_radius_and_angle_of_a_pair(pairs):
-    """Each of the 2^16 uniforms of radius and angle gives Box-Muller's value: what the words of the draw say,
-    in float64."""
+    """Each of 2^16 uniforms of radius and angle gives Box-Muller's value in float64."""
     one, other = pairs(3, 4, 5, 6)
     key = reference.stream_key(reference.episode_key(3, 4), 5, 6)
     word = np.array([reference.bits(key, i) for i in range(N)])

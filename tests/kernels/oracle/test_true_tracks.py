@@ -1,5 +1,4 @@
-"""Privileged tracks: they equal the truth, everything that reads tracks follows them, and nothing but an
-evaluation switches them on."""
+"""Privileged tracks equal the truth, whoever reads tracks follows them, only an evaluation sets them."""
 
 import ast
 
@@ -76,15 +75,13 @@ def test_forecasts_begin_at_the_obstacles_and_heights_cover_them(known):
     over, under = there & (low > own_z), there & (high < own_z)
     assert over.any() and under.any()
     slack = 2 * HEIGHT_STEP_M + 0.05
-    assert np.all(above[over] <= low[over] + 1e-5) and np.all(
-        above[over] >= np.minimum(low - slack, own_z)[over]
-    )
+    assert np.all(above[over] <= low[over] + 1e-5)
+    assert np.all(above[over] >= np.minimum(low - slack, own_z)[over])
     assert np.all(below[under] >= high[under] - 1e-5)
 
 
 def test_returns_are_named_after_the_obstacles_they_come_from(known):
-    """Every return near an obstacle's outline is that obstacle's, no other is; obstacles move 1.2 cm a step,
-    so the newest scan still tells."""
+    """Returns near an outline are that obstacle's; 1.2 cm a step leave the newest scan right."""
     ray = np.arange(known["scan.range_m"].shape[1])
     named = 0
     for env in np.flatnonzero(known["termination.outcome"] == 0):
@@ -108,13 +105,9 @@ def test_where_tracks_are_too_few_the_nearest_obstacles_get_them():
     config = Config(world=WorldConfig(n_dynamic=5), tracking=TrackingConfig(n_track=3))
     sizes = array_sizes(config, 1, "cpu")
     nouns = (
-        state.TrackState,
-        state.ClusterState,
-        state.WorldState,
-        state.PathState,
-        state.Proprioception,
+        state.TrackState, state.ClusterState, state.WorldState, state.PathState, state.Proprioception,
         state.ClockState,
-    )
+    )  # fmt: skip
     tracks, clusters, world, path, ego, clock = (state.allocate(noun, sizes) for noun in nouns)
     clock.active[0] = 1
     first = world.kind.shape[1] - 5

@@ -1,5 +1,4 @@
-"""Obstacles that the camera shows while the sonar's beams pass above or below them: scenes drawn by the depth
-camera, and a float64 oracle."""
+"""Obstacles that the camera shows while beams pass above or below: drawn scenes and a float64 oracle."""
 
 import numpy as np
 import pytest
@@ -27,22 +26,12 @@ from uuvtai.kernels.sensors.io import DepthIO
 N_ENV, N_TRACK, N_OBSTACLE = 12, 3, 3
 TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
 CAMERA, SONAR, ELEVATION, TRACKING = (
-    DepthConfig(period_steps=5),
-    SonarConfig(n_ray=256),
-    HeightConfig(),
-    TrackingConfig(),
-)
+    DepthConfig(period_steps=5), SonarConfig(n_ray=256), HeightConfig(), TrackingConfig(),
+)  # fmt: skip
 CFG = CameraTrackingConfig(
-    range_m=4.0,
-    band_m=0.9,
-    wall_margin_m=0.25,
-    split_m=0.25,
-    sigma_m=0.035,
-    gate_m=0.3,
-    max_gate_m=1.2,
-    apart_m=0.35,
-    turn_gate=12.0,
-)
+    range_m=4.0, band_m=0.9, wall_margin_m=0.25, split_m=0.25, sigma_m=0.035, gate_m=0.3, max_gate_m=1.2,
+    apart_m=0.35, turn_gate=12.0,
+)  # fmt: skip
 SIZES = {
     "n_env": N_ENV, "n_track": N_TRACK, "n_obstacle": N_OBSTACLE, "n_height": 16, "n_ray": SONAR.n_ray,
     "n_thruster": 6,
@@ -90,14 +79,10 @@ class Rig:
             setattr(self, name, state.allocate(struct, SIZES))
 
     def begin(self):
-        """Everyone level at OWN and facing +x in an empty tank at step 100; nothing tracked; the newest ping,
-        just come, met nothing."""
+        """Everyone level at OWN facing +x in an empty tank at step 100; no track; a ping that met nothing."""
         self.pos, self.rpy = np.tile(OWN, (N_ENV, 1)), np.zeros((N_ENV, 3))
-        self.kind, self.obstacle_pos, self.size = (
-            np.zeros((N_ENV, N_OBSTACLE), int),
-            np.zeros((N_ENV, N_OBSTACLE, 3)),
-            np.ones((N_ENV, N_OBSTACLE, 3)),
-        )
+        self.kind, self.obstacle_pos = np.zeros((N_ENV, N_OBSTACLE), int), np.zeros((N_ENV, N_OBSTACLE, 3))
+        self.size = np.ones((N_ENV, N_OBSTACLE, 3))
         self.memory = {name: np.zeros_like(field.to_numpy()) for name, field in vars(self.tracks).items()}
         self.memory["spot_step"][:] = -1
         self.memory["scan_step"][:] = STEP
@@ -166,8 +151,7 @@ class Rig:
         return self.memory
 
     def wait(self):
-        """To the next image: a scan that met nothing, and every track predicted to it as the tracking stage
-        does."""
+        """To the next image: a scan that met nothing, and every track predicted to it."""
         self.step += CAMERA.period_steps
         self.memory["scan_step"][:] = self.scanned["ping_step"] = np.full(N_ENV, self.step)
         for env, slot in np.argwhere(self.memory["alive"]):
@@ -234,18 +218,14 @@ def test_columns_equal_the_oracle(rig):
 
 
 def random_scene(rig, rng):
-    """Balls, cylinders and boxes ahead, tracks on or beside them (or not at all), a few beams that met
-    something as far away."""
+    """Obstacles ahead, tracks on or beside them (or not), a few beams that met something as far away."""
     rig.pos = rng.uniform([4, 1.8, -1.2], [16, 4.2, -0.4], (N_ENV, 3)).astype(np.float32).astype(float)
     rig.rpy = rng.uniform([-0.1, -0.2, -3.1], [0.1, 0.2, 3.1], (N_ENV, 3)).astype(np.float32).astype(float)
-    ping_late = rng.integers(0, 4, N_ENV)
-    rig.memory["scan_step"] = rig.scanned["ping_step"] = STEP - ping_late
+    rig.memory["scan_step"] = rig.scanned["ping_step"] = STEP - rng.integers(0, 4, N_ENV)
     rig.scanned["ping_pos_w"] = (rig.pos + rng.normal(0, 0.02, (N_ENV, 3))).astype(np.float32)
     rig.scanned["ping_yaw"] = (rig.rpy[:, 2] + rng.normal(0, 0.05, N_ENV)).astype(np.float32)
-    rig.scanned["hit"], rig.scanned["range_m"] = (
-        (rng.random((N_ENV, 256)) < 0.15),
-        np.float32(rng.uniform(0.5, 3, (N_ENV, 256))),
-    )
+    rig.scanned["hit"] = rng.random((N_ENV, 256)) < 0.15
+    rig.scanned["range_m"] = np.float32(rng.uniform(0.5, 3, (N_ENV, 256)))
     for env, slot in np.ndindex(N_ENV, N_OBSTACLE):
         bearing, away = rig.rpy[env, 2] + rng.uniform(-0.8, 0.8), rng.uniform(0.9, 3.0)
         x, y = rig.pos[env, :2] + away * np.array([np.cos(bearing), np.sin(bearing)])
@@ -257,24 +237,16 @@ def random_scene(rig, rng):
             seen, moves = rng.choice([0.06, 0.3, 1.0]), int(rng.random() < 0.8)
             spot = rng.choice([-1, STEP - 5, STEP - 25])
             rig.track(
-                env,
-                (x + off[0], y + off[1]),
-                vel,
-                slot,
-                seen,
-                (rng.uniform(0.03, 0.2), 0.4),
-                moving=moves,
+                env, (x + off[0], y + off[1]), vel, slot, seen, (rng.uniform(0.03, 0.2), 0.4), moving=moves,
                 spot_step=spot,
-            )
+            )  # fmt: skip
             spread = rng.normal(0, 0.1, (5, 5))
             P = spread @ spread.T * 0.3 + np.diag([0.004, 0.004, 0.05, 0.05, 0.1])
             rig.memory["cov"][env, slot] = P[np.triu_indices(4)]
             turns = rng.random() < 0.5
             rig.memory["turn_cov"][env, slot], rig.memory["turn_rate"][env, slot] = P[4] * turns, 0.3 * turns
-            rig.memory["radius_m"][env, slot], rig.memory["radius_var"][env, slot] = (
-                rng.uniform(0.12, 0.3),
-                0.0004,
-            )
+            rig.memory["radius_m"][env, slot] = rng.uniform(0.12, 0.3)
+            rig.memory["radius_var"][env, slot] = 0.0004
 
 
 def known_tracks(memory, env):
@@ -290,8 +262,7 @@ def known_tracks(memory, env):
 
 
 def test_every_track_equals_the_oracle(rig):
-    """Random scenes; the oracle takes the kernel's own columns, so that only the rules of spots are compared
-    here."""
+    """The oracle takes the kernel's columns: only the rules of spots are compared."""
     rng, done, left_out = np.random.default_rng(2), [], 0
     for _ in range(12):
         rig.begin()
@@ -307,20 +278,9 @@ def test_every_track_equals_the_oracle(rig):
                 *(sonar[n][env] for n in ("range_m", "hit", "ping_pos_w", "ping_yaw", "ping_step"))
             )
             what, doubt = oracle.follow(
-                tracks,
-                N_TRACK,
-                near[env],
-                edge[env],
-                view,
-                scan,
-                STEP,
-                before["scan_step"][env],
-                CFG,
-                CAMERA,
-                SONAR,
-                TRACKING,
-                0.02,
-            )
+                tracks, N_TRACK, near[env], edge[env], view, scan, STEP, before["scan_step"][env], CFG,
+                CAMERA, SONAR, TRACKING, 0.02,
+            )  # fmt: skip
             if doubt < CLOSE:
                 left_out += 1
                 continue
@@ -350,8 +310,7 @@ def assert_equal_tracks(memory, env, expected):
 
 
 def test_a_obstacle_above_or_below_the_fan_corrects_its_track(rig):
-    """At several places, heights and attitudes the track, 15 cm off, comes to within a few centimetres, and
-    to nobody else's."""
+    """A track, 15 cm off, comes to within a few centimetres, and to nobody else's."""
     for env in range(N_ENV):
         yaw = 0.6 * env
         rig.pos[env], rig.rpy[env] = (10.0, 3.0, -0.8), (0.02 * (-1) ** env, 0.06 * np.sin(env), yaw)
@@ -377,8 +336,7 @@ def test_the_expected_place_is_that_of_the_images_time(rig):
 
 
 def test_a_obstacle_that_turned_back_is_recovered(rig):
-    """Unseen for 0.6 s it has turned back, and is 0.7 m from where it is expected; four images later its
-    motion is known again."""
+    """Unseen for 0.6 s, 0.7 m from where it is expected; four images later its motion is known."""
     rig.put(0, 6.8, 2.7)
     rig.track(0, (6.8, 3.4), (0.0, 0.6), unseen_s=0.6, sigma=(0.05, 0.1))
     rig.look()
@@ -393,21 +351,18 @@ def test_a_obstacle_that_turned_back_is_recovered(rig):
 
 
 def test_how_far_a_track_may_be_found(rig):
-    """One offset, 0.5 m: an obstacle that was seen just now, or is slow, cannot have come so far; a quick one
-    that was long unseen can."""
+    """0.5 m off: too far for one just seen or slow, not for a quick one that was long unseen."""
     for env, (speed, unseen_s) in enumerate(((0.5, 0.16), (0.05, 1.0), (0.5, 0.3), (2.0, 1.0))):
         rig.put(env, 6.8, 3.0)
         rig.track(env, (6.8 + (1.25 if speed == 2.0 else 0.5), 3.0), (0.0, speed), unseen_s=unseen_s)
     memory = rig.look()
     np.testing.assert_array_equal(memory["spot_step"][:4, 0] == STEP, [False, False, True, False])
-    np.testing.assert_array_equal(
-        memory["alive"][:4].sum(1), [1, 1, 1, 2]
-    )  # 1.25 m away it is an obstacle of its own
+    # 1.25 m away it is an obstacle of its own
+    np.testing.assert_array_equal(memory["alive"][:4].sum(1), [1, 1, 1, 2])
 
 
 def test_one_track_takes_one_spot(rig):
-    """Two small obstacles within reach of it: the left one, which comes first, is it; the other is too near
-    for a track of its own."""
+    """Of two small obstacles within reach the left one, first, is it; the other is too near for a track."""
     for slot, y in enumerate((3.13, 2.87)):
         rig.put(0, 6.8, y, size=(0.1, 0.1, 0.1), slot=slot)
     rig.track(0, (6.8, 3.02), radius_m=0.1)
@@ -416,8 +371,7 @@ def test_one_track_takes_one_spot(rig):
 
 
 def test_an_unknown_obstacle_rests_until_its_second_sighting(rig):
-    """Born at its place with unknown heights; called moving by the first image more than 0.15 s later, and
-    then its velocity is learnt."""
+    """Called moving by the first image more than 0.15 s later; then its velocity is learnt."""
     for env in range(2):
         rig.put(env, 6.8, 3.0)
     rig.track(1, (12.0, 3.0), slot=2)
@@ -429,12 +383,8 @@ def test_an_unknown_obstacle_rests_until_its_second_sighting(rig):
     }
     assert off_m(rig, 0, 2) < PLACE_M and not born["state"][2:].any()
     assert (born["alive"], born["moving"], born["misses"], born["spot_step"], born["seen_step"]) == (
-        1,
-        0,
-        1,
-        STEP,
-        STEP,
-    )
+        1, 0, 1, STEP, STEP,
+    )  # fmt: skip
     assert born["radius_m"] == pytest.approx(RADIUS, abs=0.03) and born["z_m"] == pytest.approx(EYE[2])
     np.testing.assert_allclose(born["height"].ravel(), prior(ELEVATION), rtol=1e-5)
     assert off_m(rig, 1, 1) < PLACE_M  # the next free slot
@@ -451,8 +401,7 @@ def test_an_unknown_obstacle_rests_until_its_second_sighting(rig):
 
 
 def test_what_the_sonar_shows_is_left_to_the_sonar(rig):
-    """A beam towards the near side met something as far away: neither born nor corrected. Nearer, farther or
-    two beams beside: is."""
+    """A beam met something as far away: neither born nor corrected. Nearer, farther, two beams beside: is."""
     gap = 6.8 - RADIUS - OWN[0]
     beam = 2 * np.pi / SONAR.n_ray
     for env, (bearing, range_m) in enumerate(
@@ -472,8 +421,7 @@ def test_what_the_sonar_shows_is_left_to_the_sonar(rig):
 
 
 def test_tracks_that_the_sonar_sees_and_resting_ones_are_let_alone(rig):
-    """Seen 0.1 s ago; not moving; dead. None is corrected, and none (but where the dead one was) gets a
-    second track."""
+    """Seen 0.1 s ago, resting or dead: not corrected, and only the dead one gets a second track."""
     cases = {
         0: {"unseen_s": 0.1},
         1: {"moving": 0},
@@ -508,8 +456,7 @@ def test_walls_and_things_far_high_or_wide_begin_nothing(rig):
 
 
 def test_a_spot_cut_by_the_image_corrects_loosely(rig):
-    """Half beyond the left edge: hardly across. Beyond the upper edge: hardly along. Unknown and cut: nothing
-    begins."""
+    """Beyond the left edge: hardly across; the upper: hardly along. Unknown and cut: nothing begins."""
     edge = np.array([np.cos(np.pi / 4), np.sin(np.pi / 4)])
     inside = np.array([np.cos(0.4), np.sin(0.4)])
     beside = EYE[:2] + 1.8 * edge
@@ -538,8 +485,7 @@ def test_a_spot_cut_by_the_image_corrects_loosely(rig):
 
 def test_sleeping_rows_old_images_and_other_rows(rig):
     """Rows give the same bits in any company; inactive rows and rows without a new image keep theirs."""
-    rng = np.random.default_rng(4)
-    random_scene(rig, rng)
+    random_scene(rig, np.random.default_rng(4))
     first = rig.look()
     rig.begin()
     random_scene(rig, np.random.default_rng(4))
@@ -571,8 +517,7 @@ def test_sleeping_rows_old_images_and_other_rows(rig):
 
 
 def test_without_the_camera_nothing_is_spotted(small, monkeypatch):
-    """The same episodes with use_camera off: no column is measured and no track is ever spotted; with it some
-    are."""
+    """With use_camera off no column is measured and no track spotted; with it some are."""
     sim = small.sim
     for use in (False, True):
         changed = small.config.camera_tracking.model_copy(update={"use_camera": use})

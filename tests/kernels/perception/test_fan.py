@@ -1,11 +1,10 @@
-"""A sonar that is a fan ahead: where its beams look, what they meet, and that nothing is made of what lies
-behind them."""
+"""A sonar that is a fan ahead: where beams look, what they meet, nothing made of what lies behind."""
 
 import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from tests.map_bits import get_map
 from tests.oracles import scenes
 from tests.oracles.sonar import doppler_by_differences, obstacle_hits, wall_hits
@@ -50,13 +49,8 @@ from uuvtai.state import (
 N_ENV, N_OBSTACLE = 24, 14
 TANK, RULES = TankConfig(), EpisodeConfig()
 SIZES = {
-    "n_env": N_ENV,
-    "n_obstacle": N_OBSTACLE,
-    "n_ray": 512,
-    "n_latency": 2,
-    "n_cloud": 1,
-    "n_thruster": 6,
-}
+    "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_ray": 512, "n_latency": 2, "n_cloud": 1, "n_thruster": 6,
+}  # fmt: skip
 TOLERANCE_M = 2e-3
 GRAZING_SHARE = 2e-4
 """Beams that pass an edge closer than float32 can tell, of those of all scenes here."""
@@ -178,37 +172,24 @@ SMALL = SonarConfig(n_ray=64, horizontal_aperture_deg=100.0, doppler=False)
 
 
 def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
-    """At (2, 2), nose to +y: free water within 50 degrees of it up to the wall, an obstacle at (2, 3) at
-    rest; the Doppler that is not measured is not a number."""
+    """From (2, 2), nose to +y: free water within 50 degrees, an obstacle at (2, 3), Doppler not a number."""
     shape = grid_shape(POND, MAP.cell_m)
     sizes = {"n_env": 1, "n_row": shape[0], "n_col": shape[1], "n_ray": 64, "n_track": 4, "n_cluster": 4}
     sizes |= {"n_height": 16, "n_slot": 1, "n_pixel_row": 6, "n_pixel_col": 16}
     made = {
         struct: allocate(struct, sizes)
         for struct in (
-            MapState,
-            MapScratch,
-            SonarScan,
-            DepthImage,
-            TrackState,
-            ClusterState,
-            GridMask,
-            ClockState,
+            MapState, MapScratch, SonarScan, DepthImage, TrackState, ClusterState, GridMask, ClockState,
         )
-    }
+    }  # fmt: skip
     scan, grid = made[SonarScan], made[MapState]
     load_bounds(made[GridMask], np.array(outside_cells(POND, MAP.cell_m)))
     world = np.pi / 2 + bearings(SMALL)
     to_wall = np.minimum(2.0 / np.sin(world), 2.0 / np.maximum(np.abs(np.cos(world)), 1e-9))
     hits_obstacle = np.abs(bearings(SMALL)) < np.radians(10.0)
-    scan.range_m.from_numpy(np.where(hits_obstacle, 1.0, to_wall)[None].astype(np.float32))
-    scan.hit.fill(1)
-    scan.doppler_m_s.fill(np.nan)
-    scan.ping_yaw.fill(np.pi / 2)
-    scan.ping_pos_w.from_numpy(np.array([[2.0, 2.0, -0.8]], np.float32))
-    scan.ping_vel_b.from_numpy(np.array([[0.6, 0.0, 0.0]], np.float32))
-    scan.ping_vel_valid.fill(1)
-    scan.fresh.fill(1)
+    put(scan, range_m=np.where(hits_obstacle, 1.0, to_wall)[None], hit=1, doppler_m_s=np.nan)
+    put(scan, ping_yaw=np.pi / 2, ping_pos_w=[[2.0, 2.0, -0.8]], ping_vel_b=[[0.6, 0.0, 0.0]])
+    put(scan, ping_vel_valid=1, fresh=1)
     made[TrackState].beam_track.fill(-1)
     made[ClockState].active.fill(1)
     mapping.reset_map(io_for(MappingIO, grid, made[ClockState]))
@@ -235,9 +216,7 @@ def test_sectors_beside_the_fan_have_no_return(turned):
     sizes = {"n_env": 1, "n_ray": 256, "n_sector": n_sector, "n_track": 4}
     made = [allocate(struct, sizes) for struct in (ObservationState, SonarScan, Proprioception, ClockState)]
     state, scan, ego, clock = made
-    scan.range_m.fill(3.0)
-    scan.hit.fill(1)
-    scan.doppler_m_s.fill(-0.5)
+    put(scan, range_m=3.0, hit=1, doppler_m_s=-0.5)
     ego.rpy.from_numpy(np.array([[0.0, 0.0, turned]], np.float32))
     clock.active.fill(1)
     sense_sectors(io_for(ObservationIO, *made, observation, config))

@@ -50,11 +50,8 @@ GROWTH_TOLERANCE = 2e-4
 
 class Stage:
     def __init__(self):
-        self.tracks, self.clock, self.forecast = (
-            allocate(TrackState, SIZES),
-            allocate(ClockState, SIZES),
-            allocate(ForecastState, SIZES),
-        )
+        self.tracks, self.clock = allocate(TrackState, SIZES), allocate(ClockState, SIZES)
+        self.forecast = allocate(ForecastState, SIZES)
         self.turn_history, self.clusters, self.image = (
             allocate(struct, SIZES) for struct in (TurnHistory, ClusterState, DepthImage)
         )
@@ -82,8 +79,7 @@ def stage():
 
 
 def random_tracks(seed):
-    """Moving tracks in every slot: states, covariances (4 x 4), radii, turn rates up to 4 rad/s (and some 0)
-    with their variances."""
+    """Moving tracks in every slot, with turn rates up to 4 rad/s (some 0) and their variances."""
     rng = np.random.default_rng(seed)
     size = (N_ENV, N_TRACK)
     course, speed = rng.uniform(-np.pi, np.pi, size), rng.uniform(0.1, 3.0, size)
@@ -104,14 +100,9 @@ def lay_out(stage, state, cov, radius, rate, sigma):
     turn_cov = np.zeros((N_ENV, N_TRACK, 5))
     turn_cov[..., 4] = sigma**2
     stage.put(
-        alive=ones,
-        moving=ones,
-        state=state,
-        cov=cov[..., row, col],
-        radius_m=radius,
-        turn_rate=rate,
+        alive=ones, moving=ones, state=state, cov=cov[..., row, col], radius_m=radius, turn_rate=rate,
         turn_cov=turn_cov,
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("use_turn_rate", [True, False])
@@ -164,8 +155,7 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
 
 @pytest.mark.parametrize("switches", [(True, True), (True, False), (False, True)])
 def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
-    """Obstacles on straight courses, with turns remembered on the way of most: the oracle's walk, in leaps of
-    the forecast's samples."""
+    """Straight courses with remembered turns: the oracle's walk, in leaps of the samples."""
     stage.begin(
         ForecastConfig(n_turn=SIZES["n_turn"], use_turn_history=switches[0], use_reflection=switches[1])
     )
@@ -200,20 +190,15 @@ def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
 
 
 def test_the_first_turn_is_searched_again_when_a_scan_or_an_image_has_come(stage):
-    """An obstacle that goes east and is known to turn north 0.6 m ahead; between scans nothing is searched,
-    so nothing forgotten shows."""
+    """It goes east and turns north 0.6 m ahead; between scans nothing is searched, nothing forgotten."""
     for news in ("clusters", "image"):
         stage.begin(ForecastConfig(n_turn=SIZES["n_turn"], use_reflection=False))
         size = (N_ENV, N_TRACK)
         state = np.broadcast_to([5.0, 3.0, 0.5, 0.0], (*size, 4))
         lay_out(
-            stage,
-            state,
-            np.broadcast_to(1e-4 * np.eye(4), (*size, 4, 4)),
-            np.full(size, 0.2),
-            np.zeros(size),
-            np.ones(size),
-        )
+            stage, state, np.broadcast_to(1e-4 * np.eye(4), (*size, 4, 4)), np.full(size, 0.2),
+            np.zeros(size), np.ones(size),
+        )  # fmt: skip
         rows = {name: np.zeros((N_ENV, SIZES["n_turn"])) for name in habit_oracle.TURN_ROWS}
         for name, value in (("turn_x", 5.6), ("turn_y", 3.0), ("in_x", 1.0), ("out_y", 1.0), ("weight", 1.0)):
             rows[name][:, 0] = value

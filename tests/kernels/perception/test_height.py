@@ -1,5 +1,4 @@
-"""Heights of tracked obstacles: the weighing of hypotheses against its float64 oracle, and what memory and
-free water come to."""
+"""Heights of tracked obstacles: hypotheses against their float64 oracle, and what they come to."""
 
 import numpy as np
 import pytest
@@ -68,16 +67,11 @@ class Stage:
         )
 
     def begin(self):
-        """Every track moves, lies east of its env's vehicle, and may have any height; the vehicles are at (5,
-        3, -0.8)."""
+        """Moving tracks of any height lie east of their env's vehicle at (5, 3, -0.8)."""
         clear(self.tracks, self.clock, self.ego, self.scan)
-        self.forecast.above_w.fill(-9.0)
-        self.forecast.below_w.fill(-9.0)
+        put(self.forecast, above_w=-9.0, below_w=-9.0)
         self.clock.active.fill(1)
-        self.tracks.alive.fill(1)
-        self.tracks.spot_step.fill(-1)
-        self.tracks.moving.fill(1)
-        self.tracks.radius_m.fill(0.2)
+        put(self.tracks, alive=1, spot_step=-1, moving=1, radius_m=0.2)
         self.own = np.tile([5.0, 3.0, -0.8], (N_ENV, 1))
         self.place = np.tile([6.0, 3.0], (N_ENV, N_TRACK, 1))
         self.stand()
@@ -143,10 +137,8 @@ def test_any_sequence_of_hits_and_misses_equals_the_oracle(stage):
     cov = np.zeros((N_ENV, N_TRACK, 10))
     cov[..., 0], cov[..., 1], cov[..., 4] = xx, xy, yy
     put(stage.tracks, radius_m=radius, cov=cov)
-    share, present = (
-        np.broadcast_to(oracle.prior(CFG), (N_ENV, N_TRACK, LANES)).copy(),
-        np.full((N_ENV, N_TRACK), 0.95),
-    )
+    share = np.broadcast_to(oracle.prior(CFG), (N_ENV, N_TRACK, LANES)).copy()
+    present = np.full((N_ENV, N_TRACK), 0.95)
     for scan in range(10):
         stage.own = rng.uniform([3, 2, -1.5], [6, 4, -0.1], (N_ENV, 3)).astype(np.float32).astype(float)
         stage.place = (
@@ -187,8 +179,7 @@ def test_a_hit_near_by_rules_out_what_is_far_above_or_below(stage):
 
 
 def test_own_change_of_depth_tells_above_from_below(stage):
-    """Misses leave both sides open; the vehicle dives, misses again where the body below would show: it is
-    above."""
+    """Misses leave both sides open; after a dive a miss where a body below would show: it is above."""
     for _ in range(20):
         stage.weigh(MISS)
     share = stage.share[0, 0]
@@ -209,8 +200,7 @@ def test_own_change_of_depth_tells_above_from_below(stage):
 def test_what_is_missed_everywhere_has_gone(stage):
     """A miss where it could hide takes little of its presence; misses at all depths take nearly all of it."""
     stage.weigh(MISS)
-    once = stage.present[0, 0]
-    assert 0.9 < once < 0.95
+    assert 0.9 < stage.present[0, 0] < 0.95
     for own_z in (-1.4, -1.1, -0.8, -0.5, -0.2):
         stage.own[:, 2] = own_z
         for _ in range(20):
@@ -219,8 +209,7 @@ def test_what_is_missed_everywhere_has_gone(stage):
 
 
 def test_a_wrong_belief_is_given_up(stage):
-    """Hundreds of scans say "level with the vehicle"; then it dives, and what it hits there cannot be where
-    it was believed to be."""
+    """Hundreds of scans say "level"; after a dive it is hit where it was believed not to be."""
     for _ in range(300):
         stage.weigh(HIT)
     stage.own[:, 2] = -1.5
@@ -241,8 +230,7 @@ def test_an_unsure_place_makes_a_miss_say_less(stage):
 
 
 def test_scans_close_together_count_as_one(stage):
-    """Ten scans within 0.15 s say as much as one that long after the last; twice that time between two says
-    no more."""
+    """Ten scans within 0.15 s say as much as one so long after the last; twice that time says no more."""
     level, top = near(-0.8), near(-0.1)
     for _ in range(10):
         stage.weigh(MISS, CFG.evidence_s / 10)
@@ -251,10 +239,8 @@ def test_scans_close_together_count_as_one(stage):
         stage.begin()
         stage.weigh(MISS, dt)
         once = stage.share[0, 0]
-        assert (
-            once[level] / once[top] == pytest.approx(often[level] / often[top], rel=1e-3)
-            and once[level] < 0.2 * once[top]
-        )
+        assert once[level] / once[top] == pytest.approx(often[level] / often[top], rel=1e-3)
+        assert once[level] < 0.2 * once[top]
         assert present == pytest.approx(stage.present[0, 0], abs=0.01)
 
 
@@ -262,8 +248,7 @@ def test_scans_close_together_count_as_one(stage):
 
 
 def test_free_water_equals_the_oracle(stage):
-    """Random peaked shares, own depths and radii: edges of what is likely enough, no farther than the own
-    height."""
+    """Random peaked shares, depths and radii: edges of what is likely enough, up to the own height."""
     rng = np.random.default_rng(6)
     share = rng.dirichlet(np.full(LANES, 0.15), (N_ENV, N_TRACK)).astype(np.float32)
     radius = rng.uniform(0.1, 0.4, (N_ENV, N_TRACK)).astype(np.float32)
@@ -298,8 +283,7 @@ def test_a_likely_column_leaves_no_free_water(stage):
 
 
 def test_without_memory_every_obstacle_is_level(stage):
-    """And so is what does not move or is not there, with memory too (no trace is left of who had the slot
-    before); who sleeps sleeps."""
+    """So is, with memory, what does not move or is not there; who sleeps sleeps."""
     share = np.zeros((N_ENV, N_TRACK, LANES))
     share[:, :, near(-0.2)] = 1
     stage.set_share(share)
@@ -328,11 +312,8 @@ def test_no_obstacle_is_in_water_called_free(stage):
     half = rng.uniform(0.12, 0.25, (N_ENV, N_TRACK))
     z = rng.uniform(-1.4, -0.2, (N_ENV, N_TRACK))
     put(stage.tracks, radius_m=rng.uniform(0.15, 0.25, (N_ENV, N_TRACK)))
-    away, begin, end = (
-        rng.uniform(0.6, 1.2, (N_ENV, N_TRACK)),
-        rng.uniform(-1.2, -0.4, N_ENV),
-        rng.uniform(-1.2, -0.4, N_ENV),
-    )
+    away, begin = rng.uniform(0.6, 1.2, (N_ENV, N_TRACK)), rng.uniform(-1.2, -0.4, N_ENV)
+    end = rng.uniform(-1.2, -0.4, N_ENV)
     deepest = np.zeros((N_ENV, N_TRACK))
     opened = 0
     for k in range(60):
@@ -375,8 +356,7 @@ def pruned(stage, count, cfg=CFG, dt=0.06):
 
 
 def test_unseen_obstacles_are_remembered_for_their_time(stage):
-    """Behind something nearer nothing is learnt, only forgotten: with the time constant memory_s until
-    gone_share."""
+    """Behind something nearer it is only forgotten: with time constant memory_s until gone_share."""
     scan_for(stage, 0.5)
     assert pruned(stage, 50).all()
     np.testing.assert_allclose(stage.present[:, :3], 0.95 * np.exp(-50 * 0.06 / CFG.memory_s), rtol=1e-4)
@@ -391,8 +371,7 @@ def test_unseen_obstacles_are_remembered_for_their_time(stage):
 
 
 def test_a_obstacle_seen_through_is_kept_if_it_may_be_above_or_below(stage):
-    """Open water all round: near by it may have left the fan, but not far away, where the fan holds the full
-    depth."""
+    """Near by it may have left the fan, but not far away, where the fan holds the full depth."""
     scan_for(stage, SONAR.max_range_m)
     stage.place[:, 2] = [5.0 - 5.0, 3.0]
     stage.stand()
@@ -413,8 +392,7 @@ def test_seen_obstacles_are_weighed_and_resting_ones_are_not(stage):
 
 
 def test_memory_can_be_switched_off(stage):
-    """Then an obstacle that beams see through ends after see_through_s, and one that is hidden after
-    hidden_s."""
+    """An obstacle that beams see through ends after see_through_s, a hidden one after hidden_s."""
     scan_for(stage, SONAR.max_range_m)
     assert pruned(stage, 2, FORGETFUL).all()
     assert not pruned(stage, 3, FORGETFUL).any()

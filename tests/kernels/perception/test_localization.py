@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from tests.conftest import set_step
 from tests.oracles import localization as oracle
 from uuvtai.config import EpisodeConfig, LocalizationConfig, TankConfig, VehicleConfig
@@ -49,18 +49,15 @@ class Rig:
         self.io = io_for(LocalizationIO, self, cfg, voyage.sensors, voyage.tank, RULES, VEHICLE)
         self.clock.active.fill(1)
         set_step(self.clock, 0)
-        self.ego.pos_w.from_numpy(voyage.pos[0].astype(np.float32))
-        self.ego.vel_b.fill(0)
+        put(self.ego, pos_w=voyage.pos[0], vel_b=0)
         localization.reset_pose(self.io)
 
     def sense(self, k):
         """What the instruments say in step k; while the DVL is lost it says nonsense."""
         v, ego = self.voyage, self.ego
         set_step(self.clock, k)
-        ego.rpy.from_numpy(np.stack([v.roll[k], v.pitch[k], v.imu_yaw[k]], 1).astype(np.float32))
-        ego.rate_b.from_numpy(v.rates[k].astype(np.float32))
-        ego.specific_force_b.from_numpy(v.force[k].astype(np.float32))
-        ego.depth_m.from_numpy(v.depth[k].astype(np.float32))
+        put(ego, rpy=np.stack([v.roll[k], v.pitch[k], v.imu_yaw[k]], 1), rate_b=v.rates[k])
+        put(ego, specific_force_b=v.force[k], depth_m=v.depth[k])
         if k % v.sensors.dvl.period_steps == 0:
             ego.vel_valid.from_numpy(v.valid[k])
             seen = v.valid[k][:, None] == 1
@@ -85,8 +82,7 @@ class Rig:
         names = ("range_m", "doppler_m_s", "hit", "ping_pos_w", "ping_yaw", "ping_vel_b")
         for name, values in zip(names, due, strict=True):
             getattr(self.scan, name).from_numpy(values if name == "hit" else values.astype(np.float32))
-        self.scan.ping_step.from_numpy(np.full(N_ENV, k, np.int32))
-        self.scan.fresh.fill(1)
+        put(self.scan, ping_step=np.full(N_ENV, k, np.int32), fresh=1)
 
     def play(self, until=STEPS, since=0):
         for k in range(since, until):

@@ -1,5 +1,4 @@
-"""What the camera says about heights: hand-made scenes drawn by the depth camera's own oracle, and the rule
-itself in float64."""
+"""What the camera says about heights: hand-made scenes by the depth camera's oracle, the rule in float64."""
 
 import numpy as np
 import pytest
@@ -20,13 +19,9 @@ TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), Epis
 CAMERA = DepthConfig(rows=36, cols=64, fov_deg=90.0, offset_b_m=(0.2, 0.0, 0.0), max_range_m=8.0)
 CFG = HeightConfig(column_share=0.05, use_camera=True, camera_hit_share=0.6)
 SIZES = {
-    "n_env": N_ENV,
-    "n_track": N_TRACK,
-    "n_height": LANES,
-    "n_ray": 16,
-    "n_pixel_row": CAMERA.rows,
+    "n_env": N_ENV, "n_track": N_TRACK, "n_height": LANES, "n_ray": 16, "n_pixel_row": CAMERA.rows,
     "n_pixel_col": CAMERA.cols,
-}
+}  # fmt: skip
 HEIGHTS = weighing.heights(TANK)
 SLICE_M = HEIGHTS[1] - HEIGHTS[0]
 PRIOR = weighing.prior(CFG)
@@ -50,8 +45,7 @@ class Rig:
         )
 
     def begin(self):
-        """Nothing tracked, nothing but walls in view, everyone level at (5, 3, -0.8) and facing +x; a fresh
-        image at step 0."""
+        """Nothing tracked, only walls in view, everyone level at (5, 3, -0.8) facing +x; a fresh image."""
         clear(self.tracks, self.image, self.clock)
         self.clock.active.fill(1)
         self.image.fresh.fill(1)
@@ -65,8 +59,7 @@ class Rig:
         self.place[env, track], self.radius[env, track] = (x, y), radius
 
     def put(self, env, kind, x, y, z, size, tracked=True):
-        """An obstacle: size = radius of a ball, (radius, half height) of a cylinder, (half x, half y) of a
-        full-column box."""
+        """An obstacle; size: ball's radius, cylinder's (radius, half height), full box's (half x, half y)."""
         extents = {
             SPHERE: lambda: (size,) * 3,
             CYLINDER: lambda: (size[0], *size),
@@ -88,11 +81,8 @@ class Rig:
         self.depth_m = np.zeros((N_ENV, CAMERA.rows, CAMERA.cols))
         for env, obstacles in enumerate(self.obstacles):
             for slot, (kind, pos, size) in enumerate(obstacles):
-                scene["kind"][env, slot], scene["obstacle_pos"][env, slot], scene["size"][env, slot] = (
-                    kind,
-                    pos,
-                    size,
-                )
+                scene["kind"][env, slot], scene["obstacle_pos"][env, slot] = kind, pos
+                scene["size"][env, slot] = size
             rays, eye = camera_rays(scene["quat"][env], pixels, CAMERA), camera_position(scene, env, CAMERA)
             seen = np.minimum(z_depths(scene, env, TANK, rays, eye), CAMERA.max_range_m)
             self.depth_m[env] = seen.reshape(CAMERA.rows, CAMERA.cols)
@@ -129,8 +119,7 @@ def mass(share, low, high):
 
 
 def test_a_obstacle_seen_wholly_lies_where_it_is_seen(rig):
-    """Balls and cylinders at several heights and distances; also with the nose up or down, rolled, and turned
-    to any side."""
+    """At several heights and distances; also with the nose up or down, rolled, and turned."""
     z = np.linspace(-1.2, -0.4, N_ENV)
     for env in range(N_ENV):
         yaw = 0.7 * env
@@ -152,8 +141,7 @@ def test_a_obstacle_seen_wholly_lies_where_it_is_seen(rig):
 
 
 def test_a_obstacle_cut_by_the_image_tells_its_visible_end_only(rig):
-    """Close by and high (or low): what may be is from the middle of what shows to 0.4 m beyond its visible
-    end, and nothing else."""
+    """What may be is from the middle of what shows to 0.4 m beyond its visible end."""
     x = EYE_X + 0.8
     rig.put(0, CYLINDER, x, 3.0, -0.3, (0.2, 0.25))
     rig.put(1, CYLINDER, x, 3.0, -1.3, (0.2, 0.25))
@@ -164,18 +152,15 @@ def test_a_obstacle_cut_by_the_image_tells_its_visible_end_only(rig):
     assert mass(share[0, 0], 0.5 * (visible_end + image_end) - 0.1, visible_end + 0.4 + 0.1) > 0.85
     assert share[0, 0, :8].max() < 0.1 * share[0, 0].max()
     above = [share[0, 0, i] for i in range(15) if -0.4 < HEIGHTS[i] < -0.2]
-    assert (
-        len(above) == 2 and np.ptp(above) < 1e-6 and above[0] > PRIOR[0]
-    )  # hidden heights stay equally likely
+    # hidden heights stay equally likely
+    assert len(above) == 2 and np.ptp(above) < 1e-6 and above[0] > PRIOR[0]
     np.testing.assert_allclose(share[1, 0, :15], share[0, 0, :15][::-1], atol=1e-5)  # the mirror image
-    assert share[2, 0, 7] > PRIOR[7] and share[2, 0, -1] == pytest.approx(
-        share[2, 0, 7] * PRIOR[-1] / PRIOR[7], rel=1e-4
-    )
+    assert share[2, 0, 7] > PRIOR[7]
+    assert share[2, 0, -1] == pytest.approx(share[2, 0, 7] * PRIOR[-1] / PRIOR[7], rel=1e-4)
 
 
 def test_a_column_shows_from_edge_to_edge(rig):
-    """Far enough away that floor and surface are in view: an obstacle from one to the other is a column, a
-    tall one is not."""
+    """With floor and surface in view an obstacle between them is a column, a tall one is not."""
     rig.put(0, CYLINDER, EYE_X + 2.5, 3.0, -0.8, (0.2, 0.8))
     rig.put(1, CYLINDER, EYE_X + 2.5, 3.0, -0.9, (0.2, 0.5))
     rig.load()
@@ -185,8 +170,7 @@ def test_a_column_shows_from_edge_to_edge(rig):
 
 
 def test_what_is_seen_past_is_not_there(rig):
-    """Nothing shows: heights within the image lose camera_hit_share of their weight, the column too, the
-    others none; so does presence."""
+    """Nothing shows: heights within the image and the column lose camera_hit_share, so does presence."""
     rig.track(0, EYE_X + 1.0, 3.0)
     rig.track(1, EYE_X + 3.0, 3.0)
     rig.load()
@@ -194,8 +178,7 @@ def test_what_is_seen_past_is_not_there(rig):
     for env, away in enumerate((1.0, 3.0)):
         inside = np.append(np.abs(HEIGHTS + 0.8) < TOP * (away - 0.1), True)
         assert inside.all() == (env == 1) and inside.sum() > 5
-        likely = np.where(inside, 1 - CFG.camera_hit_share, 1.0)
-        wanted = weighing.seen_not(PRIOR, 0.9, likely)
+        wanted = weighing.seen_not(PRIOR, 0.9, np.where(inside, 1 - CFG.camera_hit_share, 1.0))
         np.testing.assert_allclose(share[env, 0], wanted[0], atol=SHARE_TOLERANCE)
         assert present[env, 0] == pytest.approx(wanted[1], abs=SHARE_TOLERANCE)
     assert present[1, 0] < present[0, 0] < 0.9
@@ -220,8 +203,7 @@ def test_what_is_hidden_is_not_judged(rig):
 
 
 def test_an_end_behind_something_nearer_is_not_an_end(rig):
-    """A ball hides the lower (upper) half of a cylinder farther away: its middle may be lower (higher) than
-    that of what shows."""
+    """A ball hides half of a cylinder, whose middle may be lower (higher) than what shows."""
     far = EYE_X + 2.5
     for env, side in enumerate((-1, 1)):
         rig.put(env, CYLINDER, far, 3.0, -0.8, (0.2, 0.35))
@@ -237,27 +219,20 @@ def test_an_end_behind_something_nearer_is_not_an_end(rig):
 
 
 def test_only_fresh_images_of_moving_obstacles_in_view_count(rig):
-    """One case per env: an old image, a static obstacle, a dead track, behind the camera, beside the image,
-    too far, too near, inactive."""
+    """An old image, static, dead, behind, beside, too far, too near, inactive."""
     for env in range(9):
         rig.track(env, EYE_X + 2.0, 3.0)
     for env, place in {
-        3: (3.0, 3.0),
-        4: (EYE_X + 1.0, 5.0),
-        5: (EYE_X + 7.9, 3.0),
-        6: (EYE_X + 0.4, 3.0),
-    }.items():
+        3: (3.0, 3.0), 4: (EYE_X + 1.0, 5.0), 5: (EYE_X + 7.9, 3.0), 6: (EYE_X + 0.4, 3.0),
+    }.items():  # fmt: skip
         rig.track(env, *place)
     rig.load()
     flags = {
         name: np.ones(shape)
         for name, shape in (
-            ("fresh", N_ENV),
-            ("active", N_ENV),
-            ("moving", (N_ENV, N_TRACK)),
-            ("alive", (N_ENV, N_TRACK)),
+            ("fresh", N_ENV), ("active", N_ENV), ("moving", (N_ENV, N_TRACK)), ("alive", (N_ENV, N_TRACK)),
         )
-    }
+    }  # fmt: skip
     flags["fresh"][0] = flags["moving"][1, 0] = flags["alive"][2, 0] = flags["active"][7] = 0
     put(rig.image, fresh=flags["fresh"])
     put(rig.clock, active=flags["active"])
@@ -269,8 +244,7 @@ def test_only_fresh_images_of_moving_obstacles_in_view_count(rig):
 
 
 def test_a_track_is_looked_for_where_it_is_now(rig):
-    """The image is newer than the scan the tracks refer to: the body has moved on, 0.1 s at 1 m/s, out of the
-    first place's columns."""
+    """The image is newer than the scan: the body has moved on by 0.1 s at 1 m/s."""
     rig.put(0, SPHERE, EYE_X + 1.5, 3.4, -0.5, 0.15, tracked=False)
     rig.put(1, SPHERE, EYE_X + 1.5, 3.4, -0.5, 0.15, tracked=False)
     rig.track(0, EYE_X + 1.5, 3.0)
@@ -286,8 +260,7 @@ def test_a_track_is_looked_for_where_it_is_now(rig):
 
 
 def test_any_scene_equals_the_oracle(rig):
-    """Random attitudes, scenes of up to four obstacles, tracks on and beside them: shares and presences of
-    every track in view."""
+    """Random attitudes, up to four obstacles, tracks on and beside them: every track in view."""
     rng = np.random.default_rng(12)
     compared = {"shown": 0, "missed": 0, "untouched": 0}
     for _ in range(4):

@@ -1,12 +1,11 @@
-"""The two-layer map: against the oracle on random scans, known situations by hand, and what must hold for any
-scan."""
+"""The two-layer map: the oracle on random scans, known situations by hand, invariants of any scan."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from tests.map_bits import check_bits, get_map, put_map
 from tests.oracles.mapping import MapOracle, rotation
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
@@ -58,27 +57,14 @@ class Stage:
 
     def __init__(self, n_env=N_ENV):
         sizes = {
-            "n_env": n_env,
-            "n_row": SHAPE[0],
-            "n_col": SHAPE[1],
-            "n_ray": SONAR.n_ray,
-            "n_track": 4,
-            "n_cluster": 4,
-            "n_obstacle": 4,
-            "n_height": 16,
-            "n_slot": 4,
-        }
+            "n_env": n_env, "n_row": SHAPE[0], "n_col": SHAPE[1], "n_ray": SONAR.n_ray, "n_track": 4,
+            "n_cluster": 4, "n_obstacle": 4, "n_height": 16, "n_slot": 4,
+        }  # fmt: skip
         sizes |= {"n_pixel_row": DEPTH_CAMERA.rows, "n_pixel_col": DEPTH_CAMERA.cols}
         structs = {
-            "grid_map": MapState,
-            "scratch": MapScratch,
-            "scan": SonarScan,
-            "image": DepthImage,
-            "tracks": TrackState,
-            "clusters": ClusterState,
-            "mask": GridMask,
-            "clock": ClockState,
-        }
+            "grid_map": MapState, "scratch": MapScratch, "scan": SonarScan, "image": DepthImage,
+            "tracks": TrackState, "clusters": ClusterState, "mask": GridMask, "clock": ClockState,
+        }  # fmt: skip
         for name, struct in structs.items():
             setattr(self, name, allocate(struct, sizes))
         self.n_env = n_env
@@ -108,15 +94,11 @@ class Stage:
     def put_scans(self, scans, fresh=1):
         """One scan per env."""
         s = self.scan
-        s.range_m.from_numpy(np.stack([c["range"] for c in scans]).astype(np.float32))
-        s.hit.from_numpy(np.stack([c["hit"] for c in scans]).astype(np.int32))
-        s.doppler_m_s.from_numpy(np.stack([c["doppler"] for c in scans]).astype(np.float32))
-        s.ping_pos_w.from_numpy(np.stack([c["pos"] for c in scans]).astype(np.float32))
-        s.ping_yaw.from_numpy(np.array([c["yaw"] for c in scans], np.float32))
-        s.ping_vel_b.from_numpy(np.stack([c["vel"] for c in scans]).astype(np.float32))
-        s.fresh.fill(fresh)
-        s.ping_vel_valid.from_numpy(np.array([c.get("valid", True) for c in scans], np.int32))
-        s.ping_step.fill(7)
+        put(s, range_m=np.stack([c["range"] for c in scans]), hit=np.stack([c["hit"] for c in scans]))
+        put(s, doppler_m_s=np.stack([c["doppler"] for c in scans]))
+        put(s, ping_pos_w=np.stack([c["pos"] for c in scans]), ping_yaw=[c["yaw"] for c in scans])
+        put(s, ping_vel_b=np.stack([c["vel"] for c in scans]), fresh=fresh)
+        put(s, ping_vel_valid=[c.get("valid", True) for c in scans], ping_step=7)
         walls = [c.get("walls") or ((0.0, 0.0), 0.0, False) for c in scans]
         self.clusters.slip_w.from_numpy(np.array([error for error, _, _ in walls], np.float32))
         self.clusters.own_sigma_m_s.from_numpy(np.array([sigma for _, sigma, _ in walls], np.float32))
@@ -137,15 +119,9 @@ class Stage:
 
     def update(self):
         args = (
-            self.grid_map,
-            self.scratch,
-            self.scan,
-            self.image,
-            self.tracks,
-            self.clusters,
-            self.mask,
+            self.grid_map, self.scratch, self.scan, self.image, self.tracks, self.clusters, self.mask,
             self.clock,
-        )
+        )  # fmt: skip
         mapping.update_map(io_for(MappingIO, *args, MAP, SONAR, DEPTH_CAMERA, self.tank, EPISODE))
 
     def run(self, scan_of, n_scan, first=0, image_of=None):
@@ -172,8 +148,7 @@ def _default_tank(stage):
 
 
 def ring(pos, obstacles=(), yaw=0.0, vel=(0.0, 0.0, 0.0), noise=None):
-    """Scan of the rectangular tank with discs (x, y, radius, vx, vy): ranges, hits, Doppler with ego
-    motion."""
+    """Scan of the rectangular tank with discs (x, y, radius, vx, vy): ranges, hits, Doppler."""
     pos = np.array([*pos, -0.8])
     angle = yaw + 2 * np.pi * np.arange(SONAR.n_ray) / SONAR.n_ray
     u = np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -207,8 +182,7 @@ def ring(pos, obstacles=(), yaw=0.0, vel=(0.0, 0.0, 0.0), noise=None):
 
 def blind(pos):
     """A scan that reaches no cell of interest: every beam returns from 0.2 m."""
-    scan = ring(pos)
-    return scan | {"range": np.full(SONAR.n_ray, 0.2)}
+    return ring(pos) | {"range": np.full(SONAR.n_ray, 0.2)}
 
 
 def cell(x, y):
@@ -318,9 +292,8 @@ def check_against_oracle(stage, tank, seed):
             )
         seen["dynamic"] += int((expected["dynamic_scans"] > before[env]["dynamic_scans"]).sum())
         seen["static"] += int((expected["static"] > before[env]["static"]).sum())
-        assert (after["static"][env][oracle.outside] == 0).all() and (
-            after["dynamic"][env][oracle.outside] == 0
-        ).all()
+        assert (after["static"][env][oracle.outside] == 0).all()
+        assert (after["dynamic"][env][oracle.outside] == 0).all()
     assert seen["doubtful"] < MAX_DOUBTFUL
     # the random scans exercise what they should
     assert seen["dynamic"] > 10 and seen["static"] > 20
@@ -433,8 +406,7 @@ def misread(yaw, valid, walls):
 @pytest.mark.parametrize("yaw", [0.0, 21 * 2 * np.pi / SONAR.n_ray])
 @pytest.mark.parametrize(("valid", "same"), [(False, True), (False, False), (True, True)])
 def test_walls_that_show_a_wrong_own_velocity_keep_the_standing_at_rest(stage, yaw, valid, same):
-    """Bottom lost while the vehicle stopped: the walls' Doppler tells, in the tracked scan and, while the
-    reading is held, after it."""
+    """Bottom lost as the vehicle stopped: the walls' Doppler tells, also after the scan."""
     stage.reset()
     after = stage.run(lambda k: misread(yaw, valid, (WRONG, 0.0 if valid else 0.01, same)), 1)
     assert after["dynamic"].max() == 0 and after["static"][cell(*FACE)] > 0
@@ -449,8 +421,7 @@ def test_a_valid_reading_is_not_mended_by_an_older_scan(stage):
 
 
 def test_without_a_reading_and_without_walls_doppler_proves_nothing(stage):
-    """Nobody knows the own velocity: what stands does not move by it. An obstacle faster than all doubt still
-    does."""
+    """What stands does not move by it; an obstacle faster than all doubt still does."""
     stage.reset()
     blindly = stage.run(lambda k: misread(0.0, False, ((0.0, 0.0), 1.0, True)), 1)
     assert blindly["dynamic"].max() == 0 and blindly["static"][cell(*FACE)] > 0
@@ -481,8 +452,7 @@ def test_return_from_free_water_is_dynamic_until_it_has_stayed(stage):
     stage.run(appearing, n_free)
     soon = stage.run(appearing, 10, first=n_free)
     assert soon["dynamic"][cell(*FACE)] > MAP.occupied and soon["static"].max() == 0
-    late = stage.run(appearing, n_promote - 10, first=n_free + 10)
-    assert late["static"].max() == 0
+    assert stage.run(appearing, n_promote - 10, first=n_free + 10)["static"].max() == 0
     after = stage.run(appearing, 40, first=n_free + n_promote)
     assert after["static"][cell(*FACE)] > MAP.occupied
     assert after["dynamic"].max() < MAP.occupied
@@ -512,8 +482,7 @@ def test_noisy_edges_of_a_static_obstacle_never_become_dynamic(stage):
 def test_free_water_clears_a_removed_obstacle(stage):
     stage.reset()
     stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 25)
-    after = stage.run(lambda k: ring(EYE), 40, first=25)
-    assert after["static"][cell(*FACE)] == 0
+    assert stage.run(lambda k: ring(EYE), 40, first=25)["static"][cell(*FACE)] == 0
 
 
 def test_dynamic_layer_decays_to_exactly_nothing_unseen(stage):
@@ -521,8 +490,7 @@ def test_dynamic_layer_decays_to_exactly_nothing_unseen(stage):
     before = stage.run(lambda k: ring(EYE, [(*BODY, 0.5, 0.0)]), 10)["dynamic"][cell(*FACE)]
     one = stage.run(lambda k: blind(EYE), 1, first=10)["dynamic"][cell(*FACE)]
     assert one == pytest.approx(before * (1 - MAP.dynamic_decay) ** 0.4, abs=OCCUPANCY_TOLERANCE)
-    after = stage.run(lambda k: blind(EYE), 350, first=11)
-    assert after["dynamic"][cell(*FACE)] == 0
+    assert stage.run(lambda k: blind(EYE), 350, first=11)["dynamic"][cell(*FACE)] == 0
 
 
 def test_beam_without_return_clears_only_near_water(stage):
@@ -540,8 +508,7 @@ def test_beam_without_return_clears_only_near_water(stage):
 
 
 def wall_ahead(z_m):
-    """Image of a plane across the view, moved sideways by half a pixel so that one column looks along y =
-    EYE[1]."""
+    """Image of a plane across the view, half a pixel sideways so that a column looks along y = EYE[1]."""
     pos = (EYE[0], EYE[1] - z_m * np.tan(np.radians(DEPTH_CAMERA.fov_deg / 2)) / DEPTH_CAMERA.cols, -0.8)
     return {
         "depth": np.full((DEPTH_CAMERA.rows, DEPTH_CAMERA.cols), z_m),
@@ -638,10 +605,8 @@ def test_permuting_envs_permutes_maps(stage, order, seed):
 @settings(max_examples=3, deadline=None, derandomize=True)
 @given(changed=st.integers(0, N_ENV - 1), seed=st.integers(0, 1000))
 def test_one_env_never_touches_another(stage, changed, seed):
-    plain, twisted = (
-        random_run(stage, range(N_ENV), seed),
-        random_run(stage, range(N_ENV), seed, twist=changed),
-    )
+    plain = random_run(stage, range(N_ENV), seed)
+    twisted = random_run(stage, range(N_ENV), seed, twist=changed)
     others = [env for env in range(N_ENV) if env != changed]
     assert (plain["static"][changed] != twisted["static"][changed]).any()
     for name in FIELDS:
@@ -658,8 +623,7 @@ def test_occupancy_stays_in_its_bounds(stage, seed, n_scan):
 
 
 def test_position_estimate_off_the_grid_is_harmless(stage):
-    """Dead reckoning may drift through a wall: nothing is written out of bounds, nothing off the tank is
-    occupied."""
+    """Dead reckoning may drift through a wall: no write out of bounds, nothing occupied off the tank."""
     stage.reset()
     after = stage.run(
         lambda k: ring(EYE, [(*BODY, 0, 0)]) | {"pos": np.array([-3.0 + k, 9.0 - 2 * k, -0.8])}, 8
@@ -690,12 +654,8 @@ def test_debugging_stamp_is_off_by_default_and_marks_moving_obstacles_only(stage
     assert MappingConfig().stamp == 0.0
     stage.reset()
     world = allocate(WorldState, {"n_env": N_ENV, "n_obstacle": 4})
-    kind, pos, vel, size = (
-        np.zeros((N_ENV, 4), np.int32),
-        np.zeros((N_ENV, 4, 3)),
-        np.zeros((N_ENV, 4, 3)),
-        np.zeros((N_ENV, 4, 3)),
-    )
+    kind, pos, vel = np.zeros((N_ENV, 4), np.int32), np.zeros((N_ENV, 4, 3)), np.zeros((N_ENV, 4, 3))
+    size = np.zeros((N_ENV, 4, 3))
     kind[:] = (CYLINDER, CYLINDER, BOX, NONE)
     pos[:, :, :2] = ((1.0, 1.0), (3.0, 1.0), (5.0, 3.0), (3.0, 3.0))
     size[:] = ((0.3, 0.3, 1), (0.3, 0.3, 1), (0.5, 0.1, 1), (0.3, 0.3, 1))

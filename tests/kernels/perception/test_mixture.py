@@ -5,6 +5,7 @@ import pytest
 import torch
 from safetensors.numpy import save
 
+from tests import bundles
 from tests.bundles import clear, io_for
 from uuvtai.common import enums
 from uuvtai.common.errors import UserError
@@ -54,10 +55,7 @@ class Stage:
         clear(self.tracks, self.turn_history, self.forecast, self.futures, self.clock, self.clusters)
         self.clock.active.fill(1)
         self.clusters.fresh.fill(1)
-        self.tracks.alive.fill(1)
-        self.tracks.moving.fill(1)
-        self.tracks.age.fill(9)
-        self.tracks.radius_m.fill(0.2)
+        bundles.put(self.tracks, alive=1, moving=1, age=9, radius_m=0.2)
         prediction_network.reset_past(self.past_io())
         return self
 
@@ -84,8 +82,7 @@ class Stage:
 
     def scan(self, step):
         self.clock.step.fill(step)
-        self.tracks.scan_step.fill(step)
-        self.tracks.seen_step.fill(step)
+        bundles.put(self.tracks, scan_step=step, seen_step=step)
         prediction_network.remember_past(self.past_io())
 
     def columns(self):
@@ -192,10 +189,8 @@ def test_a_straight_way_is_told_by_its_places_and_walls(stage):
 
 def test_a_mirrored_track_has_mirrored_columns(stage):
     rng = np.random.default_rng(2)
-    begin, velocity = (
-        rng.uniform([4, 1.5], [12, 4.5], (N_ENV, N_TRACK, 2)),
-        rng.normal(0, 0.7, (N_ENV, N_TRACK, 2)),
-    )
+    begin = rng.uniform([4, 1.5], [12, 4.5], (N_ENV, N_TRACK, 2))
+    velocity = rng.normal(0, 0.7, (N_ENV, N_TRACK, 2))
     rate = rng.normal(0, 1, (N_ENV, N_TRACK))
     told = []
     for flip in (1, -1):

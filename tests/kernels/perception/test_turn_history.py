@@ -1,5 +1,4 @@
-"""What is learnt from tracks that turn, and what follows: kernels against a float64 oracle, and obstacles on
-lines, loops and circles."""
+"""What is learnt from tracks that turn: against a float64 oracle, on lines, loops and circles."""
 
 import numpy as np
 import pytest
@@ -31,11 +30,8 @@ SETTLED_COV = 0.01 * np.eye(4)[np.triu_indices(4)]
 
 class Stage:
     def __init__(self):
-        self.tracks, self.clock, self.clusters = (
-            allocate(TrackState, SIZES),
-            allocate(ClockState, SIZES),
-            allocate(ClusterState, SIZES),
-        )
+        self.tracks, self.clock = allocate(TrackState, SIZES), allocate(ClockState, SIZES)
+        self.clusters = allocate(ClusterState, SIZES)
         self.turn_history, self.forecast = allocate(TurnHistory, SIZES), allocate(ForecastState, SIZES)
 
     def begin(self):
@@ -59,13 +55,9 @@ class Stage:
         turn_cov = np.zeros((N_ENV, N_TRACK, 5))
         turn_cov[..., 4] = rate_var
         self.put(
-            state=state,
-            cov=cov,
-            turn_rate=rate,
-            turn_cov=turn_cov,
-            scan_step=self.step,
+            state=state, cov=cov, turn_rate=rate, turn_cov=turn_cov, scan_step=self.step,
             **{"age": self.step, **fields},
-        )
+        )  # fmt: skip
         prediction.learn_turns(
             io_for(TrackingIO, self.turn_history, self.tracks, self.clusters, self.clock, CONFIG, RULES)
         )
@@ -121,8 +113,7 @@ class Loops:
 
 
 def test_learning_equals_the_oracle(stage):
-    """Noisy tracks on loops and lines, now and then unsettled, unseen or turning: every scan's change of
-    memory is the oracle's."""
+    """Noisy tracks on loops and lines, now and then unsettled or unseen: every scan's change of memory."""
     stage.begin()
     rng = np.random.default_rng(1)
     paths = Loops(rng, 3, 1.5)
@@ -161,14 +152,9 @@ def test_learning_equals_the_oracle(stage):
                     continue
                 leg = before["leg"][env, track].astype(float) if leg_step >= 0 else None
                 slot = oracle.learn(
-                    turns,
-                    slot,
-                    leg,
-                    leg_step * RULES.control_dt_s,
-                    x,
-                    stage.step * RULES.control_dt_s,
+                    turns, slot, leg, leg_step * RULES.control_dt_s, x, stage.step * RULES.control_dt_s,
                     CONFIG,
-                )
+                )  # fmt: skip
                 np.testing.assert_array_equal(after["leg"][env, track], state[env, track])
                 assert after["leg_step"][env, track] == stage.step
             assert after["next_slot"][env] == slot
@@ -203,8 +189,7 @@ def shuttle(t, speed=1.2, length=3.0, begin=(5.0, 2.0), course=0.6):
 
 
 def test_both_ends_of_a_line_are_learnt_in_one_go_and_back(stage):
-    """Seven scans at each reversal are unsettled, as the filter's are; the ends come out within 2 cm, from
-    which side they are reached."""
+    """Seven scans at a reversal are unsettled; the ends come out within 2 cm, with their side."""
     stage.begin()
     for k in range(int(8.0 / PERIOD_S)):
         t = k * PERIOD_S
@@ -222,8 +207,7 @@ def test_both_ends_of_a_line_are_learnt_in_one_go_and_back(stage):
 
 
 def test_circles_leave_no_turns(stage):
-    """An obstacle on a circle is on no straight leg once its turn rate stands out; before, its legs bend too
-    little to be a turn."""
+    """On a circle no leg is straight once its turn rate stands out; before, legs bend too little."""
     stage.begin()
     for k in range(120):
         a = 0.8 * k * PERIOD_S
@@ -233,8 +217,7 @@ def test_circles_leave_no_turns(stage):
 
 
 def test_a_turn_that_does_not_come_is_forgotten(stage):
-    """Learnt once from one obstacle, contradicted by another that goes straight on over the same place on the
-    same course."""
+    """Learnt once, contradicted by another obstacle that goes straight on over the same place."""
     stage.begin()
     for k in range(int(4.0 / PERIOD_S)):
         state, alive = one_obstacle(shuttle(k * PERIOD_S))
@@ -282,8 +265,7 @@ def test_only_awake_rows_learn_and_forget(stage):
 
 @pytest.mark.parametrize("shape", ["rectangle", "circle"])
 def test_coasting_equals_the_oracle(stage, shape):
-    """Unseen obstacles near remembered turns and walls: one step of 0.06 s or of 0.5 s ends where the
-    oracle's walk ends."""
+    """Unseen obstacles near turns and walls: a step of 0.06 s or 0.5 s ends where the oracle's walk ends."""
     stage.begin()
     tank = TankConfig(shape=shape, y_m=(0.0, 6.0) if shape == "rectangle" else (0.0, 20.0))
     rng = np.random.default_rng(2)
@@ -334,8 +316,7 @@ def test_coasting_equals_the_oracle(stage, shape):
 
 
 def test_a_way_remembers_what_kind_of_turn_began_it(stage):
-    """Obstacles that have swum to and fro, and round corners, for some ways: 2 = began with a turn back, 3 =
-    a corner."""
+    """To and fro, or round corners: 2 = began with a turn back, 3 = a corner."""
     for corners, kind in ((2, prediction.BEGIN_SEEN), (3, prediction.CORNER_SEEN)):
         stage.begin()
         paths = Loops(np.random.default_rng(4), corners, 1.5)

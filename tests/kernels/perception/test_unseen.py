@@ -1,5 +1,4 @@
-"""Unseen obstacles that may turn back: first and second moments against a drawn population and a float64
-oracle, rates against the ways that are expected."""
+"""Unseen obstacles that may turn back: moments against a population and a float64 oracle, and rates."""
 
 from functools import cache
 
@@ -7,7 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import clear, io_for
+from tests.bundles import clear, io_for, put
 from tests.oracles import turn_history as habit_oracle
 from uuvtai.config import Config
 from uuvtai.kernels.core.simd import LANES
@@ -19,14 +18,8 @@ from uuvtai.state import ClusterState, SonarScan, TrackState, TurnHistory, alloc
 
 N = 64
 SIZES = {
-    "n_env": N,
-    "n_ray": 256,
-    "n_track": 1,
-    "n_cluster": 1,
-    "n_height": LANES,
-    "n_turn_row": 7,
-    "n_turn": 48,
-}
+    "n_env": N, "n_ray": 256, "n_track": 1, "n_cluster": 1, "n_height": LANES, "n_turn_row": 7, "n_turn": 48,
+}  # fmt: skip
 CFG = Config.model_validate({"traffic": {"leg_m": [2.0, 6.0]}, "forecast": {"use_turning_back": True}})
 TRIANGLE = np.triu_indices(4)
 SPEED = 1.5
@@ -75,8 +68,7 @@ def full(cov):
 
 
 def oracle(mean, cov, link, rate, dt):
-    """One body, whole matrices; the noise is the integral of the kernel of the velocity's noise over dt, by
-    Simpson's rule."""
+    """One body, whole matrices; the noise is the velocity's kernel integrated over dt by Simpson's rule."""
     second = np.outer(mean[2:], mean[2:]) + cov[2:, 2:]
     square, axes = np.linalg.eigh(second)
     way = np.outer(axes[:, 1], axes[:, 1])
@@ -114,8 +106,7 @@ def test_moments_are_those_of_the_oracle(dt):
 
 
 def test_moments_are_those_of_a_drawn_population():
-    """Obstacles along (0.6, 0.8) at 1.5 m/s, known exactly at first, that turn back 0.4 times a second: after
-    1.2 s as a population drawn in small steps, in steps of 0.06 s as the tracker takes them."""
+    """Along (0.6, 0.8) at 1.5 m/s, turning back 0.4 times a second: 1.2 s in steps of 0.06 s."""
     rate, speed, steps = 0.4, 1.5, 20
     course = np.array([0.6, 0.8])
     rng = np.random.default_rng(4)
@@ -144,13 +135,11 @@ def straight_obstacles():
 
 
 def rates_of(kind, way, dt, turn_rate=0.0, turn_var=0.0, turned=None):
-    """[1/s] of obstacles that swim along +x at 1.5 m/s and have gone straight for ``way`` [m] since a turn
-    that was seen (``kind`` 2), or since they were met (1)."""
+    """[1/s] along +x at 1.5 m/s, straight for ``way`` [m] since a turn (``kind`` 2) or since met (1)."""
     tracks, turn_history = straight_obstacles()
     clear(tracks, turn_history)
     state = np.stack([way, 0 * way, 0 * way + SPEED, 0 * way], 1)[:, None]
-    tracks.state.from_numpy(state.astype(np.float32))
-    tracks.turn_rate.fill(turn_rate)
+    put(tracks, state=state, turn_rate=turn_rate)
     cov = np.zeros((N, 1, 5), np.float32)
     cov[..., 4] = turn_var
     tracks.turn_cov.from_numpy(cov)
@@ -163,8 +152,7 @@ def rates_of(kind, way, dt, turn_rate=0.0, turn_var=0.0, turned=None):
 
 
 def test_rate_is_the_share_of_ways_that_end():
-    """Of ways between 2 and 6 m and one in twenty of any length, that have lasted so long since a turn that
-    was seen."""
+    """Of ways of 2 to 6 m, one in twenty of any length, that have lasted so long."""
     way = np.linspace(0.0, 5.9, N)
 
     def lasting(y):
@@ -193,8 +181,7 @@ def test_rate_is_that_of_a_drawn_population(kind):
 
 
 def test_obstacles_that_may_circle_turn_back_less_and_known_turns_leave_no_doubt():
-    """The share that goes straight is that of Bayes' rule: the prior odds against the turn rate's density of
-    0 in its prior over that in its posterior."""
+    """Bayes' rule: prior odds against the densities of 0 turn rate in prior and posterior."""
     way = np.full(N, 3.0)
     usual = rates_of(2, way, 0.06)
     for turn_rate, var in ((0.0, 0.01), (0.2, 0.01), (0.5, 0.02)):
@@ -208,23 +195,18 @@ def test_obstacles_that_may_circle_turn_back_less_and_known_turns_leave_no_doubt
 
 
 def test_only_obstacles_that_beams_pass_by_may_have_turned():
-    """One third each: beams meet nothing where the body is expected, meet something nearer, have just met the
-    body."""
+    """One third each: beams meet nothing, meet something nearer, have just met the body."""
     structs = [allocate(struct, SIZES) for struct in (TrackState, TurnHistory, ClusterState, SonarScan)]
     clear(*structs)
     tracks, _, clusters, scan = structs
     kind = np.arange(N) % 3
     tracks.state.from_numpy(np.tile(np.array([3.0, 0.0, 1.5, 0.0], np.float32), (N, 1, 1)))
     for field, value in (
-        (tracks.alive, 1),
-        (tracks.moving, 1),
-        (tracks.radius_m, 0.2),
-        (clusters.scan_step, 3),
-    ):
+        (tracks.alive, 1), (tracks.moving, 1), (tracks.radius_m, 0.2), (clusters.scan_step, 3),
+    ):  # fmt: skip
         field.fill(value)
     tracks.misses.from_numpy((kind < 2).astype(np.int32)[:, None])
-    scan.hit.from_numpy(np.tile((kind == 1).astype(np.int32)[:, None], 256))
-    scan.range_m.fill(1.0)
+    put(scan, hit=np.tile((kind == 1).astype(np.int32)[:, None], 256), range_m=1.0)
     sections = (CFG.forecast, CFG.tracking, CFG.traffic, CFG.sensors.sonar, CFG.world.tank, CFG.episode)
     _predict(io_for(TrackingIO, *structs, *sections))
     mean, cov = tracks.state.to_numpy()[:, 0], tracks.cov.to_numpy()[:, 0]

@@ -1,12 +1,11 @@
-"""Clearance against scipy's exact transform, its sites and ties, what must hold for any map, and the funcs
-that others read it with."""
+"""Clearance against scipy's transform, sites and ties, invariants of any map, and what reads it."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from tests.map_bits import put_layers
 from tests.oracles.clearance import clearance_of, sites_of
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
@@ -37,12 +36,9 @@ class Stage:
 
     def __init__(self, n_env=N_ENV, n_slot=4):
         sizes = {
-            "n_env": n_env,
-            "n_row": SHAPE[0],
-            "n_col": SHAPE[1],
-            "n_packet": SHAPE[1] // LANES,
+            "n_env": n_env, "n_row": SHAPE[0], "n_col": SHAPE[1], "n_packet": SHAPE[1] // LANES,
             "n_slot": n_slot,
-        }
+        }  # fmt: skip
         self.clearance, self.grid_map = allocate(ClearanceState, sizes), allocate(MapState, sizes)
         self.memory = allocate(ClearanceMemory, sizes)
         self.mask, self.clock = allocate(GridMask, sizes), allocate(ClockState, sizes)
@@ -82,14 +78,12 @@ def stage():
 
 @pytest.fixture(autouse=True)
 def _fresh_clock(stage):
-    stage.clock.active.fill(1)
-    stage.clock.step.fill(0)
+    put(stage.clock, active=1, step=0)
     stage.set_outside(np.array(outside_cells(TANK, MAP.cell_m)))
 
 
 def maps_of(seed):
-    """Eight kinds of maps: empty, one cell, sparse, dense, full, blobs, baffles with gaps, random
-    corridors."""
+    """Eight kinds of maps: empty, one cell, sparse, dense, full, blobs, baffles with gaps, corridors."""
     rng = np.random.default_rng(seed)
     n_row, n_col = SHAPE
     maps = np.zeros((N_ENV, n_row, n_col))
@@ -138,15 +132,12 @@ def test_equals_the_exact_transform(stage, seed):
     "outside", [outside_cells(TANK, MAP.cell_m), outside_cells(POND, MAP.cell_m)], ids=["tank", "pond"]
 )
 def test_inflation_brings_obstacles_nearer_and_leaves_the_boundary(stage, outside):
-    """min(d_occ - inflation, d_bnd) wherever an obstacle is the nearest site; where the boundary is, its own
-    distance, which is no more than the inflation too large. The boundary and the water far from everything
-    stay as they are."""
+    """min(d_occ - inflation, d_bnd) by the nearest site; the boundary's own distance and far water stay."""
     stage.set_outside(np.array(outside))
     static, cfg = maps_of(8), ClearanceConfig(inflate_m=0.08)
     plain = stage.compute(static)
-    clearance.forget_clearance(
-        io_for(ClearanceIO, stage.memory)
-    )  # the same map again, else there would be nothing to do
+    # the same map again, else there would be nothing to do
+    clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
     distance, site_row, site_col = stage.compute(static, cfg=cfg)
     clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
     np.testing.assert_array_equal(plain[1], site_row)
@@ -160,9 +151,8 @@ def test_inflation_brings_obstacles_nearer_and_leaves_the_boundary(stage, outsid
         expected = np.where(near, np.maximum(to_obstacle - 0.08, 0.0), np.minimum(to_bound, CFG.max_m))
         assert np.abs(distance[env] - expected).max() <= ROUNDING_M
         letter = np.minimum(np.minimum(np.maximum(to_obstacle - 0.08, 0.0), to_bound), CFG.max_m)
-        assert np.all(distance[env] - letter < 0.08 + ROUNDING_M) and np.all(
-            distance[env] - letter > -ROUNDING_M
-        )
+        assert np.all(distance[env] - letter < 0.08 + ROUNDING_M)
+        assert np.all(distance[env] - letter > -ROUNDING_M)
         nearer += int(near.sum())
     assert nearer > 1000
 
@@ -281,10 +271,8 @@ def test_envs_are_independent(stage, static, order, changed):
 def test_only_awake_rows_whose_step_is_due_are_computed(stage):
     before = stage.compute(maps_of(8))[0]
     stage.clearance.fresh.from_numpy(np.array([0, 1, 0, 1, 0, 1, 0, 1], np.int32))
-    stage.clock.active.from_numpy(np.array([1, 1, 0, 0, 1, 1, 0, 0], np.int32))
-    stage.clock.step.from_numpy(np.array([0, 1, 0, 1, 5, 4, 10, 11], np.int32))
-    after = stage.compute(maps_of(9)[::-1])[0]
-    changed = (before != after).any(axis=(1, 2))
+    put(stage.clock, active=[1, 1, 0, 0, 1, 1, 0, 0], step=[0, 1, 0, 1, 5, 4, 10, 11])
+    changed = (before != stage.compute(maps_of(9)[::-1])[0]).any(axis=(1, 2))
     np.testing.assert_array_equal(changed, [True, False, False, False, True, False, False, False])
     # inactive rows keep their flag too
     np.testing.assert_array_equal(stage.clearance.fresh.to_numpy(), [1, 0, 0, 1, 1, 0, 0, 1])

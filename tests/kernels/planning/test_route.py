@@ -1,11 +1,10 @@
-"""Triggers made to happen one by one, the queue, progress and the path-relative terms, and loading a path
-from the host."""
+"""Triggers one by one, the queue, progress, path-relative terms, and loading a path from the host."""
 
 import numpy as np
 import pytest
 
 from tests import planning_maps as maps
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from tests.oracles import route as oracle
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, stage, way_of
 from uuvtai.common import enums as codes
@@ -34,9 +33,8 @@ def load(env, corners):
 
 
 def set_step(step):
-    stage().clock.step.from_numpy(
-        np.full(N_ENV, step, np.int32)
-    )  # fill() would compile a kernel for every value
+    # fill() would compile a kernel for every value
+    stage().clock.step.from_numpy(np.full(N_ENV, step, np.int32))
 
 
 def with_routes():
@@ -44,8 +42,7 @@ def with_routes():
     s = clean()
     fire()
     plan()
-    s.route.replans.fill(0)
-    s.route.stuck_steps.fill(0)
+    put(s.route, replans=0, stuck_steps=0)
     s.ego.vel_b.from_numpy(np.tile(np.float32([0.5, 0, 0]), (N_ENV, 1)))
     set_step(1000)
     return s
@@ -178,8 +175,7 @@ def put_obstacle(env, when, at, radius=0.2):
     for k in range(radii.shape[2]):
         if when[0] <= k * CONFIG.tracking.forecast_dt_s <= when[1]:
             pos[env, 1, k] = at
-    s.forecast.radius_m.from_numpy(radii)
-    s.forecast.pos_w.from_numpy(pos)
+    put(s.forecast, radius_m=radii, pos_w=pos)
 
 
 @pytest.mark.parametrize(
@@ -297,9 +293,8 @@ def test_cross_track_is_positive_on_the_left():
     s.route.arc.fill(14.0)
     fire()
     follow()
-    assert s.route.cross_track_m[0] == pytest.approx(0.4, abs=1e-5) and s.route.cross_track_m[
-        1
-    ] == pytest.approx(-0.4, abs=1e-5)
+    assert s.route.cross_track_m[0] == pytest.approx(0.4, abs=1e-5)
+    assert s.route.cross_track_m[1] == pytest.approx(-0.4, abs=1e-5)
     assert s.route.remaining_m[0] == pytest.approx(13.0, abs=1e-4)
     assert s.route.lookahead_w[0].to_numpy()[:2] == pytest.approx([6.0, 3.0], abs=1e-4)
     assert s.route.heading_error[0] == pytest.approx(np.arctan2(-0.4, 1.0), abs=1e-4)
@@ -307,8 +302,7 @@ def test_cross_track_is_positive_on_the_left():
 
 def test_progress_never_goes_back_nor_jumps_to_a_far_leg():
     s = clean()
-    hairpin = [(5.0, 2.6), (10.0, 2.6), (10.0, 3.4), (5.0, 3.4)]
-    load(0, hairpin)
+    load(0, [(5.0, 2.6), (10.0, 2.6), (10.0, 3.4), (5.0, 3.4)])
     put_ends([(6.0, 3.3)] * N_ENV, [(5.0, 3.4)] * N_ENV)  # nearer to the far leg, ten metres of route ahead
     fire()
     follow()
@@ -361,22 +355,16 @@ def test_path_risk_is_the_mean_over_the_look_ahead_segment():
     c, points = CONFIG.clearance, s.route.ahead_w.to_numpy()[2][: s.route.n_ahead[2]]
     assert len(points) == round(R.risk_horizon_m / maps.CELL_M) + 1
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    assert steps.max() < maps.CELL_M + 1e-4 and np.allclose(
-        points[-1], [4.03 + 3.0 - np.sqrt(2.0), 2.04], atol=1e-3
-    )
+    assert steps.max() < maps.CELL_M + 1e-4
+    assert np.allclose(points[-1], [4.03 + 3.0 - np.sqrt(2.0), 2.04], atol=1e-3)
     cells = [maps.cell_of(p) for p in points]
     risk = [
         oracle.risk_at(
-            static[k],
-            dynamic[k],
-            clearance[k],
-            c.risk_static,
-            c.risk_dynamic,
-            c.risk_clearance,
+            static[k], dynamic[k], clearance[k], c.risk_static, c.risk_dynamic, c.risk_clearance,
             c.risk_epsilon_m,
         )
         for k in cells
-    ]
+    ]  # fmt: skip
     assert s.route.path_risk[2] == pytest.approx(np.mean(risk), rel=1e-4)
 
 
@@ -388,9 +376,7 @@ def test_triggers_and_route_see_the_same_ahead():
     follow()
     names = ("ahead_w", "n_ahead", "path_risk")
     seen = [getattr(s.route, name).to_numpy() for name in names]
-    s.route.want_plan.fill(1)
-    s.route.n_ahead.fill(0)
-    s.route.path_risk.fill(0)
+    put(s.route, want_plan=1, n_ahead=0, path_risk=0)
     follow()
     for name, values in zip(names, seen, strict=True):
         assert np.array_equal(getattr(s.route, name).to_numpy(), values), name

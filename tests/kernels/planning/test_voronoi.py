@@ -42,8 +42,7 @@ STRICT = CONFIG.model_copy(
 
 @lru_cache(maxsize=1)
 def planned_maps():
-    """(seed, exact cost, reason, waypoints, reported cost, second passes, clearance, omega) of N_MAP random
-    maps."""
+    """(seed, exact cost, reason, waypoints, cost, second passes, clearance, omega) of N_MAP random maps."""
     out = []
     for first in range(0, N_MAP, N_ENV):
         drawn = [maps.random_map(first + i) for i in range(N_ENV)]
@@ -61,22 +60,15 @@ def planned_maps():
             ]
             exact = oracle.least_cost(omega, clearance, V.cost_epsilon_m, maps.CELL_M, *ends)
             row = (
-                first + env,
-                exact,
-                s.route.fallback_reason[env],
-                way_of(env),
-                s.route.cost[env],
-                s.route.second_passes[env],
-                clearance,
-                omega,
-            )
+                first + env, exact, s.route.fallback_reason[env], way_of(env), s.route.cost[env],
+                s.route.second_passes[env], clearance, omega,
+            )  # fmt: skip
             out.append(row)
     return out
 
 
 def test_a_route_is_found_exactly_where_there_is_one():
-    solvable = [row for row in planned_maps() if np.isfinite(row[1])]
-    assert 200 < len(solvable) < len(planned_maps())
+    assert 200 < len([row for row in planned_maps() if np.isfinite(row[1])]) < len(planned_maps())
     for seed, exact, reason, way, *_ in planned_maps():
         assert (reason == enums.FAIL_NONE) == np.isfinite(exact), (
             f"map {seed}: reason {reason}, exact cost {exact}"
@@ -123,8 +115,7 @@ def test_the_skeleton_alone_serves_nearly_every_map():
 
 
 def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
-    """By the distance between sites, never by whose they are: every cell that a plan asked about, on a few
-    maps."""
+    """By the distance between sites alone: every cell that a plan asked about, on a few maps."""
     asked = on_it = 0
     for first in range(0, 12, N_PLAN):
         drawn = [maps.random_map(first + i) for i in range(N_ENV)]
@@ -190,10 +181,8 @@ def wall(x, gap_low, gap_high):
 
 
 def test_a_gap_of_exactly_d_min_is_passable_and_a_cell_less_is_not():
-    wide, tight = (
-        wall(18.75, 2.0, 2.5),
-        wall(18.75, 2.0, 2.4),
-    )  # 5 and 4 free cells: 0.3 and 0.25 m to the wall's cells at best
+    # 5 and 4 free cells: 0.3 and 0.25 m to the wall's cells at best
+    wide, tight = (wall(18.75, 2.0, 2.5), wall(18.75, 2.0, 2.4))
     s = clean()
     put_maps([wide, tight] + [wide] * (N_ENV - 2))
     put_ends([(18.2, 2.25)] * N_ENV, [(19.4, 2.25)] * N_ENV)
@@ -249,9 +238,8 @@ def test_clearance_beyond_room_m_is_worth_no_detour():
 
 def test_the_budget_ends_the_search():
     s = clean()
-    put_maps(
-        [np.abs(maps.X - 18.6) < 0.2] * N_ENV
-    )  # the search runs from the goal and visits all of its side
+    # the search runs from the goal and visits all of its side
+    put_maps([np.abs(maps.X - 18.6) < 0.2] * N_ENV)
     put_ends([(19.4, 3.0)] * N_ENV, [(2.0, 3.0)] * N_ENV)
     plan([0], STRICT)
     assert s.route.fallback_reason[0] == enums.FAIL_BUDGET

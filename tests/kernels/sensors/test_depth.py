@@ -3,22 +3,14 @@
 import numpy as np
 import pytest
 
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from tests.conftest import set_step
 from tests.oracles import scenes
 from tests.oracles.depth import camera_position, camera_rays, z_depths
+from uuvtai import state
 from uuvtai.config import DepthConfig, TankConfig
 from uuvtai.kernels.sensors import depth_camera
 from uuvtai.kernels.sensors.io import DepthIO
-from uuvtai.state import (
-    ClockState,
-    DepthImage,
-    EpisodeState,
-    Proprioception,
-    VehicleState,
-    WorldState,
-    allocate,
-)
 
 N_ENV, N_OBSTACLE, N_BATCH = 125, 14, 8
 CLEAN = DepthConfig()
@@ -50,17 +42,16 @@ class Rig:
 
     def __init__(self):
         for name, struct in (
-            ("image", DepthImage), ("ego", Proprioception), ("vehicle", VehicleState), ("world", WorldState),
-            ("episode", EpisodeState), ("clock", ClockState),
+            ("image", state.DepthImage), ("ego", state.Proprioception), ("vehicle", state.VehicleState),
+            ("world", state.WorldState), ("episode", state.EpisodeState), ("clock", state.ClockState),
         ):  # fmt: skip
-            setattr(self, name, allocate(struct, SIZES))
+            setattr(self, name, state.allocate(struct, SIZES))
 
     def start(self, scene, key=1):
         """Reset every row at step 0 with this scene; row i gets random key key + i."""
         scenes.load(scene, self.vehicle, self.world)
         self.episode.key.from_numpy((np.arange(N_ENV) + key).astype(np.uint32))
-        self.clock.active.fill(1)
-        self.clock.step.fill(0)
+        put(self.clock, active=1, step=0)
         depth_camera.reset_depth(io_for(DepthIO, self.image, self.clock))
 
     def shoot(self, config=CLEAN, tank=TANK):
@@ -81,8 +72,7 @@ def batches():
 
 
 def compare(image, scene, env, offset, tank, truth_of):
-    """Assert the pixels offset, offset + EVERY, ... of one image; returns (how many needed the grazing
-    allowance, how many there were)."""
+    """Assert the pixels offset, offset + EVERY, ...; (how many needed the grazing allowance, of how many)."""
     index = np.arange(offset, image.size, EVERY)
     pixels = np.stack([index // CLEAN.cols, index % CLEAN.cols], axis=1)
     rays, eye = camera_rays(scene["quat"][env], pixels, CLEAN), camera_position(scene, env, CLEAN)
@@ -135,16 +125,11 @@ def test_round_tank_against_mujoco(rig):
 
 
 def test_axes_and_scale_of_the_image(rig):
-    """A ball 0.5 m to the left of and 0.25 m above the axis, 2 m ahead of the camera, level and then rolled
-    by 90 deg to the left."""
+    """A ball 0.5 m left of and 0.25 m above the axis, 2 m ahead: level, and rolled by 90 deg to the left."""
     scene = scenes.one_obstacle_scene(
-        N_ENV,
-        N_OBSTACLE,
-        (5.0, 3.0, -0.8),
-        kind=scenes.SPHERE,
-        obstacle_pos=(7.2, 3.5, -0.55),
+        N_ENV, N_OBSTACLE, (5.0, 3.0, -0.8), kind=scenes.SPHERE, obstacle_pos=(7.2, 3.5, -0.55),
         size=(0.1, 0.1, 0.1),
-    )
+    )  # fmt: skip
     rig.start(scene)
     image = rig.shoot()[0]
     row, col = np.argwhere(image < 2.5).mean(axis=0)
@@ -160,13 +145,9 @@ def test_axes_and_scale_of_the_image(rig):
 def test_obstacle_around_the_image_plane_is_not_lost(rig):
     """A box whose corners lie behind the camera while its face is in view."""
     scene = scenes.one_obstacle_scene(
-        N_ENV,
-        N_OBSTACLE,
-        (5.0, 3.0, -0.8),
-        kind=scenes.BOX,
-        obstacle_pos=(5.2, 4.0, -0.8),
+        N_ENV, N_OBSTACLE, (5.0, 3.0, -0.8), kind=scenes.BOX, obstacle_pos=(5.2, 4.0, -0.8),
         size=(0.9, 0.5, 0.8),
-    )
+    )  # fmt: skip
     rig.start(scene)
     image = rig.shoot()[0]
     assert_images([image], scene, TANK, by_oracle, range(1))
@@ -201,15 +182,13 @@ def test_rate_and_labels(rig):
         set_step(rig.clock, step)
         scene["pos"][:, 0] = 13.0 - 0.1 * step
         scenes.load(scene, rig.vehicle, rig.world)
-        rig.ego.pos_w.from_numpy(np.full((N_ENV, 3), step, np.float32))
-        rig.ego.rpy.from_numpy(np.full((N_ENV, 3), -step, np.float32))
+        put(rig.ego, pos_w=np.full((N_ENV, 3), step, np.float32), rpy=np.full((N_ENV, 3), -step, np.float32))
         image = rig.shoot()
         shot = step - step % 5
         assert np.all(rig.image.fresh.to_numpy() == (step == shot))
         assert image[0, 36, 64] == pytest.approx(20.0 - 0.2 - 13.0 + 0.1 * shot, abs=1e-4)
-        assert np.all(rig.image.shot_pos_w.to_numpy() == shot) and np.all(
-            rig.image.shot_rpy.to_numpy() == -shot
-        )
+        assert np.all(rig.image.shot_pos_w.to_numpy() == shot)
+        assert np.all(rig.image.shot_rpy.to_numpy() == -shot)
         seen.append(image)
     assert np.array_equal(seen[0], seen[4]) and not np.array_equal(seen[4], seen[5])
 

@@ -1,5 +1,4 @@
-"""A sonar without Doppler: speeds come from one scan to the next, and nowhere is "none measured" taken for
-"at rest"."""
+"""A sonar without Doppler: speeds come from scan to scan, and "none measured" is never "at rest"."""
 
 import json
 
@@ -7,7 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from tests.conftest import configure
 from tests.kernels.perception.test_tracking import (
     CONFIG,
@@ -117,12 +116,9 @@ def test_the_rate_of_a_range_is_that_of_the_track_and_the_own_motion(aperture):
     config = DEAF.model_copy(update={"n_ray": 64, "horizontal_aperture_deg": aperture})
     sizes = {"n_env": 1, "n_ray": 64, "n_track": 3, "n_height": 16}
     scan, tracks = allocate(SonarScan, sizes), allocate(TrackState, sizes)
-    scan.doppler_m_s.fill(NOT_MEASURED)
-    scan.ping_yaw.fill(0.7)
-    scan.ping_vel_b.from_numpy(np.array([[0.5, -0.2, 0.1]], np.float32))
+    put(scan, doppler_m_s=NOT_MEASURED, ping_yaw=0.7, ping_vel_b=[[0.5, -0.2, 0.1]])
     owner = np.resize([-1, 0, 1], 64)
-    tracks.beam_track.from_numpy(owner[None].astype(np.int32))
-    tracks.moving.from_numpy(np.array([[1, 0, 1]], np.int32))
+    put(tracks, beam_track=owner[None], moving=[[1, 0, 1]])
     vel = np.array([[0.0, 0.0, 0.4, -0.9], [0.0, 0.0, 3.0, 3.0], [0.0, 0.0, 3.0, 3.0]], np.float32)
     tracks.state.from_numpy(vel[None])
     found = np.zeros(64, np.float32)
@@ -147,8 +143,7 @@ def test_walls_tell_the_place_and_not_the_speed():
     rest = (LocalizationConfig(), sensors, tank, EpisodeConfig(), VehicleConfig())
     io = io_for(LocalizationIO, ego, state, clock, scan, *rest)
     clock.active.fill(1)
-    ego.pos_w.from_numpy(np.array([[10.0, 3.0, -0.8]], np.float32))
-    ego.specific_force_b.from_numpy(np.array([[0.0, 0.0, 9.81]], np.float32))
+    put(ego, pos_w=[[10.0, 3.0, -0.8]], specific_force_b=[[0.0, 0.0, 9.81]])
     localization.reset_pose(io)
     cov = np.zeros(45, np.float32)
     cov[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
@@ -158,11 +153,8 @@ def test_walls_tell_the_place_and_not_the_speed():
         to_x = np.where(np.cos(angle) > 0, tank.x_m[1] - 10, 10 - tank.x_m[0]) / np.abs(np.cos(angle))
         to_y = np.where(np.sin(angle) > 0, tank.y_m[1] - 3, 3 - tank.y_m[0]) / np.abs(np.sin(angle))
     range_m = np.minimum(to_x, to_y)
-    scan.range_m.from_numpy(range_m[None].astype(np.float32))
-    scan.hit.from_numpy((range_m < 11)[None].astype(np.int32))
-    scan.doppler_m_s.fill(NOT_MEASURED)
-    scan.ping_pos_w.from_numpy(ego.pos_w.to_numpy())
-    scan.fresh.fill(1)
+    put(scan, range_m=range_m[None], hit=(range_m < 11)[None], doppler_m_s=NOT_MEASURED)
+    put(scan, ping_pos_w=ego.pos_w.to_numpy(), fresh=1)
     localization.correct_pose(io)
     after = state.cov.to_numpy()[0]
     assert np.isfinite(after).all() and np.isfinite(state.mean.to_numpy()).all()
@@ -185,8 +177,7 @@ def told(sonar):
         "scan.doppler_m_s": np.zeros(3, np.float32),
         "scan.ping_vel_b": np.array([0.5, 0.0, 0.0], np.float32),
     }
-    config = Config(sensors=SensorsConfig(sonar=sonar))
-    moment = Moment(EpisodeHeader("bt", config, "", {}), values)
+    moment = Moment(EpisodeHeader("bt", Config(sensors=SensorsConfig(sonar=sonar)), "", {}), values)
     return [json.loads(row.encode(moment)) for row in SONAR_ROWS[:2]]
 
 

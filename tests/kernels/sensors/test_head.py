@@ -29,13 +29,8 @@ TANK, RULES = TankConfig(), EpisodeConfig()
 SECTOR = load_config("pool", "ping360").sensors.sonar
 TURN = SECTOR.model_copy(update={"n_ray": 400, "horizontal_aperture_deg": 360.0, "max_range_m": 12.0})
 SIZES = {
-    "n_env": N_ENV,
-    "n_obstacle": N_OBSTACLE,
-    "n_ray": 400,
-    "n_latency": 2,
-    "n_cloud": 1,
-    "n_thruster": 6,
-}
+    "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_ray": 400, "n_latency": 2, "n_cloud": 1, "n_thruster": 6,
+}  # fmt: skip
 TOLERANCE_M = 2e-3
 GRAZING_SHARE = 2e-3
 """Sixteen rays a beam pass sixteen times as many edges as one."""

@@ -7,18 +7,11 @@ from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.oracles.proprioception import dead_reckoned, roll_pitch_yaw, specific_force, zeroed_depth
 from tests.oracles.scenes import quaternions, rotation
+from uuvtai import state
 from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, SensorsConfig, VehicleConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.sensors import proprioception
 from uuvtai.kernels.sensors.io import ProprioceptionIO, VelocityIO
-from uuvtai.state import (
-    ClockState,
-    EpisodeState,
-    Proprioception,
-    ProprioceptionMemory,
-    VehicleState,
-    allocate,
-)
 
 N_ENV = 2000
 SIZES = {"n_env": N_ENV, "n_thruster": 6}
@@ -40,13 +33,10 @@ class Rig:
 
     def __init__(self):
         for name, struct in (
-            ("ego", Proprioception),
-            ("memory", ProprioceptionMemory),
-            ("vehicle", VehicleState),
-            ("episode", EpisodeState),
-            ("clock", ClockState),
-        ):
-            setattr(self, name, allocate(struct, SIZES))
+            ("ego", state.Proprioception), ("memory", state.ProprioceptionMemory),
+            ("vehicle", state.VehicleState), ("episode", state.EpisodeState), ("clock", state.ClockState),
+        ):  # fmt: skip
+            setattr(self, name, state.allocate(struct, SIZES))
 
     def move(self, **truth):
         for name, value in truth.items():
@@ -55,12 +45,9 @@ class Rig:
 
     def start(self, sensors, key=1, **truth):
         still = {
-            "pos_w": (5, 3, -1),
-            "quat_wb": (1, 0, 0, 0),
-            "vel_b": (0, 0, 0),
-            "rate_b": (0, 0, 0),
+            "pos_w": (5, 3, -1), "quat_wb": (1, 0, 0, 0), "vel_b": (0, 0, 0), "rate_b": (0, 0, 0),
             "acc_b": (0, 0, 0),
-        }
+        }  # fmt: skip
         self.move(**{**still, **truth})
         self.episode.key.from_numpy((np.arange(N_ENV) * 31 + key).astype(np.uint32))
         self.clock.active.fill(1)
@@ -154,8 +141,7 @@ def test_dvl_dropout_of_single_readings(rig):
             assert not lost or np.array_equal(out["vel_valid"] == 0, lost[-1]), (
                 "validity changes with readings only"
             )
-    share = np.mean(lost)
-    assert abs(share - 0.017) < SIGMAS * np.sqrt(0.017 / np.size(lost))
+    assert abs(np.mean(lost) - 0.017) < SIGMAS * np.sqrt(0.017 / np.size(lost))
 
 
 def test_dvl_dropout_bursts_last_one_to_three_seconds(rig):
@@ -284,8 +270,7 @@ def test_dead_reckoning_with_clean_sensors_is_the_integral_of_the_motion(rig):
 
 
 def test_dead_reckoning_coasts_without_the_bottom_and_takes_depth_from_pressure(rig):
-    """Bottom lost at step 1 and for ever: the estimate goes on with the velocity of step 0 along the heading
-    of now."""
+    """Bottom lost at step 1: the estimate keeps step 0's velocity along the heading of now."""
     sensors = SensorsConfig(
         localization="dead_reckoning",
         dvl=DvlConfig(dropout=1.0, dropout_s=(10.0, 10.0)),
@@ -303,8 +288,7 @@ def test_dead_reckoning_coasts_without_the_bottom_and_takes_depth_from_pressure(
 
 
 def test_dead_reckoning_zeroes_the_pressure_sensor_at_the_known_start(rig):
-    """Whatever the bias, depth begins at the start's and follows the truth; the first reading's noise is all
-    that stays."""
+    """Whatever the bias, depth follows the truth; only the first reading's noise stays."""
     sensors = SensorsConfig(localization="dead_reckoning", pressure=PressureConfig(bias_m=0.5, sigma_m=0.02))
     z = np.array([-1.0, -0.9, -0.4, -1.5])
     rig.start(sensors)
@@ -341,8 +325,7 @@ def test_zeroing_changes_no_bit_of_a_perfect_pressure_sensor(rig):
 
 
 def test_dead_reckoning_error_grows_with_scale_error_and_drift(rig):
-    """5 s straight ahead at 0.5 m/s: along-track error = scale x distance, cross-track = drift x t x distance
-    / 2."""
+    """5 s at 0.5 m/s: along-track = scale x distance, cross-track = drift x t x distance / 2."""
     sensors = SensorsConfig(
         localization="dead_reckoning",
         dvl=DvlConfig(scale_error=0.01),

@@ -1,6 +1,4 @@
-"""Ranges from the intensity image: the kernels' power, its mean and its speckle are those of a NumPy oracle,
-whose rays are MuJoCo's and whose power is that of a cloud of point scatterers; the detector is an oracle's
-too and keeps its rate of false alarms; no row depends on another; logs hold what was detected in."""
+"""Ranges from the intensity image: power and speckle by MuJoCo's rays, an oracle's detector, rows, logs."""
 
 import json
 
@@ -12,34 +10,16 @@ from tests.bundles import io_for
 from tests.oracles import scenes
 from tests.oracles.cfar import first_cells, side_lobe_level
 from tests.oracles.sonar_image import cast_rays, echo_power
+from uuvtai import state
 from uuvtai.common.errors import UserError
-from uuvtai.config import Config, EpisodeConfig, SensorsConfig, TankConfig
+from uuvtai.config import Config, EpisodeConfig, SensorsConfig, TankConfig, multibeam
 from uuvtai.config.loader import load_config
-from uuvtai.config.multibeam import (
-    ABSORPTION_NP_M,
-    beam_pattern,
-    elevation_pattern,
-    elevations,
-    heard_bearings,
-    noise_power,
-)
 from uuvtai.kernels.core.stage import Bundle
 from uuvtai.kernels.sensors import sonar, sonar_image
 from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.kernels.sensors.sonar import cfar_factor, level_beside
 from uuvtai.logs.encode import EpisodeHeader, Moment
 from uuvtai.logs.topics.sensors import SONAR_ROWS, logged_image
-from uuvtai.state import (
-    ClockState,
-    EpisodeState,
-    Proprioception,
-    SonarImage,
-    SonarMemory,
-    SonarScan,
-    VehicleState,
-    WorldState,
-    allocate,
-)
 
 SMALL = {"sensors.sonar.n_ray": 64, "sensors.sonar.image_bins": 96}
 SONAR = load_config("pool", "multibeam_image", overrides=SMALL).sensors.sonar
@@ -47,8 +27,8 @@ TANK, RULES = TankConfig(), EpisodeConfig()
 N_ENV, N_OBSTACLE, N_BIN = 6, 14, SONAR.image_bins
 SIZES = {
     "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_ray": SONAR.n_ray, "n_latency": 2, "n_cloud": 8,
-    "n_thruster": 6,
-    "n_heard": len(heard_bearings(SONAR)), "n_bin": N_BIN, "n_elevation": len(elevations()),
+    "n_thruster": 6, "n_heard": len(multibeam.heard_bearings(SONAR)), "n_bin": N_BIN,
+    "n_elevation": len(multibeam.elevations()),
 }  # fmt: skip
 NAMES = {1: "sphere", 2: "cylinder", 3: "box"}
 
@@ -76,12 +56,13 @@ class Rig:
 
     def __init__(self):
         self.scan, self.memory, self.image = (
-            allocate(s, SIZES) for s in (SonarScan, SonarMemory, SonarImage)
+            state.allocate(s, SIZES) for s in (state.SonarScan, state.SonarMemory, state.SonarImage)
         )
         self.ego, self.vehicle, self.world = (
-            allocate(s, SIZES) for s in (Proprioception, VehicleState, WorldState)
+            state.allocate(s, SIZES) for s in (state.Proprioception, state.VehicleState, state.WorldState)
         )
-        self.episode, self.clock = allocate(EpisodeState, SIZES), allocate(ClockState, SIZES)
+        self.episode = state.allocate(state.EpisodeState, SIZES)
+        self.clock = state.allocate(state.ClockState, SIZES)
         structs = (self.scan, self.memory, self.image, self.ego, self.vehicle, self.world)
         self.io = io_for(SonarIO, *structs, self.episode, self.clock, SONAR, TANK, RULES)
 
@@ -150,8 +131,8 @@ def test_what_is_heard_has_the_scenes_mean_and_rayleighs_speckle(rig, scene):
     heard = np.array(heard)
     assert not np.array_equal(heard[0], heard[1]), "each ping has speckle of its own"
     beams = SONAR.first_beam_rad + SONAR.beam_step_rad * np.arange(SONAR.n_ray)
-    pattern = beam_pattern(beams[:, None] - heard_bearings(SONAR)[None]) ** 2
-    mean = np.array([pattern @ power_of(scene, env) for env in range(N_ENV)]) + noise_power(SONAR)
+    pattern = multibeam.beam_pattern(beams[:, None] - multibeam.heard_bearings(SONAR)[None]) ** 2
+    mean = np.array([pattern @ power_of(scene, env) for env in range(N_ENV)]) + multibeam.noise_power(SONAR)
     ratio = heard[:, :, : SONAR.n_ray] / mean
     assert ratio.mean() == pytest.approx(1.0, abs=0.03)
     assert (np.sqrt(ratio).std() / np.sqrt(ratio).mean()) == pytest.approx(np.sqrt(4 / np.pi - 1), abs=0.03)
@@ -282,20 +263,21 @@ def test_its_rays_are_mujocos():
 
 
 def points_power(points, normals, area, beams):
-    """(beams, FAN_BINS) of point scatterers that face the sonar at the origin: pattern across and upwards,
-    cos^2 / r^4, absorption there and back. Written from the sonar equation, point by point."""
+    """(beams, FAN_BINS) of point scatterers facing the sonar at the origin, from the sonar equation."""
     r = np.linalg.norm(points, axis=1)
     u = points / r[:, None]
     cosine = -(u * normals).sum(1)
     near = (cosine > 0) & (r < FAN.max_range_m)
     u, r, cosine = u[near], r[near], cosine[near]
     el, az = np.arcsin(u[:, 2]), np.arctan2(u[:, 1], u[:, 0])
-    loss_db = 2 * r * ABSORPTION_NP_M * 20 / np.log(10)
-    power = cosine**2 * area * r**-4.0 * 10 ** (-loss_db / 10) * elevation_pattern(el, FAN) ** 2
+    loss_db = 2 * r * multibeam.ABSORPTION_NP_M * 20 / np.log(10)
+    power = cosine**2 * area * r**-4.0 * 10 ** (-loss_db / 10) * multibeam.elevation_pattern(el, FAN) ** 2
     out = np.zeros((len(beams), FAN_BINS))
     for i, beam in enumerate(beams):
         out[i] = np.bincount(
-            (r / FAN.max_range_m * FAN_BINS).astype(int), power * beam_pattern(az - beam) ** 2, FAN_BINS
+            (r / FAN.max_range_m * FAN_BINS).astype(int),
+            power * multibeam.beam_pattern(az - beam) ** 2,
+            FAN_BINS,
         )
     return out
 
@@ -313,7 +295,7 @@ def floor_points(rng, depth, n):
 
 def rendered(scene, beams):
     bearing, power = echo_power(scene, 0.0, np.zeros(3), 0.0, FAN, FAN_BINS)
-    return beam_pattern(beams[:, None] - bearing[None]) ** 2 @ power
+    return multibeam.beam_pattern(beams[:, None] - bearing[None]) ** 2 @ power
 
 
 @pytest.mark.parametrize("centre", [(4.0, 0.0, 0.0), (6.0, 2.0, 0.8), (3.0, -1.0, -0.7)])
@@ -345,16 +327,15 @@ def test_all_elevations_fold_into_one_range_and_bearing():
         for e in (0.0, np.radians(8.0))
     )
     assert abs(int(level.argmax()) - int(above.argmax())) <= 1
-    weight = elevation_pattern(np.radians(8.0), FAN) ** 2
+    weight = multibeam.elevation_pattern(np.radians(8.0), FAN) ** 2
     assert above.sum() == pytest.approx(weight * level.sum(), rel=0.1)
 
 
 def test_beams_have_side_lobes_13_db_down():
     off = np.radians(np.linspace(0.0, 5.0, 5001))
-    level = 20 * np.log10(np.maximum(np.abs(beam_pattern(off)), 1e-9))
+    level = 20 * np.log10(np.maximum(np.abs(multibeam.beam_pattern(off)), 1e-9))
     assert level[np.searchsorted(off, np.radians(0.5))] == pytest.approx(-3.0, abs=0.05)
-    null = np.flatnonzero(level < -60)[0]
-    assert level[null:].max() == pytest.approx(-13.26, abs=0.05)
+    assert level[np.flatnonzero(level < -60)[0] :].max() == pytest.approx(-13.26, abs=0.05)
 
 
 # -------------------------------------------------------------------------------------------------------- log

@@ -4,19 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.bundles import clear, io_for
+from tests.bundles import clear, io_for, put
 from tests.oracles import noise as noise_reference
 from uuvtai import state
-from uuvtai.common.enums import (
-    COLLIDED,
-    COLLISION,
-    FINAL_OUTCOMES,
-    OUT_OF_TANK,
-    OUTCOMES,
-    SUCCESS,
-    TIMEOUT,
-    TTC,
-)
+from uuvtai.common import enums
 from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, SPHERE
 from uuvtai.kernels.task import episode
@@ -31,26 +22,20 @@ SIZES = {"n_env": N, "n_obstacle": N_OBSTACLE, "n_thruster": 6}
 
 
 class Court:
-    """Structs of N envs; every env starts as a vehicle at rest in mid-tank, heading along x, far from a goal,
-    nothing around."""
+    """Structs of N envs: a vehicle at rest in mid-tank, heading along x, far from a goal, nothing around."""
 
     def __init__(self):
         structs = (
-            state.TerminationState,
-            state.ClockState,
-            state.VehicleState,
-            state.WorldState,
-            state.MissionState,
-            state.EpisodeState,
-        )
+            state.TerminationState, state.ClockState, state.VehicleState, state.WorldState,
+            state.MissionState, state.EpisodeState,
+        )  # fmt: skip
         self.termination, self.clock, self.vehicle, self.world, self.mission, self.episode = (
             state.allocate(s, SIZES) for s in structs
         )
 
     def clean(self):
         clear(self.termination, self.clock, self.vehicle, self.world, self.mission)
-        self.clock.running.fill(1)
-        self.clock.active.fill(1)
+        put(self.clock, running=1, active=1)
         for env in range(N):
             self.vehicle.pos_w[env] = (10.0, 3.0, -0.8)
             self.vehicle.quat_wb[env] = (1.0, 0.0, 0.0, 0.0)
@@ -159,12 +144,10 @@ def test_time_to_collision_counts_own_motion_towards_a_static_obstacle(court):
 
 
 def test_time_to_collision_counts_the_hull_s_turning(court):
-    """An obstacle abeam of the bow; turning left at 1 rad/s moves the bow end of the axis towards it at 0.1
-    m/s."""
+    """Turning left at 1 rad/s moves the bow end towards an obstacle abeam of it at 0.1 m/s."""
     court.put(0, 0, SPHERE, (10.1, 3 + 0.17 + 0.2 + 0.15, -0.8), (0.2, 0.2, 0.2))
     court.vehicle.rate_b[0] = (0, 0, 1)
-    book = court.judge()
-    assert book["ttc_s"][0] == pytest.approx(0.15 / 0.1, rel=1e-3)
+    assert court.judge()["ttc_s"][0] == pytest.approx(0.15 / 0.1, rel=1e-3)
 
 
 @pytest.mark.parametrize(("speed", "counts"), [(0.049, False), (0.051, True)])
@@ -201,31 +184,24 @@ def test_timeout_at_the_horizon(court):
 
 
 def test_rules_hold_in_their_order(court):
-    """Each row meets one rule less than the row before: all are out of time, the first four at the goal, and
-    so on."""
+    """Each row meets one rule less: all are out of time, the first four at the goal, and so on."""
     for env in range(5):
         court.clock.step[env] = 100
     for env in range(4):
         court.mission.goal_w[env] = (10.0, 3.0, -0.8)
     court.vehicle.pos_w[0] = (10.0, 3.0, 0.01)  # out, and through the surface
     for env in (0, 1):
-        court.put(
-            env, 0, SPHERE, (10 + FRONT_M + 0.05 + 0.2, 3, -0.8), (0.2, 0.2, 0.2), vel=(-3, 0, 0)
-        )  # touching and closing
+        # touching and closing
+        court.put(env, 0, SPHERE, (10 + FRONT_M + 0.05 + 0.2, 3, -0.8), (0.2, 0.2, 0.2), vel=(-3, 0, 0))
     court.put(2, 0, SPHERE, (10 + FRONT_M + 0.15 + 0.2, 3, -0.8), (0.2, 0.2, 0.2), vel=(-3, 0, 0))  # closing
     book = court.judge()
     assert [outcome(book, env) for env in range(5)] == [
-        "out_of_tank",
-        "collision",
-        "ttc",
-        "success",
-        "timeout",
-    ]
+        "out_of_tank", "collision", "ttc", "success", "timeout",
+    ]  # fmt: skip
 
 
 def test_book_of_the_episode(court):
-    """Way driven sums straight steps; the smallest clearance stays; a reset starts with the clearance there
-    and then."""
+    """Way sums straight steps; the smallest clearance stays; a reset begins with the clearance there."""
     court.put(0, 0, SPHERE, (10 + FRONT_M + 1.2, 3, -0.8), (0.2, 0.2, 0.2))
     episode.reset_termination(
         io_for(EpisodeIO, court.termination, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
@@ -265,15 +241,13 @@ def begin(court, mask, seed=3, number=7):
 
 def test_episodes_begin_advance_end_and_sleep(court):
     even = [1, 0] * (N // 2)
-    court.clock.running.fill(0)
-    court.clock.step.fill(50)
+    put(court.clock, running=0, step=50)
     begin(court, even)
     assert list(court.clock.active.to_numpy()) == list(court.clock.running.to_numpy()) == even
     assert list(court.clock.step.to_numpy()) == [0, 50] * (N // 2)
     assert court.episode.key[0] == noise_reference.episode_key(3, 7)
-    begin(
-        court, [0] + [1] * (N - 1)
-    )  # a reset pass of other rows: row 0 rests meanwhile, and goes on afterwards
+    # a reset pass of other rows: row 0 rests meanwhile, and goes on afterwards
+    begin(court, [0] + [1] * (N - 1))
     assert court.clock.active[0] == 0
     episode.wake(io_for(EpisodeIO, court.clock))
     assert court.clock.active.to_numpy().all()
@@ -292,8 +266,9 @@ def test_negative_seeds_have_keys_too(court):
 
 
 def test_codes_and_names_of_the_endings_agree():
-    assert ("running", *FINAL_OUTCOMES) == OUTCOMES
-    assert [OUTCOMES[code] for code in (SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT)] == list(
-        FINAL_OUTCOMES
-    )
-    assert set(COLLIDED) < set(FINAL_OUTCOMES)
+    assert ("running", *enums.FINAL_OUTCOMES) == enums.OUTCOMES
+    assert [
+        enums.OUTCOMES[code]
+        for code in (enums.SUCCESS, enums.COLLISION, enums.TTC, enums.OUT_OF_TANK, enums.TIMEOUT)
+    ] == list(enums.FINAL_OUTCOMES)
+    assert set(enums.COLLIDED) < set(enums.FINAL_OUTCOMES)

@@ -26,54 +26,34 @@ SIZES = defaultdict(lambda: 2, n_env=N, n_term=reward.N_TERM)
 class Bench:
     def __init__(self):
         structs = (
-            state.RewardState,
-            state.TerminationState,
-            state.VehicleState,
-            state.RouteState,
-            state.ActuationState,
-            state.ClockState,
-        )
+            state.RewardState, state.TerminationState, state.VehicleState, state.RouteState,
+            state.ActuationState, state.ClockState,
+        )  # fmt: skip
         self.structs = [state.allocate(struct, SIZES) for struct in structs]
         self.reward, self.termination, self.vehicle, self.route, self.actuation, self.clock = self.structs
         self.out = torch.zeros(N), torch.zeros(N, dtype=torch.int32), torch.zeros(N, dtype=torch.int32)
         self.target = {
-            "quat": self.vehicle.quat_wb,
-            "vel": self.vehicle.vel_b,
-            "pos": self.vehicle.pos_w,
-            "command": self.actuation.command,
-            "lookahead": self.route.lookahead_w,
-            "cross_track": self.route.cross_track_m,
-            "heading_error": self.route.heading_error,
-            "clearance": self.termination.clearance_m,
-            "ttc": self.termination.ttc_s,
-            "n_way": self.route.n_way,
-            "outcome": self.termination.outcome,
-            "remaining": self.route.remaining_m,
-            "plan_step": self.route.plan_step,
-            "step": self.clock.step,
-        }
+            "quat": self.vehicle.quat_wb, "vel": self.vehicle.vel_b, "pos": self.vehicle.pos_w,
+            "command": self.actuation.command, "lookahead": self.route.lookahead_w,
+            "cross_track": self.route.cross_track_m, "heading_error": self.route.heading_error,
+            "clearance": self.termination.clearance_m, "ttc": self.termination.ttc_s,
+            "n_way": self.route.n_way, "outcome": self.termination.outcome,
+            "remaining": self.route.remaining_m, "plan_step": self.route.plan_step, "step": self.clock.step,
+        }  # fmt: skip
 
     def clean(self):
         """Every row upright at 10 m, driving ahead at 0.5 m/s on a route of old, one step in."""
         self.clock.active.fill(1)
         reward.reset_reward(io_for(RewardIO, self.reward, self.clock))
         rest = {
-            "quat": (1, 0, 0, 0),
-            "vel": (0.5, 0, 0),
-            "pos": (10, 3, -0.8),
-            "command": (0.5, 0, 0, 0),
+            "quat": (1, 0, 0, 0), "vel": (0.5, 0, 0), "pos": (10, 3, -0.8), "command": (0.5, 0, 0, 0),
             "lookahead": (11, 3, -0.8),
-        }
+        }  # fmt: skip
         for name, value in rest.items():
             self.set(name, np.tile(value, (N, 1)))
         for name, value in {
-            "cross_track": 0,
-            "heading_error": 0,
-            "clearance": 5,
-            "ttc": 1e6,
-            "n_way": 4,
-            "outcome": 0,
-        }.items():
+            "cross_track": 0, "heading_error": 0, "clearance": 5, "ttc": 1e6, "n_way": 4, "outcome": 0,
+        }.items():  # fmt: skip
             self.set(name, np.full(N, value))
         for name, value in {"remaining": 5, "plan_step": 0, "step": 1}.items():
             self.set(name, np.full(N, value))
@@ -101,8 +81,7 @@ def bench(shared):
 
 
 def test_terms_are_config_keys_of_the_equation():
-    """The paper's come first; what is added to them is off by default. Other keys are bounds: they have a
-    unit."""
+    """The paper's come first, others are off by default; other keys are bounds, with a unit."""
     papers = [name for name in reward.TERMS if name in reference.TERMS]
     assert reward.TERMS[:13] == tuple(papers) == reference.TERMS
     assert all(getattr(RewardConfig(), name) == 0 for name in reward.TERMS[13:])
@@ -144,14 +123,12 @@ def test_every_term_equals_the_equation(bench):
 
 
 def test_total_is_the_sum_and_goes_out(bench):
-    terms = bench.compute()
-    total = sum(terms.values())
+    total = sum(bench.compute().values())
     assert bench.out[0].numpy() == pytest.approx(total, abs=TOL)
     assert bench.reward.total.to_numpy() == pytest.approx(total, abs=TOL)
     bench.compute()
-    assert bench.reward.episode_return.to_numpy() == pytest.approx(
-        2 * total, abs=0.02
-    )  # the second step earns other progress
+    # the second step earns other progress
+    assert bench.reward.episode_return.to_numpy() == pytest.approx(2 * total, abs=0.02)
     assert bench.reward.episode_sum.to_numpy().sum(axis=1) == pytest.approx(
         bench.reward.episode_return.to_numpy(), abs=TOL
     )
@@ -229,9 +206,8 @@ def test_replanning_in_every_step_while_standing_still_pays_nothing(bench):
 
 
 def test_the_first_step_and_steps_without_a_route(bench):
-    assert progress(bench, 7.0, step=1) == pytest.approx(
-        0.01, abs=1e-6
-    )  # nothing known before: movement towards the look-ahead
+    # nothing known before: movement towards the look-ahead
+    assert progress(bench, 7.0, step=1) == pytest.approx(0.01, abs=1e-6)
     bench.set("n_way", np.zeros(N))
     assert progress(bench, 3.0) == 0.0
     bench.set("n_way", np.full(N, 4))

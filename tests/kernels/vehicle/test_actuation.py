@@ -1,5 +1,4 @@
-"""Inner loop: against a NumPy oracle, its requirements on both frames, saturation, delay, dropouts, odd
-actions."""
+"""Inner loop: a NumPy oracle, requirements on both frames, saturation, delay, dropouts, odd actions."""
 
 import numpy as np
 import pytest
@@ -121,27 +120,17 @@ def test_loop_equals_the_oracle(plant, valid):
         set_ego(plant, vel, rate, rpy, valid)
         plant.write(plant.actuation.integral, integral)
         plant.command(action)
-        got_integral, got_thrust = (
-            plant.actuation.integral.to_numpy(),
-            oracle.thrust_of_rpm(plant.actuation.rpm_command.to_numpy(), cfg),
-        )
+        got_integral = plant.actuation.integral.to_numpy()
+        got_thrust = oracle.thrust_of_rpm(plant.actuation.rpm_command.to_numpy(), cfg)
         for env in range(N_ENV):
             sensed = (vel[env], rate[env], rpy[env])
             thrust, wanted = oracle.control(
-                cfg,
-                gains,
-                0.02,
-                action[env] * LIMITS,
-                integral[env],
-                *sensed,
-                wrench_of_thrust,
-                thrust_of_wrench,
-                valid,
-            )
+                cfg, gains, 0.02, action[env] * LIMITS, integral[env], *sensed, wrench_of_thrust,
+                thrust_of_wrench, valid,
+            )  # fmt: skip
             assert np.abs(got_integral[env] - wanted).max() < 1e-4
-            smooth = (
-                np.abs(thrust) > 1.0
-            )  # below the smallest thrusts the command is rounded, checked elsewhere
+            # below the smallest thrusts the command is rounded, checked elsewhere
+            smooth = np.abs(thrust) > 1.0
             assert np.abs(got_thrust[env] - thrust)[smooth].max(initial=0) < F32_THRUST_N * max(1, scale)
 
 
@@ -166,8 +155,7 @@ def test_saturation_keeps_the_direction(plant):
 
 @pytest.mark.parametrize("speed", [1.0, 0.2])
 def test_blocked_vehicle_does_not_wind_up(plant, speed):
-    """A minute against a wall, then free: no overshoot at full command, six seconds at worst to forget what a
-    slow one has pushed."""
+    """A minute against a wall, then free: no overshoot, six seconds at worst to forget."""
     plant.reset()
     set_ego(plant, 0.0, 0.0, 0.0)
     action = np.tile(np.array([speed, 0, 0, 0], np.float32), (N_ENV, 1))
@@ -245,18 +233,14 @@ def test_thrust_curve_and_its_inverse():
     rpm, thrust = np.zeros_like(wanted), np.zeros_like(wanted)
     _there_and_back(wanted, rpm, thrust, cfg)
     top, bottom = thrust_limits(cfg)
-    assert np.isclose(top, 64.13, atol=0.01) and np.isclose(
-        bottom, -51.55, atol=0.01
-    )  # 3-vehicle.md: +64.1 / -51.6 N
+    # 3-vehicle.md: +64.1 / -51.6 N
+    assert np.isclose(top, 64.13, atol=0.01) and np.isclose(bottom, -51.55, atol=0.01)
     assert np.abs(thrust - oracle.thrust_of_rpm(rpm, cfg)).max() < F32_THRUST_N
     least = oracle.thrust_of_rpm(np.array([203.5, -210.5]), cfg)
     reachable = ((wanted > least[0]) & (wanted < top)) | ((wanted < least[1]) & (wanted > bottom))
     assert np.abs(thrust - wanted)[reachable].max() < F32_THRUST_N
-    assert (
-        (np.abs(rpm) <= cfg.rotor_max_rpm).all()
-        and rpm[-1] == cfg.rotor_max_rpm
-        and rpm[0] == -cfg.rotor_max_rpm
-    )
+    assert (np.abs(rpm) <= cfg.rotor_max_rpm).all() and rpm[-1] == cfg.rotor_max_rpm
+    assert rpm[0] == -cfg.rotor_max_rpm
     assert not thrust[(wanted > 0.5 * least[1] + 1e-3) & (wanted < 0.5 * least[0] - 1e-3)].any()
 
 

@@ -24,16 +24,10 @@ def config(**disturbance):
 def disturbed():
     """All switches on."""
     settings = {
-        "current_m_s": MEAN,
-        "current_sigma_m_s": SIGMA,
-        "current_tau_s": TAU_S,
-        "thruster_delay_s": DELAY_STEPS * 0.02,
-        "thruster_gain_loss": 0.3,
-        "dead_thruster": 4,
-        "mass_spread": 0.1,
-        "damping_spread": 0.5,
-        "added_mass_spread": 0.2,
-    }
+        "current_m_s": MEAN, "current_sigma_m_s": SIGMA, "current_tau_s": TAU_S,
+        "thruster_delay_s": DELAY_STEPS * 0.02, "thruster_gain_loss": 0.3, "dead_thruster": 4,
+        "mass_spread": 0.1, "damping_spread": 0.5, "added_mass_spread": 0.2,
+    }  # fmt: skip
     plant = Plant(config(**settings), start_taichi("cpu"), n_env=N_ENV)
     plant.reset()
     return plant
@@ -144,9 +138,8 @@ def test_current_is_a_gauss_markov_process(disturbed):
         assert abs(np.corrcoef(first[:, axis], last[:, axis])[0, 1] - np.exp(-1)) < 4 / np.sqrt(N_ENV)
     kick = (second - np.exp(-0.02 / TAU_S) * first)[:, :2]
     assert np.abs(kick.std(axis=0) / (SIGMA * np.sqrt(1 - np.exp(-0.04 / TAU_S))) - 1).max() < STATISTICS
-    assert np.abs(np.corrcoef(kick.T, first[:, :2].T)[:2, 2:]).max() < 5 / np.sqrt(
-        N_ENV
-    )  # the first kick owes nothing to the initial draw
+    # the first kick owes nothing to the initial draw
+    assert np.abs(np.corrcoef(kick.T, first[:, :2].T)[:2, 2:]).max() < 5 / np.sqrt(N_ENV)
     assert abs(np.corrcoef(kick.T)[0, 1]) < 5 / np.sqrt(N_ENV)
 
 

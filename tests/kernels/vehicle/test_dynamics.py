@@ -1,5 +1,4 @@
-"""Rigid body in water: the design's reference table, an independent RK4 oracle, order of convergence,
-invariants, independent rows."""
+"""Rigid body in water: the reference table, an RK4 oracle, order of convergence, invariants, rows."""
 
 import json
 import os
@@ -170,11 +169,8 @@ def random_state(plant, seed):
     plant.reset()
     q = rng.normal(size=(N_ENV, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    nu, wrench, current = (
-        rng.uniform(-1, 1, (N_ENV, 6)),
-        rng.uniform(-20, 20, (N_ENV, 6)) * 0.5,
-        rng.uniform(-0.5, 0.5, (N_ENV, 3)),
-    )
+    nu, wrench = rng.uniform(-1, 1, (N_ENV, 6)), rng.uniform(-20, 20, (N_ENV, 6)) * 0.5
+    current = rng.uniform(-0.5, 0.5, (N_ENV, 3))
     plant.write(plant.vehicle.quat_wb, q)
     plant.write(plant.vehicle.vel_b, nu[:, :3])
     plant.write(plant.vehicle.rate_b, nu[:, 3:])
@@ -206,9 +202,8 @@ def test_acceleration_equals_the_oracle(plant):
                 oracle.Body(), rotation, nu[env] + 0.5 * dt * want, wrench[env], current[env]
             )
             rounding = 2 * np.finfo(np.float32).eps / dt  # nu is stored with 24 bits
-            turn = (
-                60 * dt
-            )  # the attitude turns by up to 1 mrad meanwhile: some 60 times that in a restoring acceleration
+            # the attitude turns by up to 1 mrad meanwhile: some 60 times that in a restoring acceleration
+            turn = 60 * dt
             assert np.abs(got[env] - middle).max() < F32_ACCELERATION + rounding + turn
 
 
@@ -218,17 +213,14 @@ def test_imu_acceleration_is_the_derivative_of_the_world_velocity(plant):
     plant.step(substeps=1, dt_s=dt)
     v = plant.vehicle
     for env in range(N_ENV):
-        before, after = (
-            oracle.quaternion_rotation(q[env]),
-            oracle.quaternion_rotation(v.quat_wb.to_numpy()[env].astype(float)),
-        )
+        before = oracle.quaternion_rotation(q[env])
+        after = oracle.quaternion_rotation(v.quat_wb.to_numpy()[env].astype(float))
         change = (after @ v.vel_b.to_numpy()[env] - before @ nu[env, :3]) / dt
         turned = oracle.quaternion_rotation(
             (q[env] + v.quat_wb.to_numpy()[env]) / np.linalg.norm(q[env] + v.quat_wb.to_numpy()[env])
         )
-        assert np.allclose(
-            turned.T @ change, v.acc_b.to_numpy()[env], atol=5e-3
-        )  # second differences of a motion of about 10 m/s^2
+        # second differences of a motion of about 10 m/s^2
+        assert np.allclose(turned.T @ change, v.acc_b.to_numpy()[env], atol=5e-3)
 
 
 @settings(max_examples=20, derandomize=True, deadline=None)
@@ -239,10 +231,8 @@ def test_energy_never_grows_without_thrust_and_current(plant, seed):
     plant.write(plant.current.vel_w, 0.0)
     last = np.full(N_ENV, np.inf)
     for _ in range(40):
-        q, nu = (
-            plant.vehicle.quat_wb.to_numpy().astype(float),
-            np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()],
-        )
+        q = plant.vehicle.quat_wb.to_numpy().astype(float)
+        nu = np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()]
         z = plant.vehicle.pos_w.to_numpy()[:, 2]
         now = np.array(
             [
@@ -273,9 +263,8 @@ def test_frictionless_body_keeps_its_energy(plant):
     before = kinetic()
     for _ in range(50):
         plant.step(substeps=8)
-    assert (
-        np.abs(kinetic() / before - 1).max() < 1e-3
-    )  # second-order error of 400 substeps of 2.5 ms at rates of 1 rad/s
+    # second-order error of 400 substeps of 2.5 ms at rates of 1 rad/s
+    assert np.abs(kinetic() / before - 1).max() < 1e-3
 
 
 def test_added_mass_that_follows_the_water_knows_no_uniform_current():
@@ -289,9 +278,8 @@ def test_added_mass_that_follows_the_water_knows_no_uniform_current():
     plant.reset()
     plant.write(plant.actuation.external_wrench_b, [4, 1, 0, 0, 0, 0.4])
     plant.write(plant.current.vel_w, [current, 0 * current])
-    plant.write(
-        plant.vehicle.vel_b, [current, 0 * current]
-    )  # heading 0: body axes are world axes at the start
+    # heading 0: body axes are world axes at the start
+    plant.write(plant.vehicle.vel_b, [current, 0 * current])
     for _ in range(250):
         plant.step()
     assert np.abs(plant.vehicle.rate_b.to_numpy()[1, 2]) > 0.3  # it does turn
@@ -311,13 +299,9 @@ def test_coriolis_matrix_is_skew_and_mass_matrix_positive():
 
 
 WRONG = [
-    {"mass_kg": 0},
-    {"inertia_kg_m2": (0.3, 0, 0.5)},
-    {"added_mass": (5, -1, 1, 0, 0, 0)},
-    {"linear_damping": (-1,) * 6},
-    {"thrust_forward": (-4.7e-7, 0, 0)},
-    {"rotor_max_rpm": 150},
-]
+    {"mass_kg": 0}, {"inertia_kg_m2": (0.3, 0, 0.5)}, {"added_mass": (5, -1, 1, 0, 0, 0)},
+    {"linear_damping": (-1,) * 6}, {"thrust_forward": (-4.7e-7, 0, 0)}, {"rotor_max_rpm": 150},
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("wrong", WRONG)
@@ -388,10 +372,8 @@ def test_reset_leaves_nothing_behind(plant):
         plant.step()
     plant.reset()
     assert np.array_equal(motion(plant), fresh)
-    assert (
-        not plant.actuation.rpm_command.to_numpy().any()
-        and not plant.actuation.external_wrench_b.to_numpy().any()
-    )
+    assert not plant.actuation.rpm_command.to_numpy().any()
+    assert not plant.actuation.external_wrench_b.to_numpy().any()
 
 
 def test_reset_starts_at_the_mission(plant):

@@ -1,5 +1,4 @@
-"""Thruster watch: what is weighed against a NumPy oracle, who is given up and who is not, and that nobody
-else notices."""
+"""Thruster watch: weighing against a NumPy oracle, who is given up, and that nobody else notices."""
 
 import numpy as np
 import pytest
@@ -15,12 +14,9 @@ LEFT, RIGHT = 4, 5
 """the vertical thrusters of the six-thruster frame"""
 HEALTHY, DEAD_LEFT, DEAD_RIGHT, BOTH_WEAK, ONE_WEAK, DEAD_LEVEL = range(6)
 GAINS = {
-    DEAD_LEFT: {LEFT: 0.0},
-    DEAD_RIGHT: {RIGHT: 0.0},
-    BOTH_WEAK: {LEFT: 0.5, RIGHT: 0.5},
-    ONE_WEAK: {LEFT: 0.6},
-    DEAD_LEVEL: {0: 0.0},
-}
+    DEAD_LEFT: {LEFT: 0.0}, DEAD_RIGHT: {RIGHT: 0.0}, BOTH_WEAK: {LEFT: 0.5, RIGHT: 0.5},
+    ONE_WEAK: {LEFT: 0.6}, DEAD_LEVEL: {0: 0.0},
+}  # fmt: skip
 STEPS = 60
 SMOOTH_S = 0.1
 

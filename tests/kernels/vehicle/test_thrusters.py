@@ -1,6 +1,4 @@
-"""Thrust of the vehicle presets against the maker's measurements of the T200.
-
-docs/data/t200.csv: PWM [us], rotor speed [rpm] and thrust [kgf] at six voltages."""
+"""Thrust of the presets against the maker's T200 (docs/data/t200.csv: PWM [us], [rpm], [kgf])."""
 
 import csv
 from pathlib import Path

@@ -1,5 +1,4 @@
-"""Scenarios of every world: ranges, counts, gaps, joined free space, paths; and that they are a pure function
-of (world, seed, episode)."""
+"""Scenarios: ranges, counts, gaps, free space, paths; pure functions of (world, seed, episode)."""
 
 import functools
 import os
@@ -41,15 +40,9 @@ SPEED_TOL_M_S = 0.02
 SHARE_SIGMAS = 5.0
 WORLDS = ("pool", "gauntlet", "mixed", "maze", "netpen", "transfer", "open")
 STRUCTS = (
-    state.WorldState,
-    state.PathState,
-    state.MissionState,
-    state.ScenarioScratch,
-    state.SceneState,
-    state.FixedTable,
-    state.EpisodeState,
-    state.ClockState,
-)
+    state.WorldState, state.PathState, state.MissionState, state.ScenarioScratch, state.SceneState,
+    state.FixedTable, state.EpisodeState, state.ClockState,
+)  # fmt: skip
 
 
 def world_config(name, **changes):
@@ -287,9 +280,8 @@ def test_moving_obstacles_keep_constant_speed_on_their_paths(any_world):
         vel = now["vel_w"][:, first : first + n].astype(float)
         assert np.allclose(np.linalg.norm(vel, axis=-1), v, atol=1e-5)
         ahead, behind = (pos[2] - pos[1]) / dt, (pos[1] - pos[0]) / dt
-        off_corners = (
-            np.abs(ahead - behind).max(axis=-1) < SPEED_TOL_M_S
-        )  # the tightest circle changes the velocity by 0.014 m/s
+        # the tightest circle changes the velocity by 0.014 m/s
+        off_corners = np.abs(ahead - behind).max(axis=-1) < SPEED_TOL_M_S
         assert off_corners.mean() > 0.95
         assert np.abs(0.5 * (ahead + behind) - vel)[off_corners].max() < SPEED_TOL_M_S
         assert np.all(pos[0][..., 2] == pos[2][..., 2])
@@ -305,9 +297,8 @@ def test_the_log_s_closed_form_gives_the_same_positions(any_world):
             assert KIND_NAMES[drawn["kind"][env, obstacle["slot"]]] == obstacle["kind"]
             if obstacle["path"] is not None:
                 (at,) = path_positions(obstacle["path"], np.array([777 * RULES.control_dt_s]))
-                assert at == pytest.approx(
-                    drawn["pos_w"][env, obstacle["slot"], :2], abs=1e-3
-                )  # float32 arcs of up to 10 m
+                # float32 arcs of up to 10 m
+                assert at == pytest.approx(drawn["pos_w"][env, obstacle["slot"], :2], abs=1e-3)
 
 
 # ---------------------------------------------------------------------------------- distributions of the pool
@@ -380,8 +371,7 @@ def test_a_reset_touches_only_its_rows_and_forgets_what_was_there():
 
 def test_seed_and_episode_both_matter():
     of, drawn = drawn_world("pool")
-    other_seed = of.draw(seed=1)
-    assert not np.any(np.all(other_seed["start_w"] == drawn["start_w"], axis=1))
+    assert not np.any(np.all(of.draw(seed=1)["start_w"] == drawn["start_w"], axis=1))
     assert len(np.unique(drawn["start_w"], axis=0)) == N
     of.draw()
 
@@ -448,8 +438,7 @@ def test_batch_size_and_thread_count_change_nothing(tmp_path):
 
 
 def test_explicit_obstacles_stand_and_move_as_written():
-    """A wall across the pool, a box that shuttles, a sphere on a triangle; start and goal always share a side
-    of the wall."""
+    """A wall, a shuttling box, a sphere on a triangle; start and goal share a side of the wall."""
     cfg = WorldConfig.model_validate(
         {
             "n_static": 0,
@@ -459,13 +448,8 @@ def test_explicit_obstacles_stand_and_move_as_written():
             "fixed": [
                 {"kind": "box", "x_m": 10, "y_m": 3, "half_extents_m": [0.1, 3.0]},
                 {
-                    "kind": "box",
-                    "x_m": 0,
-                    "y_m": 0,
-                    "half_extents_m": [0.2, 0.1],
-                    "yaw_deg": 30,
-                    "height_m": 0.4,
-                    "z_m": -1.0,
+                    "kind": "box", "x_m": 0, "y_m": 0, "half_extents_m": [0.2, 0.1], "yaw_deg": 30,
+                    "height_m": 0.4, "z_m": -1.0,
                 }
                 | {"path": [{"x_m": 2, "y_m": 2}, {"x_m": 5, "y_m": 2}], "speed_m_s": 1.5},
                 {"kind": "cylinder", "x_m": 19, "y_m": 0.5, "radius_m": 0.3},
@@ -473,7 +457,7 @@ def test_explicit_obstacles_stand_and_move_as_written():
                 | {"path": [{"x_m": 12, "y_m": 1}, {"x_m": 16, "y_m": 1}, {"x_m": 16, "y_m": 4}]},
             ],
         }
-    )
+    )  # fmt: skip
     of = Drawn(cfg, n_env=64)
     drawn = of.draw()
     assert not drawn["faults"].any()

@@ -1,5 +1,4 @@
-"""Exported policies: NumPy, ONNX Runtime and torch agree with the pilot; folders are whole, checked, and
-never believed."""
+"""Exported policies: NumPy, ONNX Runtime and torch agree with the pilot; folders are checked."""
 
 import ast
 import json
@@ -13,12 +12,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save
 
 from tests.command import run_cli
 from uuvtai.config import ObservationConfig
 from uuvtai.config.loader import ConfigError, load_training
 from uuvtai.kernels.planning.observation import observation_width, placed_columns
-from uuvtai.learning import checkpoint
+from uuvtai.learning import checkpoint, world_model
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.export import folder as deploy
 from uuvtai.learning.export import run_policy
@@ -142,11 +142,8 @@ def test_networks_that_have_seen_nothing_agree_too():
         "rate": {"hold_steps": 1, "control_dt_s": 0.02},
     }
     spec["network"] = {
-        "teacher_columns": None,
-        "activation": "elu",
-        "predict_change": True,
-        "residual_limit": 0.5,
-    }
+        "teacher_columns": None, "activation": "elu", "predict_change": True, "residual_limit": 0.5,
+    }  # fmt: skip
     policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
     answer = run_policy.replayed(policy, golden)
     assert max(run_policy.difference(values, golden[name]) for name, values in answer.items()) <= TOLERANCE
@@ -200,13 +197,8 @@ def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
     norm = load_agent(found, 1).policy.observation_norm
     mean, std = float(norm.mean[2]), float(norm.std()[2])
     assert columns[2] == {
-        "index": 2,
-        "name": "goal[2]",
-        "unit": "m",
-        "frame": "body",
-        "mean": mean,
-        "std": std,
-    }
+        "index": 2, "name": "goal[2]", "unit": "m", "frame": "body", "mean": mean, "std": std,
+    }  # fmt: skip
     assert [row["name"] for row in spec["features"]] == ["residual", "uncertainty"]
     assert [(row["name"], row["limit"], row["unit"]) for row in spec["action"]] == [
         ("surge", 0.6, "m/s"), ("sway", 0.6, "m/s"), ("heave", 0.4, "m/s"), ("yaw_rate", 1.0, "rad/s"),
@@ -222,8 +214,7 @@ def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
 
 
 def test_the_folder_drives_where_there_is_numpy_alone(folder):
-    """In a process that can import neither torch nor uuvtai; and the file itself imports NumPy and the
-    standard library alone."""
+    """Without torch and uuvtai; the file imports NumPy and the standard library alone."""
     code = (
         "import sys, runpy\n"
         "class Guard:\n"
@@ -249,8 +240,6 @@ def test_the_folder_drives_where_there_is_numpy_alone(folder):
 
 
 def test_constants_that_the_driver_repeats_are_those_of_the_package():
-    from uuvtai.learning import world_model
-
     assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, world_model.N_ACTION)
     assert (run_policy._LOG_VAR, run_policy._MAX_DEVIATIONS) == (
         world_model.LOG_VAR_BOUNDS,
@@ -305,14 +294,8 @@ def result_of(found, k=90, n=100):
         {"name": "mine", "episodes": n, "outcomes": outcomes, "checkpoint": {"sha256": found.sha256}}
     )
     return {
-        "world": "pool",
-        "S": 8,
-        "D": 6,
-        "v_m_s": 0.6,
-        "sensors": "paper",
-        "seeds": [1, 2],
-        "agents": agents,
-    }
+        "world": "pool", "S": 8, "D": 6, "v_m_s": 0.6, "sensors": "paper", "seeds": [1, 2], "agents": agents,
+    }  # fmt: skip
 
 
 def written(folder, result):
@@ -334,11 +317,8 @@ def test_the_card_has_counts_and_intervals(tmp_path, no_onnx):
         "pool, S = 8, D = 6, v = 0.6 m/s, paper sensing, seed 1, 2 | 90/100 = 90.0 % [82.6, 94.5] | 9/100 = "
         "9.0 %" in card
     )
-    assert (
-        "40/50 = 80.0 %" in card
-        and "2/4 = 50.0 % [15.0, 85.0] | 1/4" in card
-        and "too good by selection" in card
-    )
+    assert "40/50 = 80.0 %" in card and "2/4 = 50.0 % [15.0, 85.0] | 1/4" in card
+    assert "too good by selection" in card
     assert "2.00 million env-steps" in card
 
 
@@ -413,11 +393,8 @@ def resigned(folder, name, content):
 
 
 def test_other_weights_with_the_right_sha256_are_exit_3(folder, tmp_path, capfd):
-    other = saved(tmp_path / "other", config_of(), metrics={"a": 1.0})
-    weights = weights_of(load_agent(other, 1))
+    weights = weights_of(load_agent(saved(tmp_path / "other", config_of(), metrics={"a": 1.0}), 1))
     weights["actor.4.bias"] += 0.01
-    from safetensors.torch import save
-
     resigned(folder, "policy.safetensors", save(weights))
     assert run_cli("export", "--check", folder) == 3
     assert "DIFFERS" in capfd.readouterr().out

@@ -1,5 +1,4 @@
-"""Exported policies over a set of obstacles and forecasts: NumPy, ONNX Runtime and torch agree with
-what drives in the simulator, the hull rule is the kernel's, and folders are checked and never believed."""
+"""Exported policies over a set: all runtimes agree, the hull rule is the kernel's, folders are checked."""
 
 import copy
 import json
@@ -9,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save
 
 from tests.command import run_cli
 from tests.learning.export.test_deploy import resigned
@@ -130,13 +130,9 @@ def test_it_drives_where_there_is_numpy_alone(whole):
         "runpy.run_path('run_set_policy.py', run_name='__main__')"
     )
     done = subprocess.run(
-        [sys.executable, "-B", "-c", code],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120,
+        [sys.executable, "-B", "-c", code], cwd=folder, capture_output=True, text=True, timeout=120,
         check=False,
-    )
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "largest difference" in done.stdout and "p50" in done.stdout
 
@@ -187,8 +183,7 @@ def test_the_graph_says_the_same(kind, tmp_path):
     few = {name: rng.normal(size=(3, policy.widths[name])).astype(np.float32) for name in policy.inputs[1:]}
     few["obstacles"] = rng.normal(size=(3, 2, OBSTACLE_WIDTH)).astype(np.float32)
     few["obstacles"][..., 0] = 1.0
-    graph = session((out / "policy.onnx").read_bytes())
-    (wish, *_) = graph.run(["mean_wish"], few)
+    (wish, *_) = session((out / "policy.onnx").read_bytes()).run(["mean_wish"], few)
     np.testing.assert_allclose(wish, policy.said(few)["mean_wish"], atol=1e-5)
 
 
@@ -237,8 +232,7 @@ def test_the_hull_rule_is_that_of_the_oracle():
         wanted = reference.hull_command(wish, yaw, z, rule["gap_m"], VehicleConfig(), TankConfig())
         np.testing.assert_allclose(decision.command((x, y, up), flip, yaw, z), wanted, atol=1e-5)
     assert rule["limits_m_s"]["heave"] == 0.4 and rule["z_m"] == [-1.6, 0.0]
-    slow = decision.command((0.01, 0.0, 0.0), (1, 1), 0.3, -0.8)
-    assert slow[3] == 0.0, "too slow to turn for"
+    assert decision.command((0.01, 0.0, 0.0), (1, 1), 0.3, -0.8)[3] == 0.0, "too slow to turn for"
 
 
 def module_policy():
@@ -363,8 +357,6 @@ def test_other_weights_with_the_right_sha256_are_exit_3(kind, tmp_path, no_onnx,
     weights = set_weights(module_of(found, kind_of(found)))
     changed = next(name for name in weights if name.endswith("bias"))
     weights[changed] += 1.0
-    from safetensors.torch import save
-
     resigned(out, "policy.safetensors", save(weights))
     assert run_cli("export", "--check", out) == 3
     assert "DIFFERS" in capfd.readouterr().out

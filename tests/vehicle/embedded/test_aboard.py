@@ -17,16 +17,7 @@ if sys.platform != "linux":
 from benchmarks.aboard import _EMPTY
 from tests.command import uuv
 from tests.vehicle.test_replay import recorded
-from uuvtai.vehicle.embedded import export
-from uuvtai.vehicle.embedded.runtime import (
-    AGREES,
-    CarriedStack,
-    StackFolderError,
-    carried_pilot,
-    compare,
-    messages_in,
-    packed_messages,
-)
+from uuvtai.vehicle.embedded import export, runtime
 from uuvtai.vehicle.onboard import DepthShot, DvlReading, ImuReading, Mission, PressureReading, SonarPing
 
 STEPS = 60
@@ -41,8 +32,7 @@ def log(small, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(log):
-    """In a process of its own: Taichi gives the text of a kernel only where it compiles it for the first
-    time."""
+    """In a process of its own: Taichi gives a kernel's text only where it is first compiled."""
     out = log.parent / "stack"
     words = [sys.executable, "-m", "uuvtai", "export", str(log), "--out", str(out), "--json"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
@@ -68,7 +58,7 @@ def test_it_decides_the_same_without_taichi_and_torch(folder):
     done = alone(folder)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert found["agrees"] and found["steps"] == STEPS + 1 and found["largest_difference"] <= AGREES
+    assert found["agrees"] and found["steps"] == STEPS + 1 and found["largest_difference"] <= runtime.AGREES
     assert found["foreign"] == [] and found["memory_mib"] > 0
     with np.load(folder / "golden.npz") as golden:
         assert np.ptp(golden["commands"], axis=0).max() > 0.1  # there is something to agree on
@@ -105,8 +95,8 @@ def test_a_folder_that_does_not_fit_says_why(copy, change, said):
     spec = json.loads((copy / "stack.json").read_text())
     change(spec)
     (copy / "stack.json").write_text(json.dumps(spec))
-    with pytest.raises(StackFolderError, match=said):
-        CarriedStack(copy)
+    with pytest.raises(runtime.StackFolderError, match=said):
+        runtime.CarriedStack(copy)
     done = alone(copy)
     assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
 
@@ -115,25 +105,25 @@ def test_a_folder_that_does_not_fit_says_why(copy, change, said):
 def test_a_file_that_has_changed_is_not_loaded(copy, name):
     with (copy / name).open("ab") as file:
         file.write(b"\0")
-    with pytest.raises(StackFolderError, match=f"{name} has changed since"):
-        CarriedStack(copy)
+    with pytest.raises(runtime.StackFolderError, match=f"{name} has changed since"):
+        runtime.CarriedStack(copy)
 
 
 def test_begun_anew_it_decides_the_same_again(folder):
     """The whole memory of a mission is forgotten; another start gives another decision."""
-    first, second = compare(folder), compare(folder)
+    first, second = runtime.compare(folder), runtime.compare(folder)
     assert first["agrees"] and second["largest_difference"] == first["largest_difference"]
-    pilot = carried_pilot(folder, Mission((2.0, 3.0, -0.8), (18.0, 3.0, -0.8)))
+    pilot = runtime.carried_pilot(folder, Mission((2.0, 3.0, -0.8), (18.0, 3.0, -0.8)))
     command = pilot.tick()
     assert command.held and not command.action.any()
     assert command.pos_w[0] == 2.0
 
 
 def test_a_route_that_cannot_be_planned_leaves_the_old_one(folder):
-    pilot = carried_pilot(folder)
+    pilot = runtime.carried_pilot(folder)
     pilot.tick()
     running = pilot.stack
-    assert isinstance(running, CarriedStack) and len(running._keep) == 1
+    assert isinstance(running, runtime.CarriedStack) and len(running._keep) == 1
     running.views["route.n_failed"][...] = 1
     before = running.views["route.n_way"].copy()
     for line in running._keep:
@@ -150,7 +140,7 @@ def test_messages_are_packed_whole():
         (4, DepthShot(0.08, np.arange(6.0).reshape(2, 3))),
         (4, DvlReading(0.08, np.array([0.1, 0.0, 0.0]))),
     ]
-    again = messages_in(packed_messages(told), (2, 3))
+    again = runtime.messages_in(runtime.packed_messages(told), (2, 3))
     assert [step for step, _ in again] == [step for step, _ in told]
     for (_, one), (_, other) in zip(told, again, strict=True):
         assert type(one) is type(other)

@@ -1,5 +1,4 @@
-"""ArduSub's logs as drives: axes, pulses, reversed motors, holes, and what is damaged. The files are made
-here: DataFlash by a writer of its own, tlog by pymavlink."""
+"""ArduSub's logs as drives: axes, pulses, reversed motors, holes, damage. DataFlash and tlogs made here."""
 
 import math
 import struct
@@ -179,8 +178,7 @@ def tlog(
     rates=(),
     armed=True,
 ):
-    """What a ground station writes: its own clock before every message; the DVL has none. The autopilot's
-    counters have 32 bits."""
+    """A ground station's clock before every message; the DVL has none, the autopilot's has 32 bits."""
     link = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
     others = {one: mavlink.MAVLink(None, srcSystem=one[0], srcComponent=one[1]) for one in (dvl, *rates)}
     out = b""
@@ -226,26 +224,14 @@ TLOGS = {
     "begun after they ran over": (tlog(WRAP_S + 60), [8.0], ""),
     "ran over twice": (tlog(2 * WRAP_S - 3), [8.0], ""),
     "milliseconds run over": (tlog(2**32 / 1e3 - 3), [8.0], ""),
-    "a reboot": (
-        tlog(500.0) + tlog(2.0, seconds=12.0, written_s=T0 + 30),
-        [8.0, 11.6],
-        "the autopilot's clock began anew 1 times; its drives are kept apart",
-    ),
-    "two reboots": (
-        b"".join(tlog(9.0 - 3 * k, written_s=T0 + 30 * k) for k in range(3)),
-        [8.0, 7.6, 7.6],
-        "began anew 2 times",
-    ),
-    "another day, by a later clock": (
-        tlog(5.0) + tlog(500.0, written_s=T0 + 86400),
-        [8.0, 7.6],
-        "began anew 1 times",
-    ),
-    "a reboot without a drive": (
-        tlog(500.0) + tlog(2.0, written_s=T0 + 30, armed=False),
-        [8.0],
-        "left out, ",
-    ),
+    "a reboot": (tlog(500.0) + tlog(2.0, seconds=12.0, written_s=T0 + 30), [8.0, 11.6],
+        "the autopilot's clock began anew 1 times; its drives are kept apart"),
+    "two reboots": (b"".join(tlog(9.0 - 3 * k, written_s=T0 + 30 * k) for k in range(3)), [8.0, 7.6, 7.6],
+        "began anew 2 times"),
+    "another day, by a later clock": (tlog(5.0) + tlog(500.0, written_s=T0 + 86400), [8.0, 7.6],
+        "began anew 1 times"),
+    "a reboot without a drive": (tlog(500.0) + tlog(2.0, written_s=T0 + 30, armed=False), [8.0],
+        "left out, "),
     "two vehicles": (
         merged(tlog(5.0, seconds=10.0), tlog(900.0, system=2, dvl=(2, 1), speed=0.9, written_s=T0 + 0.03)),
         [10.0],
@@ -258,12 +244,9 @@ TLOGS = {
         [8.0],
         "left out 50 VISION_POSITION_DELTA of 7/1",
     ),
-    "one late datagram": (
-        tlog() + tlog(6.0, seconds=0.1, written_s=T0 + 8) + tlog(13.0, written_s=T0 + 8.02),
-        [16.0],
-        "",
-    ),
-}
+    "one late datagram": (tlog() + tlog(6.0, seconds=0.1, written_s=T0 + 8) + tlog(13.0, written_s=T0 + 8.02),
+        [16.0], ""),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", TLOGS)
@@ -291,8 +274,7 @@ def test_the_other_vehicle_of_a_tlog(tmp_path, capfd):
 
 
 def test_a_dataflash_log_that_begins_anew(tmp_path):
-    both = dataflash([*drive(), *drive()])
-    found = read(tmp_path, both)
+    found = read(tmp_path, dataflash([*drive(), *drive()]))
     assert [STEP_S * len(one.rpm) for one in found] == pytest.approx([SECONDS, SECONDS], abs=0.3)
 
 
@@ -321,15 +303,11 @@ BAD = {
     "text.tlog": (b"no log at all" * 50, "holds no pulse widths"),
     "empty.tlog": (b"", "holds no pulse widths"),
     "short.bin": (dataflash(drive()), "stretches of 5 s"),
-    "form.bin": (
-        dataflash([], {"PARM": (1, "QN~", "TimeUS,Name,Value")}),
-        "is damaged (Exception: Unsupported format",
-    ),
-    "ancient.bin": (
-        dataflash([("RCOU", (0, 1500))], {"RCOU": (2, "IH", "TimeMS,Ch1")}),
-        "are of a firmware that is not read (TimeUS); give a log of ArduSub 3.5 or later",
-    ),
-}
+    "form.bin": (dataflash([], {"PARM": (1, "QN~", "TimeUS,Name,Value")}),
+        "is damaged (Exception: Unsupported format"),
+    "ancient.bin": (dataflash([("RCOU", (0, 1500))], {"RCOU": (2, "IH", "TimeMS,Ch1")}),
+        "are of a firmware that is not read (TimeUS); give a log of ArduSub 3.5 or later"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -14,24 +14,9 @@ from uuvtai.config import VehicleConfig
 from uuvtai.config.loader import load_config
 from uuvtai.sim.setup import allocation_matrices
 from uuvtai.vehicle.identify import fit as identified_module
+from uuvtai.vehicle.identify import model
 from uuvtai.vehicle.identify.drive_log import Drive, DriveError, mean_wrench, read_drives
 from uuvtai.vehicle.identify.fit import KNOWN, _worse, horizon_errors, identified
-from uuvtai.vehicle.identify.model import (
-    AXES,
-    GAIN,
-    LAG,
-    LATE,
-    NET,
-    changed,
-    first_readings,
-    grown_starts,
-    motion,
-    parameters_of,
-    readings,
-    stretches,
-    unexcited,
-    unstepped,
-)
 
 DT_S, SECONDS = 0.02, 65.1
 NOISE = 0.004
@@ -57,8 +42,7 @@ def thrust(rpm):
 
 
 def oracle_drive(seed=5, lag_s=TOLD.rotor_tau_s):
-    """(times, velocities (n, 4), rotor speeds (n, 6), those commanded until the next sample (n, 6)): random
-    rotor speeds, Fossen's equation by RK4."""
+    """(times, velocities (n, 4), rotor speeds (n, 6), those commanded next (n, 6)) by Fossen and RK4."""
     rng, geometry = np.random.default_rng(seed), allocation_matrices(TOLD)[0]
     level, still, steps = np.eye(3), np.zeros(3), round(SECONDS / DT_S)
     nu, rpm, left, wanted = np.zeros(6), np.zeros(6), np.zeros(6, int), np.zeros(6)
@@ -117,13 +101,13 @@ def test_the_oracles_vehicle_comes_back_within_its_intervals(table, capfd):
         assert entry["fitted"] and entry["low"] < entry["value"] < entry["high"]
         assert entry["low"] - (entry["high"] - entry["low"]) < value < 2 * entry["high"] - entry["low"], entry
     assert inside >= 11
-    gain = document["parameters"][GAIN]
+    gain = document["parameters"][model.GAIN]
     assert not gain["fitted"] and gain["value"] == 1.0
     ours, given = (document["horizons"][name]["100"] for name in ("identified", "given"))
     assert all(a < b for a, b in zip(ours, given, strict=True))
     found = load_config("open", vehicle=str(out)).vehicle
     assert abs(found.added_mass[0] - TRUE.added[0]) < 0.5 and found.added_mass[3] == TOLD.added_mass[3]
-    assert abs(parameters_of(found)[NET] - 3.0) < 0.2
+    assert abs(model.parameters_of(found)[model.NET] - 3.0) < 0.2
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     code, _, err = uuv(capfd, "identify", table, "--out", out)
     assert code == 2 and "already there" in err
@@ -134,8 +118,8 @@ def test_one_force_or_mass_has_to_be_known(table):
     drives = read_drives(table)
     steady = VehicleConfig(volume_m3=TRUE.buoyancy / TOLD.gravity_m_s2 / TOLD.water_density_kg_m3)
     found = identified(drives, steady, "buoyancy").document["parameters"]
-    assert not found[NET]["fitted"] and found[GAIN]["fitted"]
-    assert found[GAIN]["low"] < 1.0 < found[GAIN]["high"]
+    assert not found[model.NET]["fitted"] and found[model.GAIN]["fitted"]
+    assert found[model.GAIN]["low"] < 1.0 < found[model.GAIN]["high"]
     with pytest.raises(DriveError, match="gain, added-mass, buoyancy"):
         identified(drives, TOLD, "mass")
     assert KNOWN == ("gain", "added-mass", "buoyancy")
@@ -149,14 +133,14 @@ def test_the_rotors_lag_comes_back_from_commanded_speeds(tmp_path, capfd):
     code, text, err = uuv(capfd, "identify", path, "--vehicle", "bluerov2", "--json")
     assert code == 0, err
     entries = json.loads(text)["parameters"]
-    for place, true in ((LAG, lag_s), (LATE[0], 0.0), (LATE[1], 0.04)):
+    for place, true in ((model.LAG, lag_s), (model.LATE[0], 0.0), (model.LATE[1], 0.04)):
         entry, width = entries[place], entries[place]["high"] - entries[place]["low"]
         assert entry["fitted"] and width < 0.02
         assert entry["low"] - width < true < entry["high"] + width, entry
     inside = sum(entries[i]["low"] <= value <= entries[i]["high"] for i, value in enumerate(true_row()))
     assert inside >= 11
     made = load_config("open", vehicle=str(path.with_suffix(".vehicle.yaml"))).vehicle
-    assert made.rotor_tau_s == pytest.approx(entries[LAG]["value"], abs=1e-4)
+    assert made.rotor_tau_s == pytest.approx(entries[model.LAG]["value"], abs=1e-4)
 
 
 def true_row():
@@ -166,7 +150,7 @@ def true_row():
 
 def test_a_log_of_turned_speeds_says_nothing_of_the_lag(table):
     document = identified(read_drives(table), TOLD).document
-    entry = document["parameters"][LAG]
+    entry = document["parameters"][model.LAG]
     assert not entry["fitted"] and entry["value"] == TOLD.rotor_tau_s
     (warning,) = [text for text in document["warnings"] if text.startswith("rotor lag")]
     assert "asked_1" in warning and "it stays that of the vehicle given" in warning
@@ -176,17 +160,16 @@ def test_commands_that_change_slowly_do_not_show_the_lag():
     n = 3000
     slow = np.tile(2000 * np.sin(np.arange(n) * DT_S)[:, None], (1, 6))
     still = np.zeros((n, 4)), np.zeros((n, 2)), np.tile([0.0, 0.0, 1.0], (n, 1))
-    assert "jump 0 times by 300 rpm" in unstepped([Drive(DT_S, *still, slow, command="held")])
+    assert "jump 0 times by 300 rpm" in model.unstepped([Drive(DT_S, *still, slow, command="held")])
     steps = np.where(np.arange(n)[:, None] // 500 % 2 == 0, 1000.0, -1000.0) * np.ones(6)
-    assert "jump 5 times" in unstepped([Drive(DT_S, *still, steps, command="held")])
+    assert "jump 5 times" in model.unstepped([Drive(DT_S, *still, steps, command="held")])
     often = np.where(np.arange(n)[:, None] // 25 % 2 == 0, 1000.0, -1000.0) * np.ones(6)
-    assert unstepped([Drive(DT_S, *still, often, command="held")]) == ""
+    assert model.unstepped([Drive(DT_S, *still, often, command="held")]) == ""
 
 
 @pytest.mark.parametrize("lag_s", [0.004, 0.03, 0.2])
 def test_thrust_of_a_lagging_rotor_against_small_steps(lag_s):
-    """First order between commands that jump from sample to sample: the mean of each step, and that weighted
-    by the time left of it."""
+    """First order: the mean of each step, and that weighted by the time left of it."""
     asked = np.array([0.0, 2000.0, 2000.0, -1500.0, 800.0, 800.0])[:, None] * np.ones(6)
     blank = np.zeros((6, 4)), np.zeros((6, 2)), np.zeros((6, 3))
     found = mean_wrench(Drive(DT_S, *blank, asked, command="held"), TOLD, np.array([lag_s]))[:, 0]
@@ -229,11 +212,11 @@ def test_speeds_as_turned_run_as_the_lag_has_it_or_straight():
 
 
 def test_a_delay_shifts_what_its_instrument_says(table):
-    given = stretches(read_drives(table), TOLD, 5.0)
-    theta, start = parameters_of(TOLD), np.full((1, len(given.velocity), 4), 0.1)
-    true = motion(theta[None], start, given, TOLD)[0]
-    theta[list(LATE)] = 3 * DT_S, 0.5 * DT_S
-    late = readings(theta[None], start, given, TOLD)[0]
+    given = model.stretches(read_drives(table), TOLD, 5.0)
+    theta, start = model.parameters_of(TOLD), np.full((1, len(given.velocity), 4), 0.1)
+    true = model.motion(theta[None], start, given, TOLD)[0]
+    theta[list(model.LATE)] = 3 * DT_S, 0.5 * DT_S
+    late = model.readings(theta[None], start, given, TOLD)[0]
     assert np.allclose(late[:, 3:, :3], true[:, :-3, :3])
     yaw = true[..., 3]
     halfway = (9 * (yaw[:, 2:-2] + yaw[:, 1:-3]) - yaw[:, 3:-1] - yaw[:, :-4]) / 16
@@ -242,22 +225,21 @@ def test_a_delay_shifts_what_its_instrument_says(table):
 
 
 def test_initial_velocities_of_an_unstable_vehicle_are_found(table):
-    """Ahead at 0.6 m/s its yaw runs away (Munk's moment), so undamped steps from first readings run away too:
-    one stretch that is not settled outweighs all others."""
-    whole = stretches(read_drives(table), TOLD, 5.0)
+    """At 0.6 m/s its yaw runs away (Munk's moment): one unsettled stretch outweighs all others."""
+    whole = model.stretches(read_drives(table), TOLD, 5.0)
     ahead = np.zeros_like(whole.wrench)
     ahead[..., 0] = 9.0
-    value = parameters_of(TOLD)
-    value[NET], value[[0, 1]] = 0.0, (1.0, 25.0)
+    value = model.parameters_of(TOLD)
+    value[model.NET], value[[0, 1]] = 0.0, (1.0, 25.0)
     still = replace(whole, wrench=ahead, up=np.zeros_like(whole.up), tilt_rate=np.zeros_like(whole.tilt_rate))
     rng = np.random.default_rng(3)
     true = np.array([0.6, 0.0, 0.0, 0.0]) + 0.1 * rng.normal(size=(len(whole.velocity), 4))
-    seen = readings(value[None], true[None], still, TOLD)[0]
+    seen = model.readings(value[None], true[None], still, TOLD)[0]
     seen[:, np.arange(seen.shape[1]) % 5 != 0, :3] = np.nan
     cuts = tuple((replace(whole.cuts[0][0], velocity=row), 0) for row in np.roll(seen, 5, axis=1))
     given = replace(still, velocity=np.where(np.isnan(whole.velocity), np.nan, seen), cuts=cuts)
-    found = grown_starts(given, TOLD, value, np.array([0.01, 0.01, 0.01, 0.003]))
-    assert np.abs(first_readings(given) - true).max() > 0.1
+    found = model.grown_starts(given, TOLD, value, np.array([0.01, 0.01, 0.01, 0.003]))
+    assert np.abs(model.first_readings(given) - true).max() > 0.1
     assert np.abs(found - true).max() < 1e-3
 
 
@@ -277,7 +259,7 @@ def test_a_log_that_excites_nothing_is_refused_with_what_to_drive():
 
 def test_axes_that_rest_are_named():
     drive = still_drive(a0=lambda t: 0.4 * np.sin(t), a3=lambda t: 0.5 * np.sin(0.7 * t))
-    assert set(unexcited(stretches([drive], TOLD, 5.0))) == {"sway", "heave"}
+    assert set(model.unexcited(model.stretches([drive], TOLD, 5.0))) == {"sway", "heave"}
 
 
 def test_short_logs_and_other_thrusters_are_refused():
@@ -289,7 +271,7 @@ def test_short_logs_and_other_thrusters_are_refused():
     with pytest.raises(DriveError, match="6 thrusters, the vehicle 8: name the one"):
         identified([drive], heavy)
     with pytest.raises(DriveError, match="identify them apart"):
-        stretches([drive, Drive(0.1, drive.velocity, drive.tilt_rate, drive.up, drive.rpm)], TOLD, 5.0)
+        model.stretches([drive, Drive(0.1, drive.velocity, drive.tilt_rate, drive.up, drive.rpm)], TOLD, 5.0)
 
 
 def test_the_vehicle_given_is_kept_where_no_fit_is_better(table, capfd):
@@ -302,7 +284,7 @@ def test_the_vehicle_given_is_kept_where_no_fit_is_better(table, capfd):
     code, _, err = uuv(capfd, "identify", table, "--vehicle", given, "--out", out)
     said = " ".join(err.split())
     assert code == 2 and "improve no number of the vehicle given, and nothing is written" in said
-    assert all(f"{axis} is no better (" in said for axis in AXES)
+    assert all(f"{axis} is no better (" in said for axis in model.AXES)
     assert not out.exists() and not out.with_suffix(".png").exists()
 
 
@@ -324,7 +306,7 @@ def test_a_fit_has_to_be_better_ahead(shares, is_better):
     rows = dict(zip(("1", "10", "100"), ((9.0,) * 4, *((share,) * 4 for share in shares)), strict=True))
     horizons = {"identified": rows, "given": dict.fromkeys(rows, (1.0,) * 4)}
     free = np.ones(17, bool)
-    for axis, places in enumerate(([0, 4, 8], [1, 5, 9], [2, 6, 10, NET], [3, 7, 11])):
+    for axis, places in enumerate(([0, 4, 8], [1, 5, 9], [2, 6, 10, model.NET], [3, 7, 11])):
         found = [places for _, places in _worse(axis, horizons, free)]
         assert found == ([] if is_better else [places])
     assert _worse(0, horizons, ~free) == []
@@ -336,8 +318,8 @@ def test_numbers_that_come_out_negative_stay_as_given_and_the_others_are_fitted_
 
     def wrong(given, vehicle_cfg, first, free):
         fit, low = real(given, vehicle_cfg, first, free), np.zeros(17)
-        low[[0, 4, LAG]] = -30.0, -5.0, -1.0
-        held.append(~free[[0, 4, LAG]])
+        low[[0, 4, model.LAG]] = -30.0, -5.0, -1.0
+        held.append(~free[[0, 4, model.LAG]])
         return replace(fit, value=np.where(free, fit.value + low, fit.value))
 
     monkeypatch.setattr(identified_module, "fitted", wrong)
@@ -357,18 +339,18 @@ def test_errors_ahead_begin_and_end_at_readings(every, table):
     seen[np.isnan(seen)] = np.where(np.arange(len(seen)) % every == 0, 0.1, np.nan)[:, None].repeat(4, 1)[
         np.isnan(seen)
     ]
-    given = stretches([replace(drive, velocity=seen)], TOLD, 5.0)
-    found = horizon_errors(given, TOLD, parameters_of(TOLD), (every, 10 * every))
+    given = model.stretches([replace(drive, velocity=seen)], TOLD, 5.0)
+    found = horizon_errors(given, TOLD, model.parameters_of(TOLD), (every, 10 * every))
     assert all(value is not None for row in found.values() for value in row)
 
 
 def test_a_vehicle_file_has_its_own_trim():
-    found = parameters_of(TOLD)
-    found[[NET, GAIN]] = 1.5, 0.9
-    keys = changed(TOLD, found)
+    found = model.parameters_of(TOLD)
+    found[[model.NET, model.GAIN]] = 1.5, 0.9
+    keys = model.changed(TOLD, found)
     assert keys["thrust_scale"] == 0.9
     again = VehicleConfig(**keys)
-    assert abs(parameters_of(again)[NET] - 1.5) < 1e-3
+    assert abs(model.parameters_of(again)[model.NET] - 1.5) < 1e-3
 
 
 BAD_TABLES = {
