@@ -22,7 +22,9 @@ def main(what: str) -> None:
     """The small simulator with and without sensor errors, and for a GPU; or the one vehicle (``one``)."""
     start_taichi("cpu")
     if what == "one":
-        return play_alone(sim_with_one_beam())
+        sim, one = sim_with_one_beam(), torch.ones(1, dtype=torch.int32)
+        sim.reset(one, one, one)
+        return step(sim)
     play(SmallSim())
     if asked_shape() == "cpu":
         play(SmallSim("clean"))
@@ -33,15 +35,11 @@ def play(small: SmallSim) -> None:
     """Begin two episodes, step, begin another, with observations asked for."""
     small.sim.observe()
     small.begin([0, 1])
-    for _ in range(STEPS):
-        small.sim.step()
+    step(small.sim)
     small.begin([2])
 
 
-def play_alone(sim) -> None:
-    """Begin an episode of one vehicle, and step."""
-    one = torch.ones(1, dtype=torch.int32)
-    sim.reset(one, one, one)
+def step(sim) -> None:
     for _ in range(STEPS):
         sim.step()
 

@@ -32,14 +32,13 @@ def test_what_only_waited_is_not_counted_as_lost(tmp_path):
     assert sorted(LocalEngine(1).run(worker_work.fall_once, places)) == list(enumerate("abcde"))
 
 
-def test_workers_that_keep_dying_end_the_work_with_a_reason():
-    with pytest.raises(EngineError, match="lost its worker 3 times"):
-        list(LocalEngine(1).run(worker_work.always_fall, [1]))
-
-
-def test_errors_of_the_work_are_not_tried_again():
-    with pytest.raises(ValueError, match="-2 is negative"):
-        list(LocalEngine(1).run(worker_work.square, [-2]))
+@pytest.mark.parametrize(("work", "item", "error", "says"), [
+    (worker_work.always_fall, 1, EngineError, "lost its worker 3 times"),
+    (worker_work.square, -2, ValueError, "-2 is negative"),  # not tried again
+])  # fmt: skip
+def test_workers_that_keep_dying_and_errors_of_the_work_end_it(work, item, error, says):
+    with pytest.raises(error, match=says):
+        list(LocalEngine(1).run(work, [item]))
 
 
 def _start_waiting(place):

@@ -117,19 +117,13 @@ def test_missing_unreadable_huge_and_binary_files(tmp_path):
         load_config(str(binary))
 
 
-def test_resolved_config_is_read_back(tmp_path):
-    config = load_config("gauntlet", "nominal")
-    path = tmp_path / "config.yaml"
-    path.write_text(to_yaml(config))
-    assert loader.load_resolved(path) == config
-
-
 # --------------------------------------------------------------------------------------------------- training
 
 
-@pytest.mark.parametrize("preset", loader.preset_names("train"))
+@pytest.mark.parametrize("preset", [None, *loader.preset_names("train")])
 def test_every_training_preset_loads_and_is_read_back(tmp_path, preset):
-    config = load_training(preset)
+    """And a config without a training (None)."""
+    config = load_training(preset) if preset else load_config("gauntlet", "nominal")
     path = tmp_path / "config.yaml"
     path.write_text(to_yaml(config))
     assert loader.load_resolved(path) == config

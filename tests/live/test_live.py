@@ -9,7 +9,6 @@ import struct
 import threading
 import time
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import pytest
 from foxglove.websocket import ServerListener
@@ -18,6 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
 from tests.command import uuv
+from uuvtai.evaluation.episodes import Job
 from uuvtai.live import server as viewer_server
 from uuvtai.live.server import BACKLOG, MOST_CLIENTS, Broadcast, LiveError, RealTime, ViewerServer
 from uuvtai.logs.writer import EpisodeRecorder
@@ -26,11 +26,6 @@ STEPS = 30
 END = SimpleNamespace(
     outcome="cut", episode_return=0.0, time_s=0.6, min_clearance_m=1.0, replans={}, planned_by={}
 )
-
-
-class Job(NamedTuple):
-    seed: int
-    episode: int
 
 
 def open_socket(port, **options):

@@ -469,12 +469,6 @@ def test_a_pipe_in_an_exported_folder_is_not_waited_for(folder, name):
     assert done.returncode == 1 and "no plain file" in done.stderr and "Traceback" not in done.stderr
 
 
-def golden_with(folder, **arrays):
-    golden = run_policy.read_golden(folder / "golden.npz") | arrays
-    np.savez(folder / "golden.npz", **golden)
-    deployed.resigned(folder, "golden.npz", (folder / "golden.npz").read_bytes())
-
-
 @pytest.mark.parametrize("arrays", [
     {"value": np.float32(1)},
     {"obs": np.float32(1)},
@@ -486,7 +480,9 @@ def golden_with(folder, **arrays):
     {"obs": np.zeros((70_000, 40), np.float32), "begins": np.zeros(70_000, bool)},
 ], ids=str)  # fmt: skip
 def test_golden_pairs_of_other_shapes_are_one_line(folder, arrays, capfd):
-    golden_with(folder, **arrays)
+    golden = folder / "golden.npz"
+    np.savez(golden, **(run_policy.read_golden(golden) | arrays))
+    deployed.resigned(folder, golden.name, golden.read_bytes())
     assert run_policy.main([str(folder)]) in (1, 3)
     assert "Traceback" not in capfd.readouterr().err
     assert run_cli("export", "--check", folder) in (2, 3)

@@ -24,18 +24,16 @@ def full(triangle, n):
     return out
 
 
-def level(roll, pitch, v):
+def level(roll, pitch, v, axes="ij"):
     """Body vectors in the level frame of the same yaw."""
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     turn = np.array([[cp, sp * sr, sp * cr], [0 * cr, cr, -sr], [-sp, cp * sr, cp * cr]])
-    return np.einsum("ij...,...j->...i", turn, v)
+    return np.einsum(f"{axes}...,...j->...i", turn, v)
 
 
 def tilted(roll, pitch, v):
     """Level vectors in the body frame."""
-    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
-    turn = np.array([[cp, sp * sr, sp * cr], [0 * cr, cr, -sr], [-sp, cp * sr, cp * cr]])
-    return np.einsum("ji...,...j->...i", turn, v)
+    return level(roll, pitch, v, "ji")
 
 
 def rotated(yaw, v):

@@ -423,10 +423,8 @@ def map_figures(log, same):
 
 def clearance_figures(log, mapper, redone):
     """/map/clearance against the distance transform of the logged map of its time and of the redone one."""
-    maps = {
-        log.step(time): (grid_values(data), grid_values(other))
-        for (time, data), (_, other) in layer_pairs(log)
-    }
+    layers = zip(log.messages["/map/static"], log.messages["/map/dynamic"], strict=True)
+    maps = {log.step(time): (grid_values(data), grid_values(other)) for (time, data), (_, other) in layers}
     worst, from_logged, other_sites, cells = 0.0, 0, 0, 0
     for _, data in log.messages["/map/clearance"]:
         step, answer = log.stamp_step(data), grid_values(data)
@@ -455,10 +453,6 @@ def clearance_figures(log, mapper, redone):
         "agreeing_share_from_scans": 1 - other_sites / cells,
         "risk_max_error": float(np.abs(risk).max()),
     }
-
-
-def layer_pairs(log):
-    return zip(log.messages["/map/static"], log.messages["/map/dynamic"], strict=True)
 
 
 # ----------------------------------------------------------------------------------------------------- camera

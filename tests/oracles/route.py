@@ -17,18 +17,11 @@ def nearest_on(way, pos):
         off = pos - way[i] - share * along
         gap = np.linalg.norm(off)
         if gap < best[0]:
-            best = (
-                gap,
-                at[i] + share * np.linalg.norm(along),
-                np.copysign(gap, along[0] * off[1] - along[1] * off[0]),
-            )
+            signed = np.copysign(gap, along[0] * off[1] - along[1] * off[0])
+            best = gap, at[i] + share * np.linalg.norm(along), signed
     return best[1], best[2]
 
 
 def point_at(way, length):
     way, at = corners_and_lengths(way)
     return np.array([np.interp(length, at, way[:, 0]), np.interp(length, at, way[:, 1])])
-
-
-def risk_at(static, dynamic, clearance, alpha_m, alpha_d, alpha_delta, epsilon):
-    return alpha_m * static + alpha_d * dynamic + alpha_delta / (clearance + epsilon)

@@ -45,30 +45,19 @@ def text_of(path):
 def kit(tmp_path_factory):
     """The kit of an evaluation, a sweep and two trainings of one agent."""
     place = tmp_path_factory.mktemp("runs")
+    small = samples.sweep_document("bt", {"S": [8], "D": [0, 6], "v_m_s": [0.4, 0.6]})
+    kept = ("iteration", "time/env_steps", "rollout/ep_rew_mean", "rollout/success_rate")
+    metrics = [{key: row[key] for key in kept} for row in samples.metrics()]
+    train = ("uuv", "train", "smoke")
     runs = [
         evaluated(place / "first", samples.agent("straight", 3, 5), samples.agent(EVIL, 7, 1)),
-        samples.write_run(place / "grid", ("uuv", "sweep"), sweep=small_sweep()),
+        samples.write_run(place / "grid", ("uuv", "sweep"), sweep=small),
         *(
-            samples.write_run(
-                place / f"run_{seed}",
-                ("uuv", "train", "smoke"),
-                f"train: {{seed: {seed}}}\n",
-                metrics=few_metrics(),
-            )
+            samples.write_run(place / f"run_{seed}", train, f"train: {{seed: {seed}}}\n", metrics=metrics)
             for seed in (1, 2)
         ),
     ]
     return paper(runs, place / "kit")
-
-
-def few_metrics():
-    """Records of two quantities."""
-    kept = ("iteration", "time/env_steps", "rollout/ep_rew_mean", "rollout/success_rate")
-    return [{key: row[key] for key in kept} for row in samples.metrics()]
-
-
-def small_sweep(agent="bt"):
-    return samples.sweep_document(agent, {"S": [8], "D": [0, 6], "v_m_s": [0.4, 0.6]})
 
 
 # ------------------------------------------------------------ figures

@@ -200,24 +200,12 @@ def test_the_map_is_redone_from_the_scans(layer, figures):
     assert sum(n * share for n, share in zip(touched, agreeing, strict=True)) >= AGREEMENT * sum(touched)
 
 
-def without_camera(log):
-    log.messages["/camera/line"] = []
-
-
-def without_tracks(log):
-    log.messages["/tracks"] = []
-
-
-def without_doppler(log):
-    log.config["mapping"]["doppler_evidence_m_s"] = 99.0
-
-
-def without_free_water(log):
-    log.config["mapping"]["free_range_m"] = 1.0
-    log.config["mapping"]["static_free"] = 0.0
-
-
-@pytest.mark.parametrize("spoil", [without_camera, without_tracks, without_doppler, without_free_water])
+@pytest.mark.parametrize("spoil", [
+    lambda log: log.messages.update({"/camera/line": []}),
+    lambda log: log.messages.update({"/tracks": []}),
+    lambda log: log.config["mapping"].update(doppler_evidence_m_s=99.0),
+    lambda log: log.config["mapping"].update(free_range_m=1.0, static_free=0.0),
+], ids=["without_camera", "without_tracks", "without_doppler", "without_free_water"])  # fmt: skip
 def test_the_map_cannot_be_redone_without(spoil, long_log):
     """Each ingredient leaves its mark, so that agreement means something."""
     spoilt = copy.copy(long_log)

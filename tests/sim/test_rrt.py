@@ -122,18 +122,11 @@ def serve(s, config=CONFIG, seed=1):
     )
 
 
-def narrow_gap():
-    return wall(10.05, 2.8, 3.3)  # 5 cells: 0.3 m at best, below d_min and above the floor
-
-
-def start_by_an_obstacle():
-    return np.hypot(maps.X - 2.0, maps.Y - 3.6) < 0.4
-
-
 CASES = {
-    "start_outside": (start_by_an_obstacle(), (2.0, 3.0), (18.0, 3.0), CONFIG),
+    "start_outside": (np.hypot(maps.X - 2.0, maps.Y - 3.6) < 0.4, (2.0, 3.0), (18.0, 3.0), CONFIG),
     "goal_outside": (np.hypot(maps.X - 18.0, maps.Y - 3.6) < 0.4, (2.0, 3.0), (18.0, 3.0), CONFIG),
-    "disconnected": (narrow_gap(), (2.0, 3.0), (18.0, 3.0), CONFIG),
+    # 5 cells: 0.3 m at best, below d_min and above the floor
+    "disconnected": (wall(10.05, 2.8, 3.3), (2.0, 3.0), (18.0, 3.0), CONFIG),
     "budget": (np.abs(maps.X - 12.0) < 0, (19.4, 3.0), (2.0, 1.0), None),
 }
 

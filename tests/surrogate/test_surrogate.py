@@ -366,15 +366,12 @@ def test_a_track_out_of_sight_follows_a_circle_and_else_goes_straight():
 
 
 def test_what_is_seen_badly_is_born_late_or_missed():
-    told = [born_of(watched(2.0, steps)).mean() for steps in (1, 3, 5, 9)]
+    told = []
+    for steps in (1, 3, 5, 9):
+        track = watched(2.0, steps)
+        tracked(track[:, None].contiguous(), born := np.zeros(len(track), np.int32))
+        told.append(born.mean())
     assert 0.7 < told[0] < told[1] < told[2] < told[3] < 0.99
-
-
-def born_of(track):
-    """1 where the tracker has the body."""
-    out = np.zeros(len(track), np.int32)
-    tracked(track[:, None].contiguous(), out)
-    return out
 
 
 # ----------------------------------------------------------------------------------------------- the policy

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import math
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from tests.command import uuv
 from tests.conftest import estimate_pose
 from uuvtai.common.errors import SettingError
 from uuvtai.config.loader import load_config
+from uuvtai.evaluation.episodes import Job
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import records
@@ -35,11 +35,6 @@ STEPS, SEED = 90, 77001
 END = SimpleNamespace(
     outcome="cut", episode_return=0.0, time_s=1.8, min_clearance_m=1.0, replans={}, planned_by={}
 )
-
-
-class Job(NamedTuple):
-    seed: int
-    episode: int
 
 
 def recorded(small, folder, depth_images=True, steps=STEPS, lost_at=None):

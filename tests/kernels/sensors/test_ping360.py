@@ -2,7 +2,6 @@
 
 import json
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ import torch
 from tests.small_sim import sim_with_one_beam
 from uuvtai.config import Config, SensorsConfig
 from uuvtai.config.loader import load_config
+from uuvtai.evaluation.episodes import Job
 from uuvtai.logs.drawing import load_recording
 from uuvtai.logs.encode import EpisodeHeader, Moment
 from uuvtai.logs.topics.sensors import SONAR_ROWS
@@ -25,11 +25,6 @@ END = SimpleNamespace(
 )
 CONFIG = load_config("pool", "ping360")
 SONAR = CONFIG.sensors.sonar
-
-
-class Job(NamedTuple):
-    seed: int
-    episode: int
 
 
 @pytest.fixture(scope="module")

@@ -282,17 +282,6 @@ def points_power(points, normals, area, beams):
     return out
 
 
-def sphere_points(rng, centre, radius, n):
-    normal = rng.normal(size=(n, 3))
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    return np.array(centre) + radius * normal, normal, 4 * np.pi * radius**2 / n
-
-
-def floor_points(rng, depth, n):
-    at = np.column_stack([rng.uniform(0, 12, n), rng.uniform(-12, 12, n), np.full(n, -depth)])
-    return at, np.tile([0.0, 0.0, 1.0], (n, 1)), 12.0 * 24.0 / n
-
-
 def rendered(scene, beams):
     bearing, power = echo_power(scene, 0.0, np.zeros(3), 0.0, FAN, FAN_BINS)
     return multibeam.beam_pattern(beams[:, None] - bearing[None]) ** 2 @ power
@@ -303,7 +292,9 @@ def test_a_sphere_returns_what_its_points_return(centre):
     """Power in all to 5 %, power of each beam to 6 % of the strongest."""
     beams = np.radians(np.arange(-40, 40.1, 0.5))
     found = rendered(scene_of(body("sphere", list(centre), [0.4] * 3)), beams)
-    truth = points_power(*sphere_points(np.random.default_rng(1), centre, 0.4, 400_000), beams)
+    normal = np.random.default_rng(1).normal(size=(n := 400_000, 3))
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    truth = points_power(np.array(centre) + 0.4 * normal, normal, 4 * np.pi * 0.4**2 / n, beams)
     assert found.sum() == pytest.approx(truth.sum(), rel=0.05)
     assert np.abs(found.sum(1) - truth.sum(1)).max() < 0.06 * truth.sum(1).max()
     near, far = (np.flatnonzero(t.sum(0) > 0.02 * t.sum(0).max())[[0, -1]] for t in (found, truth))
@@ -314,7 +305,9 @@ def test_the_floor_returns_what_its_points_return():
     """1.2 m below: it folds into the image from 1.2 m on."""
     beams = np.radians([-30.0, 0.0, 20.0])
     found = rendered(scene_of(z_m=[-1.2, 40.0]), beams)
-    truth = points_power(*floor_points(np.random.default_rng(2), 1.2, 2_000_000), beams)
+    rng, n = np.random.default_rng(2), 2_000_000
+    at = np.column_stack([rng.uniform(0, 12, n), rng.uniform(-12, 12, n), np.full(n, -1.2)])
+    truth = points_power(at, np.tile([0.0, 0.0, 1.0], (n, 1)), 12.0 * 24.0 / n, beams)
     assert not found[:, : int(1.15 / 12 * FAN_BINS)].any()
     for low, high in ((2.0, 4.0), (4.0, 7.0), (7.0, 11.0)):
         part = slice(int(low / 12 * FAN_BINS), int(high / 12 * FAN_BINS))

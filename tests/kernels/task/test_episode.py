@@ -85,15 +85,18 @@ def test_nothing_happens_in_open_water(court):
 
 @pytest.mark.parametrize(
     "pos",
-    [(-0.01, 3, -0.8), (20.01, 3, -0.8), (10, -0.01, -0.8), (10, 6.01, -0.8), (10, 3, 0.01), (10, 3, -1.61)],
+    [
+        (-0.01, 3, -0.8),
+        (20.01, 3, -0.8),
+        (10, -0.01, -0.8),
+        (10, 6.01, -0.8),
+        (10, 3, 0.01),
+        (10, 3, -1.61),
+        (float("nan"), 3, -0.8),
+    ],
 )
 def test_out_of_tank(court, pos):
     court.vehicle.pos_w[0] = pos
-    assert outcome(court.judge()) == "out_of_tank"
-
-
-def test_a_state_that_is_not_finite_is_out_of_tank(court):
-    court.vehicle.pos_w[0] = (float("nan"), 3, -0.8)
     assert outcome(court.judge()) == "out_of_tank"
 
 

@@ -304,11 +304,6 @@ def test_the_log_s_closed_form_gives_the_same_positions(any_world):
 # ---------------------------------------------------------------------------------- distributions of the pool
 
 
-def share_in_lower_half(values, low, high):
-    values = np.ravel(values)
-    return abs(np.mean(values < 0.5 * (low + high)) - 0.5) * 2 * np.sqrt(len(values))
-
-
 def test_pool_draws_are_uniform():
     of, drawn = drawn_world("pool")
     first, n = of.slots.first_dynamic, of.cfg.n_dynamic
@@ -331,8 +326,9 @@ def test_pool_draws_are_uniform():
         "direction": (drawn["path_radius_m"][:, :n][~line], (-1.0, 1.0)),
         "phase": ((drawn["path_phase_m"] / np.maximum(drawn["path_length_m"], 1e-9))[:, :n], (0.0, 1.0)),
     }
-    for name, (values, interval) in columns.items():
-        assert share_in_lower_half(values, *interval) < SHARE_SIGMAS, name
+    for name, (values, (low, high)) in columns.items():
+        lower_half = np.ravel(values) < 0.5 * (low + high)
+        assert abs(lower_half.mean() - 0.5) * 2 * np.sqrt(lower_half.size) < SHARE_SIGMAS, name
     assert np.ptp(drawn["pos_w"][:, :first, 0][cylinders | boxes]) > 18.0
 
 
