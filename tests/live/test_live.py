@@ -219,7 +219,7 @@ def test_the_number_of_clients_is_bounded_and_a_place_becomes_free(server):
     end = time.monotonic() + 30
     while True:
         try:
-            return open_socket(server.port)
+            return open_socket(server.port).close()
         except (InvalidHandshake, ConnectionClosed):
             assert time.monotonic() < end
             time.sleep(0.05)
