@@ -178,10 +178,8 @@ def fold_cells(env, row, word, statics, dynamics, free, points, io: Bundle[Mappi
     alive = io.grid_map.alive[env, row, word]
     left = alive | statics | dynamics | points
     if left != 0:
-        static_occupied, dynamic_occupied = (
-            io.grid_map.static_occupied[env, row, word],
-            io.grid_map.dynamic_occupied[env, row, word],
-        )
+        static_occupied = io.grid_map.static_occupied[env, row, word]
+        dynamic_occupied = io.grid_map.dynamic_occupied[env, row, word]
         while left != 0:
             i = lowest_bit(left)
             left = without_lowest(left)
@@ -195,18 +193,14 @@ def fold_cells(env, row, word, statics, dynamics, free, points, io: Bundle[Mappi
                 bit_of(points, i),
                 io,
             )
-            io.grid_map.static_occ[env, row, col], io.grid_map.dynamic_occ[env, row, col] = (
-                static_new,
-                dynamic_new,
-            )
+            io.grid_map.static_occ[env, row, col] = static_new
+            io.grid_map.dynamic_occ[env, row, col] = dynamic_new
             alive = with_bit(alive, i, (static_new > 0.0) | (dynamic_new > 0.0))
             static_occupied = with_bit(static_occupied, i, static_new >= io.mapping_cfg.occupied)
             dynamic_occupied = with_bit(dynamic_occupied, i, dynamic_new >= io.mapping_cfg.occupied)
         io.grid_map.alive[env, row, word] = alive
-        io.grid_map.static_occupied[env, row, word], io.grid_map.dynamic_occupied[env, row, word] = (
-            static_occupied,
-            dynamic_occupied,
-        )
+        io.grid_map.static_occupied[env, row, word] = static_occupied
+        io.grid_map.dynamic_occupied[env, row, word] = dynamic_occupied
 
 
 @ti.func
