@@ -205,19 +205,15 @@ def fold_cells(env, row, word, statics, dynamics, free, points, io: Bundle[Mappi
 
 @ti.func
 def fetch_cells(env, slot, io: Bundle[MappingIO]):
-    """Read one number of every line of eight cells that holds something, and one of the counters of every
-    word that is not all confident, so that memory answers many of them at once and not one after another."""
-    fetched, counted = 0.0, ti.cast(0, ti.u64)
+    """Read one number of every word that holds something, so that memory answers many of them at once and not
+    one after another."""
+    fetched = 0.0
     for row in range(ti.static(io.grid_map.alive.shape[1])):
         for word in range(ti.static(io.grid_map.alive.shape[2])):
-            left = io.grid_map.alive[env, row, word]
-            while left != 0:
-                i = lowest_bit(left)
-                fetched += io.grid_map.static_occ[env, row, word * WORD + i]
-                left &= ~(ti.cast(255, ti.u64) << ti.cast(i & ~7, ti.u64))
-            if io.grid_map.seen[env, row, word] & ~io.grid_map.confident[env, row, word] != 0:
-                counted ^= io.grid_map.free_scans[env, row, word][0]
-    io.map_scratch.fetched[slot] = fetched + ti.cast(counted & ti.cast(1, ti.u64), ti.f32)
+            alive = io.grid_map.alive[env, row, word]
+            if alive != 0:
+                fetched += io.grid_map.static_occ[env, row, word * WORD + lowest_bit(alive)]
+    io.map_scratch.fetched[slot] = fetched
 
 
 @ti.func
