@@ -1,4 +1,4 @@
-"""NumPy float64 oracle of the clean sonar by the design page's rules: segments, quadratics, no spans."""
+"""NumPy float64 oracle of the clean sonar: segments, quadratics, no spans."""
 
 import numpy as np
 

@@ -31,7 +31,7 @@ FAIL_NONE, FAIL_START_OUTSIDE, FAIL_GOAL_OUTSIDE, FAIL_DISCONNECTED, FAIL_BUDGET
 
 # ---- What a learned forecast is told and what it says, in numbers: read by its kernels and by what learns.
 
-PACKET = 16  # columns and units come in whole packets (``kernels.core.lanes.LANES``)
+PACKET = 16  # columns and units come in whole packets (``kernels.core.simd.LANES``)
 
 N_PAST, PAST_S = 10, 0.3  # places remembered of each track, and the time between them
 N_BEND = 4  # turns remembered of each track

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 START_S = 2.0  # a younger episode starts in danger: evading takes a second, obstacles start 1.5 m away
 UNDETECTED_S = 0.3  # out of the sonar's fan all this time before the end (no track 0.3 s before)
 TURN_S = 1.2
-"""An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it
+"""An unannounced turn lies within this before the end, and the forecast made just before it
 was off by more than MISS_M at the end, or there was none."""
 CLEAR_M = 0.1
 """An obstacle remembered farther above or below counts as clear of the own depth (the termination check's

@@ -232,7 +232,7 @@ def summary(
     wall_s: float,
     env_steps_per_s: float | None = None,
 ) -> dict[str, Any]:
-    """One agent's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never
+    """One agent's entry of ``uuv eval --json``; rates without episodes are None, never
     NaN.
 
     ``env_steps_per_s`` is a ``StepClock``'s: of simulating alone, where ``wall_s`` is all the time that the

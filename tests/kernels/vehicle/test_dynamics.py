@@ -18,7 +18,7 @@ from uuvtai.config import Config, VehicleConfig
 from uuvtai.sim.plant import Plant
 
 POSITION_M, SPEED_M_S, ANGLE_DEG = 0.01, 0.01, 0.3
-"""What the design page asks for at the 0.01 s substep."""
+"""What is asked for at the 0.01 s substep."""
 
 PRINTED = 0.5e-3
 """The table prints three decimals."""
