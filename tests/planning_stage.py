@@ -1,14 +1,12 @@
 """The structs of planning, allocated once for all its tests, and how to fill them by hand."""
 
 from functools import lru_cache
-from types import SimpleNamespace
 
 import numpy as np
 
 from tests import planning_maps as maps
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.oracles.voronoi import clearance_of
-from uuvtai import state
 from uuvtai.config import Config
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.sim.setup import load_bounds
@@ -22,7 +20,7 @@ CONFIG = Config()
 
 @lru_cache(maxsize=1)
 def stage():
-    """Every struct of planning by the name sim.py gives it."""
+    """Every struct of planning."""
     sizes = {
         "n_env": N_ENV,
         "n_plan": N_PLAN,
@@ -39,19 +37,7 @@ def stage():
         "n_forecast": 26,
         "n_ray": 16,
     }
-    structs = {
-        "voronoi": state.VoronoiState,
-        "route": state.RouteState,
-        "clearance": state.ClearanceState,
-        "grid_map": state.MapState,
-        "mask": state.GridMask,
-        "mission": state.MissionState,
-        "ego": state.Proprioception,
-        "forecast": state.ForecastState,
-        "scan": state.SonarScan,
-        "clock": state.ClockState,
-    }
-    s = SimpleNamespace(**{name: state.allocate(struct, sizes) for name, struct in structs.items()})
+    s = Stage(**sizes)
     load_bounds(s.mask, maps.OUTSIDE)
     return s
 
@@ -61,25 +47,15 @@ def clean():
     from uuvtai.kernels.planning.route import reset_route
 
     s = stage()
-    s.clock.active.fill(1)
-    s.clock.running.fill(1)
-    s.clock.step.fill(0)
-    for field in (
-        s.grid_map.static_occ,
-        s.grid_map.dynamic_occ,
-        s.ego.vel_b,
-        s.ego.rpy,
-        s.scan.hit,
-        s.scan.doppler_m_s,
-        s.route.n_queue,
-    ):
-        field.fill(0)
-    s.scan.range_m.fill(12.0)
-    s.forecast.radius_m.fill(-1.0)
-    s.forecast.pos_w.fill(0.0)
+    put(s.clock, active=1, running=1, step=0)
+    put(s.grid_map, static_occ=0, dynamic_occ=0)
+    put(s.ego, vel_b=0, rpy=0)
+    put(s.scan, hit=0, doppler_m_s=0, range_m=12.0)
+    s.route.n_queue[None] = 0
+    put(s.forecast, radius_m=-1.0, pos_w=0.0)
     put_maps([np.zeros(maps.SHAPE, bool)] * N_ENV)
     put_ends([(2.0, 3.0)] * N_ENV, [(18.0, 3.0)] * N_ENV)
-    reset_route(io_for(RouteIO, s.route, s.clock))
+    reset_route(s.io(RouteIO))
     return s
 
 
@@ -88,15 +64,14 @@ def put_maps(occupied, layer="static_occ", max_m=2.0):
     s = stage()
     getattr(s.grid_map, layer).from_numpy(np.array(occupied, np.float32))
     found = [clearance_of(occ | maps.OUTSIDE, maps.CELL_M, max_m) for occ in occupied]
-    s.clearance.clearance_m.from_numpy(np.array([f[0] for f in found], np.float32))
-    s.clearance.site_row.from_numpy(np.array([f[1] for f in found], np.int16))
-    s.clearance.site_col.from_numpy(np.array([f[2] for f in found], np.int16))
+    clearance_m, row, col = map(np.array, zip(*found, strict=True))
+    put(s.clearance, clearance_m=clearance_m, site_row=row, site_col=col)
 
 
 def put_ends(starts, goals, z=-0.8):
     s = stage()
-    s.ego.pos_w.from_numpy(np.array([(*p, z) for p in starts], np.float32))
-    s.mission.goal_w.from_numpy(np.array([(*p, z) for p in goals], np.float32))
+    put(s.ego, pos_w=[(*p, z) for p in starts])
+    put(s.mission, goal_w=[(*p, z) for p in goals])
 
 
 def plan(envs=range(N_ENV), config=CONFIG):
@@ -107,7 +82,7 @@ def plan(envs=range(N_ENV), config=CONFIG):
     queue[: len(envs)] = list(envs)
     s.route.queue.from_numpy(queue)
     s.route.n_queue[None] = len(envs)
-    plan_routes(io_for(RouteIO, s, config))
+    plan_routes(s.io(RouteIO, config))
     return s.route
 
 

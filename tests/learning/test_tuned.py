@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 import torch
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from uuvtai.common.errors import UserError
 from uuvtai.config import FastConfig, SlowConfig
 from uuvtai.config.behavior import (
@@ -39,7 +39,6 @@ from uuvtai.learning.parameter_search import (
 )
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.sim.setup import fill_constants
-from uuvtai.state import BehaviorState, allocate
 
 SMALL = {
     "train.num_envs": 8,
@@ -129,13 +128,11 @@ def _factors(out: AnyTensor, io: Bundle[BehaviorIO]):
 
 
 def test_what_holds_follows_from_the_speed_of_the_obstacles():
-    sizes = {"n_env": 4, "n_node": 1, "n_candidate": 16, "n_tuned": len(TUNED)}
-    behavior, out = allocate(BehaviorState, sizes), np.zeros(4, np.float32)
+    stage, out = Stage(n_env=4, n_node=1, n_candidate=16, n_tuned=len(TUNED)), np.zeros(4, np.float32)
     factors = np.zeros((4, len(TUNED), 2), np.float32)
     factors[:, HYSTERESIS] = np.log([4.0, 0.25])
-    behavior.tuned.from_numpy(factors)
-    behavior.alert.from_numpy(np.array([-1.0, 0.0, 0.5, 1.0], np.float32))
-    _factors(out, io_for(BehaviorIO, behavior))
+    put(stage.behavior, tuned=factors, alert=[-1.0, 0.0, 0.5, 1.0])
+    _factors(out, stage.io(BehaviorIO))
     assert out == pytest.approx([4.0, 4.0, 1.0, 0.25]), "nothing tracked, slow, between, fast"
 
 

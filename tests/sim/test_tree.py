@@ -10,8 +10,7 @@ from rich.console import Console
 
 from benchmarks.peers.tick_py_trees import PyTree
 from docs.writers.palettes import with_palette
-from tests.bundles import io_for
-from uuvtai import state
+from tests.bundles import Stage, put
 from uuvtai.common import tree_codes as codes
 from uuvtai.common.presets import preset_names
 from uuvtai.config import BehaviorConfig
@@ -196,22 +195,18 @@ def test_text_and_dot_name_every_node_and_its_use():
 
 @pytest.fixture(scope="module")
 def engine():
-    sizes = {"n_env": N_BOARD, "n_node": MAX_NODE, "n_candidate": 16, "n_tuned": len(TUNED)}
-    return state.allocate(state.BehaviorState, sizes), state.allocate(state.TreeTable, sizes)
+    return Stage(n_env=N_BOARD, n_node=MAX_NODE, n_candidate=16, n_tuned=len(TUNED))
 
 
 def begin(engine, flat):
-    behavior, table = engine
-    behavior_tree.load_tree(table, flat)
-    for array in (behavior.status, behavior.running_child, behavior.ticks):
-        array.fill(0)
+    behavior_tree.load_tree(engine.table, flat)
+    put(engine.behavior, status=0, running_child=0, ticks=0)
 
 
 def tick(engine, answers):
     """Statuses [env, node] after a tick with the given leaf answers, and the acting node."""
-    behavior, table = engine
-    tick_with_given_statuses(io_for(BehaviorIO, behavior, table), np.ascontiguousarray(answers, np.int32))
-    return behavior.status.to_numpy(), behavior.leaf.to_numpy()
+    tick_with_given_statuses(engine.io(BehaviorIO), np.ascontiguousarray(answers, np.int32))
+    return engine.behavior.status.to_numpy(), engine.behavior.leaf.to_numpy()
 
 
 def random_tree(rng) -> behavior_tree.FlatTree:
@@ -264,7 +259,7 @@ def test_engine_equals_py_trees_node_by_node(engine):
                 ]
                 assert acting[env] == (did[-1] if did else -1)
                 compared += n
-        np.testing.assert_array_equal(engine[0].ticks.to_numpy()[:, :n], counts)
+        np.testing.assert_array_equal(engine.behavior.ticks.to_numpy()[:, :n], counts)
     assert compared > 100_000
 
 
@@ -307,7 +302,7 @@ def test_priority_halts_what_ran_below(engine):
 def test_tree_that_does_not_fit_is_refused(engine):
     with pytest.raises(behavior_tree.TreeError, match="do not fit"):
         behavior_tree.load_tree(
-            engine[1],
+            engine.table,
             behavior_tree.parse_tree(xml("<Sequence>" + "<Hold/>" * (MAX_NODE + 1) + "</Sequence>")),
         )
 

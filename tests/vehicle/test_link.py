@@ -119,6 +119,11 @@ def attitude(intake, yaw=0.0, come_s=0.0, **fields):
     return taken(intake, "ATTITUDE", come_s, **({"time_boot_ms": round(1e3 * come_s)} | given | fields))
 
 
+@pytest.fixture
+def intake():
+    return Intake(CONFIG, START, 0.0)
+
+
 def test_axes_of_the_attitude():
     """A bow up and a turn to starboard are positive there, a bow down and a turn to port here."""
     intake = Intake(CONFIG, START, math.radians(30))
@@ -183,8 +188,7 @@ def test_the_height_of_a_position_is_the_pressure_sensors():
     assert later[0].pos_w[2] == pytest.approx(START[2] + 0.2), "an old depth tells nothing"
 
 
-def test_depth_is_zeroed_at_the_start_and_the_sensor_in_the_water_counts():
-    intake = Intake(CONFIG, START, 0.0)
+def test_depth_is_zeroed_at_the_start_and_the_sensor_in_the_water_counts(intake):
     hpa = CONFIG.vehicle.water_density_kg_m3 * CONFIG.vehicle.gravity_m_s2 / 100
     rest = {"press_diff": 0.0, "temperature": 20, "time_boot_ms": 0}
     assert taken(intake, "SCALED_PRESSURE", press_abs=1000.0, **rest)[0].depth_m == pytest.approx(0.8)
@@ -203,8 +207,7 @@ def obstacles(intake, distances, **fields):
     return taken(intake, "OBSTACLE_DISTANCE", **(given | fields))
 
 
-def test_sectors_become_beams_clockwise_to_counter_clockwise():
-    intake = Intake(CONFIG, START, 0.0)
+def test_sectors_become_beams_clockwise_to_counter_clockwise(intake):
     distances = [1201] * 72
     distances[0], distances[71] = 300, 700
     (ping,) = obstacles(intake, distances)
@@ -239,8 +242,7 @@ def test_there_and_back_keeps_the_nearest_return():
         ({"angle_offset": math.inf}, "not finite"),
     ],
 )
-def test_a_scan_that_would_lie_is_refused(fields, says):
-    intake = Intake(CONFIG, START, 0.0)
+def test_a_scan_that_would_lie_is_refused(fields, says, intake):
     assert obstacles(intake, [300] * 72, **fields) == []
     (reason,) = intake.heard.refused
     assert re.search(says, reason)
@@ -251,9 +253,8 @@ def test_a_scan_that_would_lie_is_refused(fields, says):
     [(300, True), (1200, True), (20, True), (0, True), (1201, False)]
     + [(blind, None) for blind in (1, 19, 1202, 65534, 65535)],
 )
-def test_a_sector_counts_as_mavlink_says(distance, hits):
+def test_a_sector_counts_as_mavlink_says(distance, hits, intake):
     """0 is a touch, one beyond the maximum is free water; what is unknown, or not measurable, is neither."""
-    intake = Intake(CONFIG, START, 0.0)
     found = obstacles(intake, [300] * 71 + [distance])
     if hits is None:
         assert found == [] and len(intake.heard.refused) == 1
@@ -261,8 +262,7 @@ def test_a_sector_counts_as_mavlink_says(distance, hits):
         assert found[0].hit[0] == hits
 
 
-def test_rangefinders_around_the_hull_are_a_ring():
-    intake = Intake(CONFIG, START, 0.0)
+def test_rangefinders_around_the_hull_are_a_ring(intake):
     ranger = {
         "time_boot_ms": 0, "min_distance": 20, "max_distance": 1200, "type": 1, "id": 0, "covariance": 0,
     }  # fmt: skip
@@ -279,8 +279,7 @@ def test_rangefinders_around_the_hull_are_a_ring():
     assert taken(intake, "DISTANCE_SENSOR", 9.0, orientation=0, current_distance=500, **later) == []
 
 
-def test_who_is_heard():
-    intake = Intake(CONFIG, START, 0.0)
+def test_who_is_heard(intake):
     beat = {"type": 12, "autopilot": 3, "base_mode": 129, "custom_mode": 4}
     taken(intake, "HEARTBEAT", 1.0, component=191, **beat)
     taken(intake, "HEARTBEAT", 1.0, system=7, **beat)
@@ -303,8 +302,7 @@ OF_OTHERS = (*KINDS["dvl"], *KINDS["sonar"])
     ("sender", "is_heard"),
     [((1, 1), True), ((1, 154), "others"), ((255, 0), "others"), ((255, 190), False), ((2, 1), False)],
 )
-def test_each_kind_of_message_counts_from_its_own_senders(name, sender, is_heard):
-    intake = Intake(CONFIG, START, 0.0)
+def test_each_kind_of_message_counts_from_its_own_senders(name, sender, is_heard, intake):
     intake.take(name, *sender, {"broken": math.nan}, 0.0)
     (why,) = intake.heard.refused
     if is_heard is True or (is_heard and name in OF_OTHERS):
@@ -330,8 +328,7 @@ def test_senders_that_are_typed_count_in_place_of_the_usual_ones(texts, name, he
     assert not any(senders.counts(name, *one) for one in left_out)
 
 
-def test_what_a_payload_says_of_itself_is_not_the_autopilots():
-    intake = Intake(CONFIG, START, 0.0)
+def test_what_a_payload_says_of_itself_is_not_the_autopilots(intake):
     attitude(intake)
     empty = {"id": 0, "voltages": [11000] + [65535] * 9, "battery_remaining": 5}
     taken(intake, "BATTERY_STATUS", component=100, **empty)
@@ -340,8 +337,7 @@ def test_what_a_payload_says_of_itself_is_not_the_autopilots():
     assert "BATTERY_STATUS of 1/100 (heard by --sender battery=1/100), 1 times" in intake.heard.left_out()
 
 
-def test_what_is_left_out_is_bounded_and_the_commonest_is_named():
-    intake = Intake(CONFIG, START, 0.0)
+def test_what_is_left_out_is_bounded_and_the_commonest_is_named(intake):
     for component in range(2, 200):
         for _ in range(1 + 2 * (component == 9)):
             intake.take("ATTITUDE", 1, component, {}, 0.0)
@@ -357,13 +353,11 @@ def dvl(intake, come_s, stamp_s):
 
 
 @pytest.mark.parametrize("stamp_s", [0.0, 77.0, 1.7e9])
-def test_a_dvl_without_a_clock_is_dated_by_its_arrival(stamp_s):
-    intake = Intake(CONFIG, START, 0.0)
+def test_a_dvl_without_a_clock_is_dated_by_its_arrival(stamp_s, intake):
     assert [dvl(intake, 0.1 * k, stamp_s)[0].time_s for k in range(90)] == [0.1 * k for k in range(90)]
 
 
-def test_a_late_attitude_replaces_no_newer_one_and_a_restart_counts_for_all_messages():
-    intake = Intake(CONFIG, START, 0.0)
+def test_a_late_attitude_replaces_no_newer_one_and_a_restart_counts_for_all_messages(intake):
     for k in range(200):
         attitude(intake, yaw=0.01, come_s=100 + 0.02 * k)
         dvl(intake, 100 + 0.02 * k, 50 + 0.02 * k)
@@ -380,8 +374,7 @@ def test_a_late_attitude_replaces_no_newer_one_and_a_restart_counts_for_all_mess
     assert depth.time_s == 120.2
 
 
-def test_the_same_message_again_makes_nothing_younger():
-    intake = Intake(CONFIG, START, 0.0)
+def test_the_same_message_again_makes_nothing_younger(intake):
     for k in range(10):
         attitude(intake, come_s=1 + 0.02 * k)
     for k in range(100):
@@ -391,9 +384,8 @@ def test_the_same_message_again_makes_nothing_younger():
     assert attitude(intake, yaw=0.1, come_s=3.2, time_boot_ms=3200)[0].time_s == 3.2
 
 
-def test_a_battery_that_is_silent_is_known_to_be():
+def test_a_battery_that_is_silent_is_known_to_be(intake):
     """Not told: 0 V, 65535, -1. Of two tellers the lower one counts while it speaks."""
-    intake = Intake(CONFIG, START, 0.0)
     heard = intake.heard
 
     def status(come_s, millivolts, share=-1):

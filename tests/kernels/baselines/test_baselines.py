@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.command import uuv
 from tests.conftest import launch_one_by_one
 from tests.small_sim import SmallSim
-from uuvtai import state
 from uuvtai.config.planning import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.dwa import plan_dynamic_window
 from uuvtai.kernels.baselines.io import LocalPlannerIO
@@ -234,31 +233,27 @@ def test_mppi_is_the_same_in_any_row_and_beside_any_others(scene):
 
 
 READ = {
-    "clock": (state.ClockState, ("active", "step")),
-    "ego": (state.Proprioception, ("pos_w", "vel_b", "rpy")),
-    "mission": (state.MissionState, ("start_w", "goal_w")),
-    "behavior": (state.BehaviorState, ("follow_vel_w",)),
-    "forecast": (state.ForecastState, ("pos_w", "radius_m", "above_w", "below_w")),
-    "clearance": (state.ClearanceState, ("clearance_m",)),
+    "clock": ("active", "step"),
+    "ego": ("pos_w", "vel_b", "rpy"),
+    "mission": ("start_w", "goal_w"),
+    "behavior": ("follow_vel_w",),
+    "forecast": ("pos_w", "radius_m", "above_w", "below_w"),
+    "clearance": ("clearance_m",),
 }
 """What MPPI reads."""
 
 
 def test_mppi_is_the_same_in_a_batch_of_another_size(scene):
     body(scene, 0, 0, near(1.5, 0.1), [-0.5, 0.0])
-    sizes = array_sizes(scene.config, 64)
-    parts = {"baselines": state.allocate(state.BaselineState, sizes)}
-    for noun, (kind, names) in READ.items():
-        parts[noun] = state.allocate(kind, sizes)
-        for name in names:
-            getattr(parts[noun], name).from_numpy(np.repeat(scene.views[f"{noun}.{name}"][:1], 64, 0))
-    io = io_for(LocalPlannerIO, *parts.values(), scene.config)
+    stage = Stage(**array_sizes(scene.config, 64))
+    for noun, names in READ.items():
+        put(getattr(stage, noun), **{name: scene.views[f"{noun}.{name}"][0] for name in names})
     for step in (0, 5):
         scene.views["clock.step"][:] = step
-        parts["clock"].step.from_numpy(np.full(64, step, np.int32))
+        put(stage.clock, step=step)
         wanted = decide(scene, "mppi")[0]
-        plan_path_integral(io)
-        np.testing.assert_array_equal(parts["baselines"].vel_w.to_numpy(), np.tile(wanted, (64, 1)))
+        plan_path_integral(stage.io(LocalPlannerIO, scene.config))
+        np.testing.assert_array_equal(stage.baselines.vel_w.to_numpy(), np.tile(wanted, (64, 1)))
 
 
 # ------------------------------------------------------------------------------------------------------ whole

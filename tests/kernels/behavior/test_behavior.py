@@ -1,7 +1,6 @@
 """Threats, evasion and the tree's leaves in hand-made situations, and the packets against a NumPy oracle."""
 
 import dataclasses
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,8 @@ import taichi as ti
 import torch
 
 from tests import bundles
-from tests.bundles import io_for
+from tests.bundles import Stage
 from tests.oracles import behavior as oracle
-from uuvtai import state
 from uuvtai.config import BehaviorConfig, Config
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.behavior import avoidance, threats, tree
@@ -70,52 +68,37 @@ CLOSE_M = 1e-4
 in float32; such candidates are not compared."""
 OPEN_M = FAR_M
 """Height of free water that nothing bounds."""
-STRUCTS = {
-    "t": state.BehaviorState, "route": state.RouteState, "forecast": state.ForecastState,
-    "futures": state.FutureState, "tracks": state.TrackState, "scan": state.SonarScan,
-    "clearance": state.ClearanceState, "ego": state.Proprioception, "clock": state.ClockState,
-    "mission": state.MissionState, "table": state.TreeTable, "baselines": state.BaselineState,
-}  # fmt: skip
-
-
-class Sizes(dict):
-    """Axes that this stage does not touch are short."""
-
-    def __missing__(self, name):
-        return 1
 
 
 @pytest.fixture(scope="module")
 def stage():
-    made = SimpleNamespace(**{name: state.allocate(struct, Sizes(SIZES)) for name, struct in STRUCTS.items()})
+    made = Rig()
     made.action = torch.zeros(N_ENV, 4)
     return made
+
+
+class Rig(Stage):
+    """Axes that this stage does not touch are short."""
+
+    sizes = SIZES
+    other = 1
 
 
 @pytest.fixture
 def scene(stage):
     """Every env alike: at (5, 3), facing +x, at rest, open water, look-ahead 1 m ahead, nothing around."""
     bundles.put(stage.clock, active=1, step=0)
-    fill(stage.ego.pos_w, (5.0, 3.0, -0.8))
-    fill(stage.ego.vel_b, (0, 0, 0))
-    fill(stage.ego.rpy, (0, 0, 0))
-    fill(stage.ego.pose_cov, [0] * 6)
-    stage.ego.given_up.fill(0)
-    fill(stage.mission.goal_w, (15.0, 3.0, -0.8))
-    fill(stage.route.lookahead_w, (6.0, 3.0, -0.8))
-    bundles.put(stage.route, n_way=10, n_ahead=0, stuck_steps=0)
+    bundles.put(stage.ego, pos_w=(5.0, 3.0, -0.8), vel_b=0, rpy=0, pose_cov=0, given_up=0)
+    bundles.put(stage.mission, goal_w=(15.0, 3.0, -0.8))
+    bundles.put(stage.route, lookahead_w=(6.0, 3.0, -0.8), n_way=10, n_ahead=0, stuck_steps=0)
     bundles.put(stage.forecast, radius_m=-1.0, pos_w=0.0, above_w=-0.8, below_w=-0.8)
     stage.futures.share.fill(0.0)
     stage.tracks.alive.fill(0)
     bundles.put(stage.scan, fresh=1, hit=0, range_m=12.0, doppler_m_s=0.0, ping_yaw=0.0)
     bundles.put(stage.clearance, clearance_m=2.0, site_row=-1, site_col=-1)
     use(stage, "bt")
-    tree.reset_behavior(io_for(BehaviorIO, stage.t, stage.table, stage.mission, stage.clock))
+    tree.reset_behavior(stage.io(BehaviorIO))
     return stage
-
-
-def fill(field, value):
-    field.from_numpy(np.broadcast_to(np.asarray(value, np.float32), (*field.shape, field.n)).copy())
 
 
 def put(field, value, *index):
@@ -140,11 +123,11 @@ def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
 
 def assess(stage, cfg=CFG.behavior, sonar=CFG.sensors.sonar):
     rest = (CFG.height, CFG.traffic, CFG.vehicle, CFG.tracking, TANK, CFG.mapping, CFG.episode, CFG.fast)
-    threats.assess_threats(io_for(BehaviorIO, stage, cfg, sonar, *rest))
+    threats.assess_threats(stage.io(BehaviorIO, cfg, sonar, *rest))
 
 
 def plan(stage):
-    avoidance.plan_evasion(io_for(BehaviorIO, stage, CFG))
+    avoidance.plan_evasion(stage.io(BehaviorIO, CFG))
 
 
 def decide(stage):
@@ -155,13 +138,13 @@ def decide(stage):
 
 def tick(stage, sonar=CFG.sensors.sonar):
     parts = (CFG.behavior, sonar, CFG.vehicle, TANK, CFG.episode)
-    tree.tick_tree(io_for(BehaviorIO, stage, *parts), stage.action)
+    tree.tick_tree(stage.io(BehaviorIO, *parts), stage.action)
     ti.sync()
 
 
 def acting(stage):
     """Type of the node that set each env's action."""
-    return [stage.tree.types[node] if node >= 0 else None for node in stage.t.leaf.to_numpy()]
+    return [stage.tree.types[node] if node >= 0 else None for node in stage.behavior.leaf.to_numpy()]
 
 
 def step(stage, count=1):
@@ -180,10 +163,10 @@ def test_packets_equal_the_scalar_oracle(scene):
     for _ in range(2):
         random_scene(scene, rng)
         assess(scene)
-        scene.t.want_evade.fill(1)
+        scene.behavior.want_evade.fill(1)
         plan(scene)
         found, chosen, price = (
-            getattr(scene.t, name).to_numpy().astype(float)
+            getattr(scene.behavior, name).to_numpy().astype(float)
             for name in ("candidate_cost", "evade_vel_w", "evade_cost")
         )
         for env in range(N_ENV):
@@ -219,7 +202,7 @@ def random_scene(scene, rng):
     pos = scene.ego.pos_w.to_numpy().astype(float)
     put(scene.mission.goal_w, pos + rng.uniform(-1, 1, (N_ENV, 3)))
     put(scene.route.lookahead_w, pos + rng.uniform(-1, 1, (N_ENV, 3)))
-    put(scene.t.last_vel_w, rng.uniform(-0.5, 0.5, (N_ENV, 3)))
+    put(scene.behavior.last_vel_w, rng.uniform(-0.5, 0.5, (N_ENV, 3)))
     put(scene.clearance.clearance_m, rng.uniform(0.2, 1.5, scene.clearance.clearance_m.shape))
     start = pos[:, None, :2] + rng.uniform(-2.5, 2.5, (N_ENV, N_TRACK, 2))
     speed = rng.uniform(-0.8, 0.8, (N_ENV, N_TRACK, 2))
@@ -251,7 +234,8 @@ class View:
 
     def __init__(self, scene, env):
         follow, last = (
-            getattr(scene.t, name).to_numpy()[env].astype(float) for name in ("follow_vel_w", "last_vel_w")
+            getattr(scene.behavior, name).to_numpy()[env].astype(float)
+            for name in ("follow_vel_w", "last_vel_w")
         )
         yaw = float(scene.ego.rpy.to_numpy()[env, 2])
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
@@ -290,7 +274,7 @@ def test_follow_changes_depth_only_where_that_comes_no_nearer(scene):
         random_scene(scene, rng)
         assess(scene)
         found = (
-            getattr(scene.t, name).to_numpy().astype(float)
+            getattr(scene.behavior, name).to_numpy().astype(float)
             for name in ("follow_vel_w", "conflict_s", "hold_conflict_s")
         )
         follow, conflict, staying = found
@@ -324,7 +308,7 @@ def test_open_water_is_travelled_at_cruise_speed(scene):
     np.testing.assert_allclose(
         scene.action[0], [CFG.behavior.cruise_m_s / CFG.vehicle.max_surge_m_s, 0, 0, 0], atol=1e-5
     )
-    assert scene.t.conflict_s.to_numpy()[0] == scene.t.ttc_s.to_numpy()[0] == FAR_M
+    assert scene.behavior.conflict_s.to_numpy()[0] == scene.behavior.ttc_s.to_numpy()[0] == FAR_M
 
 
 def test_head_on_obstacle_is_evaded_with_room(scene):
@@ -342,8 +326,8 @@ def test_head_on_obstacle_is_evaded_with_room(scene):
             np.hypot(*(at - where).T).min() - 0.2 - CFG.vehicle.hull_radius_m - CFG.vehicle.hull_half_length_m
         )
 
-    assert closest(scene.t.follow_vel_w.to_numpy()[0, :2]) < 0
-    assert closest(scene.t.evade_vel_w.to_numpy()[0, :2]) > CFG.behavior.contact_m
+    assert closest(scene.behavior.follow_vel_w.to_numpy()[0, :2]) < 0
+    assert closest(scene.behavior.evade_vel_w.to_numpy()[0, :2]) > CFG.behavior.contact_m
 
 
 def test_evasion_stays_off_the_wall(scene):
@@ -355,28 +339,28 @@ def test_evasion_stays_off_the_wall(scene):
         put(scene.route.lookahead_w, (6.0, 2.2, -0.8), env)
         body(scene, env, 0, (7.0, 2.2 + offset), (-0.6, 0.0))
     decide(scene)
-    assert (scene.t.evade_vel_w.to_numpy()[:2, 1] > 0).all()
+    assert (scene.behavior.evade_vel_w.to_numpy()[:2, 1] > 0).all()
 
 
 def test_last_command_breaks_the_tie(scene):
     """Hysteresis: of two mirror images the one that goes on with the last command is taken."""
     for env, side in enumerate((0.4, -0.4)):
         body(scene, env, 0, (7.0, 3.0), (-0.6, 0.0))
-        put(scene.t.last_vel_w, (0.3, side, 0.0), env)
+        put(scene.behavior.last_vel_w, (0.3, side, 0.0), env)
     decide(scene)
-    sideways = scene.t.evade_vel_w.to_numpy()[:2, 1]
+    sideways = scene.behavior.evade_vel_w.to_numpy()[:2, 1]
     assert sideways[0] > 0.1 and sideways[1] < -0.1
 
 
 def test_evasion_holds_between_decisions_and_ends_when_calm(scene):
     body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
     decide(scene)
-    held = scene.t.evade_vel_w.to_numpy()[0]
+    held = scene.behavior.evade_vel_w.to_numpy()[0]
     scene.forecast.radius_m.fill(-1.0)
     step(scene, CFG.behavior.decide_period_steps - 1)
-    np.testing.assert_array_equal(scene.t.evade_vel_w.to_numpy()[0], held)
+    np.testing.assert_array_equal(scene.behavior.evade_vel_w.to_numpy()[0], held)
     assert acting(scene)[0] == "Evade"
-    assert scene.t.evading_steps.to_numpy()[0] == CFG.behavior.decide_period_steps
+    assert scene.behavior.evading_steps.to_numpy()[0] == CFG.behavior.decide_period_steps
     step(
         scene, round(CFG.behavior.hysteresis_s / CFG.episode.control_dt_s) + CFG.behavior.decide_period_steps
     )
@@ -400,14 +384,14 @@ def test_sensed_emergency_backs_off_from_it(scene):
     closing_beams(scene, 3, (N_RAY - 1, 0))  # the ring closes
     decide(scene)
     assert acting(scene) == ["BackOff", "FollowRoute", "BackOff", "BackOff", "FollowRoute", "FollowRoute"]
-    velocity = scene.t.last_vel_w.to_numpy()
+    velocity = scene.behavior.last_vel_w.to_numpy()
     assert velocity[0, 1] < -0.8 and abs(velocity[0, 0]) < 0.15
     np.testing.assert_allclose(velocity[2], velocity[0], atol=1e-5)
     assert velocity[3, 0] < -0.8
-    assert scene.t.ttc_s.to_numpy()[0] == pytest.approx(
+    assert scene.behavior.ttc_s.to_numpy()[0] == pytest.approx(
         (0.45 - CFG.behavior.hull_reach_m - CFG.behavior.contact_m) / 0.6, rel=1e-4
     )
-    assert scene.t.nearest_m.to_numpy()[1] == pytest.approx(0.45 - CFG.behavior.hull_reach_m, rel=1e-4)
+    assert scene.behavior.nearest_m.to_numpy()[1] == pytest.approx(0.45 - CFG.behavior.hull_reach_m, rel=1e-4)
 
 
 def test_the_less_sure_of_its_place_the_nearer_are_walls(scene):
@@ -421,7 +405,7 @@ def test_the_less_sure_of_its_place_the_nearer_are_walls(scene):
     ]  # fmt: skip
     put(scene.ego.pose_cov, np.stack(cov, 1))
     assess(scene)
-    for found in (scene.t.clearance_m, scene.t.path_clearance_m):
+    for found in (scene.behavior.clearance_m, scene.behavior.path_clearance_m):
         np.testing.assert_allclose(found.to_numpy(), 1.0 - 2.5 * sigma, atol=1e-5)
 
 
@@ -436,7 +420,7 @@ def test_retreat_does_not_run_into_a_wall(scene):
     assert x0 + (col + 0.5) * CELL < 5.0 and abs(y0 + (row + 0.5) * CELL - 3.0) < 0.1
     decide(scene)
     assert acting(scene)[0] == "BackOff"
-    assert scene.t.last_vel_w.to_numpy()[0, 0] > -0.1
+    assert scene.behavior.last_vel_w.to_numpy()[0, 0] > -0.1
 
 
 def test_stuck_creeps_to_the_end_of_its_time(scene):
@@ -447,7 +431,7 @@ def test_stuck_creeps_to_the_end_of_its_time(scene):
     put(scene.route.stuck_steps, round(CFG.behavior.stuck_s / CFG.episode.control_dt_s), 0)
     decide(scene)
     assert acting(scene)[:2] == ["Unstick", "FollowRoute"]
-    assert scene.t.last_vel_w.to_numpy()[0, 0] > 0.9 * CFG.behavior.unstick_m_s
+    assert scene.behavior.last_vel_w.to_numpy()[0, 0] > 0.9 * CFG.behavior.unstick_m_s
     scene.route.stuck_steps.fill(0)
     step(scene, round(CFG.behavior.unstick_s / CFG.episode.control_dt_s) - 2)
     assert acting(scene)[0] == "Unstick"
@@ -460,7 +444,7 @@ def test_waits_without_a_route_and_before_a_blocked_one(scene):
     x0, y0 = grid_origin(TANK, CELL)
     put(scene.clearance.clearance_m, 0.1, 1, int((3.0 - y0) / CELL), int((5.62 - x0) / CELL))
     decide(scene)
-    names = [scene.tree.names[node] for node in scene.t.leaf.to_numpy()]
+    names = [scene.tree.names[node] for node in scene.behavior.leaf.to_numpy()]
     assert names[0] == "no route" and names[1] == "wait for a free way" and names[2] == "FollowRoute"
     np.testing.assert_array_equal(scene.action[:2], 0.0)
 
@@ -516,13 +500,13 @@ def test_climbs_or_dives_past_what_fills_the_way(scene):
     put(scene.ego.pos_w, (5.0, 3.0, top), 2)
     put(scene.mission.goal_w, (15.0, 3.0, top), 2)
     decide(scene)
-    heave = scene.t.evade_vel_w.to_numpy()[:, 2]
+    heave = scene.behavior.evade_vel_w.to_numpy()[:, 2]
     assert acting(scene) == ["Evade"] * 4 + ["FollowRoute"] * 2
     assert heave[0] > 0.9 * CFG.behavior.heave_m_s and heave[1] < -0.9 * CFG.behavior.heave_m_s
     assert abs(heave[2]) <= 0.05 + 1e-5
     scene.ego.given_up.fill(5)
     decide(scene)
-    assert scene.t.evade_vel_w.to_numpy()[2, 2] < -0.01, "out of the wider gap"
+    assert scene.behavior.evade_vel_w.to_numpy()[2, 2] < -0.01, "out of the wider gap"
     assert abs(heave[3]) < 0.1  # level with it at any depth: heave only leads away from the route
 
 
@@ -534,18 +518,18 @@ def test_patience_falls_while_it_does_not_come_on_and_comes_back(scene):
     for _ in range(50):
         assess(scene)
     waited = 50 * step_s * np.maximum(1 - speeds / CFG.behavior.waiting_m_s, 0)
-    np.testing.assert_allclose(scene.t.waited_s.to_numpy(), waited, atol=1e-4)
+    np.testing.assert_allclose(scene.behavior.waited_s.to_numpy(), waited, atol=1e-4)
     patience = np.minimum(1, CFG.behavior.patience_s / np.maximum(waited, 1e-3))
-    np.testing.assert_allclose(scene.t.patience.to_numpy(), patience, atol=1e-4)
+    np.testing.assert_allclose(scene.behavior.patience.to_numpy(), patience, atol=1e-4)
     put(scene.ego.vel_b, 0.5, slice(None), 0)
     for _ in range(100):
         assess(scene)
-    assert np.all(scene.t.patience.to_numpy() == 1)
+    assert np.all(scene.behavior.patience.to_numpy() == 1)
     endless = CFG.behavior.model_copy(update={"patience_s": 0.0})
-    fill(scene.ego.vel_b, (0, 0, 0))
+    bundles.put(scene.ego, vel_b=0)
     for _ in range(50):
         assess(scene, endless)
-    assert np.all(scene.t.patience.to_numpy() == 1)
+    assert np.all(scene.behavior.patience.to_numpy() == 1)
 
 
 def test_margins_shrink_with_patience(scene):
@@ -553,10 +537,10 @@ def test_margins_shrink_with_patience(scene):
     body(scene, 0, 0, (7.0, 3.75), (0.0, 0.0))
     body(scene, 1, 0, (7.0, 3.75), (0.0, 0.0))
     assess(scene)
-    assert np.all(scene.t.conflict_s.to_numpy()[:2] < FAR_M)
-    put(scene.t.waited_s, 8 * CFG.behavior.patience_s, 1)
+    assert np.all(scene.behavior.conflict_s.to_numpy()[:2] < FAR_M)
+    put(scene.behavior.waited_s, 8 * CFG.behavior.patience_s, 1)
     assess(scene)
-    assert scene.t.conflict_s[0] < FAR_M == scene.t.conflict_s[1]
+    assert scene.behavior.conflict_s[0] < FAR_M == scene.behavior.conflict_s[1]
 
 
 def test_what_is_far_enough_below_is_no_conflict(scene):
@@ -564,7 +548,7 @@ def test_what_is_far_enough_below_is_no_conflict(scene):
     for env, below in enumerate((-0.8, -0.9, -1.5)):
         body(scene, env, 0, (7.0, 3.0), (-0.6, 0.0), above=OPEN_M, below=below)
     decide(scene)
-    conflict = scene.t.conflict_s.to_numpy()
+    conflict = scene.behavior.conflict_s.to_numpy()
     assert acting(scene)[:3] == ["Evade", "Evade", "FollowRoute"]
     assert conflict[0] <= conflict[1] < conflict[2] == FAR_M
 
@@ -582,16 +566,16 @@ def test_stopping_is_safe_beside_the_path_of_a_obstacle(scene):
         load_tree(scene.table, scene.tree)
         decide(scene)
         assert acting(scene) == [*waiting, *["Hold"] * (N_ENV - 3)]
-    assert scene.t.conflict_s.to_numpy()[0] < FAR_M == scene.t.hold_conflict_s.to_numpy()[0]
+    assert scene.behavior.conflict_s.to_numpy()[0] < FAR_M == scene.behavior.hold_conflict_s.to_numpy()[0]
 
 
 def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene):
     """What no velocity reaches is not rolled out: following reaches farther than evading here."""
     body(scene, 0, 0, (6.7, 3.0), (0.0, 0.0))
     assess(scene)
-    sooner = scene.t.conflict_s.to_numpy()[0]
+    sooner = scene.behavior.conflict_s.to_numpy()[0]
     assess(scene, CFG.behavior.model_copy(update={"evade_m_s": 0.1, "back_off_m_s": 0.1, "unstick_m_s": 0.1}))
-    assert scene.t.conflict_s.to_numpy()[0] == sooner < FAR_M
+    assert scene.behavior.conflict_s.to_numpy()[0] == sooner < FAR_M
 
 
 def test_a_dash_gets_out_of_the_way_in_a_narrow_place(scene):
@@ -603,13 +587,13 @@ def test_a_dash_gets_out_of_the_way_in_a_narrow_place(scene):
     )
     body(scene, 0, 0, (5.0, 3.9), (0.0, -1.2), radius=0.25)
     decide(scene)
-    cost = scene.t.candidate_cost.to_numpy()[0]
+    cost = scene.behavior.candidate_cost.to_numpy()[0]
     best, first = cost.argmin(), CFG.behavior.first_burst
     assert acting(scene)[0] == "Evade"
     assert best >= first and cost[best] < cost[:first].min() - 0.3
     velocity, lasts = (pair[best] for pair in View(scene, 0).candidates())
     assert lasts == CFG.behavior.burst_s
-    np.testing.assert_allclose(scene.t.evade_vel_w.to_numpy()[0], velocity, atol=1e-5)
+    np.testing.assert_allclose(scene.behavior.evade_vel_w.to_numpy()[0], velocity, atol=1e-5)
 
 
 def test_candidates_fill_whole_packets():
@@ -635,7 +619,7 @@ def test_actions_point_along_the_wanted_velocity(scene):
         decide(scene)
         action = scene.action.numpy().astype(float)
         assert np.abs(action).max() <= 1
-        velocity = scene.t.last_vel_w.to_numpy()
+        velocity = scene.behavior.last_vel_w.to_numpy()
         for env in range(N_ENV):
             cr, cp, cy = np.cos(rpy[env])
             sr, sp, sy = np.sin(rpy[env])
@@ -657,7 +641,7 @@ def test_faster_than_the_axes_only_on_diagonals(scene):
     """In evasion the body turns a diagonal to its way."""
     body(scene, 0, 0, (6.6, 3.0), (-0.8, 0.0))
     decide(scene)
-    velocity = scene.t.last_vel_w.to_numpy()[0]
+    velocity = scene.behavior.last_vel_w.to_numpy()[0]
     turn = scene.action[0, 3].item() * CFG.vehicle.max_yaw_rate_rad_s / CFG.behavior.yaw_gain
     off = (np.arctan2(velocity[1], velocity[0]) - turn) / (np.pi / 4)
     assert abs(turn) <= np.pi / 4 + 1e-4
@@ -677,7 +661,7 @@ def blocks(scene, env, *ways, clearance_m=0.2):
 def route_ahead(scene, way, lookahead):
     """Own place off the borders of cells, points of the route at ``way`` [n, 2] from there, look-ahead."""
     own = np.array([5.05, 3.03])
-    fill(scene.ego.pos_w, (*own, -0.8))
+    bundles.put(scene.ego, pos_w=(*own, -0.8))
     put(scene.route.ahead_w, own + way)
     scene.route.n_ahead.fill(len(way))
     put(scene.route.lookahead_w, (*(own + lookahead), -0.8))
@@ -695,12 +679,12 @@ def test_round_a_corner_a_nearer_point_of_the_route_is_steered_for(scene):
     blocks(scene, 2, to_sixth)
     blocks(scene, 4, straight, clearance_m=0.43)
     assess(scene)
-    steer, room = scene.t.steer_w.to_numpy(), scene.t.path_clearance_m.to_numpy()
+    steer, room = scene.behavior.steer_w.to_numpy(), scene.behavior.path_clearance_m.to_numpy()
     np.testing.assert_allclose(
         steer, [(1.0, 0.4), (0.2, 0.4), (0.0, 0.4), (0.0, 0.4), (1.0, 0.4), (1.0, 0.4)], atol=1e-5
     )
     np.testing.assert_allclose(room, [2.0, 2.0, 2.0, 2.0, 0.43, 2.0], atol=1e-6)
-    follow = scene.t.follow_vel_w.to_numpy()[:, :2]
+    follow = scene.behavior.follow_vel_w.to_numpy()[:, :2]
     np.testing.assert_allclose(np.arctan2(*follow[:5].T), np.arctan2(*steer[:5].T), atol=1e-5)
     np.testing.assert_allclose(
         np.hypot(*follow[[0, 1, 5]].T), [CFG.behavior.cruise_m_s, CFG.behavior.cruise_m_s, 0.0], atol=1e-5
@@ -717,9 +701,11 @@ def test_where_every_way_is_narrow_the_widest_is_steered_for(scene):
             blocks(scene, env, way, clearance_m=room_m)
     assess(scene)
     np.testing.assert_allclose(
-        scene.t.steer_w.to_numpy()[:4], [(0.0, 0.2), (0.0, 0.4), (1.0, 0.0), (0.0, 0.6)], atol=1e-5
+        scene.behavior.steer_w.to_numpy()[:4], [(0.0, 0.2), (0.0, 0.4), (1.0, 0.0), (0.0, 0.6)], atol=1e-5
     )
-    np.testing.assert_allclose(scene.t.path_clearance_m.to_numpy()[:4], [0.3, 0.32, 0.3, 0.35], atol=1e-6)
+    np.testing.assert_allclose(
+        scene.behavior.path_clearance_m.to_numpy()[:4], [0.3, 0.32, 0.3, 0.35], atol=1e-6
+    )
 
 
 def test_a_narrow_way_is_entered_lengthwise(scene):
@@ -729,7 +715,7 @@ def test_a_narrow_way_is_entered_lengthwise(scene):
     scene.clearance.clearance_m.fill(0.45)
     put(scene.clearance.clearance_m, 0.51, 5)
     assess(scene)
-    speed = np.hypot(*scene.t.follow_vel_w.to_numpy()[:, :2].T)
+    speed = np.hypot(*scene.behavior.follow_vel_w.to_numpy()[:, :2].T)
     here = 0.6 * (0.5 + 0.5 * 0.13 / 0.6)
     np.testing.assert_allclose(
         speed, [here, 0.4 * here, here, 0.7 * here, 0.4 * here, 0.6 * (0.5 + 0.5 * 0.19 / 0.6)], atol=1e-5
@@ -758,15 +744,15 @@ def test_who_is_looked_at(scene):
         [(0.0, 1.9), (1.0, 0.0), (-1.5, 0.0), (0.0, 1.95 + reach), (0.0, 0.0), (0.0, 2.95 + reach)]
     )
     assess(scene)
-    np.testing.assert_allclose(scene.t.heading_w.to_numpy(), wanted, atol=1e-5)
+    np.testing.assert_allclose(scene.behavior.heading_w.to_numpy(), wanted, atol=1e-5)
     nearest = np.array([1.0 - reach, 1.0 - reach, 1.5 - reach, 1.95, 2.05, 2.95])
-    np.testing.assert_allclose(scene.t.obstacle_near_m.to_numpy(), nearest, atol=1e-5)
+    np.testing.assert_allclose(scene.behavior.obstacle_near_m.to_numpy(), nearest, atol=1e-5)
     put(scene.clearance.clearance_m, 0.59, slice(0, 3))
     put(scene.clearance.clearance_m, 0.61, 3)
     blocks(scene, 5, (0.55, 0.05))
     assess(scene)
     np.testing.assert_allclose(
-        scene.t.heading_w.to_numpy(), [*np.zeros((3, 2)), wanted[3], *np.zeros((2, 2))], atol=1e-5
+        scene.behavior.heading_w.to_numpy(), [*np.zeros((3, 2)), wanted[3], *np.zeros((2, 2))], atol=1e-5
     )
 
 
@@ -786,12 +772,12 @@ def turns(
 ):
     """[degree] that the nose is told to turn by; bearings of the gaze and of the velocity, None = none."""
     for name, degrees, length in (("heading_w", gaze, 1.5), (way_of, way, speed)):
-        field = getattr(scene.t, name)
+        field = getattr(scene.behavior, name)
         at = np.array(
             [np.zeros(2) if d is None else polar(d, length) for d in np.broadcast_to(degrees, N_ENV)]
         )
         put(field, np.pad(at, ((0, 0), (0, field.n - 2))))
-    put(scene.t.path_clearance_m, room_m)
+    put(scene.behavior.path_clearance_m, room_m)
     put(
         scene.ego.rpy,
         np.stack([np.zeros(N_ENV), np.zeros(N_ENV), np.radians(np.broadcast_to(yaw, N_ENV))], 1),
@@ -818,7 +804,7 @@ def test_following_the_nose_looks_at_the_obstacle(scene):
     )  # fmt: skip
     np.testing.assert_allclose(found, [20, -30, 10, 20, MOST_DEG, -MOST_DEG], atol=ANGLE_TOLERANCE)
     # the way itself stays
-    np.testing.assert_allclose(np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T), 0.5, atol=1e-6)
+    np.testing.assert_allclose(np.hypot(*scene.behavior.last_vel_w.to_numpy()[:, :2].T), 0.5, atol=1e-6)
 
 
 def test_with_a_fan_ahead_it_turns_before_it_drives(scene):
@@ -829,12 +815,14 @@ def test_with_a_fan_ahead_it_turns_before_it_drives(scene):
     put(scene.route.lookahead_w, np.add(ahead, (5.0, 3.0, -0.8)))
     assess(scene, sonar=fan)
     tick(scene, sonar=fan)
-    speed = np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T)[:6]
+    speed = np.hypot(*scene.behavior.last_vel_w.to_numpy()[:, :2].T)[:6]
     np.testing.assert_allclose(speed / speed[0], [1, 1, 0.5, 0, 0, 0.5], atol=1e-3)
     rate = scene.action.numpy()[:6, 3]
     assert (rate[2:4] > 0).all() and abs(rate[4]) > 0 and rate[5] < 0, "towards the way"
     assess(scene)
-    assert scene.t.speed_share.to_numpy()[4] == scene.t.speed_share.to_numpy()[0], "a ring sees all around"
+    assert scene.behavior.speed_share.to_numpy()[4] == scene.behavior.speed_share.to_numpy()[0], (
+        "a ring sees all around"
+    )
 
 
 def test_waiting_the_nose_looks_at_the_obstacle(scene):
@@ -843,7 +831,7 @@ def test_waiting_the_nose_looks_at_the_obstacle(scene):
         [20, 10, 0, -35, -10, 38],
         atol=ANGLE_TOLERANCE,
     )
-    assert not scene.t.last_vel_w.to_numpy().any()
+    assert not scene.behavior.last_vel_w.to_numpy().any()
 
 
 def test_in_danger_a_diagonal_goes_along_the_way_near_the_gaze(scene):
@@ -874,7 +862,7 @@ def test_in_danger_a_diagonal_goes_along_the_way_near_the_gaze(scene):
 
 def test_backing_off_the_nose_keeps_to_the_diagonal_near_the_gaze(scene):
     """The retreat goes straight back, the nose 25 degrees towards the nearest diagonal."""
-    bundles.put(scene.t, threat_bearing=0.0, clearance_m=2.0)
+    bundles.put(scene.behavior, threat_bearing=0.0, clearance_m=2.0)
     np.testing.assert_allclose(
         np.abs(turns(scene, "<BackOff/>", gaze=[0, 0, 0, 5, 5, 5])),
         [25, 25, 25, 30, 30, 30],
@@ -927,24 +915,24 @@ def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
     def drama(scene, others):
         bundles.put(scene.clock, active=1, step=0)
         scene.forecast.radius_m.fill(-1.0)
-        tree.reset_behavior(io_for(BehaviorIO, scene.t, scene.table, scene.mission, scene.clock))
+        tree.reset_behavior(scene.io(BehaviorIO))
         body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
         for env in range(1, N_ENV):
             if others:
                 body(scene, env, 1, (6.0, 3.0), (-0.3 * env, 0.1))
         decide(scene)
         step(scene, 7)
-        return {name: value[0] for name, value in contents(scene.t).items()}
+        return {name: value[0] for name, value in contents(scene.behavior).items()}
 
     first, second = drama(scene, False), drama(scene, True)
     for name, value in first.items():
         np.testing.assert_array_equal(value, second[name], err_msg=name)
     put(scene.clock.active, 0, 1)
-    before = contents(scene.t)
+    before = contents(scene.behavior)
     put(scene.scan.hit, 1)
     put(scene.scan.range_m, 0.4)
     step(scene, 3)
-    after = contents(scene.t)
+    after = contents(scene.behavior)
     for name in before:
         np.testing.assert_array_equal(before[name][1], after[name][1], err_msg=name)
     assert (before["ticks"][0] != after["ticks"][0]).any()
@@ -953,6 +941,6 @@ def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
 def test_counts_say_who_acted(scene):
     decide(scene)
     step(scene, 4)
-    acted, ticks = scene.t.acted.to_numpy(), scene.t.ticks.to_numpy()
+    acted, ticks = scene.behavior.acted.to_numpy(), scene.behavior.ticks.to_numpy()
     assert acted[0, scene.tree.types.index("FollowRoute")] == 5 and acted[0].sum() == 5
     assert ticks[0, 0] == 5 and ticks[0, scene.tree.types.index("BackOff")] == 0

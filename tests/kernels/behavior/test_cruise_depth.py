@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for, put
+from tests.bundles import Stage, io_for, put
 from uuvtai.config import Config
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.threats import choose_depth, level_share
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import AnyTensor, Bundle
-from uuvtai.state import BehaviorState, MissionState, Proprioception, allocate
 
 N_ENV = 6
 SIZES = {"n_env": N_ENV, "n_track": 1, "n_node": 1, "n_candidate": LANES, "n_tuned": len(TUNED)}
@@ -38,10 +37,8 @@ def _choose(out: AnyTensor, io: Bundle[BehaviorIO]):
         out[env] = choose_depth(env, io)
 
 
-class Stage:
-    def __init__(self):
-        self.behavior = allocate(BehaviorState, SIZES)
-        self.ego, self.mission = allocate(Proprioception, SIZES), allocate(MissionState, SIZES)
+class Rig(Stage):
+    sizes = SIZES
 
     def choose(self, goal_z, away_m=10.0, before_z=-0.8, sigma_m=0.0, cfg=None, given_up=0):
         """Depth to steer for of vehicles at -0.8 m whose goals lie so far ahead."""
@@ -49,20 +46,16 @@ class Stage:
         n = np.zeros(N_ENV, np.float32)
         put(self.ego, z_var=sigma_m**2, given_up=given_up, pos_w=np.stack([n + 4, n + 3, n - 0.8], 1))
         goal = np.stack([n + 4 + np.float32(away_m), n + 3, n + np.asarray(goal_z, np.float32)], 1)
-        self.mission.goal_w.from_numpy(goal.astype(np.float32))
-        self.behavior.cruise_z_m.from_numpy((n + np.asarray(before_z)).astype(np.float32))
+        put(self.mission, goal_w=goal)
+        put(self.behavior, cruise_z_m=before_z)
         out = np.zeros(N_ENV, np.float32)
-        _choose(out, io_for(BehaviorIO, *vars(self).values(), *sections(cfg)))
+        _choose(out, self.io(BehaviorIO, cfg))
         return out
-
-
-def sections(cfg):
-    return cfg.traffic, cfg.behavior, cfg.vehicle, cfg.world.tank, cfg.height, cfg.episode
 
 
 @pytest.fixture(scope="module")
 def stage():
-    return Stage()
+    return Rig()
 
 
 @pytest.mark.parametrize("column_share", [0.0, 0.5])
@@ -73,7 +66,7 @@ def test_expected_share_is_that_of_a_drawn_population(column_share):
     column = rng.random((200_000, 1)) < column_share
     drawn = ((np.abs(centre - z) < half + 0.17 + 0.1) | column).mean(0)
     out, cfg = np.zeros_like(z), config(column_share)
-    _shares(z, out, io_for(BehaviorIO, *sections(cfg)))
+    _shares(z, out, io_for(BehaviorIO, cfg))
     np.testing.assert_allclose(out, drawn, atol=0.07)
     assert out.max() > 0.99 and out.min() < 0.25 + 0.75 * column_share
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.repository.test_architecture import PACKAGE
 from tests.sources import nodes_of
-from uuvtai import state
 from uuvtai.config import Config, TrackingConfig, WorldConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.geometry import NONE, SPHERE
@@ -103,13 +102,9 @@ def test_returns_are_named_after_the_obstacles_they_come_from(known):
 
 def test_where_tracks_are_too_few_the_nearest_obstacles_get_them():
     config = Config(world=WorldConfig(n_dynamic=5), tracking=TrackingConfig(n_track=3))
-    sizes = array_sizes(config, 1, "cpu")
-    nouns = (
-        state.TrackState, state.ClusterState, state.WorldState, state.PathState, state.Proprioception,
-        state.ClockState,
-    )  # fmt: skip
-    tracks, clusters, world, path, ego, clock = (state.allocate(noun, sizes) for noun in nouns)
-    clock.active[0] = 1
+    stage = Stage(**array_sizes(config, 1, "cpu"))
+    tracks, world, path = stage.tracks, stage.world, stage.path
+    put(stage.clock, active=1)
     first = world.kind.shape[1] - 5
     for lane, x in enumerate((9.0, 2.0, 7.0, 1.0, 3.0)):
         world.kind[0, first + lane] = SPHERE if lane != 3 else NONE
@@ -117,9 +112,7 @@ def test_where_tracks_are_too_few_the_nearest_obstacles_get_them():
         world.size[0, first + lane] = (0.2, 0.2, 0.2)
         world.vel_w[0, first + lane] = (0.5, 0.0, 0.0)
         path.n_way[0, lane] = 2
-    true_state.know_obstacles(
-        io_for(TrueTracksIO, tracks, clusters, world, path, ego, clock, config.height, config.world.tank)
-    )
+    true_state.know_obstacles(stage.io(TrueTracksIO, config))
     ti.sync()
     assert tracks.state.to_numpy()[0, :, 0].tolist() == [2.0, 3.0, 7.0]
     assert tracks.alive.to_numpy()[0].tolist() == [1, 1, 1]

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from tests.bundles import io_for, put
+from tests.bundles import Stage, put
 from tests.oracles import camera_tracking as oracle
 from tests.oracles.height import prior
 from tests.oracles.scenes import BOX, CYLINDER, SPHERE, load, quaternions
 from tests.oracles.tracking import predicted
-from uuvtai import state
 from uuvtai.config import (
     CameraTrackingConfig,
     DepthConfig,
@@ -36,12 +35,6 @@ SIZES = {
     "n_env": N_ENV, "n_track": N_TRACK, "n_obstacle": N_OBSTACLE, "n_height": 16, "n_ray": SONAR.n_ray,
     "n_thruster": 6,
     "n_pixel_row": CAMERA.rows, "n_pixel_col": CAMERA.cols,
-}  # fmt: skip
-STRUCTS = {
-    "tracks": state.TrackState, "spots": state.SpotState, "image": state.DepthImage, "scan": state.SonarScan,
-    "clock": state.ClockState,
-    "vehicle": state.VehicleState, "world": state.WorldState, "episode": state.EpisodeState,
-    "ego": state.Proprioception,
 }  # fmt: skip
 STEP = 100
 OWN = np.array([5.0, 3.0, -0.8])
@@ -71,12 +64,10 @@ PLACE_M = 0.04
 tenth of the old error."""
 
 
-class Rig:
+class Rig(Stage):
     """One instance of the structs, so that each kernel is compiled once."""
 
-    def __init__(self):
-        for name, struct in STRUCTS.items():
-            setattr(self, name, state.allocate(struct, SIZES))
+    sizes = SIZES
 
     def begin(self):
         """Everyone level at OWN facing +x in an empty tank at step 100; no track; a ping that met nothing."""
@@ -138,15 +129,13 @@ class Rig:
     def look(self):
         """Draw the image and follow what it shows; returns the memory afterwards."""
         self.load()
-        io = io_for(DepthIO, self, CAMERA, TANK)
+        io = self.io(DepthIO, CAMERA, TANK)
         depth_camera.cast_depth(io)
         return self.follow()
 
     def follow(self):
-        camera_tracking.scan_columns(
-            io_for(TrackingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK)
-        )
-        camera_tracking.follow_spots(io_for(TrackingIO, self, CFG, CAMERA, SONAR, ELEVATION, TRACKING, RULES))
+        camera_tracking.scan_columns(self.io(TrackingIO, CFG, CAMERA, TANK))
+        camera_tracking.follow_spots(self.io(TrackingIO, CFG, CAMERA, SONAR, ELEVATION, TRACKING, RULES))
         self.memory = {name: field.to_numpy() for name, field in vars(self.tracks).items()}
         return self.memory
 
@@ -503,9 +492,7 @@ def test_sleeping_rows_old_images_and_other_rows(rig):
         rig.active[rows] = still == "stale"
         rig.load()
         before = {name: field.to_numpy() for name, field in vars(rig.tracks).items()}
-        depth_camera.cast_depth(
-            io_for(DepthIO, rig.image, rig.ego, rig.vehicle, rig.world, rig.episode, rig.clock, CAMERA, TANK)
-        )
+        depth_camera.cast_depth(rig.io(DepthIO, CAMERA, TANK))
         fresh = np.ones(N_ENV)
         fresh[rows] = still == "asleep"
         put(rig.image, fresh=fresh)

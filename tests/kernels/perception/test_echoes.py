@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.kernels.perception.test_tracking import CONFIG, ELEVATION, FORECAST
 from tests.map_bits import get_map
 from uuvtai.config import (
@@ -19,21 +19,6 @@ from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 from uuvtai.kernels.perception import localization, mapping, sensor_model, tracking
 from uuvtai.kernels.perception.io import EchoesIO, LocalizationIO, MappingIO, TrackingIO
 from uuvtai.sim.setup import load_bounds
-from uuvtai.state import (
-    ClockState,
-    ClusterState,
-    DepthImage,
-    EchoState,
-    GridMask,
-    LocalizationState,
-    MapScratch,
-    MapState,
-    Proprioception,
-    SonarScan,
-    TrackState,
-    TurnHistory,
-    allocate,
-)
 
 SENSORS = load_config("pool", "ping360").sensors
 SONAR = SENSORS.sonar
@@ -45,28 +30,21 @@ SIZES = {
     "n_turn_row": 7, "n_turn": 16,
     "n_track": 16, "n_cluster": 16, "n_height": 16, "n_pixel_row": 6, "n_pixel_col": 16,
 }  # fmt: skip
-STRUCTS = (
-    SonarScan, EchoState, ClockState, MapState, MapScratch, DepthImage, TrackState, ClusterState, GridMask,
-    TurnHistory,
-)  # fmt: skip
 
 
-class Head:
+class Head(Stage):
     """A beam that is turned over discs in an endless pond, by a NumPy model; and the kernels that use it."""
 
+    sizes = SIZES
+
     def __init__(self):
-        self.made = {struct: allocate(struct, SIZES) for struct in STRUCTS}
-        self.scan, self.clock, self.tracks = (self.made[s] for s in (SonarScan, ClockState, TrackState))
-        load_bounds(self.made[GridMask], np.array(outside_cells(POND, MAP.cell_m)))
+        super().__init__()
+        load_bounds(self.mask, np.array(outside_cells(POND, MAP.cell_m)))
         self.clock.active.fill(1)
-        self.io = io_for(EchoesIO, self.scan, self.made[EchoState], self.clock, SONAR)
-        self.tracking = io_for(
-            TrackingIO, *(self.made[s] for s in (TrackState, ClusterState, EchoState, TurnHistory)),
-            self.scan,
-            self.clock, CONFIG, FORECAST, ELEVATION, SONAR, POND, RULES,
-        )  # fmt: skip
-        self.mapping = io_for(MappingIO, *self.made.values(), MAP, SONAR, CAMERA, POND, RULES)
-        sensor_model.reset_echoes(self.io)
+        self.recall = self.io(EchoesIO, SONAR)
+        self.tracking = self.io(TrackingIO, CONFIG, FORECAST, ELEVATION, SONAR, POND, RULES)
+        self.mapping = self.io(MappingIO, MAP, SONAR, CAMERA, POND, RULES)
+        sensor_model.reset_echoes(self.recall)
         tracking.reset_tracks(self.tracking)
         mapping.reset_map(self.mapping)
         self.taken, self.step = 0, 0
@@ -81,16 +59,12 @@ class Head:
 
     def hear(self, beam, pos, yaw, range_m):
         """Deliver one beam (range None = no return), and recall."""
-        put = {"ping_yaw": [yaw], "ping_pos_w": [[*pos, -0.8]], "ping_vel_b": [[0.0, 0.0, 0.0]]}
-        for name, value in put.items():
-            getattr(self.scan, name).from_numpy(np.array(value, np.float32))
-        for name, value in (("new_from", beam), ("new_count", 1), ("fresh", 1), ("ping_step", self.step)):
-            getattr(self.scan, name).fill(value)
-        self.scan.ping_vel_valid.fill(1)
+        put(self.scan, ping_yaw=yaw, ping_pos_w=[*pos, -0.8], ping_vel_b=0.0, ping_vel_valid=1)
+        put(self.scan, new_from=beam, new_count=1, fresh=1, ping_step=self.step)
         self.scan.range_m[0, beam] = SONAR.max_range_m if range_m is None else range_m
         self.scan.hit[0, beam] = int(range_m is not None)
         self.clock.step.fill(self.step)
-        sensor_model.recall_echoes(self.io)
+        sensor_model.recall_echoes(self.recall)
 
     def bearing(self, beam):
         return SONAR.first_beam_rad + SONAR.beam_step_rad * beam
@@ -167,7 +141,7 @@ def test_hits_are_marked_once_and_where_the_vehicle_was_when_the_beam_was_taken(
             mapping.update_map(beam_head.mapping)
             beam_head.scan.fresh.fill(0)
         beam_head.step += 1
-    found = get_map(beam_head.made[MapState])
+    found = get_map(beam_head.grid_map)
     x0, y0 = grid_origin(POND, MAP.cell_m)
     row, col = np.nonzero(found["static"][0] > MAP.occupied)
     x, y = x0 + (col + 0.5) * MAP.cell_m, y0 + (row + 0.5) * MAP.cell_m
@@ -177,39 +151,37 @@ def test_hits_are_marked_once_and_where_the_vehicle_was_when_the_beam_was_taken(
     before = found["static"][0].copy()
     beam_head.hear(0, (4.0, 4.0), 0.0, None)  # elsewhere: the old returns are not marked from here again
     mapping.update_map(beam_head.mapping)
-    after = get_map(beam_head.made[MapState])["static"][0]
+    after = get_map(beam_head.grid_map)["static"][0]
     assert not ((after > MAP.occupied) & (before <= MAP.occupied)).any()
 
 
 # ------------------------------------------------------------------------------------------------------- pose
 
 
+POSE_COV = np.zeros(45)
+POSE_COV[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
+
+
+def corrected(place, sensors, tank, **scan):
+    """What one scan makes of the pose of a vehicle that rests at a place, of covariance ``POSE_COV``."""
+    stage, pos = Stage(n_env=1, n_ray=sensors.sonar.n_ray), [*place, -0.8]
+    io = stage.io(LocalizationIO, LocalizationConfig(), sensors, tank, RULES, VehicleConfig())
+    put(stage.clock, active=1)
+    put(stage.ego, pos_w=pos, specific_force_b=[0.0, 0.0, 9.81])
+    localization.reset_pose(io)
+    put(stage.localization, cov=POSE_COV)
+    put(stage.scan, ping_pos_w=pos, fresh=1, **scan)
+    localization.correct_pose(io)
+    return stage.localization
+
+
 def test_the_pose_filter_uses_a_beam_once():
     """A wall is heard by one beam; the other beams of the scan hold what was heard before."""
-    sizes = {"n_env": 1, "n_ray": 64}
-    ego, state, clock, scan = (
-        allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
-    )
-    rest = (LocalizationConfig(), SENSORS, POND, EpisodeConfig(), VehicleConfig())
-    io = io_for(LocalizationIO, ego, state, clock, scan, *rest)
-    clock.active.fill(1)
-    ego.pos_w.from_numpy(np.array([[9.0, 4.0, -0.8]], np.float32))
-    ego.specific_force_b.from_numpy(np.array([[0.0, 0.0, 9.81]], np.float32))
-    localization.reset_pose(io)
-    cov = np.zeros(45, np.float32)
-    cov[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
     away = SONAR.first_beam_rad + SONAR.beam_step_rad * np.arange(64)
-    scan.range_m.from_numpy((3.0 / np.cos(away))[None].astype(np.float32))
-    scan.ping_pos_w.from_numpy(ego.pos_w.to_numpy())
     left = {}
     for count in (1, 3):
-        state.cov.from_numpy(cov[None])
-        scan.hit.from_numpy((np.abs(away) < 0.6)[None].astype(np.int32))
-        scan.fresh.fill(1)
-        scan.new_from.fill(32)
-        scan.new_count.fill(count)
-        localization.correct_pose(io)
-        left[count] = state.cov.to_numpy()[0, 0]
+        scan = {"range_m": 3.0 / np.cos(away), "hit": np.abs(away) < 0.6, "new_from": 32, "new_count": count}
+        left[count] = corrected((9.0, 4.0), SENSORS, POND, **scan).cov.to_numpy()[0, 0]
     one = 1 / (1 / 0.01 + 1 / (0.02**2 + 0.005**2 / 12 + LocalizationConfig().wall_sigma_m ** 2))
     assert left[1] == pytest.approx(one, rel=0.4), "what one range tells, and no more"
     assert left[3] < 0.7 * left[1] < 0.007

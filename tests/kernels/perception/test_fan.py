@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for, put
+from tests.bundles import Stage, put
 from tests.map_bits import get_map
 from tests.oracles import scenes
 from tests.oracles.sonar import doppler_by_differences, obstacle_hits, wall_hits
@@ -28,23 +28,6 @@ from uuvtai.kernels.planning.observation import sense_sectors
 from uuvtai.kernels.sensors import sonar
 from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.sim.setup import load_bounds
-from uuvtai.state import (
-    ClockState,
-    ClusterState,
-    DepthImage,
-    EpisodeState,
-    GridMask,
-    MapScratch,
-    MapState,
-    ObservationState,
-    Proprioception,
-    SonarMemory,
-    SonarScan,
-    TrackState,
-    VehicleState,
-    WorldState,
-    allocate,
-)
 
 N_ENV, N_OBSTACLE = 24, 14
 TANK, RULES = TankConfig(), EpisodeConfig()
@@ -81,17 +64,13 @@ def scene():
 
 def cast(scene, config):
     """What a sonar reports of a scene: ranges, returns and Doppler (N_ENV, n_ray)."""
-    parts = [
-        allocate(struct, SIZES)
-        for struct in (SonarScan, SonarMemory, Proprioception, VehicleState, WorldState, EpisodeState)
-    ]
-    clock = allocate(ClockState, SIZES)
-    scenes.load(scene, parts[3], parts[4])
-    clock.active.fill(1)
-    sonar.reset_sonar(io_for(SonarIO, parts[0], parts[1], clock))
-    sonar.cast_sonar(io_for(SonarIO, *parts, clock, config, TANK, RULES))
-    names = ("range_m", "hit", "doppler_m_s")
-    return [getattr(parts[0], name).to_numpy()[:, : config.n_ray] for name in names]
+    stage = Stage(**SIZES)
+    stage.start(scene)
+    io = stage.io(SonarIO, config, TANK, RULES)
+    sonar.reset_sonar(io)
+    sonar.cast_sonar(io)
+    scan = stage.scan
+    return [array.to_numpy()[:, : config.n_ray] for array in (scan.range_m, scan.hit, scan.doppler_m_s)]
 
 
 def test_a_fan_lies_ahead_and_a_ring_begins_there():
@@ -174,28 +153,24 @@ SMALL = SonarConfig(n_ray=64, horizontal_aperture_deg=100.0, doppler=False)
 def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
     """From (2, 2), nose to +y: free water within 50 degrees, an obstacle at (2, 3), Doppler not a number."""
     shape = grid_shape(POND, MAP.cell_m)
-    sizes = {"n_env": 1, "n_row": shape[0], "n_col": shape[1], "n_ray": 64, "n_track": 4, "n_cluster": 4}
-    sizes |= {"n_height": 16, "n_slot": 1, "n_pixel_row": 6, "n_pixel_col": 16}
-    made = {
-        struct: allocate(struct, sizes)
-        for struct in (
-            MapState, MapScratch, SonarScan, DepthImage, TrackState, ClusterState, GridMask, ClockState,
-        )
-    }  # fmt: skip
-    scan, grid = made[SonarScan], made[MapState]
-    load_bounds(made[GridMask], np.array(outside_cells(POND, MAP.cell_m)))
+    stage = Stage(
+        n_env=1, n_row=shape[0], n_col=shape[1], n_ray=64, n_track=4, n_cluster=4, n_height=16, n_slot=1,
+        n_pixel_row=6, n_pixel_col=16,
+    )  # fmt: skip
+    scan, grid = stage.scan, stage.grid_map
+    load_bounds(stage.mask, np.array(outside_cells(POND, MAP.cell_m)))
     world = np.pi / 2 + bearings(SMALL)
     to_wall = np.minimum(2.0 / np.sin(world), 2.0 / np.maximum(np.abs(np.cos(world)), 1e-9))
     hits_obstacle = np.abs(bearings(SMALL)) < np.radians(10.0)
     put(scan, range_m=np.where(hits_obstacle, 1.0, to_wall)[None], hit=1, doppler_m_s=np.nan)
     put(scan, ping_yaw=np.pi / 2, ping_pos_w=[[2.0, 2.0, -0.8]], ping_vel_b=[[0.6, 0.0, 0.0]])
     put(scan, ping_vel_valid=1, fresh=1)
-    made[TrackState].beam_track.fill(-1)
-    made[ClockState].active.fill(1)
-    mapping.reset_map(io_for(MappingIO, grid, made[ClockState]))
-    io = io_for(MappingIO, *made.values(), MAP, SMALL, CAMERA, POND, RULES)
+    stage.tracks.beam_track.fill(-1)
+    stage.clock.active.fill(1)
+    io = stage.io(MappingIO, MAP, SMALL, CAMERA, POND, RULES)
+    mapping.reset_map(io)
     for step in range(20):
-        made[ClockState].step.fill(step)
+        stage.clock.step.fill(step)
         mapping.update_map(io)
     found = get_map(grid)
     x0, y0 = grid_origin(POND, MAP.cell_m)
@@ -213,13 +188,12 @@ def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
 def test_sectors_beside_the_fan_have_no_return(turned):
     """Every beam returns from 3 m; the vehicle has turned since."""
     n_sector, observation, config = 12, ObservationConfig(), SONAR.model_copy(update={"doppler": True})
-    sizes = {"n_env": 1, "n_ray": 256, "n_sector": n_sector, "n_track": 4}
-    made = [allocate(struct, sizes) for struct in (ObservationState, SonarScan, Proprioception, ClockState)]
-    state, scan, ego, clock = made
-    put(scan, range_m=3.0, hit=1, doppler_m_s=-0.5)
-    ego.rpy.from_numpy(np.array([[0.0, 0.0, turned]], np.float32))
-    clock.active.fill(1)
-    sense_sectors(io_for(ObservationIO, *made, observation, config))
+    stage = Stage(n_env=1, n_ray=256, n_sector=n_sector, n_track=4)
+    put(stage.scan, range_m=3.0, hit=1, doppler_m_s=-0.5)
+    put(stage.ego, rpy=[[0.0, 0.0, turned]])
+    stage.clock.active.fill(1)
+    sense_sectors(stage.io(ObservationIO, observation, config))
+    state = stage.observation
     middle = np.arange(n_sector) * 2 * np.pi / n_sector + turned
     away = np.degrees(np.abs(np.angle(np.exp(1j * middle)))) - 15.0
     sees = away < 64.0

@@ -3,22 +3,13 @@
 import numpy as np
 import pytest
 
-from tests.bundles import clear, io_for, put
+from tests.bundles import Stage, clear, put
 from tests.oracles import forecast as oracle
 from tests.oracles import turn_history as habit_oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import prediction
 from uuvtai.kernels.perception.io import TrackingIO
-from uuvtai.state import (
-    ClockState,
-    ClusterState,
-    DepthImage,
-    ForecastState,
-    TrackState,
-    TurnHistory,
-    allocate,
-)
 
 N_ENV, N_TRACK = 6, 5
 TRACKING, RULES, TANK = TrackingConfig(), EpisodeConfig(), TankConfig()
@@ -48,13 +39,8 @@ GROWTH_TOLERANCE = 2e-4
 """[m] a square root of a variance that float32 forms from terms up to 100 times as large."""
 
 
-class Stage:
-    def __init__(self):
-        self.tracks, self.clock = allocate(TrackState, SIZES), allocate(ClockState, SIZES)
-        self.forecast = allocate(ForecastState, SIZES)
-        self.turn_history, self.clusters, self.image = (
-            allocate(struct, SIZES) for struct in (TurnHistory, ClusterState, DepthImage)
-        )
+class Rig(Stage):
+    sizes = SIZES
 
     def begin(self, cfg=None):
         self.cfg = cfg or ForecastConfig()
@@ -62,20 +48,17 @@ class Stage:
         self.clock.active.fill(1)
         self.clusters.fresh.fill(1)
         self.image.fresh.fill(0)
-        prediction.reset_forecast(io_for(TrackingIO, self.forecast, self.turn_history, self.clock))
+        prediction.reset_forecast(self.io(TrackingIO))
         return self
 
-    def put(self, **fields):
-        put(self.tracks, **fields)
-
     def predict(self):
-        prediction.forecast_tracks(io_for(TrackingIO, self, self.cfg, TRACKING, TANK, RULES))
+        prediction.forecast_tracks(self.io(TrackingIO, self.cfg, TRACKING, TANK, RULES))
         return self.forecast.pos_w.to_numpy().astype(float), self.forecast.radius_m.to_numpy().astype(float)
 
 
 @pytest.fixture(scope="module")
 def stage():
-    return Stage()
+    return Rig()
 
 
 def random_tracks(seed):
@@ -99,7 +82,8 @@ def lay_out(stage, state, cov, radius, rate, sigma):
     ones = np.ones((N_ENV, N_TRACK))
     turn_cov = np.zeros((N_ENV, N_TRACK, 5))
     turn_cov[..., 4] = sigma**2
-    stage.put(
+    put(
+        stage.tracks,
         alive=ones, moving=ones, state=state, cov=cov[..., row, col], radius_m=radius, turn_rate=rate,
         turn_cov=turn_cov,
     )  # fmt: skip
@@ -140,7 +124,7 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
     moving[:, 1] = 0
     alive = np.ones((N_ENV, N_TRACK))
     alive[:, 2] = 0
-    stage.put(moving=moving, alive=alive)
+    put(stage.tracks, moving=moving, alive=alive)
     active = np.arange(N_ENV) % 2
     stage.clock.active.from_numpy(active.astype(np.int32))
     _, then = stage.predict()
@@ -148,7 +132,7 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
     assert (then[active == 1][:, [0, 3, 4]] > 0).all()
     np.testing.assert_array_equal(then[active == 0], first[active == 0])
     stage.clock.active.fill(1)
-    prediction.reset_forecast(io_for(TrackingIO, stage.forecast, stage.turn_history, stage.clock))
+    prediction.reset_forecast(stage.io(TrackingIO))
     assert (stage.forecast.radius_m.to_numpy() < 0).all()
     assert (stage.forecast.pos_w.to_numpy() == 0).all()
 

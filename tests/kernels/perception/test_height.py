@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import clear, io_for, put
+from tests.bundles import Stage, clear, put
 from tests.oracles import height as oracle
 from uuvtai.config import EpisodeConfig, HeightConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.config.loader import ConfigError, load_config
@@ -13,7 +13,6 @@ from uuvtai.kernels.core.stage import AnyTensor, Bundle
 from uuvtai.kernels.perception import height
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.tracking import prune_tracks
-from uuvtai.state import ClockState, ForecastState, Proprioception, SonarScan, TrackState, allocate
 
 N_ENV, N_TRACK, N_RAY = 8, 32, 64
 TANK, RULES = TankConfig(z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
@@ -59,12 +58,8 @@ def prune(dt: ti.f32, io: Bundle[TrackingIO]):
         prune_tracks(env, dt, io)
 
 
-class Stage:
-    def __init__(self):
-        self.tracks, self.clock, self.forecast, self.ego, self.scan = (
-            allocate(struct, SIZES)
-            for struct in (TrackState, ClockState, ForecastState, Proprioception, SonarScan)
-        )
+class Rig(Stage):
+    sizes = SIZES
 
     def begin(self):
         """Moving tracks of any height lie east of their env's vehicle at (5, 3, -0.8)."""
@@ -86,11 +81,11 @@ class Stage:
 
     def weigh(self, what, dt=0.06):
         what = np.broadcast_to(what, (N_ENV, N_TRACK)).astype(np.int32)
-        weigh(what, self.own.astype(np.float32), dt, io_for(TrackingIO, self.tracks, CFG, SONAR, TANK))
+        weigh(what, self.own.astype(np.float32), dt, self.io(TrackingIO, CFG, SONAR, TANK))
 
     def bound(self, cfg=CFG):
         """(above_w, below_w) as the kernel writes them."""
-        height.bound_heights(io_for(TrackingIO, self.forecast, self.tracks, self.ego, self.clock, cfg, TANK))
+        height.bound_heights(self.io(TrackingIO, cfg, TANK))
         return self.forecast.above_w.to_numpy().astype(float), self.forecast.below_w.to_numpy().astype(float)
 
     def set_share(self, share):
@@ -107,7 +102,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def loaded():
-    return Stage()
+    return Rig()
 
 
 @pytest.fixture
@@ -351,7 +346,7 @@ def scan_for(stage, range_m):
 def pruned(stage, count, cfg=CFG, dt=0.06):
     for k in range(1, count + 1):
         put(stage.scan, ping_step=np.full(N_ENV, 3 * k))
-        prune(dt, io_for(TrackingIO, stage, TRACKING, cfg, SONAR, TANK, RULES))
+        prune(dt, stage.io(TrackingIO, TRACKING, cfg, SONAR, TANK, RULES))
     return stage.tracks.alive.to_numpy()[:, :3]
 
 
@@ -401,7 +396,7 @@ def test_memory_can_be_switched_off(stage):
     assert pruned(stage, round(TRACKING.hidden_s / 0.06) - 1, FORGETFUL).all()
     np.testing.assert_allclose(stage.present[:, :3], 0.95)
     put(stage.scan, ping_step=np.full(N_ENV, round(TRACKING.hidden_s / RULES.control_dt_s) + 1))
-    prune(0.06, io_for(TrackingIO, stage, TRACKING, FORGETFUL, SONAR, TANK, RULES))
+    prune(0.06, stage.io(TrackingIO, TRACKING, FORGETFUL, SONAR, TANK, RULES))
     assert not stage.tracks.alive.to_numpy()[:, :3].any()
 
 

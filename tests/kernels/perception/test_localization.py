@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tests.bundles import io_for, put
+from tests.bundles import Stage, put
 from tests.conftest import set_step
 from tests.oracles import localization as oracle
 from uuvtai.config import EpisodeConfig, LocalizationConfig, TankConfig, VehicleConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.perception import localization
 from uuvtai.kernels.perception.io import LocalizationIO
-from uuvtai.state import ClockState, LocalizationState, Proprioception, SonarScan, allocate
 
 N_ENV, STEPS = 200, 201
 RULES = EpisodeConfig()
@@ -35,22 +34,17 @@ EDGE = 1e-3
 """A beam so close to its gate may be decided otherwise in float32."""
 
 
-class Rig:
+class Rig(Stage):
     """The filter's structs, and a voyage that is fed to it."""
 
-    def __init__(self):
-        sizes = {"n_env": N_ENV, "n_ray": SENSORS["harsh"].sonar.n_ray}
-        self.ego, self.localization, self.clock, self.scan = (
-            allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
-        )
+    sizes = {"n_env": N_ENV, "n_ray": SENSORS["harsh"].sonar.n_ray}
 
     def begin(self, voyage, cfg):
         self.voyage, self.cfg, self.pings = voyage, cfg, {}
-        self.io = io_for(LocalizationIO, self, cfg, voyage.sensors, voyage.tank, RULES, VEHICLE)
-        self.clock.active.fill(1)
-        set_step(self.clock, 0)
+        self.filter = self.io(LocalizationIO, cfg, voyage.sensors, voyage.tank, RULES, VEHICLE)
+        put(self.clock, active=1, step=0)
         put(self.ego, pos_w=voyage.pos[0], vel_b=0)
-        localization.reset_pose(self.io)
+        localization.reset_pose(self.filter)
 
     def sense(self, k):
         """What the instruments say in step k; while the DVL is lost it says nonsense."""
@@ -62,7 +56,7 @@ class Rig:
             ego.vel_valid.from_numpy(v.valid[k])
             seen = v.valid[k][:, None] == 1
             ego.vel_b.from_numpy(np.where(seen, v.reading[k], WRONG).astype(np.float32))
-        localization.predict_pose(self.io)
+        localization.predict_pose(self.filter)
 
     def ping(self, k):
         """Take a scan, deliver what is due; (ping step, range, Doppler, hit), or None."""
@@ -88,7 +82,7 @@ class Rig:
         for k in range(since, until):
             self.sense(k)
             self.ping(k)
-            localization.correct_pose(self.io)
+            localization.correct_pose(self.filter)
         return self.errors(until - 1)
 
     def errors(self, k):
@@ -165,7 +159,7 @@ def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
         middle = rig.state()
         assert_close(middle, filters, rows)
         due = rig.ping(k)
-        localization.correct_pose(rig.io)
+        localization.correct_pose(rig.filter)
         if due is not None:
             late, clear = (k - int(rig.scan.ping_step[0])) * RULES.control_dt_s, []
             for row, ours in filters.items():
@@ -253,7 +247,7 @@ def test_what_stands_before_the_walls_makes_them_count_less(rig):
         for field, values in zip(("mean", "cov", "depth", "depth_cov", "motion"), before, strict=True):
             getattr(rig.localization, field).from_numpy(values)
         rig.deliver(5, (ranges, doppler, hit, *told))
-        localization.correct_pose(rig.io)
+        localization.correct_pose(rig.filter)
         sure.append(rig.ego.pose_cov.to_numpy()[:, [0, 3, 5]])
     assert np.all(sure[1] > sure[0])
 

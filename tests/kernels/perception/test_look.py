@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.bundles import clear, io_for, put
+from tests.bundles import Stage, clear, put
 from tests.oracles import height as weighing
 from tests.oracles import look as oracle
 from tests.oracles.depth import camera_position, camera_rays, z_depths
@@ -12,7 +12,6 @@ from uuvtai.config import DepthConfig, EpisodeConfig, HeightConfig, TankConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import camera_tracking
 from uuvtai.kernels.perception.io import TrackingIO
-from uuvtai.state import ClockState, DepthImage, TrackState, allocate
 
 N_ENV, N_TRACK = 12, 3
 TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
@@ -38,11 +37,8 @@ CLOSE = 1e-4
 good to 2e-6 m)."""
 
 
-class Rig:
-    def __init__(self):
-        self.tracks, self.image, self.clock = (
-            allocate(struct, SIZES) for struct in (TrackState, DepthImage, ClockState)
-        )
+class Rig(Stage):
+    sizes = SIZES
 
     def begin(self):
         """Nothing tracked, only walls in view, everyone level at (5, 3, -0.8) facing +x; a fresh image."""
@@ -94,9 +90,7 @@ class Rig:
 
     def look(self):
         """(shares, presences) after the kernel."""
-        camera_tracking.look_at_obstacles(
-            io_for(TrackingIO, self.tracks, self.image, self.clock, CFG, CAMERA, TANK, RULES)
-        )
+        camera_tracking.look_at_obstacles(self.io(TrackingIO, CFG, CAMERA, TANK, RULES))
         return self.tracks.height.to_numpy()[:, :, 0].astype(float), self.tracks.present.to_numpy().astype(
             float
         )

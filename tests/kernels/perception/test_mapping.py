@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.bundles import io_for, put
+from tests.bundles import Stage, put
 from tests.map_bits import check_bits, get_map, put_map
 from tests.oracles.mapping import MapOracle, rotation
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
@@ -16,18 +16,6 @@ from uuvtai.kernels.oracle.io import TrueMapIO
 from uuvtai.kernels.perception import mapping
 from uuvtai.kernels.perception.io import MappingIO
 from uuvtai.sim.setup import load_bounds
-from uuvtai.state import (
-    ClockState,
-    ClusterState,
-    DepthImage,
-    GridMask,
-    MapScratch,
-    MapState,
-    SonarScan,
-    TrackState,
-    WorldState,
-    allocate,
-)
 
 N_ENV = 6
 TANK = TankConfig(x_m=(0.0, 6.0), y_m=(0.0, 4.0))
@@ -52,21 +40,17 @@ MAX_DOUBTFUL = 0.08
 FIELDS = ("static", "dynamic", "depth_hit", "seen", "free_scans", "dynamic_scans")
 
 
-class Stage:
+class Rig(Stage):
     """The structs of mapping, and one call per control step."""
 
+    sizes = {
+        "n_row": SHAPE[0], "n_col": SHAPE[1], "n_ray": SONAR.n_ray, "n_track": 4, "n_cluster": 4,
+        "n_obstacle": 4, "n_height": 16, "n_slot": 4, "n_pixel_row": DEPTH_CAMERA.rows,
+        "n_pixel_col": DEPTH_CAMERA.cols,
+    }  # fmt: skip
+
     def __init__(self, n_env=N_ENV):
-        sizes = {
-            "n_env": n_env, "n_row": SHAPE[0], "n_col": SHAPE[1], "n_ray": SONAR.n_ray, "n_track": 4,
-            "n_cluster": 4, "n_obstacle": 4, "n_height": 16, "n_slot": 4,
-        }  # fmt: skip
-        sizes |= {"n_pixel_row": DEPTH_CAMERA.rows, "n_pixel_col": DEPTH_CAMERA.cols}
-        structs = {
-            "grid_map": MapState, "scratch": MapScratch, "scan": SonarScan, "image": DepthImage,
-            "tracks": TrackState, "clusters": ClusterState, "mask": GridMask, "clock": ClockState,
-        }  # fmt: skip
-        for name, struct in structs.items():
-            setattr(self, name, allocate(struct, sizes))
+        super().__init__(n_env=n_env)
         self.n_env = n_env
         self.set_tank(TANK)
 
@@ -77,13 +61,13 @@ class Stage:
     def reset(self, active=1):
         self.set_active(active)
         self.set_step(0)
-        mapping.reset_map(io_for(MappingIO, self.grid_map, self.clock))
+        mapping.reset_map(self.io(MappingIO))
 
     def set_active(self, active):
-        self.clock.active.from_numpy(np.broadcast_to(active, self.n_env).astype(np.int32).copy())
+        put(self.clock, active=active)
 
     def set_step(self, step):
-        self.clock.step.from_numpy(np.broadcast_to(step, self.n_env).astype(np.int32).copy())
+        put(self.clock, step=step)
 
     def read(self):
         return get_map(self.grid_map)
@@ -100,29 +84,20 @@ class Stage:
         put(s, ping_vel_b=np.stack([c["vel"] for c in scans]), fresh=fresh)
         put(s, ping_vel_valid=[c.get("valid", True) for c in scans], ping_step=7)
         walls = [c.get("walls") or ((0.0, 0.0), 0.0, False) for c in scans]
-        self.clusters.slip_w.from_numpy(np.array([error for error, _, _ in walls], np.float32))
-        self.clusters.own_sigma_m_s.from_numpy(np.array([sigma for _, sigma, _ in walls], np.float32))
-        self.clusters.scan_step.from_numpy(np.array([7 if same else 4 for _, _, same in walls], np.int32))
-        self.tracks.moving.from_numpy(np.tile(np.array([1, 0, 0, 0], np.int32), (self.n_env, 1)))
+        slip, sigma, same = zip(*walls, strict=True)
+        put(self.clusters, slip_w=slip, own_sigma_m_s=sigma, scan_step=np.where(same, 7, 4))
         # untracked beams: half of them on a track that does not move
-        still = np.tile(np.where(np.arange(SONAR.n_ray) % 2, 1, -1), (self.n_env, 1))
-        self.tracks.beam_track.from_numpy(
-            np.where(np.stack([c["tracked"] for c in scans]), 0, still).astype(np.int32)
-        )
+        still = np.where(np.arange(SONAR.n_ray) % 2, 1, -1)
+        put(self.tracks, moving=[1, 0, 0, 0], beam_track=np.where([c["tracked"] for c in scans], 0, still))
 
     def put_images(self, images):
         self.image.fresh.fill(int(images is not None))
         if images is not None:
-            self.image.depth_m.from_numpy(np.stack([i["depth"] for i in images]).astype(np.float32))
-            self.image.shot_pos_w.from_numpy(np.stack([i["pos"] for i in images]).astype(np.float32))
-            self.image.shot_rpy.from_numpy(np.stack([i["rpy"] for i in images]).astype(np.float32))
+            put(self.image, depth_m=np.stack([i["depth"] for i in images]))
+            put(self.image, shot_pos_w=[i["pos"] for i in images], shot_rpy=[i["rpy"] for i in images])
 
     def update(self):
-        args = (
-            self.grid_map, self.scratch, self.scan, self.image, self.tracks, self.clusters, self.mask,
-            self.clock,
-        )  # fmt: skip
-        mapping.update_map(io_for(MappingIO, *args, MAP, SONAR, DEPTH_CAMERA, self.tank, EPISODE))
+        mapping.update_map(self.io(MappingIO, MAP, SONAR, DEPTH_CAMERA, self.tank, EPISODE))
 
     def run(self, scan_of, n_scan, first=0, image_of=None):
         """``n_scan`` scans at the map's rate, the same for every env: scan_of(k), image_of(k)."""
@@ -136,7 +111,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def stage():
-    return Stage()
+    return Rig()
 
 
 @pytest.fixture(autouse=True)
@@ -653,19 +628,17 @@ def test_reset_empties_awake_rows_only(stage):
 def test_debugging_stamp_is_off_by_default_and_marks_moving_obstacles_only(stage):
     assert MappingConfig().stamp == 0.0
     stage.reset()
-    world = allocate(WorldState, {"n_env": N_ENV, "n_obstacle": 4})
+    world = stage.world
     kind, pos, vel = np.zeros((N_ENV, 4), np.int32), np.zeros((N_ENV, 4, 3)), np.zeros((N_ENV, 4, 3))
     size = np.zeros((N_ENV, 4, 3))
     kind[:] = (CYLINDER, CYLINDER, BOX, NONE)
     pos[:, :, :2] = ((1.0, 1.0), (3.0, 1.0), (5.0, 3.0), (3.0, 3.0))
     size[:] = ((0.3, 0.3, 1), (0.3, 0.3, 1), (0.5, 0.1, 1), (0.3, 0.3, 1))
     vel[:, 1:, 0] = 0.5
-    for field, value in ((world.kind, kind), (world.pos_w, pos), (world.vel_w, vel), (world.size, size)):
-        field.from_numpy(value.astype(np.int32 if value is kind else np.float32))
-    world.yaw.fill(np.pi / 2)
+    put(world, kind=kind, pos_w=pos, vel_w=vel, size=size, yaw=np.pi / 2)
     cfg = MappingConfig(stamp=0.7)
     for _ in range(2):
-        true_state.stamp_truth(io_for(TrueMapIO, stage.grid_map, world, stage.clock, cfg, TANK))
+        true_state.stamp_truth(stage.io(TrueMapIO, cfg, TANK))
     dynamic = stage.read()["dynamic"][0]
     assert dynamic[cell(3.05, 1.05)] == 1.0 and dynamic[cell(5.05, 3.35)] == 1.0
     for x, y in ((1.05, 1.05), (5.35, 3.05), (3.05, 3.05), (3.05, 1.45)):

@@ -5,8 +5,7 @@ import pytest
 import torch
 from safetensors.numpy import save
 
-from tests import bundles
-from tests.bundles import clear, io_for
+from tests.bundles import Stage, clear, put
 from uuvtai.common import enums
 from uuvtai.common.errors import UserError
 from uuvtai.config import Config
@@ -15,17 +14,6 @@ from uuvtai.kernels.perception import prediction_network
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.learning.networks import TIMES_S, MixtureNet, mirrored
 from uuvtai.sim.forecast_weights import SHAPES, SPREADS, packed_weights, put_weights, read_weights
-from uuvtai.state import (
-    ClockState,
-    ClusterState,
-    ForecastState,
-    FutureState,
-    MixtureState,
-    PastState,
-    TrackState,
-    TurnHistory,
-    allocate,
-)
 
 CFG = Config()
 N_ENV, N_TRACK, N_SAMPLE = 3, 4, 26
@@ -41,36 +29,18 @@ TOLERANCE = 2e-5
 WIDTH_M, LENGTH_M = 6.0, 20.0
 
 
-class Stage:
+class Rig(Stage):
     """Tracks of obstacles, what is remembered of them, and a network that says what they may do."""
 
-    def __init__(self):
-        kinds = (TrackState, TurnHistory, ForecastState, FutureState, ClockState, ClusterState)
-        self.tracks, self.turn_history, self.forecast, self.futures, self.clock, self.clusters = (
-            allocate(kind, SIZES) for kind in kinds
-        )
-        self.past, self.mixture = allocate(PastState, SIZES), allocate(MixtureState, SIZES)
+    sizes = SIZES
 
     def begin(self):
         clear(self.tracks, self.turn_history, self.forecast, self.futures, self.clock, self.clusters)
         self.clock.active.fill(1)
         self.clusters.fresh.fill(1)
-        bundles.put(self.tracks, alive=1, moving=1, age=9, radius_m=0.2)
-        prediction_network.reset_past(self.past_io())
+        put(self.tracks, alive=1, moving=1, age=9, radius_m=0.2)
+        prediction_network.reset_past(self.io(TrackingIO, CFG))
         return self
-
-    def past_io(self):
-        structs = (
-            self.mixture,
-            self.past,
-            self.clock,
-            self.clusters,
-            self.forecast,
-            self.turn_history,
-            self.tracks,
-            CFG,
-        )
-        return io_for(TrackingIO, *structs)
 
     def swim(self, places, velocity):
         """Every body at a place (n_env, n_track, 2), on a velocity, for a scan."""
@@ -82,22 +52,21 @@ class Stage:
 
     def scan(self, step):
         self.clock.step.fill(step)
-        bundles.put(self.tracks, scan_step=step, seen_step=step)
-        prediction_network.remember_past(self.past_io())
+        put(self.tracks, scan_step=step, seen_step=step)
+        prediction_network.remember_past(self.io(TrackingIO, CFG))
 
     def columns(self):
-        prediction_network.describe_motion(self.past_io())
+        prediction_network.describe_motion(self.io(TrackingIO, CFG))
         return self.mixture.column.to_numpy()
 
     def mix(self):
-        structs = (self.forecast, self.futures, self.mixture, self.clock, CFG)
-        prediction_network.mix_futures(io_for(TrackingIO, *structs))
+        prediction_network.mix_futures(self.io(TrackingIO, CFG))
         return self.futures.share.to_numpy(), self.futures.pos_w.to_numpy(), self.forecast.pos_w.to_numpy()
 
 
 @pytest.fixture(scope="module")
 def stage():
-    return Stage()
+    return Rig()
 
 
 @pytest.fixture(scope="module")
@@ -118,20 +87,20 @@ def drive(stage, begin, velocity, seconds):
     return last
 
 
-def put(field, values):
+def fill(field, values):
     field.from_numpy(np.ascontiguousarray(values, field.to_numpy().dtype))
 
 
 def test_the_kernel_says_what_the_network_says(stage, net):
     stage.begin()
-    put_weights(stage.mixture, net.weights(), put)
+    put_weights(stage.mixture, net.weights(), fill)
     rng = np.random.default_rng(1)
     told = rng.normal(0, 0.5, (N_ENV, N_TRACK, enums.N_COLUMN)).astype(np.float32)
     course, speed = rng.uniform(-np.pi, np.pi, (N_ENV, N_TRACK)), rng.uniform(0.3, 1.5, (N_ENV, N_TRACK))
     place = rng.uniform(1, 5, (N_ENV, N_TRACK, 2))
     frame = np.concatenate([place, np.stack([np.cos(course), np.sin(course), speed], -1)], -1)
-    put(stage.mixture.column, told)
-    put(stage.mixture.frame, frame)
+    fill(stage.mixture.column, told)
+    fill(stage.mixture.frame, frame)
     share, pos, forecast = stage.mix()
     said = net(torch.from_numpy(told).view(-1, told.shape[-1]), torch.from_numpy(speed).float().view(-1))
     weight = said.log_weight.exp().detach().numpy().reshape(share.shape)
@@ -156,7 +125,7 @@ def test_the_kernel_says_what_the_network_says(stage, net):
 
 def test_tracks_without_a_forecast_have_no_futures(stage, net):
     stage.begin()
-    put_weights(stage.mixture, net.weights(), put)
+    put_weights(stage.mixture, net.weights(), fill)
     radius = np.zeros((N_ENV, N_TRACK, N_SAMPLE), np.float32)
     radius[:, 1] = -1.0
     stage.forecast.radius_m.from_numpy(radius)
@@ -196,9 +165,9 @@ def test_a_mirrored_track_has_mirrored_columns(stage):
     for flip in (1, -1):
         mirror = np.array([1.0, flip])
         stage.begin()
-        put(stage.tracks.turn_rate, flip * rate)
+        fill(stage.tracks.turn_rate, flip * rate)
         stage.tracks.turn_cov.fill(0.1)
-        put(
+        fill(
             stage.turn_history.run_from_w,
             np.where(flip > 0, 0, WIDTH_M) * np.array([0, 1]) + (begin - 0.5) * mirror,
         )
@@ -235,7 +204,7 @@ def test_turns_are_remembered_newest_first(stage):
     bends = [(2.0, 2.0), (5.0, 2.0), (2.05, 2.0), (5.1, 2.0), (2.0, 2.1), (5.0, 2.1)]
     for nth, bend in enumerate(bends):
         for again in range(2):
-            put(stage.turn_history.run_from_w, np.broadcast_to(bend, (N_ENV, N_TRACK, 2)))
+            fill(stage.turn_history.run_from_w, np.broadcast_to(bend, (N_ENV, N_TRACK, 2)))
             stage.scan(30 * nth + 3 * again)
     n = enums.N_BEND
     np.testing.assert_allclose(stage.past.bend_w.to_numpy()[0, 0], bends[::-1][:n], atol=1e-6)

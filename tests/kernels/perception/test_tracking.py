@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.conftest import set_step
 from tests.oracles import small_sonar
 from tests.oracles import tracking as oracle
@@ -14,7 +14,6 @@ from uuvtai.config import EpisodeConfig, ForecastConfig, HeightConfig, SonarConf
 from uuvtai.kernels.core import kalman
 from uuvtai.kernels.perception import tracking
 from uuvtai.kernels.perception.io import TrackingIO
-from uuvtai.state import ClockState, ClusterState, SonarScan, TrackState, TurnHistory, allocate
 
 N_ENV = 16
 DT_S = 0.02
@@ -63,52 +62,34 @@ N_LEAVING = 35
 PARTIAL = CONFIG.model_copy(update={"partial_sigmas": 2.0})
 
 
-class Lab:
+class Lab(Stage):
     """The stage's arrays, and own motion; feeds NumPy scans to the kernels. Tracks every scan given."""
 
+    sizes = SIZES
+
     def __init__(self, sonar):
+        super().__init__()
         self.sonar = sonar
-        self.tracks, self.clusters, self.scan, self.clock = (
-            allocate(struct, SIZES) for struct in (TrackState, ClusterState, SonarScan, ClockState)
-        )
-        self.turn_history = allocate(TurnHistory, SIZES)
 
     def begin(self, seed=0, cfg=CONFIG):
         self.rng, self.cfg = np.random.default_rng(seed), cfg
         self.clock.active.fill(1)
-        tracking.reset_tracks(io_for(TrackingIO, self.tracks, self.clusters, self.clock))
+        tracking.reset_tracks(self.io(TrackingIO))
         return self
 
     def feed(self, step, pos, yaw, vel_w, range_m, doppler, hit, late=0, valid=1):
         """One scan for every env: own pose and world velocity (held where it is not ``valid``), beams."""
         c, s = np.cos(yaw), np.sin(yaw)
         vel_b = np.stack([c * vel_w[:, 0] + s * vel_w[:, 1], -s * vel_w[:, 0] + c * vel_w[:, 1], 0 * yaw], 1)
-        for name, value in (
-            ("range_m", range_m), ("doppler_m_s", doppler), ("ping_yaw", yaw), ("ping_vel_b", vel_b),
-            ("ping_pos_w", np.column_stack([pos, np.full(N_ENV, -0.8)])),
-        ):  # fmt: skip
-            getattr(self.scan, name).from_numpy(np.asarray(value, np.float32))
-        counts = {"fresh": 1, "ping_step": step, "ping_vel_valid": valid}
-        for name, value in (("hit", hit), *((name, np.full(N_ENV, count)) for name, count in counts.items())):
-            getattr(self.scan, name).from_numpy(np.asarray(value, np.int32))
+        put(self.scan, range_m=range_m, doppler_m_s=doppler, hit=hit, fresh=1, ping_step=step)
+        put(self.scan, ping_yaw=yaw, ping_vel_b=vel_b, ping_vel_valid=valid)
+        put(self.scan, ping_pos_w=np.column_stack([pos, np.full(N_ENV, -0.8)]))
         set_step(self.clock, step + late)
         self.track()
 
     def track(self):
-        parts = (
-            self.tracks,
-            self.clusters,
-            self.turn_history,
-            self.scan,
-            self.clock,
-            self.cfg,
-            FORECAST,
-            ELEVATION,
-            self.sonar,
-            TANK,
-            RULES,
-        )
-        tracking.track_obstacles(io_for(TrackingIO, *parts))
+        sections = (self.cfg, FORECAST, ELEVATION, self.sonar, TANK, RULES)
+        tracking.track_obstacles(self.io(TrackingIO, *sections))
 
     def sense(self, step, pos, yaw, vel_w, obstacles, clean=False):
         """Cast, spoil and track one scan of ``obstacles`` = (centre, vel, radius, half, yaw); returns the
@@ -833,10 +814,10 @@ def test_only_awake_rows_change(paper):
     assert not half["alive"][active == 0].any()
     paper.clock.active.from_numpy((1 - active).astype(np.int32))
     before = paper.everything()
-    tracking.reset_tracks(io_for(TrackingIO, paper.tracks, paper.clusters, paper.clock))
+    tracking.reset_tracks(paper.io(TrackingIO))
     assert_same(before, paper.everything(), active == 1)
     paper.clock.active.fill(1)
-    tracking.reset_tracks(io_for(TrackingIO, paper.tracks, paper.clusters, paper.clock))
+    tracking.reset_tracks(paper.io(TrackingIO))
     assert not paper.read("alive").any()
     assert (paper.read("beam_track") == -1).all()
     assert (paper.read("scan_step") == -1).all()

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import clear, io_for
+from tests.bundles import Stage, clear, put
 from tests.oracles import turn_history as oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import Bundle
 from uuvtai.kernels.perception import prediction
 from uuvtai.kernels.perception.io import TrackingIO
-from uuvtai.state import ClockState, ClusterState, ForecastState, TrackState, TurnHistory, allocate
 
 N_ENV, N_TRACK, PERIOD = 6, 5, 3
 CONFIG, RULES = ForecastConfig(n_turn=16), EpisodeConfig()
@@ -28,39 +27,28 @@ least 26 deg (0.1)."""
 SETTLED_COV = 0.01 * np.eye(4)[np.triu_indices(4)]
 
 
-class Stage:
-    def __init__(self):
-        self.tracks, self.clock = allocate(TrackState, SIZES), allocate(ClockState, SIZES)
-        self.clusters = allocate(ClusterState, SIZES)
-        self.turn_history, self.forecast = allocate(TurnHistory, SIZES), allocate(ForecastState, SIZES)
+class Rig(Stage):
+    sizes = SIZES
 
     def begin(self):
         clear(self.tracks, self.clock, self.clusters)
-        self.clock.active.fill(1)
-        self.clusters.fresh.fill(1)
-        self.tracks.moving.fill(1)
-        self.tracks.alive.fill(1)
+        put(self.clock, active=1)
+        put(self.clusters, fresh=1)
+        put(self.tracks, moving=1, alive=1)
         self.step = 0
-        prediction.reset_forecast(io_for(TrackingIO, self.forecast, self.turn_history, self.clock))
+        prediction.reset_forecast(self.io(TrackingIO))
         return self
-
-    def put(self, **fields):
-        for name, value in fields.items():
-            field = getattr(self.tracks, name)
-            field.from_numpy(np.broadcast_to(value, field.to_numpy().shape).astype(field.to_numpy().dtype))
 
     def watch(self, state, cov=SETTLED_COV, rate=0.0, rate_var=0.01, **fields):
         """One scan later: every track's state (N_ENV, N_TRACK, 4) and what the filter says of it."""
         self.step += PERIOD
         turn_cov = np.zeros((N_ENV, N_TRACK, 5))
         turn_cov[..., 4] = rate_var
-        self.put(
-            state=state, cov=cov, turn_rate=rate, turn_cov=turn_cov, scan_step=self.step,
+        put(
+            self.tracks, state=state, cov=cov, turn_rate=rate, turn_cov=turn_cov, scan_step=self.step,
             **{"age": self.step, **fields},
         )  # fmt: skip
-        prediction.learn_turns(
-            io_for(TrackingIO, self.turn_history, self.tracks, self.clusters, self.clock, CONFIG, RULES)
-        )
+        prediction.learn_turns(self.io(TrackingIO, CONFIG, RULES))
 
     def read(self):
         """Every array of the turn history; the packed ones as (N_ENV, n_turn)."""
@@ -76,7 +64,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def stage():
-    return Stage()
+    return Rig()
 
 
 def oracle_turns(table, env):
@@ -254,10 +242,10 @@ def test_only_awake_rows_learn_and_forget(stage):
         stage.watch(state, alive=alive)
     assert [len(stage.turns(env)) for env in range(N_ENV)] == list(active)
     stage.clock.active.from_numpy((1 - active).astype(np.int32))
-    prediction.reset_forecast(io_for(TrackingIO, stage.forecast, stage.turn_history, stage.clock))
+    prediction.reset_forecast(stage.io(TrackingIO))
     assert [len(stage.turns(env)) for env in range(N_ENV)] == list(active)
     stage.clock.active.fill(1)
-    prediction.reset_forecast(io_for(TrackingIO, stage.forecast, stage.turn_history, stage.clock))
+    prediction.reset_forecast(stage.io(TrackingIO))
     assert (stage.read()["leg_step"] == -1).all()
     for name, value in stage.read().items():
         assert name == "leg_step" or (value == 0).all(), f"{name} keeps a trace of the last episode"
@@ -301,8 +289,8 @@ def test_coasting_equals_the_oracle(stage, shape):
     x[near, 1] = 3.0 if shape == "rectangle" else 10.0
     mean.from_numpy(x)
     time.from_numpy(seconds)
-    stage.put(radius_m=0.25)
-    coast(io_for(TrackingIO, stage.tracks, stage.turn_history, CONFIG, tank))
+    put(stage.tracks, radius_m=0.25)
+    coast(stage.io(TrackingIO, CONFIG, tank))
     got, table, turned = out.to_numpy(), stage.read(), 0
     for i in range(n):
         turns = oracle_turns(table, i % N_ENV)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import clear, io_for, put
+from tests.bundles import Stage, clear, put
 from tests.oracles import turn_history as habit_oracle
 from uuvtai.config import Config
 from uuvtai.kernels.core.simd import LANES
@@ -14,7 +14,6 @@ from uuvtai.kernels.core.stage import AnyTensor, Bundle
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.track_filter import turn_back_rate, turned_back
 from uuvtai.kernels.perception.tracking import predict_tracks
-from uuvtai.state import ClusterState, SonarScan, TrackState, TurnHistory, allocate
 
 N = 64
 SIZES = {
@@ -131,12 +130,13 @@ def test_moments_are_those_of_a_drawn_population():
 
 @cache
 def straight_obstacles():
-    return allocate(TrackState, SIZES), allocate(TurnHistory, SIZES)
+    return Stage(**SIZES)
 
 
 def rates_of(kind, way, dt, turn_rate=0.0, turn_var=0.0, turned=None):
     """[1/s] along +x at 1.5 m/s, straight for ``way`` [m] since a turn (``kind`` 2) or since met (1)."""
-    tracks, turn_history = straight_obstacles()
+    stage = straight_obstacles()
+    tracks, turn_history = stage.tracks, stage.turn_history
     clear(tracks, turn_history)
     state = np.stack([way, 0 * way, 0 * way + SPEED, 0 * way], 1)[:, None]
     put(tracks, state=state, turn_rate=turn_rate)
@@ -147,7 +147,7 @@ def rates_of(kind, way, dt, turn_rate=0.0, turn_var=0.0, turned=None):
     if turned is not None:
         turn_history.turn.from_numpy(turned)
     out = np.zeros(N, np.float32)
-    _rates(dt, out, io_for(TrackingIO, tracks, turn_history, CFG.forecast, CFG.tracking, CFG.traffic))
+    _rates(dt, out, stage.io(TrackingIO, CFG.forecast, CFG.tracking, CFG.traffic))
     return out
 
 
@@ -196,19 +196,12 @@ def test_obstacles_that_may_circle_turn_back_less_and_known_turns_leave_no_doubt
 
 def test_only_obstacles_that_beams_pass_by_may_have_turned():
     """One third each: beams meet nothing, meet something nearer, have just met the body."""
-    structs = [allocate(struct, SIZES) for struct in (TrackState, TurnHistory, ClusterState, SonarScan)]
-    clear(*structs)
-    tracks, _, clusters, scan = structs
-    kind = np.arange(N) % 3
-    tracks.state.from_numpy(np.tile(np.array([3.0, 0.0, 1.5, 0.0], np.float32), (N, 1, 1)))
-    for field, value in (
-        (tracks.alive, 1), (tracks.moving, 1), (tracks.radius_m, 0.2), (clusters.scan_step, 3),
-    ):  # fmt: skip
-        field.fill(value)
-    tracks.misses.from_numpy((kind < 2).astype(np.int32)[:, None])
-    put(scan, hit=np.tile((kind == 1).astype(np.int32)[:, None], 256), range_m=1.0)
-    sections = (CFG.forecast, CFG.tracking, CFG.traffic, CFG.sensors.sonar, CFG.world.tank, CFG.episode)
-    _predict(io_for(TrackingIO, *structs, *sections))
+    stage = Stage(**SIZES)
+    tracks, kind = stage.tracks, np.arange(N) % 3
+    put(tracks, state=[3.0, 0.0, 1.5, 0.0], alive=1, moving=1, radius_m=0.2, misses=(kind < 2)[:, None])
+    put(stage.clusters, scan_step=3)
+    put(stage.scan, hit=(kind == 1)[:, None], range_m=1.0)
+    _predict(stage.io(TrackingIO, CFG))
     mean, cov = tracks.state.to_numpy()[:, 0], tracks.cov.to_numpy()[:, 0]
     np.testing.assert_allclose(mean[kind > 0], np.tile([3.09, 0, 1.5, 0], ((kind > 0).sum(), 1)), atol=1e-6)
     assert (mean[kind == 0, 2] < 1.47).all() and (mean[kind == 0, 2] > 1.4).all()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.bundles import io_for, put
+from tests.bundles import Stage, put
 from tests.map_bits import put_layers
 from tests.oracles.clearance import clearance_of, sites_of
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
@@ -14,7 +14,7 @@ from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.planning import clearance
 from uuvtai.kernels.planning.io import ClearanceIO
 from uuvtai.sim.setup import load_bounds
-from uuvtai.state import PACKET, ClearanceMemory, ClearanceState, ClockState, GridMask, MapState, allocate
+from uuvtai.state import PACKET
 
 N_ENV = 8
 TANK = TankConfig(x_m=(0.0, 7.0), y_m=(0.0, 5.0))
@@ -31,17 +31,13 @@ ROUNDING_M = 5e-7
 """float32 square root and product of numbers up to 2 m"""
 
 
-class Stage:
+class Rig(Stage):
     """The structs of clearance."""
 
+    sizes = {"n_row": SHAPE[0], "n_col": SHAPE[1], "n_packet": SHAPE[1] // LANES}
+
     def __init__(self, n_env=N_ENV, n_slot=4):
-        sizes = {
-            "n_env": n_env, "n_row": SHAPE[0], "n_col": SHAPE[1], "n_packet": SHAPE[1] // LANES,
-            "n_slot": n_slot,
-        }  # fmt: skip
-        self.clearance, self.grid_map = allocate(ClearanceState, sizes), allocate(MapState, sizes)
-        self.memory = allocate(ClearanceMemory, sizes)
-        self.mask, self.clock = allocate(GridMask, sizes), allocate(ClockState, sizes)
+        super().__init__(n_env=n_env, n_slot=n_slot)
         self.clock.active.fill(1)
         self.set_outside(np.array(outside_cells(TANK, MAP.cell_m)))
 
@@ -61,10 +57,7 @@ class Stage:
         return self.launch(cfg, voronoi)
 
     def launch(self, cfg=CFG, voronoi=VORONOI):
-        io = io_for(
-            ClearanceIO, self.clearance, self.memory, self.grid_map, self.mask, self.clock, cfg, MAP, voronoi
-        )
-        clearance.compute_clearance(io)
+        clearance.compute_clearance(self.io(ClearanceIO, cfg, MAP, voronoi))
         return tuple(
             f.to_numpy()
             for f in (self.clearance.clearance_m, self.clearance.site_row, self.clearance.site_col)
@@ -73,7 +66,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def stage():
-    return Stage()
+    return Rig()
 
 
 @pytest.fixture(autouse=True)
@@ -137,9 +130,9 @@ def test_inflation_brings_obstacles_nearer_and_leaves_the_boundary(stage, outsid
     static, cfg = maps_of(8), ClearanceConfig(inflate_m=0.08)
     plain = stage.compute(static)
     # the same map again, else there would be nothing to do
-    clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
+    clearance.forget_clearance(stage.io(ClearanceIO))
     distance, site_row, site_col = stage.compute(static, cfg=cfg)
-    clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
+    clearance.forget_clearance(stage.io(ClearanceIO))
     np.testing.assert_array_equal(plain[1], site_row)
     np.testing.assert_array_equal(plain[2], site_col)
     nearer = 0
@@ -212,7 +205,7 @@ def test_what_changed_is_redone_and_nothing_else_differs(stage):
             elif kind == 2:
                 static[env][rng.random(SHAPE) < 0.01] = rng.random()
         partly = stage.compute(static)
-        clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
+        clearance.forget_clearance(stage.io(ClearanceIO))
         for a, b in zip(partly, stage.compute(static), strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -224,7 +217,7 @@ def test_what_did_not_change_is_left_alone(stage):
     static[0, 20, 30] = 1
     found = stage.compute(static)[0]
     assert (found[1:] == 9).all()
-    clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
+    clearance.forget_clearance(stage.io(ClearanceIO))
     assert found[0, 20, 30] == 0 and (found[0, :, 64:] == 9).all()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.oracles import observation as oracle
 from uuvtai.common import tree_codes as codes
 from uuvtai.config import (
@@ -28,46 +28,29 @@ from uuvtai.kernels.planning.observation import (
     write_observation,
     write_obstacles,
 )
-from uuvtai.state import (
-    BehaviorState,
-    ClockState,
-    ForecastState,
-    MissionState,
-    ObservationState,
-    Proprioception,
-    RouteState,
-    SonarScan,
-    TrackState,
-    TreeTable,
-    allocate,
-)
 
-N_ENV, N_RAY, N_SECTOR, N_TRACK = 20, 256, 12, 5
+N_ENV, N_RAY, N_SECTOR, N_TRACK, N_FORECAST = 20, 256, 12, 5, 8
 FEATURES, SONAR = ObservationConfig(), SonarConfig()
 
 ROUNDING = 1e-5
 """Single precision of one division."""
 
 
-class Stage:
+class Rig(Stage):
     """The stage's structs and one call."""
 
-    def __init__(self):
-        sizes = {"n_env": N_ENV, "n_ray": N_RAY, "n_sector": N_SECTOR, "n_track": N_TRACK}
-        self.observation, self.scan = allocate(ObservationState, sizes), allocate(SonarScan, sizes)
-        self.ego, self.clock = allocate(Proprioception, sizes), allocate(ClockState, sizes)
+    sizes = {
+        "n_env": N_ENV, "n_ray": N_RAY, "n_sector": N_SECTOR, "n_track": N_TRACK, "n_way": 2, "n_ahead": 2,
+        "n_trigger": 4, "n_planner": 3, "n_reason": 4, "n_forecast": N_FORECAST, "n_height": 16, "n_node": 8,
+        "n_candidate": 16, "n_tuned": len(TUNED),
+    }  # fmt: skip
 
-    def run(self, range_m, doppler, hit, yaw, ping_yaw, active=None):
+    def run(self, range_m, doppler, hit, yaw, ping_yaw, active=1):
         """(4, n_env, n_sector): range, ttc, closing, valid."""
-        self.scan.range_m.from_numpy(range_m.astype(np.float32))
-        self.scan.doppler_m_s.from_numpy(doppler.astype(np.float32))
-        self.scan.hit.from_numpy(hit.astype(np.int32))
-        self.scan.ping_yaw.from_numpy(ping_yaw.astype(np.float32))
-        self.ego.rpy.from_numpy(np.stack([0 * yaw, 0 * yaw, yaw], axis=1).astype(np.float32))
-        self.clock.active.from_numpy(np.ones(N_ENV, np.int32) if active is None else active.astype(np.int32))
-        sense_sectors(
-            io_for(ObservationIO, self.observation, self.scan, self.ego, self.clock, FEATURES, SONAR)
-        )
+        put(self.scan, range_m=range_m, doppler_m_s=doppler, hit=hit, ping_yaw=ping_yaw)
+        put(self.ego, rpy=np.stack([0 * yaw, 0 * yaw, yaw], axis=1))
+        put(self.clock, active=active)
+        sense_sectors(self.io(ObservationIO, FEATURES, SONAR))
         f = self.observation
         return np.array(
             [x.to_numpy() for x in (f.sector_range_m, f.sector_ttc_s, f.sector_closing_m_s, f.sector_valid)]
@@ -76,7 +59,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def stage():
-    return Stage()
+    return Rig()
 
 
 def random_scan(seed):
@@ -145,12 +128,10 @@ OBSERVATION_ROUNDING = 1e-5
 def observed(stage):
     """(observation (n_env, n_obs), arrays it was made of, rows active) for random states; -7 was there
     before."""
-    sizes = {"n_env": N_ENV, "n_way": 2, "n_ahead": 2, "n_trigger": 4, "n_planner": 3, "n_reason": 4}
-    route, mission = allocate(RouteState, sizes), allocate(MissionState, sizes)
     rng, arrays = np.random.default_rng(0), {}
     for struct, names in {
-        route: ("lookahead_w", "heading_error", "cross_track_m", "remaining_m", "path_risk"),
-        mission: ("goal_w",),
+        stage.route: ("lookahead_w", "heading_error", "cross_track_m", "remaining_m", "path_risk"),
+        stage.mission: ("goal_w",),
         stage.ego: ("pos_w", "rpy", "vel_b", "rate_b", "depth_m"),
         stage.observation: ("sector_range_m", "sector_ttc_s", "sector_closing_m_s"),
     }.items():
@@ -159,11 +140,9 @@ def observed(stage):
             arrays[name] = rng.uniform(-3, 3, field.to_numpy().shape).astype(np.float32)
             field.from_numpy(arrays[name])
     active = np.arange(N_ENV) % 4 != 1
-    stage.clock.active.from_numpy(active.astype(np.int32))
+    put(stage.clock, active=active)
     obs = torch.full((N_ENV, observation_width(FEATURES)), -7.0)
-    write_observation(
-        io_for(ObservationIO, stage.observation, route, stage.ego, mission, stage.clock, FEATURES), obs
-    )
+    write_observation(stage.io(ObservationIO, FEATURES), obs)
     return obs.numpy(), arrays, active
 
 
@@ -205,7 +184,6 @@ def test_first_columns_are_the_papers_targets_of_the_world_model():
 
 MORE = ObservationConfig(n_track=3, behavior=True)
 FORECAST, TRACKING, TANK, RULES = ForecastConfig(), TrackingConfig(), TankConfig(), EpisodeConfig()
-N_FORECAST = 8
 
 OBSTACLE_ROUNDING = 2e-5
 """Single precision of positions of about 10 m that are rotated."""
@@ -219,28 +197,16 @@ def span(name):
     return slice(first, first + width)
 
 
-class Obstacles:
-    """Structs of what is remembered of moving obstacles, and one call."""
-
-    def __init__(self, stage):
-        sizes = {"n_env": N_ENV, "n_track": N_TRACK, "n_forecast": N_FORECAST, "n_height": 16, "n_ray": N_RAY}
-        self.observation, self.ego, self.clock = stage.observation, stage.ego, stage.clock
-        self.tracks, self.forecast = allocate(TrackState, sizes), allocate(ForecastState, sizes)
-
-    def run(self, values, active=None):
-        """Observation (n_env, n_obs), -7 where nothing is written; ``values`` by 'struct.array'."""
-        for name, array in values.items():
-            struct, field = name.split(".")
-            getattr(getattr(self, struct), field).from_numpy(array)
-        self.clock.active.from_numpy(np.ones(N_ENV, np.int32) if active is None else active.astype(np.int32))
-        obs = torch.full((N_ENV, observation_width(MORE)), -7.0)
-        write_obstacles(io_for(ObservationIO, self, MORE, FORECAST, TRACKING, TANK, RULES), obs)
-        return obs.numpy()
-
-
-@pytest.fixture(scope="module")
-def obstacles(stage):
-    return Obstacles(stage)
+def run_obstacles(stage, values, active=1):
+    """Observation (n_env, n_obs) of what is remembered of moving obstacles, -7 where nothing is written;
+    ``values`` by 'struct.array'."""
+    for name, array in values.items():
+        struct, field = name.split(".")
+        put(getattr(stage, struct), **{field: array})
+    put(stage.clock, active=active)
+    obs = torch.full((N_ENV, observation_width(MORE)), -7.0)
+    write_obstacles(stage.io(ObservationIO, MORE, FORECAST, TRACKING, TANK, RULES), obs)
+    return obs.numpy()
 
 
 def no_obstacles():
@@ -286,11 +252,11 @@ def random_obstacles(seed):
     return {name: array.astype(kinds.get(name, np.float32)) for name, array in values.items()}
 
 
-def test_obstacles_equal_the_oracle_in_every_column(obstacles):
+def test_obstacles_equal_the_oracle_in_every_column(stage):
     seen = 0
     for seed in range(3):
         values = random_obstacles(seed)
-        obs = obstacles.run(values)
+        obs = run_obstacles(stage, values)
         for env in range(N_ENV):
             want = oracle.obstacles(
                 {name: np.float64(a[env]) for name, a in values.items()},
@@ -309,7 +275,7 @@ def test_obstacles_equal_the_oracle_in_every_column(obstacles):
     assert 100 < seen < 3 * N_ENV * MORE.n_track
 
 
-def test_obstacles_by_hand(obstacles):
+def test_obstacles_by_hand(stage):
     """Heading along y at 0.5 m/s. One body stands 2 m ahead, one comes from the right ahead at 1 m/s and
     passes behind, one recedes."""
     values = no_obstacles()
@@ -324,7 +290,7 @@ def test_obstacles_by_hand(obstacles):
     values["tracks.state"][:, 4] = [0, -1, 0, -1]
     values["tracks.seen_step"][:] = 75
     values["forecast.above_w"][:, 2], values["forecast.below_w"][:, 2] = -0.4, -FAR_M
-    obs = obstacles.run(values)[0]
+    obs = run_obstacles(stage, values)[0]
     np.testing.assert_allclose(obs[span("obstacle_valid")], [1, 1, 1])
     np.testing.assert_allclose(obs[span("obstacle_position")], [0, -0.5, -1, 0, 2, 0], atol=OBSTACLE_ROUNDING)
     np.testing.assert_allclose(
@@ -345,17 +311,17 @@ def test_obstacles_by_hand(obstacles):
     np.testing.assert_allclose(obs[span("obstacle_closest_time")], [0.4, 0, 0.7], atol=OBSTACLE_ROUNDING)
 
 
-def test_without_obstacles_their_columns_are_zero(obstacles):
-    obs = obstacles.run(no_obstacles())
+def test_without_obstacles_their_columns_are_zero(stage):
+    obs = run_obstacles(stage, no_obstacles())
     first = min(span(column.name).start for column in columns(MORE) if column.per == "body")
     last = max(span(column.name).stop for column in columns(MORE) if column.per == "body")
     assert not obs[:, first:last].any()
     assert (obs[:, :first] == -7).all() and (obs[:, last:] == -7).all(), "the others' columns are left alone"
 
 
-def test_sleeping_rows_keep_their_obstacles(obstacles):
+def test_sleeping_rows_keep_their_obstacles(stage):
     active = np.arange(N_ENV) % 2 == 0
-    obs = obstacles.run(random_obstacles(1), active)
+    obs = run_obstacles(stage, random_obstacles(1), active)
     assert (obs[~active] == -7).all() and (obs[active] != -7).any(axis=1).all()
 
 
@@ -365,26 +331,18 @@ CLASS_OF_LEAF = (0, 1, 2, 3, 4, 4)
 
 def test_advice_is_what_the_tree_says(stage):
     """A tree of the six action leaves; env i lets leaf i act, the seventh none."""
-    sizes = {"n_env": N_ENV, "n_node": 8, "n_candidate": 16, "n_tuned": len(TUNED)}
-    behavior, table = allocate(BehaviorState, sizes), allocate(TreeTable, sizes)
-    table.leaf.from_numpy(np.array([*LEAVES, -1, -1], np.int32))
+    put(stage.table, leaf=[*LEAVES, -1, -1])
     acting = np.full(N_ENV, -1, np.int32)
     acting[: len(LEAVES)] = np.arange(len(LEAVES))
     rng = np.random.default_rng(3)
     action = rng.uniform(-1, 1, (N_ENV, 4)).astype(np.float32)
     conflict = np.where(np.arange(N_ENV) % 2 == 0, FAR_M, rng.uniform(0, 2.5, N_ENV)).astype(np.float32)
     cost = rng.uniform(0, 20, N_ENV).astype(np.float32)
-    for field, array in (
-        (behavior.leaf, acting),
-        (behavior.action, action),
-        (behavior.conflict_s, conflict),
-        (behavior.evade_cost, cost),
-    ):
-        field.from_numpy(array)
+    put(stage.behavior, leaf=acting, action=action, conflict_s=conflict, evade_cost=cost)
     active = np.arange(N_ENV) != 9
-    stage.clock.active.from_numpy(active.astype(np.int32))
+    put(stage.clock, active=active)
     tensor = torch.full((N_ENV, observation_width(MORE)), -7.0)
-    write_advice(io_for(ObservationIO, behavior, table, stage.clock, MORE), tensor)
+    write_advice(stage.io(ObservationIO, MORE), tensor)
     obs = tensor.numpy()
     assert span("behavior_class").stop == obs.shape[1], "the last columns of all"
     assert (obs[9] == -7).all() and (obs[:, : span("teacher_action").start] == -7).all()

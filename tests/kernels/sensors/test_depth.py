@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from tests.bundles import io_for, put
+from tests.bundles import Stage, put
 from tests.conftest import set_step
 from tests.oracles import scenes
 from tests.oracles.depth import camera_position, camera_rays, z_depths
-from uuvtai import state
 from uuvtai.config import DepthConfig, TankConfig
 from uuvtai.kernels.sensors import depth_camera
 from uuvtai.kernels.sensors.io import DepthIO
@@ -37,26 +36,17 @@ TANK, ROUND_TANK = TankConfig(), TankConfig(shape="circle", x_m=(0.0, 16.0), y_m
 SIGMAS = 5.0
 
 
-class Rig:
+class Rig(Stage):
     """One instance of the structs, so that the kernel is compiled once per config."""
 
-    def __init__(self):
-        for name, struct in (
-            ("image", state.DepthImage), ("ego", state.Proprioception), ("vehicle", state.VehicleState),
-            ("world", state.WorldState), ("episode", state.EpisodeState), ("clock", state.ClockState),
-        ):  # fmt: skip
-            setattr(self, name, state.allocate(struct, SIZES))
+    sizes = SIZES
 
     def start(self, scene, key=1):
-        """Reset every row at step 0 with this scene; row i gets random key key + i."""
-        scenes.load(scene, self.vehicle, self.world)
-        self.episode.key.from_numpy((np.arange(N_ENV) + key).astype(np.uint32))
-        put(self.clock, active=1, step=0)
-        depth_camera.reset_depth(io_for(DepthIO, self.image, self.clock))
+        super().start(scene, key)
+        depth_camera.reset_depth(self.io(DepthIO))
 
     def shoot(self, config=CLEAN, tank=TANK):
-        io = io_for(DepthIO, self, config, tank)
-        depth_camera.cast_depth(io)
+        depth_camera.cast_depth(self.io(DepthIO, config, tank))
         return self.image.depth_m.to_numpy()
 
 
@@ -182,7 +172,7 @@ def test_rate_and_labels(rig):
         set_step(rig.clock, step)
         scene["pos"][:, 0] = 13.0 - 0.1 * step
         scenes.load(scene, rig.vehicle, rig.world)
-        put(rig.ego, pos_w=np.full((N_ENV, 3), step, np.float32), rpy=np.full((N_ENV, 3), -step, np.float32))
+        put(rig.ego, pos_w=step, rpy=-step)
         image = rig.shoot()
         shot = step - step % 5
         assert np.all(rig.image.fresh.to_numpy() == (step == shot))

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for, put
+from tests.bundles import Stage, put
 from tests.conftest import configure
+from tests.kernels.perception.test_echoes import corrected
 from tests.kernels.perception.test_tracking import (
     CONFIG,
     N_ENV,
@@ -19,24 +20,14 @@ from tests.kernels.perception.test_tracking import (
     resting,
     with_movers,
 )
-from uuvtai.config import (
-    Config,
-    EpisodeConfig,
-    LocalizationConfig,
-    SensorsConfig,
-    SonarConfig,
-    TankConfig,
-    VehicleConfig,
-)
+from uuvtai.config import Config, SensorsConfig, SonarConfig, TankConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.beams import range_rate
 from uuvtai.kernels.core.stage import AnyTensor, Const, In
-from uuvtai.kernels.perception import localization
-from uuvtai.kernels.perception.io import LocalizationIO
 from uuvtai.logs.encode import EpisodeHeader, Moment
 from uuvtai.logs.topics.sensors import SONAR_ROWS
 from uuvtai.plugins.adapters import Readings
-from uuvtai.state import ClockState, LocalizationState, Proprioception, SonarScan, TrackState, allocate
+from uuvtai.state import SonarScan, TrackState
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, SonarPing
 
 DEAF = PAPER.model_copy(update={"doppler": False})
@@ -114,13 +105,13 @@ def rates(scan: In[SonarScan], tracks: In[TrackState], out: AnyTensor, sonar_cfg
 @pytest.mark.parametrize("aperture", [360.0, 130.0])
 def test_the_rate_of_a_range_is_that_of_the_track_and_the_own_motion(aperture):
     config = DEAF.model_copy(update={"n_ray": 64, "horizontal_aperture_deg": aperture})
-    sizes = {"n_env": 1, "n_ray": 64, "n_track": 3, "n_height": 16}
-    scan, tracks = allocate(SonarScan, sizes), allocate(TrackState, sizes)
+    stage = Stage(n_env=1, n_ray=64, n_track=3, n_height=16)
+    scan, tracks = stage.scan, stage.tracks
     put(scan, doppler_m_s=NOT_MEASURED, ping_yaw=0.7, ping_vel_b=[[0.5, -0.2, 0.1]])
     owner = np.resize([-1, 0, 1], 64)
     put(tracks, beam_track=owner[None], moving=[[1, 0, 1]])
     vel = np.array([[0.0, 0.0, 0.4, -0.9], [0.0, 0.0, 3.0, 3.0], [0.0, 0.0, 3.0, 3.0]], np.float32)
-    tracks.state.from_numpy(vel[None])
+    put(tracks, state=vel)
     found = np.zeros(64, np.float32)
     rates(scan, tracks, found, config)
     away = config.first_beam_rad + config.beam_step_rad * np.arange(64)
@@ -136,26 +127,14 @@ def test_walls_tell_the_place_and_not_the_speed():
     """One scan of the walls from (10, 3): the place gets surer, the velocity stays as it was."""
     usual = load_config("pool", "nominal").sensors
     sensors = usual.model_copy(update={"sonar": usual.sonar.model_copy(update={"doppler": False})})
-    sizes, tank, n = {"n_env": 1, "n_ray": 256}, TankConfig(), 256
-    ego, state, clock, scan = (
-        allocate(struct, sizes) for struct in (Proprioception, LocalizationState, ClockState, SonarScan)
-    )
-    rest = (LocalizationConfig(), sensors, tank, EpisodeConfig(), VehicleConfig())
-    io = io_for(LocalizationIO, ego, state, clock, scan, *rest)
-    clock.active.fill(1)
-    put(ego, pos_w=[[10.0, 3.0, -0.8]], specific_force_b=[[0.0, 0.0, 9.81]])
-    localization.reset_pose(io)
-    cov = np.zeros(45, np.float32)
-    cov[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
-    state.cov.from_numpy(cov[None])
+    tank, n = TankConfig(), 256
     angle = 2 * np.pi * np.arange(n) / n
     with np.errstate(divide="ignore"):
         to_x = np.where(np.cos(angle) > 0, tank.x_m[1] - 10, 10 - tank.x_m[0]) / np.abs(np.cos(angle))
         to_y = np.where(np.sin(angle) > 0, tank.y_m[1] - 3, 3 - tank.y_m[0]) / np.abs(np.sin(angle))
     range_m = np.minimum(to_x, to_y)
-    put(scan, range_m=range_m[None], hit=(range_m < 11)[None], doppler_m_s=NOT_MEASURED)
-    put(scan, ping_pos_w=ego.pos_w.to_numpy(), fresh=1)
-    localization.correct_pose(io)
+    scan = {"range_m": range_m, "hit": range_m < 11, "doppler_m_s": NOT_MEASURED}
+    state = corrected((10.0, 3.0), sensors, tank, **scan)
     after = state.cov.to_numpy()[0]
     assert np.isfinite(after).all() and np.isfinite(state.mean.to_numpy()).all()
     assert after[0] < 1e-3 and after[9] < 1e-3, "x, y"

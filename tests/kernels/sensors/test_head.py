@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import Stage
 from tests.oracles import scenes
 from tests.oracles.sonar import obstacle_hits, wall_hits
 from uuvtai.common.errors import UserError
@@ -13,16 +13,6 @@ from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.stage import AnyTensor, Const
 from uuvtai.kernels.sensors import mechanical_sonar, sonar
 from uuvtai.kernels.sensors.io import SonarIO
-from uuvtai.state import (
-    ClockState,
-    EpisodeState,
-    Proprioception,
-    SonarMemory,
-    SonarScan,
-    VehicleState,
-    WorldState,
-    allocate,
-)
 
 N_ENV, N_OBSTACLE, STEPS = 24, 14, 60
 TANK, RULES = TankConfig(), EpisodeConfig()
@@ -105,18 +95,13 @@ def nearest(scene, env, config, beam):
 
 @pytest.mark.parametrize("config", [clean(SECTOR), clean(TURN)], ids=["sector", "turn"])
 def test_beams_come_in_turn_and_hear_what_is_nearest_within_them(scene, config):
-    parts = [
-        allocate(struct, SIZES)
-        for struct in (SonarScan, SonarMemory, Proprioception, VehicleState, WorldState, EpisodeState)
-    ]
-    scan, clock = parts[0], allocate(ClockState, SIZES)
-    scenes.load(scene, parts[3], parts[4])
-    clock.active.fill(1)
-    sonar.reset_sonar(io_for(SonarIO, parts[0], parts[1], clock))
-    io = io_for(SonarIO, *parts, clock, config, TANK, RULES)
+    stage = Stage(**SIZES)
+    stage.start(scene)
+    scan, io = stage.scan, stage.io(SonarIO, config, TANK, RULES)
+    sonar.reset_sonar(io)
     wrong = heard = 0
     for step, beams in enumerate(looked_along(config, STEPS)):
-        clock.step.fill(step)
+        stage.clock.step.fill(step)
         mechanical_sonar.turn_head(io)
         assert (scan.fresh.to_numpy() == bool(beams)).all()
         if not beams:

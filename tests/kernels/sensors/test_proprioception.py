@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.conftest import set_step
 from tests.oracles.proprioception import dead_reckoned, roll_pitch_yaw, specific_force, zeroed_depth
 from tests.oracles.scenes import quaternions, rotation
-from uuvtai import state
 from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, SensorsConfig, VehicleConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.sensors import proprioception
@@ -28,43 +27,30 @@ pass."""
 READINGS = ("vel_b", "vel_valid", "rpy", "rate_b", "specific_force_b", "depth_m", "pos_w")
 
 
-class Rig:
+class Rig(Stage):
     """One instance of the structs; rows share nothing but the motion that a test gives them."""
 
-    def __init__(self):
-        for name, struct in (
-            ("ego", state.Proprioception), ("memory", state.ProprioceptionMemory),
-            ("vehicle", state.VehicleState), ("episode", state.EpisodeState), ("clock", state.ClockState),
-        ):  # fmt: skip
-            setattr(self, name, state.allocate(struct, SIZES))
-
-    def move(self, **truth):
-        for name, value in truth.items():
-            field = getattr(self.vehicle, name)
-            field.from_numpy(np.broadcast_to(np.asarray(value, np.float32), (N_ENV, field.n)).copy())
+    sizes = SIZES
 
     def start(self, sensors, key=1, **truth):
         still = {
             "pos_w": (5, 3, -1), "quat_wb": (1, 0, 0, 0), "vel_b": (0, 0, 0), "rate_b": (0, 0, 0),
             "acc_b": (0, 0, 0),
         }  # fmt: skip
-        self.move(**{**still, **truth})
-        self.episode.key.from_numpy((np.arange(N_ENV) * 31 + key).astype(np.uint32))
-        self.clock.active.fill(1)
-        self.clock.step.fill(0)
-        proprioception.reset_proprioception(
-            io_for(ProprioceptionIO, self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors)
-        )
+        put(self.vehicle, **{**still, **truth})
+        put(self.episode, key=np.arange(N_ENV) * 31 + key)
+        put(self.clock, active=1, step=0)
+        proprioception.reset_proprioception(self.io(ProprioceptionIO, sensors))
 
     def sense(self, sensors, step, names=READINGS):
         set_step(self.clock, step)
-        proprioception.sense_proprioception(io_for(ProprioceptionIO, self, sensors, BODY, RULES))
+        proprioception.sense_proprioception(self.io(ProprioceptionIO, sensors, BODY, RULES))
         return {name: getattr(self.ego, name).to_numpy() for name in names}
 
     def find(self, sensors, step):
         """(vel_b, vel_valid) of a step as the stack has them."""
         self.sense(sensors, step, ())
-        proprioception.find_velocity(io_for(VelocityIO, self.ego, self.clock, sensors, RULES))
+        proprioception.find_velocity(self.io(VelocityIO, sensors, RULES))
         return self.ego.vel_b.to_numpy(), self.ego.vel_valid.to_numpy()
 
 
@@ -116,9 +102,9 @@ def test_dvl_noise_scale_and_period(rig):
     assert_normal(outs[0], 0.01)
     assert_normal(outs[5], 0.01)
     assert abs(np.corrcoef(outs[0].ravel(), outs[5].ravel())[0, 1]) < SIGMAS / np.sqrt(outs[0].size)
-    scale = rig.memory.dvl_scale.to_numpy()
+    scale = rig.ego_memory.dvl_scale.to_numpy()
     assert_normal(scale - 1.0, 0.02)
-    rig.move(vel_b=(10.0, 0.0, 0.0))
+    put(rig.vehicle, vel_b=(10.0, 0.0, 0.0))
     fast = [rig.sense(sensors, step)["vel_b"][:, 0] / 10.0 for step in (10, 15)]
     assert np.abs(np.mean(fast, axis=0) - scale).max() < 6 * 0.001, (
         "the scale factor stays the same over an episode"
@@ -131,7 +117,7 @@ def test_dvl_dropout_of_single_readings(rig):
     assert np.all(rig.sense(sensors, 0)["vel_valid"] == 1), "the bottom is in sight at the start"
     lost = []
     for step in range(1, 300):
-        rig.move(vel_b=(0.01 * step, 0, 0))
+        put(rig.vehicle, vel_b=(0.01 * step, 0, 0))
         out = rig.sense(sensors, step, ("vel_b", "vel_valid"))
         if step % 5 == 0:
             lost.append(out["vel_valid"] == 0)
@@ -201,13 +187,13 @@ def test_the_accelerometers_error_stays_the_same_over_an_episode(rig):
     errors = [rig.sense(sensors, step)["specific_force_b"] - (0, 0, 9.81) for step in (0, 7)]
     assert_normal(errors[0], 0.2)
     np.testing.assert_allclose(errors[0], errors[1], atol=1e-5)
-    np.testing.assert_allclose(errors[0], rig.memory.accel_bias_b.to_numpy(), atol=1e-5)
+    np.testing.assert_allclose(errors[0], rig.ego_memory.accel_bias_b.to_numpy(), atol=1e-5)
 
 
 def test_pressure_bias_and_sigma(rig):
     sensors = SensorsConfig(pressure=PressureConfig(bias_m=0.5, sigma_m=0.02))
     rig.start(sensors)
-    bias = rig.memory.pressure_bias_m.to_numpy()
+    bias = rig.ego_memory.pressure_bias_m.to_numpy()
     assert np.abs(bias).max() <= 0.5 and bias.std() == pytest.approx(1 / np.sqrt(12), rel=0.05)
     errors = [rig.sense(sensors, step)["depth_m"] - 1.0 - bias for step in (0, 1)]
     assert_normal(errors[0], 0.02)
@@ -218,7 +204,7 @@ def test_truth_localization_ignores_the_errors_of_the_readings(rig):
     sensors = load_config("pool", "harsh", overrides={"sensors.localization": "truth"}).sensors
     rig.start(sensors)
     for step in range(20):
-        rig.move(pos_w=(5 + 0.1 * step, 3, -1))
+        put(rig.vehicle, pos_w=(5 + 0.1 * step, 3, -1))
         assert np.allclose(rig.sense(sensors, step)["pos_w"], (5 + 0.1 * step, 3, -1))
 
 
@@ -234,7 +220,7 @@ def test_a_given_position_tells_the_velocity_while_the_dvl_is_silent(rig):
     found, valid = rig.find(sensors, 0)
     assert np.array_equal(found, rig.ego.dvl_b.to_numpy()) and np.all(valid == 1)
     vel_w = np.random.default_rng(7).normal(0, 0.5, (N_ENV, 3))
-    rig.move(pos_w=truth["pos_w"] + vel_w * DT)
+    put(rig.vehicle, pos_w=truth["pos_w"] + vel_w * DT)
     found, valid = rig.find(sensors, 1)
     want = [rotation(quat).T @ vel for quat, vel in zip(truth["quat_wb"], vel_w, strict=True)]
     assert np.all(valid == 1) and np.abs(found - want).max() < 2e-6 / DT
@@ -247,7 +233,7 @@ def test_dead_reckoning_knows_heave_alone_while_the_dvl_is_silent(rig):
     rig.start(sensors, quat_wb=quat, vel_b=(0.3, -0.1, 0.05))
     rig.find(sensors, 0)
     for step in range(1, 151):
-        rig.move(pos_w=(5, 3, -1 + 0.1 * step * DT))
+        put(rig.vehicle, pos_w=(5, 3, -1 + 0.1 * step * DT))
         found, valid = rig.find(sensors, step)
     assert np.all(valid == 2) and np.allclose(found[:, :2], (0.3, -0.1), atol=1e-6), "the last reading"
     rises = found @ rotation(quat[0])[2] - 0.1
@@ -264,7 +250,7 @@ def test_dead_reckoning_with_clean_sensors_is_the_integral_of_the_motion(rig):
     rig.start(sensors)
     assert np.allclose(rig.sense(sensors, 0)["pos_w"], (5, 3, -1)), "starts at the known start"
     for step in range(1, steps + 1):
-        rig.move(pos_w=path[step], quat_wb=quats[step - 1], vel_b=vels[step - 1])
+        put(rig.vehicle, pos_w=path[step], quat_wb=quats[step - 1], vel_b=vels[step - 1])
         out = rig.sense(sensors, step)
     assert np.abs(out["pos_w"] - path[-1]).max() < 1e-4
 
@@ -278,12 +264,12 @@ def test_dead_reckoning_coasts_without_the_bottom_and_takes_depth_from_pressure(
     )
     rig.start(sensors, vel_b=(0.5, 0, 0))
     rig.sense(sensors, 0)
-    rig.move(vel_b=(-1, -1, -1), quat_wb=(np.sqrt(0.5), 0, 0, np.sqrt(0.5)), pos_w=(0, 0, -0.5))
+    put(rig.vehicle, vel_b=(-1, -1, -1), quat_wb=(np.sqrt(0.5), 0, 0, np.sqrt(0.5)), pos_w=(0, 0, -0.5))
     for step in range(1, 51):
         out = rig.sense(sensors, step)
     assert np.all(out["vel_valid"] == 0) and np.all(out["vel_b"] == np.float32((0.5, 0, 0)))
     assert np.abs(out["pos_w"][:, :2] - (5.0, 3.5)).max() < 1e-4
-    assert np.abs(rig.memory.pressure_bias_m.to_numpy()).max() > 0.4
+    assert np.abs(rig.ego_memory.pressure_bias_m.to_numpy()).max() > 0.4
     assert np.allclose(out["pos_w"][:, 2], -0.5, atol=1e-6), "the start's depth is known: the bias drops out"
 
 
@@ -292,10 +278,10 @@ def test_dead_reckoning_zeroes_the_pressure_sensor_at_the_known_start(rig):
     sensors = SensorsConfig(localization="dead_reckoning", pressure=PressureConfig(bias_m=0.5, sigma_m=0.02))
     z = np.array([-1.0, -0.9, -0.4, -1.5])
     rig.start(sensors)
-    bias = rig.memory.pressure_bias_m.to_numpy()
+    bias = rig.ego_memory.pressure_bias_m.to_numpy()
     outputs = []
     for step, height in enumerate(z):
-        rig.move(pos_w=(5.0, 3.0, height))
+        put(rig.vehicle, pos_w=(5.0, 3.0, height))
         outputs.append(rig.sense(sensors, step))
         assert np.array_equal(outputs[-1]["pos_w"][:, 2], -outputs[-1]["depth_m"])
     depth = np.stack([out["depth_m"] for out in outputs], 1)
@@ -304,7 +290,7 @@ def test_dead_reckoning_zeroes_the_pressure_sensor_at_the_known_start(rig):
     rig.start(SensorsConfig(pressure=sensors.pressure))
     raw = []
     for step, height in enumerate(z):
-        rig.move(pos_w=(5.0, 3.0, height))
+        put(rig.vehicle, pos_w=(5.0, 3.0, height))
         raw.append(rig.sense(SensorsConfig(pressure=sensors.pressure), step)["depth_m"])
     noise = np.stack(raw, 1) + z - bias[:, None]
     expected = [zeroed_depth(-1.0, z, b, n) for b, n in zip(bias, noise, strict=True)]
@@ -336,7 +322,7 @@ def test_dead_reckoning_error_grows_with_scale_error_and_drift(rig):
         out = rig.sense(sensors, step)
     error = out["pos_w"] - (7.5, 3.0, -1.0)
     assert_normal(error[:, 1], 0.01 * 5.0 / 2 * 2.5 * 251 / 250)
-    along = (rig.memory.dvl_scale.to_numpy() - 1.0) * 2.5
+    along = (rig.ego_memory.dvl_scale.to_numpy() - 1.0) * 2.5
     assert np.abs(error[:, 0] - along).max() < 0.03, "what is left is the bent track: (drift t)^2 / 6"
 
 
@@ -348,9 +334,7 @@ def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
     def run(truth, keys):
         rig.start(sensors, **truth)
         rig.episode.key.from_numpy(keys)
-        proprioception.reset_proprioception(
-            io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors)
-        )
+        proprioception.reset_proprioception(rig.io(ProprioceptionIO, sensors))
         for step in range(15):
             out = rig.sense(sensors, step)
         return out
@@ -360,10 +344,8 @@ def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
     permuted = run({name: value[order] for name, value in truth.items()}, keys[order])
     assert all(np.array_equal(first[name][order], permuted[name]) for name in READINGS)
     rig.clock.active.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
-    rig.move(vel_b=(3, 3, 3))
-    proprioception.reset_proprioception(
-        io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors)
-    )
+    put(rig.vehicle, vel_b=(3, 3, 3))
+    proprioception.reset_proprioception(rig.io(ProprioceptionIO, sensors))
     after = rig.sense(sensors, 20)
     assert all(np.array_equal(permuted[name][::2], after[name][::2]) for name in READINGS)
     assert not np.array_equal(permuted["rate_b"][1::2], after["rate_b"][1::2])

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import Stage, io_for, put
 from tests.conftest import set_step
 from tests.oracles import scenes
 from tests.oracles.sonar import WALL, beam_headings, doppler_by_differences, sonar_scan
-from uuvtai import state
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.geometry import FAR_M
@@ -44,25 +43,15 @@ SIGMAS = 5.0
 pass."""
 
 
-class Rig:
+class Rig(Stage):
     """One instance of the structs, so that each kernel is compiled once per config."""
 
-    def __init__(self):
-        for name, struct in (
-            ("scan", state.SonarScan), ("memory", state.SonarMemory), ("ego", state.Proprioception),
-            ("vehicle", state.VehicleState), ("world", state.WorldState), ("episode", state.EpisodeState),
-            ("clock", state.ClockState),
-        ):  # fmt: skip
-            setattr(self, name, state.allocate(struct, SIZES))
+    sizes = SIZES
 
     def start(self, scene, key=1):
-        """Reset every row at step 0 with this scene; row i gets random key key + i."""
-        scenes.load(scene, self.vehicle, self.world)
-        self.episode.key.from_numpy((np.arange(N_ENV) + key).astype(np.uint32))
-        self.clock.active.fill(1)
-        self.clock.step.fill(0)
-        self.ego.pos_w.from_numpy(scene["pos"].astype(np.float32))
-        sonar.reset_sonar(io_for(SonarIO, self.scan, self.memory, self.clock))
+        super().start(scene, key)
+        put(self.ego, pos_w=scene["pos"])
+        sonar.reset_sonar(self.io(SonarIO))
 
     def cast(
         self,
@@ -70,7 +59,7 @@ class Rig:
         tank=TANK,
         names=("range_m", "doppler_m_s", "intensity", "hit", "fresh", "ping_step"),
     ):
-        sonar.cast_sonar(io_for(SonarIO, self, config, tank, RULES))
+        sonar.cast_sonar(self.io(SonarIO, config, tank, RULES))
         return {name: getattr(self.scan, name).to_numpy() for name in names}
 
 
@@ -414,7 +403,7 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
             for env in range(0, N_ENV, 5):
                 values, counts = np.unique(out["range_m"][env][nearer[env]], return_counts=True)
                 runs += list(counts[values > 0])
-    until = rig.memory.cloud_until.to_numpy()
+    until = rig.sonar_memory.cloud_until.to_numpy()
     assert until.max() <= 995 + 150 and lives.max() >= 10 and lives.max() * 5 <= 2 * 150 + 5
     assert set(range(3, 9)) <= set(runs) and max(runs) <= 8
     # one cloud forms at a range uniform in [0.5, 12] and shows only in front of the walls
@@ -435,10 +424,7 @@ def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
         set_step(rig.clock, step)
         scene["pos"][:, 0] = 10.0 - 0.1 * step
         scenes.load(scene, rig.vehicle, rig.world)
-        rig.ego.pos_w.from_numpy(np.full((N_ENV, 3), step, np.float32))
-        rig.ego.vel_b.from_numpy(np.full((N_ENV, 3), -step, np.float32))
-        rig.ego.vel_valid.from_numpy(np.full(N_ENV, step % 4 == 0, np.int32))
-        rig.ego.rpy.from_numpy(np.full((N_ENV, 3), 0.01 * step, np.float32))
+        put(rig.ego, pos_w=step, vel_b=-step, vel_valid=step % 4 == 0, rpy=0.01 * step)
         out = rig.cast(config)
         assert len(set(out["fresh"])) == 1
         if out["fresh"][0]:
@@ -464,7 +450,7 @@ def test_sleeping_rows_keep_their_scan(rig, batches):
     after = rig.cast()
     assert all(np.array_equal(before[name][::2], after[name][::2]) for name in before)
     assert not np.array_equal(before["range_m"][1::2], after["range_m"][1::2])
-    sonar.reset_sonar(io_for(SonarIO, rig.scan, rig.memory, rig.clock))
+    sonar.reset_sonar(rig.io(SonarIO))
     cleared = rig.scan.hit.to_numpy()
     assert np.array_equal(cleared[::2], after["hit"][::2]) and not cleared[1::2].any()
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.oracles import scenes
 from tests.oracles.cfar import first_cells, side_lobe_level
 from tests.oracles.sonar_image import cast_rays, echo_power
-from uuvtai import state
 from uuvtai.common.errors import UserError
 from uuvtai.config import Config, EpisodeConfig, SensorsConfig, TankConfig, multibeam
 from uuvtai.config.loader import load_config
@@ -51,34 +50,23 @@ def side_lobe_levels(io: Bundle[SonarIO], out: ti.types.ndarray(dtype=ti.f32, nd
         out[env, beam, cell] = level_beside(env, beam, cell, io)
 
 
-class Rig:
+class Rig(Stage):
     """One instance of the structs."""
 
     def __init__(self):
-        self.scan, self.memory, self.image = (
-            state.allocate(s, SIZES) for s in (state.SonarScan, state.SonarMemory, state.SonarImage)
-        )
-        self.ego, self.vehicle, self.world = (
-            state.allocate(s, SIZES) for s in (state.Proprioception, state.VehicleState, state.WorldState)
-        )
-        self.episode = state.allocate(state.EpisodeState, SIZES)
-        self.clock = state.allocate(state.ClockState, SIZES)
-        structs = (self.scan, self.memory, self.image, self.ego, self.vehicle, self.world)
-        self.io = io_for(SonarIO, *structs, self.episode, self.clock, SONAR, TANK, RULES)
+        super().__init__(**SIZES)
+        self.sonar = self.io(SonarIO, SONAR, TANK, RULES)
 
     def start(self, scene, keys):
-        scenes.load(scene, self.vehicle, self.world)
-        self.episode.key.from_numpy(np.asarray(keys, np.uint32))
-        self.clock.active.fill(1)
-        self.clock.step.fill(0)
-        sonar.reset_sonar(self.io)
+        super().start(scene)
+        put(self.episode, key=keys)
+        sonar.reset_sonar(self.sonar)
 
     def ping(self):
         """(range, hit, what was heard)."""
-        sonar_image.hear(self.io)
-        sonar.cast_sonar(self.io)
-        arrays = (self.scan.range_m, self.scan.hit, self.image.heard)
-        return [array.to_numpy() for array in arrays]
+        sonar_image.hear(self.sonar)
+        sonar.cast_sonar(self.sonar)
+        return [array.to_numpy() for array in (self.scan.range_m, self.scan.hit, self.sonar_image.heard)]
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +102,8 @@ def power_of(scene, env):
 def test_power_is_the_oracles(rig, scene):
     """But for rays on the edge of an obstacle or of a bin, which float32 puts elsewhere."""
     rig.start(scene, range(N_ENV))
-    fold_only(rig.io)
-    found = rig.image.echo.to_numpy()[:, :, :N_BIN]
+    fold_only(rig.sonar)
+    found = rig.sonar_image.echo.to_numpy()[:, :, :N_BIN]
     for env in range(N_ENV):
         truth = power_of(scene, env)
         assert np.abs(found[env] - truth).sum() < 0.01 * truth.sum()
@@ -143,7 +131,7 @@ def test_side_lobes_and_returns_are_the_oracles(rig, scene):
     ranges, hit, heard = rig.ping()
     heard = heard[:, : SONAR.n_ray, :N_BIN].astype(float)
     lobes = np.zeros(heard.shape, np.float32)
-    side_lobe_levels(rig.io, lobes)
+    side_lobe_levels(rig.sonar, lobes)
     cells = np.array([first_cells(heard[env], SONAR, cfar_factor(SONAR)) for env in range(N_ENV)])
     truth = np.array([side_lobe_level(heard[env], SONAR) for env in range(N_ENV)])
     np.testing.assert_allclose(lobes, truth, rtol=1e-3, atol=1e-6 * truth.max())

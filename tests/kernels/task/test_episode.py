@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.bundles import clear, io_for, put
+from tests.bundles import Stage, clear, put
 from tests.oracles import noise as noise_reference
-from uuvtai import state
 from uuvtai.common import enums
 from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, SPHERE
@@ -21,28 +20,17 @@ FRONT_M = VEHICLE.hull_half_length_m + VEHICLE.hull_radius_m
 SIZES = {"n_env": N, "n_obstacle": N_OBSTACLE, "n_thruster": 6}
 
 
-class Court:
+class Court(Stage):
     """Structs of N envs: a vehicle at rest in mid-tank, heading along x, far from a goal, nothing around."""
 
-    def __init__(self):
-        structs = (
-            state.TerminationState, state.ClockState, state.VehicleState, state.WorldState,
-            state.MissionState, state.EpisodeState,
-        )  # fmt: skip
-        self.termination, self.clock, self.vehicle, self.world, self.mission, self.episode = (
-            state.allocate(s, SIZES) for s in structs
-        )
+    sizes = SIZES
 
     def clean(self):
         clear(self.termination, self.clock, self.vehicle, self.world, self.mission)
         put(self.clock, running=1, active=1)
-        for env in range(N):
-            self.vehicle.pos_w[env] = (10.0, 3.0, -0.8)
-            self.vehicle.quat_wb[env] = (1.0, 0.0, 0.0, 0.0)
-            self.mission.goal_w[env] = (18.0, 3.0, -0.8)
-        episode.reset_termination(
-            io_for(EpisodeIO, self.termination, self.clock, self.vehicle, self.world, VEHICLE, TANK, RULES)
-        )
+        put(self.vehicle, pos_w=(10.0, 3.0, -0.8), quat_wb=(1.0, 0.0, 0.0, 0.0))
+        put(self.mission, goal_w=(18.0, 3.0, -0.8))
+        episode.reset_termination(self.io(EpisodeIO, VEHICLE, TANK, RULES))
         return self
 
     def put(self, env, slot, kind, pos, size, vel=(0, 0, 0), yaw=0.0):
@@ -51,7 +39,7 @@ class Court:
         self.world.vel_w[env, slot], self.world.yaw[env, slot] = vel, yaw
 
     def judge(self):
-        io = io_for(EpisodeIO, self, VEHICLE, TANK, RULES)
+        io = self.io(EpisodeIO, VEHICLE, TANK, RULES)
         episode.check_termination(io)
         return {name: field.to_numpy() for name, field in vars(self.termination).items()}
 
@@ -206,9 +194,7 @@ def test_rules_hold_in_their_order(court):
 def test_book_of_the_episode(court):
     """Way sums straight steps; the smallest clearance stays; a reset begins with the clearance there."""
     court.put(0, 0, SPHERE, (10 + FRONT_M + 1.2, 3, -0.8), (0.2, 0.2, 0.2))
-    episode.reset_termination(
-        io_for(EpisodeIO, court.termination, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
-    )
+    episode.reset_termination(court.io(EpisodeIO, VEHICLE, TANK, RULES))
     assert court.termination.min_clearance_m[0] == pytest.approx(1.0, abs=TOL)
     for x in (10.3, 10.5, 10.1):
         court.vehicle.pos_w[0] = (x, 3.0, -0.8)
@@ -216,9 +202,7 @@ def test_book_of_the_episode(court):
     assert book["path_length_m"][0] == pytest.approx(0.3 + 0.2 + 0.4, abs=TOL)
     assert book["min_clearance_m"][0] == pytest.approx(0.5, abs=TOL)
     assert book["clearance_m"][0] == pytest.approx(0.9, abs=TOL)
-    episode.reset_termination(
-        io_for(EpisodeIO, court.termination, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
-    )
+    episode.reset_termination(court.io(EpisodeIO, VEHICLE, TANK, RULES))
     again = {name: field.to_numpy()[0] for name, field in vars(court.termination).items()}
     assert again["path_length_m"] == 0
     assert again["min_clearance_m"] == again["clearance_m"] == pytest.approx(0.9, abs=TOL)
@@ -239,7 +223,7 @@ def test_sleeping_rows_stay_as_they_are(court):
 
 def begin(court, mask, seed=3, number=7):
     rows = (torch.tensor(values, dtype=torch.int32).expand(N).contiguous() for values in (mask, seed, number))
-    episode.begin_episodes(io_for(EpisodeIO, court.clock, court.episode), *rows)
+    episode.begin_episodes(court.io(EpisodeIO), *rows)
 
 
 def test_episodes_begin_advance_end_and_sleep(court):
@@ -252,13 +236,13 @@ def test_episodes_begin_advance_end_and_sleep(court):
     # a reset pass of other rows: row 0 rests meanwhile, and goes on afterwards
     begin(court, [0] + [1] * (N - 1))
     assert court.clock.active[0] == 0
-    episode.wake(io_for(EpisodeIO, court.clock))
+    episode.wake(court.io(EpisodeIO))
     assert court.clock.active.to_numpy().all()
-    episode.advance_clock(io_for(EpisodeIO, court.clock))
+    episode.advance_clock(court.io(EpisodeIO))
     assert np.all(court.clock.step.to_numpy() == 1)
     court.termination.outcome[2] = episode.TIMEOUT
-    episode.deactivate_ended(io_for(EpisodeIO, court.clock, court.termination))
-    episode.advance_clock(io_for(EpisodeIO, court.clock))
+    episode.deactivate_ended(court.io(EpisodeIO))
+    episode.advance_clock(court.io(EpisodeIO))
     assert court.clock.step.to_numpy().tolist() == [2, 2, 1] + [2] * (N - 3)
     assert court.clock.running[2] == court.clock.active[2] == 0
 

@@ -1,14 +1,11 @@
 """The reward: every term against the equation, its sums, its ends, and progress that no replan can fake."""
 
-from collections import defaultdict
-
 import numpy as np
 import pytest
 import torch
 
-from tests.bundles import io_for
+from tests.bundles import Stage, put
 from tests.oracles import reward as reference
-from uuvtai import state
 from uuvtai.config import EpisodeConfig, RewardConfig, VehicleConfig
 from uuvtai.kernels.task import reward
 from uuvtai.kernels.task.episode import OUTCOMES
@@ -19,54 +16,44 @@ TOL = 2e-5
 """float32; acos near upright amplifies rounding to sqrt(eps)"""
 CFG = RewardConfig(overspeed=0.3, tilt=0.04)
 VEHICLE, RULES = VehicleConfig(), EpisodeConfig()
-SIZES = defaultdict(lambda: 2, n_env=N, n_term=reward.N_TERM)
-"""other axes do not matter here"""
 
 
-class Bench:
+class Bench(Stage):
+    sizes = {"n_env": N, "n_term": reward.N_TERM}
+    other = 2
+
     def __init__(self):
-        structs = (
-            state.RewardState, state.TerminationState, state.VehicleState, state.RouteState,
-            state.ActuationState, state.ClockState,
-        )  # fmt: skip
-        self.structs = [state.allocate(struct, SIZES) for struct in structs]
-        self.reward, self.termination, self.vehicle, self.route, self.actuation, self.clock = self.structs
+        super().__init__()
         self.out = torch.zeros(N), torch.zeros(N, dtype=torch.int32), torch.zeros(N, dtype=torch.int32)
         self.target = {
-            "quat": self.vehicle.quat_wb, "vel": self.vehicle.vel_b, "pos": self.vehicle.pos_w,
-            "command": self.actuation.command, "lookahead": self.route.lookahead_w,
-            "cross_track": self.route.cross_track_m, "heading_error": self.route.heading_error,
-            "clearance": self.termination.clearance_m, "ttc": self.termination.ttc_s,
-            "n_way": self.route.n_way, "outcome": self.termination.outcome,
-            "remaining": self.route.remaining_m, "plan_step": self.route.plan_step, "step": self.clock.step,
+            "quat": (self.vehicle, "quat_wb"), "vel": (self.vehicle, "vel_b"), "pos": (self.vehicle, "pos_w"),
+            "command": (self.actuation, "command"), "lookahead": (self.route, "lookahead_w"),
+            "cross_track": (self.route, "cross_track_m"), "heading_error": (self.route, "heading_error"),
+            "clearance": (self.termination, "clearance_m"), "ttc": (self.termination, "ttc_s"),
+            "n_way": (self.route, "n_way"), "outcome": (self.termination, "outcome"),
+            "remaining": (self.route, "remaining_m"), "plan_step": (self.route, "plan_step"),
+            "step": (self.clock, "step"),
         }  # fmt: skip
 
     def clean(self):
         """Every row upright at 10 m, driving ahead at 0.5 m/s on a route of old, one step in."""
         self.clock.active.fill(1)
-        reward.reset_reward(io_for(RewardIO, self.reward, self.clock))
+        reward.reset_reward(self.io(RewardIO))
         rest = {
             "quat": (1, 0, 0, 0), "vel": (0.5, 0, 0), "pos": (10, 3, -0.8), "command": (0.5, 0, 0, 0),
-            "lookahead": (11, 3, -0.8),
+            "lookahead": (11, 3, -0.8), "cross_track": 0, "heading_error": 0, "clearance": 5, "ttc": 1e6,
+            "n_way": 4, "outcome": 0, "remaining": 5, "plan_step": 0, "step": 1,
         }  # fmt: skip
         for name, value in rest.items():
-            self.set(name, np.tile(value, (N, 1)))
-        for name, value in {
-            "cross_track": 0, "heading_error": 0, "clearance": 5, "ttc": 1e6, "n_way": 4, "outcome": 0,
-        }.items():  # fmt: skip
-            self.set(name, np.full(N, value))
-        for name, value in {"remaining": 5, "plan_step": 0, "step": 1}.items():
-            self.set(name, np.full(N, value))
+            self.set(name, value)
         return self
 
     def set(self, name, values):
-        field = self.target[name]
-        field.from_numpy(
-            np.asarray(values, np.int32 if name in ("n_way", "outcome", "plan_step", "step") else np.float32)
-        )
+        struct, field = self.target[name]
+        put(struct, **{field: values})
 
     def compute(self):
-        reward.compute_reward(io_for(RewardIO, *self.structs, CFG, VEHICLE, RULES), *self.out)
+        reward.compute_reward(self.io(RewardIO, CFG, VEHICLE, RULES), *self.out)
         return dict(zip(reward.TERMS, self.reward.term.to_numpy().T.astype(float), strict=True))
 
 
@@ -132,7 +119,7 @@ def test_total_is_the_sum_and_goes_out(bench):
     assert bench.reward.episode_sum.to_numpy().sum(axis=1) == pytest.approx(
         bench.reward.episode_return.to_numpy(), abs=TOL
     )
-    reward.reset_reward(io_for(RewardIO, bench.reward, bench.clock))
+    reward.reset_reward(bench.io(RewardIO))
     assert not bench.reward.episode_sum.to_numpy().any()
     assert not bench.reward.episode_return.to_numpy().any()
 
@@ -151,7 +138,7 @@ def test_bytes_and_booleans_hold_the_ends_too(bench):
     bench.set("outcome", np.full(N, OUTCOMES.index("timeout")))
     for dtype in (torch.uint8, torch.bool):
         ends = torch.ones(N, dtype=dtype), torch.zeros(N, dtype=dtype)
-        reward.compute_reward(io_for(RewardIO, *bench.structs, CFG, VEHICLE, RULES), bench.out[0], *ends)
+        reward.compute_reward(bench.io(RewardIO, CFG, VEHICLE, RULES), bench.out[0], *ends)
         assert not ends[0].any()
         assert ends[1].all()
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.bundles import io_for
+from tests.bundles import Stage
 from tests.conftest import set_step
 from tests.oracles import world as reference
-from uuvtai import state
 from uuvtai.common.obstacle_motion import KIND_NAMES, describe_scenario, path_positions
 from uuvtai.common.presets import PRESET_DIR, preset_names
 from uuvtai.config import EpisodeConfig, TrafficConfig, WorldConfig
@@ -39,10 +38,6 @@ SPEED_TOL_M_S = 0.02
 """a corner passed within the last 2 % of a step; float32 positions alone give 2e-4"""
 SHARE_SIGMAS = 5.0
 WORLDS = ("pool", "gauntlet", "mixed", "maze", "netpen", "transfer", "open")
-STRUCTS = (
-    state.WorldState, state.PathState, state.MissionState, state.ScenarioScratch, state.SceneState,
-    state.FixedTable, state.EpisodeState, state.ClockState,
-)  # fmt: skip
 
 
 def world_config(name, **changes):
@@ -50,16 +45,12 @@ def world_config(name, **changes):
     return WorldConfig.model_validate({**tree, **changes})
 
 
-class Drawn:
+class Drawn(Stage):
     """Structs of one world, and its scenarios as arrays."""
 
     def __init__(self, cfg, n_env=N):
+        super().__init__(n_env=n_env, **setup.scenario_sizes(cfg))
         self.cfg, self.n_env = cfg, n_env
-        sizes = {"n_env": n_env, **setup.scenario_sizes(cfg)}
-        self.structs = [state.allocate(struct, sizes) for struct in STRUCTS]
-        self.world, self.path, self.mission, _, self.scene, self.fixed, self.episode, self.clock = (
-            self.structs
-        )
         self.slots = setup.obstacle_slots(cfg)
         setup.load_fixed(self.fixed, cfg)
 
@@ -70,16 +61,16 @@ class Drawn:
         numbers = np.arange(n) if numbers is None else np.asarray(numbers)
         mask = np.ones(n) if mask is None else np.asarray(mask)
         rows = (np.broadcast_to(a, n).astype(np.int32) for a in (mask, seed, numbers))
-        episode.begin_episodes(io_for(EpisodeIO, self.clock, self.episode), *rows)
-        scenarios.generate_scenarios(io_for(WorldIO, *self.structs, cfg))
+        episode.begin_episodes(self.io(EpisodeIO), *rows)
+        scenarios.generate_scenarios(self.io(WorldIO, cfg))
         return self.at(0, keep_active=True)
 
     def at(self, step, keep_active=False):
         """Arrays by name with the obstacles where they are at a step."""
         if not keep_active:
-            episode.wake(io_for(EpisodeIO, self.clock))
+            episode.wake(self.io(EpisodeIO))
         set_step(self.clock, step)
-        scenarios.move_obstacles(io_for(WorldIO, self.world, self.path, self.clock, RULES))
+        scenarios.move_obstacles(self.io(WorldIO, RULES))
         out = {f"path_{name}": field.to_numpy() for name, field in vars(self.path).items()}
         for struct in (self.world, self.mission):
             out |= {name: field.to_numpy() for name, field in vars(struct).items()}
