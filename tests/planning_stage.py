@@ -21,23 +21,11 @@ CONFIG = Config()
 @lru_cache(maxsize=1)
 def stage():
     """Every struct of planning."""
-    sizes = {
-        "n_env": N_ENV,
-        "n_plan": N_PLAN,
-        "n_row": maps.SHAPE[0],
-        "n_col": maps.SHAPE[1],
-        "n_heap": maps.SHAPE[0] * maps.SHAPE[1],
-        "n_path": 2048,
-        "n_way": CONFIG.route.n_way,
-        "n_ahead": N_AHEAD,
-        "n_trigger": 4,
-        "n_planner": 3,
-        "n_reason": 4,
-        "n_track": 2,
-        "n_forecast": 26,
-        "n_ray": 16,
-    }
-    s = Stage(**sizes)
+    s = Stage(
+        n_env=N_ENV, n_plan=N_PLAN, n_row=maps.SHAPE[0], n_col=maps.SHAPE[1],
+        n_heap=maps.SHAPE[0] * maps.SHAPE[1], n_path=2048, n_way=CONFIG.route.n_way, n_ahead=N_AHEAD,
+        n_trigger=4, n_planner=3, n_reason=4, n_track=2, n_forecast=26, n_ray=16,
+    )  # fmt: skip
     load_bounds(s.mask, maps.OUTSIDE)
     return s
 

@@ -1,4 +1,4 @@
-"""CPU and CUDA run the same kernels: the same states within float tolerance, the same outcomes. Skipped where
+"""CPU and CUDA run the same kernels: the same states within float tolerance, as many successes. Skipped where
 there is no CUDA device.
 
 Each device gets a process of its own, because a process has one Taichi runtime.
@@ -11,6 +11,8 @@ import sys
 import numpy as np
 import pytest
 import torch
+
+from uuvtai.common.statistics import mcnemar_p
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 
@@ -40,14 +42,14 @@ def state_after_200_steps(device, folder):
     return np.load(target)
 
 
-def outcomes(device, folder):
+def successes(device, folder):
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "64", "--num-envs", "64",
+        sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "256", "--num-envs", "256",
         "--device", device,
         "--run-dir", str(folder / f"run_{device}"), "--json",
     ]  # fmt: skip
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return [d["outcome"] for d in json.loads(done.stdout)["agents"][0]["episodes_detail"]]
+    return [d["outcome"] == "success" for d in json.loads(done.stdout)["agents"][0]["episodes_detail"]]
 
 
 def test_states_agree_after_200_steps(tmp_path):
@@ -56,5 +58,8 @@ def test_states_agree_after_200_steps(tmp_path):
         np.testing.assert_allclose(cuda[name], cpu[name], atol=POSITION_TOLERANCE_M, err_msg=name)
 
 
-def test_outcomes_agree_on_64_episodes(tmp_path):
-    assert outcomes("cuda", tmp_path) == outcomes("cpu", tmp_path)
+def test_as_many_of_256_episodes_succeed(tmp_path):
+    """Episode by episode: rounding decides some of them otherwise, to both sides as often."""
+    pairs = list(zip(successes("cuda", tmp_path), successes("cpu", tmp_path), strict=True))
+    only = [sum(pair == won for pair in pairs) for won in ((True, False), (False, True))]
+    assert mcnemar_p(*only) > 0.01 and sum(only) < 26, only

@@ -1,5 +1,6 @@
 """The whole step: determinism, independence of envs, zero copy."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -175,6 +176,17 @@ def test_a_closed_simulator_leaves_its_arrays_to_the_next_one_as_new(small):
     assert other.memory().address != address, "one that is open keeps its own"
     other.close()
     second.close()
+
+
+@pytest.mark.skipif(not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="no large pages here")
+def test_arrays_lie_in_large_pages_where_the_system_has_them(small):
+    address, holds, flags = small.sim.memory().address, False, []
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        if found := re.match(r"([0-9a-f]+)-([0-9a-f]+) ", line):
+            holds = int(found[1], 16) <= address < int(found[2], 16)
+        if holds and line.startswith("VmFlags:"):
+            flags = line.split()
+    assert "hg" in flags
 
 
 def test_memory_of_closed_environments_is_given_back():

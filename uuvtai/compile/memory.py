@@ -22,8 +22,8 @@ from uuvtai.state import PACKET
 if TYPE_CHECKING:
     import torch
 
-_MADV_DONTNEED = 4
-"""of Linux: private memory reads as zero afterwards"""
+_MADV_DONTNEED, _MADV_HUGEPAGE = 4, 14
+"""of Linux: private memory reads as zero afterwards; pages of 2 MiB from the next touch on"""
 Put = Callable[[Any, np.ndarray], None]
 """Fills a field from an array of its shape (vectors add a last axis) and dtype."""
 
@@ -141,16 +141,27 @@ class Memory:
         if self.device.type != "cpu":
             self._on_device().zero_()
             return
-        content, page = self.read(), mmap.PAGESIZE
-        begin = -self.address % page
-        count = max(0, (self.n_bytes - begin) // page) * page
+        content = self.read()
+        begin, count = self._advise(_MADV_DONTNEED)
+        content[:begin], content[begin + count :] = 0, 0
+
+    def widened(self) -> "Memory":
+        """This memory, all zero, in large pages where the system has them (Linux, CPU): a step touches lines
+        all over it, and small pages are more than the processor's table of addresses holds."""
+        if self.device.type == "cpu" and self._advise(_MADV_HUGEPAGE)[1]:
+            self.clear()
+        return self
+
+    def _advise(self, what: int) -> tuple[int, int]:
+        """(first byte, count) of the whole pages for which the system took the advice."""
+        begin = -self.address % mmap.PAGESIZE
+        count = max(0, (self.n_bytes - begin) // mmap.PAGESIZE) * mmap.PAGESIZE
         if sys.platform == "linux" and count:
-            free = ctypes.CDLL(None).madvise
-            free.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
-            if free(self.address + begin, count, _MADV_DONTNEED) == 0:
-                content[:begin], content[begin + count :] = 0, 0
-                return
-        content[:] = 0
+            advise = ctypes.CDLL(None).madvise
+            advise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+            if advise(self.address + begin, count, what) == 0:
+                return begin, count
+        return begin, 0
 
     def rows(self, field: Any, rows: list[int] | slice) -> np.ndarray:
         """Copy of these rows of a field, shape (len(rows), ...), vectors with a last axis. CPU

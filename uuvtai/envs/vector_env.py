@@ -12,6 +12,7 @@ import hashlib
 import json
 import operator
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,7 +59,7 @@ def observation_sha256(table: tuple[ObservationColumn, ...]) -> str:
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
-class VectorEnv:
+class VectorEnv(AbstractContextManager["VectorEnv"]):
     """``num_envs`` episodes side by side; an env whose episode ends begins its next one in the same step
     (``autoreset``).
 
@@ -258,10 +259,6 @@ class VectorEnv:
             self.sim.observation = None
         if self._owns_sim:
             self.sim.close()
-
-    def __enter__(self) -> VectorEnv:
-        """The environment itself."""
-        return self
 
     def __exit__(self, *_error: Any) -> None:
         """Close."""

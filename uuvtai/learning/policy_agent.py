@@ -8,11 +8,13 @@ the matrix products.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, TypeVar
 
 import torch
+from torch import nn
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
@@ -192,7 +194,7 @@ def load_agent(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     if config.learner in _NO_NETWORK:
         raise CheckpointError(f"{checkpoint.path}: {_NO_NETWORK[config.learner]}")
     parts, generator = checkpoint.model(), torch.Generator()
-    try:
+    with fitting(checkpoint):
         n_obs = max(row["stop"] for row in rows)
         teacher = next(
             (slice(row["first"], row["stop"]) for row in rows if row["name"] == TEACHER_COLUMN), None
@@ -204,17 +206,34 @@ def load_agent(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
         if config.world_model.enabled and config.world_model.as_features:
             world_model = WorldModel(n_obs, config.world_model, generator)
             world_model.load_state_dict(parts["world_model"])
+    for module in (policy, world_model):
+        if module is not None:
+            finite(module, checkpoint).to(device)
+    return PolicyAgent(policy, world_model, num_envs, device)
+
+
+Net = TypeVar("Net", bound=nn.Module)
+
+
+@contextlib.contextmanager
+def fitting(checkpoint: Checkpoint) -> Iterator[None]:
+    """Turn what networks of another shape raise into a CheckpointError."""
+    try:
+        yield
+    except CheckpointError:
+        raise
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
         ) from None
-    modules = [module for module in (policy, world_model) if module is not None]
-    for module in modules:
-        for name, tensor in module.state_dict().items():
-            if not bool(torch.isfinite(tensor).all()):
-                raise CheckpointError(
-                    f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
-                    "checkpoint"
-                )
-        module.to(device).eval()
-    return PolicyAgent(policy, world_model, num_envs, device)
+
+
+def finite(net: Net, checkpoint: Checkpoint) -> Net:
+    """The network, to act with. Raises CheckpointError where a weight is not finite."""
+    for name, tensor in net.state_dict().items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(
+                f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
+                "checkpoint"
+            )
+    return net.eval()

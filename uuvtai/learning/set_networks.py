@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import nn
 
 from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
+from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.networks import MixtureNet, mlp
+from uuvtai.learning.policy_agent import finite, fitting
 
 # ------------------------------------------------------------------------------------------------------------
 # Policy over a set of obstacles: every obstacle goes through one encoder, and what comes out is pooled by
@@ -132,18 +131,12 @@ def _sum(each: torch.Tensor) -> torch.Tensor:
     return each.sum(dim=0, dtype=torch.float32).to(each.dtype)
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
-Net = TypeVar("Net", bound=nn.Module)
-
-
 def actor_of(checkpoint: Checkpoint) -> SetActor:
     """The policy over a set of obstacles. Raises CheckpointError where its networks are not those of its
     config."""
     config = checkpoint.config
     wide, head = config.surrogate.obstacle_hidden, config.surrogate.head_hidden
-    with _refused(checkpoint):
+    with fitting(checkpoint):
         part = checkpoint.model()["policy"]
         for name, shape in (
             ("net.obstacle.0.weight", (wide, OBSTACLE_WIDTH)),
@@ -153,35 +146,12 @@ def actor_of(checkpoint: Checkpoint) -> SetActor:
                 raise ValueError(f"{name} is {tuple(part[name].shape)} instead of {shape}")
         actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator())
         actor.load_state_dict(part)
-    return _finite(actor, checkpoint)
+    return finite(actor, checkpoint)
 
 
 def mixture_net_of(checkpoint: Checkpoint) -> MixtureNet:
     """A learned forecast. Raises as ``actor_of``."""
-    with _refused(checkpoint):
+    with fitting(checkpoint):
         net = MixtureNet(torch.Generator())
         net.load_state_dict(checkpoint.model()["forecast"])
-    return _finite(net, checkpoint)
-
-
-@contextlib.contextmanager
-def _refused(checkpoint: Checkpoint) -> Iterator[None]:
-    """Turn what networks of another shape raise into a CheckpointError."""
-    try:
-        yield
-    except CheckpointError:
-        raise
-    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
-        ) from None
-
-
-def _finite(net: Net, checkpoint: Checkpoint) -> Net:
-    for name, tensor in net.state_dict().items():
-        if not bool(torch.isfinite(tensor).all()):
-            raise CheckpointError(
-                f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
-                "checkpoint"
-            )
-    return net.eval()
+    return finite(net, checkpoint)

@@ -274,7 +274,7 @@ class LiveError(UserError, RuntimeError):
     """Episodes cannot be shown live: what, where, why, what to type next."""
 
 
-class ViewerServer:
+class ViewerServer(contextlib.AbstractContextManager["ViewerServer"]):
     """Sends messages to whoever has subscribed to their topic. Use as a context: it ends with it."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 8765, origins: Collection[str] = ()) -> None:
@@ -350,9 +350,6 @@ class ViewerServer:
     def close(self) -> None:
         self._server.stop()
         self._door.close()
-
-    def __enter__(self) -> ViewerServer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -18,7 +18,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -102,7 +101,7 @@ class TopicStream:
         return last is None or not hertz or time_s - last >= 1.0 / hertz - 1e-6
 
 
-class McapEpisodeLog:
+class McapEpisodeLog(contextlib.AbstractContextManager["McapEpisodeLog"]):
     """One episode's log. Raises LogError where the file cannot be written, of which nothing is left then."""
 
     def __init__(self, path: Path, header: EpisodeHeader, depth_images: bool = False) -> None:
@@ -141,12 +140,7 @@ class McapEpisodeLog:
                 self._file.leave()
             self._closed = True
 
-    def __enter__(self) -> McapEpisodeLog:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.abandon()
 
     def _write_head(self) -> None:

@@ -9,6 +9,7 @@ import select
 import socket
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from threading import Event
 from typing import Any
@@ -52,7 +53,7 @@ def place_of(text: str, option: str = "--mavlink") -> LinkPlace:
     return LinkPlace(found[2], int(found[3]), found[1] == "udpout")
 
 
-class Endpoint:
+class Endpoint(AbstractContextManager["Endpoint"]):
     """One side of a UDP link. Use as a context."""
 
     clock_jumps = 0  # how often the clock that it keeps, if any, ran on without its senders' clocks
@@ -113,9 +114,6 @@ class Endpoint:
 
     def close(self) -> None:
         self._socket.close()
-
-    def __enter__(self) -> Endpoint:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -53,9 +53,7 @@ class Rig(Stage):
         put(ego, rpy=np.stack([v.roll[k], v.pitch[k], v.imu_yaw[k]], 1), rate_b=v.rates[k])
         put(ego, specific_force_b=v.force[k], depth_m=v.depth[k])
         if k % v.sensors.dvl.period_steps == 0:
-            ego.vel_valid.from_numpy(v.valid[k])
-            seen = v.valid[k][:, None] == 1
-            ego.vel_b.from_numpy(np.where(seen, v.reading[k], WRONG).astype(np.float32))
+            put(ego, vel_valid=v.valid[k], vel_b=np.where(v.valid[k][:, None] == 1, v.reading[k], WRONG))
         localization.predict_pose(self.filter)
 
     def ping(self, k):
@@ -74,9 +72,7 @@ class Rig(Stage):
     def deliver(self, k, due):
         """The scan of step ``k`` comes now."""
         names = ("range_m", "doppler_m_s", "hit", "ping_pos_w", "ping_yaw", "ping_vel_b")
-        for name, values in zip(names, due, strict=True):
-            getattr(self.scan, name).from_numpy(values if name == "hit" else values.astype(np.float32))
-        put(self.scan, ping_step=np.full(N_ENV, k, np.int32), fresh=1)
+        put(self.scan, **dict(zip(names, due, strict=True)), ping_step=k, fresh=1)
 
     def play(self, until=STEPS, since=0):
         for k in range(since, until):

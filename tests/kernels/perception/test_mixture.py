@@ -44,11 +44,9 @@ class Rig(Stage):
 
     def swim(self, places, velocity):
         """Every body at a place (n_env, n_track, 2), on a velocity, for a scan."""
-        state = np.concatenate([places, velocity], -1).astype(np.float32)
-        self.tracks.state.from_numpy(np.broadcast_to(state, (N_ENV, N_TRACK, 4)).copy())
+        put(self.tracks, state=np.concatenate([places, velocity], -1))
         ahead = 0.1 * np.arange(N_SAMPLE)[:, None]
-        way = (places[..., None, :] + ahead * velocity[..., None, :]).astype(np.float32)
-        self.forecast.pos_w.from_numpy(np.broadcast_to(way, (N_ENV, N_TRACK, N_SAMPLE, 2)).copy())
+        put(self.forecast, pos_w=places[..., None, :] + ahead * velocity[..., None, :])
 
     def scan(self, step):
         self.clock.step.fill(step)

@@ -61,6 +61,12 @@ def spread(n_env: int, inner: int = 1) -> int:
     return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // (n_env * inner))))
 
 
+def shares(count: int) -> int:
+    """Loop items among which an env's ``count`` rows or tracks are shared: one each on a GPU, one for all on
+    a CPU, where a reset passes over a thousand envs that sleep."""
+    return count if is_gpu_shaped() else 1
+
+
 # ------------------------------------------------------------------------------------------------------------
 # What a group of columns of the observation is: the environment's table is read off these declarations, and
 # the kernels write by them.

@@ -14,7 +14,7 @@ from uuvtai.kernels.core.beams import beam_there, beam_towards
 from uuvtai.kernels.core.geometry import FAR_M, quaternion_wb, rotation_wb, wrapped_angle
 from uuvtai.kernels.core.kalman import born, corrected, position_variance
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, shares, spread
 from uuvtai.kernels.perception.height import COLUMN, begin_height, heights, weigh_camera
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.sensor_model import NO_RETURN_SHARE, pinhole, wall_lanes
@@ -349,17 +349,15 @@ _PAST = 2
 def look_at_obstacles(io: Bundle[TrackingIO]):
     """Weigh the heights of every moving track in the view of a fresh image."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
-        if (
-            pad == 0
-            and io.clock.active[env] == 1
-            and io.image.fresh[env] == 1
-            and io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1
-        ):
+    n_share = ti.static(shares(n_track))
+    for env, share, pad in ti.ndrange(n, n_share, ti.static(spread(n, n_share))):
+        if pad == 0 and io.clock.active[env] == 1 and io.image.fresh[env] == 1:
             late = (io.clock.step[env] - io.tracks.scan_step[env]) * io.episode_cfg.control_dt_s
-            mean = io.tracks.state[env, track]
-            at = ti.Vector([mean[0] + late * mean[2], mean[1] + late * mean[3]])
-            look_at(env, track, at, io)
+            for track in range(share * n_track // n_share, (share + 1) * n_track // n_share):
+                if io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
+                    mean = io.tracks.state[env, track]
+                    at = ti.Vector([mean[0] + late * mean[2], mean[1] + late * mean[3]])
+                    look_at(env, track, at, io)
 
 
 @ti.func

@@ -18,7 +18,7 @@ from uuvtai.config import HeightConfig, TankConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
-from uuvtai.kernels.core.stage import Bundle, Const, In, Out, spread
+from uuvtai.kernels.core.stage import Bundle, Const, In, Out, shares, spread
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import TrackState
 
@@ -144,17 +144,19 @@ def bound_heights(io: Bundle[TrackingIO]):
     with the vehicle, and for tracks that do not move.
     """
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
+    n_share = ti.static(shares(n_track))
+    for env, share, pad in ti.ndrange(n, n_share, ti.static(spread(n, n_share))):
         if pad == 0 and io.clock.active[env] == 1:
             own_z = io.ego.pos_w[env][2]
-            above, below = own_z, own_z
-            if (
-                ti.static(io.height_cfg.memory_s > 0)
-                and io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1
-            ):
-                above, below = free_water(env, track, own_z, io)
-            io.forecast.above_w[env, track] = above
-            io.forecast.below_w[env, track] = below
+            for track in range(share * n_track // n_share, (share + 1) * n_track // n_share):
+                above, below = own_z, own_z
+                if (
+                    ti.static(io.height_cfg.memory_s > 0)
+                    and io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1
+                ):
+                    above, below = free_water(env, track, own_z, io)
+                io.forecast.above_w[env, track] = above
+                io.forecast.below_w[env, track] = below
 
 
 @ti.func

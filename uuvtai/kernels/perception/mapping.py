@@ -28,7 +28,7 @@ import taichi as ti
 
 from uuvtai.compile.launch import quick_launch, with_cse
 from uuvtai.kernels.core.simd import WORD, bit_of, lowest_bit, n_item, n_turn, taken, with_bit, without_lowest
-from uuvtai.kernels.core.stage import Bundle, Const, spread
+from uuvtai.kernels.core.stage import Bundle, Const, shares, spread
 from uuvtai.kernels.perception.io import MappingIO
 from uuvtai.kernels.perception.sensor_model import mark_depth, mark_free, mark_hits
 
@@ -350,17 +350,19 @@ def update_map(io: Bundle[MappingIO]):
 def reset_map(io: Bundle[MappingIO]):
     """An empty map: nothing occupied, nothing seen."""
     n_env, n_row, n_col = ti.static(io.grid_map.static_occ.shape)
-    for env, row in ti.ndrange(n_env, n_row):
-        if io.clock.active[env] == 1:
+    n_share = ti.static(shares(n_row))
+    for env, share, pad in ti.ndrange(n_env, n_share, ti.static(spread(n_env, n_share))):
+        if pad == 0 and io.clock.active[env] == 1:
             io.grid_map.map_step[env] = _NO_SCAN
             io.grid_map.depth_waits[env] = 0
-            for col in range(n_col):
-                io.grid_map.static_occ[env, row, col] = 0.0
-                io.grid_map.dynamic_occ[env, row, col] = 0.0
-                io.grid_map.dynamic_scans[env, row, col] = ti.u8(0)
-            for word in range(ti.static(io.grid_map.seen.shape[2])):
-                io.grid_map.free_scans[env, row, word] = ti.Vector.zero(
-                    ti.u64, ti.static(io.grid_map.free_scans.n)
-                )
-                for words in ti.static(bit_fields(io.grid_map)):
-                    words[env, row, word] = ti.cast(0, ti.u64)
+            for row in range(share * n_row // n_share, (share + 1) * n_row // n_share):
+                for col in range(n_col):
+                    io.grid_map.static_occ[env, row, col] = 0.0
+                    io.grid_map.dynamic_occ[env, row, col] = 0.0
+                    io.grid_map.dynamic_scans[env, row, col] = ti.u8(0)
+                for word in range(ti.static(io.grid_map.seen.shape[2])):
+                    io.grid_map.free_scans[env, row, word] = ti.Vector.zero(
+                        ti.u64, ti.static(io.grid_map.free_scans.n)
+                    )
+                    for words in ti.static(bit_fields(io.grid_map)):
+                        words[env, row, word] = ti.cast(0, ti.u64)

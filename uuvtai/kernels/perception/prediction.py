@@ -10,7 +10,7 @@ from uuvtai.config import ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.geometry import FAR_M, turned_z
 from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.simd import LANES, f16x
-from uuvtai.kernels.core.stage import Bundle, Const, In, spread
+from uuvtai.kernels.core.stage import Bundle, Const, In, shares, spread
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import TrackState, TurnHistory
 
@@ -363,18 +363,19 @@ def forecast_tracks(io: Bundle[TrackingIO]):
     """
     n = ti.static(io.clock.active.shape[0])
     n_track = ti.static(io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
+    n_share = ti.static(shares(n_track))
+    for env, share, pad in ti.ndrange(n, n_share, ti.static(spread(n, n_share))):
         if pad == 0 and io.clock.active[env] == 1:
-            changed = (
-                io.clusters.fresh[env] + io.image.fresh[env] > 0
-            )  # only a tracked scan or an image changes tracks and turn history
-            if io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
-                if expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) != 0.0:
-                    follow_arc(env, track, io)
-                else:
-                    follow_legs(env, track, changed, io)
-            elif io.forecast.radius_m[env, track, 0] >= 0:
-                clear_forecast(env, track, io)
+            # only a tracked scan or an image changes tracks and turn history
+            changed = io.clusters.fresh[env] + io.image.fresh[env] > 0
+            for track in range(share * n_track // n_share, (share + 1) * n_track // n_share):
+                if io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
+                    if expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) != 0.0:
+                        follow_arc(env, track, io)
+                    else:
+                        follow_legs(env, track, changed, io)
+                elif io.forecast.radius_m[env, track, 0] >= 0:
+                    clear_forecast(env, track, io)
 
 
 @ti.func

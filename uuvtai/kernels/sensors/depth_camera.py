@@ -15,7 +15,7 @@ from uuvtai.compile.launch import is_gpu_shaped, quick_launch, with_cse
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE, rotation_wb
 from uuvtai.kernels.core.noise import STREAM_DEPTH, normal_pair_lanes, stream_key
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, shares, spread
 from uuvtai.kernels.sensors.io import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
 
@@ -44,11 +44,13 @@ CameraPose = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
 def reset_depth(io: Bundle[DepthIO]):
     """Forget the image of the active rows (the shot of step 0 fills it)."""
     n, n_row, n_col = ti.static(io.image.depth_m.shape)
-    for env, row, pad in ti.ndrange(n, n_row, ti.static(spread(n, n_row))):
+    n_share = ti.static(shares(n_row))
+    for env, share, pad in ti.ndrange(n, n_share, ti.static(spread(n, n_share))):
         if pad == 0 and io.clock.active[env] == 1:
-            for col in range(n_col):
-                io.image.depth_m[env, row, col] = 0.0
-            if row == 0:
+            for row in range(share * n_row // n_share, (share + 1) * n_row // n_share):
+                for col in range(n_col):
+                    io.image.depth_m[env, row, col] = 0.0
+            if share == 0:
                 io.image.fresh[env] = 0
                 io.image.shot_pos_w[env] = ti.zero(io.image.shot_pos_w[env])
                 io.image.shot_rpy[env] = ti.zero(io.image.shot_rpy[env])

@@ -22,7 +22,7 @@ from uuvtai.kernels.core.geometry import (
     nearest_squared,
 )
 from uuvtai.kernels.core.noise import STREAM_SCENARIO, stream_key, uniform, uniform_in
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, shares, spread
 from uuvtai.kernels.world.io import WorldIO
 from uuvtai.kernels.world.motion import (
     draw_moving_obstacles,
@@ -347,12 +347,15 @@ def place_fixed(env, io: Bundle[WorldIO]):
 def move_obstacles(io: Bundle[WorldIO]):
     """Put every moving obstacle of the active rows where it is at time step * dt, with its velocity; depth
     stays."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, lane in ti.ndrange(n, ti.static(io.path.n_way.shape[1])):
-        slot = first_moving(io.world, io.path) + lane
-        if io.clock.active[env] == 1 and io.world.kind[env, slot] != NONE:
-            speed = io.path.speed_m_s[env, lane]
+    n, n_lane = ti.static(io.path.n_way.shape[:2])
+    n_share = ti.static(shares(n_lane))
+    for env, share, pad in ti.ndrange(n, n_share, ti.static(spread(n, n_share))):
+        if pad == 0 and io.clock.active[env] == 1:
             time_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
-            at = path_point(env, lane, io.path.phase_m[env, lane] + speed * time_s, io)
-            io.world.pos_w[env, slot] = ti.Vector([at[0], at[1], io.world.pos_w[env, slot][2]])
-            io.world.vel_w[env, slot] = ti.Vector([speed * at[2], speed * at[3], 0.0])
+            for lane in range(share * n_lane // n_share, (share + 1) * n_lane // n_share):
+                slot = first_moving(io.world, io.path) + lane
+                if io.world.kind[env, slot] != NONE:
+                    speed = io.path.speed_m_s[env, lane]
+                    at = path_point(env, lane, io.path.phase_m[env, lane] + speed * time_s, io)
+                    io.world.pos_w[env, slot] = ti.Vector([at[0], at[1], io.world.pos_w[env, slot][2]])
+                    io.world.vel_w[env, slot] = ti.Vector([speed * at[2], speed * at[3], 0.0])
