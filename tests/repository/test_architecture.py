@@ -224,8 +224,11 @@ def test_every_bundle_holds_what_its_stage_touches_and_nothing_else():
         )
 
 
-def test_only_the_runtime_starts_taichi():
+def test_only_one_room_knows_taichis_inside_and_only_the_runtime_starts_it():
     for path in PACKAGE.rglob("*.py"):
+        taken = [str(n.module) for n in nodes_of(path) if isinstance(n, ast.ImportFrom)]
+        taken += [name.name for n in nodes_of(path) if isinstance(n, ast.Import) for name in n.names]
+        assert path.parent == PACKAGE / "compile" or not any(name.startswith("taichi.") for name in taken)
         calls = [ast.unparse(n.func) for n in nodes_of(path) if isinstance(n, ast.Call)]
         assert ("ti.init" in calls) == (path == PACKAGE / "compile/runtime.py")
 

@@ -237,9 +237,14 @@ def _layout(field: Any, lanes: bool) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return shape, tuple(cell * math.prod(shape[axis + 1 :]) for axis in range(len(shape)))
 
 
-def _view(field: Any, lanes: bool, content: np.ndarray) -> np.ndarray:
+def numpy_type(field: Any) -> np.dtype:
+    """NumPy's name of a field's type."""
     kind, bits = str(field.dtype)[0], int(str(field.dtype)[1:])
-    dtype = np.dtype(f"{kind}{bits // 8}")
+    return np.dtype(f"{kind}{bits // 8}")
+
+
+def _view(field: Any, lanes: bool, content: np.ndarray) -> np.ndarray:
+    dtype = numpy_type(field)
     shape, strides = _layout(field, lanes)
     if len(field.vars) > 1:
         shape, strides = (*shape, len(field.vars)), (*strides, dtype.itemsize)

@@ -31,11 +31,15 @@ CACHE_BYTES = 1 << 30
 push each other's kernels out"""
 
 
+def cache_folder() -> Path:
+    """Where Taichi keeps compiled kernels."""
+    return Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or default_cfg().offline_cache_file_path)
+
+
 def stale_locks() -> list[Path]:
     """Locks of the kernel cache that nobody holds any more: with one of them every process compiles
     everything again."""
-    cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or default_cfg().offline_cache_file_path)
-    return [lock for lock in cache.rglob("*.lock") if time.time() - lock.stat().st_mtime > _LOCKED_S]
+    return [lock for lock in cache_folder().rglob("*.lock") if time.time() - lock.stat().st_mtime > _LOCKED_S]
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -119,11 +119,9 @@ def _cuda() -> str:
 
 
 def _cache() -> str:
-    from taichi.lang.impl import default_cfg
+    from uuvtai.compile.runtime import cache_folder, stale_locks
 
-    from uuvtai.compile.runtime import stale_locks
-
-    path = Path(default_cfg().offline_cache_file_path)
+    path = cache_folder()
     for lock in stale_locks():
         raise RuntimeError(
             f"{lock} was left by a process that was killed, so every run compiles again; delete this file"

@@ -65,8 +65,7 @@ def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
     screen.line(
         f"{part['agent']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told "
         f"of the moving obstacles it arrives), {part['forecast_decision']} by forecast, decision and inertia "
-        f"(a "
-        f"point had a way), {part['physics']} by physics (the oracle finds none)"
+        f"(a point had a way), {part['physics']} by physics (the oracle finds none)"
     )
 
 

@@ -76,15 +76,13 @@ CAUSES: dict[str, str] = {
     "hit_floor": "touched the floor",
     "hit_surface": "touched the surface",
     "evaded_into_static": f"touched a static or wall while evading, or with a moving obstacle within "
-    f"{NEAR_M:g} "
-    "m",
+    f"{NEAR_M:g} m",
     "hit_static": "touched a static obstacle, no moving obstacle near",
     "hit_wall": "touched a side wall, no moving obstacle near",
     "no_escape_at_start": f"killed in the first {START_S:g} s",
     "undetected_beside": f"killer beside or behind the sonar's fan all through the last {UNDETECTED_S:g} s",
     "undetected_depth_change": f"killer above or below the sonar's fan all through the last {UNDETECTED_S:g} "
-    f"s, and the own "
-    f"depth changed towards it by > {CLIMB_M:g} m in the last {CLIMB_S:g} s",
+    f"s, and the own depth changed towards it by > {CLIMB_M:g} m in the last {CLIMB_S:g} s",
     "undetected_above": f"killer above the sonar's fan all through the last {UNDETECTED_S:g} s",
     "undetected_below": f"killer below the sonar's fan all through the last {UNDETECTED_S:g} s",
     "obstacle_reversed": f"killer turned back in the last {TURN_S:g} s and the forecast before it was wrong",

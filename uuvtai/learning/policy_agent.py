@@ -178,11 +178,9 @@ _NO_NETWORK = {
     "forecast_training": "forecasts and does not drive; give it to an agent that does: --set "
     "forecast.learned=RUN",
     "parameter_search": "numbers for the behaviour tree, no network that could be exported; they drive as "
-    "--agent best, "
-    "or as stack.yaml of the run",
+    "--agent best, or as stack.yaml of the run",
     "surrogate": "a policy over a set of obstacles, which looks at the simulator itself; it drives in 'uuv "
-    "eval' and "
-    "'uuv sweep', and is exported by 'uuv export'",
+    "eval' and 'uuv sweep', and is exported by 'uuv export'",
 }
 """what cannot be a ``PolicyAgent``, by ``LearningConfig.learner``"""
 

@@ -577,8 +577,7 @@ def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
         raise SettingError(
             f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: the surrogate decides every "
-            f"{DECISION_S} s, "
-            f"after {HOLD_STEPS} control steps"
+            f"{DECISION_S} s, after {HOLD_STEPS} control steps"
         )
     samples = config.ppo.rollout_steps * config.train.num_envs
     if config.ppo.minibatches > samples:

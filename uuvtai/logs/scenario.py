@@ -33,8 +33,7 @@ FORMULAS = {
         "range * tan(a); a = sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and "
         "surface never; "
         "nothing beyond sensors.sonar.max_range_m returns. Doppler = (velocity of the obstacle or wall that "
-        "is "
-        "met - own velocity) . beam: how fast that piece of surface recedes; none is measured where "
+        "is met - own velocity) . beam: how fast that piece of surface recedes; none is measured where "
         "sensors.sonar.doppler is false. Errors as in sensors.sonar. If sensors.sonar.mechanical, a scan "
         "holds the beams taken in that control step; a beam returns the nearest that 16 rays meet, evenly "
         "over beam_width_deg about it. The k-th is taken at the end of the control step in which k (2 "
@@ -109,8 +108,7 @@ FORMULAS = {
     ),
     "candidates": (
         "Velocities in the order of `costs` of /evasion; names are keys of `behaviour tree`, followed, asked "
-        "and "
-        "top defined here. followed = `follow`; asked = `asked` of /action one control step before; "
+        "and top defined here. followed = `follow`; asked = `asked` of /action one control step before; "
         "top(h) = min(evade_m_s, 1 / max(|cos(h - yaw)| / max_surge_m_s, |sin(h - yaw)| / max_sway_m_s)), "
         "limits of `vehicle`; h0 = heading of followed. First n_heading * n_speed level ones with the "
         "heave of followed: number i has heading h0 + 2 pi (i mod n_heading) / n_heading and speed top "

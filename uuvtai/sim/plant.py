@@ -7,11 +7,10 @@ from dataclasses import is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
-from taichi.lang.util import to_numpy_type
 
 from uuvtai import state
 from uuvtai.common.errors import SettingError
-from uuvtai.compile.memory import HostFields
+from uuvtai.compile.memory import HostFields, numpy_type
 from uuvtai.compile.runtime import Runtime
 from uuvtai.config import Config
 from uuvtai.kernels.sensors import proprioception
@@ -67,8 +66,8 @@ class Plant:
             view[...] = value
             return
         shape = (*field.shape, field.n) if hasattr(field, "n") else field.shape
-        dtype = to_numpy_type(field.dtype)
-        field.from_numpy(np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=dtype), shape)))
+        whole = np.broadcast_to(np.asarray(value, numpy_type(field)), shape)
+        field.from_numpy(np.ascontiguousarray(whole))
 
     def read(self, field: Any) -> np.ndarray:
         """A copy of a field, vectors with a last axis."""

@@ -97,8 +97,7 @@ def test_the_kernel_says_what_the_network_says(stage, net):
     course, speed = rng.uniform(-np.pi, np.pi, (N_ENV, N_TRACK)), rng.uniform(0.3, 1.5, (N_ENV, N_TRACK))
     place = rng.uniform(1, 5, (N_ENV, N_TRACK, 2))
     frame = np.concatenate([place, np.stack([np.cos(course), np.sin(course), speed], -1)], -1)
-    fill(stage.mixture.column, told)
-    fill(stage.mixture.frame, frame)
+    put(stage.mixture, column=told, frame=frame)
     share, pos, forecast = stage.mix()
     said = net(torch.from_numpy(told).view(-1, told.shape[-1]), torch.from_numpy(speed).float().view(-1))
     weight = said.log_weight.exp().detach().numpy().reshape(share.shape)
@@ -163,13 +162,9 @@ def test_a_mirrored_track_has_mirrored_columns(stage):
     for flip in (1, -1):
         mirror = np.array([1.0, flip])
         stage.begin()
-        fill(stage.tracks.turn_rate, flip * rate)
-        stage.tracks.turn_cov.fill(0.1)
-        fill(
-            stage.turn_history.run_from_w,
-            np.where(flip > 0, 0, WIDTH_M) * np.array([0, 1]) + (begin - 0.5) * mirror,
-        )
-        stage.turn_history.run_kind.fill(2)
+        put(stage.tracks, turn_rate=flip * rate, turn_cov=0.1)
+        since = np.where(flip > 0, 0, WIDTH_M) * np.array([0, 1]) + (begin - 0.5) * mirror
+        put(stage.turn_history, run_from_w=since, run_kind=2)
         turned = np.zeros((N_ENV, 7, 3, LANES), np.float32)
         turned[..., 0] = np.array([14, 3, 1, 0, -0.6, 0.8 * flip, 1.0])[None, :, None]
         stage.turn_history.turn.from_numpy(turned)
