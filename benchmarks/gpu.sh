@@ -20,7 +20,8 @@ if [ "${1:-}" = carry ]; then
     for glibc in 2_28 2_27 2_24 2_17; do there+=(--platform "manylinux_${glibc}_x86_64"); done
     there+=(--platform manylinux2014_x86_64)
     "$PY" -m pip download -q "${there[@]}" -d "$made" taichi==1.7.4
-    # without its C interface and its examples Taichi is half as large; llvmlite is for CPUs alone
+    # without its C interface and its examples Taichi is half as large; llvmlite is for CPUs alone; pydantic and
+    # its core fit in pairs
     (cd "$made" && "$PY" -m zipfile -e taichi-*.whl . && rm -rf taichi/_lib/c_api taichi/examples)
     tar -C "$made" -cJf .wheels/taichi.tar.xz taichi taichi-1.7.4.dist-info
     "$PY" -m pip download -q "${there[@]}" -d .wheels pydantic==2.13.4 pydantic-core==2.46.4 annotated-types \

@@ -178,8 +178,8 @@ def test_a_closed_simulator_leaves_its_arrays_to_the_next_one_as_new(small):
     second.close()
 
 
-@pytest.mark.skipif(not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="no large pages here")
-def test_arrays_lie_in_large_pages_where_the_system_has_them(small):
+@pytest.mark.skipif(not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="no huge pages here")
+def test_arrays_lie_in_huge_pages_where_the_system_has_them(small):
     address, holds, flags = small.sim.memory().address, False, []
     for line in Path("/proc/self/smaps").read_text().splitlines():
         if found := re.match(r"([0-9a-f]+)-([0-9a-f]+) ", line):

@@ -144,7 +144,7 @@ class MachineCode:
 
 
 def default_folder() -> Path:
-    """``UUV_NATIVE_CACHE``, or uuvtai/compile in the user's cache folder."""
+    """``UUV_NATIVE_CACHE``, or uuvtai/native in the user's cache folder."""
     if chosen := os.environ.get("UUV_NATIVE_CACHE"):
         return Path(chosen)
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

@@ -145,9 +145,9 @@ class Memory:
         begin, count = self._advise(_MADV_DONTNEED)
         content[:begin], content[begin + count :] = 0, 0
 
-    def widened(self) -> "Memory":
-        """This memory, all zero, in large pages where the system has them (Linux, CPU): a step touches lines
-        all over it, and small pages are more than the processor's table of addresses holds."""
+    def in_huge_pages(self) -> "Memory":
+        """This memory, all zero, in huge pages where the system has them (Linux, CPU): a step touches lines
+        all over it, and its small pages are more than the TLB holds."""
         if self.device.type == "cpu" and self._advise(_MADV_HUGEPAGE)[1]:
             self.clear()
         return self

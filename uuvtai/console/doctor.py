@@ -137,7 +137,7 @@ def _native() -> str:
     store = Store(default_folder())
     Machine(1)
     size = sum(file.lstat().st_size for file in store.files())
-    return f"{store.folder}, {size / 2**20:.1f} MB; used with --set runtime.native=true"
+    return f"{store.folder}, {size / 2**20:.1f} MB; off with --set runtime.native=false"
 
 
 def clean() -> int:

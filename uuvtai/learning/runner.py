@@ -125,7 +125,7 @@ def _train(
     if config.learner == "surrogate" and config.surrogate.warm_start_waves and not found:
         watch.note(
             f"first {config.surrogate.warm_start_waves} waves of episodes in the simulator, in which the "
-            f"policy imitates the tree: about a minute each"
+            "policy imitates the tree: about a minute each"
         )
     trainer = _continued(_TRAINERS[config.learner](config, request.device), config, found)
     env = getattr(trainer, "env", None)  # of those that learn in the simulator

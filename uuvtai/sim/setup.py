@@ -327,7 +327,7 @@ def arrays_for(config: Config, sizes: dict[str, int], device: torch.device) -> A
     s = found.s if found else allocate_state(sizes)
     io = bind_all(Stages, s, config.model_copy(update={"world": config.world.compiled()}))
     anchor = s.clock.running
-    memory = found.memory if found else Memory(s, anchor, address_of(anchor, device), device).widened()
+    memory = found.memory if found else Memory(s, anchor, address_of(anchor, device), device).in_huge_pages()
     return Arrays((device.type, sizes), settings, s, io, memory)
 
 

@@ -328,9 +328,7 @@ def test_covariance_stays_positive_and_equals_joseph():
     n_step, n_run = 1000, 8
     mean, cov, link = (ti.Vector.field(size, ti.f32, n_run) for size in (4, 10, 5))
     rate = ti.field(ti.f32, n_run)
-    data = ti.Vector.field(
-        5, ti.f32, (n_step, n_run)
-    )  # bearing, position and velocity along it, variance, dt
+    data = ti.Vector.field(5, ti.f32, (n_step, n_run))  # bearing; place, velocity along it; variance; dt
 
     @ti.kernel
     def run(k: int):

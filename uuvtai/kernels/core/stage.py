@@ -63,7 +63,7 @@ def spread(n_env: int, inner: int = 1) -> int:
 
 def shares(count: int) -> int:
     """Loop items among which an env's ``count`` rows or tracks are shared: one each on a GPU, one for all on
-    a CPU, where a reset passes over a thousand envs that sleep."""
+    a CPU, so that a reset of few rows asks every other env only once whether it is active."""
     return count if is_gpu_shaped() else 1
 
 

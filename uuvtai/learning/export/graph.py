@@ -551,7 +551,7 @@ def _pair_outputs(agent: PolicyAgent, row: Row) -> Row:
 
 SET_INPUTS = {
     "obstacles": f"(N, n, {OBSTACLE_WIDTH}) float32: the nearest moving obstacles in any order, any n from 1 "
-    f"on; a row of zeros is no obstacle",
+    "on; a row of zeros is no obstacle",
     "own": f"(N, {EGO_COLUMNS}) float32: the vehicle, its goal and the free distances around it",
 }
 FORECAST_INPUTS = {
