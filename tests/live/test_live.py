@@ -30,7 +30,7 @@ END = SimpleNamespace(
 
 def open_socket(port, **options):
     place = f"ws://127.0.0.1:{port}"
-    return connect(place, subprotocols=["foxglove.sdk.v1"], max_size=None, **options).__enter__()
+    return connect(place, subprotocols=["foxglove.sdk.v1"], max_size=None, ping_interval=None, **options)
 
 
 class Viewer:

@@ -254,9 +254,9 @@ LENGTHENED = (
 def allocate_state(sizes: dict[str, int]) -> SimState:
     """Every struct, with the lengths of ``array_sizes``; those that other options lengthen lie last, so
     that the others keep their places, and what was compiled for them holds."""
-    kinds = get_type_hints(SimState)
-    built = {name: state.allocate(kinds[name], sizes) for name in sorted(kinds, key=lambda n: rank(kinds[n]))}
-    return SimState(**built)
+    ti.sync()  # what others have declared is placed by itself: a tree takes 1,024 nodes, and we need 950
+    kinds = sorted(get_type_hints(SimState).items(), key=lambda pair: rank(pair[1]))
+    return SimState(**{name: state.allocate(kind, sizes) for name, kind in kinds})
 
 
 def rank(kind: type) -> int:
