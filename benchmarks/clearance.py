@@ -70,7 +70,7 @@ class Maps:
         io = bind(ClearanceIO, *self.structs, cfg, self.config.mapping, self.config.voronoi)
 
         def call() -> None:
-            clearance.forget_clearance(io)
+            io.clearance_memory.limit.fill(0)
             clearance.compute_clearance(io)
 
         return call

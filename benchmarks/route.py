@@ -11,7 +11,7 @@ from benchmarks.common import Job, Row, seconds_per_call
 from tests import planning_maps as maps
 from tests.oracles.voronoi import clearance_of
 from uuvtai import state
-from uuvtai.common.enums import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
+from uuvtai.common.enums import FAIL_NONE, FULL, N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
 from uuvtai.kernels.planning import route, voronoi
@@ -114,7 +114,7 @@ def _maps(n: int, config: Config) -> list[tuple]:
         regions, _count = label(wide & ~occ)  # type: ignore[misc]
         ends = regions[maps.cell_of(_START)], regions[maps.cell_of(_GOAL)]
         if ends[0] == ends[1] != 0:
-            out.append((occ, *found))
+            out.append((occ * FULL, *found))
     return out
 
 
@@ -135,7 +135,7 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     s["clock"].active.fill(1)
     route.reset_route(bind(RouteIO, s["route"], s["clock"], partial=True))
     for field, i, dtype in (
-        (s["grid_map"].static_occ, 0, np.float32), (s["clearance"].clearance_m, 1, np.float32),
+        (s["grid_map"].static_occ, 0, np.uint16), (s["clearance"].clearance_m, 1, np.float32),
         (s["clearance"].site_row, 2, np.int16), (s["clearance"].site_col, 3, np.int16),
     ):  # fmt: skip
         field.from_numpy(np.array([f[i] for f in found], dtype))

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from uuvtai.common.enums import FULL, occupancy
+
 WORD = 64
 
 
@@ -19,13 +21,19 @@ def cells(words_, n_col):
     return np.unpackbits(octets, axis=-1, bitorder="little").astype(bool)[..., :n_col]
 
 
+def kept(occupancies):
+    """A layer as the map keeps it."""
+    return np.rint(np.asarray(occupancies) * FULL).astype(np.uint16)
+
+
 def put_layers(grid_map, static, dynamic, occupied):
     """Both layers of every env, and the bits that follow from them."""
-    grid_map.static_occ.from_numpy(np.ascontiguousarray(static, np.float32))
-    grid_map.dynamic_occ.from_numpy(np.ascontiguousarray(dynamic, np.float32))
-    grid_map.alive.from_numpy(words((np.asarray(static) > 0) | (np.asarray(dynamic) > 0)))
-    grid_map.static_occupied.from_numpy(words(np.asarray(static) >= occupied))
-    grid_map.dynamic_occupied.from_numpy(words(np.asarray(dynamic) >= occupied))
+    static, dynamic = kept(static), kept(dynamic)
+    grid_map.static_occ.from_numpy(static)
+    grid_map.dynamic_occ.from_numpy(dynamic)
+    grid_map.alive.from_numpy(words((static > 0) | (dynamic > 0)))
+    grid_map.static_occupied.from_numpy(words(occupancy(static) >= occupied))
+    grid_map.dynamic_occupied.from_numpy(words(occupancy(dynamic) >= occupied))
 
 
 def put_map(grid_map, state, occupied, confident):
@@ -44,12 +52,12 @@ def put_map(grid_map, state, occupied, confident):
 
 def get_map(grid_map):
     """What ``put_map`` takes, read back."""
-    static = grid_map.static_occ.to_numpy()
+    static = occupancy(grid_map.static_occ.to_numpy())
     n_col = static.shape[-1]
     counter = grid_map.free_scans.to_numpy()
     return {
         "static": static,
-        "dynamic": grid_map.dynamic_occ.to_numpy(),
+        "dynamic": occupancy(grid_map.dynamic_occ.to_numpy()),
         "dynamic_scans": grid_map.dynamic_scans.to_numpy(),
         "free_scans": sum(
             cells(counter[..., k].copy(), n_col).astype(int) << k for k in range(counter.shape[-1])

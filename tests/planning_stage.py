@@ -6,6 +6,7 @@ import numpy as np
 
 from tests import planning_maps as maps
 from tests.bundles import Stage, put
+from tests.map_bits import kept
 from tests.oracles.voronoi import clearance_of
 from uuvtai.config import Config
 from uuvtai.kernels.planning.io import RouteIO
@@ -50,7 +51,7 @@ def clean():
 def put_maps(occupied, layer="static_occ", max_m=2.0):
     """Occupancy of every env in one layer, and the clearance with sites that follows from it."""
     s = stage()
-    getattr(s.grid_map, layer).from_numpy(np.array(occupied, np.float32))
+    getattr(s.grid_map, layer).from_numpy(kept(occupied))
     found = [clearance_of(occ | maps.OUTSIDE, maps.CELL_M, max_m) for occ in occupied]
     clearance_m, row, col = map(np.array, zip(*found, strict=True))
     put(s.clearance, clearance_m=clearance_m, site_row=row, site_col=col)

@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import errno
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -172,6 +173,13 @@ def test_code_that_does_something_else_is_never_used(place, expected, monkeypatc
         np.testing.assert_array_equal(scene.launch(), expected[0])
     np.testing.assert_array_equal(scene.launch(), expected[1])
     assert (ours.made, ours.refused, list(place.glob("*.kernel"))) == (0, 1, [])
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="looks for x86's instructions")
+def test_fetching_waits_for_nothing(place):
+    text = "define void @f(i16* %p) {\n%1 = atomicrmw or i16* %p, i16 0 seq_cst\nret void\n}"
+    code = started(Scene(), place).machine.object_of(text)
+    assert b"\x0f\x0d" in code or b"\x0f\x18" in code, "a prefetch in place of a locked instruction"
 
 
 def changed(text):

@@ -104,12 +104,8 @@ def test_every_number_is_one_of_the_config(config):
         assert getattr(config.slow, number.name) == getattr(config.fast, number.name) == 1.0
         assert 0 < number.least < 1 <= number.most
     assert [TUNED[i].name for i in (DEVIATION, HORIZON, TTC, RANGE, HEADING_RANGE)] == [
-        "weight_deviation",
-        "horizon_s",
-        "emergency_ttc_s",
-        "emergency_range_m",
-        "heading_range_m",
-    ]
+        "weight_deviation", "horizon_s", "emergency_ttc_s", "emergency_range_m", "heading_range_m",
+    ]  # fmt: skip
     low, high = log_bounds()
     assert low[TTC] == pytest.approx(math.log(0.15)) and high[HORIZON] == 0.0
 

@@ -392,7 +392,7 @@ class Mapper:
 
 
 def clipped(values):
-    return np.where(values < 1e-6, 0.0, np.minimum(values, 1.0))
+    return np.floor(np.clip(values, 0.0, 1.0) * 65535) / 65535  # a layer keeps two bytes
 
 
 def map_figures(log, same):

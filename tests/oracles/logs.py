@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.map_bits import kept
 from uuvtai.common import enums
 from uuvtai.common.obstacle_motion import obstacle_positions
 from uuvtai.config import Config, SensorsConfig, SonarConfig
@@ -215,8 +216,8 @@ def layers(static: np.ndarray, dynamic: np.ndarray) -> dict[str, np.ndarray]:
             source = np.roll(occupied, (dr, dc), (0, 1))
             clearance = np.where(source, np.minimum(clearance, CELL_M * math.hypot(dr, dc)), clearance)
     return {
-        "grid_map.static_occ": static.copy(),
-        "grid_map.dynamic_occ": dynamic.copy(),
+        "grid_map.static_occ": kept(static),
+        "grid_map.dynamic_occ": kept(dynamic),
         "clearance.clearance_m": clearance.astype(np.float32),
     }
 

@@ -232,8 +232,8 @@ class MapOracle:
         )
         hit = s_hit | d_hit
         return {
-            "static": np.clip(static, 0, 1),
-            "dynamic": np.clip(dynamic, 0, 1),
+            "static": np.floor(np.clip(static, 0, 1) * 65535) / 65535,
+            "dynamic": np.floor(np.clip(dynamic, 0, 1) * 65535) / 65535,
             "depth_hit": np.zeros(free.shape, bool),
             "seen": state["seen"] | free | (bits > 0),
             "free_scans": np.where(

@@ -1,5 +1,7 @@
 """Codes for kernels, and their names for logs, results and tables: outcomes, plans, forecasts, sets."""
 
+from typing import Any
+
 OUTCOMES = ("running", "success", "collision", "ttc", "out_of_tank", "timeout")  # names by code
 RUNNING, SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT = range(len(OUTCOMES))
 
@@ -27,6 +29,14 @@ REASONS = ("start_outside", "goal_outside", "disconnected", "budget")
 not join them (gaps below d_min), or the search ran out of pops or memory."""
 N_REASON = len(REASONS)
 FAIL_NONE, FAIL_START_OUTSIDE, FAIL_GOAL_OUTSIDE, FAIL_DISCONNECTED, FAIL_BUDGET = range(N_REASON + 1)
+
+
+FULL = 65535  # an occupancy of 1, as a layer of the map keeps it
+
+
+def occupancy(layer: Any) -> Any:
+    """Occupancies in [0, 1], float32, of an array of a layer as the map keeps it."""
+    return (layer / FULL).astype("float32")
 
 
 # ---- What a learned forecast is told and what it says, in numbers: read by its kernels and by what learns.

@@ -190,6 +190,9 @@ done:
 _TASK = re.compile(
     r"^define (?:dso_local )?void @([\w.]+_kernel_(\d+)\w*)\(%struct\.RuntimeContext[\w.]*\* ", re.M
 )
+_FETCH = re.compile(r"(%[\w.]+) = atomicrmw or (i\d+\*) (%[\w.]+), i\d+ 0 seq_cst.*")
+_PREFETCH = r"\1 = bitcast \2 \3 to i8*\n  call void @llvm.prefetch.p0i8(i8* \1, i32 1, i32 3, i32 1)"
+_DECLARED = "\ndeclare void @llvm.prefetch.p0i8(i8* nocapture readonly, i32, i32, i32)\n"
 _SUFFIX = re.compile(r"(%struct\.\w+?)\.\d+\b")
 
 
@@ -238,7 +241,7 @@ class Machine:
     def object_of(self, text: str) -> bytes:
         """Machine code of a module of LLVM's text. Raises UnfitError where it is not understood."""
         try:
-            module = self.llvm.parse_assembly(text)
+            module = self.llvm.parse_assembly(_FETCH.sub(_PREFETCH, text) + _DECLARED)
             module.verify()
         except RuntimeError as error:
             raise UnfitError(f"LLVM: {error}") from error

@@ -333,10 +333,9 @@ def is_gpu_shaped() -> bool:
 # Numbers of the config that kernels are told at every launch, so that another threshold is no other code.
 #
 # While Taichi reads a kernel, a float of a section is a ``Number``: one can reckon with it in Python, and
-# what
-# comes out becomes an argument of the kernel, rounded once as a constant would be. Whatever else is done with
-# it, for example a comparison that decides what code there is, is done with its value and noted: the code
-# depends on what came of it.
+# what comes out becomes an argument of the kernel, rounded once as a constant would be. Whatever else is done
+# with it, for example a comparison that decides what code there is, is done with its value and noted: the
+# code depends on what came of it.
 
 
 Sum = str | int | float | list

@@ -1,5 +1,4 @@
-"""What training adds to a run: policy, PPO, distillation, world model and the schedule of the run
-itself.
+"""What training adds to a run: policy, PPO, distillation, world model and the schedule of the run itself.
 
 Defaults are Table app_repro of the paper where it gives a number; the rest says why. Presets
 (``presets/train``) state differences only.

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 
-from uuvtai.common.enums import SUCCESS
+from uuvtai.common.enums import SUCCESS, occupancy
 from uuvtai.common.obstacle_motion import describe_scenario
 from uuvtai.config import Config
 from uuvtai.config.loader import load_config
@@ -370,8 +370,8 @@ def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     time_s = int(read("clock.step")) * config.episode.control_dt_s
     pos_w, cell_m = read("vehicle.pos_w"), config.mapping.cell_m
     static, dynamic = (
-        Layer.of(read(occupancy), grid_origin(config.world.tank, cell_m), cell_m)
-        for occupancy in ("grid_map.static_occ", "grid_map.dynamic_occ")
+        Layer.of(occupancy(read(layer)), grid_origin(config.world.tank, cell_m), cell_m)
+        for layer in ("grid_map.static_occ", "grid_map.dynamic_occ")
     )
     canvas = map_canvas(scenario["tank"], width_px, _MARGINS)
     paint_water(canvas, scenario["tank"])

@@ -86,10 +86,8 @@ def _counts() -> tuple[int, int]:
 
 # ------------------------------------------------------------------------------------------------------------
 # The second process of a start in which everything has to be compiled: ``python -m uuvtai.envs.warm_up``,
-# which
-# ``compile/runtime.py`` begins. The first one compiles a reset and a step in their order, this one from
-# their
-# end; they meet in the folder of machine code.
+# which ``compile/runtime.py`` begins. The first one compiles a reset and a step in their order, this one from
+# their end; they meet in the folder of machine code.
 
 
 def main() -> None:

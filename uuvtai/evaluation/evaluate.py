@@ -1,5 +1,4 @@
-"""Compare agents on paired scenarios in one run folder: results, logs, pictures,
-videos."""
+"""Compare agents on paired scenarios in one run folder: results, logs, pictures, videos."""
 
 from __future__ import annotations
 

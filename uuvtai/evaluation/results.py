@@ -232,8 +232,7 @@ def summary(
     wall_s: float,
     env_steps_per_s: float | None = None,
 ) -> dict[str, Any]:
-    """One agent's entry of ``uuv eval --json``; rates without episodes are None, never
-    NaN.
+    """One agent's entry of ``uuv eval --json``; rates without episodes are None, never NaN.
 
     ``env_steps_per_s`` is a ``StepClock``'s: of simulating alone, where ``wall_s`` is all the time that the
     agent took.
@@ -327,8 +326,7 @@ def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, i
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What ``uuv eval`` was asked for, as an object and as the file from which an interrupted evaluation goes
-# on.
+# What ``uuv eval`` was asked for, as an object and as the file from which an interrupted evaluation goes on.
 
 
 REQUEST_FILE = "eval/request.json"

@@ -38,8 +38,7 @@ def distillation_loss(mean: torch.Tensor, teacher_action: torch.Tensor, weight: 
 
 
 def sample_weight(signal: torch.Tensor) -> torch.Tensor:
-    """Weight of every sample in proportion to a signal >= 0 of any shape: mean one,
-    bounded.
+    """Weight of every sample in proportion to a signal >= 0 of any shape: mean one, bounded.
 
     Weights differ by at most ``MAX_WEIGHT_RATIO`` squared; a sample whose signal is not finite counts as an
     average one; where the signal is zero everywhere all weights are one.

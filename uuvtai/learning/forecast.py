@@ -203,8 +203,7 @@ class ForecastTrainer:
         self._sims: dict[str, Sim] = dict(sims or {})
 
     def iterate(self) -> dict[str, float]:
-        """Run episodes of one world, learn from all that is kept; metrics by their names in
-        metrics.jsonl."""
+        """Run episodes of one world, learn from all that is kept; metrics by their names in metrics.jsonl."""
         began, config = time.perf_counter(), self.config
         worlds = config.forecast_training.worlds
         found, steps = self._watched(

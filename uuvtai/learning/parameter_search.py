@@ -33,10 +33,8 @@ if TYPE_CHECKING:
 # surface of all trials.
 #
 # A quadratic without mixed terms is fitted to the trials by ridge regression: a response surface (Box &
-# Wilson
-# 1951, Journal of the Royal Statistical Society B 13). Noise of one trial hardly matters, for every trial
-# says
-# something about every number.
+# Wilson 1951, Journal of the Royal Statistical Society B 13). Noise of one trial hardly matters, for every
+# trial says something about every number.
 
 
 class NumberSearch:

@@ -103,9 +103,8 @@ class RunFolder:
         """The folder of a run that ended or was killed, held, and nothing read or changed in it yet;
         ``go_on`` comes next.
 
-        ``command`` makes such folders, for the message.
-        Raises RunFolderError for what is no run folder, for one that another process works in, and for one
-        with a link anywhere in it.
+        ``command`` makes such folders, for the message. Raises RunFolderError for what is no run folder, for
+        one that another process works in, and for one with a link anywhere in it.
         """
         folder = cls.__new__(cls)
         folder.path, folder._started = path, time.time()

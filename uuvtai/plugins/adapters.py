@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from uuvtai.common.enums import occupancy
 from uuvtai.config import SonarConfig
 from uuvtai.learning.policy_agent import CHUNK, AgentDecision
 from uuvtai.plugins.api import (
@@ -92,6 +93,8 @@ class Readings:
             ahead = self._read("forecast")
             moving, state = (read[0] == 1) & (read[1] == 1), read[2]
             return Tracks(moving, state[..., :2], state[..., 2:], read[3], ahead[0], ahead[1])
+        if name == "map":
+            read[:2] = map(occupancy, read[:2])
         kinds: dict[str, Callable[..., Any]] = {"ego": Ego, "map": OccupancyGrid, "route": Way}
         return kinds[name](*read) if name in kinds else read[0]
 
@@ -209,8 +212,7 @@ class Fixed:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What came back from the user's code, checked: shape, kind of number, NaN; each refusal says what was
-# wanted.
+# What came back from the user's code, checked: shape, kind of number, NaN; each refusal says what was wanted.
 
 
 MAX_WAYPOINTS = 10_000

@@ -1,5 +1,4 @@
-"""What the figures show, panel by panel: heat maps, curves with seed bands, intervals, time per
-stage.
+"""What the figures show, panel by panel: heat maps, curves with seed bands, intervals, time per stage.
 
 Every function gives a ``Panel`` whose drawing is done later; the hover texts carry counts and intervals.
 """

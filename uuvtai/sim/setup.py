@@ -256,7 +256,12 @@ def allocate_state(sizes: dict[str, int]) -> SimState:
     that the others keep their places, and what was compiled for them holds."""
     ti.sync()  # what others have declared is placed by itself: a tree takes 1,024 nodes, and we need 950
     kinds = sorted(get_type_hints(SimState).items(), key=lambda pair: rank(pair[1]))
-    return SimState(**{name: state.allocate(kind, sizes) for name, kind in kinds})
+    built = {}
+    for name, kind in kinds:
+        built[name] = state.allocate(kind, sizes)
+        if sizes["n_env"] % LANES == 0 and (beyond := state.bytes_of(kind, sizes) % 64):
+            ti.field(ti.u8, shape=64 - beyond)  # the next one begins with a line of memory
+    return SimState(**built)
 
 
 def rank(kind: type) -> int:
@@ -516,6 +521,7 @@ _TORCH_DTYPE = {
     ti.u8: torch.uint8,
     ti.i8: torch.int8,
     ti.u32: torch.uint32,
+    ti.u16: torch.uint16,
 }
 
 

@@ -2,8 +2,7 @@
 
 Data goes one way: action -> actuation -> dynamics -> world -> termination check -> sensing -> pose ->
 tracking -> mapping -> clearance -> planning -> behaviour tree -> observation -> reward. A pass works on the
-rows whose
-``clock.active`` is 1: all running rows in a step, only the rows being reset in a reset.
+rows whose ``clock.active`` is 1: all running rows in a step, only the rows being reset in a reset.
 """
 
 from __future__ import annotations

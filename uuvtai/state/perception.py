@@ -271,10 +271,10 @@ class MapState:
     """Remembered: the two-layer occupancy map. Row = y, column = x. What is asked of many cells at once is
     kept in bits."""
 
-    static_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32, beside="layers")
-    """[0, 1] persistent layer M^s"""
-    dynamic_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32, beside="layers")
-    """[0, 1] layer M^d of what moves"""
+    static_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u16, beside="layers")
+    """persistent layer M^s; ``enums.FULL`` is an occupancy of 1"""
+    dynamic_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u16, beside="layers")
+    """layer M^d of what moves; likewise"""
     dynamic_scans: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
     """scans with dynamic evidence since the cell was last seen free (saturating): promotion to static"""
     free_scans: ti.Field = array("n_env", "n_row", "n_col", vec=8, bits=True)
@@ -313,9 +313,7 @@ class MapScratch:
     dynamic_hit: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
     """returns of what moves"""
     fan_edge: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
-    """cells at which a column enters or leaves the fan of free water (fan.py)"""
-    fetched: ti.Field = array("n_slot", dtype=ti.f32, scratch=True)
-    """see mapping.fetch_cells"""
+    """cells at which a column enters or leaves the fan of free water (sensor_model.py)"""
     due: ti.Field = array("n_slot", dtype=ti.i32, scratch=True)
     """where several loop items share an env: 1 = the scan marked here is to be merged, 2 = with points of the
     camera"""

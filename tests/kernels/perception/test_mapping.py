@@ -32,8 +32,7 @@ SCAN_S = 0.04
 SHAPE = grid_shape(TANK, MAP.cell_m)
 CONFIDENT = mapping.scans_in(MAP.free_confident_s, SCAN_S)
 
-OCCUPANCY_TOLERANCE = 1e-5
-"""float32 sums of a few terms below 1, and occupancy below 1e-6 becomes 0"""
+OCCUPANCY_TOLERANCE = 2.01 / 65535  # half a step in what it begins with, one and a half after it
 MAX_DOUBTFUL = 0.08
 """share of the cells in which float32 and float64 may place a sample differently"""
 
@@ -325,7 +324,7 @@ def test_static_obstacle_appears_and_outlives_its_sight(stage):
     assert after["dynamic"].max() == 0
     hidden = stage.run(lambda k: blind(EYE), 25, first=25)
     assert hidden["static"][cell(*FACE)] == pytest.approx(
-        after["static"][cell(*FACE)] * (1 - MAP.static_decay) ** 10, abs=OCCUPANCY_TOLERANCE
+        after["static"][cell(*FACE)] * (1 - MAP.static_decay) ** 10, abs=25 / 65535
     )
 
 

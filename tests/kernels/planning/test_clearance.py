@@ -130,9 +130,9 @@ def test_inflation_brings_obstacles_nearer_and_leaves_the_boundary(stage, outsid
     static, cfg = maps_of(8), ClearanceConfig(inflate_m=0.08)
     plain = stage.compute(static)
     # the same map again, else there would be nothing to do
-    clearance.forget_clearance(stage.io(ClearanceIO))
+    stage.clearance_memory.limit.fill(0)
     distance, site_row, site_col = stage.compute(static, cfg=cfg)
-    clearance.forget_clearance(stage.io(ClearanceIO))
+    stage.clearance_memory.limit.fill(0)
     np.testing.assert_array_equal(plain[1], site_row)
     np.testing.assert_array_equal(plain[2], site_col)
     nearer = 0
@@ -205,7 +205,7 @@ def test_what_changed_is_redone_and_nothing_else_differs(stage):
             elif kind == 2:
                 static[env][rng.random(SHAPE) < 0.01] = rng.random()
         partly = stage.compute(static)
-        clearance.forget_clearance(stage.io(ClearanceIO))
+        stage.clearance_memory.limit.fill(0)
         for a, b in zip(partly, stage.compute(static), strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -217,7 +217,7 @@ def test_what_did_not_change_is_left_alone(stage):
     static[0, 20, 30] = 1
     found = stage.compute(static)[0]
     assert (found[1:] == 9).all()
-    clearance.forget_clearance(stage.io(ClearanceIO))
+    stage.clearance_memory.limit.fill(0)
     assert found[0, 20, 30] == 0 and (found[0, :, 64:] == 9).all()
 
 

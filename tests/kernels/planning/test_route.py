@@ -5,6 +5,7 @@ import pytest
 
 from tests import planning_maps as maps
 from tests.bundles import io_for, put
+from tests.map_bits import kept
 from tests.oracles import route as oracle
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, stage, way_of
 from uuvtai.common import enums as codes
@@ -161,8 +162,8 @@ def test_intersection_with_the_map_looks_as_far_as_its_horizon_and_not_back(x, f
 
 def test_intersection_with_the_map_before_the_clearance_is_renewed():
     s = with_routes()
-    occ = np.zeros((N_ENV, *maps.SHAPE), np.float32)
-    occ[0][maps.cell_of((4.0, 3.0))] = 1.0
+    occ = np.zeros((N_ENV, *maps.SHAPE), np.uint16)
+    occ[0][maps.cell_of((4.0, 3.0))] = codes.FULL
     s.grid_map.static_occ.from_numpy(occ)
     fire()
     assert held(0) == ["intersection"] and held(1) == []
@@ -338,17 +339,11 @@ def test_without_a_route_the_vehicle_hovers():
 
 def test_path_risk_is_the_mean_over_the_look_ahead_segment():
     s = clean()
-    occ = np.zeros((N_ENV, *maps.SHAPE), np.float32)
     rng = np.random.default_rng(5)
     static, dynamic = rng.random((2, *maps.SHAPE)).astype(np.float32)
     clearance = rng.uniform(0.1, 2.0, maps.SHAPE).astype(np.float32)
-    for field, values in (
-        (s.grid_map.static_occ, static),
-        (s.grid_map.dynamic_occ, dynamic),
-        (s.clearance.clearance_m, clearance),
-    ):
-        occ[2] = values
-        field.from_numpy(occ)
+    put(s.grid_map, static_occ=kept(static), dynamic_occ=kept(dynamic))
+    put(s.clearance, clearance_m=clearance)
     load(2, [(3.03, 1.04), (4.03, 2.04), (12.0, 2.04)])
     put_ends([(3.03, 1.04)] * N_ENV, [(12.0, 2.04)] * N_ENV)
     follow()

@@ -8,6 +8,7 @@ import pytest
 import taichi as ti
 
 from tests import planning_maps as maps
+from tests.map_bits import kept
 from tests.oracles import voronoi as oracle
 from tests.planning_stage import CONFIG, N_ENV, N_PLAN, clean, plan, put_ends, put_maps, stage, way_of
 from uuvtai.common import enums
@@ -217,7 +218,7 @@ def test_a_failed_plan_keeps_the_old_route():
 
 def test_the_dynamic_layer_counts_only_when_asked_for():
     s = clean()
-    s.grid_map.dynamic_occ.from_numpy(np.array([np.abs(maps.X - 18.7) < 0.1] * N_ENV, np.float32))
+    s.grid_map.dynamic_occ.from_numpy(kept([np.abs(maps.X - 18.7) < 0.1] * N_ENV))
     put_ends([(18.0, 3.0)] * N_ENV, [(19.5, 3.0)] * N_ENV)
     plan([0])
     assert s.route.fallback_reason[0] == enums.FAIL_NONE

@@ -33,11 +33,9 @@ from uuvtai.kernels.core.stage import AnyTensor, Bundle, IntVector, spread
 #
 # Returned statuses and ticked leaves follow BehaviorTree.CPP 4: ``Sequence`` and ``Fallback`` go on with the
 # child that was running, their ``Reactive`` forms begin at the first child in every tick and halt the
-# siblings
-# after the one that decides. Kept statuses follow py_trees (2.x), node by node: a finished node keeps its
-# status until its parent enters it anew or a sibling halts it, where BehaviorTree.CPP resets the children of
-# a
-# finished node to IDLE at once. The kept form shows in a log what the newest tick found.
+# siblings after the one that decides. Kept statuses follow py_trees (2.x), node by node: a finished node
+# keeps its status until its parent enters it anew or a sibling halts it, where BehaviorTree.CPP resets the
+# children of a finished node to IDLE at once. The kept form shows in a log what the newest tick found.
 
 
 @ti.func
@@ -382,9 +380,8 @@ def _turn(env, leaf, velocity, heading, yaw, room, io: Bundle[BehaviorIO]):
     first is as slim).
 
     In danger, and to cruise faster than the nose drives ahead, a diagonal of the body goes along the way,
-    because diagonals are faster: that whose nose is
-    nearest to what is to be looked at, not farther off than the camera sees well, or else nearest to the
-    present heading.
+    because diagonals are faster: that whose nose is nearest to what is to be looked at, not farther off than
+    the camera sees well, or else nearest to the present heading.
     """
     has_heading = heading[0] * heading[0] + heading[1] * heading[1] > 0.0
     look = wrapped_angle(ti.atan2(heading[1], heading[0]) - yaw)

@@ -49,16 +49,19 @@ def beam_there(number, sonar_cfg: Const[SonarConfig]):
 
 @ti.func
 def beam_lanes(yaw, first_ray, sonar_cfg: Const[SonarConfig]):
-    """Horizontal unit vectors (x lanes, y lanes) of sixteen neighbouring beams (``yaw`` 0: in the body's
-    frame)."""
+    """Horizontal unit vectors (x lanes, y lanes) of sixteen neighbouring beams, then of the beam after each
+    (``yaw`` 0: in the body's frame)."""
     bearing = (yaw + ti.static(sonar_cfg.first_beam_rad)) + ti.static(sonar_cfg.beam_step_rad) * first_ray
     c, s = ti.cos(bearing), ti.sin(bearing)
-    x, y = f16x(0.0), f16x(0.0)
+    x, y, next_x, next_y = f16x(0.0), f16x(0.0), f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
         cosine, sine = ti.static(math.cos(sonar_cfg.turn_rad(i)), math.sin(sonar_cfg.turn_rad(i)))
         x[i] = c * cosine - s * sine
         y[i] = s * cosine + c * sine
-    return x, y
+        cosine_n, sine_n = ti.static(math.cos(sonar_cfg.turn_rad(i + 1)), math.sin(sonar_cfg.turn_rad(i + 1)))
+        next_x[i] = c * cosine_n - s * sine_n
+        next_y[i] = s * cosine_n + c * sine_n
+    return x, y, next_x, next_y
 
 
 @ti.func
@@ -66,7 +69,7 @@ def beam_packet(yaw, first_ray, sonar_cfg: Const[SonarConfig]):
     """``beam_lanes`` of as many beams as a packet has (``n_lane``), to the same bits: of one it is the beam
     itself."""
     if ti.static(n_lane() == LANES):
-        x, y = beam_lanes(yaw, first_ray, sonar_cfg)
+        x, y, _x, _y = beam_lanes(yaw, first_ray, sonar_cfg)
         return x, y
     else:
         x, y = beam_unit(yaw, first_ray - first_ray % LANES, first_ray % LANES, sonar_cfg)
@@ -75,11 +78,11 @@ def beam_packet(yaw, first_ray, sonar_cfg: Const[SonarConfig]):
 
 @ti.func
 def beam_unit(yaw, first_ray, lane, sonar_cfg: Const[SonarConfig]):
-    """What ``beam_lanes`` says of one of its sixteen beams."""
+    """What ``beam_lanes`` says of one of its sixteen beams, or the one after them."""
     bearing = (yaw + ti.static(sonar_cfg.first_beam_rad)) + ti.static(sonar_cfg.beam_step_rad) * first_ray
     c, s = ti.cos(bearing), ti.sin(bearing)
     cosine, sine = 1.0, 0.0
-    for i in ti.static(range(LANES)):
+    for i in ti.static(range(LANES + 1)):
         cosine = ti.select(lane == i, ti.static(math.cos(sonar_cfg.turn_rad(i))), cosine)
         sine = ti.select(lane == i, ti.static(math.sin(sonar_cfg.turn_rad(i))), sine)
     return c * cosine - s * sine, s * cosine + c * sine

@@ -87,8 +87,7 @@ def turned_z3(v, yaw):
 #
 # The capsule follows the full attitude (roll does not matter). Distance to a convex body is a convex function
 # along the capsule's axis, so bisection on the sign of its slope finds the nearest point: an end of the axis
-# in
-# most cases, else to 2^-16 of the axis's length.
+# in most cases, else to 2^-16 of the axis's length.
 
 
 _BISECTIONS = 16
@@ -221,9 +220,8 @@ def is_in_tank(pos_w, tank_cfg: Const[TankConfig]):
 # A footprint is seven numbers (centre x, y; direction x, y; half extents along and across, in units of the
 # direction's length; rounding radius [m]): a disc has no extents, a box no rounding, a straight stroke of a
 # moving disc has length and rounding. What is decided here must be decided alike on every device, so
-# distances
-# are compared as squares and directions come from a fixed polynomial: no square root, sine or cosine, which
-# differ in the last bit between devices.
+# distances are compared as squares and directions come from a fixed polynomial: no square root, sine or
+# cosine, which differ in the last bit between devices.
 
 
 _TINY_LENGTH = 1e-12

@@ -7,6 +7,7 @@ special cases at the border and the border's cells are the sites of the known bo
 
 import taichi as ti
 
+from uuvtai.common.enums import FULL
 from uuvtai.config import TankConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import Const, In, Out
@@ -68,12 +69,17 @@ def centre_of(row, col, tank_cfg: Const[TankConfig], cell_m: Const[float]):
     return ti.Vector([x0 + (col + 0.5) * cell_m, y0 + (row + 0.5) * cell_m])
 
 
+@ti.func
+def occupancy_of(kept):
+    """Occupancy in [0, 1] of what a layer of the map keeps of a cell."""
+    return ti.cast(kept, ti.f32) * ti.static(1.0 / FULL)
+
+
 # ------------------------------------------------------------------------------------------------------------
 # Binary min-heap of cells, one per slot. Old entries of a cell stay until they surface.
 #
 # An entry is one number that sorts as it should: the key's bits (those of a float32 that is not negative are
-# in
-# its order), then the cell.
+# in its order), then the cell.
 
 
 @ti.func

@@ -67,6 +67,14 @@ def shares(count: int) -> int:
     return count if is_gpu_shaped() else 1
 
 
+@ti.func
+def fetch(element: Out[Any]):
+    """Ask memory for the line of a whole number that will be needed soon, and do not wait for it: our machine
+    code makes a prefetch of this (``compile/codegen.py``). On a GPU others wait instead."""
+    if ti.static(not is_gpu_shaped()):
+        ti.atomic_or(element, element ^ element)  # a 0 of its type
+
+
 # ------------------------------------------------------------------------------------------------------------
 # What a group of columns of the observation is: the environment's table is read off these declarations, and
 # the kernels write by them.

@@ -6,9 +6,10 @@ Launched only where ``mapping.stamp`` > 0 (default 0).
 
 import taichi as ti
 
+from uuvtai.common.enums import FULL
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import BOX, NONE, turned_z
-from uuvtai.kernels.core.grid import centre_of
+from uuvtai.kernels.core.grid import centre_of, occupancy_of
 from uuvtai.kernels.core.simd import LANES, f16x, put_bit
 from uuvtai.kernels.core.stage import Bundle, Const, spread
 from uuvtai.kernels.oracle.io import TrueMapIO, TrueTracksIO
@@ -43,8 +44,8 @@ def is_covered(env, point, io: Bundle[TrueMapIO]):
 @ti.func
 def stamp(env, row, col, io: Bundle[TrueMapIO]):
     """Add to one cell's occupancy, and keep the bits that follow from it."""
-    stamped_occ = ti.min(1.0, io.grid_map.dynamic_occ[env, row, col] + io.mapping_cfg.stamp)
-    io.grid_map.dynamic_occ[env, row, col] = stamped_occ
+    stamped_occ = ti.min(1.0, occupancy_of(io.grid_map.dynamic_occ[env, row, col]) + io.mapping_cfg.stamp)
+    io.grid_map.dynamic_occ[env, row, col] = ti.cast(stamped_occ * FULL, ti.u16)
     put_bit(io.grid_map.alive, env, row, col)
     if stamped_occ >= io.mapping_cfg.occupied:
         put_bit(io.grid_map.dynamic_occupied, env, row, col)

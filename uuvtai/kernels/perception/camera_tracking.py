@@ -94,18 +94,10 @@ def column_distances(env, first_col, io: Bundle[TrackingIO]):
                 shown = (away[i] < ti.static(NO_RETURN_SHARE * io.depth_cfg.max_range_m)) & (
                     ti.abs(away[i] * z) < io.camera_tracking_cfg.band_m
                 )
-                shown = (
-                    shown
-                    & (level < wall[i] - io.camera_tracking_cfg.wall_margin_m)
-                    & (level < io.camera_tracking_cfg.range_m)
-                )
-                near[i] = ti.min(near[i], ti.select(shown, level, FAR_M))
-                edge[i] = ti.min(
-                    edge[i],
-                    ti.select(
-                        shown & (row == 0 or row >= ti.static(io.depth_cfg.rows - _ROW_STRIDE)), level, FAR_M
-                    ),
-                )
+                near_m = ti.select(shown & (level < limit[i]), level, FAR_M)
+                near[i] = ti.min(near[i], near_m)
+                if row == 0 or row >= ti.static(io.depth_cfg.rows - _ROW_STRIDE):
+                    edge[i] = ti.min(edge[i], near_m)
     return near, edge
 
 
@@ -318,10 +310,8 @@ def begin_spotted(env, at, along, radius, late, height, io: Bundle[TrackingIO]):
 # where it begins and ends.
 #
 # Only what lies in the image and at the obstacle's distance counts; an obstacle cut by the image's edge or by
-# something
-# nearer tells one end, a column through which the camera sees farther tells where no obstacle is. Feeds the
-# height
-# hypotheses of ``elevation.py``; sees the image and tracks only.
+# something nearer tells one end, a column through which the camera sees farther tells where no obstacle is.
+# Feeds the height hypotheses of ``elevation.py``; sees the image and tracks only.
 
 
 _DEPTH_SLACK_M = 0.25

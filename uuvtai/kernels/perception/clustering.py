@@ -87,7 +87,7 @@ def label_beams(env, io: Bundle[TrackingIO]):
     vel = turned_z(io.scan.ping_vel_b[env], yaw)
     normal = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
     for packet in range(io.sonar_cfg.n_ray // LANES):
-        ux, uy = beam_lanes(yaw, packet * LANES, io.sonar_cfg)
+        ux, uy, _x, _y = beam_lanes(yaw, packet * LANES, io.sonar_cfg)
         range_m, hit = f16x(0.0), f16x(0.0)
         for i in ti.static(range(LANES)):
             range_m[i] = io.scan.range_m[env, packet * LANES + i]

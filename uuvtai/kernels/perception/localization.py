@@ -118,7 +118,7 @@ def add_dopplers(env, fix: Out[Any], kept, speed, speed_cov, io: Bundle[Localiza
     """What the Doppler of the beams that end on a wall says of the velocity; ``kept``: a bit for each of
     them, by packet. A loop of its own: both together need more registers than a GPU's thread has."""
     for packet in range(ti.static(io.sensors_cfg.sonar.n_ray // LANES)):
-        ahead, left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
+        ahead, left, _ahead, _left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
         good, doppler = f16x(0.0), f16x(0.0)
         for i in ti.static(range(LANES)):
             good[i] = ti.cast((kept[packet] >> i) & 1, ti.f32)
@@ -154,7 +154,7 @@ def beside(values):
 def read_beams(env, packet, io: Bundle[LocalizationIO]):
     """Sixteen beams; ranges without the mean of their one-sided error. What a mechanical beam heard before
     was used then: it counts as no return."""
-    ahead, left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
+    ahead, left, _ahead, _left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
     range_m, hit = f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
         range_m[i] = io.scan.range_m[env, packet * LANES + i] - io.sensors_cfg.sonar.range_jitter_m

@@ -26,19 +26,20 @@ import math
 
 import taichi as ti
 
+from uuvtai.common.enums import FULL
 from uuvtai.compile.launch import quick_launch, with_cse
+from uuvtai.kernels.core.grid import occupancy_of
 from uuvtai.kernels.core.simd import WORD, bit_of, lowest_bit, n_item, n_turn, taken, with_bit, without_lowest
-from uuvtai.kernels.core.stage import Bundle, Const, shares, spread
+from uuvtai.kernels.core.stage import Bundle, Const, fetch, shares, spread
 from uuvtai.kernels.perception.io import MappingIO
-from uuvtai.kernels.perception.sensor_model import mark_depth, mark_free, mark_hits
+from uuvtai.kernels.perception.sensor_model import mark_depth, mark_scan
 
 RATED_HZ = 10.0
 """Scan rate for which the gains of MappingConfig are given."""
 
 COUNTER_MAX = 255
-VANISHED = 1e-6
-"""Occupancy below this is 0: decay alone would never end."""
-
+_LINE, _ROWS_AHEAD = 16, 8
+"""Cells of both layers in a line of memory; rows of words that memory is asked for before they are needed."""
 _NO_SCAN = -(1 << 20)
 
 
@@ -85,12 +86,6 @@ def scans_in(seconds, period_s):
     return count
 
 
-def bit_fields(grid_map):
-    """Every array of bits that a map keeps from scan to scan, but the counters."""
-    m = grid_map
-    return m.confident, m.held, m.alive, m.seen, m.static_occupied, m.dynamic_occupied, m.depth_hit
-
-
 # ------------------------------------------------------------------------------------------------------ merge
 
 
@@ -107,9 +102,9 @@ def is_due(env, io: Bundle[MappingIO]):
 
 
 @ti.func
-def clipped(value):
-    """Occupancy clipped to [0, 1]; what has all but decayed is 0."""
-    return ti.select(value < VANISHED, 0.0, ti.min(value, 1.0))
+def kept(value):
+    """Occupancy clipped to [0, 1], as a layer keeps it: rounded down, so that decay ends."""
+    return ti.cast(ti.math.clamp(value, 0.0, 1.0) * FULL, ti.u16)
 
 
 @ti.func
@@ -150,7 +145,7 @@ def count_dynamic(env, row, word, free, dynamics, io: Bundle[MappingIO]):
 
 @ti.func
 def folded(static_old, dynamic_old, static_hit, dynamic_hit, free, point, io: Bundle[MappingIO]):
-    """Both equations for one cell; indicators are 0 or 1."""
+    """Both equations for one cell, as the layers keep it; indicators are 0 or 1."""
     scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
     look_s = ti.static(look_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
     depth_s = ti.static(depth_period_s(io.mapping_cfg, io.sonar_cfg, io.depth_cfg, io.episode_cfg))
@@ -158,13 +153,13 @@ def folded(static_old, dynamic_old, static_hit, dynamic_hit, free, point, io: Bu
     depth_hit = ti.select(
         supported & (dynamic_old < io.mapping_cfg.occupied), point & ~dynamic_hit & ~free, 0
     )
-    static_new = clipped(
+    static_new = kept(
         ti.static(1.0 - decay_per_scan(io.mapping_cfg.static_decay, scan_s)) * static_old
         + ti.static(per_scan(io.mapping_cfg.static_hit, look_s)) * static_hit
         - ti.static(per_scan(io.mapping_cfg.static_free, look_s)) * free
         + ti.static(per_scan(io.mapping_cfg.depth_hit, depth_s)) * depth_hit
     )
-    dynamic_new = clipped(
+    dynamic_new = kept(
         ti.static(1.0 - decay_per_scan(io.mapping_cfg.dynamic_decay, scan_s)) * dynamic_old
         + ti.static(per_scan(io.mapping_cfg.dynamic_hit, look_s)) * dynamic_hit
         - ti.static(per_scan(io.mapping_cfg.dynamic_free, look_s)) * free
@@ -184,66 +179,73 @@ def fold_cells(env, row, word, statics, dynamics, free, points, io: Bundle[Mappi
             i = lowest_bit(left)
             left = without_lowest(left)
             col = word * WORD + i
-            static_new, dynamic_new = folded(
-                io.grid_map.static_occ[env, row, col],
-                io.grid_map.dynamic_occ[env, row, col],
+            static, dynamic = folded(
+                occupancy_of(io.grid_map.static_occ[env, row, col]),
+                occupancy_of(io.grid_map.dynamic_occ[env, row, col]),
                 bit_of(statics, i),
                 bit_of(dynamics, i),
                 bit_of(free, i),
                 bit_of(points, i),
                 io,
             )
-            io.grid_map.static_occ[env, row, col] = static_new
-            io.grid_map.dynamic_occ[env, row, col] = dynamic_new
-            alive = with_bit(alive, i, (static_new > 0.0) | (dynamic_new > 0.0))
-            static_occupied = with_bit(static_occupied, i, static_new >= io.mapping_cfg.occupied)
-            dynamic_occupied = with_bit(dynamic_occupied, i, dynamic_new >= io.mapping_cfg.occupied)
+            io.grid_map.static_occ[env, row, col] = static
+            io.grid_map.dynamic_occ[env, row, col] = dynamic
+            alive = with_bit(alive, i, (static | dynamic) != 0)
+            static_occupied = with_bit(static_occupied, i, occupancy_of(static) >= io.mapping_cfg.occupied)
+            dynamic_occupied = with_bit(dynamic_occupied, i, occupancy_of(dynamic) >= io.mapping_cfg.occupied)
         io.grid_map.alive[env, row, word] = alive
         io.grid_map.static_occupied[env, row, word] = static_occupied
         io.grid_map.dynamic_occupied[env, row, word] = dynamic_occupied
 
 
 @ti.func
-def fetch_cells(env, slot, io: Bundle[MappingIO]):
-    """Read one number of every word that holds something, so that memory answers many of them at once and not
-    one after another."""
-    fetched = 0.0
-    for row in range(ti.static(io.grid_map.alive.shape[1])):
-        for word in range(ti.static(io.grid_map.alive.shape[2])):
-            alive = io.grid_map.alive[env, row, word]
-            if alive != 0:
-                fetched += io.grid_map.static_occ[env, row, word * WORD + lowest_bit(alive)]
-    io.map_scratch.fetched[slot] = fetched
+def fetch_word(env, row, word, io: Bundle[MappingIO]):
+    """Ask memory for what a merge will touch of a word's cells, as far as the word tells."""
+    fetch(io.grid_map.alive[env, ti.min(row + _ROWS_AHEAD, ti.static(io.grid_map.alive.shape[1] - 1)), word])
+    left = io.grid_map.alive[env, row, word]
+    while left != 0:
+        i = lowest_bit(left)
+        fetch(io.grid_map.static_occ[env, row, word * WORD + i])
+        left &= ~(ti.cast(ti.static((1 << _LINE) - 1), ti.u64) << ti.cast(i // _LINE * _LINE, ti.u64))
+    if io.grid_map.seen[env, row, word] & ~io.grid_map.confident[env, row, word] != 0:
+        fetch(io.grid_map.free_scans[env, row, word][0])
+    if io.grid_map.held[env, row, word] != 0:
+        fetch(io.grid_map.dynamic_scans[env, row, word * WORD])
 
 
 @ti.func
 def merge_scan(env, slot, confident_scans: Const[int], io: Bundle[MappingIO]):
     """Fold everything marked in the slot's scratch into an env's map, word by word; the marks are used up.
 
-    Each strip of sixty-four columns goes upwards: an odd number of the fan's edges below means inside.
+    Each strip of sixty-four columns goes upwards: an odd number of the fan's edges below means inside. Most
+    words are water where nothing is new. Meanwhile memory gets the next env ready.
     """
+    waits, after = io.grid_map.depth_waits[env], ti.min(env + 1, ti.static(io.clock.active.shape[0] - 1))
     for word in range(ti.static(io.map_scratch.fan_edge.shape[2])):
         in_fan = ti.cast(0, ti.u64)
         for row in range(ti.static(io.map_scratch.fan_edge.shape[1])):
-            in_fan ^= taken(io.map_scratch.fan_edge, slot, row, word)
-            points = waiting_points(env, row, word, io.grid_map.depth_waits[env], io)
-            merge_word(env, slot, row, word, in_fan, points, confident_scans, io)
+            fetch_word(after, row, word, io)
+            edge = io.map_scratch.fan_edge[slot, row, word]
+            in_fan ^= edge
+            news = in_fan & ~io.mask.outside_bits[row, word]
+            news &= io.grid_map.held[env, row, word] | ~io.grid_map.confident[env, row, word]
+            news |= io.grid_map.alive[env, row, word] | edge
+            news |= io.map_scratch.static_hit[slot, row, word] | io.map_scratch.dynamic_hit[slot, row, word]
+            if waits == 1:
+                news |= io.grid_map.depth_hit[env, row, word]
+            if news != 0:
+                io.map_scratch.fan_edge[slot, row, word] = ti.cast(0, ti.u64)
+                merge_word(env, slot, row, word, in_fan, waits, confident_scans, io)
     io.grid_map.depth_waits[env] = 0
 
 
 @ti.func
-def waiting_points(env, row, word, waits, io: Bundle[MappingIO]):
-    """The camera's points in a word's cells, if any wait."""
-    points = ti.cast(0, ti.u64)
+def merge_word(env, slot, row, word, in_fan, waits, confident_scans: Const[int], io: Bundle[MappingIO]):
+    """Fold what is marked of a word's cells; ``in_fan``: those within the fan of free water; ``waits``: 1
+    where points of the camera wait."""
+    inside, points = ~io.mask.outside_bits[row, word], ti.cast(0, ti.u64)
     if waits == 1:
-        points = taken(io.grid_map.depth_hit, env, row, word) & ~io.mask.outside_bits[row, word]
-    return points
-
-
-@ti.func
-def merge_word(env, slot, row, word, in_fan, points, confident_scans: Const[int], io: Bundle[MappingIO]):
-    """Fold what is marked of a word's cells; ``in_fan``: those within the fan of free water."""
-    inside = ~io.mask.outside_bits[row, word]
+        points = taken(io.grid_map.depth_hit, env, row, word) & inside
     statics, dynamics = (
         taken(io.map_scratch.static_hit, slot, row, word) & inside,
         taken(io.map_scratch.dynamic_hit, slot, row, word) & inside,
@@ -264,9 +266,7 @@ def take_alone(env, slot, confident_scans: Const[int], promote_scans: Const[int]
         mark_depth(env, 0, io)
         io.grid_map.depth_waits[env] = 1
     if is_due(env, io) == 1:
-        fetch_cells(env, slot, io)
-        mark_free(env, slot, 0, io)
-        mark_hits(env, slot, 0, promote_scans, io)
+        mark_scan(env, slot, 0, promote_scans, io)
         merge_scan(env, slot, confident_scans, io)
         io.grid_map.map_step[env] = io.clock.step[env]
 
@@ -285,8 +285,7 @@ def mark_together(env, item, promote_scans: Const[int], io: Bundle[MappingIO]):
     if item == 0:
         io.map_scratch.due[env] = due * (1 + io.grid_map.depth_waits[env])
     if due == 1:
-        mark_free(env, env, item, io)
-        mark_hits(env, env, item, promote_scans, io)
+        mark_scan(env, env, item, promote_scans, io)
 
 
 @ti.func
@@ -311,8 +310,7 @@ def merge_together(env, item, confident_scans: Const[int], io: Bundle[MappingIO]
         row, word = place // n_word, place % n_word
         if row < n_row:
             in_fan = taken(io.map_scratch.fan_edge, env, row, word)
-            points = waiting_points(env, row, word, io.map_scratch.due[env] - 1, io)
-            merge_word(env, env, row, word, in_fan, points, confident_scans, io)
+            merge_word(env, env, row, word, in_fan, io.map_scratch.due[env] - 1, confident_scans, io)
 
 
 # ---------------------------------------------------------------------------------------------------- kernels
@@ -357,12 +355,16 @@ def reset_map(io: Bundle[MappingIO]):
             io.grid_map.depth_waits[env] = 0
             for row in range(share * n_row // n_share, (share + 1) * n_row // n_share):
                 for col in range(n_col):
-                    io.grid_map.static_occ[env, row, col] = 0.0
-                    io.grid_map.dynamic_occ[env, row, col] = 0.0
+                    io.grid_map.static_occ[env, row, col] = ti.u16(0)
+                    io.grid_map.dynamic_occ[env, row, col] = ti.u16(0)
                     io.grid_map.dynamic_scans[env, row, col] = ti.u8(0)
                 for word in range(ti.static(io.grid_map.seen.shape[2])):
                     io.grid_map.free_scans[env, row, word] = ti.Vector.zero(
                         ti.u64, ti.static(io.grid_map.free_scans.n)
                     )
-                    for words in ti.static(bit_fields(io.grid_map)):
+                    for words in ti.static((io.grid_map.confident, io.grid_map.held, io.grid_map.alive)):
+                        words[env, row, word] = ti.cast(0, ti.u64)
+                    for words in ti.static((io.grid_map.seen, io.grid_map.depth_hit)):
+                        words[env, row, word] = ti.cast(0, ti.u64)
+                    for words in ti.static((io.grid_map.static_occupied, io.grid_map.dynamic_occupied)):
                         words[env, row, word] = ti.cast(0, ti.u64)

@@ -24,10 +24,9 @@ from uuvtai.state import TrackState, TurnHistory
 # goes. Circles need no memory, their turn rate is in the filter.
 #
 # A turn is what lies between two straight legs of one track. Their ends p0, p1 [m], unit courses d0, d1 and
-# the
-# way L = speed x time between give the corner p0 + a d0 = p1 - b d1 by least squares along d0 - d1 under a +
-# b
-# = L: the speed is kept through a turn, which is what places a reversal, where both legs lie on one line.
+# the way L = speed x time between give the corner p0 + a d0 = p1 - b d1 by least squares along d0 - d1 under
+# a + b = L: the speed is kept through a turn, which is what places a reversal, where both legs lie on one
+# line.
 
 
 TURN_X, TURN_Y, IN_X, IN_Y, OUT_X, OUT_Y, WEIGHT = range(7)

@@ -1,8 +1,8 @@
 """What a scan and a depth image say about the cells of the map: a return that stays or moves, a point seen by
 the camera.
 
-Each is a bit per cell, set by those that share an env's returns (``n_item``); ``mark_fan`` adds free water,
-``mapping.py`` merges all of it into the two layers.
+Each is a bit per cell, set by those that share an env's returns (``n_item``); ``mark_packets`` adds free
+water, ``mapping.py`` merges all of it into the two layers.
 """
 
 import math
@@ -37,7 +37,7 @@ from uuvtai.kernels.core.simd import (
     put_bit,
     ramp,
 )
-from uuvtai.kernels.core.stage import Bundle, Const, In, spread
+from uuvtai.kernels.core.stage import Bundle, Const, In, fetch, spread
 from uuvtai.kernels.perception.io import EchoesIO, MappingIO
 from uuvtai.state import SonarScan
 
@@ -47,13 +47,9 @@ from uuvtai.state import SonarScan
 # Each beam proves free water up to a reach. Between beam b and b + 1 lies a triangle with its tip at the ping
 # and both legs as long as the smaller of their reaches; a cell is free where its centre lies in one of these
 # triangles. Their union is one star-shaped polygon, so it is filled the way printers fill polygons: every
-# edge
-# leaves a bit where it crosses a column of cell centres (``fan_edge``), and whoever goes up a column is
-# inside
-# after an odd number of bits. That takes some 600 bits where walking 256 beams cell by cell takes 10,000
-# stores, and far out, where beams are several cells apart, it leaves no gaps between them. Behind the last
-# beam
-# of a partial fan there is no triangle: the outline goes back to the ping.
+# edge leaves a bit where it crosses a column of cell centres (``fan_edge``), and whoever goes up a column is
+# inside after an odd number of bits. Behind the last beam of a partial fan there is no triangle: the outline
+# goes back to the ping.
 
 
 @ti.func
@@ -124,16 +120,17 @@ def ping_cell(env, io: Bundle[MappingIO]):
 
 
 @ti.func
-def mark_fan(env, slot, io: Bundle[MappingIO]):
-    """Bits of the fan's outline, triangle after triangle: along each chord, then along the beam to the next
-    triangle's leg."""
+def mark_packets(env, slot, promote_scans: Const[int], io: Bundle[MappingIO]):
+    """Bits of the fan's outline, triangle after triangle, along each chord, then along the beam to the next
+    triangle's leg; and those of the returns."""
     n_ray, n_col = ti.static(io.sonar_cfg.n_ray, grid_shape(io.tank_cfg, io.mapping_cfg.cell_m)[1])
+    pos = ti.Vector([io.scan.ping_pos_w[env][0], io.scan.ping_pos_w[env][1]])
+    vel, threshold = own_motion(env, io)
     ping = ping_cell(env, io)
     first, last = ti.Vector([0.0, 0.0]), ti.Vector([0.0, 0.0])
     first_col, last_col = 0, 0
     for packet in range(ti.static(n_ray // LANES)):
-        unit_x, unit_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES, io.sonar_cfg)
-        next_x, next_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES + 1, io.sonar_cfg)
+        unit_x, unit_y, next_x, next_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES, io.sonar_cfg)
         legs = triangle_legs(env, packet * LANES, io)
         begin_x, begin_y = ping[0] + legs * unit_x, ping[1] + legs * unit_y
         end_x, end_y = ping[0] + legs * next_x, ping[1] + legs * next_y
@@ -150,12 +147,13 @@ def mark_fan(env, slot, io: Bundle[MappingIO]):
             mark_edge(slot, last, begin, last_col, begin_col[i], n_col, io)
             mark_edge(slot, begin, end, begin_col[i], end_col[i], n_col, io)
             last, last_col = end, end_col[i]
+        mark_returns(env, slot, packet * LANES, unit_x, unit_y, pos, vel, threshold, promote_scans, io)
     mark_edge(slot, last, first, last_col, first_col, n_col, io)
 
 
 @ti.func
 def mark_fan_together(env, slot, item, io: Bundle[MappingIO]):
-    """``mark_fan`` by all that share an env (``n_item``), each with triangles of its own: edges need no
+    """``mark_packets`` by all that share an env (``n_item``), each with triangles of its own: edges need no
     order, and where the triangle before ends is computed once more."""
     n_ray, n_col = ti.static(io.sonar_cfg.n_ray, grid_shape(io.tank_cfg, io.mapping_cfg.cell_m)[1])
     ping = ping_cell(env, io)
@@ -176,9 +174,9 @@ def mark_fan_together(env, slot, item, io: Bundle[MappingIO]):
 @ti.func
 def leg_end(env, ray, side: Const[int], ping, io: Bundle[MappingIO]):
     """(x, y) [cells] of the end of a triangle's leg, along its own beam (``side`` 0) or the next (1); to the
-    bits of ``mark_fan``."""
+    bits of ``mark_packets``."""
     lane = ray % LANES
-    unit_x, unit_y = beam_unit(io.scan.ping_yaw[env], ray - lane + side, lane, io.sonar_cfg)
+    unit_x, unit_y = beam_unit(io.scan.ping_yaw[env], ray - lane, lane + side, io.sonar_cfg)
     leg = (
         ti.min(free_reach(env, ray, io), free_reach(env, (ray + 1) % io.sonar_cfg.n_ray, io))
         / io.mapping_cfg.cell_m
@@ -211,28 +209,13 @@ def mark_sectors(env, slot, io: Bundle[MappingIO]):
     mark_edge(slot, last, ping, last_col, ping_col, n_col, io)
 
 
-@ti.func
-def mark_free(env, slot, item, io: Bundle[MappingIO]):
-    """Bits of the outline of what the new beams prove free. ``item``: which of those that share the env
-    (``n_item``)."""
-    if ti.static(io.sonar_cfg.mechanical):
-        if item == 0:  # a head has few new beams, each of which begins where the one before ended
-            mark_sectors(env, slot, io)
-    elif ti.static(n_item() > 1):
-        mark_fan_together(env, slot, item, io)
-    else:
-        mark_fan(env, slot, io)
-
-
 # ------------------------------------------------------------------------------------------------------------
 # Memory of a mechanical beam: beams of different ages as one scan.
 #
 # Each bearing of the head keeps the last return, when it came and where the vehicle was. In every step in
-# which
-# a beam comes, the scan is made anew: the new beams as they are, and in the others the remembered returns
-# where
-# they would be seen from here, the nearest of each bearing. A new beam takes away the remembered returns that
-# it goes through or replaces.
+# which a beam comes, the scan is made anew: the new beams as they are, and in the others the remembered
+# returns where they would be seen from here, the nearest of each bearing. A new beam takes away the
+# remembered returns that it goes through or replaces.
 
 
 NEVER = -(1 << 20)
@@ -487,21 +470,19 @@ def is_inconsistent(env, row, col, range_m, promote_scans: Const[int], io: Bundl
 
 @ti.func
 def own_motion(env, io: Bundle[MappingIO]):
-    """Own velocity (ahead, left) [m/s] at the ping, as the tracking knows it, and the Doppler [m/s] beyond
-    which a return then moves.
+    """Own velocity (x, y) [m/s] at the ping, as the tracking knows it, and the Doppler [m/s] beyond which a
+    return then moves.
 
     It is the measured velocity less the error that the known walls show in the same scan. A scan between
     tracked ones takes the error of the last of them as long as the reading is only held, and trusts a valid
     reading as it is. Where neither a reading nor the walls tell the own velocity, Doppler proves little: the
     threshold is three standard deviations of what is left.
     """
-    vel, threshold = (
-        ti.Vector([io.scan.ping_vel_b[env][0], io.scan.ping_vel_b[env][1]]),
-        ti.static(doppler_threshold(io.mapping_cfg, io.sonar_cfg)),
-    )
+    vel = turned_z(io.scan.ping_vel_b[env], io.scan.ping_yaw[env])
+    threshold = ti.cast(ti.static(doppler_threshold(io.mapping_cfg, io.sonar_cfg)), ti.f32)
     held = io.scan.ping_vel_valid[env] != 1
     if held or io.clusters.scan_step[env] == io.scan.ping_step[env]:
-        vel -= turned_z(io.clusters.slip_w[env], -io.scan.ping_yaw[env])
+        vel -= io.clusters.slip_w[env]
     if held:
         sigma = io.clusters.own_sigma_m_s[env]
         threshold = ti.max(
@@ -511,12 +492,12 @@ def own_motion(env, io: Bundle[MappingIO]):
 
 
 @ti.func
-def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
-    """Of a packet of beams: kind of return (0 = none or from a known wall, 1 = at rest as far as it tells
-    itself, 2 = moving by its Doppler), row, column, range [m].
+def mapped_lanes(env, first_ray, unit_x, unit_y, pos, vel, threshold, io: Bundle[MappingIO]):
+    """Of a packet of beams along these unit vectors: kind of return (0 = none or from a known wall, 1 = at
+    rest as far as it tells itself, 2 = moving by its Doppler), row, column, range [m].
 
-    ``vel`` [m/s] is the own velocity along x and y of the obstacle, ``threshold`` [m/s] the compensated
-    Doppler that counts as motion.
+    ``vel`` [m/s] is the own velocity along x and y, ``threshold`` [m/s] the compensated Doppler that counts
+    as motion.
     """
     n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
     lanes = ti.static(n_lane())
@@ -525,27 +506,23 @@ def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
     for i in ti.static(range(lanes)):
         range_m[i] = io.scan.range_m[env, first_ray + i]
         hit[i] = io.scan.hit[env, first_ray + i]
-    unit_x, unit_y = beam_packet(io.scan.ping_yaw[env], first_ray, io.sonar_cfg)
     x, y = pos[0] + unit_x * range_m, pos[1] + unit_y * range_m
     # noise along a slanting beam reaches deeper into the tank than the margin
-    gap, short = (
-        wall_gaps(x, y, io),
-        wall_lanes(pos, unit_x, unit_y, io.tank_cfg) - range_error(range_m, io) - range_m,
-    )
+    error = range_error(range_m, io)
+    gap, beyond = wall_gaps(x, y, io), wall_gaps(x + unit_x * error, y + unit_y * error, io)
     moves = filled(0.0, lanes)
     if ti.static(io.sonar_cfg.doppler):
         # measured rate of range plus own velocity along the beam: motion through the water
-        ahead_x, ahead_y = beam_packet(0.0, first_ray, io.sonar_cfg)
         for i in ti.static(range(lanes)):
             moves[i] = io.scan.doppler_m_s[env, first_ray + i]
-        moves = moves + ahead_x * vel[0] + ahead_y * vel[1]
+        moves = moves + unit_x * vel[0] + unit_y * vel[1]
     margin = wall_margins(range_m, io)
     kind, row, col = filled_int(0, lanes), filled_int(0, lanes), filled_int(0, lanes)
     for i in ti.static(range(lanes)):
         row[i] = ti.cast(ti.floor((y[i] - y0) / io.mapping_cfg.cell_m), ti.i32)
         col[i] = ti.cast(ti.floor((x[i] - x0) / io.mapping_cfg.cell_m), ti.i32)
     for i in ti.static(range(lanes)):
-        known = (gap[i] < margin[i]) | (short[i] < 0.0)
+        known = (gap[i] < margin[i]) | (beyond[i] < 0.0)
         off = (row[i] < 0) | (row[i] >= n_row) | (col[i] < 0) | (col[i] >= n_col)
         moving = ti.abs(moves[i]) > threshold
         kind[i] = ti.select((hit[i] == 0) | known | off, 0, ti.select(moving, 2, 1))
@@ -553,30 +530,54 @@ def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
 
 
 @ti.func
+def mark_scan(env, slot, item, promote_scans: Const[int], io: Bundle[MappingIO]):
+    """Bits of the outline of what the new beams prove free, and of the returns. ``item``: which of those that
+    share the env (``n_item``)."""
+    if ti.static(n_item() == 1 and not io.sonar_cfg.mechanical):
+        mark_packets(env, slot, promote_scans, io)
+    else:
+        if ti.static(not io.sonar_cfg.mechanical):
+            mark_fan_together(env, slot, item, io)
+        elif item == 0:  # a head has few new beams, each of which begins where the one before ended
+            mark_sectors(env, slot, io)
+        mark_hits(env, slot, item, promote_scans, io)
+
+
+@ti.func
 def mark_hits(env, slot, item, promote_scans: Const[int], io: Bundle[MappingIO]):
-    """Bit of every return's cell: what moves is a dynamic hit only, the rest static hits; returns from known
-    walls are left out. ``item``: which of those that share the env (``n_item``)."""
-    lanes = ti.static(n_lane())
+    """Bit of every return's cell. ``item``: which of those that share the env (``n_item``)."""
     pos = ti.Vector([io.scan.ping_pos_w[env][0], io.scan.ping_pos_w[env][1]])
     vel, threshold = own_motion(env, io)
     for turn in range(ti.static(n_turn(io.sonar_cfg.n_ray // n_lane()))):
-        first = (turn * ti.static(n_item()) + item) * lanes
+        first = (turn * ti.static(n_item()) + item) * ti.static(n_lane())
         if first < io.sonar_cfg.n_ray:
-            kind, row, col, range_m = mapped_lanes(env, first, pos, vel, threshold, io)
-            for i in range(lanes):
-                if kind[i] != 0 and is_new(env, first + i, io.scan, io.sonar_cfg):
-                    moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, first + i, io)
-                    mark_hit(env, slot, row[i], col[i], range_m[i], moves, promote_scans, io)
+            unit_x, unit_y = beam_packet(io.scan.ping_yaw[env], first, io.sonar_cfg)
+            mark_returns(env, slot, first, unit_x, unit_y, pos, vel, threshold, promote_scans, io)
+
+
+@ti.func
+def mark_returns(
+    env, slot, first, unit_x, unit_y, pos, vel, threshold, promote_scans: Const[int], io: Bundle[MappingIO]
+):
+    """Bit of the cell of each return of a packet: what moves is a dynamic hit only, the rest static hits;
+    returns from known walls are left out."""
+    kind, row, col, range_m = mapped_lanes(env, first, unit_x, unit_y, pos, vel, threshold, io)
+    for i in range(ti.static(n_lane())):
+        if kind[i] != 0 and is_new(env, first + i, io.scan, io.sonar_cfg):
+            moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, first + i, io)
+            mark_hit(env, slot, row[i], col[i], range_m[i], moves, promote_scans, io)
 
 
 @ti.func
 def mark_hit(env, slot, row, col, range_m, moves, promote_scans: Const[int], io: Bundle[MappingIO]):
     """Bit of a return's cell; ``moves``: 1 where the return or its track says so."""
     dynamic = moves
+    fetch(io.grid_map.static_occ[env, row, col])
     if moves == 0:
         dynamic = is_inconsistent(env, row, col, range_m, promote_scans, io)
     if dynamic == 1:
         put_bit(io.map_scratch.dynamic_hit, slot, row, col)
+        fetch(io.grid_map.dynamic_scans[env, row, col])
     else:
         put_bit(io.map_scratch.static_hit, slot, row, col)
 

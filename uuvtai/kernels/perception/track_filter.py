@@ -314,13 +314,12 @@ def update_turn_rate(env, track, before, io: Bundle[TrackingIO]):
 # tracking).
 #
 # An obstacle that swims to and fro at constant speed and turns back at the rate h [1/s] has the velocity s(t)
-# v with
-# s = +-1: its mean is exp(-2ht) v, and the covariance of its velocity at two times falls as exp(-2h |t - t'|)
-# (Kac's telegraph process). An Ornstein-Uhlenbeck velocity with the rate 2h and the same mean square has the
-# same first and second moments at all times, so a Kalman filter can carry them: the mean slows down and stays
-# ahead of the last sight by v / 2h, the variance along the way grows backwards as well as forwards. The mean
-# square of the velocity, mean^2 + variance, is what such an obstacle keeps: its largest axis is the way, its
-# root the speed.
+# v with s = +-1: its mean is exp(-2ht) v, and the covariance of its velocity at two times falls as exp(-2h |t
+# - t'|) (Kac's telegraph process). An Ornstein-Uhlenbeck velocity with the rate 2h and the same mean square
+# has the same first and second moments at all times, so a Kalman filter can carry them: the mean slows down
+# and stays ahead of the last sight by v / 2h, the variance along the way grows backwards as well as forwards.
+# The mean square of the velocity, mean^2 + variance, is what such an obstacle keeps: its largest axis is the
+# way, its root the speed.
 
 
 _SLOWEST_M_S = 0.1

@@ -356,10 +356,3 @@ def compute_clearance(io: Bundle[ClearanceIO]):
             if pad == 0:
                 for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
                     bring_up_to_date(env, slot, io)
-
-
-@ti.kernel
-def forget_clearance(io: Bundle[ClearanceIO]):
-    """Have everything computed anew, as after the start."""
-    for env in range(ti.static(io.clearance_memory.limit.shape[0])):
-        io.clearance_memory.limit[env] = 0

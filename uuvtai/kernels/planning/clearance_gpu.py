@@ -24,8 +24,7 @@ from uuvtai.kernels.core.stage import Bundle, Const
 from uuvtai.kernels.planning.io import ClearanceIO
 
 # ------------------------------------------------------------------------------------------------------------
-# What the clearance on a CPU (``clearance.py``) and on a GPU (here) share: keys, sites,
-# when it is due.
+# What the clearance on a CPU (``clearance.py``) and on a GPU (here) share: keys, sites, when it is due.
 
 
 # ---------------------------------------------------------- plain Python, evaluated when a kernel is compiled

@@ -9,7 +9,7 @@ the eight around a cell; a diagonal step needs both cells beside it (no corner i
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.core.grid import grid_origin, heap_after_pop, heap_after_push, top_cell
+from uuvtai.kernels.core.grid import grid_origin, heap_after_pop, heap_after_push, occupancy_of, top_cell
 from uuvtai.kernels.core.stage import Bundle, In, Out
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.state import ClockState, RouteState
@@ -219,8 +219,7 @@ def _size_after_expansion(slot, env, size, row, col, start, everywhere, floor_we
 
 
 # ------------------------------------------------------------------------------------------------------------
-# The traversable set: cells that are not occupied, lie inside the tank and keep d_min (the paper's
-# Omega).
+# The traversable set: cells that are not occupied, lie inside the tank and keep d_min (the paper's Omega).
 
 
 _SLACK_M = 1.0e-5
@@ -234,7 +233,7 @@ def occupancy(env, row, col, io: Bundle[RouteIO]):
     value = io.grid_map.static_occ[env, row, col]
     if ti.static(io.voronoi_cfg.use == "fused"):
         value = ti.max(value, io.grid_map.dynamic_occ[env, row, col])
-    return value
+    return occupancy_of(value)
 
 
 @ti.func

@@ -20,8 +20,7 @@ from uuvtai.kernels.planning.io import ObservationIO
 # going to come.
 #
 # A policy without memory sees no motion in one observation; track and forecast hold what many scans have
-# told.
-# Sees sensor data and memory only, never the truth.
+# told. Sees sensor data and memory only, never the truth.
 
 
 @ti.func

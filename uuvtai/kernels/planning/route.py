@@ -6,7 +6,7 @@ import taichi as ti
 from uuvtai.common.enums import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import wrapped_angle
-from uuvtai.kernels.core.grid import cell_of
+from uuvtai.kernels.core.grid import cell_of, occupancy_of
 from uuvtai.kernels.core.stage import Bundle, FloatMatrix, In, spread
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.kernels.planning.medial_axis import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
@@ -115,9 +115,10 @@ def cell_on_grid(pos_w, io: Bundle[RouteIO]):
 @ti.func
 def risk_at(env, cell, io: Bundle[RouteIO]):
     """R: alpha_m M^s + alpha_d M^d + alpha_delta / (clearance + eps)."""
-    occupied = ti.static(io.clearance_cfg.risk_static) * io.grid_map.static_occ[env, cell[0], cell[1]]
-    moving = ti.static(io.clearance_cfg.risk_dynamic) * io.grid_map.dynamic_occ[env, cell[0], cell[1]]
-    room = io.clearance.clearance_m[env, cell[0], cell[1]] + ti.static(io.clearance_cfg.risk_epsilon_m)
+    row, col = cell[0], cell[1]
+    occupied = ti.static(io.clearance_cfg.risk_static) * occupancy_of(io.grid_map.static_occ[env, row, col])
+    moving = ti.static(io.clearance_cfg.risk_dynamic) * occupancy_of(io.grid_map.dynamic_occ[env, row, col])
+    room = io.clearance.clearance_m[env, row, col] + ti.static(io.clearance_cfg.risk_epsilon_m)
     return occupied + moving + ti.static(io.clearance_cfg.risk_clearance) / room
 
 

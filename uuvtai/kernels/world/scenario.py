@@ -38,8 +38,7 @@ from uuvtai.kernels.world.motion import (
 # Floor of ``world.py``.
 #
 # Every search is bounded; where its draws run out, ``WorldState.faults`` says so and the scenario counts as
-# not
-# placed.
+# not placed.
 
 
 COARSE_M = 0.2

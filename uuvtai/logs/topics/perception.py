@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uuvtai.common.enums import occupancy
 from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.config import Config
 from uuvtai.logs.encode import (
@@ -319,11 +320,11 @@ class Layer:
 
 
 def _static(moment: Moment) -> bytes:
-    return _grid(moment, moment.stamp, moment["grid_map.static_occ"], static_colors)
+    return _grid(moment, moment.stamp, occupancy(moment["grid_map.static_occ"]), static_colors)
 
 
 def _dynamic(moment: Moment) -> bytes:
-    return _grid(moment, moment.stamp, moment["grid_map.dynamic_occ"], dynamic_colors)
+    return _grid(moment, moment.stamp, occupancy(moment["grid_map.dynamic_occ"]), dynamic_colors)
 
 
 def _clearance(moment: Moment) -> bytes:
@@ -333,8 +334,8 @@ def _clearance(moment: Moment) -> bytes:
 def _risk(moment: Moment) -> bytes:
     c, clearance_m = moment.header.config.clearance, moment["clearance.clearance_m"]
     risk = (
-        c.risk_static * moment["grid_map.static_occ"]
-        + c.risk_dynamic * moment["grid_map.dynamic_occ"]
+        c.risk_static * occupancy(moment["grid_map.static_occ"])
+        + c.risk_dynamic * occupancy(moment["grid_map.dynamic_occ"])
         + c.risk_clearance / (clearance_m + c.risk_epsilon_m)
     )
     return _grid(moment, _computed(moment), risk, _risk_colors)
