@@ -69,8 +69,8 @@ def shares(count: int) -> int:
 
 @ti.func
 def fetch(element: Out[Any]):
-    """Ask memory for the line of a whole number that will be needed soon, and do not wait for it: our machine
-    code makes a prefetch of this (``compile/codegen.py``). On a GPU others wait instead."""
+    """Ask memory for a whole number that will be needed soon, without waiting for it: our machine code makes
+    a prefetch of this "or" with 0 (``compile/codegen.py``). On a GPU it does nothing."""
     if ti.static(not is_gpu_shaped()):
         ti.atomic_or(element, element ^ element)  # a 0 of its type
 
