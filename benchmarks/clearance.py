@@ -8,8 +8,9 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from benchmarks.common import Job, Row, seconds_per_call
-from tests.map_bits import put_layers
+from tests.map_bits import nearest_sites, put_layers
 from uuvtai import state
+from uuvtai.common.enums import clearance_m
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import ClearanceConfig
 from uuvtai.config.loader import load_config
@@ -88,11 +89,8 @@ class Maps:
     def check(self, cfg: ClearanceConfig) -> None:
         """Raise RuntimeError unless all three agree and our sites lie where they are said to."""
         self.ours(cfg)()
-        found = self.clearance.clearance_m.to_numpy()
-        rows, cols = (
-            self.clearance.site_row.to_numpy().astype(int),
-            self.clearance.site_col.to_numpy().astype(int),
-        )
+        site = self.clearance.site.to_numpy()
+        found, (rows, cols) = clearance_m(site, self.config), nearest_sites(site)
         row, col = np.indices(self.outside.shape)
         for i, image in enumerate(self.images):
             exact = np.minimum(np.asarray(distance_transform_edt(image)) * self.cell_m, cfg.max_m)

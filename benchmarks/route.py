@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.common import Job, Row, seconds_per_call
 from tests import planning_maps as maps
+from tests.map_bits import sites
 from tests.oracles.voronoi import clearance_of
 from uuvtai import state
 from uuvtai.common.enums import FAIL_NONE, FULL, N_PLANNER, N_REASON, N_TRIGGER
@@ -134,11 +135,9 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     s["mask"].outside.from_numpy(maps.OUTSIDE.astype(np.int32))
     s["clock"].active.fill(1)
     route.reset_route(bind(RouteIO, s["route"], s["clock"], partial=True))
-    for field, i, dtype in (
-        (s["grid_map"].static_occ, 0, np.uint16), (s["clearance"].clearance_m, 1, np.float32),
-        (s["clearance"].site_row, 2, np.int16), (s["clearance"].site_col, 3, np.int16),
-    ):  # fmt: skip
-        field.from_numpy(np.array([f[i] for f in found], dtype))
+    occ, _room, row, col = (np.array([f[i] for f in found]) for i in range(4))
+    s["grid_map"].static_occ.from_numpy(occ.astype(np.uint16))
+    s["clearance"].site.from_numpy(sites(row, col))
     s["ego"].pos_w.from_numpy(np.tile(np.array([*_START, _Z_M], np.float32), (n_env, 1)))
     s["mission"].goal_w.from_numpy(np.tile(np.array([*_GOAL, _Z_M], np.float32), (n_env, 1)))
     s["route"].queue.from_numpy(np.arange(n_env, dtype=np.int32))

@@ -3,9 +3,11 @@ anew."""
 
 from collections import defaultdict
 from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import get_type_hints
 
 import numpy as np
+import pytest
 
 from tests.oracles import scenes
 from uuvtai import state
@@ -29,6 +31,17 @@ class Stage:
         self.sizes = {**type(self).sizes, **sizes}
         if self.other:
             self.sizes = defaultdict(lambda: self.other, self.sizes)
+
+    @classmethod
+    def fixture(cls):
+        """A fixture: one of a module."""
+        return pytest.fixture(scope="module")(cache(cls))
+
+    @classmethod
+    def begun(cls):
+        """A fixture: one of a module, which begins anew with every test."""
+        made = cache(cls)
+        return pytest.fixture(lambda: made().begin())
 
     def __getattr__(self, noun):
         if noun not in STRUCTS:

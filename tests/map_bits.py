@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uuvtai.common.enums import FULL, occupancy
+from uuvtai.common.enums import FULL, NO_SITE, occupancy
 
 WORD = 64
 
@@ -24,6 +24,37 @@ def cells(words_, n_col):
 def kept(occupancies):
     """A layer as the map keeps it."""
     return np.rint(np.asarray(occupancies) * FULL).astype(np.uint16)
+
+
+def sites(row, col):
+    """What the clearance keeps of nearest sites [.., row, col]; row -1 = none."""
+    own_row, own_col = np.ogrid[: np.shape(row)[-2], : np.shape(row)[-1]]
+    return np.where(row < 0, NO_SITE, away(row - own_row, col - own_col)).astype(np.int16)
+
+
+def away(rows, cols):
+    """What the clearance keeps of a site so many rows and columns away."""
+    return np.asarray(rows) * 256 + (np.asarray(cols) & 127) * 2
+
+
+def nearest_sites(kept):
+    """(row, col) of nearest sites that the clearance keeps [.., row, col]; -1 = none."""
+    own_row, own_col = np.ogrid[: kept.shape[-2], : kept.shape[-1]]
+    near = kept != NO_SITE
+    return np.where(near, own_row + (kept >> 8), -1), np.where(near, own_col + (kept << 8 >> 9), -1)
+
+
+_AWAY = np.stack(np.meshgrid(np.arange(21), np.arange(21)), -1).reshape(-1, 2)
+_AWAY = _AWAY[np.argsort(np.hypot(*_AWAY.T), kind="stable")]
+
+
+def room(metres):
+    """What the clearance keeps of the site whose distance is nearest to ``metres``, in cells of 0.1 m; none
+    from 2 m on."""
+    reach, cells_away = np.hypot(*_AWAY.T), np.asarray(metres) / 0.1
+    above = np.searchsorted(reach, cells_away).clip(1, len(reach) - 1)
+    nearest = above - (cells_away - reach[above - 1] < reach[above] - cells_away)
+    return np.where(cells_away < 20, away(*np.moveaxis(_AWAY[nearest], -1, 0)), NO_SITE).astype(np.int16)
 
 
 def put_layers(grid_map, static, dynamic, occupied):

@@ -6,8 +6,9 @@ import numpy as np
 
 from tests import planning_maps as maps
 from tests.bundles import Stage, put
-from tests.map_bits import kept
+from tests.map_bits import kept, sites
 from tests.oracles.voronoi import clearance_of
+from uuvtai.common.enums import clearance_m
 from uuvtai.config import Config
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.sim.setup import load_bounds
@@ -53,8 +54,13 @@ def put_maps(occupied, layer="static_occ", max_m=2.0):
     s = stage()
     getattr(s.grid_map, layer).from_numpy(kept(occupied))
     found = [clearance_of(occ | maps.OUTSIDE, maps.CELL_M, max_m) for occ in occupied]
-    clearance_m, row, col = map(np.array, zip(*found, strict=True))
-    put(s.clearance, clearance_m=clearance_m, site_row=row, site_col=col)
+    _, row, col = map(np.array, zip(*found, strict=True))
+    put(s.clearance, site=sites(row, col))
+
+
+def room_m(s):
+    """Clearance of every env's cells [m]."""
+    return clearance_m(s.clearance.site.to_numpy(), CONFIG)
 
 
 def put_ends(starts, goals, z=-0.8):

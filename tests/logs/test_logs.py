@@ -21,10 +21,10 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from tests.command import read_by_viewer
-from tests.map_bits import kept
+from tests.map_bits import kept, room
 from tests.oracles import logs as episode
 from tests.oracles.world import path_position
-from uuvtai.common.enums import occupancy
+from uuvtai.common.enums import clearance_m, occupancy
 from uuvtai.common.files import FileError
 from uuvtai.common.obstacle_motion import KIND_NAMES, obstacle_positions
 from uuvtai.config.loader import load_config
@@ -46,7 +46,7 @@ DEPTH_ROUNDING_MM = 0.5 + 1e-3
 """a depth image has whole millimetres"""
 RISK_ROUNDING = 1e-6
 """the log adds its terms in another order, in float32"""
-LAYERS = ("grid_map.static_occ", "grid_map.dynamic_occ", "clearance.clearance_m")
+LAYERS = ("grid_map.static_occ", "grid_map.dynamic_occ", "clearance.site")
 CLOSED_FORM_M = 2e-6
 """float32 rounding of positions up to 20 m"""
 
@@ -252,8 +252,8 @@ def test_a_late_scan_carries_the_time_of_its_ping(tmp_path, snaps):
 
 
 def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, snaps):
-    static, dynamic, clearance = (snaps[-1][name] for name in LAYERS)
-    static, dynamic = occupancy(static), occupancy(dynamic)
+    static, dynamic = (occupancy(snaps[-1][name]) for name in LAYERS[:2])
+    clearance = clearance_m(snaps[-1]["clearance.site"], episode.config())
     weights = episode.config().clearance
     risk = weights.risk_clearance / (clearance + weights.risk_epsilon_m)
     risk = risk + weights.risk_static * static + weights.risk_dynamic * dynamic
@@ -277,7 +277,7 @@ def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, sna
 def large(metres):
     """The first step of an episode in a tank of that (width, length), its maps full."""
     cells = np.resize(np.linspace(0, 1, 997, dtype=np.float32), [10 * side + 8 for side in metres])
-    maps = {LAYERS[0]: kept(cells), LAYERS[1]: kept(cells), LAYERS[2]: cells}
+    maps = {LAYERS[0]: kept(cells), LAYERS[1]: kept(cells), LAYERS[2]: room(cells)}
     return next(episode.snapshots(1, maps=False)) | maps
 
 
@@ -400,7 +400,6 @@ def test_kinds_are_those_of_the_simulator():
 
 @pytest.mark.parametrize("field", [
     "vehicle.pos_w", "ego.pos_w", "scan.range_m", "vehicle.rpm", "world.pos_w", "tracks.state",
-    "clearance.clearance_m",
 ])  # fmt: skip
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
 def test_numbers_that_are_not_finite_are_refused(tmp_path, snaps, field, bad):

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from tests.map_bits import kept
+from tests.map_bits import away, kept
 from uuvtai.common import enums
+from uuvtai.common.enums import NO_SITE
 from uuvtai.common.obstacle_motion import obstacle_positions
 from uuvtai.config import Config, SensorsConfig, SonarConfig
 from uuvtai.logs.encode import EpisodeHeader
@@ -210,15 +211,16 @@ def layers(static: np.ndarray, dynamic: np.ndarray) -> dict[str, np.ndarray]:
     occupied = np.maximum(static, dynamic) >= 0.5
     x, y = ORIGIN[0] + (cols + 0.5) * CELL_M, ORIGIN[1] + (rows + 0.5) * CELL_M
     occupied |= (x < 0) | (x > 20) | (y < 0) | (y > 6)
-    clearance = np.full(SHAPE, 1.0, np.float32)
+    nearest, site = np.full(SHAPE, 10.5), np.full(SHAPE, NO_SITE)
     for dr in range(-10, 11):
         for dc in range(-10, 11):
             source = np.roll(occupied, (dr, dc), (0, 1))
-            clearance = np.where(source, np.minimum(clearance, CELL_M * math.hypot(dr, dc)), clearance)
+            source &= nearest > math.hypot(dr, dc)
+            nearest[source], site[source] = math.hypot(dr, dc), away(-dr, -dc)
     return {
         "grid_map.static_occ": kept(static),
         "grid_map.dynamic_occ": kept(dynamic),
-        "clearance.clearance_m": clearance.astype(np.float32),
+        "clearance.site": site.astype(np.int16),
     }
 
 

@@ -86,7 +86,7 @@ def test_views_show_every_layout_as_taichi_does(small):
     fields = {
         "route.n_queue": s.route.n_queue, "clock.step": s.clock.step, "vehicle.quat_wb": s.vehicle.quat_wb,
         "tracks.height": s.tracks.height, "scan.range_m": s.scan.range_m,
-        "clearance.site_row": s.clearance.site_row, "grid_map.dynamic_occ": s.grid_map.dynamic_occ,
+        "clearance.site": s.clearance.site, "grid_map.dynamic_occ": s.grid_map.dynamic_occ,
         "grid_map.free_scans": s.grid_map.free_scans,
     }  # fmt: skip
     views = memory.views(memory.read(), scratch=True)

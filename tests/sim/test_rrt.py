@@ -10,7 +10,7 @@ from tests import planning_maps as maps
 from tests.bundles import io_for
 from tests.kernels.planning.test_voronoi import STRICT, wall
 from tests.oracles.voronoi import clearance_of, line_points
-from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, way_of
+from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, room_m, way_of
 from uuvtai.common import enums as codes
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.sim import rrt
@@ -152,7 +152,7 @@ def test_rrt_takes_over(reason):
         way = way_of(env)
         assert np.allclose(way[0], start, atol=EDGE_M) and np.allclose(way[-1], goal, atol=EDGE_M)
         assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() <= config.route.spacing_m * (1 + 2e-4)
-        clearance = s.clearance.clearance_m.to_numpy()[env]
+        clearance = room_m(s)[env]
         assert (clearance[crossed_cells(way)] >= FLOOR_M - EDGE_M).all()
         assert s.route.planner[env] == codes.PLANNER_RRT and s.route.planned_by[env, 1] == 1
         assert s.route.kept[env] == 0

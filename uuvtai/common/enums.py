@@ -39,6 +39,17 @@ def occupancy(layer: Any) -> Any:
     return (layer / FULL).astype("float32")
 
 
+NO_SITE = 127 << 8  # no site in reach, as the clearance keeps it: farther away than any that is
+
+
+def clearance_m(site: Any, config: Any) -> Any:
+    """Clearance [m], float32, of an int16 array of sites as the clearance keeps them."""
+    rows, cols = site >> 8, site << 8 >> 9
+    found = (rows * rows + cols * cols).astype("float32") ** 0.5 * config.mapping.cell_m
+    nearer = (found - config.clearance.inflate_m).clip(0)
+    return (found * (site & 1 == 0) + nearer * (site & 1)).clip(max=config.clearance.max_m)
+
+
 # ---- What a learned forecast is told and what it says, in numbers: read by its kernels and by what learns.
 
 PACKET = 16  # columns and units come in whole packets (``kernels.core.simd.LANES``)

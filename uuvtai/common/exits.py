@@ -24,19 +24,9 @@ UsageError: Any = typer.BadParameter.__base__
 """Typer carries its own copy of click from 0.26 on, so the class is taken from what Typer exports."""
 
 _SYSTEM_NAMES = (
-    "ENOSPC",
-    "EDQUOT",
-    "EFBIG",
-    "EIO",
-    "EROFS",
-    "EMFILE",
-    "ENFILE",
-    "ENOMEM",
-    "EAGAIN",
-    "EACCES",
-    "EPERM",
+    "ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EMFILE", "ENFILE", "ENOMEM", "EAGAIN", "EACCES", "EPERM",
     "ESTALE",
-)
+)  # fmt: skip
 _SYSTEM = tuple(getattr(errno, name) for name in _SYSTEM_NAMES if hasattr(errno, name))
 """what the system may refuse at any moment, whatever was typed and however right the program is"""
 

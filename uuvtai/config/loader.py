@@ -30,21 +30,9 @@ from uuvtai.config.learning import LearningConfig
 DEFAULT_WORLD, DEFAULT_SENSORS, DEFAULT_VEHICLE = "pool", "paper", "bluerov2"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 STACK_SECTIONS = (
-    "localization",
-    "tracking",
-    "forecast",
-    "height",
-    "camera_tracking",
-    "mapping",
-    "clearance",
-    "voronoi",
-    "quiet",
-    "route",
-    "behavior",
-    "slow",
-    "fast",
-    "baselines",
-)
+    "localization", "tracking", "forecast", "height", "camera_tracking", "mapping", "clearance", "voronoi",
+    "quiet", "route", "behavior", "slow", "fast", "baselines",
+)  # fmt: skip
 """what a stack preset may set: nothing that a scenario, a sensor, the termination check or the observation's
 columns depend on"""
 LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()

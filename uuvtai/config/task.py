@@ -9,20 +9,9 @@ from pydantic import Field
 from uuvtai.config.base import NonNegative, Positive, PositiveCount, Real, Section
 
 TERMS = (
-    "alive",
-    "progress",
-    "path_distance",
-    "cross_track",
-    "clearance",
-    "ttc",
-    "overspeed",
-    "upright",
-    "heading",
-    "success",
-    "failure",
-    "tilt",
-    "effort",
-)
+    "alive", "progress", "path_distance", "cross_track", "clearance", "ttc", "overspeed", "upright",
+    "heading", "success", "failure", "tilt", "effort",
+)  # fmt: skip
 """Names of the reward's terms, in the order of ``RewardState.term``; their weights are the config keys of the
 same names."""
 

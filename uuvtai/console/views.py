@@ -122,17 +122,9 @@ _RATES = {
 }
 _FLAME_WIDTH = 100
 _FLAME_COLORS = (
-    "blue",
-    "cyan",
-    "green",
-    "yellow",
-    "magenta",
-    "red",
-    "bright_blue",
-    "bright_cyan",
-    "bright_green",
+    "blue", "cyan", "green", "yellow", "magenta", "red", "bright_blue", "bright_cyan", "bright_green",
     "bright_yellow",
-)
+)  # fmt: skip
 
 
 def show_profile(screen: Screen, result: dict[str, Any]) -> None:

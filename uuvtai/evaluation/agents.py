@@ -29,19 +29,9 @@ TRUTH = "truth"
 """suffix of a tree's name: an oracle whose tracks of moving obstacles are the truth"""
 
 _STACK = (
-    "tracking",
-    "forecast",
-    "height",
-    "mapping",
-    "clearance",
-    "voronoi",
-    "quiet",
-    "route",
-    "behavior",
-    "fast",
-    "actuation",
-    "episode",
-)
+    "tracking", "forecast", "height", "mapping", "clearance", "voronoi", "quiet", "route", "behavior",
+    "fast", "actuation", "episode",
+)  # fmt: skip
 """sections that shape what a policy sees and does; differences from its training are told, not refused"""
 
 

@@ -49,15 +49,8 @@ often"""
 
 _COUNTS = ("replans", "planned_by", "fallbacks")
 _PLAIN = (
-    "seed",
-    "episode",
-    "outcome",
-    "time_s",
-    "episode_return",
-    "min_clearance_m",
-    "path_length_m",
-    *_COUNTS,
-)
+    "seed", "episode", "outcome", "time_s", "episode_return", "min_clearance_m", "path_length_m", *_COUNTS,
+)  # fmt: skip
 
 
 class Finished(NamedTuple):

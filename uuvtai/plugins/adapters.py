@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from uuvtai.common.enums import occupancy
+from uuvtai.common.enums import clearance_m, occupancy
 from uuvtai.config import SonarConfig
 from uuvtai.learning.policy_agent import CHUNK, AgentDecision
 from uuvtai.plugins.api import (
@@ -51,7 +51,7 @@ FIELDS = {
     ),
     "tracks": ("tracks.alive", "tracks.moving", "tracks.state", "tracks.radius_m"),
     "forecast": ("forecast.pos_w", "forecast.radius_m"),
-    "map": ("grid_map.static_occ", "grid_map.dynamic_occ", "clearance.clearance_m"),
+    "map": ("grid_map.static_occ", "grid_map.dynamic_occ", "clearance.site"),
     "route": (
         *("route.n_way", "route.way_w", "route.lookahead_w", "route.heading_error", "route.cross_track_m"),
         "route.remaining_m",
@@ -94,7 +94,7 @@ class Readings:
             moving, state = (read[0] == 1) & (read[1] == 1), read[2]
             return Tracks(moving, state[..., :2], state[..., 2:], read[3], ahead[0], ahead[1])
         if name == "map":
-            read[:2] = map(occupancy, read[:2])
+            read = [*map(occupancy, read[:2]), clearance_m(read[2], self._sim.config)]
         kinds: dict[str, Callable[..., Any]] = {"ego": Ego, "map": OccupancyGrid, "route": Way}
         return kinds[name](*read) if name in kinds else read[0]
 

@@ -188,14 +188,9 @@ def _swatches(agents: list[AgentSpec]) -> list[str]:
 
 
 _PLAIN = (
-    "success_rate",
-    "collision_rate",
-    "time_to_success_mean_s",
-    "time_mean_s",
-    "tts_s",
-    "return_mean",
+    "success_rate", "collision_rate", "time_to_success_mean_s", "time_mean_s", "tts_s", "return_mean",
     "min_clearance_mean_m",
-)
+)  # fmt: skip
 
 
 def evaluation_data(agents: list[AgentSpec]) -> Data:
@@ -231,14 +226,8 @@ def _rates_line(place: int, agent: AgentSpec, key: str, colour: str) -> Line:
 
 
 _PAIRED = (
-    "both",
-    "only_a",
-    "only_b",
-    "mcnemar_p",
-    "time_a_mean_s",
-    "time_b_mean_s",
-    "time_difference_mean_s",
-)
+    "both", "only_a", "only_b", "mcnemar_p", "time_a_mean_s", "time_b_mean_s", "time_difference_mean_s",
+)  # fmt: skip
 
 
 _BOUNDS = "time_difference_ci95"

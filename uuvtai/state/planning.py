@@ -11,14 +11,11 @@ from uuvtai.state.arrays import array
 
 @dataclass(frozen=True, eq=False)
 class ClearanceState:
-    """Distance to the nearest occupied or outside cell, centre to centre, with that cell."""
+    """The nearest occupied or outside cell, from which follows how far it is, centre to centre."""
 
-    clearance_m: ti.Field = array("n_env", "n_row", "n_col", lanes=True, dtype=ti.f32)
-    """[m] exact up to clearance.max_m, which stands for "at least" """
-    site_row: ti.Field = array("n_env", "n_row", "n_col", lanes=True, dtype=ti.i16)
-    """row of the nearest site, -1 = none within clearance.max_m"""
-    site_col: ti.Field = array("n_env", "n_row", "n_col", lanes=True, dtype=ti.i16)
-    """column of the nearest site"""
+    site: ti.Field = array("n_env", "n_row", "n_col", lanes=True, dtype=ti.i16)
+    """the nearest site: how many rows away (upper 8 bits), how many columns (the next 7), 1 = an obstacle's,
+    which clearance.inflate_m brings nearer; common.enums.NO_SITE = none within clearance.max_m"""
     fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = computed in this very step"""
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from uuvtai.config import (
     ActuationConfig,
+    ClearanceConfig,
     EpisodeConfig,
     MappingConfig,
     TankConfig,
@@ -17,16 +18,8 @@ from uuvtai.kernels.core.stage import Const, In
 from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState, Proprioception, TrackState
 
 AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL = (
-    0,
-    3,
-    6,
-    7,
-    8,
-    9,
-    12,
-    14,
-    17,
-)
+    0, 3, 6, 7, 8, 9, 12, 14, 17,
+)  # fmt: skip
 """columns of an env's row: position in the world, velocity in the body frame, heading, yaw rate, time, goal,
 signs of the way to the goal, last action, integrals of the velocity loops"""
 EGO_WIDTH = 21
@@ -61,6 +54,7 @@ class ObserverIO:
     tracks: In[TrackState]
     forecast: In[ForecastState]
     clearance: In[ClearanceState]
+    clearance_cfg: Const[ClearanceConfig]
     vehicle_cfg: Const[VehicleConfig]
     tank_cfg: Const[TankConfig]
     mapping_cfg: Const[MappingConfig]

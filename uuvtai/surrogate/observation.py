@@ -6,7 +6,7 @@ import taichi as ti
 from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH, OWN_WIDTH
 from uuvtai.envs.vector_env import ObservationColumn
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
-from uuvtai.kernels.core.grid import cell_of
+from uuvtai.kernels.core.grid import cell_of, clearance_of
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, FloatMatrix, IntVector
 from uuvtai.surrogate.arrays import (
     AT_FLIP,
@@ -33,12 +33,12 @@ LARGEST_TURN = 3.5
 def free_ray(env, x, y, ux, uy, io: Bundle[ObserverIO]):
     """[m] along a ray to the nearest occupied cell or wall of the map, in steps of the clearance."""
     far, hit = 0.0, 0
-    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
+    n_row, n_col = ti.static(io.clearance.site.shape[1:])
     for _ in range(MARCHES):
         if hit == 0 and far <= SIGHT_M:
             cell = cell_of(ti.Vector([x + far * ux, y + far * uy]), io.tank_cfg, io.mapping_cfg.cell_m)
             row, col = ti.math.clamp(cell[0], 0, n_row - 1), ti.math.clamp(cell[1], 0, n_col - 1)
-            clear = io.clearance.clearance_m[env, row, col]
+            clear = clearance_of(io.clearance.site[env, row, col], io.clearance_cfg, io.mapping_cfg.cell_m)
             if clear < 0.08:
                 hit = 1
             else:

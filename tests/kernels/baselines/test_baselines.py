@@ -10,7 +10,9 @@ import taichi as ti
 from tests.bundles import Stage, put
 from tests.command import uuv
 from tests.conftest import launch_one_by_one
+from tests.map_bits import room
 from tests.small_sim import SmallSim
+from uuvtai.common.enums import NO_SITE
 from uuvtai.config.planning import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.dwa import plan_dynamic_window
 from uuvtai.kernels.baselines.io import LocalPlannerIO
@@ -45,7 +47,7 @@ def scene(small):
     views["behavior.follow_vel_w"][:] = [0.6, 0, 0]
     views["behavior.away_w"][:] = 0
     views["forecast.radius_m"][:] = -1
-    views["clearance.clearance_m"][:] = 2
+    views["clearance.site"][:] = NO_SITE
     yield SimpleNamespace(sim=small.sim, views=views, config=small.config, n=small.N)
     memory.read()[:] = before
 
@@ -129,10 +131,10 @@ def test_a_obstacle_that_is_known_to_be_above_or_below_is_passed(scene, name):
 def test_no_velocity_leads_into_a_wall(scene, name):
     """A wall along y, 0.75 m ahead, on the way that is wanted: what is driven stops before contact."""
     tank, cell = scene.config.world.tank, scene.config.mapping.cell_m
-    n_col = scene.views["clearance.clearance_m"].shape[2]
+    n_col = scene.views["clearance.site"].shape[2]
     x = grid_origin(tank, cell)[0] + (np.arange(n_col) + 0.5) * cell
     wall = HERE[0] + 0.75
-    scene.views["clearance.clearance_m"][:] = np.clip(wall - x, 0, 2)
+    scene.views["clearance.site"][:] = room(np.clip(wall - x, 0, 2))
     scene.views["behavior.away_w"][:] = [-1, 0]
     places = drive(scene, name, lambda _time: None)
     assert (wall - places[:, 0]).min() > touch_m(scene), "it has not touched the wall"
@@ -238,7 +240,7 @@ READ = {
     "mission": ("start_w", "goal_w"),
     "behavior": ("follow_vel_w",),
     "forecast": ("pos_w", "radius_m", "above_w", "below_w"),
-    "clearance": ("clearance_m",),
+    "clearance": ("site",),
 }
 """What MPPI reads."""
 

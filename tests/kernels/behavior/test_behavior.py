@@ -10,7 +10,9 @@ import torch
 
 from tests import bundles
 from tests.bundles import Stage
+from tests.map_bits import away, room
 from tests.oracles import behavior as oracle
+from uuvtai.common.enums import NO_SITE, clearance_m
 from uuvtai.config import BehaviorConfig, Config
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.behavior import avoidance, threats, tree
@@ -95,7 +97,7 @@ def scene(stage):
     stage.futures.share.fill(0.0)
     stage.tracks.alive.fill(0)
     bundles.put(stage.scan, fresh=1, hit=0, range_m=12.0, doppler_m_s=0.0, ping_yaw=0.0)
-    bundles.put(stage.clearance, clearance_m=2.0, site_row=-1, site_col=-1)
+    bundles.put(stage.clearance, site=NO_SITE)
     use(stage, "bt")
     tree.reset_behavior(stage.io(BehaviorIO))
     return stage
@@ -122,8 +124,9 @@ def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
 
 
 def assess(stage, cfg=CFG.behavior, sonar=CFG.sensors.sonar):
-    rest = (CFG.height, CFG.traffic, CFG.vehicle, CFG.tracking, TANK, CFG.mapping, CFG.episode, CFG.fast)
-    threats.assess_threats(stage.io(BehaviorIO, cfg, sonar, *rest))
+    sensors = CFG.sensors.model_copy(update={"sonar": sonar})
+    config = CFG.model_copy(update={"behavior": cfg, "sensors": sensors})
+    threats.assess_threats(stage.io(BehaviorIO, config))
 
 
 def plan(stage):
@@ -203,7 +206,7 @@ def random_scene(scene, rng):
     put(scene.mission.goal_w, pos + rng.uniform(-1, 1, (N_ENV, 3)))
     put(scene.route.lookahead_w, pos + rng.uniform(-1, 1, (N_ENV, 3)))
     put(scene.behavior.last_vel_w, rng.uniform(-0.5, 0.5, (N_ENV, 3)))
-    put(scene.clearance.clearance_m, rng.uniform(0.2, 1.5, scene.clearance.clearance_m.shape))
+    put(scene.clearance.site, room(rng.uniform(0.2, 1.5, scene.clearance.site.shape)))
     start = pos[:, None, :2] + rng.uniform(-2.5, 2.5, (N_ENV, N_TRACK, 2))
     speed = rng.uniform(-0.8, 0.8, (N_ENV, N_TRACK, 2))
     put(scene.forecast.pos_w, start[:, :, None] + speed[:, :, None] * TIMES[:, None])
@@ -246,7 +249,9 @@ class View:
             getattr(scene.forecast, name).to_numpy()[env].astype(float)
             for name in ("pos_w", "radius_m", "above_w", "below_w")
         ] + [getattr(scene.futures, name).to_numpy()[env].astype(float) for name in ("pos_w", "share")]
-        self.clearance = scene.clearance.clearance_m.to_numpy()[env].astype(float) - doubt(scene, env)
+        self.clearance = clearance_m(scene.clearance.site.to_numpy()[env], CFG).astype(float) - doubt(
+            scene, env
+        )
 
     def candidates(self):
         return oracle.candidates(
@@ -333,7 +338,7 @@ def test_head_on_obstacle_is_evaded_with_room(scene):
 def test_evasion_stays_off_the_wall(scene):
     """With a wall on one side the body is passed on the other."""
     low_wall = (np.arange(SIZES["n_row"]) * CELL - 2.0)[:, None].clip(0, 2)
-    put(scene.clearance.clearance_m, np.broadcast_to(low_wall, scene.clearance.clearance_m.shape[1:]))
+    put(scene.clearance.site, np.broadcast_to(room(low_wall), scene.clearance.site.shape[1:]))
     for env, offset in enumerate((0.1, -0.1)):
         put(scene.ego.pos_w, (5.0, 2.2, -0.8), env)
         put(scene.route.lookahead_w, (6.0, 2.2, -0.8), env)
@@ -396,7 +401,7 @@ def test_sensed_emergency_backs_off_from_it(scene):
 
 def test_the_less_sure_of_its_place_the_nearer_are_walls(scene):
     """2.5 standard deviations of the worst direction, here and on the way."""
-    scene.clearance.clearance_m.fill(1.0)
+    scene.clearance.site.fill(int(room(1.0)))
     sigma, turn = np.array([0.0, 0.01, 0.05, 0.1, 0.2, 0.3]), np.linspace(0, 3, N_ENV)
     c, s = np.cos(turn), np.sin(turn)
     zero, worst, best = 0 * sigma, sigma**2, (0.3 * sigma) ** 2
@@ -412,12 +417,8 @@ def test_the_less_sure_of_its_place_the_nearer_are_walls(scene):
 def test_retreat_does_not_run_into_a_wall(scene):
     """Threat ahead, wall behind: the retreat slides along instead."""
     closing_beams(scene, 0, (0, 1))
-    scene.clearance.clearance_m.fill(0.45)
-    row, col = 32, 40
-    put(scene.clearance.site_row, row)
-    put(scene.clearance.site_col, col)
-    x0, y0 = grid_origin(TANK, CELL)
-    assert x0 + (col + 0.5) * CELL < 5.0 and abs(y0 + (row + 0.5) * CELL - 3.0) < 0.1
+    scene.clearance.site.fill(int(away(0, -4)))
+    put(scene.ego.pos_w, (5.0, 3.05, -0.8), 0)  # on the row of cells with the wall's
     decide(scene)
     assert acting(scene)[0] == "BackOff"
     assert scene.behavior.last_vel_w.to_numpy()[0, 0] > -0.1
@@ -425,9 +426,7 @@ def test_retreat_does_not_run_into_a_wall(scene):
 
 def test_stuck_creeps_to_the_end_of_its_time(scene):
     """Unstick stands in a sequence with memory: it outlasts the condition that began it."""
-    put(scene.clearance.site_row, 32)
-    put(scene.clearance.site_col, 40)
-    scene.clearance.clearance_m.fill(0.6)
+    scene.clearance.site.fill(int(away(0, -6)))
     put(scene.route.stuck_steps, round(CFG.behavior.stuck_s / CFG.episode.control_dt_s), 0)
     decide(scene)
     assert acting(scene)[:2] == ["Unstick", "FollowRoute"]
@@ -442,7 +441,7 @@ def test_stuck_creeps_to_the_end_of_its_time(scene):
 def test_waits_without_a_route_and_before_a_blocked_one(scene):
     put(scene.route.n_way, 0, 0)
     x0, y0 = grid_origin(TANK, CELL)
-    put(scene.clearance.clearance_m, 0.1, 1, int((3.0 - y0) / CELL), int((5.62 - x0) / CELL))
+    put(scene.clearance.site, room(0.1), 1, int((3.0 - y0) / CELL), int((5.62 - x0) / CELL))
     decide(scene)
     names = [scene.tree.names[node] for node in scene.behavior.leaf.to_numpy()]
     assert names[0] == "no route" and names[1] == "wait for a free way" and names[2] == "FollowRoute"
@@ -488,7 +487,7 @@ def corridor(scene, half_width):
     """Walls on both sides of y = 3."""
     y = grid_origin(TANK, CELL)[1] + (np.arange(SIZES["n_row"]) + 0.5) * CELL
     free = (half_width - np.abs(y - 3.0)).clip(0)
-    put(scene.clearance.clearance_m, np.broadcast_to(free[:, None], scene.clearance.clearance_m.shape[1:]))
+    put(scene.clearance.site, np.broadcast_to(room(free)[:, None], scene.clearance.site.shape[1:]))
 
 
 def test_climbs_or_dives_past_what_fills_the_way(scene):
@@ -581,10 +580,8 @@ def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene)
 def test_a_dash_gets_out_of_the_way_in_a_narrow_place(scene):
     """Only a short dash clears what crosses fast and stops before the end of the water beside its path."""
     x = grid_origin(TANK, CELL)[0] + (np.arange(SIZES["n_col"]) + 0.5) * CELL
-    put(
-        scene.clearance.clearance_m,
-        np.broadcast_to((0.75 - np.abs(x - 5.0)).clip(0), scene.clearance.clearance_m.shape[1:]),
-    )
+    free = (0.75 - np.abs(x - 5.0)).clip(0)
+    put(scene.clearance.site, np.broadcast_to(room(free), scene.clearance.site.shape[1:]))
     body(scene, 0, 0, (5.0, 3.9), (0.0, -1.2), radius=0.25)
     decide(scene)
     cost = scene.behavior.candidate_cost.to_numpy()[0]
@@ -651,11 +648,16 @@ def test_faster_than_the_axes_only_on_diagonals(scene):
 # ---------------------------------------------------------------------------------------------- narrow places
 
 
+def near_m(metres):
+    """[m] of the site whose distance is nearest to ``metres``."""
+    return float(clearance_m(room(metres), CFG))
+
+
 def blocks(scene, env, *ways, clearance_m=0.2):
     """Little clearance in the cells at these ways from the vehicle."""
     x0, y0 = grid_origin(TANK, CELL)
     for x, y in scene.ego.pos_w.to_numpy()[env, :2] + np.array(ways):
-        put(scene.clearance.clearance_m, clearance_m, env, int((y - y0) / CELL), int((x - x0) / CELL))
+        put(scene.clearance.site, room(clearance_m), env, int((y - y0) / CELL), int((x - x0) / CELL))
 
 
 def route_ahead(scene, way, lookahead):
@@ -679,11 +681,11 @@ def test_round_a_corner_a_nearer_point_of_the_route_is_steered_for(scene):
     blocks(scene, 2, to_sixth)
     blocks(scene, 4, straight, clearance_m=0.43)
     assess(scene)
-    steer, room = scene.behavior.steer_w.to_numpy(), scene.behavior.path_clearance_m.to_numpy()
+    steer, nearest = scene.behavior.steer_w.to_numpy(), scene.behavior.path_clearance_m.to_numpy()
     np.testing.assert_allclose(
         steer, [(1.0, 0.4), (0.2, 0.4), (0.0, 0.4), (0.0, 0.4), (1.0, 0.4), (1.0, 0.4)], atol=1e-5
     )
-    np.testing.assert_allclose(room, [2.0, 2.0, 2.0, 2.0, 0.43, 2.0], atol=1e-6)
+    np.testing.assert_allclose(nearest, [2.0, 2.0, 2.0, 2.0, near_m(0.43), 2.0], atol=1e-6)
     follow = scene.behavior.follow_vel_w.to_numpy()[:, :2]
     np.testing.assert_allclose(np.arctan2(*follow[:5].T), np.arctan2(*steer[:5].T), atol=1e-5)
     np.testing.assert_allclose(
@@ -694,7 +696,7 @@ def test_round_a_corner_a_nearer_point_of_the_route_is_steered_for(scene):
 def test_where_every_way_is_narrow_the_widest_is_steered_for(scene):
     """Of equals the farthest, so the look-ahead point where no nearer one has more room."""
     route_ahead(scene, 0.1 * np.stack([np.zeros(16), np.arange(16)], 1), (1.0, 0.0))
-    scene.clearance.clearance_m.fill(0.35)
+    scene.clearance.site.fill(int(room(0.35)))
     narrow = ((0.1, 0.2, 0.25, 0.3), (0.1, 0.3, 0.32, 0.32), (0.3, 0.1, 0.2, 0.3), (0.1, 0.35, 0.35, 0.35))
     for env, rooms in enumerate(narrow):
         for way, room_m in zip(((0.5, 0.0), (0.0, 0.53), (0.0, 0.32), (0.0, 0.12)), rooms, strict=True):
@@ -704,22 +706,20 @@ def test_where_every_way_is_narrow_the_widest_is_steered_for(scene):
         scene.behavior.steer_w.to_numpy()[:4], [(0.0, 0.2), (0.0, 0.4), (1.0, 0.0), (0.0, 0.6)], atol=1e-5
     )
     np.testing.assert_allclose(
-        scene.behavior.path_clearance_m.to_numpy()[:4], [0.3, 0.32, 0.3, 0.35], atol=1e-6
+        scene.behavior.path_clearance_m.to_numpy()[:4], [0.3, near_m(0.32), 0.3, near_m(0.35)], atol=1e-6
     )
 
 
 def test_a_narrow_way_is_entered_lengthwise(scene):
-    """Across the way 0.4 of the speed is left; along it what clearance allows (0.5 + 0.5 x 0.13 / 0.6)."""
+    """Across the way 0.4 of the speed is left; along it what clearance allows."""
     turned = np.radians([0, 90, 180, 30, -90, 90])
     put(scene.ego.rpy, np.stack([0 * turned, 0 * turned, turned], 1))
-    scene.clearance.clearance_m.fill(0.45)
-    put(scene.clearance.clearance_m, 0.51, 5)
+    scene.clearance.site.fill(int(room(0.45)))
+    put(scene.clearance.site, room(0.51), 5)
     assess(scene)
     speed = np.hypot(*scene.behavior.follow_vel_w.to_numpy()[:, :2].T)
-    here = 0.6 * (0.5 + 0.5 * 0.13 / 0.6)
-    np.testing.assert_allclose(
-        speed, [here, 0.4 * here, here, 0.7 * here, 0.4 * here, 0.6 * (0.5 + 0.5 * 0.19 / 0.6)], atol=1e-5
-    )
+    here, wider = (0.6 * (0.5 + 0.5 * (near_m(metres) - 0.32) / 0.6) for metres in (0.45, 0.51))
+    np.testing.assert_allclose(speed, [here, 0.4 * here, here, 0.7 * here, 0.4 * here, wider], atol=1e-5)
 
 
 # ------------------------------------------------------------------------------------------------------- gaze
@@ -747,8 +747,8 @@ def test_who_is_looked_at(scene):
     np.testing.assert_allclose(scene.behavior.heading_w.to_numpy(), wanted, atol=1e-5)
     nearest = np.array([1.0 - reach, 1.0 - reach, 1.5 - reach, 1.95, 2.05, 2.95])
     np.testing.assert_allclose(scene.behavior.obstacle_near_m.to_numpy(), nearest, atol=1e-5)
-    put(scene.clearance.clearance_m, 0.59, slice(0, 3))
-    put(scene.clearance.clearance_m, 0.61, 3)
+    put(scene.clearance.site, room(0.59), slice(0, 3))
+    put(scene.clearance.site, room(0.61), 3)
     blocks(scene, 5, (0.55, 0.05))
     assess(scene)
     np.testing.assert_allclose(

@@ -53,9 +53,7 @@ class Rig(Stage):
         return out
 
 
-@pytest.fixture(scope="module")
-def stage():
-    return Rig()
+stage = Rig.fixture()
 
 
 @pytest.mark.parametrize("column_share", [0.0, 0.5])

@@ -159,14 +159,7 @@ def belief(memory, env, slot):
     ).T
 
 
-@pytest.fixture(scope="module")
-def made():
-    return Rig()
-
-
-@pytest.fixture
-def rig(made):
-    return made.begin()
+rig = Rig.begun()
 
 
 def off_m(rig, env, slot=0, body=0):

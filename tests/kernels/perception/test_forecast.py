@@ -56,9 +56,7 @@ class Rig(Stage):
         return self.forecast.pos_w.to_numpy().astype(float), self.forecast.radius_m.to_numpy().astype(float)
 
 
-@pytest.fixture(scope="module")
-def stage():
-    return Rig()
+stage = Rig.fixture()
 
 
 def random_tracks(seed):

@@ -100,14 +100,7 @@ class Rig(Stage):
         return self.tracks.present.to_numpy().astype(float)
 
 
-@pytest.fixture(scope="module")
-def loaded():
-    return Rig()
-
-
-@pytest.fixture
-def stage(loaded):
-    return loaded.begin()
+stage = Rig.begun()
 
 
 def near(z):

@@ -100,9 +100,7 @@ class Rig(Stage):
         ]
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return Rig()
+rig = Rig.fixture()
 
 
 def voyage(preset, cfg, tank, seed, steps=STEPS, **scene):

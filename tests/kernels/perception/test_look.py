@@ -96,14 +96,7 @@ class Rig(Stage):
         )
 
 
-@pytest.fixture(scope="module")
-def made():
-    return Rig()
-
-
-@pytest.fixture
-def rig(made):
-    return made.begin()
+rig = Rig.begun()
 
 
 def mass(share, low, high):

@@ -108,9 +108,7 @@ class Rig(Stage):
         return {name: value[0] for name, value in self.read().items()}
 
 
-@pytest.fixture(scope="module")
-def stage():
-    return Rig()
+stage = Rig.fixture()
 
 
 @pytest.fixture(autouse=True)

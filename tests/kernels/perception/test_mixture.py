@@ -62,9 +62,7 @@ class Rig(Stage):
         return self.futures.share.to_numpy(), self.futures.pos_w.to_numpy(), self.forecast.pos_w.to_numpy()
 
 
-@pytest.fixture(scope="module")
-def stage():
-    return Rig()
+stage = Rig.fixture()
 
 
 @pytest.fixture(scope="module")

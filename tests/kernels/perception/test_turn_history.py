@@ -62,9 +62,7 @@ class Rig(Stage):
         return rows[rows[:, 6] > 0]
 
 
-@pytest.fixture(scope="module")
-def stage():
-    return Rig()
+stage = Rig.fixture()
 
 
 def oracle_turns(table, env):

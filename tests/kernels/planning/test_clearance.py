@@ -1,13 +1,16 @@
 """Clearance against scipy's transform, sites and ties, invariants of any map, and what reads it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.bundles import Stage, put
-from tests.map_bits import put_layers
+from tests.map_bits import nearest_sites, put_layers
 from tests.oracles.clearance import clearance_of, sites_of
+from uuvtai.common.enums import clearance_m
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
 from uuvtai.kernels.core.grid import grid_shape, outside_cells
 from uuvtai.kernels.core.simd import LANES
@@ -58,15 +61,11 @@ class Rig(Stage):
 
     def launch(self, cfg=CFG, voronoi=VORONOI):
         clearance.compute_clearance(self.io(ClearanceIO, cfg, MAP, voronoi))
-        return tuple(
-            f.to_numpy()
-            for f in (self.clearance.clearance_m, self.clearance.site_row, self.clearance.site_col)
-        )
+        kept = self.clearance.site.to_numpy()
+        return (clearance_m(kept, SimpleNamespace(clearance=cfg, mapping=MAP)), *nearest_sites(kept))
 
 
-@pytest.fixture(scope="module")
-def stage():
-    return Rig()
+stage = Rig.fixture()
 
 
 @pytest.fixture(autouse=True)
@@ -213,12 +212,13 @@ def test_what_changed_is_redone_and_nothing_else_differs(stage):
 def test_what_did_not_change_is_left_alone(stage):
     static = np.zeros((N_ENV, *SHAPE))
     stage.compute(static)
-    stage.clearance.clearance_m.fill(9.0)
+    stage.clearance.site.fill(9 << 8)
     static[0, 20, 30] = 1
     found = stage.compute(static)[0]
-    assert (found[1:] == 9).all()
+    left = np.float32(9) * np.float32(MAP.cell_m)
+    assert (found[1:] == left).all()
     stage.clearance_memory.limit.fill(0)
-    assert found[0, 20, 30] == 0 and (found[0, :, 64:] == 9).all()
+    assert found[0, 20, 30] == 0 and (found[0, :, 64:] == left).all()
 
 
 def test_limits_of_the_keys():

@@ -57,9 +57,7 @@ class Rig(Stage):
         )
 
 
-@pytest.fixture(scope="module")
-def stage():
-    return Rig()
+stage = Rig.fixture()
 
 
 def random_scan(seed):

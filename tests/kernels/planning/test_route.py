@@ -5,9 +5,9 @@ import pytest
 
 from tests import planning_maps as maps
 from tests.bundles import io_for, put
-from tests.map_bits import kept
+from tests.map_bits import kept, room
 from tests.oracles import route as oracle
-from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, stage, way_of
+from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, room_m, stage, way_of
 from uuvtai.common import enums as codes
 from uuvtai.kernels.planning import route, triggers
 from uuvtai.kernels.planning.io import RouteIO
@@ -28,7 +28,7 @@ def follow():
 
 def load(env, corners):
     s, c = stage(), CONFIG
-    io = io_for(RouteIO, s.route, s.clearance, s.clock, c.route, c.voronoi, c.mapping, maps.TANK)
+    io = io_for(RouteIO, s.route, s.clearance, s.clock, c.clearance, c.route, c.voronoi, c.mapping, maps.TANK)
     route.load_route(io, np.array(corners, np.float32), env, codes.PLANNER_RRT)
     s.route.want_plan[env] = 1  # nobody loads a route that was not asked for
 
@@ -249,7 +249,7 @@ def test_loading_counts_the_cost_of_the_line():
     load(0, [(5.0, 1.05), (9.0, 1.05)])
     load(1, [(5.0, 3.0), (9.0, 3.0)])
     row, col = maps.cell_of((7.0, 1.05))
-    assert s.route.cost[0] == pytest.approx(4.0 / s.clearance.clearance_m[0, row, col], rel=1e-3)
+    assert s.route.cost[0] == pytest.approx(4.0 / room_m(s)[0, row, col], rel=1e-3)
     assert s.route.cost[1] == pytest.approx(4.0 / CONFIG.clearance.max_m, rel=1e-3)
 
 
@@ -341,13 +341,13 @@ def test_path_risk_is_the_mean_over_the_look_ahead_segment():
     s = clean()
     rng = np.random.default_rng(5)
     static, dynamic = rng.random((2, *maps.SHAPE)).astype(np.float32)
-    clearance = rng.uniform(0.1, 2.0, maps.SHAPE).astype(np.float32)
+    site = room(rng.uniform(0.1, 2.0, maps.SHAPE))
     put(s.grid_map, static_occ=kept(static), dynamic_occ=kept(dynamic))
-    put(s.clearance, clearance_m=clearance)
+    put(s.clearance, site=site)
     load(2, [(3.03, 1.04), (4.03, 2.04), (12.0, 2.04)])
     put_ends([(3.03, 1.04)] * N_ENV, [(12.0, 2.04)] * N_ENV)
     follow()
-    c, points = CONFIG.clearance, s.route.ahead_w.to_numpy()[2][: s.route.n_ahead[2]]
+    c, clearance, points = CONFIG.clearance, room_m(s)[2], s.route.ahead_w.to_numpy()[2][: s.route.n_ahead[2]]
     assert len(points) == round(R.risk_horizon_m / maps.CELL_M) + 1
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert steps.max() < maps.CELL_M + 1e-4

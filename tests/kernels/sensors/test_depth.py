@@ -50,9 +50,7 @@ class Rig(Stage):
         return self.image.depth_m.to_numpy()
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return Rig()
+rig = Rig.fixture()
 
 
 @pytest.fixture(scope="module")

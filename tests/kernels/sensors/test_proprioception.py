@@ -54,9 +54,7 @@ class Rig(Stage):
         return self.ego.vel_b.to_numpy(), self.ego.vel_valid.to_numpy()
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return Rig()
+rig = Rig.fixture()
 
 
 def random_motion(rng):

@@ -63,9 +63,7 @@ class Rig(Stage):
         return {name: getattr(self.scan, name).to_numpy() for name in names}
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return Rig()
+rig = Rig.fixture()
 
 
 @pytest.fixture(scope="module")

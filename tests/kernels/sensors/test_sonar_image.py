@@ -69,9 +69,7 @@ class Rig(Stage):
         return [array.to_numpy() for array in (self.scan.range_m, self.scan.hit, self.sonar_image.heard)]
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return Rig()
+rig = Rig.fixture()
 
 
 @pytest.fixture(scope="module")

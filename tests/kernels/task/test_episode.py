@@ -25,7 +25,7 @@ class Court(Stage):
 
     sizes = SIZES
 
-    def clean(self):
+    def begin(self):
         clear(self.termination, self.clock, self.vehicle, self.world, self.mission)
         put(self.clock, running=1, active=1)
         put(self.vehicle, pos_w=(10.0, 3.0, -0.8), quat_wb=(1.0, 0.0, 0.0, 0.0))
@@ -44,14 +44,7 @@ class Court(Stage):
         return {name: field.to_numpy() for name, field in vars(self.termination).items()}
 
 
-@pytest.fixture(scope="module")
-def shared():
-    return Court()
-
-
-@pytest.fixture
-def court(shared):
-    return shared.clean()
+court = Court.begun()
 
 
 def outcome(book, env=0):

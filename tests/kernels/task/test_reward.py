@@ -35,7 +35,7 @@ class Bench(Stage):
             "step": (self.clock, "step"),
         }  # fmt: skip
 
-    def clean(self):
+    def begin(self):
         """Every row upright at 10 m, driving ahead at 0.5 m/s on a route of old, one step in."""
         self.clock.active.fill(1)
         reward.reset_reward(self.io(RewardIO))
@@ -57,14 +57,7 @@ class Bench(Stage):
         return dict(zip(reward.TERMS, self.reward.term.to_numpy().T.astype(float), strict=True))
 
 
-@pytest.fixture(scope="module")
-def shared():
-    return Bench()
-
-
-@pytest.fixture
-def bench(shared):
-    return shared.clean()
+bench = Bench.begun()
 
 
 def test_terms_are_config_keys_of_the_equation():

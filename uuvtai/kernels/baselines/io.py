@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from uuvtai.config import (
     BaselinesConfig,
     BehaviorConfig,
+    ClearanceConfig,
     DynamicWindowConfig,
     EpisodeConfig,
     MappingConfig,
@@ -44,6 +45,7 @@ class LocalPlannerIO:
     tracks: In[TrackState]
     baselines_cfg: Const[BaselinesConfig]
     behavior_cfg: Const[BehaviorConfig]
+    clearance_cfg: Const[ClearanceConfig]
     dwa_cfg: Const[DynamicWindowConfig]
     episode_cfg: Const[EpisodeConfig]
     field_cfg: Const[PotentialFieldConfig]

@@ -10,7 +10,7 @@ import taichi as ti
 from uuvtai.config.planning import ACCELERATION_M_S2, N_AXIS
 from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.core.geometry import turned_z
-from uuvtai.kernels.core.grid import cell_of
+from uuvtai.kernels.core.grid import cell_of, clearance_of
 from uuvtai.kernels.core.stage import Bundle, Const
 
 
@@ -85,12 +85,11 @@ def nearest_obstacle_m(env, sample, at, io: Bundle[LocalPlannerIO]):
 @ti.func
 def mapped_m(env, at, io: Bundle[LocalPlannerIO]):
     """Mapped clearance [m] of a place (x, y, ...) beyond contact; off the grid its border's, which is 0."""
-    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
+    n_row, n_col = ti.static(io.clearance.site.shape[1:])
     cell = cell_of(at, io.tank_cfg, ti.static(io.mapping_cfg.cell_m))
     row, col = ti.math.clamp(cell[0], 0, n_row - 1), ti.math.clamp(cell[1], 0, n_col - 1)
-    return io.clearance.clearance_m[env, row, col] - ti.static(
-        io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m
-    )
+    room = clearance_of(io.clearance.site[env, row, col], io.clearance_cfg, io.mapping_cfg.cell_m)
+    return room - ti.static(io.behavior_cfg.hull_reach_m + io.behavior_cfg.contact_m)
 
 
 def depth_limits(tank_cfg, baselines_cfg):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from uuvtai.config import (
     BehaviorConfig,
+    ClearanceConfig,
     EpisodeConfig,
     FastConfig,
     HeightConfig,
@@ -50,6 +51,7 @@ class BehaviorIO:
     table: In[TreeTable]
     tracks: In[TrackState]
     behavior_cfg: Const[BehaviorConfig]
+    clearance_cfg: Const[ClearanceConfig]
     episode_cfg: Const[EpisodeConfig]
     fast_cfg: Const[FastConfig]
     height_cfg: Const[HeightConfig]

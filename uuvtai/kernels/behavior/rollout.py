@@ -12,7 +12,7 @@ import taichi as ti
 from uuvtai.config.behavior import CAUTION, CLOSING, DOUBT, GROWTH, HORIZON, LAG, STATIC_MARGIN, VERTICAL
 from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3
-from uuvtai.kernels.core.grid import grid_origin
+from uuvtai.kernels.core.grid import clearance_of, grid_origin
 from uuvtai.kernels.core.simd import filled
 from uuvtai.kernels.core.stage import Bundle, Const, Out
 
@@ -228,7 +228,7 @@ def static_depths(env, drive, doubt, io: Bundle[BehaviorIO]):
             io,
         )
         for i in ti.static(range(drive.x.n)):
-            below = touch + doubt - free[i]
+            below = touch + doubt - free[i]  # type: ignore[index]
             mean[i] += ti.max(below + drive.static_margin_m, 0.0) / n_sample
             contact[i] = ti.max(contact[i], below)
     return mean, contact
@@ -246,15 +246,15 @@ def clearance_lanes(env, x, y, io: Bundle[BehaviorIO]):
     """Mapped clearance [m] of the cells that hold the lanes' positions; positions off the grid take its
     border, which is 0."""
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
-    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
+    n_row, n_col = ti.static(io.clearance.site.shape[1:])
     at_col = (x - x0) * ti.static(1.0 / io.mapping_cfg.cell_m)
     at_row = (y - y0) * ti.static(1.0 / io.mapping_cfg.cell_m)
-    out = filled(0.0, x.n)
+    site = filled(0, x.n)
     for i in ti.static(range(x.n)):
         row = ti.math.clamp(ti.cast(ti.floor(at_row[i]), ti.i32), 0, n_row - 1)
         col = ti.math.clamp(ti.cast(ti.floor(at_col[i]), ti.i32), 0, n_col - 1)
-        out[i] = io.clearance.clearance_m[env, row, col]
-    return out
+        site[i] = ti.cast(io.clearance.site[env, row, col], ti.i32)
+    return clearance_of(site, io.clearance_cfg, io.mapping_cfg.cell_m)
 
 
 @ti.func

@@ -5,6 +5,7 @@ import math
 
 import taichi as ti
 
+from uuvtai.common.enums import NO_SITE
 from uuvtai.compile.launch import quick_launch
 from uuvtai.config.behavior import ARRIVAL, DEPTH_CHANGE, GOAL_DEPTH, HEADING_RANGE, HYSTERESIS, SLOPE, TTC
 from uuvtai.kernels.behavior.io import BehaviorIO
@@ -19,7 +20,7 @@ from uuvtai.kernels.behavior.rollout import (
 )
 from uuvtai.kernels.core.beams import beam_bearing, range_rate
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3, wrapped_angle
-from uuvtai.kernels.core.grid import cell_of, centre_of
+from uuvtai.kernels.core.grid import away_of, cell_of, centre_of, clearance_of
 from uuvtai.kernels.core.simd import filled, n_lane
 from uuvtai.kernels.core.stage import Bundle, spread
 
@@ -198,18 +199,15 @@ def _read_clearance(env, io: Bundle[BehaviorIO]):
     """Mapped clearance here, the way out of it, and the smallest one up to the look-ahead point; both less
     what the own place is not sure of."""
     pos = io.ego.pos_w[env]
-    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
+    n_row, n_col = ti.static(io.clearance.site.shape[1:])
     cell = _held_cell(pos, n_row, n_col, io)
     doubt = place_doubt(env, io)
-    io.behavior.clearance_m[env] = io.clearance.clearance_m[env, cell[0], cell[1]] - doubt
+    nearest = io.clearance.site[env, cell[0], cell[1]]
+    io.behavior.clearance_m[env] = clearance_of(nearest, io.clearance_cfg, io.mapping_cfg.cell_m) - doubt
     away = ti.Vector([0.0, 0.0])
-    if io.clearance.site_row[env, cell[0], cell[1]] >= 0:
-        site = centre_of(
-            ti.cast(io.clearance.site_row[env, cell[0], cell[1]], ti.i32),
-            ti.cast(io.clearance.site_col[env, cell[0], cell[1]], ti.i32),
-            io.tank_cfg,
-            ti.static(io.mapping_cfg.cell_m),
-        )
+    if nearest != NO_SITE:
+        rows, cols = away_of(nearest)
+        site = centre_of(cell[0] + rows, cell[1] + cols, io.tank_cfg, ti.static(io.mapping_cfg.cell_m))
         away = _unit(ti.Vector([pos[0] - site[0], pos[1] - site[1]]))
     io.behavior.away_w[env] = away
     here = ti.Vector([pos[0], pos[1]])
@@ -239,11 +237,12 @@ def _read_clearance(env, io: Bundle[BehaviorIO]):
 @ti.func
 def _room_to(env, here, there, doubt, io: Bundle[BehaviorIO]):
     """Smallest mapped clearance [m] on the straight way to a place, the own one included, less ``doubt``."""
-    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
+    n_row, n_col = ti.static(io.clearance.site.shape[1:])
     smallest = io.behavior.clearance_m[env]
     for k in range(1, _PATH_SAMPLES + 1):
         on_way = _held_cell(here + (there - here) * (k / _PATH_SAMPLES), n_row, n_col, io)
-        smallest = ti.min(smallest, io.clearance.clearance_m[env, on_way[0], on_way[1]] - doubt)
+        site = io.clearance.site[env, on_way[0], on_way[1]]
+        smallest = ti.min(smallest, clearance_of(site, io.clearance_cfg, io.mapping_cfg.cell_m) - doubt)
     return smallest
 
 

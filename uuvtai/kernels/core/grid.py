@@ -8,7 +8,7 @@ special cases at the border and the border's cells are the sites of the known bo
 import taichi as ti
 
 from uuvtai.common.enums import FULL
-from uuvtai.config import TankConfig
+from uuvtai.config import ClearanceConfig, TankConfig
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import Const, In, Out
 from uuvtai.state import VoronoiState
@@ -73,6 +73,22 @@ def centre_of(row, col, tank_cfg: Const[TankConfig], cell_m: Const[float]):
 def occupancy_of(kept):
     """Occupancy in [0, 1] of what a layer of the map keeps of a cell."""
     return ti.cast(kept, ti.f32) * ti.static(1.0 / FULL)
+
+
+@ti.func
+def away_of(site):
+    """(rows, columns) to the site that the clearance keeps of a cell, or of each of a packet's cells."""
+    return ti.cast(site, ti.i32) >> 8, (ti.cast(site, ti.i32) << 24) >> 25
+
+
+@ti.func
+def clearance_of(site, clearance_cfg: Const[ClearanceConfig], cell_m: Const[float]):
+    """Distance [m] to it, exact up to ``max_m``, which stands for "at least"."""
+    rows, cols = away_of(site)
+    found = ti.sqrt(ti.cast(rows * rows + cols * cols, ti.f32)) * cell_m
+    if ti.static(clearance_cfg.inflate_m > 0):
+        found = ti.select(site & 1 == 1, ti.max(found - clearance_cfg.inflate_m, 0.0), found)
+    return ti.min(found, clearance_cfg.max_m)
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ import math
 
 import taichi as ti
 
+from uuvtai.common.enums import NO_SITE
 from uuvtai.compile.launch import quick_launch, with_cse
 from uuvtai.kernels.core.simd import (
     LANES,
@@ -44,6 +45,7 @@ from uuvtai.kernels.planning.clearance_gpu import (
     is_due,
     no_site,
     note_farthest,
+    note_obstacle,
     offset_bits,
     redo_cells,
     site_word,
@@ -244,7 +246,7 @@ def best_keys(slot, row, packet, io: Bundle[ClearanceIO]):
 
 @ti.func
 def write_packet(env, slot, row, packet, io: Bundle[ClearanceIO]):
-    """Distance and site of sixteen cells, decoded from their keys."""
+    """Sites of sixteen cells, decoded from their keys."""
     reach, bits, limit = ti.static(
         window_reach(io.clearance_cfg, io.mapping_cfg),
         offset_bits(io.clearance_cfg, io.mapping_cfg),
@@ -257,36 +259,14 @@ def write_packet(env, slot, row, packet, io: Bundle[ClearanceIO]):
     rows = (key & ti.static((1 << bits) - 1)) - reach
     cols = ti.cast(ti.sqrt(ti.cast(squared - rows * rows, ti.f32)), ti.i32)
     signed_cols = cols * (2 * ((key >> bits) & 1) - 1)
+    site = (rows << 8) | ((signed_cols & 127) << 1)
     for i in ti.static(range(LANES)):
-        distance = ti.sqrt(ti.cast(squared[i], ti.f32)) * io.mapping_cfg.cell_m
-        io.clearance.clearance_m[env, row, packet * LANES + i] = ti.select(
-            squared[i] <= limit, distance, io.clearance_cfg.max_m
-        )
-    for i in ti.static(range(LANES)):
-        io.clearance.site_row[env, row, packet * LANES + i] = ti.cast(
-            ti.select(squared[i] <= limit, row + rows[i], -1), ti.i16
-        )
-    for i in ti.static(range(LANES)):
-        col = packet * LANES + i + signed_cols[i]
-        io.clearance.site_col[env, row, packet * LANES + i] = ti.cast(
-            ti.select(squared[i] <= limit, col, -1), ti.i16
+        io.clearance.site[env, row, packet * LANES + i] = ti.cast(
+            ti.select(squared[i] <= limit, site[i], NO_SITE), ti.i16
         )
     if ti.static(io.clearance_cfg.inflate_m > 0):
-        shorten(env, row, packet, io)
-
-
-@ti.func
-def shorten(env, row, packet, io: Bundle[ClearanceIO]):
-    """Take the inflation off the distances of sixteen cells to obstacles."""
-    for col in range(packet * LANES, (packet + 1) * LANES):
-        site_row, site_col = (
-            ti.cast(io.clearance.site_row[env, row, col], ti.i32),
-            ti.cast(io.clearance.site_col[env, row, col], ti.i32),
-        )
-        if site_row >= 0 and io.mask.outside[site_row, site_col] == 0:
-            io.clearance.clearance_m[env, row, col] = ti.max(
-                io.clearance.clearance_m[env, row, col] - io.clearance_cfg.inflate_m, 0.0
-            )
+        for col in range(packet * LANES, (packet + 1) * LANES):
+            note_obstacle(env, row, col, io)
 
 
 # ----------------------------------------------------------------------------------------------------- kernel

@@ -9,6 +9,8 @@ import math
 
 import taichi as ti
 
+from uuvtai.common.enums import NO_SITE
+from uuvtai.kernels.core.grid import away_of
 from uuvtai.kernels.core.simd import (
     LANES,
     WORD,
@@ -71,6 +73,15 @@ def is_due(env, io: Bundle[ClearanceIO]):
     return ti.cast(
         io.clock.active[env] == 1 and io.clock.step[env] % io.clearance_cfg.period_steps == 0, ti.i32
     )
+
+
+@ti.func
+def note_obstacle(env, row, col, io: Bundle[ClearanceIO]):
+    """Mark the site kept of a cell where it is an obstacle's, not the boundary's."""
+    site = ti.cast(io.clearance.site[env, row, col], ti.i32)
+    rows, cols = away_of(site)
+    if site != NO_SITE and io.mask.outside[row + rows, col + cols] == 0:
+        io.clearance.site[env, row, col] = ti.cast(site | 1, ti.i16)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -156,7 +167,7 @@ def mark_everything(env, item, io: Bundle[ClearanceIO]):
 
 @ti.func
 def redo_cells(env, item, io: Bundle[ClearanceIO]):
-    """Distance and site of an item's share of the cells that are marked: in every few packets one column."""
+    """Sites of an item's share of the cells that are marked: in every few packets one column."""
     n_packet, n_word = ti.static(io.clearance_memory.stale.shape[1:])
     for turn in range(ti.static(n_turn(n_packet * LANES))):
         col = turn * ti.static(n_item()) + item
@@ -213,7 +224,7 @@ def best_key(env, row, col, io: Bundle[ClearanceIO]):
 
 @ti.func
 def write_cell(env, row, col, io: Bundle[ClearanceIO]):
-    """Distance and site of a cell, decoded from its key as ``clearance.write_packet`` does."""
+    """Site of a cell, decoded from its key as ``clearance.write_packet`` does."""
     reach, bits, limit = ti.static(
         window_reach(io.clearance_cfg, io.mapping_cfg),
         offset_bits(io.clearance_cfg, io.mapping_cfg),
@@ -221,18 +232,14 @@ def write_cell(env, row, col, io: Bundle[ClearanceIO]):
     )
     key = best_key(env, row, col, io)
     squared = key >> (bits + 1)
-    distance, site_row, site_col = ti.cast(io.clearance_cfg.max_m, ti.f32), -1, -1
+    site = NO_SITE
     if squared <= limit:
         rows = (key & ti.static((1 << bits) - 1)) - reach
         cols = ti.cast(ti.sqrt(ti.cast(squared - rows * rows, ti.f32)), ti.i32)
-        site_row, site_col = row + rows, col + cols * (2 * ((key >> bits) & 1) - 1)
-        distance = ti.sqrt(ti.cast(squared, ti.f32)) * io.mapping_cfg.cell_m
-        if ti.static(io.clearance_cfg.inflate_m > 0):
-            if io.mask.outside[site_row, site_col] == 0:
-                distance = ti.max(distance - io.clearance_cfg.inflate_m, 0.0)
-    io.clearance.clearance_m[env, row, col] = distance
-    io.clearance.site_row[env, row, col] = ti.cast(site_row, ti.i16)
-    io.clearance.site_col[env, row, col] = ti.cast(site_col, ti.i16)
+        site = (rows << 8) | ((cols * (2 * ((key >> bits) & 1) - 1) & 127) << 1)
+    io.clearance.site[env, row, col] = ti.cast(site, ti.i16)
+    if ti.static(io.clearance_cfg.inflate_m > 0):
+        note_obstacle(env, row, col, io)
 
 
 # --------------------------------------------------------------------------------------------------- farthest
@@ -250,10 +257,8 @@ def note_farthest(env, item, io: Bundle[ClearanceIO]):
             ti.atomic_and(io.clearance_memory.stale[env, packet, row // WORD], ~cell_bit(row))
             farthest = 0
             for col in range(packet * LANES, (packet + 1) * LANES):
-                rows = ti.cast(io.clearance.site_row[env, row, col], ti.i32) - row
-                cols = ti.cast(io.clearance.site_col[env, row, col], ti.i32) - col
-                squared = ti.select(io.clearance.site_row[env, row, col] < 0, limit + 1, rows**2 + cols**2)
-                farthest = ti.max(farthest, squared)
+                rows, cols = away_of(io.clearance.site[env, row, col])
+                farthest = ti.max(farthest, ti.min(rows**2 + cols**2, limit + 1))
             io.clearance_memory.farthest[env, row, packet] = farthest
     if item == 0:
         io.clearance_memory.limit[env] = limit

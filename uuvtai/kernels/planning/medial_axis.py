@@ -8,8 +8,17 @@ the eight around a cell; a diagonal step needs both cells beside it (no corner i
 
 import taichi as ti
 
+from uuvtai.common.enums import NO_SITE
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.core.grid import grid_origin, heap_after_pop, heap_after_push, occupancy_of, top_cell
+from uuvtai.kernels.core.grid import (
+    away_of,
+    clearance_of,
+    grid_origin,
+    heap_after_pop,
+    heap_after_push,
+    occupancy_of,
+    top_cell,
+)
 from uuvtai.kernels.core.stage import Bundle, In, Out
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.state import ClockState, RouteState
@@ -80,17 +89,17 @@ def _is_medial(env, row, col, io: Bundle[RouteIO]):
     """True on a plateau and where a neighbour's nearest site is far from the own one."""
     # The integer medial axis (Hesselink and Roerdink 2008, IEEE PAMI 30): where the nearest site jumps by
     # more than a threshold from one cell to the next, the two cells lie on either side of the axis.
-    medial = io.clearance.clearance_m[env, row, col] >= ti.static(
+    site = io.clearance.site[env, row, col]
+    rows, cols = away_of(site)
+    medial = clearance_of(site, io.clearance_cfg, io.mapping_cfg.cell_m) >= ti.static(
         widest_m(io.clearance_cfg, io.quiet_cfg, io.voronoi_cfg) - _FLAT_M
     )
-    site_row = ti.cast(io.clearance.site_row[env, row, col], ti.i32)
-    site_col = ti.cast(io.clearance.site_col[env, row, col], ti.i32)
     for k in range(4):
         step = step_of(ti.select(k < 2, 1 + 2 * k, 2 * k))  # the four sides: 1, 3, 4, 6
-        other_row = ti.cast(io.clearance.site_row[env, row + step[0], col + step[1]], ti.i32)
-        other_col = ti.cast(io.clearance.site_col[env, row + step[0], col + step[1]], ti.i32)
-        gap = ti.cast((other_row - site_row) ** 2 + (other_col - site_col) ** 2, ti.f32)
-        if other_row >= 0 and site_row >= 0 and gap > ti.static(io.voronoi_cfg.site_gap_cells**2):
+        other = io.clearance.site[env, row + step[0], col + step[1]]
+        other_rows, other_cols = away_of(other)
+        gap = ti.cast((step[0] + other_rows - rows) ** 2 + (step[1] + other_cols - cols) ** 2, ti.f32)
+        if ti.max(site, other) < NO_SITE and gap > ti.static(io.voronoi_cfg.site_gap_cells**2):
             medial = True
     return medial
 
@@ -134,10 +143,10 @@ def join_skeleton(slot, env, start, goal, io: Bundle[RouteIO]):
 @ti.func
 def _uphill(slot, env, row, col, io: Bundle[RouteIO]):
     """Direction of the open neighbour with the largest clearance, -1 on a summit."""
-    best, best_m = -1, io.clearance.clearance_m[env, row, col]
+    best, best_m = -1, room_at(env, row, col, io)
     for k in range(8):
         step = step_of(k)
-        higher = io.clearance.clearance_m[env, row + step[0], col + step[1]]
+        higher = room_at(env, row + step[0], col + step[1], io)
         if higher > best_m and _step_is_open(slot, row, col, step, io):
             best, best_m = k, higher
     return best
@@ -237,9 +246,15 @@ def occupancy(env, row, col, io: Bundle[RouteIO]):
 
 
 @ti.func
-def is_traversable(env, row, col, io: Bundle[RouteIO]):
-    """True where a route may pass. The map may be newer than the clearance, so both are asked."""
-    wide = io.clearance.clearance_m[env, row, col] >= ti.static(io.voronoi_cfg.min_clearance_m - _SLACK_M)
+def room_at(env, row, col, io: Bundle[RouteIO]):
+    """Clearance of a cell [m]."""
+    return clearance_of(io.clearance.site[env, row, col], io.clearance_cfg, io.mapping_cfg.cell_m)
+
+
+@ti.func
+def is_traversable(env, row, col, room, io: Bundle[RouteIO]):
+    """True where a route may pass: a cell with its clearance. The map may be newer, so both are asked."""
+    wide = room >= ti.static(io.voronoi_cfg.min_clearance_m - _SLACK_M)
     free = occupancy(env, row, col, io) < ti.static(io.mapping_cfg.occupied)
     return wide and free and io.mask.outside[row, col] == 0
 

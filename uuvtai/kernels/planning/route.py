@@ -9,7 +9,13 @@ from uuvtai.kernels.core.geometry import wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, occupancy_of
 from uuvtai.kernels.core.stage import Bundle, FloatMatrix, In, spread
 from uuvtai.kernels.planning.io import RouteIO
-from uuvtai.kernels.planning.medial_axis import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
+from uuvtai.kernels.planning.medial_axis import (
+    MAX_WIDENINGS,
+    WIDENING,
+    count_after_segment,
+    install_route,
+    room_at,
+)
 from uuvtai.state import RouteState
 
 # ------------------------------------------------------------------------------------------------------------
@@ -108,18 +114,21 @@ def look_along(env, pos_w, io: Bundle[RouteIO]):
 def cell_on_grid(pos_w, io: Bundle[RouteIO]):
     """(row, col), off-grid positions held at the edge."""
     cell = cell_of(pos_w, io.tank_cfg, io.mapping_cfg.cell_m)
-    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1:])
+    n_row, n_col = ti.static(io.clearance.site.shape[1:])
     return ti.Vector([ti.math.clamp(cell[0], 0, n_row - 1), ti.math.clamp(cell[1], 0, n_col - 1)])
 
 
 @ti.func
-def risk_at(env, cell, io: Bundle[RouteIO]):
-    """R: alpha_m M^s + alpha_d M^d + alpha_delta / (clearance + eps)."""
+def risk_at(env, cell, room, io: Bundle[RouteIO]):
+    """R: alpha_m M^s + alpha_d M^d + alpha_delta / (clearance + eps), of a cell with its clearance [m]."""
     row, col = cell[0], cell[1]
     occupied = ti.static(io.clearance_cfg.risk_static) * occupancy_of(io.grid_map.static_occ[env, row, col])
     moving = ti.static(io.clearance_cfg.risk_dynamic) * occupancy_of(io.grid_map.dynamic_occ[env, row, col])
-    room = io.clearance.clearance_m[env, row, col] + ti.static(io.clearance_cfg.risk_epsilon_m)
-    return occupied + moving + ti.static(io.clearance_cfg.risk_clearance) / room
+    return (
+        occupied
+        + moving
+        + ti.static(io.clearance_cfg.risk_clearance) / (room + ti.static(io.clearance_cfg.risk_epsilon_m))
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -136,27 +145,12 @@ def reset_route(io: Bundle[RouteIO]):
     n = ti.static(io.clock.active.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.active[env] == 1:
-            for field in ti.static(
-                (
-                    io.route.n_way,
-                    io.route.cost,
-                    io.route.planner,
-                    io.route.trigger,
-                    io.route.fired,
-                    io.route.want_plan,
-                    io.route.fallback_reason,
-                    io.route.plan_step,
-                    io.route.kept,
-                    io.route.second_passes,
-                    io.route.n_ahead,
-                    io.route.arc,
-                    io.route.heading_error,
-                    io.route.cross_track_m,
-                    io.route.remaining_m,
-                    io.route.path_risk,
-                    io.route.stuck_steps,
-                )
-            ):
+            for field in ti.static((
+                io.route.n_way, io.route.cost, io.route.planner, io.route.trigger, io.route.fired,
+                io.route.want_plan, io.route.fallback_reason, io.route.plan_step, io.route.kept,
+                io.route.second_passes, io.route.n_ahead, io.route.arc, io.route.heading_error,
+                io.route.cross_track_m, io.route.remaining_m, io.route.path_risk, io.route.stuck_steps,
+            )):  # fmt: skip
                 field[env] = 0
             io.route.lookahead_w[env] = ti.Vector([0.0, 0.0, 0.0])
             for i in range(io.route.way_w.shape[1]):
@@ -196,7 +190,7 @@ def _look_again(env, io: Bundle[RouteIO]):
     risk = 0.0
     for k in range(io.route.n_ahead[env]):
         cell = cell_on_grid(io.route.ahead_w[env, k], io)
-        risk += risk_at(env, cell, io)
+        risk += risk_at(env, cell, room_at(env, cell[0], cell[1], io), io)
     io.route.path_risk[env] = risk / io.route.n_ahead[env]
 
 
@@ -271,9 +265,7 @@ def _route_cost(env, n_way, io: Bundle[RouteIO]):
         pieces = ti.cast(ti.ceil(along.norm() / ti.static(0.5 * io.mapping_cfg.cell_m)), ti.i32)
         for k in range(pieces):  # type: ignore[arg-type]
             cell = cell_on_grid(a + along * ((k + 0.5) / pieces), io)
-            room = ti.max(
-                io.clearance.clearance_m[env, cell[0], cell[1]], ti.static(io.voronoi_cfg.cost_epsilon_m)
-            )
+            room = ti.max(room_at(env, cell[0], cell[1], io), ti.static(io.voronoi_cfg.cost_epsilon_m))
             cost += along.norm() / pieces / room
     return cost
 

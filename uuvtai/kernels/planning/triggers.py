@@ -25,7 +25,7 @@ from uuvtai.kernels.core.beams import range_rate
 from uuvtai.kernels.core.simd import LANES, i16x
 from uuvtai.kernels.core.stage import Bundle, spread
 from uuvtai.kernels.planning.io import RouteIO
-from uuvtai.kernels.planning.medial_axis import is_traversable
+from uuvtai.kernels.planning.medial_axis import is_traversable, room_at
 from uuvtai.kernels.planning.route import advanced_arc, cell_on_grid, level, look_along, risk_at
 
 _STUCK_M_S, _FORECAST_CLEARANCE_M = 0.08, 0.35
@@ -108,9 +108,10 @@ def _is_path_closed(env, io: Bundle[RouteIO]):
     closed, risk = False, 0.0
     for k in range(io.route.n_ahead[env]):
         cell = cell_on_grid(io.route.ahead_w[env, k], io)
-        if not is_traversable(env, cell[0], cell[1], io):
+        room = room_at(env, cell[0], cell[1], io)
+        if not is_traversable(env, cell[0], cell[1], room, io):
             closed = True
-        risk += risk_at(env, cell, io)
+        risk += risk_at(env, cell, room, io)
     io.route.path_risk[env] = risk / io.route.n_ahead[env]
     return closed
 

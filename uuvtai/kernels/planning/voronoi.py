@@ -18,7 +18,7 @@ from uuvtai.common.enums import (
     PLANNER_VORONOI,
 )
 from uuvtai.compile.launch import quick_launch
-from uuvtai.kernels.core.grid import grid_origin
+from uuvtai.kernels.core.grid import clearance_of, grid_origin
 from uuvtai.kernels.core.simd import filled, n_lane
 from uuvtai.kernels.core.stage import Bundle, FloatMatrix, spread
 from uuvtai.kernels.planning.io import RouteIO
@@ -33,6 +33,7 @@ from uuvtai.kernels.planning.medial_axis import (
     join_skeleton,
     occupancy,
     path_cells,
+    room_at,
     search_cells,
     straightened_cost,
     widest_m,
@@ -94,10 +95,13 @@ def _weigh_cells(slot, env, io: Bundle[RouteIO]):
     for row in range(io.voronoi.weight.shape[1]):
         for packet in range(io.voronoi.weight.shape[2] // lanes):
             first = packet * lanes
-            room, is_open = filled(1.0, lanes), filled(0.0, lanes)
+            site, is_open = filled(0, lanes), filled(0.0, lanes)
             for i in ti.static(range(lanes)):
-                room[i] = io.clearance.clearance_m[env, row, first + i]
-                if is_traversable(env, row, first + i, io):
+                site[i] = ti.cast(io.clearance.site[env, row, first + i], ti.i32)
+            room = clearance_of(site, io.clearance_cfg, io.mapping_cfg.cell_m)
+            for i in ti.static(range(lanes)):
+                wide = room[i]  # type: ignore[index]
+                if is_traversable(env, row, first + i, wide, io):
                     is_open[i] = 1.0
             weight = 1.0 / ti.math.clamp(
                 room,
@@ -185,7 +189,7 @@ def _write_reason(slot, env, start_w, goal_w, io: Bundle[RouteIO]):
 def overlay_clearance(io: Bundle[RouteIO], out: FloatMatrix, env: int):
     """Clearance (n_row, n_col) [m] of one env for the host's fallback: 0 where occupied or outside."""
     for row, col in ti.ndrange(out.shape[0], out.shape[1]):
-        room = io.clearance.clearance_m[env, row, col]
+        room = room_at(env, row, col, io)
         if (
             occupancy(env, row, col, io) >= ti.static(io.mapping_cfg.occupied)
             or io.mask.outside[row, col] == 1

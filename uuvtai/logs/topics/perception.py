@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from uuvtai.common.enums import occupancy
+from uuvtai.common.enums import clearance_m, occupancy
 from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.config import Config
 from uuvtai.logs.encode import (
@@ -327,16 +327,20 @@ def _dynamic(moment: Moment) -> bytes:
     return _grid(moment, moment.stamp, occupancy(moment["grid_map.dynamic_occ"]), dynamic_colors)
 
 
+def _room(moment: Moment) -> np.ndarray:
+    return clearance_m(moment["clearance.site"], moment.header.config)
+
+
 def _clearance(moment: Moment) -> bytes:
-    return _grid(moment, _computed(moment), moment["clearance.clearance_m"], _clearance_colors)
+    return _grid(moment, _computed(moment), _room(moment), _clearance_colors)
 
 
 def _risk(moment: Moment) -> bytes:
-    c, clearance_m = moment.header.config.clearance, moment["clearance.clearance_m"]
+    c = moment.header.config.clearance
     risk = (
         c.risk_static * occupancy(moment["grid_map.static_occ"])
         + c.risk_dynamic * occupancy(moment["grid_map.dynamic_occ"])
-        + c.risk_clearance / (clearance_m + c.risk_epsilon_m)
+        + c.risk_clearance / (_room(moment) + c.risk_epsilon_m)
     )
     return _grid(moment, _computed(moment), risk, _risk_colors)
 
@@ -431,7 +435,7 @@ def _read_layer(data: dict[str, Any]) -> Layer:
     return Layer.of(grid_values(data), (origin["x"], origin["y"]), data["cell_size"]["x"])
 
 
-_LAYERS = ("grid_map.static_occ", "grid_map.dynamic_occ", "clearance.clearance_m")
+_LAYERS = ("grid_map.static_occ", "grid_map.dynamic_occ", "clearance.site")
 
 MAP_ROWS = (
     Topic("/map/static", MAPS, GRID, _static, _LAYERS[:1], _read_layer, in_picture=True),
