@@ -183,13 +183,13 @@ def test_fetching_waits_for_nothing(place):
 
 
 def test_where_a_tree_begins_is_asked_once(place):
-    ask = """%a{0} = load %struct.LLVMRuntime*, %struct.LLVMRuntime** %at, align 8
-%b{0} = getelementptr inbounds %struct.LLVMRuntime, %struct.LLVMRuntime* %a{0}, i64 0, i32 7, i64 1
-%c{0} = load i8*, i8** %b{0}, align 8
-store i8 {0}, i8* %c{0}
-"""
+    ask = """
+  %a{0} = load %struct.LLVMRuntime*, %struct.LLVMRuntime** %at, align 8
+  %b{0} = getelementptr inbounds %struct.LLVMRuntime, %struct.LLVMRuntime* %a{0}, i64 0, i32 7, i64 1
+  %c{0} = load i8*, i8** %b{0}, align 8
+  store i8 {0}, i8* %c{0}"""
     text = "%struct.LLVMRuntime = type { i8*, i8*, i8*, i8*, i8*, i8*, i8*, [2 x i8*] }\ndefine void @f"
-    text += "(%struct.LLVMRuntime** %at) {\n" + "".join(map(ask.format, range(9))) + "ret void\n}"
+    text += "(%struct.LLVMRuntime** %at) {\n" + "".join(map(ask.format, range(9))) + "\nret void\n}"
     asked_once, asked_again = map(started(Scene(), place).machine.object_of, (text, text.replace("LLVM", "")))
     assert len(asked_once) + 8 * 6 < len(asked_again)
 
