@@ -12,7 +12,6 @@ import torch
 from tests.command import uuv
 from uuvtai.compile.launch import native
 from uuvtai.config.loader import load_config
-from uuvtai.kernels.core.stage import spread
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.setup import LENGTHENED, array_sizes, rank, rows_for
 from uuvtai.sim.sim import Sim
@@ -100,13 +99,6 @@ def test_warm_makes_what_another_process_finds(capfd):
     (shape,) = json.loads(out)["shapes"]
     assert code == 0 and (shape["sensors"], shape["num_envs"]) == ("paper", 8)
     assert shape["compiled"] + shape["found"] > 30
-
-
-def test_one_vehicle_has_no_idle_items():
-    """Loops of many rows are padded until every core has a part; one row has one thread."""
-    assert [spread(n, inner) for n, inner in ((1, 1), (1, 16), (8, 1), (1024, 1), (1024, 16))] == [
-        1, 1, 512, 8, 1,
-    ]  # fmt: skip
 
 
 def test_sizes_are_known_before_taichi_has_started():

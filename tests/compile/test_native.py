@@ -75,7 +75,7 @@ def add_up(io: Bundle[SumsIO], table: FloatMatrix, weight: float, count: int, ou
         io.sums.total[i] += weight * io.source.value[i] + count + table[i % 2, 1] + io.rules.control_dt_s
         io.sums.pair[i] = ti.Vector([io.sums.total[i], ti.sin(io.source.value[i])])
         io.sums.rest[i] = 1.0
-    for i in range(N):
+    for i in range(count * 1000):
         out[i] = io.sums.total[i] + io.sums.pair[i][1]
 
 
@@ -180,6 +180,16 @@ def test_fetching_waits_for_nothing(place):
     text = "define void @f(i16* %p) {\n%1 = atomicrmw or i16* %p, i16 0 seq_cst\nret void\n}"
     code = started(Scene(), place).machine.object_of(text)
     assert b"\x0f\x0d" in code or b"\x0f\x18" in code, "a prefetch in place of a locked instruction"
+
+
+def test_a_loop_to_an_end_that_is_not_known_has_blocks_of_any_size(place):
+    """As Taichi compiles it they have 512 items; what threads make of it, the tests above ask."""
+    scene, texts = Scene(), []
+    machine = started(scene, place).machine
+    emit = machine.object_of
+    machine.object_of = lambda text: texts.append(text) or emit(text)
+    scene.launch()
+    assert [len(codegen._BLOCK.findall(text)) for text in texts] == [1]
 
 
 def test_where_a_tree_begins_is_asked_once(place):

@@ -201,17 +201,9 @@ def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluat
     assert code == 0 and "a[/x]/odd.yaml: 0.1 s" in out, err
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        KeyError("x"),
-        ValueError("y"),
-        RuntimeError("z"),
-        OverflowError("w"),
-        StopIteration(),
-        LookupError("v"),
-    ],
-)
+@pytest.mark.parametrize("error", [
+    KeyError("x"), ValueError("y"), RuntimeError("z"), OverflowError("w"), StopIteration(), LookupError("v"),
+])  # fmt: skip
 def test_a_bug_is_one_line_exit_1_and_a_file_with_the_traceback(error, capfd, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("UUV_DEBUG", raising=False)

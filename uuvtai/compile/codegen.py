@@ -192,6 +192,7 @@ _TASK = re.compile(
 )
 _FETCH = re.compile(r"(%[\w.]+) = atomicrmw or (i\d+\*) (%[\w.]+), i\d+ 0 seq_cst.*")
 _PREFETCH = r"\1 = bitcast \2 \3 to i8*\n  call void @llvm.prefetch.p0i8(i8* \1, i32 1, i32 3, i32 1)"
+_BLOCK = re.compile(r"(?<= i32 @llvm\.smax\.i32\(i32 %\d\d, i32 )512\)(?=\n +%\d\d = mul i32 %\d\d, %2\n)")
 _FIXED = re.compile(
     r"(= load %struct\.LLVMRuntime[\w.]*\*, .*"  # the runtime, and in it where a tree begins
     r"|= getelementptr inbounds %struct\.LLVMRuntime.*, i32 7, i64 \d+\n +%[\w.]+ = load i8\*, .*)"
@@ -247,6 +248,7 @@ class Machine:
 
         Taichi asks memory where a tree of fields begins before each access, as any store might have changed
         it. None does: two of five loads go by the passes here once they know."""
+        text = _BLOCK.sub("1)", text)
         text = _FIXED.sub(r"\1, !invariant.load !9999", _FETCH.sub(_PREFETCH, text))
         try:
             module = self.llvm.parse_assembly(text + _DECLARED)

@@ -136,6 +136,16 @@ class Sim:
         by the episode's key (``_plan_seed``): the same readings give the same commands
         (``uuvtai.vehicle.onboard``).
         """
+        if type(self.sensors) is SimulatedSensors:  # a vehicle's do more than launch
+            self._launched(self._sense)
+        else:
+            self._sense()
+        self._launched(self._see)
+        with self._stage("planning"):
+            self.fallback.serve(self.io, self._plan_seed, self.rows, self.counts.number, self.planner)
+        self._launched(self._act)
+
+    def _sense(self) -> None:
         io, c = self.io, self.config
         with self._stage("proprioception"):
             self.sensors.sense_motion(io)
@@ -153,10 +163,6 @@ class Sim:
                 localization.correct_pose(io.localization)
         with self._stage("depth"):
             self.sensors.sense_depth(io)
-        self._launched(self._see)
-        with self._stage("planning"):
-            self.fallback.serve(io, self._plan_seed, self.rows, self.counts.number, self.planner)
-        self._launched(self._act)
 
     def _see(self) -> None:
         io, c = self.io, self.config
@@ -180,26 +186,29 @@ class Sim:
                 stack.observe(io, c.observation, self.observation)
 
     def _launched(self, work: Callable[[], None]) -> None:
-        """Do ``work``, which is nothing but launches; by what ``decides`` about them they are known again."""
-        decides = self.io, self.config, self.tree, self.action, self.observation, self.privileged
+        """Do ``work``, which is nothing but launches; by what they are launched on they are known again."""
+        on = self.io, self.config, self.tree, self.action, self.observation, self.privileged, self.sensors
         if self._rows is None or self.stage_s is not None:
             work()
         else:
-            self._rows.play(work, (*decides, self.planner is None))
+            self._rows.play(work, (*on, self.planner is None))
 
     def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
         """Begin episode ``number`` of ``seed`` where ``mask`` is 1 (int32, (n_env,)), and look around."""
-        io = self.io
         if self.planner is not None:
             self.planner.reset(mask)
         self.draw(mask, seed, number)
+        self._launched(self._forget)
+        self.perceive()
+        episode.wake(self.io.episode)
+
+    def _forget(self) -> None:
+        io = self.io
         dynamics.reset_vehicle(io.dynamics)
         control.reset_actuation(io.actuation)
         stack.forget(io, self.config)
         reward.reset_reward(io.reward)
         episode.reset_termination(io.episode)
-        self.perceive()
-        episode.wake(io.episode)
 
     def draw(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
         """Draw the scenarios of a ``reset`` to look at them, and nothing more: no row is ready for a step."""

@@ -29,14 +29,9 @@ HARSH = SonarConfig(
     missed_return=0.10, false_return=0.03, doppler_sigma_m_s=0.20, doppler_outlier=0.10,
 )  # fmt: skip
 SIZES = {
-    "n_env": N_ENV,
-    "n_ray": PAPER.n_ray,
-    "n_track": CONFIG.n_track,
-    "n_cluster": CONFIG.n_cluster,
-    "n_height": 16,
-    "n_turn_row": 7,
-    "n_turn": FORECAST.n_turn,
-}
+    "n_env": N_ENV, "n_ray": PAPER.n_ray, "n_track": CONFIG.n_track, "n_cluster": CONFIG.n_cluster,
+    "n_height": 16, "n_turn_row": 7, "n_turn": FORECAST.n_turn,
+}  # fmt: skip
 
 STATE_TOLERANCE = 2e-4
 """[m, m/s] one update: float32 bearings of up to 10 rad are good to 1e-6 rad, x 12 m = 1e-5 m, and gains in

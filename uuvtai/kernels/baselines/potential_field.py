@@ -21,7 +21,7 @@ from uuvtai.kernels.baselines.local_planner import (
     speed_limited,
     wanted_velocity,
 )
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, n_envs
 
 _STATIC_REACH_M = 0.3
 """Mapped obstacles and walls farther away push nobody."""
@@ -35,9 +35,9 @@ _LEAST_M = 0.05
 @ti.kernel
 def plan_potential_field(io: Bundle[LocalPlannerIO]):
     """Velocity along the sum of pull and pushes for the rows that decide in this step."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and decides(env, io):
+    n = n_envs(io.clock)
+    for env in range(n):
+        if decides(env, io):
             pull = wanted_velocity(env, io)
             force = pull + _push_of_obstacles(env, io) + _push_of_map(env, io)
             heave = ti.static(io.baselines_cfg.heave_m_s)

@@ -22,7 +22,7 @@ from uuvtai.kernels.core.beams import beam_bearing, range_rate
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3, wrapped_angle
 from uuvtai.kernels.core.grid import away_of, cell_of, centre_of, clearance_of
 from uuvtai.kernels.core.simd import filled, n_lane
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, n_envs
 
 # ------------------------------------------------------------------------------------------------------------
 # Where a vehicle may drive whose sonar is a fan ahead: not where it has not looked. A ring looks everywhere,
@@ -139,9 +139,9 @@ _NEARER_M = 0.2
 @ti.kernel
 def assess_threats(io: Bundle[BehaviorIO]):
     """Fill the blackboard, and decide which envs must plan an evasion in this step."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             if io.scan.fresh[env] == 1:
                 _sense_contact(env, io)
             _read_clearance(env, io)

@@ -26,7 +26,7 @@ from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.rollout import held_heave, tuned
 from uuvtai.kernels.behavior.threats import cruising_speed, kept_in_sight
 from uuvtai.kernels.core.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
-from uuvtai.kernels.core.stage import AnyTensor, Bundle, IntVector, spread
+from uuvtai.kernels.core.stage import AnyTensor, Bundle, IntVector, n_envs
 
 # ------------------------------------------------------------------------------------------------------------
 # Tick of a behaviour tree stored as preorder arrays, for one env, without recursion.
@@ -142,9 +142,9 @@ def tick_with_given_statuses(io: Bundle[BehaviorIO], result: AnyTensor):  # pyri
 @ti.kernel
 def reset_behavior(io: Bundle[BehaviorIO]):
     """Forget everything of the last episode in the active rows."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             for node in range(ti.static(io.behavior.status.shape[1])):
                 io.behavior.status[env, node] = ti.cast(codes.IDLE, ti.i8)
                 io.behavior.running_child[env, node] = ti.cast(0, ti.i16)
@@ -201,9 +201,9 @@ def _reset_blackboard(env, io: Bundle[BehaviorIO]):
 def tick_tree(io: Bundle[BehaviorIO], action: AnyTensor):
     """Tick the tree of every active env once and write its action, here and into ``action`` (n_env, 4) [-1,
     1]."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             for node in range(io.table.n_node[None]):
                 if io.table.kind[node] >= codes.CONDITION:
                     answer = _answer(env, node, io)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 import taichi as ti
 
 from uuvtai.compile.launch import is_gpu_shaped
+from uuvtai.state import ClockState
 
 _T = TypeVar("_T")
 
@@ -45,20 +46,17 @@ else:
         """All that a stage reads and writes, in one frozen dataclass."""
 
 
-_CPU_BLOCK = 512
-"""Taichi's CPU scheduler never splits a loop into blocks of fewer items than this (measured on 1.7.4)."""
+@ti.func
+def cut(count, clock: In[ClockState]):
+    """A loop's end, said such that no compiler knows it: our machine code cuts such a loop into blocks of any
+    size, where Taichi's have 512 items or more (``compile/codegen.py``)."""
+    return ti.min(count, count + clock.nothing[None])
 
-_BLOCKS = 16
-"""Blocks wanted per loop, so that two to sixteen cores share unequal work evenly."""
 
-
-def spread(n_env: int, inner: int = 1) -> int:
-    """Loop items per env (and ``inner`` index) that make ``ti.ndrange(n_env, inner, spread(n_env, inner))``
-    fill every core; use only the items with ``pad == 0``. One on a GPU, where an idle item is an idle thread,
-    and for one env, which has one thread: idle items only cost time there."""
-    if is_gpu_shaped() or n_env == 1:
-        return 1
-    return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // (n_env * inner))))
+@ti.func
+def n_envs(clock: In[ClockState]):
+    """How many envs there are, as the end of a loop."""
+    return cut(ti.static(clock.active.shape[0]), clock)
 
 
 def shares(count: int) -> int:

@@ -23,7 +23,7 @@ from uuvtai.kernels.core.beams import beam_lanes
 from uuvtai.kernels.core.geometry import quaternion_wb, rotation_wb, wrapped_angle
 from uuvtai.kernels.core.kalman import halved, measured, place
 from uuvtai.kernels.core.simd import LANES, f16x, lane_bits
-from uuvtai.kernels.core.stage import Bundle, Out, spread
+from uuvtai.kernels.core.stage import Bundle, Out, n_envs
 from uuvtai.kernels.perception.io import LocalizationIO
 from uuvtai.kernels.perception.sensor_model import is_new
 
@@ -277,9 +277,9 @@ _LEAST_DEPTH_SIGMA_M = 0.001
 @ti.kernel
 def reset_pose(io: Bundle[LocalizationIO]):
     """At the known start, where ``ego.pos_w`` is, with the heading that the IMU says. Active rows only."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             pos = io.ego.pos_w[env]
             io.localization.mean[env] = ti.Vector([pos[0], pos[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
             io.localization.depth[env] = ti.Vector([pos[2], 0.0, 0.0, 0.0])
@@ -306,9 +306,9 @@ def reset_pose(io: Bundle[LocalizationIO]):
 def predict_pose(io: Bundle[LocalizationIO]):
     """Move both filters to this step, take in DVL and pressure, and say where the vehicle is: the sonar's
     ping is noted there. Active rows only."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             step = io.clock.step[env]
             motion = level_motion(env, io)
             if step > 0:
@@ -330,9 +330,9 @@ def predict_pose(io: Bundle[LocalizationIO]):
 @ti.kernel
 def correct_pose(io: Bundle[LocalizationIO]):
     """Take in the walls of a scan that has just come. Active rows only."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
             before = io.localization.mean[env][2]
             take_walls(env, io)
             tell_pose(env, before, io)

@@ -10,7 +10,7 @@ from uuvtai.config import ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.geometry import FAR_M, turned_z
 from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.simd import LANES, f16x
-from uuvtai.kernels.core.stage import Bundle, Const, In, shares, spread
+from uuvtai.kernels.core.stage import Bundle, Const, In, n_envs, shares
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import TrackState, TurnHistory
 
@@ -328,9 +328,9 @@ MOST_LEGS = 6
 @ti.kernel
 def reset_forecast(io: Bundle[TrackingIO]):
     """Know no turn history and expect nothing in the active rows."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             forget_turns(env, io)
             for track in range(io.forecast.radius_m.shape[1]):
                 clear_forecast(env, track, io)
@@ -344,9 +344,9 @@ def reset_forecast(io: Bundle[TrackingIO]):
 @ti.kernel
 def learn_turns(io: Bundle[TrackingIO]):
     """Watch how the tracks move, after each tracked scan."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             for track in range(io.tracks.alive.shape[1]):
                 learn_turn(env, track, io)
 
@@ -360,11 +360,11 @@ def forecast_tracks(io: Bundle[TrackingIO]):
     as the filter knows it today: turns to come are not in it (the planner's own growing margin is for them).
     At most ``max_growth_m``.
     """
-    n = ti.static(io.clock.active.shape[0])
+    n = n_envs(io.clock)
     n_track = ti.static(io.tracks.alive.shape[1])
     n_share = ti.static(shares(n_track))
-    for env, share, pad in ti.ndrange(n, n_share, ti.static(spread(n, n_share))):
-        if pad == 0 and io.clock.active[env] == 1:
+    for env, share in ti.ndrange(n, n_share):
+        if io.clock.active[env] == 1:
             # only a tracked scan or an image changes tracks and turn history
             changed = io.clusters.fresh[env] + io.image.fresh[env] > 0
             for track in range(share * n_track // n_share, (share + 1) * n_track // n_share):

@@ -37,7 +37,7 @@ from uuvtai.kernels.core.simd import (
     put_bit,
     ramp,
 )
-from uuvtai.kernels.core.stage import Bundle, Const, In, fetch, spread
+from uuvtai.kernels.core.stage import Bundle, Const, In, fetch, n_envs
 from uuvtai.kernels.perception.io import EchoesIO, MappingIO
 from uuvtai.state import SonarScan
 
@@ -238,9 +238,9 @@ def is_new(env, beam, scan: In[SonarScan], sonar_cfg: Const[SonarConfig]):
 @ti.kernel
 def reset_echoes(io: Bundle[EchoesIO]):
     """Nothing was heard yet, in the active rows."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             for slot in range(io.echoes.step.shape[1]):
                 io.echoes.step[env, slot] = NEVER
                 io.echoes.pos_x_m[env, slot] = 0.0
@@ -257,9 +257,9 @@ def reset_echoes(io: Bundle[EchoesIO]):
 @ti.kernel
 def recall_echoes(io: Bundle[EchoesIO]):
     """Keep the new beams, and fill the others of the scan with what is remembered."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
             keep_new(env, io)
             show_old(env, io)
 

@@ -15,7 +15,7 @@ from uuvtai.kernels.core.beams import beam_bearing, beam_there, beam_towards
 from uuvtai.kernels.core.geometry import FAR_M, wrapped_angle
 from uuvtai.kernels.core.kalman import born, predicted
 from uuvtai.kernels.core.simd import f16x
-from uuvtai.kernels.core.stage import Bundle, Out, spread
+from uuvtai.kernels.core.stage import Bundle, Out, n_envs
 from uuvtai.kernels.perception.clustering import HELD_SIGMA_M_S, find_clusters, label_beams, split_distance
 from uuvtai.kernels.perception.height import begin_height, weigh_seen, weigh_unseen
 from uuvtai.kernels.perception.io import TrackingIO
@@ -468,9 +468,9 @@ def swept_reach(env, track, io: Bundle[TrackingIO]):
 @ti.kernel
 def reset_tracks(io: Bundle[TrackingIO]):
     """Forget everything about the active rows."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             io.tracks.scan_step[env] = -1
             io.clusters.scan_step[env] = -1
             io.clusters.slip_w[env] = ti.zero(io.clusters.slip_w[env])
@@ -507,9 +507,9 @@ def track_obstacles(io: TrackingIO) -> None:
 @ti.kernel
 def take_scan(io: Bundle[TrackingIO]):
     """See whether a scan is due, and which of its beams may have hit a obstacle."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             io.clusters.fresh[env] = is_due(env, io)
             if io.clusters.fresh[env] == 1:
                 io.clusters.scan_step[env] = io.scan.ping_step[env]
@@ -521,9 +521,9 @@ def take_scan(io: Bundle[TrackingIO]):
 @ti.kernel
 def cluster_beams(io: Bundle[TrackingIO]):
     """Gather the beams into clusters."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             find_clusters(env, io)
 
 
@@ -531,9 +531,9 @@ def cluster_beams(io: Bundle[TrackingIO]):
 @ti.kernel
 def follow_obstacles(io: Bundle[TrackingIO]):
     """Predict the tracks to the new ping, match them with clusters and correct them."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             dt = predict_tracks(env, io)
             associate(env, dt, io)
             update_tracks(env, dt, io)
@@ -543,13 +543,13 @@ def follow_obstacles(io: Bundle[TrackingIO]):
 @ti.kernel
 def keep_slots(io: Bundle[TrackingIO]):
     """End lost tracks, begin new ones, and name the beams."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             prune_tracks(env, ti.static(tracked_period_s(io.tracking_cfg, io.sonar_cfg, io.episode_cfg)), io)
             spawn_tracks(env, io)
             name_beams(env, io)
-        if pad == 0 and io.clock.active[env] == 1 and io.clusters.fresh[env] == 0 and io.scan.fresh[env] == 1:
+        if io.clock.active[env] == 1 and io.clusters.fresh[env] == 0 and io.scan.fresh[env] == 1:
             carry_names(env, io)
 
 

@@ -7,7 +7,7 @@ from uuvtai.common.enums import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, occupancy_of
-from uuvtai.kernels.core.stage import Bundle, FloatMatrix, In, spread
+from uuvtai.kernels.core.stage import Bundle, FloatMatrix, In, n_envs
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.kernels.planning.medial_axis import (
     MAX_WIDENINGS,
@@ -142,9 +142,9 @@ _LONG_AGO = -(1 << 20)
 @ti.kernel
 def reset_route(io: Bundle[RouteIO]):
     """No route, no history, in the active rows."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             for field in ti.static((
                 io.route.n_way, io.route.cost, io.route.planner, io.route.trigger, io.route.fired,
                 io.route.want_plan, io.route.fallback_reason, io.route.plan_step, io.route.kept,
@@ -172,9 +172,9 @@ def reset_route(io: Bundle[RouteIO]):
 def follow_route(io: Bundle[RouteIO]):
     """Path-relative terms of the active rows, from the foot that ``fire_triggers`` moved or from the start of
     a route planned since."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             if io.route.want_plan[env] == 1:  # else ``fire_triggers`` has just looked along the same route
                 _look_again(env, io)
             if io.route.n_way[env] > 0:

@@ -23,7 +23,7 @@ from uuvtai.common.enums import (
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.beams import range_rate
 from uuvtai.kernels.core.simd import LANES, i16x
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, n_envs
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.kernels.planning.medial_axis import is_traversable, room_at
 from uuvtai.kernels.planning.route import advanced_arc, cell_on_grid, level, look_along, risk_at
@@ -36,10 +36,10 @@ _STUCK_M_S, _FORECAST_CLEARANCE_M = 0.08, 0.35
 def fire_triggers(io: Bundle[RouteIO]):
     """Move the foot along the route, look along it, find the triggers that hold, and queue the envs that plan
     in this step, in any order."""
-    n = ti.static(io.clock.active.shape[0])
+    n = n_envs(io.clock)
     io.route.n_queue[None] = 0
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    for env in range(n):
+        if io.clock.active[env] == 1:
             if io.route.n_way[env] > 0:
                 io.route.arc[env] = advanced_arc(io.route, env, level(io.ego.pos_w[env]))
             look_along(env, level(io.ego.pos_w[env]), io)

@@ -14,7 +14,7 @@ from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.beams import beam_bearing
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.simd import LANES, f16x
-from uuvtai.kernels.core.stage import Bundle, Const, spread
+from uuvtai.kernels.core.stage import Bundle, Const, n_envs
 from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.kernels.sensors.raycast import nearest_echo
 from uuvtai.kernels.sensors.sonar import note_ping, place_sonar, reported, sonar_mount, start_cloud
@@ -25,9 +25,9 @@ from uuvtai.kernels.sensors.sonar import note_ping, place_sonar, reported, sonar
 def turn_head(io: Bundle[SonarIO]):
     """Take the beams that are due; ``scan.fresh`` is 1 only where there is one. The first is due at
     step 0."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             step = io.clock.step[env]
             begin, end = ti.cast(0, ti.i64), head_steps(step, io)
             if step > 0:

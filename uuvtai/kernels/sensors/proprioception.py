@@ -25,7 +25,7 @@ from uuvtai.kernels.core.noise import (
     uniform,
     uniform_in,
 )
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, n_envs
 from uuvtai.kernels.sensors.io import ExactProprioceptionIO, ProprioceptionIO, VelocityIO
 
 _EPISODE_DRAW = 1000
@@ -40,9 +40,9 @@ _RISE_RATE = 4.0
 def reset_proprioception(io: Bundle[ProprioceptionIO]):
     """Draw the errors that stay constant over an episode; the estimate starts at the true position. Active
     rows only."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             draw_constants(env, io)
             clear_readings(env, io)
 
@@ -52,7 +52,7 @@ def reset_proprioception(io: Bundle[ProprioceptionIO]):
 def sense_exactly(io: Bundle[ExactProprioceptionIO]):
     """Perfect velocity, attitude and rates for the inner loop: experiments on the plant alone have no
     sensors."""
-    for env in range(ti.static(io.clock.active.shape[0])):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             io.ego.vel_b[env] = io.vehicle.vel_b[env]
             io.ego.vel_valid[env] = 1
@@ -106,9 +106,9 @@ def clear_readings(env, io: Bundle[ProprioceptionIO]):
 @ti.kernel
 def sense_proprioception(io: Bundle[ProprioceptionIO]):
     """One reading of every sensor whose turn it is, then the pose estimate. Active rows only."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             key, step = io.episode.key[env], io.clock.step[env]
             read_imu(env, key, step, io)
             io.ego.dvl_fresh[env], io.ego.fix_valid[env] = 0, 1
@@ -223,9 +223,9 @@ def loses_velocity(sensors_cfg):
 def find_velocity(io: Bundle[VelocityIO]):
     """Find what is known of the velocity where the DVL says nothing, whoever filled the readings. Active rows
     only."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             rpy = io.ego.rpy[env]
             rotation = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
             if ti.static(io.sensors_cfg.localization == "truth"):

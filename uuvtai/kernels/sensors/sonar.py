@@ -30,7 +30,7 @@ from uuvtai.kernels.core.noise import (
     uniform_lanes,
 )
 from uuvtai.kernels.core.simd import LANES, filled
-from uuvtai.kernels.core.stage import Bundle, Const, spread
+from uuvtai.kernels.core.stage import Bundle, Const, n_envs
 from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.kernels.sensors.raycast import nearest_echo, place_obstacles
 
@@ -244,9 +244,9 @@ Mount = ti.types.struct(pos=ti.math.vec3, vel=ti.math.vec2, heading=ti.math.vec2
 def reset_sonar(io: Bundle[SonarIO]):
     """Forget scans and clouds of the active rows: no return anywhere, nothing fresh or under way (step 0 then
     fills the scan)."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             clear_scan(env, io)
             clear_memory(env, io)
 
@@ -286,16 +286,16 @@ def cast_sonar(io: Bundle[SonarIO]):
     only then), so that the first observation is not empty. ``memory`` needs n_latency > latency_steps /
     period_steps.
     """
-    n = ti.static(io.clock.active.shape[0])
+    n = n_envs(io.clock)
     beams = ti.static(n_beam())
     n_part = ti.static(io.sonar_cfg.n_ray // beams)
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0:
+    for env in range(n):
+        if io.clock.active[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0:
             place_sonar(env, io)
             if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
                 start_cloud(env, io)
-    for env, part, pad in ti.ndrange(n, n_part, ti.static(spread(n, n_part))):
-        if pad == 0 and io.clock.active[env] == 1:
+    for env, part in ti.ndrange(n, n_part):
+        if io.clock.active[env] == 1:
             step = io.clock.step[env]
             if step % io.sonar_cfg.period_steps == 0:
                 ping(env, part * beams, step, io)

@@ -24,7 +24,7 @@ from uuvtai.config.multibeam import (
 from uuvtai.kernels.core.geometry import BOX, FAR_M, SPHERE
 from uuvtai.kernels.core.noise import STREAM_SONAR_HISS, STREAM_SONAR_SPECKLE, normal_pair_lanes, stream_key
 from uuvtai.kernels.core.simd import LANES, f16x
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, n_envs
 from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, obstacles_in_wedge, slab_span, wall_echo
 from uuvtai.kernels.sensors.sonar import place_sonar, sonar_mount
@@ -38,21 +38,21 @@ _WALL, _FLOOR, _SURFACE = -1, -2, -3
 @ti.kernel
 def hear(io: Bundle[SonarIO]):
     """Fill ``heard`` of the active rows whose sonar pings in this step."""
-    n = ti.static(io.clock.active.shape[0])
+    n = n_envs(io.clock)
     n_heard, n_packet = ti.static(io.sonar_image.echo.shape[1], packets(io.sonar_cfg))
     for beams in range(n_heard):
         io.sonar_image.across[beams] = heard_across(beams, io)
     for row in range(ti.static(io.sonar_image.upright.shape[0])):
         io.sonar_image.upright[row] = heard_upright(row, io)
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and pings(env, io):
+    for env in range(n):
+        if pings(env, io):
             place_sonar(env, io)
-    for env, bearing, pad in ti.ndrange(n, n_heard, ti.static(spread(n * n_heard))):
-        if pad == 0 and pings(env, io):
+    for env, bearing in ti.ndrange(n, n_heard):
+        if pings(env, io):
             fold(env, bearing, io)
             speckle(env, bearing, io)
-    for env, packet, pad in ti.ndrange(n, n_packet, ti.static(spread(n * n_packet))):
-        if pad == 0 and pings(env, io):
+    for env, packet in ti.ndrange(n, n_packet):
+        if pings(env, io):
             listen(env, packet, io)
 
 

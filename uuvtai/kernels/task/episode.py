@@ -15,7 +15,7 @@ from uuvtai.kernels.core.geometry import (
     rotation_wb,
 )
 from uuvtai.kernels.core.noise import episode_key
-from uuvtai.kernels.core.stage import Bundle, IntVector, spread
+from uuvtai.kernels.core.stage import Bundle, IntVector, n_envs
 from uuvtai.kernels.task.io import EpisodeIO
 
 __all__ = ["COLLISION", "OUTCOMES", "OUT_OF_TANK", "RUNNING", "SUCCESS", "TIMEOUT", "TTC"]
@@ -39,7 +39,7 @@ def begin_episodes(io: Bundle[EpisodeIO], mask: IntVector, seed: IntVector, numb
 @ti.kernel
 def advance_clock(io: Bundle[EpisodeIO]):
     """One control step more for the active rows."""
-    for env in range(ti.static(io.clock.active.shape[0])):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             io.clock.step[env] += 1
 
@@ -48,7 +48,7 @@ def advance_clock(io: Bundle[EpisodeIO]):
 @ti.kernel
 def wake(io: Bundle[EpisodeIO]):
     """After a reset: every running row takes part in the next step."""
-    for env in range(ti.static(io.clock.active.shape[0])):
+    for env in range(n_envs(io.clock)):
         io.clock.active[env] = io.clock.running[env]
 
 
@@ -56,7 +56,7 @@ def wake(io: Bundle[EpisodeIO]):
 @ti.kernel
 def deactivate_ended(io: Bundle[EpisodeIO]):
     """Rows whose episode has ended take no part in further steps."""
-    for env in range(ti.static(io.clock.active.shape[0])):
+    for env in range(n_envs(io.clock)):
         if io.termination.outcome[env] != RUNNING:
             io.clock.running[env] = 0
             io.clock.active[env] = 0
@@ -121,9 +121,9 @@ def outcome_of(env, io: Bundle[EpisodeIO]):
 @ti.kernel
 def reset_termination(io: Bundle[EpisodeIO]):
     """Start the termination check's book of the active rows with the initial clearance."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             threat = nearest_threat(env, io)
             io.termination.outcome[env] = RUNNING
             io.termination.clearance_m[env] = threat[0]
@@ -138,9 +138,9 @@ def reset_termination(io: Bundle[EpisodeIO]):
 def check_termination(io: Bundle[EpisodeIO]):
     """Clearance, time to collision, way driven and outcome of the active rows after they and the obstacles
     have moved."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             threat = nearest_threat(env, io)
             io.termination.clearance_m[env] = threat[0]
             io.termination.ttc_s[env] = threat[1]

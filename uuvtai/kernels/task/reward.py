@@ -20,7 +20,7 @@ from uuvtai.kernels.core.stage import (
     FloatMatrix,
     FloatVector,
     IntVector,
-    spread,
+    n_envs,
 )
 from uuvtai.kernels.task.io import RewardIO
 
@@ -49,7 +49,7 @@ def is_failure(outcome):
 @ti.kernel
 def reset_reward(io: Bundle[RewardIO]):
     """Forget the last episode of the active rows."""
-    for env in range(ti.static(io.clock.active.shape[0])):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             for term in range(ti.static(N_TERM)):
                 io.reward.term[env, term] = 0.0
@@ -136,11 +136,11 @@ def compute_reward(
     """Reward of the step, weighted terms, their sums, and how the step ended. Rows that sleep earn 0 and keep
     their end."""
     weights = ti.Vector(ti.static(list(signed_weights(io.reward_cfg))))
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 0 and env < reward_out.shape[0]:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 0 and env < reward_out.shape[0]:
             reward_out[env] = 0.0
-        if pad == 0 and io.clock.active[env] == 1:
+        if io.clock.active[env] == 1:
             progress = route_progress(env, io.episode_cfg.control_dt_s, io)
             terms = unweighted_terms(env, progress, io)
             total = 0.0

@@ -29,7 +29,7 @@ from uuvtai.kernels.core.noise import (
     uniform_in,
 )
 from uuvtai.kernels.core.simd import column, is_active, n_active, n_column, put_column
-from uuvtai.kernels.core.stage import Bundle, Const, In, Out, spread
+from uuvtai.kernels.core.stage import Bundle, Const, In, Out, cut, n_envs
 from uuvtai.kernels.vehicle.io import DynamicsIO
 
 # ------------------------------------------------------------------------------------------------------------
@@ -128,8 +128,8 @@ def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
     step."""
     n, lanes = ti.static(io.clock.active.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
-    for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
-        if pad == 0 and n_active(packet * lanes, lanes, io.clock) > 0:
+    for packet in range(cut(n_packet, io.clock)):
+        if n_active(packet * lanes, lanes, io.clock) > 0:
             _move(packet * lanes, lanes, dt_s / n_substep, n_substep, io)
             if ti.static(io.disturbance_cfg.current_sigma_m_s > 0):
                 _change_currents(packet * lanes, lanes, dt_s, io)
@@ -139,9 +139,9 @@ def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
 @ti.kernel
 def reset_vehicle(io: Bundle[DynamicsIO]):
     """At rest at the mission's start, with this episode's parameters and current."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             _place(env, io)
             _draw_body(env, io)
             _draw_thrusters(env, io)

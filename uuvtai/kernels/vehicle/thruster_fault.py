@@ -25,7 +25,7 @@ keeps away, which of them it is nobody needs to know.
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
-from uuvtai.kernels.core.stage import Bundle, spread
+from uuvtai.kernels.core.stage import Bundle, n_envs
 from uuvtai.kernels.vehicle.dynamics import thrust_of_rpm
 from uuvtai.kernels.vehicle.io import ThrusterWatchIO
 
@@ -79,9 +79,9 @@ def _offset_n2(vehicle_cfg, sensors_cfg):
 @ti.kernel
 def watch_thrusters(io: Bundle[ThrusterWatchIO]):
     """Weigh what the last commands did, before new ones are given. Active rows only."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             watched = io.clock.step[env] > 0 and io.ego.vel_valid[env] == 1
             if watched and io.ego.given_up[env] <= 0:
                 _weigh(env, io)

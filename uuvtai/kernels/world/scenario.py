@@ -22,7 +22,7 @@ from uuvtai.kernels.core.geometry import (
     nearest_squared,
 )
 from uuvtai.kernels.core.noise import STREAM_SCENARIO, stream_key, uniform, uniform_in
-from uuvtai.kernels.core.stage import Bundle, shares, spread
+from uuvtai.kernels.core.stage import Bundle, cut, n_envs, shares
 from uuvtai.kernels.world.io import WorldIO
 from uuvtai.kernels.world.motion import (
     draw_moving_obstacles,
@@ -295,15 +295,15 @@ def flood_sweep(env, backward, io: Bundle[WorldIO]):
 def generate_scenarios(io: Bundle[WorldIO]):
     """Draw start, goal, static and moving obstacles of every active row; ``move_obstacles`` then puts the
     moving ones in place."""
-    n = ti.static(io.clock.active.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.active[env] == 1:
+    n = n_envs(io.clock)
+    for env in range(n):
+        if io.clock.active[env] == 1:
             clear_obstacles(env, io)
             place_fixed(env, io)
             draw_layout(env, io)
     if ti.static(io.world_cfg.dynamic_slots > 0):
-        for env, pad in ti.ndrange(n, ti.static(spread(n))):  # a loop of its own compiles in half the time
-            if pad == 0 and io.clock.active[env] == 1:
+        for env in range(n):  # a loop of its own compiles in half the time
+            if io.clock.active[env] == 1:
                 draw_moving_obstacles(env, io)
 
 
@@ -348,8 +348,8 @@ def move_obstacles(io: Bundle[WorldIO]):
     stays."""
     n, n_lane = ti.static(io.path.n_way.shape[:2])
     n_share = ti.static(shares(n_lane))
-    for env, share, pad in ti.ndrange(n, n_share, ti.static(spread(n, n_share))):
-        if pad == 0 and io.clock.active[env] == 1:
+    for env, share in ti.ndrange(cut(n, io.clock), n_share):
+        if io.clock.active[env] == 1:
             time_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
             for lane in range(share * n_lane // n_share, (share + 1) * n_lane // n_share):
                 slot = first_moving(io.world, io.path) + lane
