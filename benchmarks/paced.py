@@ -1,5 +1,5 @@
-"""Time of a control step beside another commit (``--against``, default HEAD): one vehicle paced at 50 Hz, and
-1,024 on all cores.
+"""Time of a control step beside another commit (``--against``, default HEAD): one vehicle paced at 50 Hz,
+1,024 on all cores, and on one thread their steps, maps and resets; their memory.
 
 Back to back, one step warms the caches and keeps the threads active for the next; a vehicle's loop sleeps in
 between. Both sides run in this environment with caches of their own, in turns.
@@ -17,11 +17,18 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.before import ROOT, Side, checked_out
+from benchmarks.before import ROOT, Player, Side, checked_out
 from benchmarks.common import Job, Row
 
 LONGEST_S = 3600
 _SENSORS = ("nominal", "paper")
+_PARTS = (
+    ("a step of one, paper sensing", "speed", "paper", 6, "us", 1e6),
+    ("a step of one, nominal sensing", "speed", "nominal", 6, "us", 1e6),
+    ("a scan of one drawn into its map", "map", "paper", 5, "us", 1e6),
+    ("a reset of two", "reset", "nominal", 10, "ms", 1e3),
+)
+"""name, what ``played.py`` does, sensing, how often a turn, unit and its share of a second"""
 
 
 def measure(job: Job) -> list[Row]:
@@ -35,7 +42,7 @@ def measure(job: Job) -> list[Row]:
             rows += _paced(job, sides, sensors, commit)
             rows.append(_together(job, sides, sensors, commit))
             job.say(rows[-1].what)
-        return rows
+        return rows + _alone(job, sides, commit) + [_memory(job, sides, commit)]
 
 
 def _paced(job: Job, sides: tuple[Side, Side], sensors: str, commit: str) -> list[Row]:
@@ -70,6 +77,46 @@ def _together(job: Job, sides: tuple[Side, Side], sensors: str, commit: str) -> 
         commit,
         details={"ours": found[0], "theirs": found[1]},
     )
+
+
+def _alone(job: Job, sides: tuple[Side, Side], commit: str) -> list[Row]:
+    """Parts of the work on one thread, CPU time; the ratio of every turn, and their median."""
+    num_envs, turns = (16, 2) if job.quick else (1024, 24)
+    rows = []
+    for name, what, sensors, count, unit, scale in _PARTS:
+        players = [Player(side, what, "pool", sensors, str(num_envs), threads=1) for side in sides]
+        for player in players:
+            player.seconds(2 * count)
+        taken: list[list[float]] = [[], []]
+        for turn in range(turns):
+            for i in (0, 1) if turn % 2 else (1, 0):
+                taken[i].append(scale * players[i].seconds(count) / count / (num_envs if unit == "us" else 1))
+        for player in players:
+            player.close()
+        ratios = [theirs / ours for ours, theirs in zip(*taken, strict=True)]
+        note = f"{turns} turns: median {statistics.median(ratios):.3f} x"
+        ours, theirs = map(statistics.median, taken)
+        said = f"{num_envs:,} vehicles, one thread: {name}"
+        rows.append(
+            Row(said, ours, unit, theirs, commit, less_is_better=True, note=note, details={"ratios": ratios})
+        )
+        job.say(f"{said}: {note}")
+    return rows
+
+
+def _memory(job: Job, sides: tuple[Side, Side], commit: str) -> Row:
+    num_envs = 16 if job.quick else 1024
+    ours, theirs = (
+        float(
+            subprocess.run(
+                side.played("bytes", "pool", "paper", str(num_envs)),
+                env=side.environment, cwd=side.tree, check=True, stdout=subprocess.PIPE, text=True,
+            ).stdout.split()[-1]
+        )
+        for side in sides
+    )  # fmt: skip
+    what = f"{num_envs:,} vehicles: memory of each"
+    return Row(what, ours / 1e3, "kB", theirs / 1e3, commit, less_is_better=True)
 
 
 def _in_turns(

@@ -6,6 +6,11 @@ python played.py speed WORLD SENSORS NUM_ENVS        for every number read: CPU 
 python played.py paced WORLD SENSORS NUM_ENVS        for every number read: milliseconds of each of so many
                                                      steps, one begun every 20 ms, as JSON
 python played.py all_cores WORLD SENSORS NUM_ENVS    for every number read: seconds of so many steps
+python played.py map WORLD SENSORS NUM_ENVS          for every number read: CPU seconds of so many scans drawn
+                                                     into the map
+python played.py reset WORLD SENSORS NUM_ENVS        for every number read: CPU seconds of so many resets of
+                                                     two rows
+python played.py bytes WORLD SENSORS NUM_ENVS        memory of the arrays of a vehicle
 """
 
 from __future__ import annotations
@@ -14,7 +19,11 @@ import hashlib
 import json
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
+
+import numpy as np
+import torch
 
 _SEED = 5
 _PERIOD_S = 0.02
@@ -26,6 +35,11 @@ def main() -> None:
     what, world, sensors, *numbers = sys.argv[1:]
     if what == "bits":
         print("\n" + json.dumps(bits(world, sensors, *map(int, numbers))))
+    elif what == "bytes":
+        from uuvtai.config.loader import load_config
+        from uuvtai.sim.setup import memory_bytes
+
+        print(f"\n{memory_bytes(load_config(world, sensors), int(numbers[0])) / int(numbers[0])}")
     else:
         answer(what, world, sensors, int(numbers[0]))
 
@@ -53,8 +67,13 @@ def answer(what: str, world: str, sensors: str, num_envs: int) -> None:
     env = uuvtai.make(world, num_envs, _SEED, sensors=sensors)
     _observation, info = env.reset()
     info = _steps(env, info, 1)
+    alone = {"map": _drawing, "reset": _resetting}.get(what)
+    work = alone(env, _steps(env, info, 100)) if alone else None
     print(f"ready {time.process_time()}", flush=True)
     for line in sys.stdin:
+        if work:
+            print(f"steps {sum(work(turn) for turn in range(int(line)))}", flush=True)
+            continue
         if what == "paced":
             info, taken = _paced(env, info, int(line))
             print("steps " + json.dumps(taken), flush=True)
@@ -77,6 +96,41 @@ def _paced(env: Any, info: dict[str, Any], count: int) -> tuple[dict[str, Any], 
         if not bool((terminated | truncated).any()):
             taken.append(1e3 * (time.perf_counter() - begun))
     return info, taken
+
+
+def _drawing(env: Any, _info: dict[str, Any]) -> Callable[[int], float]:
+    """Draws the scan that is there into the map, with another error each time."""
+    from uuvtai.kernels.perception.mapping import update_map
+
+    s, memory = env.sim.s, env.sim.memory()
+    range_m, hit = memory.live(s.scan.range_m), memory.live(s.scan.hit) == 1
+    fresh, step, image = (memory.live(field) for field in (s.scan.fresh, s.clock.step, s.image.fresh))
+    first = range_m.copy()
+    errors = np.random.default_rng(0).normal(0, 0.02, (5, *first.shape)).astype(np.float32) * hit
+
+    def drawn(turn: int) -> float:
+        range_m[...], fresh[...], image[...] = first + errors[turn % 5], 1, 0
+        step[...] += 3
+        begun = time.process_time()
+        update_map(env.sim.io.mapping)
+        return time.process_time() - begun
+
+    return drawn
+
+
+def _resetting(env: Any, _info: dict[str, Any]) -> Callable[[int], float]:
+    """Begins new episodes in two rows, others each time."""
+    n, made = env.num_envs, [0]
+
+    def reset(turn: int) -> float:
+        mask, made[0] = torch.zeros(n, dtype=torch.int32), made[0] + 1
+        mask[torch.tensor([37 * made[0] % n, (37 * made[0] + 1) % n])] = 1
+        seed, number = torch.zeros_like(mask), torch.arange(n, dtype=torch.int32) + n * (made[0] % 1000)
+        begun = time.process_time()
+        env.sim.reset(mask, seed, number)
+        return time.process_time() - begun
+
+    return reset
 
 
 def _steps(env: Any, info: dict[str, Any], count: int) -> dict[str, Any]:
