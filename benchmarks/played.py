@@ -22,9 +22,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-import torch
-
 _SEED = 5
 _PERIOD_S = 0.02
 
@@ -67,8 +64,8 @@ def answer(what: str, world: str, sensors: str, num_envs: int) -> None:
     env = uuvtai.make(world, num_envs, _SEED, sensors=sensors)
     _observation, info = env.reset()
     info = _steps(env, info, 1)
-    alone = {"map": _drawing, "reset": _resetting}.get(what)
-    work = alone(env, _steps(env, info, 100)) if alone else None
+    info = _steps(env, info, 100 if what in ("map", "reset") else 0)
+    work = _drawing(env) if what == "map" else _resetting(env) if what == "reset" else None
     print(f"ready {time.process_time()}", flush=True)
     for line in sys.stdin:
         if work:
@@ -98,8 +95,10 @@ def _paced(env: Any, info: dict[str, Any], count: int) -> tuple[dict[str, Any], 
     return info, taken
 
 
-def _drawing(env: Any, _info: dict[str, Any]) -> Callable[[int], float]:
-    """Draws the scan that is there into the map, with another error each time."""
+def _drawing(env: Any) -> Callable[[int], float]:
+    """Draws the scan that is there into the map, with another error each time; CPU seconds."""
+    import numpy as np
+
     from uuvtai.kernels.perception.mapping import update_map
 
     s, memory = env.sim.s, env.sim.memory()
@@ -109,8 +108,7 @@ def _drawing(env: Any, _info: dict[str, Any]) -> Callable[[int], float]:
     errors = np.random.default_rng(0).normal(0, 0.02, (5, *first.shape)).astype(np.float32) * hit
 
     def drawn(turn: int) -> float:
-        range_m[...], fresh[...], image[...] = first + errors[turn % 5], 1, 0
-        step[...] += 3
+        range_m[...], fresh[...], image[...], step[...] = first + errors[turn % 5], 1, 0, step + 3
         begun = time.process_time()
         update_map(env.sim.io.mapping)
         return time.process_time() - begun
@@ -118,11 +116,13 @@ def _drawing(env: Any, _info: dict[str, Any]) -> Callable[[int], float]:
     return drawn
 
 
-def _resetting(env: Any, _info: dict[str, Any]) -> Callable[[int], float]:
-    """Begins new episodes in two rows, others each time."""
+def _resetting(env: Any) -> Callable[[int], float]:
+    """Begins new episodes in two rows, others each time; CPU seconds."""
+    import torch
+
     n, made = env.num_envs, [0]
 
-    def reset(turn: int) -> float:
+    def reset(_turn: int) -> float:
         mask, made[0] = torch.zeros(n, dtype=torch.int32), made[0] + 1
         mask[torch.tensor([37 * made[0] % n, (37 * made[0] + 1) % n])] = 1
         seed, number = torch.zeros_like(mask), torch.arange(n, dtype=torch.int32) + n * (made[0] % 1000)

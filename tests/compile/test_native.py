@@ -182,7 +182,7 @@ def test_fetching_waits_for_nothing(place):
     assert b"\x0f\x0d" in code or b"\x0f\x18" in code, "a prefetch in place of a locked instruction"
 
 
-def test_a_loop_to_an_end_that_is_not_known_has_blocks_of_any_size(place):
+def test_a_loop_whose_end_is_not_known_has_blocks_of_any_size(place):
     """As Taichi compiles it they have 512 items; what threads make of it, the tests above ask."""
     scene, texts = Scene(), []
     machine = started(scene, place).machine

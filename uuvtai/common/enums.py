@@ -1,4 +1,4 @@
-"""Codes for kernels, and their names for logs, results and tables: outcomes, plans, forecasts, sets."""
+"""Codes for kernels, and their names for logs, results and tables: outcomes, plans, maps, forecasts, sets."""
 
 from typing import Any
 
@@ -46,8 +46,8 @@ def clearance_m(site: Any, config: Any) -> Any:
     """Clearance [m], float32, of an int16 array of sites as the clearance keeps them."""
     rows, cols = site >> 8, site << 8 >> 9
     found = (rows * rows + cols * cols).astype("float32") ** 0.5 * config.mapping.cell_m
-    nearer = (found - config.clearance.inflate_m).clip(0)
-    return (found * (site & 1 == 0) + nearer * (site & 1)).clip(max=config.clearance.max_m)
+    inflation = (site & 1).astype("float32") * config.clearance.inflate_m
+    return (found - inflation).clip(0, config.clearance.max_m)
 
 
 # ---- What a learned forecast is told and what it says, in numbers: read by its kernels and by what learns.

@@ -192,11 +192,15 @@ _TASK = re.compile(
 )
 _FETCH = re.compile(r"(%[\w.]+) = atomicrmw or (i\d+\*) (%[\w.]+), i\d+ 0 seq_cst.*")
 _PREFETCH = r"\1 = bitcast \2 \3 to i8*\n  call void @llvm.prefetch.p0i8(i8* \1, i32 1, i32 3, i32 1)"
-_BLOCK = re.compile(r"(?<= i32 @llvm\.smax\.i32\(i32 %\d\d, i32 )512\)(?=\n +%\d\d = mul i32 %\d\d, %2\n)")
+_BLOCK = re.compile(
+    r"(i32 @llvm\.smax\.i32\(i32 %[\w.]+, i32 )512(\)\n +%[\w.]+ = mul[ a-z]* i32 %[\w.]+, %2\n)"
+)
+"""items of a block, where Taichi works them out for a loop: at least 512"""
 _FIXED = re.compile(
-    r"(= load %struct\.LLVMRuntime[\w.]*\*, .*"  # the runtime, and in it where a tree begins
+    r"(= load %struct\.LLVMRuntime[\w.]*\*, .*"
     r"|= getelementptr inbounds %struct\.LLVMRuntime.*, i32 7, i64 \d+\n +%[\w.]+ = load i8\*, .*)"
 )
+"""loads of what no kernel changes: the address of the runtime, and in it that of a tree of fields"""
 _DECLARED = "\ndeclare void @llvm.prefetch.p0i8(i8* nocapture readonly, i32, i32, i32)\n!9999 = !{}\n"
 _SUFFIX = re.compile(r"(%struct\.\w+?)\.\d+\b")
 
@@ -244,22 +248,13 @@ class Machine:
         return block
 
     def object_of(self, text: str) -> bytes:
-        """Machine code of a module of LLVM's text. Raises UnfitError where it is not understood.
-
-        Taichi asks memory where a tree of fields begins before each access, as any store might have changed
-        it. None does: two of five loads go by the passes here once they know."""
-        text = _BLOCK.sub("1)", text)
-        text = _FIXED.sub(r"\1, !invariant.load !9999", _FETCH.sub(_PREFETCH, text))
+        """Machine code of a module of LLVM's text. Raises UnfitError where it is not understood."""
         try:
-            module = self.llvm.parse_assembly(text + _DECLARED)
+            module = self.llvm.parse_assembly(completed(text))
             module.verify()
         except RuntimeError as error:
             raise UnfitError(f"LLVM: {error}") from error
-        passes = self.llvm.create_module_pass_manager()
-        passes.add_gvn_pass()
-        passes.add_cfg_simplification_pass()
-        passes.run(module)
-        return self._target().emit_object(module)
+        return emitted(module, self._target())
 
     def tasks_of(self, code: bytes, names: list[str]) -> list[int]:
         """Addresses of the functions of an object, which is loaded. Raises UnfitError."""
@@ -313,6 +308,23 @@ def tasks_in(text: str) -> list[str]:
     if [number for number, _ in found] != list(range(len(found))) or not found:
         raise UnfitError("a kernel's tasks cannot be told apart")
     return [name for _, name in found]
+
+
+def completed(text: str) -> str:
+    """A kernel's text with what Taichi cannot say: prefetches (``kernels.core.stage.fetch``), blocks of any
+    size (``loop_end`` there), and that trees of fields do not move."""
+    text = _BLOCK.sub(r"\g<1>1\2", _FETCH.sub(_PREFETCH, text))
+    return _FIXED.sub(r"\1, !invariant.load !9999", text) + _DECLARED
+
+
+def emitted(module: Any, target: Any) -> bytes:
+    """Machine code of a module. Taichi loads the address of a tree before each access, as any store might
+    have changed it: the passes merge these loads, two of five of all."""
+    passes = _llvm().create_module_pass_manager()
+    passes.add_gvn_pass()
+    passes.add_cfg_simplification_pass()
+    passes.run(module)
+    return target.emit_object(module)
 
 
 def _set(block: Any, offset: int, address: int) -> None:

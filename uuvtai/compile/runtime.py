@@ -96,7 +96,7 @@ def start_taichi(device: str = "cpu", precision: str = "f32") -> Runtime:
             fast_math=False,
             offline_cache=True,
             offline_cache_max_size_of_files=CACHE_BYTES,
-            cache_loop_invariant_global_vars=False,  # it takes two elements of an env for apart that are one
+            cache_loop_invariant_global_vars=False,  # wrong where two indices are of one element
             cfg_optimization=False,  # LLVM does that work again: half of the time to compile, equal results;
             # and on CUDA Taichi 1.7.4 falls over what that pass leaves of ``tick_tree``
             log_level=ti.WARN,

@@ -44,11 +44,12 @@ as it is there; the other files fail loudly. Try a new version of Taichi with ``
     while a kernel is read: numbers of the config become arguments. Can go when Taichi has arguments that
     Python may reckon with beforehand.
 
-``runtime``, ``cache_loop_invariant_global_vars``: that pass of Taichi's keeps elements of an env in registers
-while others of the same array are written, which may be the same ones: a scenario's flood fill never began.
+``runtime``
+    ``cache_loop_invariant_global_vars`` is off: that pass keeps an element in a register while the kernel
+    writes the same one by another index. With it a scenario's flood fill never began.
 
-Elsewhere, by what Taichi publishes: ``kernels.core.stage.cut`` (its scheduler keeps short loops on one core),
-``config.base.Section.__getattr__`` (what it asks of every argument), ``state.arrays`` (layouts by
+Elsewhere, by what Taichi publishes: ``kernels.core.stage.loop_end`` (its scheduler keeps short loops on one
+core), ``config.base.Section.__getattr__`` (what it asks of every argument), ``state.arrays`` (layouts by
 nested ``dense``).
 """
 

@@ -119,8 +119,8 @@ class ClockState:
     reset"""
     step: ti.Field = array("n_env", dtype=ti.i32)
     """control steps done since the episode's start; time = step * control_dt_s"""
-    nothing: ti.Field = array(dtype=ti.i32)
-    """0 for ever; see ``kernels.core.stage.cut``"""
+    zero: ti.Field = array(dtype=ti.i32)
+    """always 0; see ``kernels.core.stage.loop_end``"""
 
 
 @dataclass(frozen=True, eq=False)

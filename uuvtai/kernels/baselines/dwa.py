@@ -21,7 +21,7 @@ from uuvtai.kernels.baselines.local_planner import (
     wanted_velocity,
 )
 from uuvtai.kernels.core.geometry import FAR_M, PI, turned_z3
-from uuvtai.kernels.core.stage import Bundle, cut
+from uuvtai.kernels.core.stage import Bundle, loop_end
 
 _CLEAR_M = 0.6
 """Clearance beyond the margin from which on more is worth nothing."""
@@ -35,12 +35,12 @@ def plan_dynamic_window(io: Bundle[LocalPlannerIO]):
     """Velocity of best score for the rows that decide in this step."""
     n, n_trial = ti.static(io.clock.active.shape[0], io.baselines_cfg.n_reachable)
     window_s = ti.static(io.dwa_cfg.window_s)
-    for env, trial in ti.ndrange(cut(n, io.clock), n_trial):
+    for env, trial in ti.ndrange(loop_end(n, io.clock), n_trial):
         if decides(env, io):
             io.baselines.score[env, trial] = _score(
                 env, wanted_velocity(env, io), reachable_velocity(env, trial, window_s, io), io
             )
-    for env in range(cut(n, io.clock)):
+    for env in range(loop_end(n, io.clock)):
         if decides(env, io):
             best = 0
             for trial in range(1, n_trial):

@@ -27,7 +27,7 @@ from uuvtai.kernels.baselines.local_planner import (
 )
 from uuvtai.kernels.core.geometry import turned_z3
 from uuvtai.kernels.core.noise import STREAM_MPPI, episode_key, normal, stream_key
-from uuvtai.kernels.core.stage import Bundle, cut
+from uuvtai.kernels.core.stage import Bundle, loop_end
 
 _HEAVE_SIGMA_M_S = 0.2
 """Standard deviation of the noise on heave."""
@@ -48,13 +48,13 @@ _NEGLIGIBLE = 16.0
 def plan_path_integral(io: Bundle[LocalPlannerIO]):
     """One iteration of MPPI for the rows that decide in this step."""
     n, n_sample = ti.static(io.clock.active.shape[0], io.mppi_cfg.n_sample)
-    for env in range(cut(n, io.clock)):
+    for env in range(loop_end(n, io.clock)):
         if decides(env, io):
             _shift(env, io)
-    for env, sample in ti.ndrange(cut(n, io.clock), n_sample):
+    for env, sample in ti.ndrange(loop_end(n, io.clock), n_sample):
         if decides(env, io):
             io.baselines.score[env, sample] = _cost(env, sample, io)
-    for env in range(cut(n, io.clock)):
+    for env in range(loop_end(n, io.clock)):
         if decides(env, io):
             _average(env, io)
             first = io.baselines.plan_w[env, 0]

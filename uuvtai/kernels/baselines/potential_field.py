@@ -35,8 +35,7 @@ _LEAST_M = 0.05
 @ti.kernel
 def plan_potential_field(io: Bundle[LocalPlannerIO]):
     """Velocity along the sum of pull and pushes for the rows that decide in this step."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if decides(env, io):
             pull = wanted_velocity(env, io)
             force = pull + _push_of_obstacles(env, io) + _push_of_map(env, io)

@@ -21,7 +21,7 @@ from uuvtai.kernels.baselines.local_planner import (
     wanted_velocity,
 )
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3
-from uuvtai.kernels.core.stage import Bundle, cut
+from uuvtai.kernels.core.stage import Bundle, loop_end
 
 _FORBIDDEN = 100.0
 """Cost above that of every velocity outside all cones."""
@@ -36,10 +36,10 @@ def plan_velocity_obstacle(io: Bundle[LocalPlannerIO]):
     """Velocity of least cost for the rows that decide in this step."""
     n, n_trial = ti.static(io.clock.active.shape[0], io.baselines_cfg.n_reachable)
     window_s = ti.static(io.obstacle_cfg.window_s)
-    for env, trial in ti.ndrange(cut(n, io.clock), n_trial):
+    for env, trial in ti.ndrange(loop_end(n, io.clock), n_trial):
         if decides(env, io):
             io.baselines.score[env, trial] = _cost(env, reachable_velocity(env, trial, window_s, io), io)
-    for env in range(cut(n, io.clock)):
+    for env in range(loop_end(n, io.clock)):
         if decides(env, io):
             best = n_trial - 1
             for back in range(1, n_trial):

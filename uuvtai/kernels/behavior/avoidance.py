@@ -17,7 +17,7 @@ from uuvtai.kernels.behavior.rollout import (
 )
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
 from uuvtai.kernels.core.simd import filled, n_lane, put_column, row_lanes
-from uuvtai.kernels.core.stage import Bundle, Const, cut
+from uuvtai.kernels.core.stage import Bundle, Const, loop_end
 
 
 @quick_launch
@@ -27,7 +27,7 @@ def plan_evasion(io: Bundle[BehaviorIO]):
     as good as the best one."""
     n, lanes = ti.static(io.clock.active.shape[0], n_lane())
     n_packet = ti.static(io.behavior.candidate_cost.shape[1] // lanes)
-    for env, packet in ti.ndrange(cut(n, io.clock), n_packet):
+    for env, packet in ti.ndrange(loop_end(n, io.clock), n_packet):
         if io.clock.active[env] == 1 and io.behavior.want_evade[env] == 1:
             cx, cy, cz = candidate_lanes(env, packet * lanes, lanes, io)
             burst_s = ti.select(
@@ -38,7 +38,7 @@ def plan_evasion(io: Bundle[BehaviorIO]):
             cost = cost_lanes(env, cx, cy, cz, burst_s, io)
             for i in ti.static(range(lanes)):
                 io.behavior.candidate_cost[env, packet * lanes + i] = cost[i]
-    for env in range(cut(n, io.clock)):
+    for env in range(loop_end(n, io.clock)):
         if io.clock.active[env] == 1 and io.behavior.want_evade[env] == 1:
             index, best_cost, mean = _chosen(env, io)
             cx, cy, cz = filled(mean[0], lanes), filled(mean[1], lanes), filled(mean[2], lanes)

@@ -139,8 +139,7 @@ _NEARER_M = 0.2
 @ti.kernel
 def assess_threats(io: Bundle[BehaviorIO]):
     """Fill the blackboard, and decide which envs must plan an evasion in this step."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             if io.scan.fresh[env] == 1:
                 _sense_contact(env, io)

@@ -142,8 +142,7 @@ def tick_with_given_statuses(io: Bundle[BehaviorIO], result: AnyTensor):  # pyri
 @ti.kernel
 def reset_behavior(io: Bundle[BehaviorIO]):
     """Forget everything of the last episode in the active rows."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             for node in range(ti.static(io.behavior.status.shape[1])):
                 io.behavior.status[env, node] = ti.cast(codes.IDLE, ti.i8)
@@ -201,8 +200,7 @@ def _reset_blackboard(env, io: Bundle[BehaviorIO]):
 def tick_tree(io: Bundle[BehaviorIO], action: AnyTensor):
     """Tick the tree of every active env once and write its action, here and into ``action`` (n_env, 4) [-1,
     1]."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             for node in range(io.table.n_node[None]):
                 if io.table.kind[node] >= codes.CONDITION:

@@ -47,16 +47,17 @@ else:
 
 
 @ti.func
-def cut(count, clock: In[ClockState]):
-    """A loop's end, said such that no compiler knows it: our machine code cuts such a loop into blocks of any
-    size, where Taichi's have 512 items or more (``compile/codegen.py``)."""
-    return ti.min(count, count + clock.nothing[None])
+def loop_end(count, clock: In[ClockState]):
+    """``count`` as the end of a parallel loop. The compiler cannot know that ``zero`` is 0, so the size of a
+    block is worked out at run time, and our machine code makes blocks of any size; blocks of a loop whose end
+    is known have 512 items or more (``compile/codegen.py``)."""
+    return ti.min(count, count + clock.zero[None])
 
 
 @ti.func
 def n_envs(clock: In[ClockState]):
     """How many envs there are, as the end of a loop."""
-    return cut(ti.static(clock.active.shape[0]), clock)
+    return loop_end(ti.static(clock.active.shape[0]), clock)
 
 
 def shares(count: int) -> int:

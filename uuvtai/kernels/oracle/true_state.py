@@ -11,7 +11,7 @@ from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import BOX, NONE, turned_z
 from uuvtai.kernels.core.grid import centre_of, occupancy_of
 from uuvtai.kernels.core.simd import LANES, f16x, put_bit
-from uuvtai.kernels.core.stage import Bundle, Const, cut
+from uuvtai.kernels.core.stage import Bundle, Const, loop_end
 from uuvtai.kernels.oracle.io import TrueMapIO, TrueTracksIO
 from uuvtai.kernels.perception.height import COLUMN, half_height
 from uuvtai.kernels.perception.track_filter import CONFIRMED
@@ -56,7 +56,7 @@ def stamp_truth(io: Bundle[TrueMapIO]):
     """Add ``stamp`` to the dynamic occupancy of every cell whose centre a moving obstacle covers, clipped at
     1."""
     n_env, n_row, n_col = ti.static(io.grid_map.dynamic_occ.shape)
-    for env, row in ti.ndrange(cut(n_env, io.clock), n_row):
+    for env, row in ti.ndrange(loop_end(n_env, io.clock), n_row):
         if io.clock.active[env] == 1:
             for col in range(n_col):
                 if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), io) == 1:
@@ -94,7 +94,7 @@ def know_obstacles(io: Bundle[TrueTracksIO]):
     """One track for every moving obstacle, in the order of the obstacles; the nearest obstacles where the
     tracks are too few."""
     n, n_track = ti.static(io.tracks.alive.shape)
-    for env, track in ti.ndrange(cut(n, io.clock), n_track):
+    for env, track in ti.ndrange(loop_end(n, io.clock), n_track):
         if io.clock.active[env] == 1:
             io.clusters.fresh[env] = (
                 1  # tracks have changed: turn history and forecasts are to be worked out anew
@@ -191,7 +191,7 @@ def name_beams_truly(io: Bundle[TrueTracksIO]):
     """Every return of a fresh scan within ``_NAMED_M`` of an obstacle's outline, where it was at the ping,
     belongs to the nearest such body."""
     n, n_ray = ti.static(io.tracks.beam_track.shape)
-    for env, ray in ti.ndrange(cut(n, io.clock), n_ray):
+    for env, ray in ti.ndrange(loop_end(n, io.clock), n_ray):
         if io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
             ago = (io.clock.step[env] - io.scan.ping_step[env]) * io.episode_cfg.control_dt_s
             bearing = (io.scan.ping_yaw[env] + ti.static(io.sonar_cfg.first_beam_rad)) + ray * ti.static(

@@ -14,7 +14,7 @@ from uuvtai.kernels.core.beams import beam_there, beam_towards
 from uuvtai.kernels.core.geometry import FAR_M, quaternion_wb, rotation_wb, wrapped_angle
 from uuvtai.kernels.core.kalman import born, corrected, position_variance
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
-from uuvtai.kernels.core.stage import Bundle, cut, n_envs, shares
+from uuvtai.kernels.core.stage import Bundle, loop_end, n_envs, shares
 from uuvtai.kernels.perception.height import COLUMN, begin_height, heights, weigh_camera
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.sensor_model import NO_RETURN_SHARE, pinhole, wall_lanes
@@ -41,7 +41,7 @@ def scan_columns(io: Bundle[TrackingIO]):
     """Horizontal distance of the nearest thing in every column of a fresh image, FAR_M = none within range,
     height band and walls."""
     n, n_packet = ti.static(io.clock.active.shape[0], io.depth_cfg.cols // LANES)
-    for env, packet in ti.ndrange(cut(n, io.clock), n_packet):
+    for env, packet in ti.ndrange(loop_end(n, io.clock), n_packet):
         if io.clock.active[env] == 1 and io.image.fresh[env] == 1:
             near, edge = column_distances(env, packet * LANES, io)
             for i in ti.static(range(LANES)):
@@ -105,8 +105,7 @@ def column_distances(env, first_col, io: Bundle[TrackingIO]):
 @ti.kernel
 def follow_spots(io: Bundle[TrackingIO]):
     """Gather columns to spots and correct the moving tracks that they show."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1 and io.image.fresh[env] == 1:
             take_spots(env, io)
 
@@ -340,7 +339,7 @@ def look_at_obstacles(io: Bundle[TrackingIO]):
     """Weigh the heights of every moving track in the view of a fresh image."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     n_share = ti.static(shares(n_track))
-    for env, share in ti.ndrange(cut(n, io.clock), n_share):
+    for env, share in ti.ndrange(loop_end(n, io.clock), n_share):
         if io.clock.active[env] == 1 and io.image.fresh[env] == 1:
             late = (io.clock.step[env] - io.tracks.scan_step[env]) * io.episode_cfg.control_dt_s
             for track in range(share * n_track // n_share, (share + 1) * n_track // n_share):

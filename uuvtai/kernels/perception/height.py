@@ -18,7 +18,7 @@ from uuvtai.config import HeightConfig, TankConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
-from uuvtai.kernels.core.stage import Bundle, Const, In, Out, cut, shares
+from uuvtai.kernels.core.stage import Bundle, Const, In, Out, loop_end, shares
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.state import TrackState
 
@@ -145,7 +145,7 @@ def bound_heights(io: Bundle[TrackingIO]):
     """
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     n_share = ti.static(shares(n_track))
-    for env, share in ti.ndrange(cut(n, io.clock), n_share):
+    for env, share in ti.ndrange(loop_end(n, io.clock), n_share):
         if io.clock.active[env] == 1:
             own_z = io.ego.pos_w[env][2]
             for track in range(share * n_track // n_share, (share + 1) * n_track // n_share):

@@ -277,8 +277,7 @@ _LEAST_DEPTH_SIGMA_M = 0.001
 @ti.kernel
 def reset_pose(io: Bundle[LocalizationIO]):
     """At the known start, where ``ego.pos_w`` is, with the heading that the IMU says. Active rows only."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             pos = io.ego.pos_w[env]
             io.localization.mean[env] = ti.Vector([pos[0], pos[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -306,8 +305,7 @@ def reset_pose(io: Bundle[LocalizationIO]):
 def predict_pose(io: Bundle[LocalizationIO]):
     """Move both filters to this step, take in DVL and pressure, and say where the vehicle is: the sonar's
     ping is noted there. Active rows only."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             step = io.clock.step[env]
             motion = level_motion(env, io)
@@ -330,8 +328,7 @@ def predict_pose(io: Bundle[LocalizationIO]):
 @ti.kernel
 def correct_pose(io: Bundle[LocalizationIO]):
     """Take in the walls of a scan that has just come. Active rows only."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
             before = io.localization.mean[env][2]
             take_walls(env, io)

@@ -30,7 +30,7 @@ from uuvtai.common.enums import FULL
 from uuvtai.compile.launch import quick_launch, with_cse
 from uuvtai.kernels.core.grid import occupancy_of
 from uuvtai.kernels.core.simd import WORD, bit_of, lowest_bit, n_item, n_turn, taken, with_bit, without_lowest
-from uuvtai.kernels.core.stage import Bundle, Const, cut, fetch, shares
+from uuvtai.kernels.core.stage import Bundle, Const, fetch, loop_end, shares
 from uuvtai.kernels.perception.io import MappingIO
 from uuvtai.kernels.perception.sensor_model import mark_depth, mark_scan
 
@@ -327,16 +327,16 @@ def update_map(io: Bundle[MappingIO]):
         scans_in(io.mapping_cfg.free_confident_s, look_s), scans_in(io.mapping_cfg.promote_s, look_s)
     )
     if ti.static(n_item() > 1):  # each loop ends before the next begins
-        for env, item in ti.ndrange(cut(n_env, io.clock), ti.static(n_item())):
+        for env, item in ti.ndrange(loop_end(n_env, io.clock), ti.static(n_item())):
             mark_together(env, item, promote, io)
-        for env, word in ti.ndrange(cut(n_env, io.clock), ti.static(io.map_scratch.fan_edge.shape[2])):
+        for env, word in ti.ndrange(loop_end(n_env, io.clock), ti.static(io.map_scratch.fan_edge.shape[2])):
             if io.map_scratch.due[env] != 0:
                 fill_fan(env, word, io)
-        for env, item in ti.ndrange(cut(n_env, io.clock), ti.static(n_item())):
+        for env, item in ti.ndrange(loop_end(n_env, io.clock), ti.static(n_item())):
             if io.map_scratch.due[env] != 0:
                 merge_together(env, item, confident, io)
     else:  # one thread has all of an env's bits, and does all of it while its scratch is in the cache
-        for slot in range(cut(n_slot, io.clock)):
+        for slot in range(loop_end(n_slot, io.clock)):
             for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
                 take_alone(env, slot, confident, promote, io)
 
@@ -348,7 +348,7 @@ def reset_map(io: Bundle[MappingIO]):
     """An empty map: nothing occupied, nothing seen."""
     n_env, n_row, n_col = ti.static(io.grid_map.static_occ.shape)
     n_share = ti.static(shares(n_row))
-    for env, share in ti.ndrange(cut(n_env, io.clock), n_share):
+    for env, share in ti.ndrange(loop_end(n_env, io.clock), n_share):
         if io.clock.active[env] == 1:
             io.grid_map.map_step[env] = _NO_SCAN
             io.grid_map.depth_waits[env] = 0

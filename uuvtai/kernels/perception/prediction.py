@@ -328,8 +328,7 @@ MOST_LEGS = 6
 @ti.kernel
 def reset_forecast(io: Bundle[TrackingIO]):
     """Know no turn history and expect nothing in the active rows."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             forget_turns(env, io)
             for track in range(io.forecast.radius_m.shape[1]):
@@ -344,8 +343,7 @@ def reset_forecast(io: Bundle[TrackingIO]):
 @ti.kernel
 def learn_turns(io: Bundle[TrackingIO]):
     """Watch how the tracks move, after each tracked scan."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             for track in range(io.tracks.alive.shape[1]):
                 learn_turn(env, track, io)
@@ -360,10 +358,9 @@ def forecast_tracks(io: Bundle[TrackingIO]):
     as the filter knows it today: turns to come are not in it (the planner's own growing margin is for them).
     At most ``max_growth_m``.
     """
-    n = n_envs(io.clock)
     n_track = ti.static(io.tracks.alive.shape[1])
     n_share = ti.static(shares(n_track))
-    for env, share in ti.ndrange(n, n_share):
+    for env, share in ti.ndrange(n_envs(io.clock), n_share):
         if io.clock.active[env] == 1:
             # only a tracked scan or an image changes tracks and turn history
             changed = io.clusters.fresh[env] + io.image.fresh[env] > 0

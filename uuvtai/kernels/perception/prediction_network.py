@@ -30,7 +30,7 @@ from uuvtai.common.enums import (
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.simd import LANES
-from uuvtai.kernels.core.stage import Bundle, cut
+from uuvtai.kernels.core.stage import Bundle, loop_end
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.prediction import IN_X, IN_Y, OUT_X, OUT_Y, WEIGHT, next_turn, wall_ahead
 
@@ -41,7 +41,7 @@ def mix_futures(io: Bundle[TrackingIO]):
     """In decision steps: the likeliest future of every track that has a forecast becomes its forecast, the
     others are its futures, with their probabilities."""
     n, n_track = ti.static(io.clock.active.shape[0], io.forecast.radius_m.shape[1])
-    for env, track in ti.ndrange(cut(n, io.clock), n_track):
+    for env, track in ti.ndrange(loop_end(n, io.clock), n_track):
         due = io.clock.step[env] % ti.static(io.behavior_cfg.decide_period_steps) == 0
         if due and io.clock.active[env] == 1:
             if io.forecast.radius_m[env, track, 0] >= 0:
@@ -146,7 +146,7 @@ _BACK_COS = -0.9
 def reset_past(io: Bundle[TrackingIO]):
     """Remember nothing in the active rows."""
     n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
-    for env, track in ti.ndrange(cut(n, io.clock), n_track):
+    for env, track in ti.ndrange(loop_end(n, io.clock), n_track):
         if io.clock.active[env] == 1:
             _forget(env, track, io)
             for i in range(io.mixture.frame.shape[2]):
@@ -162,7 +162,7 @@ def reset_past(io: Bundle[TrackingIO]):
 def remember_past(io: Bundle[TrackingIO]):
     """After each tracked scan: where the tracks are, and where they turned. A new track remembers nothing."""
     n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
-    for env, track in ti.ndrange(cut(n, io.clock), n_track):
+    for env, track in ti.ndrange(loop_end(n, io.clock), n_track):
         if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             if io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0:
                 _forget(env, track, io)
@@ -175,7 +175,7 @@ def remember_past(io: Bundle[TrackingIO]):
 def describe_motion(io: Bundle[TrackingIO]):
     """In decision steps: the columns of every track that has a forecast."""
     n, n_track = ti.static(io.clock.active.shape[0], io.tracks.alive.shape[1])
-    for env, track in ti.ndrange(cut(n, io.clock), n_track):
+    for env, track in ti.ndrange(loop_end(n, io.clock), n_track):
         due = io.clock.step[env] % ti.static(io.behavior_cfg.decide_period_steps) == 0
         if due and io.clock.active[env] == 1 and io.forecast.radius_m[env, track, 0] >= 0:
             mean, place = io.tracks.state[env, track], io.forecast.pos_w[env, track, 0]

@@ -238,8 +238,7 @@ def is_new(env, beam, scan: In[SonarScan], sonar_cfg: Const[SonarConfig]):
 @ti.kernel
 def reset_echoes(io: Bundle[EchoesIO]):
     """Nothing was heard yet, in the active rows."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             for slot in range(io.echoes.step.shape[1]):
                 io.echoes.step[env, slot] = NEVER
@@ -257,8 +256,7 @@ def reset_echoes(io: Bundle[EchoesIO]):
 @ti.kernel
 def recall_echoes(io: Bundle[EchoesIO]):
     """Keep the new beams, and fill the others of the scan with what is remembered."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1 and io.scan.fresh[env] == 1:
             keep_new(env, io)
             show_old(env, io)

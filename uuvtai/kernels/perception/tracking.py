@@ -468,8 +468,7 @@ def swept_reach(env, track, io: Bundle[TrackingIO]):
 @ti.kernel
 def reset_tracks(io: Bundle[TrackingIO]):
     """Forget everything about the active rows."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             io.tracks.scan_step[env] = -1
             io.clusters.scan_step[env] = -1
@@ -507,8 +506,7 @@ def track_obstacles(io: TrackingIO) -> None:
 @ti.kernel
 def take_scan(io: Bundle[TrackingIO]):
     """See whether a scan is due, and which of its beams may have hit a obstacle."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             io.clusters.fresh[env] = is_due(env, io)
             if io.clusters.fresh[env] == 1:
@@ -521,8 +519,7 @@ def take_scan(io: Bundle[TrackingIO]):
 @ti.kernel
 def cluster_beams(io: Bundle[TrackingIO]):
     """Gather the beams into clusters."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             find_clusters(env, io)
 
@@ -531,8 +528,7 @@ def cluster_beams(io: Bundle[TrackingIO]):
 @ti.kernel
 def follow_obstacles(io: Bundle[TrackingIO]):
     """Predict the tracks to the new ping, match them with clusters and correct them."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             dt = predict_tracks(env, io)
             associate(env, dt, io)
@@ -543,8 +539,7 @@ def follow_obstacles(io: Bundle[TrackingIO]):
 @ti.kernel
 def keep_slots(io: Bundle[TrackingIO]):
     """End lost tracks, begin new ones, and name the beams."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1 and io.clusters.fresh[env] == 1:
             prune_tracks(env, ti.static(tracked_period_s(io.tracking_cfg, io.sonar_cfg, io.episode_cfg)), io)
             spawn_tracks(env, io)

@@ -39,7 +39,7 @@ from uuvtai.kernels.core.simd import (
     put_bit,
     without_lowest,
 )
-from uuvtai.kernels.core.stage import Bundle, Const, In, cut
+from uuvtai.kernels.core.stage import Bundle, Const, In, loop_end
 from uuvtai.kernels.planning.clearance_gpu import (
     find_changes,
     is_due,
@@ -323,15 +323,15 @@ def compute_clearance(io: Bundle[ClearanceIO]):
     due."""
     n_env, n_slot = ti.static(io.clock.active.shape[0], io.clearance_memory.row_key.shape[0])
     if ti.static(n_item() > 1):  # each loop ends before the next begins
-        for env, item in ti.ndrange(cut(n_env, io.clock), ti.static(n_item())):
+        for env, item in ti.ndrange(loop_end(n_env, io.clock), ti.static(n_item())):
             find_changes(env, item, io)
-        for env, item in ti.ndrange(cut(n_env, io.clock), ti.static(n_item())):
+        for env, item in ti.ndrange(loop_end(n_env, io.clock), ti.static(n_item())):
             if is_due(env, io) == 1:
                 redo_cells(env, item, io)
-        for env, item in ti.ndrange(cut(n_env, io.clock), ti.static(n_item())):
+        for env, item in ti.ndrange(loop_end(n_env, io.clock), ti.static(n_item())):
             if is_due(env, io) == 1:
                 note_farthest(env, item, io)
     else:
-        for slot in range(cut(n_slot, io.clock)):
+        for slot in range(loop_end(n_slot, io.clock)):
             for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
                 bring_up_to_date(env, slot, io)

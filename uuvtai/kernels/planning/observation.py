@@ -11,7 +11,7 @@ from uuvtai.compile.launch import quick_launch
 from uuvtai.config import ObservationConfig
 from uuvtai.kernels.core.beams import range_rate
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, turned_z
-from uuvtai.kernels.core.stage import Bundle, ColumnGroup, FloatMatrix, Out, cut, n_envs
+from uuvtai.kernels.core.stage import Bundle, ColumnGroup, FloatMatrix, Out, loop_end, n_envs
 from uuvtai.kernels.perception.prediction import expected_turn_rate
 from uuvtai.kernels.planning.io import ObservationIO
 
@@ -262,7 +262,7 @@ def sense_sectors(io: Bundle[ObservationIO]):
     """Sector s is centred at s * 360 / n_sector degrees from ahead, counter-clockwise. One work item per
     sector."""
     n, n_sector = ti.static(io.observation.sector_range_m.shape[0], io.observation.sector_range_m.shape[1])
-    for env, sector in ti.ndrange(cut(n, io.clock), n_sector):
+    for env, sector in ti.ndrange(loop_end(n, io.clock), n_sector):
         if io.clock.active[env] == 1:
             first, last = sector_beams(
                 sector,
@@ -508,7 +508,7 @@ _OWN_COLUMNS = tuple(column for column in COLUMNS if not column.per)
 def write_observation(io: Bundle[ObservationIO], obs: FloatMatrix):
     """Observation (n_env, n_obs) of the active rows, raw SI units, in the order of ``COLUMNS``."""
     n, n_sector = ti.static(io.observation.sector_range_m.shape[0], io.observation.sector_range_m.shape[1])
-    for env in range(cut(n, io.clock)):
+    for env in range(loop_end(n, io.clock)):
         if io.clock.active[env] == 1:
             for source, first, width in ti.static(_sources(_OWN_COLUMNS, io.observation_cfg)):
                 value = source(env, io)
@@ -525,13 +525,13 @@ def write_obstacles(io: Bundle[ObservationIO], obs: FloatMatrix):
     """Columns of the ``n_track`` moving obstacles that come closest to the active rows, in the order of
     ``OBSTACLE_COLUMNS``."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
-    for env, track in ti.ndrange(cut(n, io.clock), n_track):
+    for env, track in ti.ndrange(loop_end(n, io.clock), n_track):
         if io.clock.active[env] == 1:
             io.observation.closest_m[env, track] = FAR_M
             if io.forecast.radius_m[env, track, 0] >= 0.0:
                 gap, time = closest_approach(env, track, io)
                 io.observation.closest_m[env, track], io.observation.closest_s[env, track] = gap, time
-    for env in range(cut(n, io.clock)):
+    for env in range(loop_end(n, io.clock)):
         if io.clock.active[env] == 1:
             track, used = -1, 1
             for slot in range(ti.static(io.observation_cfg.n_track)):
@@ -556,8 +556,7 @@ def put_obstacle_columns(env, slot, value, obs: Out[FloatMatrix], io: Bundle[Obs
 @ti.kernel
 def write_advice(io: Bundle[ObservationIO], obs: FloatMatrix):
     """Columns of what the behaviour tree does now in the active rows, in the order of ``TEACHER_COLUMNS``."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             for source, first, width in ti.static(_sources(TEACHER_COLUMNS, io.observation_cfg)):
                 value = source(env, io)

@@ -142,8 +142,7 @@ _LONG_AGO = -(1 << 20)
 @ti.kernel
 def reset_route(io: Bundle[RouteIO]):
     """No route, no history, in the active rows."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             for field in ti.static((
                 io.route.n_way, io.route.cost, io.route.planner, io.route.trigger, io.route.fired,
@@ -172,8 +171,7 @@ def reset_route(io: Bundle[RouteIO]):
 def follow_route(io: Bundle[RouteIO]):
     """Path-relative terms of the active rows, from the foot that ``fire_triggers`` moved or from the start of
     a route planned since."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             if io.route.want_plan[env] == 1:  # else ``fire_triggers`` has just looked along the same route
                 _look_again(env, io)

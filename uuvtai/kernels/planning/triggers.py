@@ -36,9 +36,8 @@ _STUCK_M_S, _FORECAST_CLEARANCE_M = 0.08, 0.35
 def fire_triggers(io: Bundle[RouteIO]):
     """Move the foot along the route, look along it, find the triggers that hold, and queue the envs that plan
     in this step, in any order."""
-    n = n_envs(io.clock)
     io.route.n_queue[None] = 0
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             if io.route.n_way[env] > 0:
                 io.route.arc[env] = advanced_arc(io.route, env, level(io.ego.pos_w[env]))

@@ -20,7 +20,7 @@ from uuvtai.common.enums import (
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.grid import clearance_of, grid_origin
 from uuvtai.kernels.core.simd import filled, n_lane
-from uuvtai.kernels.core.stage import Bundle, FloatMatrix, cut
+from uuvtai.kernels.core.stage import Bundle, FloatMatrix, loop_end
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.kernels.planning.medial_axis import (
     FOUND,
@@ -47,7 +47,7 @@ def plan_routes(io: Bundle[RouteIO]):
     route."""
     n = ti.static(io.voronoi.cost.shape[0])
     io.route.n_failed[None] = 0
-    for slot in range(cut(n, io.clock)):
+    for slot in range(loop_end(n, io.clock)):
         item = slot
         while item < io.route.n_queue[None]:
             _plan(slot, io.route.queue[item], io)

@@ -15,7 +15,7 @@ from uuvtai.compile.launch import is_gpu_shaped, quick_launch, with_cse
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE, rotation_wb
 from uuvtai.kernels.core.noise import STREAM_DEPTH, normal_pair_lanes, stream_key
 from uuvtai.kernels.core.simd import LANES, f16x, ramp
-from uuvtai.kernels.core.stage import Bundle, cut, n_envs, shares
+from uuvtai.kernels.core.stage import Bundle, loop_end, n_envs, shares
 from uuvtai.kernels.sensors.io import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
 
@@ -45,7 +45,7 @@ def reset_depth(io: Bundle[DepthIO]):
     """Forget the image of the active rows (the shot of step 0 fills it)."""
     n, n_row, n_col = ti.static(io.image.depth_m.shape)
     n_share = ti.static(shares(n_row))
-    for env, share in ti.ndrange(cut(n, io.clock), n_share):
+    for env, share in ti.ndrange(loop_end(n, io.clock), n_share):
         if io.clock.active[env] == 1:
             for row in range(share * n_row // n_share, (share + 1) * n_row // n_share):
                 for col in range(n_col):
@@ -62,10 +62,9 @@ def reset_depth(io: Bundle[DepthIO]):
 def cast_depth(io: Bundle[DepthIO]):
     """New image in the rows whose step is a multiple of period_steps (step 0 included); the others keep
     theirs with ``fresh`` = 0."""
-    n = n_envs(io.clock)
     block_rows = ti.static(rows_per_item())
     n_block = ti.static(-(-io.depth_cfg.rows // block_rows))
-    for env, block in ti.ndrange(n, n_block):
+    for env, block in ti.ndrange(n_envs(io.clock), n_block):
         if io.clock.active[env] == 1:
             due = io.clock.step[env] % io.depth_cfg.period_steps == 0
             if block == 0:

@@ -25,8 +25,7 @@ from uuvtai.kernels.sensors.sonar import note_ping, place_sonar, reported, sonar
 def turn_head(io: Bundle[SonarIO]):
     """Take the beams that are due; ``scan.fresh`` is 1 only where there is one. The first is due at
     step 0."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             step = io.clock.step[env]
             begin, end = ti.cast(0, ti.i64), head_steps(step, io)

@@ -40,8 +40,7 @@ _RISE_RATE = 4.0
 def reset_proprioception(io: Bundle[ProprioceptionIO]):
     """Draw the errors that stay constant over an episode; the estimate starts at the true position. Active
     rows only."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             draw_constants(env, io)
             clear_readings(env, io)
@@ -106,8 +105,7 @@ def clear_readings(env, io: Bundle[ProprioceptionIO]):
 @ti.kernel
 def sense_proprioception(io: Bundle[ProprioceptionIO]):
     """One reading of every sensor whose turn it is, then the pose estimate. Active rows only."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             key, step = io.episode.key[env], io.clock.step[env]
             read_imu(env, key, step, io)
@@ -223,8 +221,7 @@ def loses_velocity(sensors_cfg):
 def find_velocity(io: Bundle[VelocityIO]):
     """Find what is known of the velocity where the DVL says nothing, whoever filled the readings. Active rows
     only."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             rpy = io.ego.rpy[env]
             rotation = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))

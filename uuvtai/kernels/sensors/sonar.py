@@ -244,8 +244,7 @@ Mount = ti.types.struct(pos=ti.math.vec3, vel=ti.math.vec2, heading=ti.math.vec2
 def reset_sonar(io: Bundle[SonarIO]):
     """Forget scans and clouds of the active rows: no return anywhere, nothing fresh or under way (step 0 then
     fills the scan)."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             clear_scan(env, io)
             clear_memory(env, io)

@@ -121,8 +121,7 @@ def outcome_of(env, io: Bundle[EpisodeIO]):
 @ti.kernel
 def reset_termination(io: Bundle[EpisodeIO]):
     """Start the termination check's book of the active rows with the initial clearance."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             threat = nearest_threat(env, io)
             io.termination.outcome[env] = RUNNING
@@ -138,8 +137,7 @@ def reset_termination(io: Bundle[EpisodeIO]):
 def check_termination(io: Bundle[EpisodeIO]):
     """Clearance, time to collision, way driven and outcome of the active rows after they and the obstacles
     have moved."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             threat = nearest_threat(env, io)
             io.termination.clearance_m[env] = threat[0]

@@ -136,8 +136,7 @@ def compute_reward(
     """Reward of the step, weighted terms, their sums, and how the step ended. Rows that sleep earn 0 and keep
     their end."""
     weights = ti.Vector(ti.static(list(signed_weights(io.reward_cfg))))
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 0 and env < reward_out.shape[0]:
             reward_out[env] = 0.0
         if io.clock.active[env] == 1:

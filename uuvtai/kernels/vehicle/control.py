@@ -11,7 +11,7 @@ import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.simd import column, is_active, n_active, n_column, put_column
-from uuvtai.kernels.core.stage import Bundle, Const, FloatMatrix, In, Out, cut, n_envs
+from uuvtai.kernels.core.stage import Bundle, Const, FloatMatrix, In, Out, loop_end, n_envs
 from uuvtai.kernels.vehicle.dynamics import rpm_of_thrust, thrust_limits, thrust_of_rpm
 from uuvtai.kernels.vehicle.io import ActuationIO
 from uuvtai.kernels.vehicle.thruster_fault import vertical_pair
@@ -27,7 +27,7 @@ def command_thrusters(io: Bundle[ActuationIO], action: FloatMatrix):
     actuation.rpm_command."""
     n, lanes = ti.static(io.clock.active.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
-    for packet in range(cut(n_packet, io.clock)):
+    for packet in range(loop_end(n_packet, io.clock)):
         if n_active(packet * lanes, lanes, io.clock) > 0:
             for env in range(packet * lanes, (packet + 1) * lanes):
                 if is_active(env, io.clock):
@@ -56,8 +56,7 @@ def take_action(io: Bundle[ActuationIO], asked: FloatMatrix, action: FloatMatrix
 @ti.kernel
 def reset_actuation(io: Bundle[ActuationIO]):
     """Nothing commanded, nothing under way."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             io.actuation.command[env] = 0.0
             io.actuation.integral[env] = 0.0

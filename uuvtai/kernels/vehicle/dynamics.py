@@ -29,7 +29,7 @@ from uuvtai.kernels.core.noise import (
     uniform_in,
 )
 from uuvtai.kernels.core.simd import column, is_active, n_active, n_column, put_column
-from uuvtai.kernels.core.stage import Bundle, Const, In, Out, cut, n_envs
+from uuvtai.kernels.core.stage import Bundle, Const, In, Out, loop_end, n_envs
 from uuvtai.kernels.vehicle.io import DynamicsIO
 
 # ------------------------------------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
     step."""
     n, lanes = ti.static(io.clock.active.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
-    for packet in range(cut(n_packet, io.clock)):
+    for packet in range(loop_end(n_packet, io.clock)):
         if n_active(packet * lanes, lanes, io.clock) > 0:
             _move(packet * lanes, lanes, dt_s / n_substep, n_substep, io)
             if ti.static(io.disturbance_cfg.current_sigma_m_s > 0):
@@ -139,8 +139,7 @@ def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
 @ti.kernel
 def reset_vehicle(io: Bundle[DynamicsIO]):
     """At rest at the mission's start, with this episode's parameters and current."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             _place(env, io)
             _draw_body(env, io)

@@ -79,8 +79,7 @@ def _offset_n2(vehicle_cfg, sensors_cfg):
 @ti.kernel
 def watch_thrusters(io: Bundle[ThrusterWatchIO]):
     """Weigh what the last commands did, before new ones are given. Active rows only."""
-    n = n_envs(io.clock)
-    for env in range(n):
+    for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             watched = io.clock.step[env] > 0 and io.ego.vel_valid[env] == 1
             if watched and io.ego.given_up[env] <= 0:

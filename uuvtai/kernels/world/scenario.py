@@ -22,7 +22,7 @@ from uuvtai.kernels.core.geometry import (
     nearest_squared,
 )
 from uuvtai.kernels.core.noise import STREAM_SCENARIO, stream_key, uniform, uniform_in
-from uuvtai.kernels.core.stage import Bundle, cut, n_envs, shares
+from uuvtai.kernels.core.stage import Bundle, loop_end, n_envs, shares
 from uuvtai.kernels.world.io import WorldIO
 from uuvtai.kernels.world.motion import (
     draw_moving_obstacles,
@@ -348,7 +348,7 @@ def move_obstacles(io: Bundle[WorldIO]):
     stays."""
     n, n_lane = ti.static(io.path.n_way.shape[:2])
     n_share = ti.static(shares(n_lane))
-    for env, share in ti.ndrange(cut(n, io.clock), n_share):
+    for env, share in ti.ndrange(loop_end(n, io.clock), n_share):
         if io.clock.active[env] == 1:
             time_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
             for lane in range(share * n_lane // n_share, (share + 1) * n_lane // n_share):

@@ -22,7 +22,7 @@ import numpy as np
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import whole_folder
 from uuvtai.common.version import __version__
-from uuvtai.compile.codegen import Compiler, Machine, UnfitError, runtime_layout, tasks_in
+from uuvtai.compile.codegen import Compiler, Machine, UnfitError, completed, emitted, runtime_layout, tasks_in
 from uuvtai.compile.launch import NativeLaunch, compiling, given
 from uuvtai.config import Config
 from uuvtai.kernels.planning import route
@@ -341,13 +341,13 @@ def _object(text: str, kind: MachineKind, public: str) -> bytes:
     machine = target.create_target_machine(
         cpu=kind.cpu, features=kind.features, opt=3, reloc="pic", codemodel="default"
     )
-    module = llvm.parse_assembly(_OF_A_PROCESSOR.sub("", text))
+    module = llvm.parse_assembly(completed(_OF_A_PROCESSOR.sub("", text)))
     module.triple, module.data_layout = kind.triple, str(machine.target_data)
     for function in module.functions:
         if not function.is_declaration and function.name != public:
             function.linkage = "internal"
     module.verify()
-    return machine.emit_object(module)
+    return emitted(module, machine)
 
 
 PACKAGE = "uuv_stack"  # of the copied files
