@@ -41,13 +41,12 @@ def test_a_gpus_numbers_are_told_at_once(small):
         assert (counts.number(sim.s.route.n_failed), counts.any_ended) == (3, 0)
         outcome[SmallSim.N - 1] = TIMEOUT
         assert (counts.number(sim.s.route.n_failed), counts.any_ended) == (3, 1)
-        mask = torch.zeros(SmallSim.N, dtype=torch.int32)
-        assert not counts.has_any(sim.s.termination.outcome, mask)
-        mask[-1] = 1
-        assert counts.has_any(sim.s.termination.outcome, mask)
-        assert HostCounts(sim._memory, sim.s.termination.outcome, SmallSim.N).has_any(
-            sim.s.termination.outcome, mask
-        )
+        for where in (memory, sim._memory):
+            counts = HostCounts(where, sim.s.termination.outcome, SmallSim.N)
+            outcome[...] = 0
+            assert not counts.has_any(sim.s.termination.outcome)
+            outcome[SmallSim.N - 1] = TIMEOUT
+            assert counts.has_any(sim.s.termination.outcome)
     finally:
         outcome[...], failed[...] = kept, 0
 

@@ -410,13 +410,10 @@ class MixtureNet(nn.Module):
         out, bias = torch.zeros(N_HIDDEN, N_SAID), torch.zeros(N_SAID)
         out[:, :N_TOLD], bias[:N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
         found = {"weight_out": out, "bias_out": bias}
-        for name, layer in self._layers().items():
+        layers = {"in": self.into, "mid": self.middle, "spread": self.spread}  # the last one is padded there
+        for name, layer in layers.items():
             found |= {f"weight_{name}": layer.weight.T, f"bias_{name}": layer.bias}
         return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
-
-    def _layers(self) -> dict[str, nn.Linear]:
-        """Those that are in the file as they are; the last one is padded there."""
-        return {"in": self.into, "mid": self.middle, "spread": self.spread}
 
 
 def negative_log_likelihood(mixture: Mixture, truth: torch.Tensor) -> torch.Tensor:

@@ -20,7 +20,6 @@ from uuvtai.config.loader import MAX_BYTES as MAX_YAML_BYTES
 from uuvtai.config.loader import ConfigError
 from uuvtai.report import figures
 from uuvtai.report.blocks import Block, Figure, PageSection
-from uuvtai.report.tables import Data
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -67,8 +66,9 @@ def render(page: Page) -> tuple[str, dict[str, bytes]]:
     drawing = _Drawing()
     html = _template().render(
         page=page, version=__version__, svgs=drawing.svgs, kind=lambda block: type(block).__name__,
-        max_rows=_MAX_SHOWN_ROWS,
-        on_page=on_page, csv_uri=_csv_uri, file_name=_file_name, data_uri=_data_uri, text=_text,
+        max_rows=_MAX_SHOWN_ROWS, text=_text,
+        csv_uri=lambda data: "data:text/csv;charset=utf-8," + quote(data.csv()),
+        on_page=on_page, file_name=_file_name, data_uri=_data_uri,
     )  # fmt: skip
     return html, drawing.pngs
 
@@ -83,10 +83,6 @@ def _template() -> Template:
     return environment.from_string(
         (resources.files("uuvtai") / "report" / "page.html.j2").read_text(encoding="utf-8")
     )
-
-
-def _csv_uri(data: Data) -> str:
-    return "data:text/csv;charset=utf-8," + quote(data.csv())
 
 
 def _data_uri(mime: str, content: bytes) -> str:

@@ -549,11 +549,11 @@ class HostCounts:
         chosen = range(self._num_envs) if envs is None else envs
         return copied_rows(field, torch.tensor(chosen, dtype=torch.int32, device=self._memory.device))
 
-    def has_any(self, field: ti.Field, mask: torch.Tensor) -> bool:
-        """Whether a number of these rows (int32 ``mask``) is not 0."""
+    def has_any(self, field: ti.Field) -> bool:
+        """Whether a number of a field of one axis is not 0."""
         if self._memory.device.type == "cpu":
-            return bool(self._memory.live(field)[: len(mask)][mask.numpy() != 0].any())
-        return bool((self._memory.tensor(field)[: len(mask)] * mask).any())
+            return bool(np.count_nonzero(self._memory.live(field)))
+        return bool(self._memory.tensor(field).any())
 
 
 def copied_rows(field: ti.Field, chosen: torch.Tensor) -> np.ndarray:

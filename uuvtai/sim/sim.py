@@ -214,12 +214,15 @@ class Sim:
         """Draw the scenarios of a ``reset`` to look at them, and nothing more: no row is ready for a step."""
         for kept, given in zip(self._asked, (mask, seed, number), strict=True):
             kept.copy_(given)
+        self._launched(self._begin)
+        if self.counts.has_any(self.s.world.faults):
+            check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
+
+    def _begin(self) -> None:
         episode.begin_episodes(self.io.episode, *self._asked)
         with self._stage("world"):
             scenario.generate_scenarios(self.io.world)
             scenario.move_obstacles(self.io.world)
-        if self.counts.has_any(self.s.world.faults, mask):
-            check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
 
     def deactivate_ended(self) -> None:
         """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""

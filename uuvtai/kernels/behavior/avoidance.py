@@ -17,7 +17,7 @@ from uuvtai.kernels.behavior.rollout import (
 )
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
 from uuvtai.kernels.core.simd import filled, n_lane, put_column, row_lanes
-from uuvtai.kernels.core.stage import Bundle, Const, loop_end
+from uuvtai.kernels.core.stage import Bundle, Const, loop_end, shares
 
 
 @quick_launch
@@ -27,17 +27,20 @@ def plan_evasion(io: Bundle[BehaviorIO]):
     as good as the best one."""
     n, lanes = ti.static(io.clock.active.shape[0], n_lane())
     n_packet = ti.static(io.behavior.candidate_cost.shape[1] // lanes)
-    for env, packet in ti.ndrange(loop_end(n, io.clock), n_packet):
+    n_share = ti.static(shares(n_packet))
+    for env, share in ti.ndrange(loop_end(n, io.clock), n_share):
         if io.clock.active[env] == 1 and io.behavior.want_evade[env] == 1:
-            cx, cy, cz = candidate_lanes(env, packet * lanes, lanes, io)
-            burst_s = ti.select(
-                packet * lanes >= io.behavior_cfg.first_burst,
-                io.behavior_cfg.burst_s * tuned(env, BURST, io),
-                FAR_M,
-            )
-            cost = cost_lanes(env, cx, cy, cz, burst_s, io)
-            for i in ti.static(range(lanes)):
-                io.behavior.candidate_cost[env, packet * lanes + i] = cost[i]
+            for packet in range(share * n_packet // n_share, (share + 1) * n_packet // n_share):
+                first = packet * lanes
+                cx, cy, cz = candidate_lanes(env, first, lanes, io)
+                burst_s = ti.select(
+                    first >= io.behavior_cfg.first_burst,
+                    io.behavior_cfg.burst_s * tuned(env, BURST, io),
+                    FAR_M,
+                )
+                cost = cost_lanes(env, cx, cy, cz, burst_s, io)
+                for i in ti.static(range(lanes)):
+                    io.behavior.candidate_cost[env, first + i] = cost[i]
     for env in range(loop_end(n, io.clock)):
         if io.clock.active[env] == 1 and io.behavior.want_evade[env] == 1:
             index, best_cost, mean = _chosen(env, io)

@@ -41,12 +41,14 @@ def scan_columns(io: Bundle[TrackingIO]):
     """Horizontal distance of the nearest thing in every column of a fresh image, FAR_M = none within range,
     height band and walls."""
     n, n_packet = ti.static(io.clock.active.shape[0], io.depth_cfg.cols // LANES)
-    for env, packet in ti.ndrange(loop_end(n, io.clock), n_packet):
+    n_share = ti.static(shares(n_packet))
+    for env, share in ti.ndrange(loop_end(n, io.clock), n_share):
         if io.clock.active[env] == 1 and io.image.fresh[env] == 1:
-            near, edge = column_distances(env, packet * LANES, io)
-            for i in ti.static(range(LANES)):
-                io.spots.column_m[env, packet * LANES + i] = near[i]
-                io.spots.edge_m[env, packet * LANES + i] = edge[i]
+            for packet in range(share * n_packet // n_share, (share + 1) * n_packet // n_share):
+                near, edge = column_distances(env, packet * LANES, io)
+                for i in ti.static(range(LANES)):
+                    io.spots.column_m[env, packet * LANES + i] = near[i]
+                    io.spots.edge_m[env, packet * LANES + i] = edge[i]
 
 
 @ti.func

@@ -256,7 +256,7 @@ def is_traversable(env, row, col, room, io: Bundle[RouteIO]):
     """True where a route may pass: a cell with its clearance. The map may be newer, so both are asked."""
     wide = room >= ti.static(io.voronoi_cfg.min_clearance_m - _SLACK_M)
     free = occupancy(env, row, col, io) < ti.static(io.mapping_cfg.occupied)
-    return wide and free and io.mask.outside[row, col] == 0
+    return wide & free & (io.mask.outside[row, col] == 0)
 
 
 # ------------------------------------------------------------------------------------------------------------

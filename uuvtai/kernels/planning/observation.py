@@ -11,7 +11,7 @@ from uuvtai.compile.launch import quick_launch
 from uuvtai.config import ObservationConfig
 from uuvtai.kernels.core.beams import range_rate
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, turned_z
-from uuvtai.kernels.core.stage import Bundle, ColumnGroup, FloatMatrix, Out, loop_end, n_envs
+from uuvtai.kernels.core.stage import Bundle, ColumnGroup, FloatMatrix, Out, loop_end, n_envs, shares
 from uuvtai.kernels.perception.prediction import expected_turn_rate
 from uuvtai.kernels.planning.io import ObservationIO
 
@@ -259,18 +259,15 @@ TEACHER_COLUMNS = (
 @quick_launch
 @ti.kernel
 def sense_sectors(io: Bundle[ObservationIO]):
-    """Sector s is centred at s * 360 / n_sector degrees from ahead, counter-clockwise. One work item per
-    sector."""
+    """Sector s is centred at s * 360 / n_sector degrees from ahead, counter-clockwise."""
     n, n_sector = ti.static(io.observation.sector_range_m.shape[0], io.observation.sector_range_m.shape[1])
-    for env, sector in ti.ndrange(loop_end(n, io.clock), n_sector):
+    n_share = ti.static(shares(n_sector))
+    for env, share in ti.ndrange(loop_end(n, io.clock), n_share):
         if io.clock.active[env] == 1:
-            first, last = sector_beams(
-                sector,
-                io.ego.rpy[env][2] - io.scan.ping_yaw[env] - ti.static(io.sonar_cfg.first_beam_rad),
-                n_sector,
-                ti.static(io.sonar_cfg.circle_beams),
-            )
-            _summarise(env, sector, first, last, io)
+            turned = io.ego.rpy[env][2] - io.scan.ping_yaw[env] - ti.static(io.sonar_cfg.first_beam_rad)
+            for sector in range(share * n_sector // n_share, (share + 1) * n_sector // n_share):
+                first, last = sector_beams(sector, turned, n_sector, ti.static(io.sonar_cfg.circle_beams))
+                _summarise(env, sector, first, last, io)
 
 
 @ti.func
@@ -525,12 +522,14 @@ def write_obstacles(io: Bundle[ObservationIO], obs: FloatMatrix):
     """Columns of the ``n_track`` moving obstacles that come closest to the active rows, in the order of
     ``OBSTACLE_COLUMNS``."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
-    for env, track in ti.ndrange(loop_end(n, io.clock), n_track):
+    n_share = ti.static(shares(n_track))
+    for env, share in ti.ndrange(loop_end(n, io.clock), n_share):
         if io.clock.active[env] == 1:
-            io.observation.closest_m[env, track] = FAR_M
-            if io.forecast.radius_m[env, track, 0] >= 0.0:
-                gap, time = closest_approach(env, track, io)
-                io.observation.closest_m[env, track], io.observation.closest_s[env, track] = gap, time
+            for track in range(share * n_track // n_share, (share + 1) * n_track // n_share):
+                io.observation.closest_m[env, track] = FAR_M
+                if io.forecast.radius_m[env, track, 0] >= 0.0:
+                    gap, time = closest_approach(env, track, io)
+                    io.observation.closest_m[env, track], io.observation.closest_s[env, track] = gap, time
     for env in range(loop_end(n, io.clock)):
         if io.clock.active[env] == 1:
             track, used = -1, 1

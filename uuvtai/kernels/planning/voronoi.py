@@ -91,6 +91,8 @@ def _cell(pos_w, io: Bundle[RouteIO]):
 def _weigh_cells(slot, env, io: Bundle[RouteIO]):
     """Weight of every cell, and forget the slot's last search."""
     lanes = ti.static(n_lane())
+    least = ti.static(io.voronoi_cfg.cost_epsilon_m)
+    widest = ti.static(widest_m(io.clearance_cfg, io.quiet_cfg, io.voronoi_cfg))
     for row in range(io.voronoi.weight.shape[1]):
         for packet in range(io.voronoi.weight.shape[2] // lanes):
             first = packet * lanes
@@ -102,11 +104,8 @@ def _weigh_cells(slot, env, io: Bundle[RouteIO]):
                 wide = room[i]  # type: ignore[index]
                 if is_traversable(env, row, first + i, wide, io):
                     is_open[i] = 1.0
-            weight = 1.0 / ti.math.clamp(
-                room,
-                ti.static(io.voronoi_cfg.cost_epsilon_m),
-                ti.static(widest_m(io.clearance_cfg, io.quiet_cfg, io.voronoi_cfg)),
-            )
+            narrow = ti.select(room < widest, room, widest)
+            weight = 1.0 / ti.select(narrow > least, narrow, least)
             for i in ti.static(range(lanes)):
                 value = weight[i]  # type: ignore[index]
                 io.voronoi.weight[slot, row, first + i] = ti.select(is_open[i] > 0.0, value, 0.0)

@@ -64,14 +64,16 @@ def cast_depth(io: Bundle[DepthIO]):
     theirs with ``fresh`` = 0."""
     block_rows = ti.static(rows_per_item())
     n_block = ti.static(-(-io.depth_cfg.rows // block_rows))
-    for env, block in ti.ndrange(n_envs(io.clock), n_block):
+    n_share = ti.static(shares(n_block))
+    for env, share in ti.ndrange(n_envs(io.clock), n_share):
         if io.clock.active[env] == 1:
             due = io.clock.step[env] % io.depth_cfg.period_steps == 0
-            if block == 0:
+            if share == 0:
                 label_image(env, due, io)
             if due:
-                fill_block(env, block * block_rows, io)
-                disturb_block(env, block * block_rows, io.clock.step[env], io)
+                for block in range(share * n_block // n_share, (share + 1) * n_block // n_share):
+                    fill_block(env, block * block_rows, io)
+                    disturb_block(env, block * block_rows, io.clock.step[env], io)
 
 
 def rows_per_item() -> int:

@@ -30,7 +30,7 @@ from uuvtai.kernels.core.noise import (
     uniform_lanes,
 )
 from uuvtai.kernels.core.simd import LANES, filled
-from uuvtai.kernels.core.stage import Bundle, Const, n_envs
+from uuvtai.kernels.core.stage import Bundle, Const, n_envs, shares
 from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.kernels.sensors.raycast import nearest_echo, place_obstacles
 
@@ -288,17 +288,19 @@ def cast_sonar(io: Bundle[SonarIO]):
     n = n_envs(io.clock)
     beams = ti.static(n_beam())
     n_part = ti.static(io.sonar_cfg.n_ray // beams)
+    n_share = ti.static(shares(n_part))
     for env in range(n):
         if io.clock.active[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0:
             place_sonar(env, io)
             if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
                 start_cloud(env, io)
-    for env, part in ti.ndrange(n, n_part):
+    for env, share in ti.ndrange(n, n_share):
         if io.clock.active[env] == 1:
             step = io.clock.step[env]
-            if step % io.sonar_cfg.period_steps == 0:
-                ping(env, part * beams, step, io)
-            deliver(env, part * beams, step, io)
+            for part in range(share * n_part // n_share, (share + 1) * n_part // n_share):
+                if step % io.sonar_cfg.period_steps == 0:
+                    ping(env, part * beams, step, io)
+                deliver(env, part * beams, step, io)
 
 
 def n_beam() -> int:

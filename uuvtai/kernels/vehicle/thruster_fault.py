@@ -70,11 +70,6 @@ def response_size(vehicle_cfg):
     return 6 + 3 * len(vertical_group(vehicle_cfg))
 
 
-def _offset_n2(vehicle_cfg, sensors_cfg):
-    """[N^2] variance of the felt thrust's constant error, by the accelerometer's data sheet; plain Python."""
-    return ((vehicle_cfg.mass_kg + vehicle_cfg.added_mass[2]) * sensors_cfg.imu.accel_bias_m_s2) ** 2
-
-
 @quick_launch
 @ti.kernel
 def watch_thrusters(io: Bundle[ThrusterWatchIO]):
@@ -110,7 +105,9 @@ def _weigh(env, io: Bundle[ThrusterWatchIO]):
         _summed(env, n + 3, total * total, io),
     )
     mean_r, mean_t, time = _summed(env, n + 4, r, io), 0.0, _summed(env, n + 5, 1.0, io)
-    offset_n2 = ti.static(_offset_n2(io.vehicle_cfg, io.sensors_cfg))
+    # [N^2] variance of the felt thrust's constant error, by the accelerometer's data sheet
+    mass_kg = ti.static(io.vehicle_cfg.mass_kg + io.vehicle_cfg.added_mass[2])
+    offset_n2 = ti.static((mass_kg * io.sensors_cfg.imu.accel_bias_m_s2) ** 2)
     weight = offset_n2 / (offset_n2 * time + _OFFSET_NOISE_N2_S)
     for i in ti.static(range(n)):
         left, mean_a = r + asked[i], _summed(env, n + 7 + 2 * i, asked[i], io)
