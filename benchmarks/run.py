@@ -34,7 +34,7 @@ NOT_BENCHMARKS = ("__init__", "common", "played", "run")
 NEED_POLICY = ("parity",)
 """left out of a run of all where no --policy is given"""
 PEERS = (
-    "mujoco", "embreex", "opencv-python-headless", "scipy", "ompl", "pyastar2d", "py_trees",
+    "mujoco", "embreex", "opencv-python-headless", "scipy", "ompl", "pyastar2d", "py_trees", "behaviortreepy",
     "numpy", "torch",
 )  # fmt: skip
 _LONGEST_S = 1200
