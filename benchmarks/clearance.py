@@ -136,17 +136,10 @@ def measure(job: Job) -> list[Row]:
                 maps.check(cfg)
                 sides = {"ours": maps.ours(cfg), **maps.peers()}
                 cost = seconds_per_call(sides, job.seconds / 3)
+                what, each = f"{world} {n_col} x {n_row}, {kind}, to {cfg.max_m:g} m", "maps/s per core"
+                rate = {side: _MAPS / seconds for side, seconds in cost.items()}
                 rows += [
-                    Row(
-                        what=f"{world} {n_col} x {n_row}, {kind}, to {cfg.max_m:g} m",
-                        ours=_MAPS / cost["ours"],
-                        peer=_MAPS / cost[name],
-                        peer_name=name,
-                        unit="maps/s per core",
-                        floor=FLOOR,
-                        floor_on="ratio",
-                        note=note,
-                    )
+                    Row(what, rate["ours"], each, rate[name], name, floor=FLOOR, floor_on="ratio", note=note)
                     for name, note in _NOTES.items()
                 ]
     return rows

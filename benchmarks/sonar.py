@@ -113,19 +113,15 @@ def measure(job: Job) -> list[Row]:
 
     theirs = dict(zip(PEERS, map(all_scenes, (peer.mujoco, peer.embree)), strict=True))
     cost = seconds_per_call({"flat": ours(flat), "wide": ours(wide), **theirs}, job.seconds)
+    rate = {side: (_MODELS if side in PEERS else n_env) / seconds for side, seconds in cost.items()}
     return [
         Row(
-            what=f"{flat.n_ray} {what}, {N_OBSTACLE} obstacles",
-            ours=n_env / cost[side],
-            peer=_MODELS / cost[name],
-            peer_name=name,
-            unit="scans/s per core",
-            floor=FLOOR if name == PEERS[0] else None,
-            floor_on="ratio",
-            note=f"{1e6 * cost[side] / n_env:.2f} against {1e6 * cost[name] / _MODELS:.1f} us, its call from "
-            f"Python included; {apart[name]} of {beams} beams apart",
+            f"{flat.n_ray} {what}, {N_OBSTACLE} obstacles", rate[side], "scans/s per core", rate[name], name,
+            floor=FLOOR if name == PEERS[0] else None, floor_on="ratio",
+            note=f"{1e6 / rate[side]:.2f} against {1e6 / rate[name]:.1f} us, its call from Python included; "
+            f"{apart[name]} of {beams} beams apart",
             details={"num_envs": n_env, "beams_apart": apart[name]},
         )
         for side, what in (("flat", "flat beams"), ("wide", "beams with their aperture"))
         for name in PEERS
-    ]
+    ]  # fmt: skip

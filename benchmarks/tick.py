@@ -70,21 +70,16 @@ def measure(job: Job) -> list[Row]:
     theirs = dict(zip(_NOTES, (of(python), of(cpp), lambda: [tick() for tick in fixed]), strict=True))
     sides = {"ours": lambda: tree_tick.tick_with_given_statuses(io, next(given_next)), **theirs}
     cost = seconds_per_call(sides, job.seconds)
+    rate = {side: (n_env if side == "ours" else _BLACKBOARDS) / seconds for side, seconds in cost.items()}
     return [
         Row(
-            what=f"tree ticks, {n_node} nodes",
-            ours=n_env / cost["ours"],
-            peer=_BLACKBOARDS / cost[name],
-            peer_name=name,
-            unit="ticks/s per core",
-            floor=FLOOR if name == "py_trees" else None,
-            floor_on="ratio",
-            note=f"{1e9 * cost['ours'] / n_env:.0f} ns against {1e6 * cost[name] / _BLACKBOARDS:.1f} us a "
-            f"tick{_NOTES[name]}",
+            f"tree ticks, {n_node} nodes", rate["ours"], "ticks/s per core", rate[name], name,
+            floor=FLOOR if name == "py_trees" else None, floor_on="ratio",
+            note=f"{1e9 / rate['ours']:.0f} ns against {1e6 / rate[name]:.1f} us a tick{_NOTES[name]}",
             details={"num_envs": n_env},
         )
         for name in theirs
-    ]
+    ]  # fmt: skip
 
 
 def check(io: Any, tree: FlatTree, python: list[PyTree], cpp: list[CppTree], answers: np.ndarray) -> None:
