@@ -220,17 +220,10 @@ def _logging(job: Job, sides: tuple[Side, Side], commit: str, command: list[str]
     ours, theirs = map(statistics.median, spent)
     details = {"ours_s": spent[0], "theirs_s": spent[1]}
     return [
-        Row(
-            "uuv eval that writes two logs",
-            ours,
-            "CPU s",
-            theirs,
-            commit,
-            less_is_better=True,
-            details=details,
-        ),
+        Row("uuv eval that writes two logs", ours, "CPU s", theirs, commit, less_is_better=True,
+            details=details),
         Row("their size", sizes[0] / 1e6, "MB", sizes[1] / 1e6, commit, less_is_better=True),
-    ]
+    ]  # fmt: skip
 
 
 def _children_s() -> float:

@@ -14,6 +14,7 @@ from uuvtai.evaluation.agents import AgentSpec, load_agents
 from uuvtai.evaluation.profile import WARM_STEPS, SimBatch
 from uuvtai.sim.sim import Sim
 
+CODE = ("examples.own_field", "examples.own_torch")
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 PLUGINS = (
     ("NumPy controller", 64, "own_field.py:act", 500.0),

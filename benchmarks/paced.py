@@ -21,6 +21,7 @@ from benchmarks.before import ROOT, Player, Side, checked_out
 from benchmarks.common import Job, Row
 
 LONGEST_S = 3600
+CODE = ("benchmarks.played", "uuvtai.envs.vector_env")
 _SENSORS = ("nominal", "paper")
 _PARTS = (
     ("a step of one, paper sensing", "speed", "paper", 6, "us", 1e6),

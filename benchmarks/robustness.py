@@ -335,14 +335,8 @@ class Bench:
                     self.job.say(f"VIOLATION {kept}: {end}: {told[-300:]}")
             bad = ends.total() - ends["accepted"] - ends["refused"]
             note = ", ".join(f"{end} {number}" for end, number in sorted(ends.items()))
-            yield Row(
-                f"damaged {kind}: ended badly",
-                bad,
-                f"of {ends.total()}",
-                less_is_better=True,
-                floor=0,
-                note=note,
-            )
+            what, unit = f"damaged {kind}: ended badly", f"of {ends.total()}"
+            yield Row(what, bad, unit, less_is_better=True, floor=0, note=note)
 
     def _judged(self, file: Path, command: list[str]) -> tuple[str, str]:
         """(how it ended, what was told) of a command on one damaged file, in its folder."""
@@ -373,13 +367,9 @@ class Bench:
 
     def _begun(self, command: list[str]) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, "-m", "uuvtai", *command],
-            cwd=self.folder,
-            env=os.environ | {"PYTHONPATH": str(_ROOT)},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+            [sys.executable, "-m", "uuvtai", *command], cwd=self.folder, text=True,
+            env=os.environ | {"PYTHONPATH": str(_ROOT)}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        )  # fmt: skip
 
     def _run(self, command: list[str]) -> tuple[int, str]:
         child = self._begun(command)

@@ -3,9 +3,11 @@ cells."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 
 import numpy as np
+import pyastar2d
 
 from benchmarks.common import Job, Row, seconds_per_call
 from tests import planning_maps as maps
@@ -35,7 +37,7 @@ def measure(job: Job) -> list[Row]:
     found = _maps(n_env, config)
     s = _structs(n_env, config, found)
 
-    io = bind(RouteIO, *s.values(), config)
+    io = bind(RouteIO, *s.values(), config, partial=True)
 
     def ours():
         voronoi.plan_routes(io)
@@ -55,7 +57,10 @@ def measure(job: Job) -> list[Row]:
     weights = [_weights(grid) for grid in grids]
 
     def shortest():
-        return [_a_star(cells) for cells in weights]
+        return [
+            pyastar2d.astar_path(cells, maps.cell_of(_START), maps.cell_of(_GOAL), allow_diagonal=True)
+            for cells in weights
+        ]
 
     ours()
     mine = _our_cost(s["route"], grids)
@@ -65,7 +70,7 @@ def measure(job: Job) -> list[Row]:
         "pyastar2d": "C++, eight neighbours, weights 1/clearance made beforehand",
     }
     rows = []
-    for name, ways in (("OMPL RRT", theirs()), ("pyastar2d", shortest())):
+    for name, ways in (("OMPL RRT", theirs()), ("pyastar2d", map(_way, shortest()))):
         others = _peer_cost(name, ways, grids)
         row = Row(
             what=f"plans over {_N_OBSTACLE} obstacles, grid {maps.SHAPE[1]} x {maps.SHAPE[0]}",
@@ -91,15 +96,11 @@ def _weights(grid: rrt.ClearanceGrid) -> np.ndarray:
     return costs
 
 
-def _a_star(weights: np.ndarray) -> list[tuple[float, float]] | None:
+def _way(cells: np.ndarray | None) -> list | None:
     """Way through the cells' centres [m], None where there is none."""
-    import pyastar2d
-
-    cells = pyastar2d.astar_path(weights, maps.cell_of(_START), maps.cell_of(_GOAL), allow_diagonal=True)
     if cells is None:
         return None
-    centres = (cells[:, ::-1] + 0.5) * maps.CELL_M + np.asarray(maps.ORIGIN[:2])
-    return [_START, *map(tuple, centres[1:-1]), _GOAL]
+    return [_START, *((cells[1:-1, ::-1] + 0.5) * maps.CELL_M + np.asarray(maps.ORIGIN[:2])), _GOAL]
 
 
 def _maps(n: int, config: Config) -> list[tuple]:
@@ -153,8 +154,9 @@ def _our_cost(ours: state.RouteState, grids: list[rrt.ClearanceGrid]) -> float:
     return float(np.mean([_cost(ways[i, : counts[i]], grid) for i, grid in enumerate(grids)]))
 
 
-def _peer_cost(name: str, theirs: list, grids: list[rrt.ClearanceGrid]) -> float:
+def _peer_cost(name: str, theirs: Iterable, grids: list[rrt.ClearanceGrid]) -> float:
     """Mean cost of a peer's ways. Raises RuntimeError as ``_our_cost``."""
+    theirs = list(theirs)
     if lost := sum(path is None for path in theirs):
         raise RuntimeError(f"{lost} maps without {name}'s route; all of them have one")
     return float(np.mean([_cost(np.array(path), grid) for path, grid in zip(theirs, grids, strict=True)]))

@@ -1,5 +1,5 @@
-"""Run benchmarks, print a table, keep results/<date>_<device>_<what>.json with machine, versions, commit and
-command.
+"""Run benchmarks, print a table, keep results/<date>_<device>_<what>.json with machine, versions, commit,
+digest of what was timed, and command.
 
 python benchmarks/run.py                          all of them
 python benchmarks/run.py dynamics tick            some
@@ -29,11 +29,15 @@ if sys.path[0] == str(HERE):
     sys.path[0] = str(HERE.parent)  # modules here are benchmarks.*: their names must not hide others
 
 from benchmarks.common import Job, Row  # noqa: E402
+from benchmarks.digest import digest  # noqa: E402
 
-NOT_BENCHMARKS = ("__init__", "common", "played", "run")
+NOT_BENCHMARKS = ("__init__", "common", "digest", "played", "run")
 NEED_POLICY = ("parity",)
 """left out of a run of all where no --policy is given"""
-PEERS = ("mujoco", "opencv-python-headless", "scipy", "ompl", "py_trees", "numpy", "torch")
+PEERS = (
+    "mujoco", "embreex", "opencv-python-headless", "scipy", "ompl", "pyastar2d", "py_trees", "behaviortreepy",
+    "numpy", "torch",
+)  # fmt: skip
 _LONGEST_S = 1200
 """of a benchmark that names no LONGEST_S of its own"""
 _THREAD_VARIABLES = ("UUV_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -130,14 +134,9 @@ def _work(chosen: argparse.Namespace) -> int:
     sizes = tuple(int(n) for n in chosen.num_envs.split(",") if n)
     seconds = chosen.seconds or (0.3 if chosen.quick else 4.0)
     job = Job(
-        chosen.device,
-        chosen.quick,
-        sizes,
-        seconds,
-        chosen.against,
-        chosen.policy,
+        chosen.device, chosen.quick, sizes, seconds, chosen.against, chosen.policy,
         say=lambda text: print(f"  {text}", file=sys.stderr, flush=True),
-    )
+    )  # fmt: skip
     module = importlib.import_module(f"benchmarks.{name}")
     begun = time.perf_counter()
     rows: list[Row] = module.measure(job)
@@ -182,21 +181,9 @@ def _commit() -> str | None:
     sha = git_sha()
     if sha is None:
         return None
-    changed = subprocess.run(
-        [
-            "git",
-            "-C",
-            str(HERE.parent),
-            "status",
-            "--porcelain",
-            "--untracked-files=no",
-            "uuvtai",
-            "benchmarks/*.py",
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    status = ["git", "-C", str(HERE.parent), "status", "--porcelain", "--untracked-files=no"]
+    status += ["uuvtai", "benchmarks/*.py"]
+    changed = subprocess.run(status, capture_output=True, text=True, check=False)
     return sha + ("+" if changed.stdout.strip() else "")
 
 
@@ -212,9 +199,21 @@ def _kept(name: str, chosen: argparse.Namespace, document: dict[str, Any]) -> Pa
         "command": " ".join(["python", "benchmarks/run.py", *sys.argv[1:]]),
         "date": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "commit": _commit(),
+        "digest": digest(name),
     }
-    target.write_text(json.dumps({**head, **document}, indent=1) + "\n")
+    rows = ",\n ".join(json.dumps(_six_digits(row)) for row in document.pop("rows"))
+    text = json.dumps({**head, **document, "rows": []}, indent=1)
+    target.write_text(text.replace('"rows": []', f'"rows": [\n {rows}]') + "\n")
     return target
+
+
+def _six_digits(value: Any) -> Any:
+    """As it is kept: nothing is measured to more, and results are small."""
+    if isinstance(value, dict):
+        return {key: _six_digits(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_six_digits(part) for part in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _show(name: str, document: dict[str, Any]) -> None:
@@ -231,14 +230,9 @@ def _show(name: str, document: dict[str, Any]) -> None:
         ratio = f"{row['ratio']:.3g} x" if row["ratio"] is not None else ""
         mark = {None: "", True: "met", False: "[bold red]NOT MET[/]"}[row["met"]]
         table.add_row(
-            row["what"],
-            _number(row["ours"]),
-            peer,
-            ratio,
-            row["unit"],
-            _floor(row),
+            row["what"], _number(row["ours"]), peer, ratio, row["unit"], _floor(row),
             " ".join(filter(None, (mark, escape(row["note"])))),
-        )
+        )  # fmt: skip
     console.print(table)
     for row in document["rows"]:
         if columns := row["details"].get("table"):

@@ -55,13 +55,8 @@ def _row(job: Job, sensors: str, n_env: int) -> Row:
         floor=FLOORS[sensors] if bounded else None,
         note=f"{cpu_us:.1f} us of CPU time a step, {memory:,.0f} kB/env, start {start_s:.0f} s",
         details={
-            "num_envs": n_env,
-            "cpu_us_per_env_step": cpu_us,
-            "memory_kb_per_env": memory,
-            "start_s": start_s,
-            "env_steps_per_s_by_window": speeds,
-            "steps_measured": steps,
-            "episodes_ended": episodes,
+            "num_envs": n_env, "cpu_us_per_env_step": cpu_us, "memory_kb_per_env": memory, "start_s": start_s,
+            "env_steps_per_s_by_window": speeds, "steps_measured": steps, "episodes_ended": episodes,
             "table": {"us per env-step": {**stages, "sum": sum(stages.values())}},
         },
-    )
+    )  # fmt: skip

@@ -76,12 +76,9 @@ def _seconds(side: Side, arguments: list[str]) -> float:
         begun = time.perf_counter()
         subprocess.run(
             [sys.executable, "-m", "uuvtai", *arguments, *_folder_of(arguments, run)],
-            env=side.environment,
-            cwd=side.tree,
-            check=True,
-            stdout=subprocess.DEVNULL,
+            env=side.environment, cwd=side.tree, check=True, stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-        )
+        )  # fmt: skip
         return time.perf_counter() - begun
 
 

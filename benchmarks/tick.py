@@ -1,30 +1,39 @@
-"""Tick of the behaviour tree ``bt`` with the statuses of all nodes kept, against py_trees on the same tree
-and the same leaf answers."""
+"""Tick of the behaviour tree ``bt`` with the statuses of all nodes kept, against py_trees and
+BehaviorTree.CPP on the same tree and the same leaf answers."""
 
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import torch
 
 from benchmarks.common import Job, Row, seconds_per_call
+from benchmarks.peers.tick_behaviortree_cpp import CppTree, fixed_tree
 from benchmarks.peers.tick_py_trees import PyTree
 from uuvtai import state
+from uuvtai.common import tree_codes as codes
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
 from uuvtai.kernels.behavior import tree as tree_tick
 from uuvtai.kernels.behavior.io import BehaviorIO
-from uuvtai.sim.behavior_tree import load_tree, read_tree
+from uuvtai.sim.behavior_tree import FlatTree, load_tree, read_tree
 from uuvtai.sim.setup import array_sizes
 from uuvtai.sim.stages import bind
 
 THREADS = 1
 FLOOR = 200.0
+"""times the rate of py_trees"""
 _BLACKBOARDS = 64
-"""Different leaf answers that py_trees ticks in turn, the first envs of ours."""
+"""Different leaf answers that the peers tick in turn, the first envs of ours."""
 _TURNS = 4
 """Sets of such answers, taken in turn."""
+_NOTES = {
+    "py_trees": "",
+    "BehaviorTree.CPP": "; its leaves are Python functions",
+    "BehaviorTree.CPP, fixed leaves": "; in C++, the first set of answers only",
+}
 
 
 def measure(job: Job) -> list[Row]:
@@ -41,47 +50,56 @@ def measure(job: Job) -> list[Row]:
     )
     given = [torch.from_numpy(a) for a in answers]
     n_node = len(tree.kind)
-    peers = [PyTree(tree) for _ in range(_BLACKBOARDS)]
-    check(behavior, table, peers, answers, n_node)
-    prepared = [[peers[0].prepared(row[:n_node]) for row in a[:_BLACKBOARDS]] for a in answers]
-    ours_next, theirs_next = itertools.cycle(given), itertools.cycle(prepared)
-
     io = bind(BehaviorIO, behavior, table, partial=True)
+    python, cpp = [PyTree(tree) for _ in range(_BLACKBOARDS)], [CppTree(tree) for _ in range(_BLACKBOARDS)]
+    check(io, tree, python, cpp, answers)
+    fixed = [fixed_tree(tree, row) for row in answers[0, :_BLACKBOARDS]]
+    check_fixed(io, fixed, given[0])
+    given_next = itertools.cycle(given)
 
-    def ours() -> None:
-        tree_tick.tick_with_given_statuses(io, next(ours_next))
+    def of(trees):
+        prepared = [[trees[0].prepared(row[:n_node]) for row in a[:_BLACKBOARDS]] for a in answers]
+        prepared_next = itertools.cycle(prepared)
 
-    def theirs() -> None:
-        for peer, answer in zip(peers, next(theirs_next), strict=True):
-            peer.tick_prepared(answer)
+        def tick_all() -> None:
+            for peer, answer in zip(trees, next(prepared_next), strict=True):
+                peer.tick_prepared(answer)
 
-    cost = seconds_per_call({"ours": ours, "peer": theirs}, job.seconds)
+        return tick_all
+
+    theirs = dict(zip(_NOTES, (of(python), of(cpp), lambda: [tick() for tick in fixed]), strict=True))
+    sides = {"ours": lambda: tree_tick.tick_with_given_statuses(io, next(given_next)), **theirs}
+    cost = seconds_per_call(sides, job.seconds)
+    rate = {side: (n_env if side == "ours" else _BLACKBOARDS) / seconds for side, seconds in cost.items()}
     return [
         Row(
-            what=f"tree ticks, {n_node} nodes",
-            ours=n_env / cost["ours"],
-            peer=_BLACKBOARDS / cost["peer"],
-            peer_name="py_trees",
-            unit="ticks/s per core",
-            floor=FLOOR,
-            floor_on="ratio",
-            note=f"{1e9 * cost['ours'] / n_env:.0f} ns against {1e6 * cost['peer'] / _BLACKBOARDS:.1f} us a "
-            "tick",
+            f"tree ticks, {n_node} nodes", rate["ours"], "ticks/s per core", rate[name], name,
+            floor=FLOOR if name == "py_trees" else None, floor_on="ratio",
+            note=f"{1e9 / rate['ours']:.0f} ns against {1e6 / rate[name]:.1f} us a tick{_NOTES[name]}",
             details={"num_envs": n_env},
         )
-    ]
+        for name in theirs
+    ]  # fmt: skip
 
 
-def check(
-    behavior: state.BehaviorState,
-    table: state.TreeTable,
-    peers: list[PyTree],
-    answers: np.ndarray,
-    n_node: int,
-) -> None:
-    """Raise AssertionError unless every node's status is the peers', tick by tick, memories included."""
-    io = bind(BehaviorIO, behavior, table, partial=True)
+def check(io: Any, tree: FlatTree, python: list[PyTree], cpp: list[CppTree], answers: np.ndarray) -> None:
+    """Raise AssertionError unless every node's status is py_trees' tick by tick, memories included, and
+    BehaviorTree.CPP comes to the same leaves in the same order with the same status of the root."""
     for answer in answers:
         tree_tick.tick_with_given_statuses(io, torch.from_numpy(answer))
-        found = behavior.status.to_numpy()[: len(peers), :n_node]
-        np.testing.assert_array_equal(found, [peer.tick(answer[i, :n_node]) for i, peer in enumerate(peers)])
+        found = io.behavior.status.to_numpy()[:, : len(tree.kind)]
+        for row, told, one, other in zip(found, answer, python, cpp, strict=False):
+            visited = [node for node in one.visited(told) if tree.kind[node] >= codes.CONDITION]
+            np.testing.assert_array_equal(row, one.statuses())
+            assert other.tick(told) == (row[0], visited)
+
+
+def check_fixed(io: Any, fixed: list, answer: torch.Tensor) -> None:
+    """Raise AssertionError unless trees of fixed leaves end as ours from the start, and where a sequence
+    goes on."""
+    io.behavior.status.fill(codes.IDLE)
+    io.behavior.running_child.fill(0)
+    for _ in range(2):
+        tree_tick.tick_with_given_statuses(io, answer)
+        ends = io.behavior.status.to_numpy()[: len(fixed), 0]
+        np.testing.assert_array_equal(ends, [tick().value for tick in fixed])

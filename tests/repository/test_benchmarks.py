@@ -12,6 +12,7 @@ import torch
 
 from benchmarks import before, dynamics, parity, run, tick
 from benchmarks.common import Job, Row, seconds_per_call
+from benchmarks.digest import digest
 from benchmarks.peers.vehicle_arrays import Vehicles
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
@@ -64,7 +65,7 @@ def test_every_benchmark_measures_and_says_what(name):
 
 
 def test_rows_have_figures_beside_peers():
-    """measure raises where the kernel and py_trees disagree."""
+    """measure raises where the kernel and its peers disagree."""
     for row in tick.measure(TINY):
         assert row.ours > 0 and row.peer > 0 and math.isfinite(row.ratio)
         assert row.what and row.unit and row.peer_name
@@ -90,6 +91,27 @@ def test_peers_of_dynamics_agree_and_a_wrong_one_is_seen():
         assert exact.shape == (n_env,) and np.all(exact < dynamics.AGREEMENT)
     assert np.mean(apart(torch, 1.001) > dynamics.AGREEMENT) > 0.5, "drag that is off shows in most vehicles"
     assert np.abs(plant.vehicle.vel_b.to_numpy()).max() > 0.2, "nothing moved"
+
+
+def test_a_digest_is_of_the_code_that_is_timed(tmp_path):
+    """Imported or run, without its comments."""
+    files = {"a": "from uuvtai import low\n", "b": "import subprocess\n"}
+    files = {f"benchmarks/{name}.py": text for name, text in files.items()}
+    files |= {"uuvtai/low.py": "def f():\n    return 1\n", "uuvtai/other.py": "A = 1\n"}
+
+    def digests(name, **changed):
+        place = tmp_path / name
+        for file, text in (files | {f"uuvtai/{module}.py": text for module, text in changed.items()}).items():
+            (place / file).parent.mkdir(parents=True, exist_ok=True)
+            (place / file).write_text(text)
+        return digest("a", place), digest("b", place)
+
+    first = digests("first")
+    said = '"""Module."""\n\n\ndef f():  # why\n    """Function."""\n    return 1\n'
+    assert digests("said", low=said) == first
+    imported, run_as_a_command = digests("other", other="A = 2\n")
+    assert imported == first[0] and run_as_a_command != first[1]
+    assert digests("body", low=files["uuvtai/low.py"].replace("1", "2"))[0] != first[0]
 
 
 def test_unknown_names_are_refused():

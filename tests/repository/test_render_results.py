@@ -6,25 +6,16 @@ import shutil
 
 import pytest
 
+from benchmarks.digest import digest
 from docs import render_results
-from docs.render_results import (
-    BENCHMARKS,
-    EVALUATIONS,
-    README,
-    REPRODUCTION,
-    RESULTS,
-    ROBUSTNESS,
-    ROOT,
-    SPEEDS,
-    SWEEPS,
-)
+from docs.render_results import BENCHMARKS, EVALUATIONS, README, REPRODUCTION, RESULTS, ROBUSTNESS, ROOT
 from tests.repository.test_docs import fault
 from uuvtai.evaluation.claims import Share
 
 
 def test_the_pages_are_those_of_the_results(capsys):
-    """Where this fails: ``python -m docs.render_results``."""
-    assert render_results.differences() == []
+    found = render_results.differences()
+    assert not found, "\n".join(["`python -m docs.render_results` renews the pages:", *found])
     assert render_results.main(["--check"]) == 0
     for page, wanted in render_results.TABLES.items():
         tables = render_results.TABLE.findall((ROOT / page).read_text())
@@ -50,7 +41,7 @@ def copy(tmp_path, monkeypatch):
         (RESULTS, "| withdrawn |", "| holds |"),
         (ROBUSTNESS, "503/512 = 98.2 %", "512/512 = 100.0 %"),
         (ROBUSTNESS, "| `paper` | ", "| `paper` | 1"),
-        (SPEEDS, "| 2026-11-22 | 46e0ba7 |", "| 2026-11-27 | 46e0ba7 |"),
+        (render_results.SPEEDS, "| `tick` | tree ticks, 22 nodes | ", "| `tick` | tree ticks, 22 nodes | 1"),
     ],
 )
 def test_a_cell_that_was_changed_by_hand_is_caught(copy, page, cell, changed):
@@ -79,12 +70,13 @@ def test_a_seed_that_was_tuned_on_is_called_so(copy):
     assert "was looked at while tuning" in render_results.measured(copy)
 
 
-def test_the_newest_speed_of_a_kind_is_shown_with_its_date_and_commit(copy):
-    new = json.loads((copy / BENCHMARKS / "2026-11-22_cpu_tick.json").read_text())
-    new |= {"date": "2026-12-01T00:00:00+0000", "commit": "abcdef0123"}
-    (copy / BENCHMARKS / "2026-12-01_cpu_tick.json").write_text(json.dumps(new))
-    (row,) = [line for line in render_results.speeds(copy).splitlines() if line.startswith("| `tick` |")]
-    assert "| 2026-12-01 | abcdef0 | cpu |" in row
+def test_the_newest_speed_of_a_kind_is_shown_and_marked_unless_it_is_of_todays_code(copy):
+    new = json.loads(next((copy / BENCHMARKS).glob("*_cpu_tick.json")).read_text())
+    new |= {"date": "2099-12-01T00:00:00+0000", "commit": "abcdef0123"}
+    for kept, mark in ((digest("tick"), ""), ("0" * 12, "*"), (None, "*")):
+        (copy / BENCHMARKS / "2099-12-01_cpu_tick.json").write_text(json.dumps(new | {"digest": kept}))
+        rows = [line for line in render_results.speeds(copy).splitlines() if line.startswith("| `tick` |")]
+        assert rows and all(f"| 2099-12-01 | abcdef0{mark} | cpu |" in row for row in rows)
 
 
 def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
@@ -104,7 +96,7 @@ def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
     record["argv"] = ["uuv", "sweep", "--agent", "bt", "--run-dir", "runs/a b", "--json"]
     (tmp_path / "run.json").write_text(json.dumps(record))
     render_results.keep_sweep("pool", tmp_path, copy)
-    kept = json.loads((copy / SWEEPS).read_text())["pool"]
+    kept = json.loads((copy / render_results.SWEEPS).read_text())["pool"]
     assert (kept["commit"], kept["command"]) == ("abc", "uuv sweep --agent bt")
     low, high = Share(39, 40).interval
     assert f"`bt` | 117/120 = 97.5 % [{100 * low - 1:.0f}" in render_results.grid(copy), (low, high)

@@ -165,15 +165,8 @@ def test_first_columns_are_the_papers_targets_of_the_world_model():
     """3 goal errors, sine and cosine of the heading error, 3 velocities, yaw rate, depth, roll and pitch, 12
     ranges: 24."""
     names = [column.name for column, _first, width in placed_columns(FEATURES) for _ in range(width)]
-    paper = {
-        "goal": 3,
-        "heading_error": 2,
-        "velocity": 3,
-        "yaw_rate": 1,
-        "depth": 1,
-        "tilt": 2,
-        "sector_range": 12,
-    }
+    paper = {"goal": 3, "heading_error": 2, "velocity": 3, "yaw_rate": 1, "depth": 1, "tilt": 2}
+    paper["sector_range"] = 12
     assert names[:24] == [name for name, width in paper.items() for _ in range(width)]
 
 
