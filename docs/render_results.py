@@ -241,7 +241,10 @@ def speeds(root: Path) -> str:
     return text_table(["benchmark", "what", "here", "peer", "measured", "commit", "device"], lines)
 
 
-TIMED = {"scale": 3, "own": 2, "sonar": 2, "clearance": 2, "dynamics": 2, "route": 2, "tick": 1, "paced": 2}
+TIMED = {
+    "scale": 3, "own": 2, "sonar": 2, "clearance": 2, "dynamics": 2, "route": 2, "tick": 1, "paced": 2,
+    "quadrants": 8,
+}  # fmt: skip
 """benchmarks of speed, and how many of their rows the page shows"""
 
 
@@ -268,17 +271,12 @@ def safety_rules(root: Path) -> str:
 TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
     README: {"measured": measured, "short": short},
     ROBUSTNESS: {
-        "measured": measured,
-        "evaluations": evaluations,
-        "local_planners": local_planners,
-        "sweep_commands": sweep_commands,
-        "grid": grid,
-        "caution": caution,
-        "one_at_a_time": one_at_a_time,
+        "measured": measured, "evaluations": evaluations, "local_planners": local_planners,
+        "sweep_commands": sweep_commands, "grid": grid, "caution": caution, "one_at_a_time": one_at_a_time,
     },
     SPEEDS: {"speeds": speeds},
     SAFETY: {"safety_rules": safety_rules},
-}
+}  # fmt: skip
 
 
 # ------------------------------------------------------------------------------------------------------ pages

@@ -14,17 +14,10 @@ from uuvtai.kernels.perception.io import TrackingIO
 N_ENV, N_TRACK = 6, 5
 TRACKING, RULES, TANK = TrackingConfig(), EpisodeConfig(), TankConfig()
 SIZES = {
-    "n_env": N_ENV,
-    "n_ray": 16,
-    "n_track": N_TRACK,
-    "n_cluster": 1,
-    "n_pixel_row": 1,
-    "n_pixel_col": LANES,
-    "n_height": LANES,
-    "n_turn_row": 7,
-    "n_turn": 16,
+    "n_env": N_ENV, "n_ray": 16, "n_track": N_TRACK, "n_cluster": 1, "n_pixel_row": 1, "n_pixel_col": LANES,
+    "n_height": LANES, "n_turn_row": 7, "n_turn": 16,
     "n_forecast": round(TRACKING.horizon_s / TRACKING.forecast_dt_s) + 1,
-}
+}  # fmt: skip
 AHEAD = TRACKING.forecast_dt_s * np.arange(SIZES["n_forecast"])
 
 POSITION_TOLERANCE = 1e-4
