@@ -33,7 +33,7 @@ from benchmarks.common import Job, Row  # noqa: E402
 NOT_BENCHMARKS = ("__init__", "common", "played", "run")
 NEED_POLICY = ("parity",)
 """left out of a run of all where no --policy is given"""
-PEERS = ("mujoco", "opencv-python-headless", "scipy", "ompl", "py_trees", "numpy", "torch")
+PEERS = ("mujoco", "opencv-python-headless", "scipy", "ompl", "py_trees", "quadrants", "numpy", "torch")
 _LONGEST_S = 1200
 """of a benchmark that names no LONGEST_S of its own"""
 _THREAD_VARIABLES = ("UUV_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
