@@ -97,15 +97,15 @@ def measure(job: Job) -> list[Row]:
         for world, sensors in _WORLDS[: 1 if job.quick else None]:
             one, other = (side.bits(world, sensors, num_envs, steps) for side in (ours, theirs))
             what = f"{world}, {sensors} sensing, {num_envs} vehicles, {steps} steps: arrays that differ"
-            rows.append(_equal(what, one, other, commit))
+            rows.append(equal(what, one, other, commit))
         one, other = (_topics(side.uuv([*_EVAL, *horizon], "eval")) for side in (ours, theirs))
-        rows.append(_equal("two recorded episodes: topics that differ", one, other, commit))
+        rows.append(equal("two recorded episodes: topics that differ", one, other, commit))
         for name, small in _SMALL.items():
             sets = (word for key, value in small.items() for word in ("--set", f"{key}={value}"))
             command = ["train", name, *_TRAIN, *sets]
             one, other = (_weights(side.uuv(command, name)) for side in (ours, theirs))
             what = f"four iterations of uuv train {name}: tensors of checkpoints that differ"
-            rows.append(_equal(what, one, other, commit))
+            rows.append(equal(what, one, other, commit))
         rows += _speed(job, ours, theirs, commit, num_envs)
         return rows + _logging(job, (ours, theirs), commit, [*_EVAL, *horizon])
 
@@ -124,7 +124,7 @@ def checked_out(commit: str, place: Path) -> Iterator[tuple[str, Path]]:
         subprocess.run([*git, "worktree", "remove", "--force", str(place)], check=False)
 
 
-def _equal(what: str, ours: dict[str, str], theirs: dict[str, str], commit: str) -> Row:
+def equal(what: str, ours: dict[str, str], theirs: dict[str, str], commit: str) -> Row:
     """How many of the names that both sides have are of other bits; those of one side alone are named, but
     where the other side has their bits under another name."""
     both = ours.keys() & theirs.keys()

@@ -36,7 +36,7 @@ NEED_POLICY = ("parity",)
 """left out of a run of all where no --policy is given"""
 PEERS = (
     "mujoco", "embreex", "opencv-python-headless", "scipy", "ompl", "pyastar2d", "py_trees", "behaviortreepy",
-    "numpy", "torch",
+    "quadrants", "numpy", "torch",
 )  # fmt: skip
 _LONGEST_S = 1200
 """of a benchmark that names no LONGEST_S of its own"""

@@ -103,32 +103,19 @@ class Story:
         lead = 0.1 * np.arange(26)
         forecast = self.obstacle[:, KILLER, None, :2] + lead[:, None] * self.foreseen_vel[:, None]
         return History(
-            t_s=self.t,
-            pos_w=self.pos,
-            believed_pos_w=self.pos + self.place_error,
-            vel_valid=self.vel_valid,
-            quat_wb=np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1),
-            vel_b=self.hull_vel,
-            rate_b=np.zeros((self.n, 3)),
-            obstacle_w=self.obstacle,
-            obstacle_vel_w=self.vel,
-            ping_age_s=np.zeros(self.n),
-            range_m=self.scan(),
-            track_moving=np.where(self.believes, 1, 0)[:, None],
-            track_w=self.obstacle[:, KILLER, None, :2],
-            forecast_w=forecast[:, None],
-            forecast_m=np.where(self.believes, 0.2, -1.0)[:, None],
+            t_s=self.t, pos_w=self.pos, believed_pos_w=self.pos + self.place_error, vel_valid=self.vel_valid,
+            quat_wb=np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1), vel_b=self.hull_vel,
+            rate_b=np.zeros((self.n, 3)), obstacle_w=self.obstacle, obstacle_vel_w=self.vel,
+            ping_age_s=np.zeros(self.n), range_m=self.scan(),
+            track_moving=np.where(self.believes, 1, 0)[:, None], track_w=self.obstacle[:, KILLER, None, :2],
+            forecast_w=forecast[:, None], forecast_m=np.where(self.believes, 0.2, -1.0)[:, None],
             forecast_above_w=self.pos[:, 2:] + self.believed_gap,
-            forecast_below_w=self.pos[:, 2:] - self.believed_gap,
-            conflict=self.conflict,
-            leaf=self.leaf,
-            action=np.zeros((self.n, 4)),
-            map_clearance_m=np.ones(self.n),
-            coarse=self.coarse
-            or CoarseHistory(
+            forecast_below_w=self.pos[:, 2:] - self.believed_gap, conflict=self.conflict, leaf=self.leaf,
+            action=np.zeros((self.n, 4)), map_clearance_m=np.ones(self.n),
+            coarse=self.coarse or CoarseHistory(
                 np.array([0.0, END_S]), np.stack([HERE, HERE]), np.ones(2), np.ones(2, bool), ["", ""]
             ),
-        )
+        )  # fmt: skip
 
     def explained(self, outcome="collision"):
         return failure_causes.explain(outcome, self.history(), self.obstacles(), self.config)

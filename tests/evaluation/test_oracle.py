@@ -48,23 +48,16 @@ def arrival(start, goal, *obstacles, config=CONFIG):
     "path",
     [
         {
-            "shape": "circle",
-            "center": [5.0, 3.0],
-            "radius_m": -1.5,
-            "length_m": 3 * math.pi,
-            "phase_m": 2.0,
-            "speed_m_s": 0.7,
+            "shape": "circle", "center": [5.0, 3.0], "radius_m": -1.5, "length_m": 3 * math.pi,
+            "phase_m": 2.0, "speed_m_s": 0.7,
         },
         {
-            "shape": "polyline",
-            "corners": [[1, 1], [4, 1], [4, 5]],
-            "length_m": 12.0,
-            "phase_m": 6.5,
-            "speed_m_s": 1.5,
+            "shape": "polyline", "corners": [[1, 1], [4, 1], [4, 5]], "length_m": 12.0,
+            "phase_m": 6.5, "speed_m_s": 1.5,
         },
         line((2, 2), (6, 5), 0.6, phase=9.0),
     ],
-)
+)  # fmt: skip
 def test_many_positions_of_a_path_are_those_of_one_by_one(path):
     t = np.linspace(0.0, 40.0, 123)
     assert path_positions(path, t) == pytest.approx(np.array([path_position(path, s) for s in t]), abs=1e-9)

@@ -122,13 +122,13 @@ def test_unknown_names_are_refused():
 
 
 def test_what_differs_from_a_commit_is_counted_and_what_one_side_lacks_is_named():
-    same = before._equal("arrays", {"a": "1"}, {"a": "1"}, "abc")
+    same = before.equal("arrays", {"a": "1"}, {"a": "1"}, "abc")
     assert (same.ours, same.met) == (0, True)
-    row = before._equal("arrays", {"a": "1", "b": "2", "new": "3"}, {"a": "1", "b": "x", "gone": "4"}, "abc")
+    row = before.equal("arrays", {"a": "1", "b": "2", "new": "3"}, {"a": "1", "b": "x", "gone": "4"}, "abc")
     assert (row.ours, row.met, row.details["differ"]) == (1, False, ["b"])
     assert row.note == "of 2: b; only here, 1: new; only abc, 1: gone"
-    assert before._equal("arrays", {"new": "3"}, {"gone": "4"}, "abc").met is False, "nothing was compared"
-    found = before._equal("arrays", {"a": "1", "new": "3", "twice": "3"}, {"a": "1", "old": "3"}, "abc")
+    assert before.equal("arrays", {"new": "3"}, {"gone": "4"}, "abc").met is False, "nothing was compared"
+    found = before.equal("arrays", {"a": "1", "new": "3", "twice": "3"}, {"a": "1", "old": "3"}, "abc")
     assert (found.met, found.details["renamed"]) == (True, {"new": "old"})
     assert found.note == "of 2; 1 of them renamed; only here, 1: twice"
 

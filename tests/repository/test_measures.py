@@ -39,22 +39,11 @@ def test_files_are_counted(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     assert measures.of_files(tmp_path) == {
-        "package: lines": 67,
-        "package: files with code": 2,
+        "package: lines": 67, "package: files with code": 2,
         "package: files under 60 lines, those without code too": 3,
-        "package: files with code under 60 lines": 1,
-        "package: folders and loose files at its top": 4,
-        "package: floors": 3,
-        "package: preset files": 1,
-        "docs: pages": 1,
-        "docs: words": 3,
-        "docs: lines of Python": 0,
-        "README: lines": 1,
-        "README: words": 2,
-        "tests: lines of Python and JavaScript": 3,
-        "benchmarks: lines": 1,
-        "results and data: bytes": 5,
-        "longest function": 3,
-        "longest file but cli.py": 60,
-        "cli.py": 4,
-    }
+        "package: files with code under 60 lines": 1, "package: folders and loose files at its top": 4,
+        "package: floors": 3, "package: preset files": 1, "docs: pages": 1, "docs: words": 3,
+        "docs: lines of Python": 0, "README: lines": 1, "README: words": 2,
+        "tests: lines of Python and JavaScript": 3, "benchmarks: lines": 1, "results and data: bytes": 5,
+        "longest function": 3, "longest file but cli.py": 60, "cli.py": 4,
+    }  # fmt: skip

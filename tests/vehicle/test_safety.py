@@ -12,20 +12,10 @@ from uuvtai.vehicle import safety
 
 LIMITS = safety.SafetyLimits(box_m=(0.0, 0.0, 20.0, 6.0), depth_m=(0.2, 1.4))
 FINE = safety.VehicleView(
-    now_s=100.0,
-    wanted=(0.3, 0.1, 0.05, 0.2),
-    held=(),
-    vehicle_age_s=0.5,
-    operator_age_s=0.5,
-    sensor_age_s={"imu": 0.02, "dvl": 0.1, "pressure": 0.1, "sonar": 0.1},
-    pos_w=(10.0, 3.0, -0.8),
-    rpy=(0.0, 0.0, 0.0),
-    speed_m_s=0.3,
-    battery_v=15.0,
-    battery_share=0.8,
-    stalled_s=0.0,
-    lost_command="",
-)
+    now_s=100.0, wanted=(0.3, 0.1, 0.05, 0.2), held=(), vehicle_age_s=0.5, operator_age_s=0.5,
+    sensor_age_s={"imu": 0.02, "dvl": 0.1, "pressure": 0.1, "sonar": 0.1}, pos_w=(10.0, 3.0, -0.8),
+    rpy=(0.0, 0.0, 0.0), speed_m_s=0.3, battery_v=15.0, battery_share=0.8, stalled_s=0.0, lost_command="",
+)  # fmt: skip
 DRIVE, HOLD, SURFACE, HAND_BACK = safety.SafeAction
 NAN = math.nan
 

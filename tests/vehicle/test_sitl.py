@@ -106,18 +106,10 @@ def test_turning_over_the_axes_turns_attitudes_over():
 @pytest.mark.parametrize(
     "data",
     [
-        b"",
-        b"\x1a",
-        GOLDEN_PACKET[:-1],
-        GOLDEN_PACKET + b"\0",
-        packet(1, magic=1),
-        packet(1, rate=0),
-        packet(1, rate=65535),
-        packet(1, (1500,) * 32),
-        packet(1, magic=29569),
-        b"\xff" * 40,
+        b"", b"\x1a", GOLDEN_PACKET[:-1], GOLDEN_PACKET + b"\0", packet(1, magic=1), packet(1, rate=0),
+        packet(1, rate=65535), packet(1, (1500,) * 32), packet(1, magic=29569), b"\xff" * 40,
     ],
-)
+)  # fmt: skip
 def test_what_is_no_packet(data):
     assert frame_of(data) is None
 

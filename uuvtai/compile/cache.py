@@ -90,9 +90,8 @@ def value_of(bundle: Any, name: str) -> Any:
 
 def _value(bundle: Any, name: str) -> str:
     if name.startswith("["):
-        with contextlib.suppress(
-            ArithmeticError, TypeError
-        ):  # of another config, which goes another way before
+        # of another config, which goes another way before
+        with contextlib.suppress(ArithmeticError, TypeError):
             return repr(worked_out(json.loads(name), lambda leaf: value_of(bundle, leaf)))
         return ""
     value, leaf = value_of(bundle, name), name.rpartition(".")[2]

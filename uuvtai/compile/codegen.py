@@ -585,10 +585,8 @@ class Native:
         return made, sorted(names), numbers.table
 
     def _launch(self, code: MachineCode, kernel: Any, arguments: tuple, owner: Owner) -> NativeLaunch:
-        tasks, values = (
-            self.machine.tasks_of(code.machine, code.tasks),
-            _values(kernel, arguments, code.numbers),
-        )
+        tasks = self.machine.tasks_of(code.machine, code.tasks)
+        values = _values(kernel, arguments, code.numbers)
         return NativeLaunch(self.machine, owner.runtime, tasks, arguments, values)
 
     def _tell(self, kernel: Any, error: Exception, effect: str = "Taichi launches it") -> None:

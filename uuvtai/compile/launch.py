@@ -36,6 +36,9 @@ class TaichiLaunch:
     """A kernel compiled by Taichi for one list of arguments, which are kept alive: their identities are the
     key."""
 
+    place: Callable[[int], Any] = staticmethod(lambda number: (number,))
+    """how Taichi names an argument"""
+
     def __init__(
         self,
         kernel: Any,
@@ -46,7 +49,8 @@ class TaichiLaunch:
         """``values``: as in ``NativeLaunch``; None where no number of the config is an argument."""
         self.program: Any = impl.get_runtime().prog
         self._arguments = arguments
-        self._given = given(kernel, arguments) if values is None else values
+        told = given(kernel, arguments) if values is None else values
+        self._given = [(self.place(number), *value) for number, value in enumerate(told)]
         self._kernel, self._compiled = compiled or self._found(kernel)
 
     def _found(self, kernel: Any) -> tuple[Any, Any]:
@@ -56,15 +60,15 @@ class TaichiLaunch:
     def again(self) -> None:
         """Launch it."""
         context = self._kernel.make_launch_context()
-        for number, (declared, value) in enumerate(self._given):
+        for place, declared, value in self._given:
             if declared is int:
-                context.set_arg_int((number,), value)
+                context.set_arg_int(place, value)
             elif declared is float:
-                context.set_arg_float((number,), value)
+                context.set_arg_float(place, value)
             else:
                 size = value.element_size() * value.nelement()
                 context.set_arg_external_array_with_shape(
-                    (number,), value.data_ptr(), size, tuple(value.shape), 0
+                    place, value.data_ptr(), size, tuple(value.shape), 0
                 )
         self.program.launch_kernel(self._compiled, context)
 

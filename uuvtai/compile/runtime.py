@@ -17,6 +17,7 @@ from taichi.lang import impl
 from taichi.lang.impl import default_cfg
 
 from uuvtai.common.errors import DeviceError, SettingError
+from uuvtai.compile.first_import import adapt_quadrants
 
 # ------------------------------------------------------------------------------------------------------------
 # Taichi's cache of compiled kernels: how large it may grow, and locks that nobody holds any more.
@@ -81,12 +82,14 @@ def start_taichi(device: str = "cpu", precision: str = "f32") -> Runtime:
         if _started[0] != wanted:
             raise RuntimeError(f"Taichi already runs as {_started[0]}; start a new process for {wanted}")
         return wanted
-    with contextlib.suppress(
-        OSError
-    ):  # another process was faster, or may do so in our place: ``uuv doctor`` tells
+    # another process was faster, or may do so in our place: ``uuv doctor`` tells
+    with contextlib.suppress(OSError):
         for lock in stale_locks():
             lock.unlink()
-    options = {}
+    options: dict[str, Any] = {"offline_cache_max_size_of_files": CACHE_BYTES}
+    if ti.__name__ == "quadrants":
+        adapt_quadrants()
+        options = {}
     if threads := os.environ.get("UUV_NUM_THREADS"):
         options["cpu_max_num_threads"] = _thread_count(threads)
     with contextlib.redirect_stdout(sys.stderr):  # Taichi greets on stdout, which belongs to results
@@ -95,7 +98,6 @@ def start_taichi(device: str = "cpu", precision: str = "f32") -> Runtime:
             default_fp=wanted.real,
             fast_math=False,
             offline_cache=True,
-            offline_cache_max_size_of_files=CACHE_BYTES,
             cache_loop_invariant_global_vars=False,  # wrong where two indices are of one element
             cfg_optimization=False,  # LLVM does that work again: half of the time to compile, equal results;
             # and on CUDA Taichi 1.7.4 falls over what that pass leaves of ``tick_tree``

@@ -63,7 +63,7 @@ import types
 from typing import Any
 
 from taichi.lang import impl, kernel_impl, snode
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+from taichi.lang.ast import ast_transformer_utils
 
 from uuvtai.compile.first_import import inside_class
 
@@ -71,10 +71,9 @@ from uuvtai.compile.first_import import inside_class
 def remember_sources() -> None:
     """Give this process's Taichi the memory; once is enough. A Taichi without these names is left as it
     is."""
-    if hasattr(ASTTransformerContext, "get_pos_info") and not hasattr(
-        ASTTransformerContext.get_pos_info, "__wrapped__"
-    ):
-        ASTTransformerContext.get_pos_info = _short_unless_raised(ASTTransformerContext.get_pos_info)
+    context: Any = getattr(ast_transformer_utils, "ASTTransformerContext", None)
+    if hasattr(context, "get_pos_info") and not hasattr(context.get_pos_info, "__wrapped__"):
+        context.get_pos_info = _short_unless_raised(context.get_pos_info)
     for name in ("getsourcefile", "getsourcelines"):
         if hasattr(kernel_impl, name) and not hasattr(getattr(kernel_impl, name), "__wrapped__"):
             setattr(kernel_impl, name, functools.cache(getattr(kernel_impl, name)))
@@ -109,9 +108,8 @@ def _counted(materialize: Any) -> Any:
     @functools.wraps(materialize)
     def counted(kernel: Any, *arguments: Any, **named: Any) -> Any:
         before, tracer = len(kernel.compiled_kernels), sys.gettrace()
-        if (
-            tracer is not None
-        ):  # nobody debugs Taichi's front end, or measures its coverage: a third of the time under either
+        # nobody debugs Taichi's front end, or measures its coverage: a third of the time under either
+        if tracer is not None:
             sys.settrace(None)
         try:
             result = materialize(kernel, *arguments, **named)

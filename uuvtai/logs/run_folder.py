@@ -279,7 +279,8 @@ def _is_plain(path: Path) -> bool:
 
 def versions() -> dict[str, str]:
     found = {"uuvtai": __version__, "python": platform.python_version()}
-    for name in ("taichi", "torch", "numpy", "ompl", "mcap", "opencv-python-headless"):
+    compiler = getattr(sys.modules.get("taichi"), "__name__", "taichi")  # or quadrants, in its place
+    for name in (compiler, "torch", "numpy", "ompl", "mcap", "opencv-python-headless"):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

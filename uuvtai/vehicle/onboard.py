@@ -117,18 +117,6 @@ def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:
 
 
 __all__ = [
-    "KINDS",
-    "DepthShot",
-    "DvlReading",
-    "ImuReading",
-    "Mission",
-    "OnboardPilot",
-    "PilotCommand",
-    "PositionFix",
-    "PressureReading",
-    "SensorMessage",
-    "SonarPing",
-    "StaleLimits",
-    "Tally",
-    "ThrusterLoss",
-]
+    "KINDS", "DepthShot", "DvlReading", "ImuReading", "Mission", "OnboardPilot", "PilotCommand",
+    "PositionFix", "PressureReading", "SensorMessage", "SonarPing", "StaleLimits", "Tally", "ThrusterLoss",
+]  # fmt: skip
