@@ -52,7 +52,9 @@ def rows_of(sim):
 def test_every_bit_is_as_one_by_one(small, monkeypatch):
     in_a_row = driven(small)
     found = rows_of(small.sim)
-    assert found.keys() == {"_forget", "_sense", "_move", "_see", "_act"} and sum(found.values()) > 20
+    assert (
+        found.keys() == {"_begin", "_forget", "_sense", "_move", "_see", "_act"} and sum(found.values()) > 20
+    )
     assert np.ptp([float(action.sum()) for _, action, _ in in_a_row[0]]) > 0.1, "there is something to do"
     launch_one_by_one(monkeypatch, small.sim)
     assert_same(in_a_row, driven(small))
