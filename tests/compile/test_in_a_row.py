@@ -51,10 +51,8 @@ def rows_of(sim):
 
 def test_every_bit_is_as_one_by_one(small, monkeypatch):
     in_a_row = driven(small)
-    found = rows_of(small.sim)
-    assert (
-        found.keys() == {"_begin", "_forget", "_sense", "_move", "_see", "_act"} and sum(found.values()) > 20
-    )
+    names = {"_begin_anew", "_look", "_act_and_wake", "_move", "_act"}
+    assert rows_of(small.sim).keys() == names and sum(rows_of(small.sim).values()) > 20
     assert np.ptp([float(action.sum()) for _, action, _ in in_a_row[0]]) > 0.1, "there is something to do"
     launch_one_by_one(monkeypatch, small.sim)
     assert_same(in_a_row, driven(small))
@@ -116,7 +114,7 @@ def test_only_what_was_made_by_machine_code_becomes_a_row(small):
     rows.play(nothing, ())
     assert not rows._known
     rows.play(sim._act, ("what decides",))
-    assert rows_of(small.sim).keys() >= {"_act"} and rows._known["_act"]._on == ("what decides",)
+    assert rows_of(small.sim).keys() >= {"_act_and_wake"} and rows._known["_act"]._on == ("what decides",)
 
 
 def test_no_kernel_of_theirs_is_left_out(small, monkeypatch):
@@ -139,7 +137,7 @@ def test_no_kernel_of_theirs_is_left_out(small, monkeypatch):
                 monkeypatch.setattr(module, name, told(kernel))
     for privileged in (False, True):
         monkeypatch.setattr(sim, "privileged", privileged)
-        for work in (sim._move, sim._see, sim._act):
+        for work in (sim._move, sim._look, sim._act):
             launched.clear()
             assert len(noted(work)) == len(launched) > 3, work.__name__
 

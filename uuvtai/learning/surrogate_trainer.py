@@ -343,13 +343,8 @@ class SurrogateTrainer:
         self.iteration = self.env_steps = 0
         self._returns = torch.zeros(config.train.num_envs)
         self._held_out: ScenarioBank | None = None
-        self._allocate(
-            config.ppo.rollout_steps,
-            config.train.num_envs,
-            self.surrogate.view.obstacles.shape[1],
-            OBSTACLE_WIDTH,
-            EGO_COLUMNS,
-        )
+        lanes = self.surrogate.view.obstacles.shape[1]
+        self._allocate(config.ppo.rollout_steps, config.train.num_envs, lanes, OBSTACLE_WIDTH, EGO_COLUMNS)
         self.surrogate.begin(torch.ones(config.train.num_envs, dtype=torch.bool), self._next_scenarios())
         self.surrogate.look()
 
@@ -459,14 +454,9 @@ class SurrogateTrainer:
     def _learn(self) -> dict[str, float]:
         config = self.config.ppo
         advantage, target = gae(
-            self._reward,
-            self._value,
-            self._next_value,
-            self._terminated,
-            self._ended,
-            config.gamma,
+            self._reward, self._value, self._next_value, self._terminated, self._ended, config.gamma,
             config.gae_lambda,
-        )
+        )  # fmt: skip
         rows = [part.flatten(0, 1) for part in (self._obstacles, self._own, self._truth, self._action)]
         flat = [
             part.flatten()

@@ -136,14 +136,21 @@ class Sim:
         by the episode's key (``_plan_seed``): the same readings give the same commands
         (``uuvtai.vehicle.onboard``).
         """
-        if type(self.sensors) is SimulatedSensors:  # a vehicle's do more than launch
-            self._launched(self._sense)
-        else:
+        self._perceive(self._act)
+
+    def _perceive(self, act: Callable[[], None]) -> None:
+        if type(self.sensors) is SimulatedSensors:
+            self._launched(self._look)
+        else:  # a vehicle's do more than launch
             self._sense()
-        self._launched(self._see)
+            self._launched(self._see)
         with self._stage("planning"):
             self.fallback.serve(self.io, self._plan_seed, self.rows, self.counts.number, self.planner)
-        self._launched(self._act)
+        self._launched(act)
+
+    def _look(self) -> None:
+        self._sense()
+        self._see()
 
     def _sense(self) -> None:
         io, c = self.io, self.config
@@ -197,12 +204,15 @@ class Sim:
         """Begin episode ``number`` of ``seed`` where ``mask`` is 1 (int32, (n_env,)), and look around."""
         if self.planner is not None:
             self.planner.reset(mask)
-        self.draw(mask, seed, number)
-        self._launched(self._forget)
-        self.perceive()
+        self._draw(self._begin_anew, mask, seed, number)
+        self._perceive(self._act_and_wake)
+
+    def _act_and_wake(self) -> None:
+        self._act()
         episode.wake(self.io.episode)
 
-    def _forget(self) -> None:
+    def _begin_anew(self) -> None:
+        self._begin()
         io = self.io
         dynamics.reset_vehicle(io.dynamics)
         control.reset_actuation(io.actuation)
@@ -212,11 +222,14 @@ class Sim:
 
     def draw(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
         """Draw the scenarios of a ``reset`` to look at them, and nothing more: no row is ready for a step."""
-        for kept, given in zip(self._asked, (mask, seed, number), strict=True):
+        self._draw(self._begin, mask, seed, number)
+
+    def _draw(self, begin: Callable[[], None], *asked: torch.Tensor) -> None:
+        for kept, given in zip(self._asked, asked, strict=True):
             kept.copy_(given)
-        self._launched(self._begin)
+        self._launched(begin)
         if self.counts.has_any(self.s.world.faults):
-            check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
+            check_scenarios(self.rows(self.s.world.faults)[asked[0].cpu().numpy() == 1])
 
     def _begin(self) -> None:
         episode.begin_episodes(self.io.episode, *self._asked)

@@ -193,15 +193,9 @@ class Surrogate:
         """Carry out a decision (N, 3): (reward, outcome code), both (N,)."""
         b = self.bank
         motion.drive_surrogate(
-            self.rules,
-            action.contiguous(),
-            b.obstacle,
-            b.path,
-            self.scenario,
-            self.ego,
-            self.reward,
+            self.rules, action.contiguous(), b.obstacle, b.path, self.scenario, self.ego, self.reward,
             self.outcome,
-        )
+        )  # fmt: skip
         return self.reward, self.outcome
 
     def capture(self) -> dict[str, np.ndarray]:
