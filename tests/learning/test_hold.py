@@ -1,7 +1,5 @@
 """A decision held for several steps is one transition: rewards add up, endings are kept."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
@@ -39,17 +37,10 @@ class Scripted:
         )
 
 
-def held(steps, residual):
-    return Scripted(), SimpleNamespace(config=SimpleNamespace(hold_steps=steps, residual=residual))
-
-
 def test_rewards_add_up_and_an_ending_on_the_way_is_kept():
-    env, policy = held(4, residual=False)
     watched = []
-    end = Hold(env, policy).drive(
-        torch.ones(N, NUM_ACTIONS),
-        torch.zeros(N, NUM_ACTIONS),
-        lambda ended, info: watched.append(ended.tolist()),
+    end = Hold(Scripted(), 4).drive(
+        torch.ones(N, NUM_ACTIONS), lambda ended, info: watched.append(ended.tolist())
     )
     assert end.reward.tolist() == [10.0, 3.0, 10.0]
     assert end.final_obs.flatten().tolist() == [4.0, 2.0, 4.0]
@@ -59,20 +50,18 @@ def test_rewards_add_up_and_an_ending_on_the_way_is_kept():
     assert watched == [[False] * 3, [False, True, False], [False] * 3, [False] * 3]
 
 
-@pytest.mark.parametrize("residual", [False, True])
-def test_what_is_held_is_the_action_or_its_difference_from_the_tree(residual):
-    env, policy = held(4, residual)
-    Hold(env, policy).drive(torch.full((N, NUM_ACTIONS), 0.5), torch.full((N, NUM_ACTIONS), 0.2), None)
-    ours = [action[0, 0].item() for action in env.actions]
-    assert ours == pytest.approx([0.5, 1.3, 2.3, 3.3] if residual else [0.5] * 4)
+def test_what_is_held_is_the_action():
+    env = Scripted()
+    Hold(env, 4).drive(torch.full((N, NUM_ACTIONS), 0.5))
+    assert [action[0, 0].item() for action in env.actions] == [0.5] * 4
     assert [action[1, 0].item() for action in env.actions[2:]] == [2.0, 3.0], (
         "a new episode is driven by the tree until the next decision"
     )
 
 
 def test_one_step_is_a_step_of_the_env():
-    env, policy = held(1, residual=True)
-    end = Hold(env, policy).drive(torch.full((N, NUM_ACTIONS), 0.5), torch.zeros(N, NUM_ACTIONS), None)
+    env = Scripted()
+    end = Hold(env, 1).drive(torch.full((N, NUM_ACTIONS), 0.5))
     assert (env.steps, end.reward.tolist()) == (1, [1.0] * 3)
     assert env.actions[0].unique().tolist() == [0.5]
 

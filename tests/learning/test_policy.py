@@ -14,10 +14,8 @@ FLOAT32 = 1e-5
 """relative and absolute; a small network in float32, its sums in another order"""
 
 
-def make(seed=0, teacher_slice=None, **config):
-    return ActorCritic(
-        N_IN, PolicyConfig(hidden=(16, 16), **config), teacher_slice, torch.Generator().manual_seed(seed)
-    )
+def make(seed=0, **config):
+    return ActorCritic(N_IN, PolicyConfig(hidden=(16, 16), **config), torch.Generator().manual_seed(seed))
 
 
 @pytest.fixture
@@ -55,29 +53,6 @@ def test_shapes_follow_the_input(x):
     policy = make()
     assert policy.distribution(x.view(5, 10, N_IN))[0].shape == (5, 10, 4)
     assert policy.value(x.view(5, 10, N_IN)).shape == (5, 10)
-
-
-def test_a_residual_policy_is_the_teacher_at_birth(x):
-    policy = make(teacher_slice=slice(2, 6), residual=True, residual_limit=0.3)
-    policy.observation_norm.update(x)
-    assert torch.equal(policy.distribution(x)[0], x[:, 2:6])
-    nn.init.normal_(policy.actor[-1].weight, std=100.0, generator=torch.Generator().manual_seed(0))
-    added = (policy.distribution(x)[0] - x[:, 2:6]).detach()
-    assert float(added.abs().max()) == pytest.approx(0.3, abs=FLOAT32)
-
-
-def test_a_residual_policy_without_a_finite_teacher_stays_finite(x):
-    policy = make(teacher_slice=slice(2, 6), residual=True)
-    x[3, 2] = math.nan
-    mean = policy.distribution(x)[0].detach()
-    assert torch.isfinite(mean).all()
-    assert float(mean[3, 0]) == 0.0
-
-
-@pytest.mark.parametrize("teacher_slice", [None, slice(0, 3), slice(5, 9)])
-def test_a_residual_policy_needs_the_teacher_s_columns(teacher_slice):
-    with pytest.raises(ValueError, match=r"observation\.behavior=true"):
-        make(teacher_slice=teacher_slice, residual=True)
 
 
 def test_the_floor_of_the_deviation():

@@ -25,7 +25,7 @@ def networks(n_obs=N_OBS, seed=0, **config):
     """A policy and a world model that have seen a batch and act decidedly."""
     learning = load_training("smoke", [(f"policy.{key}", value) for key, value in config.items()])
     rng = torch.Generator().manual_seed(seed)
-    policy = ActorCritic(n_obs + 2, learning.policy, None, rng)
+    policy = ActorCritic(n_obs + 2, learning.policy, rng)
     model = WorldModel(n_obs, learning.world_model, rng)
     policy.observation_norm.update(3.0 * torch.randn(500, n_obs + 2, generator=rng))
     model.observation_norm.update(3.0 * torch.randn(500, n_obs, generator=rng))

@@ -112,9 +112,7 @@ def test_the_rate_follows_the_divergence():
 
 
 def make_policy(seed=0, **config):
-    return ActorCritic(
-        N_IN, PolicyConfig(hidden=(16, 16), **config), None, torch.Generator().manual_seed(seed)
-    )
+    return ActorCritic(N_IN, PolicyConfig(hidden=(16, 16), **config), torch.Generator().manual_seed(seed))
 
 
 def make_ppo(seed=0, **config):
@@ -467,7 +465,7 @@ def test_a_point_learns_to_go_home():
 
     def train():
         generator = torch.Generator().manual_seed(3)
-        policy = ActorCritic(4, PolicyConfig(hidden=(32, 32), initial_std=0.5), None, generator)
+        policy = ActorCritic(4, PolicyConfig(hidden=(32, 32), initial_std=0.5), generator)
         ppo = Ppo(
             policy, PpoConfig(rollout_steps=32, learning_rate=3e-3, epochs=4, gamma=0.9, entropy_weight=0.0)
         )

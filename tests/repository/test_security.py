@@ -680,8 +680,8 @@ SPECS = {
     b"{": "is not JSON",
     b"[" * 100_000: "is not JSON",
     b"[]": "is not the specification",
-    b'{"schema": 3}': "is not the specification",
-    b'{"schema": 2, "files": {}}': "lists other files",
+    b'{"schema": 2}': "is not the specification of an exported policy of schema 3",
+    b'{"schema": 3, "files": {}}': "lists other files",
 }
 STRANGE = ["../../etc/passwd", "/etc/passwd", "sub/policy.onnx"]
 

@@ -523,7 +523,6 @@ def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
-        ("policy.residual", True, "the surrogate has none"),
         ("world_model.enabled", True, "the surrogate has none"),
         ("policy.hold_steps", 4, "decides every 0.1 s"),
         ("episode.control_dt_s", 0.01, "decides every 0.1 s"),

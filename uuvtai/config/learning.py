@@ -30,14 +30,9 @@ class PolicyConfig(Section):
     """of the action, in parts of the vehicle's limits (EC)"""
     min_std: Positive = 0.05
     """floor: the policy never stops exploring altogether (EC)"""
-    residual: bool = False
-    """the mean is the tree's action plus what the network adds; needs ``observation.behavior``"""
-    residual_limit: Positive = 0.5
-    """largest addition, in parts of the vehicle's limits"""
     hold_steps: PositiveCount = 1
-    """control steps that a decision is held: the action, or what a residual policy adds to the tree's newest
-    one. Noise drawn anew every 0.02 s averages out before the vehicle has moved; held, it explores, and the
-    networks run that much less often"""
+    """control steps that an action is held. Noise drawn anew every 0.02 s averages out before the vehicle has
+    moved; held, it explores, and the networks run that much less often"""
 
 
 class PpoConfig(Section):

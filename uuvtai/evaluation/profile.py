@@ -157,9 +157,7 @@ def _networks(config: LearningConfig) -> dict[str, Callable[[], Any]]:
 
     generator, n_obs = torch.Generator().manual_seed(0), observation_width(config.observation)
     model = WorldModel(n_obs, config.world_model, generator)
-    policy = ActorCritic(
-        n_obs + N_FEATURES, config.policy.model_copy(update={"residual": False}), None, generator
-    )
+    policy = ActorCritic(n_obs + N_FEATURES, config.policy, generator)
     obs, action, x = torch.randn(1, n_obs), torch.rand(1, 4), torch.randn(1, n_obs + N_FEATURES)
     latent = torch.randn(1, config.world_model.latent)
     return {

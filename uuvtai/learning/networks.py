@@ -212,35 +212,18 @@ def entropy(log_std: torch.Tensor) -> torch.Tensor:
 
 class ActorCritic(nn.Module):
     """Two separate networks on the normalised input; all it knows, statistics included, is in its
-    ``state_dict``.
+    ``state_dict``. Inputs x are (..., n_in) raw."""
 
-    Inputs x are (..., n_in) raw. With ``config.residual`` the mean is the teacher's action, read from x
-    before normalisation, plus ``residual_limit`` tanh(network): the teacher itself at birth.
-    """
-
-    def __init__(
-        self, n_in: int, config: PolicyConfig, teacher_slice: slice | None, generator: torch.Generator
-    ) -> None:
-        """``teacher_slice``: columns of x with the teacher's action; ValueError where a residual policy has
-        none."""
+    def __init__(self, n_in: int, config: PolicyConfig, generator: torch.Generator) -> None:
+        """ValueError for a deviation that begins below its floor."""
         super().__init__()
-        if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != NUM_ACTIONS):
-            raise SettingError(
-                f"policy.residual adds to the teacher's {NUM_ACTIONS} commands, but the observation has no "
-                f"such columns (got {teacher_slice}): set observation.behavior=true or policy.residual=false"
-            )
         if config.initial_std < config.min_std:
             raise SettingError(
                 f"policy.initial_std {config.initial_std:g} lies below the floor policy.min_std "
                 f"{config.min_std:g}"
             )
-        self.config, self.n_in, self.teacher_slice = config, n_in, teacher_slice
-        self.actor = mlp(
-            (n_in, *config.hidden, NUM_ACTIONS),
-            config.activation,
-            generator,
-            0.0 if config.residual else _MEAN_GAIN,
-        )
+        self.config, self.n_in = config, n_in
+        self.actor = mlp((n_in, *config.hidden, NUM_ACTIONS), config.activation, generator, _MEAN_GAIN)
         self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
         self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
         self.observation_norm = RunningNorm(n_in, CLIP_OBSERVATION)
@@ -248,7 +231,7 @@ class ActorCritic(nn.Module):
 
     def distribution(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(mean (..., 4), log_std (4,)) of the action."""
-        return self.mean(self.observation_norm(x), self.teacher_action(x)), self.log_std
+        return self.actor(self.observation_norm(x)), self.log_std
 
     def value(self, x: torch.Tensor) -> torch.Tensor:
         """(...,) expected return, in units of the reward."""
@@ -258,29 +241,11 @@ class ActorCritic(nn.Module):
     def act(self, x: torch.Tensor, generator: torch.Generator) -> PolicyStep:
         """Draw actions for x (N, n_in) with noise from a CPU generator."""
         normalised = self.observation_norm(x)
-        mean = self.mean(normalised, self.teacher_action(x))
+        mean = self.actor(normalised)
         noise = torch.randn(mean.shape, generator=generator).to(mean.device)
         action = torch.addcmul(mean, noise, self.log_std.exp())
         value = self.value_norm.inverse(self.critic(normalised).squeeze(-1))
         return PolicyStep(action, log_prob(action, mean, self.log_std), value, mean)
-
-    def mean(self, normalised: torch.Tensor, teacher_action: torch.Tensor | None) -> torch.Tensor:
-        """(..., 4) mean action of normalised inputs; ``teacher_action`` is what ``teacher_action(x)``
-        gave."""
-        return self.mean_of(self.actor(normalised), teacher_action)
-
-    def mean_of(self, out: torch.Tensor, teacher_action: torch.Tensor | None) -> torch.Tensor:
-        """(..., 4) mean action from the actor network's output (..., 4)."""
-        if not self.config.residual or teacher_action is None:
-            return out
-        return teacher_action + self.config.residual_limit * torch.tanh(out)
-
-    def teacher_action(self, x: torch.Tensor) -> torch.Tensor | None:
-        """(..., 4) the columns that a residual policy adds to (what is not finite counts as 0); None for
-        others."""
-        if not self.config.residual or self.teacher_slice is None:
-            return None
-        return x[..., self.teacher_slice].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
 
     @torch.no_grad()
     def floor_std(self) -> None:

@@ -23,8 +23,6 @@ from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
 CHUNK = 64
 """rows that go through the networks together"""
-TEACHER_COLUMN = "teacher_action"
-"""column of the observation that a residual policy adds to"""
 
 
 class AgentDecision(NamedTuple):
@@ -58,21 +56,16 @@ class PolicyAgent:
         self.policy, self.world_model, self.device = policy, world_model, torch.device(device)
         self._n_obs = policy.n_in - N_FEATURES
         rows = num_envs
-        self._x, self._last_obs = (
-            torch.zeros(rows, width, device=device) for width in (policy.n_in, self._n_obs)
+        self._obs, self._last_obs = (torch.zeros(rows, self._n_obs, device=device) for _ in range(2))
+        self.mean_action, self._last_action = (
+            torch.zeros(rows, NUM_ACTIONS, device=device) for _ in range(2)
         )
-        self._action, self._last_action = (torch.zeros(rows, NUM_ACTIONS, device=device) for _ in range(2))
+        """(num_envs, 4) of the last decision, before it was cut off to [-1, 1]"""
         self._has_last = torch.zeros(rows, dtype=torch.bool, device=device)
         self._hold, self._age = policy.config.hold_steps, torch.zeros(rows, dtype=torch.int64, device=device)
-        self._offset, self._said = (torch.zeros(rows, width, device=device) for width in (NUM_ACTIONS, 3))
+        self._said = torch.zeros(rows, 3, device=device)
         self.decision = AgentDecision(*(torch.zeros(0) for _ in AgentDecision._fields))
         """the last one; where an older one is held, what the networks said then"""
-
-    @property
-    def mean_action(self) -> torch.Tensor:
-        """(num_envs, 4) action of the last decision before it was cut off to [-1, 1]: what the difference
-        that is held was taken from."""
-        return self._action
 
     def reset(self, rows: torch.Tensor) -> None:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
@@ -83,24 +76,21 @@ class PolicyAgent:
     @torch.no_grad()
     def decide(self, obs: torch.Tensor) -> AgentDecision:
         """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on."""
-        x = self._x
         fill = self.policy.observation_norm.mean[: self._n_obs].float()
-        x[:, : self._n_obs] = torch.where(torch.isfinite(obs), obs, fill)
+        self._obs[:] = torch.where(torch.isfinite(obs), obs, fill)
         due = self._due()
         if len(due):
             self._think(due)
-        teacher = self.policy.teacher_action(x)
-        self._action = self._offset if teacher is None else teacher + self._offset
         value, residual, uncertainty = self._said.clone().T
         self.decision = AgentDecision(
-            self._action.clamp(-1.0, 1.0), value, self.policy.log_std.exp(), residual, uncertainty
+            self.mean_action.clamp(-1.0, 1.0), value, self.policy.log_std.exp(), residual, uncertainty
         )
         return self.decision
 
     def advance(self) -> None:
         """The last decision has been carried out."""
         due = self._due()
-        self._last_obs[due], self._last_action[due] = self._x[due, : self._n_obs], self._action[due]
+        self._last_obs[due], self._last_action[due] = self._obs[due], self.mean_action[due]
         self._has_last[due] = True
         self._age += 1
 
@@ -116,20 +106,15 @@ class PolicyAgent:
 
     def _think(self, rows: torch.Tensor) -> None:
         """Ask the networks about these rows."""
-        x = self._x[rows]
-        x[:, self._n_obs :] = self._features(rows, x)
-        self._x[rows] = x
-        teacher = self.policy.teacher_action(x)
-        mean = by_chunk(lambda part: self.policy.distribution(part)[0], x)
-        self._offset[rows] = mean if teacher is None else mean - teacher
+        obs = self._obs[rows]
+        x = torch.cat([obs, self._features(rows, obs)], dim=1)
+        self.mean_action[rows] = by_chunk(lambda part: self.policy.distribution(part)[0], x)
         self._said[rows] = torch.stack([by_chunk(self.policy.value, x), x[:, -2], x[:, -1]], dim=1)
 
-    def _features(self, rows: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    def _features(self, rows: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         if self.world_model is None:
-            return x.new_zeros(len(x), N_FEATURES)
-        found = by_chunk(
-            self.world_model.features, self._last_obs[rows], self._last_action[rows], x[:, : self._n_obs]
-        )
+            return obs.new_zeros(len(obs), N_FEATURES)
+        found = by_chunk(self.world_model.features, self._last_obs[rows], self._last_action[rows], obs)
         return torch.where(self._has_last[rows, None], found, 0.0)
 
 
@@ -188,17 +173,14 @@ _NO_NETWORK = {
 def load_agent(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> PolicyAgent:
     """PolicyAgent with the networks of a checkpoint. Raises CheckpointError where they do not fit what its
     config says."""
-    config, rows = checkpoint.config, checkpoint.manifest.observation_table
+    config = checkpoint.config
     if config.learner in _NO_NETWORK:
         raise CheckpointError(f"{checkpoint.path}: {_NO_NETWORK[config.learner]}")
     parts, generator = checkpoint.model(), torch.Generator()
     with fitting(checkpoint):
-        n_obs = max(row["stop"] for row in rows)
-        teacher = next(
-            (slice(row["first"], row["stop"]) for row in rows if row["name"] == TEACHER_COLUMN), None
-        )
+        n_obs = max(row["stop"] for row in checkpoint.manifest.observation_table)
         _check_sizes(parts, config, n_obs)
-        policy = ActorCritic(n_obs + N_FEATURES, config.policy, teacher, generator)
+        policy = ActorCritic(n_obs + N_FEATURES, config.policy, generator)
         policy.load_state_dict(parts["policy"])
         world_model = None
         if config.world_model.enabled and config.world_model.as_features:

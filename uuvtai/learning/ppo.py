@@ -82,8 +82,6 @@ class Minibatch:
     that were not finite."""
 
     normalised: torch.Tensor
-    prior: torch.Tensor
-    """(M, 4) teacher's action that a residual policy adds to; (M, 0) for others"""
     action: torch.Tensor
     log_prob: torch.Tensor
     advantage: torch.Tensor
@@ -200,10 +198,8 @@ class Ppo:
             )
             for name in ("action", "log_prob", "teacher_action", "weight")
         }
-        prior = self.policy.teacher_action(rollout.flat("x"))
         return Minibatch(
             normalised=self._normalise(rollout.flat("x")),
-            prior=flat_valid.new_empty(len(flat_valid), 0) if prior is None else prior,
             advantage=_standardised(advantage, valid).flatten(),
             target=norm(returns.flatten()),
             valid=flat_valid.float(),
@@ -254,14 +250,14 @@ class Ppo:
         bfloat16 = in_bfloat16(self.config, x.device.type)
         value = _output(self.policy.critic, x, bfloat16)
         acting = surrogate or distillation_weight != 0.0
-        out = _output(self.policy.actor, x, bfloat16) if acting else batch.action
-        self._loss(batch, value, out, count, distillation_weight, surrogate, sums).backward()
+        mean = _output(self.policy.actor, x, bfloat16) if acting else batch.action
+        self._loss(batch, value, mean, count, distillation_weight, surrogate, sums).backward()
 
     def _loss(
         self,
         batch: Minibatch,
         value_out: torch.Tensor,
-        actor_out: torch.Tensor,
+        mean: torch.Tensor,
         count: torch.Tensor,
         distillation_weight: float,
         surrogate: bool,
@@ -274,7 +270,6 @@ class Ppo:
         loss = config.value_weight * (share * value_error).sum()
         zero = torch.zeros_like(batch.valid)
         policy_loss, kl, clipped, distill = zero, zero, zero, zero
-        mean = self.policy.mean_of(actor_out, batch.prior)
         if surrogate:
             log_ratio = log_prob(batch.action, mean, self.policy.log_std) - batch.log_prob
             policy_loss = surrogate_loss(log_ratio, batch.advantage, config.clip)

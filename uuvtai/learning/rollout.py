@@ -228,17 +228,16 @@ class HeldResult(NamedTuple):
 
 
 class Hold:
-    """Drives the envs through ``policy.hold_steps`` control steps by one decision.
+    """Drives the envs through ``steps`` control steps by one action.
 
     An episode that begins on the way is driven by the behaviour tree until the next decision.
     """
 
-    def __init__(self, env: VectorEnv, policy: ActorCritic) -> None:
-        """What is held is the policy's action, or its difference from the tree's for a residual policy."""
-        self._env, self.steps, self._residual = env, policy.config.hold_steps, policy.config.residual
+    def __init__(self, env: VectorEnv, steps: int) -> None:
+        self._env, self.steps = env, steps
 
-    def drive(self, action: torch.Tensor, teacher: torch.Tensor, watch: Watch | None = None) -> HeldResult:
-        """Carry out ``action`` (N, 4), decided where the tree would have done ``teacher`` (N, 4)."""
+    def drive(self, action: torch.Tensor, watch: Watch | None = None) -> HeldResult:
+        """Carry out ``action`` (N, 4)."""
         end = self._step(action)
         if watch:
             watch(end.ended, end.info)
@@ -247,11 +246,9 @@ class Hold:
         end = end._replace(
             final_obs=end.final_obs.clone(), reward=end.reward.clone(), terminated=end.terminated.clone()
         )
-        offset = action - teacher if self._residual else action
         for _ in range(self.steps - 1):
             newest = end.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-            held = newest + offset if self._residual else offset
-            step = self._step(torch.where(end.ended[:, None], newest, held))
+            step = self._step(torch.where(end.ended[:, None], newest, action))
             if watch:
                 watch(step.ended, step.info)
             end = _joined(end, step)
@@ -315,7 +312,7 @@ class Collector:
         self.uncertainty = torch.zeros(rollout.steps, n, device=device)
         """(T, N) the world model's uncertainty proxy of every transition in the rollout"""
         self.leaf_errors = LeafErrors(env.node_names, device)
-        self.hold = Hold(env, policy)
+        self.hold = Hold(env, policy.config.hold_steps)
         self._teacher, self._reward = (
             torch.zeros(n, NUM_ACTIONS, device=device),
             torch.zeros(n, device=device),
@@ -388,9 +385,7 @@ class Collector:
     def _drive(self, action: torch.Tensor, sums: RolloutSums | None = None) -> HeldResult:
         """Hold a decision; fills the reward, NaN for samples with anything bad, and the input it led to."""
         began = time.perf_counter()
-        end = self.hold.drive(
-            action, self._teacher, None if sums is None else lambda ended, info: _count(sums, ended, info)
-        )
+        end = self.hold.drive(action, None if sums is None else lambda ended, info: _count(sums, ended, info))
         self._obs, self.info = end.obs, end.info
         self.simulate_s += time.perf_counter() - began
         self._bad |= self.guard.values("reward", end.reward, self._reward)

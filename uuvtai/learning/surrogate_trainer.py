@@ -555,14 +555,11 @@ def _copied(net: torch.nn.Module) -> dict[str, torch.Tensor]:
 def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
     """Raise SettingError for parts of a training that the surrogate does not have, and sizes that do not
     fit."""
-    for name, is_on in (
-        ("policy.residual", config.policy.residual),
-        ("world_model.enabled", config.world_model.enabled),
-    ):
-        if is_on:
-            raise SettingError(
-                f"{name}: the surrogate has none; set {name}=false, or surrogate.enabled=false"
-            )
+    if config.world_model.enabled:
+        raise SettingError(
+            "world_model.enabled: the surrogate has none; set world_model.enabled=false, or "
+            "surrogate.enabled=false"
+        )
     held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
         raise SettingError(

@@ -25,9 +25,6 @@ from uuvtai.learning.world_model import WorldModel, WorldModelLearner
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import VectorEnv
 
-TEACHER_COLUMN = "teacher_action"
-"""column of the observation that a residual policy adds to"""
-
 
 class Trainer:
     """Everything that training carries from one iteration to the next.
@@ -42,9 +39,7 @@ class Trainer:
         self.env, self.config, self.observation_table = env, config, env.observation_table
         self.generator = torch.Generator().manual_seed(config.train.seed)
         n_in, device = env.num_obs + N_FEATURES, env.device
-        self.policy = ActorCritic(n_in, config.policy, _columns(env, TEACHER_COLUMN), self.generator).to(
-            device
-        )
+        self.policy = ActorCritic(n_in, config.policy, self.generator).to(device)
         self.uncertainty = Uncertainty(config.uncertainty).to(device)
         self.rollout = Rollout(config.ppo.rollout_steps, env.num_envs, n_in, device)
         self.guard = Guard(
@@ -197,8 +192,3 @@ class Trainer:
     def _samples(self) -> int:
         """Env-steps of one rollout."""
         return self.rollout.steps * self.collector.hold.steps * self.env.num_envs
-
-
-def _columns(env: VectorEnv, name: str) -> slice | None:
-    """Columns of the observation with this name, None where it has none."""
-    return next((column.slice for column in env.observation_table if column.name == name), None)

@@ -27,19 +27,13 @@ from uuvtai.learning.export.folder import of_torch
 from uuvtai.learning.export.graph import TOLERANCE, OneDecision, golden_of, missing_packages
 from uuvtai.learning.export.spec import weights_of
 from uuvtai.learning.networks import ActorCritic
-from uuvtai.learning.policy_agent import TEACHER_COLUMN, PolicyAgent, load_agent
+from uuvtai.learning.policy_agent import PolicyAgent, load_agent
 from uuvtai.learning.world_model import N_TARGET, WorldModel
 from uuvtai.plugins.api import plugin_spec
 from uuvtai.plugins.loading import graph_of, onnx_policy
 
 N_OBS = 40
-TEACHER = slice(30, 34)
-TABLE = [
-    ("goal", 0, 3, "m", "body"),
-    ("rest", 3, 30, "1", "level"),
-    (TEACHER_COLUMN, 30, 34, "1", "body"),
-    ("more", 34, 40, "s", "body"),
-]
+TABLE = [("goal", 0, 3, "m", "body"), ("rest", 3, 30, "1", "level"), ("more", 30, 40, "s", "body")]
 SMALL = {"policy.hidden": [16, 16], "world_model.hidden": [16], "world_model.latent": 8}
 
 
@@ -59,7 +53,7 @@ def config_of(**changes):
 def networks(config, seed=0):
     """Networks that have seen a batch and act decidedly, as a trainer's state."""
     rng = torch.Generator().manual_seed(seed)
-    policy = ActorCritic(N_OBS + 2, config.policy, TEACHER, rng)
+    policy = ActorCritic(N_OBS + 2, config.policy, rng)
     policy.observation_norm.update(3.0 * torch.randn(500, N_OBS + 2, generator=rng) + 1.0)
     policy.value_norm.update(20.0 * torch.randn(500, 1, generator=rng) + 5.0)
     with torch.no_grad():
@@ -88,8 +82,6 @@ def exported(found, out, note=lambda _text: None, evaluations=()):
 # -------------------------------------------------------------------------------------------------- agreement
 
 CASES = {
-    "residual held for ten steps": {"policy.residual": True, "policy.hold_steps": 10},
-    "residual at every step": {"policy.residual": True},
     "plain, held for ten": {"policy.hold_steps": 10},
     "plain at every step": {},
     "no features, tanh": {
@@ -133,34 +125,29 @@ def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, chan
 def test_networks_that_have_seen_nothing_agree_too():
     config, rng = config_of(), torch.Generator().manual_seed(0)
     pilot = PolicyAgent(
-        ActorCritic(N_OBS + 2, config.policy, None, rng), WorldModel(N_OBS, config.world_model, rng), 1
+        ActorCritic(N_OBS + 2, config.policy, rng), WorldModel(N_OBS, config.world_model, rng), 1
     )
     golden = golden_of(pilot)
     spec = {
         "observation": {"width": N_OBS},
         "action": [{"limit": 1.0}] * 4,
         "rate": {"hold_steps": 1, "control_dt_s": 0.02},
+        "network": {"activation": "elu", "predict_change": True},
     }
-    spec["network"] = {
-        "teacher_columns": None, "activation": "elu", "predict_change": True, "residual_limit": 0.5,
-    }  # fmt: skip
     policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
     answer = run_policy.replayed(policy, golden)
     assert max(run_policy.difference(values, golden[name]) for name, values in answer.items()) <= TOLERANCE
 
 
-def test_a_held_residual_follows_the_newest_tree_action(tmp_path, no_onnx):
-    exported(saved(tmp_path / "run", policy__residual=True, policy__hold_steps=10), tmp_path / "out")
+def test_a_held_action_does_not_follow_the_newest_observation(tmp_path, no_onnx):
+    exported(saved(tmp_path / "run", policy__hold_steps=10), tmp_path / "out")
     policy = run_policy.load(tmp_path / "out")
-    obs = np.zeros(N_OBS, np.float32)
-    first = policy.act(obs)
-    obs[TEACHER] = 0.1
-    second = policy.act(obs)
-    np.testing.assert_allclose(second.action, np.clip(first.action + 0.1, -1, 1), atol=1e-6)
+    first, second = policy.act(np.zeros(N_OBS)), policy.act(np.ones(N_OBS))
+    np.testing.assert_array_equal(second.action, first.action)
     np.testing.assert_allclose(second.command_si, second.action * [0.6, 0.6, 0.4, 1.0], rtol=1e-6)
     assert second.value == first.value, "what it thinks is held too"
     policy.reset()
-    assert policy.act(obs).value != first.value
+    assert policy.act(np.ones(N_OBS)).value != first.value
 
 
 def test_an_observation_of_another_width_is_refused(folder):
@@ -172,9 +159,7 @@ def test_an_observation_of_another_width_is_refused(folder):
 
 
 @pytest.mark.skipif(bool(missing_packages()), reason="needs the extra uuvtai[export]")
-@pytest.mark.parametrize(
-    "changes", [{"policy__residual": True, "policy__hold_steps": 10}, {"world_model__as_features": False}]
-)
+@pytest.mark.parametrize("changes", [{"policy__hold_steps": 10}, {"world_model__as_features": False}])
 def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, capfd):
     pytest.importorskip("onnxruntime")
     found = exported(saved(tmp_path / "run", **changes), tmp_path / "out")

@@ -165,7 +165,7 @@ simulator of uuvtai {version}.
 `python run_policy.py` (NumPy alone) replays the golden pairs and prints the latency. In a program:
 `load(folder)`, `reset()` when a mission begins, `act(observation)` at every control step ({control_hz:g} Hz).
 A decision is made every {hold_steps} control step(s);
-{residual} `policy_spec.json` lists every column of the observation
+in between the action is kept. `policy_spec.json` lists every column of the observation
 with unit, frame and scaling, the limits of the actions, the rate and the sha256 of every file.{graph}
 
 ## What it is for
@@ -184,11 +184,6 @@ means something else makes the policy worthless.
 _COUNTED = """
 Rates are counts with 95 % Wilson intervals. Collision counts contacts, time-to-collision stops and leaving
 the tank."""
-_RESIDUAL = (
-    "it adds to the behaviour tree's action, which is part of the observation, so the tree has to "
-    "run beside it."
-)
-_PLAIN = "in between the action is kept."
 _GRAPH = """
 
 `policy.onnx` is one decision without memory: remember the last decision yourself, as `graph`
@@ -197,7 +192,6 @@ in the specification says."""
 
 def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
     """The card as Markdown."""
-    is_residual = spec["network"]["teacher_columns"] is not None
     return _TEXT.format(
         name=spec["name"],
         version=checkpoint.manifest.version,
@@ -205,7 +199,6 @@ def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[E
         results=results_text(checkpoint, evaluations),
         control_hz=spec["rate"]["control_hz"],
         hold_steps=spec["rate"]["hold_steps"],
-        residual=_RESIDUAL if is_residual else _PLAIN,
         tree=", behaviour tree" if checkpoint.config.observation.behavior else "",
         graph=_GRAPH if spec["graph"] else "",
     )

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 SPEC, WEIGHTS, GOLDEN = "policy_spec.json", "policy.safetensors", "golden.npz"
-SCHEMA = 2
+SCHEMA = 3
 """of the folder; another one is refused"""
 FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py", "run_set_policy.py")
 """names that the spec may list; nothing else is ever opened"""
@@ -86,8 +86,6 @@ class Policy:
             )
             self.n_obs, self.hold_steps = int(spec["observation"]["width"]), int(spec["rate"]["hold_steps"])
             self.control_dt_s = float(spec["rate"]["control_dt_s"])
-            teacher = self._network["teacher_columns"]
-            self._teacher = None if teacher is None else slice(int(teacher[0]), int(teacher[1]))
             self._a = arrays
             self._nets = {
                 name: layers_of(arrays, name)
@@ -106,7 +104,7 @@ class Policy:
         """Forget the last step: another mission begins."""
         self._age = 0
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._offset, self._said = np.zeros(N_ACTION, np.float32), np.zeros(3, np.float32)
+        self._mean, self._said = np.zeros(N_ACTION, np.float32), np.zeros(3, np.float32)
 
     def act(self, observation: Any) -> Decision:
         """Decision for the newest observation (n_obs,), carried out: call it every control step, also while a
@@ -117,35 +115,20 @@ class Policy:
                 f"the observation must have shape ({self.n_obs},), got {obs.shape}; its columns are listed "
                 f"in {SPEC}"
             )
-        obs = self._filled(obs)
+        obs = np.where(np.isfinite(obs), obs, self._a["norm.mean"][: self.n_obs])
         if self._age % self.hold_steps == 0:
             self._think(obs)
-        action = self._base(obs) + self._offset
-        if self._age % self.hold_steps == 0:
-            self._last = obs, action
+            self._last = obs, self._mean
         self._age += 1
         value, residual, uncertainty = (float(said) for said in self._said)
-        action = np.clip(action, -1.0, 1.0)
+        action = np.clip(self._mean, -1.0, 1.0)
         return Decision(action, action * self._limits, value, residual, uncertainty)
-
-    def _filled(self, obs: np.ndarray) -> np.ndarray:
-        """What is not finite counts as the training's mean."""
-        return np.where(np.isfinite(obs), obs, self._a["norm.mean"][: self.n_obs])
-
-    def _base(self, obs: np.ndarray) -> np.ndarray:
-        """What the network's part is added to: the tree's newest action for a residual policy."""
-        return np.zeros(N_ACTION, np.float32) if self._teacher is None else obs[self._teacher]
 
     def _think(self, obs: np.ndarray) -> None:
         """Ask the networks: what is held until the next decision, and what they say."""
         x = np.concatenate([obs, self._features(obs)])
         scaled = self._scaled(x, "norm")
-        out = self._through("actor", scaled)
-        if self._teacher is None:
-            self._offset = out
-        else:  # as in training: the difference between the mean and the tree's action is what is held
-            tree = self._base(obs)
-            self._offset = (tree + np.float32(self._network["residual_limit"]) * np.tanh(out)) - tree
+        self._mean = self._through("actor", scaled)
         value = self._a["value.mean"][0] + self._through("critic", scaled)[0] * self._a["value.std"][0]
         self._said = np.array([value, x[-2], x[-1]], np.float32)
 
@@ -199,8 +182,6 @@ class Policy:
                 raise ValueError(f"{name} is not a network from {first} to {last}")
         if self.hold_steps < 1 or self._network["activation"] not in _ACTIVATIONS:
             raise ValueError("hold_steps or activation")
-        if self._teacher is not None and len(range(self.n_obs)[self._teacher]) != N_ACTION:
-            raise ValueError("teacher_columns")
 
 
 _ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -254,7 +235,7 @@ def read_spec(folder: Path) -> dict[str, Any]:
     if not isinstance(spec, dict) or spec.get("schema") != SCHEMA:
         raise PolicyError(
             f"{file}: is not the specification of an exported policy of schema {SCHEMA}; give a folder of "
-            "uuv export"
+            "this version's uuv export"
         )
     return spec
 

@@ -51,9 +51,8 @@ _OBSERVATION = (
 )
 _HOLD = (
     "The networks decide at the first control step of a mission and then at every hold_steps-th one. In "
-    "between the decision is held: the action itself, or, for a residual policy, its difference from the "
-    "tree's action, which is added to the newest tree action in the observation. The result is cut off to "
-    "[-1, 1]. last_obs and last_action are those of the last decision."
+    "between the action is held. It is carried out cut off to [-1, 1]. last_obs and last_action are those of "
+    "the last decision."
 )
 
 
@@ -140,12 +139,10 @@ def _rate(control_dt_s: float, hold_steps: int) -> dict[str, Any]:
 
 def _network(agent: PolicyAgent) -> dict[str, Any]:
     """What ``run_policy.py`` has to know beside the arrays."""
-    config, teacher = agent.policy.config, agent.policy.teacher_slice
+    config = agent.policy.config
     return {
         "hidden": list(config.hidden),
         "activation": config.activation,
-        "residual_limit": config.residual_limit,
-        "teacher_columns": [teacher.start, teacher.stop] if config.residual and teacher else None,
         "predict_change": agent.world_model is None or agent.world_model.config.predict_change,
         "clip_observation": CLIP_OBSERVATION,
     }
