@@ -32,14 +32,14 @@ def describe_scenario(read: Read) -> dict[str, Any]:
     for slot in range(len(kind)):
         if kind[slot] in KIND_NAMES:
             lane = slot - first_moving
-            row = {name: rows[lane] for name, rows in path.items()}
+            row = {name: rows[lane] for name, rows in path.items()} if lane >= 0 else {}
             body = {
                 "slot": slot,
                 "kind": KIND_NAMES[int(kind[slot])],
                 "position": pos[slot].tolist(),
                 "size": size[slot].tolist(),
                 "yaw": float(yaw[slot]),
-                "path": path_document(row) if lane >= 0 else None,
+                "path": path_document(row) if row else None,
             }
             obstacles.append(body)
     return {
