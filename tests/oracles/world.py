@@ -90,3 +90,30 @@ def path_position(path, time_s):
     a, b = corners[i], corners[(i + 1) % len(corners)]
     share = min(1.0, arc / math.dist(a, b))
     return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])
+
+
+def driven(corners, phase_m, speed, acceleration, times_s):
+    """Rows of (x, y, vx, vy) at times (n,) [s]: around a closed polyline, integrated in steps of 1 ms. Where
+    the next corner is so near that half of the change of velocity is done when an obstacle that turns at once
+    would be there, it accelerates towards the next leg's velocity."""
+    legs = np.roll(corners, -1, axis=0) - corners
+    length = np.linalg.norm(legs, axis=1)
+    along = speed * legs / length[:, None]
+    turn = along - np.roll(along, 1, axis=0)  # at each corner, from the leg before it
+    turn_s = np.linalg.norm(turn, axis=1) / acceleration
+    begun_s = (np.cumsum(length) - length) / speed  # when each corner would be reached
+    lap_s, now_s, last_s = length.sum() / speed, phase_m / speed, phase_m / speed + times_s[-1]
+    share = turn_s[0] / (turn_s[0] + turn_s[1])  # a moment of leg 0 that is in no turn
+    t = share * length[0] / speed - lap_s
+    state, out, wanted = np.array([*(corners[0] + share * legs[0]), *along[0]]), [], list(now_s + times_s)
+    while t <= last_s + 1e-3:
+        while wanted and wanted[0] <= t:
+            out.append(state.copy())
+            wanted.pop(0)
+        apart = (t + 5e-4 - begun_s + 0.5 * lap_s) % lap_s - 0.5 * lap_s
+        within = np.clip((0.5 * turn_s - np.abs(apart)) / 1e-3 + 0.5, 0.0, 1.0)  # parts of this step
+        push = within @ (turn / turn_s[:, None])
+        state[:2] += 1e-3 * (state[2:] + 5e-4 * push)
+        state[2:] += 1e-3 * push
+        t += 1e-3
+    return np.array(out)

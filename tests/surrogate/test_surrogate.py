@@ -183,11 +183,13 @@ def test_the_hull_rule_is_that_of_the_oracle():
     np.testing.assert_allclose(out.numpy(), expected, atol=1e-5)
 
 
-def test_obstacles_move_as_in_closed_form(small, bank):
+@pytest.mark.parametrize("easing_m", [0.0, 0.4])
+def test_obstacles_move_as_in_closed_form(small, bank, easing_m):
     small.begin(range(small.N), seed=5)
-    times = torch.linspace(0.0, 50.0, small.N)
+    times, path = torch.linspace(0.0, 50.0, small.N), bank.path.clone()
+    path[..., 15] = easing_m
     out = torch.zeros(*bank.path.shape[:2], 4)
-    places(bank.path, times, out)
+    places(path, times, out)
     checked = 0
     for row in range(small.N):
         arrays = {k: v[row] for k, v in small.arrays("world", "path", "mission").items()}
@@ -195,10 +197,13 @@ def test_obstacles_move_as_in_closed_form(small, bank):
         for body in describe_scenario(lambda name, arrays=arrays: arrays[name])["obstacles"]:
             if body["path"]:
                 near = np.array([times[row] - 1e-3, times[row], times[row] + 1e-3])
-                way = path_positions(body["path"], near)
+                way = path_positions({**body["path"], "easing_m": easing_m}, near)
                 found = out[row, body["slot"] - first].numpy()
                 np.testing.assert_allclose(found[:2], way[1], atol=1e-3)  # float32 after 50 s
-                np.testing.assert_allclose(np.hypot(*found[2:]), body["path"]["speed_m_s"], rtol=1e-4)
+                if easing_m:
+                    np.testing.assert_allclose(found[2:], (way[2] - way[0]) / 2e-3, atol=2e-3)
+                else:
+                    np.testing.assert_allclose(np.hypot(*found[2:]), body["path"]["speed_m_s"], rtol=1e-4)
                 checked += 1
     assert checked == 6 * small.N
 

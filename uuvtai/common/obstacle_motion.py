@@ -25,20 +25,21 @@ def describe_scenario(read: Read) -> dict[str, Any]:
     kind, pos, size, yaw = (read(f"world.{name}") for name in ("kind", "pos_w", "size", "yaw"))
     path = {
         name: read(f"path.{name}")
-        for name in ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s")
+        for name in ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s", "easing_m")
     }
     first_moving = len(kind) - len(path["n_way"])
     obstacles = []
     for slot in range(len(kind)):
         if kind[slot] in KIND_NAMES:
             lane = slot - first_moving
+            row = {name: rows[lane] for name, rows in path.items()} if lane >= 0 else {}
             body = {
                 "slot": slot,
                 "kind": KIND_NAMES[int(kind[slot])],
                 "position": pos[slot].tolist(),
                 "size": size[slot].tolist(),
                 "yaw": float(yaw[slot]),
-                "path": None if lane < 0 else _path({name: rows[lane] for name, rows in path.items()}),
+                "path": path_document(row) if row else None,
             }
             obstacles.append(body)
     return {
@@ -52,11 +53,14 @@ def describe_scenario(read: Read) -> dict[str, Any]:
     }
 
 
-def _path(row: dict[str, Any]) -> dict[str, Any]:
+def path_document(row: dict[str, Any]) -> dict[str, Any]:
+    """The path of one moving obstacle, by its row of each field of ``PathState``."""
     common = {key: float(row[key]) for key in ("length_m", "phase_m", "speed_m_s")}
     if row["n_way"] == 0:
         circle = {"shape": "circle", "center": row["way_w"][0].tolist(), "radius_m": float(row["radius_m"])}
         return circle | common
+    if row["easing_m"] > 0:
+        common["easing_m"] = float(row["easing_m"])
     return {"shape": "polyline", "corners": row["way_w"][: int(row["n_way"])].tolist(), **common}
 
 
@@ -73,7 +77,16 @@ def path_positions(path: dict[str, Any], times_s: np.ndarray) -> np.ndarray:
     begun = np.concatenate([[0.0], np.cumsum(length)[:-1]])
     leg = np.searchsorted(begun, arc, side="right") - 1
     share = np.minimum((arc - begun[leg]) / np.maximum(length[leg], 1e-9), 1.0)
-    return corners[leg] + share[:, None] * legs[leg]
+    place = corners[leg] + share[:, None] * legs[leg]
+    if easing_m := path.get("easing_m", 0.0):  # turns are parabolas: see ``kernels.world.motion.bend``
+        along = legs / length[:, None]
+        turns = along - np.roll(along, 1, axis=0)
+        gone, leg_m = share * length[leg], length[leg]
+        for corner, away_m in ((leg, gone), ((leg + 1) % len(legs), leg_m - gone)):
+            size = np.linalg.norm(turns[corner], axis=1)
+            inside = np.maximum(0.5 * easing_m * size - away_m, 0.0)
+            place += turns[corner] * (0.5 * inside**2 / np.maximum(easing_m * size, 1e-9))[:, None]
+    return place
 
 
 def obstacle_positions(body: dict[str, Any], times_s: np.ndarray) -> np.ndarray:

@@ -170,6 +170,8 @@ class WorldConfig(Section, Truth):
     """D"""
     dynamic_speed_m_s: NonNegative = 0.6
     """v"""
+    obstacle_acceleration_m_s2: NonNegative = 0.0
+    """of moving obstacles, which turn and reverse on parabolas; 0 = at once"""
     static_capacity: Count | None = None
     """slots kept for static obstacles, so that S can vary without recompilation; default n_static, rounded up
     to a multiple of 16"""

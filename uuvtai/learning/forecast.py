@@ -16,6 +16,7 @@ import torch
 
 from uuvtai.common.enums import COLUMNS, N_COLUMN, OUTCOMES, RUNNING
 from uuvtai.common.errors import SettingError
+from uuvtai.common.obstacle_motion import path_document, path_positions
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.networks import (
     TIMES_S,
@@ -89,24 +90,13 @@ class TrackMoments(NamedTuple):
 def path_places(path: np.ndarray, time_s: np.ndarray) -> np.ndarray:
     """(n, n_lane, t, 2) [m] of the obstacles of n scenarios, ``path`` (n, n_lane, 16) as in a bank of the
     surrogate's, at times (n, t) [s]; NaN where there is no obstacle."""
-    n_way = path[..., 0].astype(int)[..., None]
-    radius, length, phase, speed = (path[..., i, None].astype(float) for i in range(1, 5))
-    way = path[..., 5:15].reshape(*path.shape[:2], 5, 2).astype(float)
-    arc = np.mod(phase + speed * time_s[:, None], np.where(length > 0, length, 1.0))
-    slot = np.arange(5)
-    after = np.where(slot + 1 < n_way, slot + 1, 0)
-    leg = np.take_along_axis(way, after[..., None], 2) - way
-    leg_m = np.where(slot < n_way, np.linalg.norm(leg, axis=-1), 0.0)
-    begun = np.where(slot < n_way, np.cumsum(leg_m, -1) - leg_m, np.inf)
-    at = np.maximum((arc[..., None] >= begun[:, :, None]).sum(-1) - 1, 0)
-    pick = lambda values: np.take_along_axis(values, at, -1)  # noqa: E731
-    gone = np.minimum((arc - pick(np.where(slot < n_way, begun, 0.0))) / np.maximum(pick(leg_m), 1e-9), 1.0)
-    corner, ahead = (np.take_along_axis(values, at[..., None], 2) for values in (way, leg))
-    on_line = corner + gone[..., None] * ahead
-    angle = arc / np.where(radius == 0, 1.0, radius)
-    round_it = np.abs(radius)[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    out = np.where((n_way == 0)[..., None], way[:, :, :1] + round_it, on_line)
-    return np.where((speed > 0)[..., None], out, np.nan)
+    names = ("n_way", "radius_m", "length_m", "phase_m", "speed_m_s")
+    out = np.full((*path.shape[:2], time_s.shape[1], 2), np.nan)
+    for i, lane in zip(*np.nonzero(path[..., 4] > 0), strict=True):
+        row = path[i, lane].astype(float)
+        told = dict(zip(names, row, strict=False)) | {"way_w": row[5:15].reshape(5, 2), "easing_m": row[15]}
+        out[i, lane] = path_positions(path_document(told), time_s[i])
+    return out
 
 
 def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int) -> tuple[TrackMoments, int]:

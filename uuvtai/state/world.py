@@ -64,6 +64,8 @@ class PathState(Truth):
     """[m] arc length along the closed path at t = 0"""
     speed_m_s: ti.Field = array("n_env", "n_dynamic")
     """[m/s]"""
+    easing_m: ti.Field = array("n_env", "n_dynamic")
+    """[m] speed squared over acceleration; 0 = turns at once"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ from uuvtai.kernels.core.geometry import (
 )
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
 from uuvtai.kernels.vehicle.control import axis_loops, integrated
+from uuvtai.kernels.world.motion import corner_shift
 from uuvtai.surrogate.arrays import (
     AT_FLIP,
     AT_GOAL,
@@ -107,6 +108,16 @@ EVERY_SLOT = -1
 
 
 @ti.func
+def way_direction(number, lane, leg, path: AnyTensor):
+    """Unit vector along a leg of a closed polyline; legs are counted on, round after round."""
+    n_way = int(path[number, lane, 0])
+    i, j = 5 + 2 * (leg % n_way), 5 + 2 * ((leg + 1) % n_way)
+    way = ti.Vector([path[number, lane, j] - path[number, lane, i], 0.0])
+    way[1] = path[number, lane, j + 1] - path[number, lane, i + 1]
+    return way / ti.max(way.norm(), 1e-9)
+
+
+@ti.func
 def path_places(number, lane, times, path: AnyTensor):
     """Rows of (x, y, vx, vy) of a moving obstacle of scenario ``number`` at some times [s], as the simulator
     moves it."""
@@ -136,6 +147,13 @@ def path_places(number, lane, times, path: AnyTensor):
                 gone = ti.min(rest[k], leg_m) * scale
                 out[k, 0], out[k, 1] = x + gone * leg_x, y + gone * leg_y
                 out[k, 2], out[k, 3] = speed * scale * leg_x, speed * scale * leg_y
+                if path[number, lane, 15] > 0:
+                    before = way_direction(number, lane, j + n_way - 1, path)
+                    here, then = ti.Vector([leg_x, leg_y]) * scale, way_direction(number, lane, j + 1, path)
+                    shift = corner_shift(before, here, then, rest[k], leg_m, path[number, lane, 15])
+                    for i in ti.static(range(2)):
+                        out[k, i] += shift[i]
+                        out[k, 2 + i] += speed * shift[2 + i]
                 on_it[k] = 1
             rest[k] -= leg_m
     return out

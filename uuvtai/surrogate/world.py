@@ -115,7 +115,7 @@ def scenario_rows(sim: Sim) -> list[np.ndarray]:
     numbers = (s.path.n_way, s.path.radius_m, s.path.length_m, s.path.phase_m, s.path.speed_m_s)
     path = np.stack([sim.rows(field) for field in numbers], axis=-1)
     path = np.concatenate([path, way.reshape(*way.shape[:2], -1)], axis=-1)
-    path = np.concatenate([path, np.zeros((*path.shape[:2], 16 - path.shape[2]))], axis=-1)
+    path = np.concatenate([path, sim.rows(s.path.easing_m)[..., None]], axis=-1)
     path[..., 2] = np.where(path[..., 2] > 0, path[..., 2], 1.0)
     m = s.mission
     mission = np.concatenate(

@@ -8,13 +8,12 @@ from operator import attrgetter
 
 import numpy as np
 import pytest
-import yaml
 
 from tests.bundles import Stage
 from tests.conftest import set_step
 from tests.oracles import world as reference
 from uuvtai.common.obstacle_motion import KIND_NAMES, describe_scenario, path_positions
-from uuvtai.common.presets import PRESET_DIR, preset_names
+from uuvtai.common.presets import preset_names
 from uuvtai.config import EpisodeConfig, TrafficConfig, WorldConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
@@ -37,12 +36,11 @@ OUTLINE_TOL_M = 1.5e-3
 SPEED_TOL_M_S = 0.02
 """a corner passed within the last 2 % of a step; float32 positions alone give 2e-4"""
 SHARE_SIGMAS = 5.0
-WORLDS = ("pool", "gauntlet", "mixed", "maze", "netpen", "transfer", "open")
+WORLDS = ("pool", "gauntlet", "gauntlet_inertial", "mixed", "maze", "netpen", "transfer", "open")
 
 
 def world_config(name, **changes):
-    tree = yaml.safe_load((PRESET_DIR / "worlds" / f"{name}.yaml").read_text())["world"]
-    return WorldConfig.model_validate({**tree, **changes})
+    return WorldConfig.model_validate({**load_config(name).world.model_dump(), **changes})
 
 
 class Drawn(Stage):
@@ -70,7 +68,7 @@ class Drawn(Stage):
         if not keep_active:
             episode.wake(self.io(EpisodeIO))
         set_step(self.clock, step)
-        scenarios.move_obstacles(self.io(WorldIO, RULES))
+        scenarios.move_obstacles(self.io(WorldIO, self.cfg, RULES))
         out = {f"path_{name}": field.to_numpy() for name, field in vars(self.path).items()}
         for struct in (self.world, self.mission):
             out |= {name: field.to_numpy() for name, field in vars(struct).items()}
@@ -260,6 +258,8 @@ def _row(drawn, env, lane):
 def test_moving_obstacles_keep_constant_speed_on_their_paths(any_world):
     """Central differences over one control step equal the stated velocity; off corners its length is v."""
     of, drawn = any_world
+    if of.cfg.obstacle_acceleration_m_s2 > 0:
+        return  # they slow down in turns: the next test
     n, first = of.cfg.n_dynamic, of.slots.first_dynamic
     if n == 0:
         assert not (drawn["kind"][:, first:] != NONE).any()
@@ -276,6 +276,30 @@ def test_moving_obstacles_keep_constant_speed_on_their_paths(any_world):
         assert off_corners.mean() > 0.95
         assert np.abs(0.5 * (ahead + behind) - vel)[off_corners].max() < SPEED_TOL_M_S
         assert np.all(pos[0][..., 2] == pos[2][..., 2])
+
+
+@pytest.mark.parametrize("motion", ["waypoints", "line_circle"])
+def test_obstacles_with_inertia_move_as_an_integrator_says(motion):
+    """Turns, reversals and their moments by constant acceleration, integrated in float64; speeds that a path
+    cannot have are lowered."""
+    dynamic = load_config("gauntlet").world.dynamic.model_copy(update={"motion": motion})
+    of = Drawn(world_config("gauntlet_inertial", dynamic_speed_m_s=1.5, dynamic=dynamic), n_env=8)
+    drawn, steps = of.draw(seed=5), np.arange(0, 1000, 50)
+    shown = [of.at(step) for step in steps]
+    speed, easing, n_way = (drawn[f"path_{name}"] for name in ("speed_m_s", "easing_m", "n_way"))
+    lanes = np.argwhere(speed > 0)
+    assert easing[speed > 0] == pytest.approx(speed[speed > 0] ** 2 / 1.5, rel=1e-5)
+    for env, lane in lanes:
+        slot = of.slots.first_dynamic + lane
+        found = np.array([[*at["pos_w"][env, slot, :2], *at["vel_w"][env, slot, :2]] for at in shown])
+        if n_way[env, lane] == 0:
+            assert speed[env, lane] ** 2 <= 1.5 * abs(drawn["path_radius_m"][env, lane]) * (1 + 1e-5)
+            continue
+        corners = drawn["path_way_w"][env, lane, : n_way[env, lane]].astype(float)
+        numbers = (drawn[f"path_{name}"][env, lane].astype(float) for name in ("phase_m", "speed_m_s"))
+        wanted = reference.driven(corners, *numbers, 1.5, steps * RULES.control_dt_s)
+        assert found == pytest.approx(wanted, abs=0.01)
+    assert 0.0 < np.mean(speed[speed > 0] < 1.5) < 0.9 and np.max(speed) == 1.5
 
 
 def test_the_log_s_closed_form_gives_the_same_positions(any_world):

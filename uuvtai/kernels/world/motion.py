@@ -71,8 +71,56 @@ def polyline_length(env, lane, io: Bundle[WorldIO]):
 
 
 @ti.func
+def direction(env, lane, leg, io: Bundle[WorldIO]):
+    """Unit vector along a leg of the closed polyline; legs are counted on, round after round."""
+    n_way = io.path.n_way[env, lane]
+    along = io.path.way_w[env, lane, (leg + 1) % n_way] - io.path.way_w[env, lane, leg % n_way]
+    return along / ti.max(along.norm(), 1e-9)
+
+
+@ti.func
+def bend(turn, away_m, easing_m):
+    """(shift (2) [m], its slope (2)) ``away_m`` from a corner whose legs' directions differ by ``turn``."""
+    # To turn from direction p to q takes the constant acceleration a along q - p for the time v |q - p| / a:
+    # a parabola that leaves the one leg and meets the other easing_m |q - p| / 2 from the corner, when an
+    # obstacle that turns at once would be there. After a way w of it the shift is w^2 / (2 easing_m).
+    size = turn.norm()
+    inside = ti.max(0.5 * easing_m * size - away_m, 0.0)
+    shift = turn * (0.5 * inside * inside / (easing_m * ti.max(size, 1e-9)))
+    slope = turn * (inside / (easing_m * ti.max(size, 1e-9)))
+    return ti.Vector([shift[0], shift[1], slope[0], slope[1]])
+
+
+@ti.func
+def corner_shift(before, along, after, gone_m, leg_m, easing_m):
+    """What a bounded acceleration adds to (place, velocity in parts of the speed) ``gone_m`` along a leg;
+    ``before`` and ``after``: directions of the neighbouring legs, ``easing_m``: as in ``PathState``."""
+    begun = bend(along - before, gone_m, easing_m)
+    return bend(after - along, leg_m - gone_m, easing_m) + begun * ti.Vector([1.0, 1.0, -1.0, -1.0])
+
+
+@ti.func
+def set_speed(env, lane, wanted, io: Bundle[WorldIO]):
+    """Speed along a path that is there: less than wanted where corners lie so close together, or a circle is
+    so small, that it would take more than the acceleration."""
+    io.path.speed_m_s[env, lane], io.path.easing_m[env, lane] = wanted, 0.0
+    if ti.static(io.world_cfg.obstacle_acceleration_m_s2 > 0):
+        most, n_way = ti.abs(io.path.radius_m[env, lane]), io.path.n_way[env, lane]
+        for j in range(n_way):
+            along = direction(env, lane, j, io)
+            turns = (along - direction(env, lane, j + n_way - 1, io)).norm()
+            turns += (direction(env, lane, j + 1, io) - along).norm()
+            leg = io.path.way_w[env, lane, (j + 1) % n_way] - io.path.way_w[env, lane, j]
+            room = 2.0 * leg.norm() / ti.max(turns, 1e-6)
+            most = room if j == 0 else ti.min(most, room)
+        speed = ti.min(wanted, ti.sqrt(most * io.world_cfg.obstacle_acceleration_m_s2))
+        io.path.speed_m_s[env, lane] = speed
+        io.path.easing_m[env, lane] = ti.max(speed * speed / io.world_cfg.obstacle_acceleration_m_s2, 1e-9)
+
+
+@ti.func
 def path_point(env, lane, arc_m, io: Bundle[WorldIO]):
-    """(x, y, direction x, direction y) at an arc length along the closed path."""
+    """(x, y, velocity x, velocity y in parts of the speed) at an arc length along the closed path."""
     length = io.path.length_m[env, lane]
     rest = arc_m - length * ti.floor(arc_m / length)
     n_way = io.path.n_way[env, lane]
@@ -94,6 +142,9 @@ def path_point(env, lane, arc_m, io: Bundle[WorldIO]):
                 along = leg / ti.max(leg_m, 1e-9)
                 at = corner + ti.min(rest, leg_m) * along
                 out = ti.Vector([at[0], at[1], along[0], along[1]])
+                if ti.static(io.world_cfg.obstacle_acceleration_m_s2 > 0):
+                    before, after = direction(env, lane, j + n_way - 1, io), direction(env, lane, j + 1, io)
+                    out += corner_shift(before, along, after, rest, leg_m, io.path.easing_m[env, lane])
                 on_it = 1
             rest -= leg_m
     return out
@@ -108,7 +159,6 @@ def draw_moving_obstacles(env, io: Bundle[WorldIO]):
         slot = first_moving(io.world, io.path) + lane
         key = stream_key(io.episode.key[env], i, STREAM_PATH)
         draw_moving_obstacle(env, slot, i, key, io)
-        io.path.speed_m_s[env, lane] = io.scene.speed_m_s[env]
         draw_clear_path(env, lane, slot, i, key, io)
 
 
@@ -179,6 +229,7 @@ def draw_path(env, lane, i, draw, radius, key, io: Bundle[WorldIO]):
     else:
         fits = draw_line_or_circle(env, lane, i, radius, key, first, io)
     io.path.phase_m[env, lane] = io.path.length_m[env, lane] * uniform(key, first)
+    set_speed(env, lane, io.scene.speed_m_s[env], io)
     return fits
 
 
@@ -271,4 +322,26 @@ def is_path_clear(env, lane, radius, io: Bundle[WorldIO]):
             for j in range(n_way):
                 along = stroke(io.path.way_w[env, lane, j], io.path.way_w[env, lane, (j + 1) % n_way], radius)
                 clear &= is_apart(along, shape, 0.0)
+            if ti.static(io.world_cfg.obstacle_acceleration_m_s2 > 0):
+                clear &= are_turns_clear(env, lane, radius, shape, io)
+    return clear
+
+
+@ti.func
+def are_turns_clear(env, lane, radius, shape, io: Bundle[WorldIO]):
+    """1 where a static obstacle lies in no turn: four chords each, the disc larger by what a parabola leaves
+    its chord."""
+    clear, corner_m, n_way = 1, 0.0, io.path.n_way[env, lane]
+    for j in range(n_way):
+        easing = io.path.easing_m[env, lane]
+        turn = direction(env, lane, j, io) - direction(env, lane, j + n_way - 1, io)
+        piece = 0.25 * easing * turn.norm()
+        for k in range(-2, 2):
+            a = path_point(env, lane, corner_m + k * piece, io)
+            b = path_point(env, lane, corner_m + (k + 1) * piece, io)
+            more = piece * piece / (8.0 * easing)
+            chord = stroke(ti.Vector([a[0], a[1]]), ti.Vector([b[0], b[1]]), radius + more)
+            clear &= is_apart(chord, shape, 0.0)
+        leg = io.path.way_w[env, lane, (j + 1) % n_way] - io.path.way_w[env, lane, j]
+        corner_m += leg.norm()
     return clear

@@ -31,6 +31,7 @@ from uuvtai.kernels.world.motion import (
     path_point,
     polyline_length,
     put_obstacle,
+    set_speed,
 )
 
 # ------------------------------------------------------------------------------------------------------------
@@ -329,12 +330,11 @@ def place_fixed(env, io: Bundle[WorldIO]):
             io.path.n_way[env, lane] = io.fixed.n_way[i]
             io.path.radius_m[env, lane] = 0.0
             io.path.phase_m[env, lane] = 0.0
-            io.path.speed_m_s[env, lane] = (
-                io.fixed.speed_m_s[i] if io.fixed.speed_m_s[i] >= 0.0 else io.scene.speed_m_s[env]
-            )
             for j in range(io.path.way_w.shape[2]):
                 io.path.way_w[env, lane, j] = io.fixed.way_w[i, j]
             io.path.length_m[env, lane] = polyline_length(env, lane, io)
+            wanted = io.fixed.speed_m_s[i] if io.fixed.speed_m_s[i] >= 0.0 else io.scene.speed_m_s[env]
+            set_speed(env, lane, wanted, io)
         put_obstacle(env, slot, io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i], io)
         io.scratch.footprint[env, slot] = footprint_of(
             io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i]
