@@ -152,8 +152,8 @@ def path_places(number, lane, times, path: AnyTensor):
                     here, then = ti.Vector([leg_x, leg_y]) * scale, way_direction(number, lane, j + 1, path)
                     shift = corner_shift(before, here, then, rest[k], leg_m, path[number, lane, 15])
                     for i in ti.static(range(2)):
-                        out[k, i] += shift[i]
-                        out[k, 2 + i] += speed * shift[2 + i]
+                        out[k, i] += shift[i]  # type: ignore[index]
+                        out[k, 2 + i] += speed * shift[2 + i]  # type: ignore[index]
                 on_it[k] = 1
             rest[k] -= leg_m
     return out

@@ -287,9 +287,8 @@ def test_obstacles_with_inertia_move_as_an_integrator_says(motion):
     drawn, steps = of.draw(seed=5), np.arange(0, 1000, 50)
     shown = [of.at(step) for step in steps]
     speed, easing, n_way = (drawn[f"path_{name}"] for name in ("speed_m_s", "easing_m", "n_way"))
-    lanes = np.argwhere(speed > 0)
     assert easing[speed > 0] == pytest.approx(speed[speed > 0] ** 2 / 1.5, rel=1e-5)
-    for env, lane in lanes:
+    for env, lane in np.argwhere(speed > 0):
         slot = of.slots.first_dynamic + lane
         found = np.array([[*at["pos_w"][env, slot, :2], *at["vel_w"][env, slot, :2]] for at in shown])
         if n_way[env, lane] == 0:
@@ -300,6 +299,18 @@ def test_obstacles_with_inertia_move_as_an_integrator_says(motion):
         wanted = reference.driven(corners, *numbers, 1.5, steps * RULES.control_dt_s)
         assert found == pytest.approx(wanted, abs=0.01)
     assert 0.0 < np.mean(speed[speed > 0] < 1.5) < 0.9 and np.max(speed) == 1.5
+
+
+def test_turns_with_inertia_keep_clear_of_static_obstacles_too():
+    dynamic = load_config("gauntlet").world.dynamic.model_copy(update={"keep_clear_draws": 16})
+    of = Drawn(world_config("gauntlet_inertial", dynamic_speed_m_s=1.5, dynamic=dynamic), n_env=16)
+    drawn, moving = of.draw(), slice(of.slots.first_dynamic, None)
+    place = np.stack([of.at(step)["pos_w"][:, moving, :2].astype(float) for step in range(0, 3000, 15)])
+    touching, used = np.zeros(16), drawn["kind"][:, moving] != NONE
+    for env, lane in np.argwhere(used):
+        still = [reference.plan_distances(place[:, env, lane], *one).min() for one in of.still(drawn, env)]
+        touching[env] += min(still) < drawn["size"][env, moving][lane, 0] - OUTLINE_TOL_M
+    assert (touching <= drawn["unclear_paths"]).all() and 0 < drawn["unclear_paths"].sum() < 0.5 * used.sum()
 
 
 def test_the_log_s_closed_form_gives_the_same_positions(any_world):
