@@ -143,7 +143,7 @@ def runs(tmp_path):
 
 @pytest.mark.parametrize(("words", "offers"), [
     (["ev"], ["eval"]),
-    (["eval", "--world", "ga"], ["gauntlet"]),
+    (["eval", "--world", "ga"], ["gauntlet", "gauntlet_inertial"]),
     (["eval", "--world", "mi"], ["mixed", "mine.yaml"]),
     (["eval", "--sensors", "n"], ["nominal"]),
     (["train", "curr"], ["curriculum"]),
@@ -155,7 +155,7 @@ def runs(tmp_path):
     (["train", "--resume", "runs/"], ["runs/first", "runs/first_eval"]),
     (["presets", "show", "bt", "--run", "runs/"], ["runs/first/", "runs/first_eval"]),
     (["eval", "--device", ""], ["auto", "cpu", "cuda"]),
-    (["presets", "show", "gau"], ["gauntlet"]),
+    (["presets", "show", "gau"], ["gauntlet", "gauntlet_inertial"]),
     (["presets", "show", "train/p"], ["train/paper", "train/ppo"]),
 ], ids=" ".join)  # fmt: skip
 def test_the_shell_is_offered_names_and_folders(words, offers, runs):
