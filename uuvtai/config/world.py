@@ -194,6 +194,8 @@ class WorldConfig(Section, Truth):
                 )
         for i, obstacle in enumerate(self.fixed):
             self._check_place(f"fixed.{i}", obstacle)
+            if self.obstacle_acceleration_m_s2 and obstacle.path and obstacle.path[0] == obstacle.path[-1]:
+                raise ValueError(f"fixed.{i}.path closes by itself: leave its last waypoint out")
         return self
 
     def _check_place(self, name: str, obstacle: FixedObstacle) -> None:

@@ -557,8 +557,7 @@ def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
     fit."""
     if config.world_model.enabled:
         raise SettingError(
-            "world_model.enabled: the surrogate has none; set world_model.enabled=false, or "
-            "surrogate.enabled=false"
+            "world_model.enabled: the surrogate has none; set it or surrogate.enabled to false"
         )
     held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
