@@ -556,9 +556,7 @@ def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
     """Raise SettingError for parts of a training that the surrogate does not have, and sizes that do not
     fit."""
     if config.world_model.enabled:
-        raise SettingError(
-            "world_model.enabled: the surrogate has none; set it or surrogate.enabled to false"
-        )
+        raise SettingError("world_model.enabled: the surrogate has none; turn it off, or surrogate.enabled")
     held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
         raise SettingError(

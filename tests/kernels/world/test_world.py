@@ -301,15 +301,20 @@ def test_obstacles_with_inertia_move_as_an_integrator_says(motion):
 
 
 def test_turns_with_inertia_keep_clear_of_static_obstacles_too():
-    dynamic = load_config("gauntlet").world.dynamic.model_copy(update={"keep_clear_draws": 16})
-    of = Drawn(world_config("gauntlet_inertial", dynamic_speed_m_s=1.5, dynamic=dynamic), n_env=16)
+    """Small obstacles within wide turns, where both legs are clear: five of these 64 scenarios would have
+    one in a way that nobody counted."""
+    world = load_config("gauntlet_inertial").world.model_dump()
+    small = {"radius_m": (0.1, 0.12), "half_extent_m": (0.1, 0.12)}
+    changes = {"dynamic_speed_m_s": 1.5, "obstacle_acceleration_m_s2": 0.5, "n_static": 4}
+    changes |= {"static": world["static"] | small, "dynamic": world["dynamic"] | {"keep_clear_draws": 16}}
+    of = Drawn(world_config("gauntlet_inertial", **changes), n_env=64)
     drawn, moving = of.draw(), slice(of.slots.first_dynamic, None)
     place = np.stack([of.at(step)["pos_w"][:, moving, :2].astype(float) for step in range(0, 3000, 15)])
-    touching, used = np.zeros(16), drawn["kind"][:, moving] != NONE
+    touching, used = np.zeros(64), drawn["kind"][:, moving] != NONE
     for env, lane in np.argwhere(used):
         still = [reference.plan_distances(place[:, env, lane], *one).min() for one in of.still(drawn, env)]
         touching[env] += min(still) < drawn["size"][env, moving][lane, 0] - OUTLINE_TOL_M
-    assert (touching <= drawn["unclear_paths"]).all() and 0 < drawn["unclear_paths"].sum() < 0.5 * used.sum()
+    assert (touching <= drawn["unclear_paths"]).all() and drawn["unclear_paths"].sum() < 0.5 * used.sum()
 
 
 def test_the_log_s_closed_form_gives_the_same_positions(any_world):
