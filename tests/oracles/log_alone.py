@@ -101,6 +101,12 @@ def obstacle_motion(body, times):
     unit = legs / lengths[:, None]
     pos[:, :2] = corners[leg] + along[:, None] * unit[leg]
     vel[:, :2] = path["speed_m_s"] * unit[leg]
+    turns, easing = unit - np.roll(unit, 1, axis=0), path.get("easing_m", 1e-9)
+    for corner, away, sign in ((leg, along, -1), ((leg + 1) % len(legs), lengths[leg] - along, 1)):
+        size = np.hypot(*turns[corner].T)[:, None]
+        inside = np.maximum(easing * size / 2 - away[:, None], 0)
+        pos[:, :2] += turns[corner] / size * inside**2 / (2 * easing)
+        vel[:, :2] += sign * path["speed_m_s"] * turns[corner] / size * inside / easing
     return pos, vel
 
 

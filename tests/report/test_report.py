@@ -247,15 +247,9 @@ def figures(blocks):
 def test_methods_are_shown_with_counts_intervals_and_both_times():
     first = tables(evaluation(samples.evaluation_document()))[0]
     assert rows(first)[1] == [
-        "bt",
-        "6/8 = 75.0 % [40.9, 92.9]",
-        "2/8 = 25.0 % [7.1, 59.1]",
-        "2 / 0 / 0 / 0",
-        "12.0",
-        "16.0",
-        "3.0",
-        "0.30",
-    ]
+        "bt", "6/8 = 75.0 % [40.9, 92.9]", "2/8 = 25.0 % [7.1, 59.1]", "2 / 0 / 0 / 0", "12.0", "16.0",
+        "3.0", "0.30",
+    ]  # fmt: skip
     assert first.data.columns[:3] == ["agent", "episodes", "success"]
     assert first.data.rows[1][:3] == ["bt", 8, 6]
 

@@ -68,7 +68,7 @@ def recordings(tmp_path_factory):
         folder / "paper", "--agent", "straight,bt", "--seeds", "7,3", "--episodes", "2", "--record", "3"
     )
     once = ["--agent", "bt", "--sensors", "clean", "--seeds", "3", "--episodes", "1", "--record", "1"]
-    clean, _ = recorded(folder / "clean", *once)
+    clean, _ = recorded(folder / "clean", *once, "--set", "world.obstacle_acceleration_m_s2=0.5")
     return {"paper": paper, "clean": clean, "printed": printed}
 
 
@@ -117,6 +117,7 @@ def test_what_describes_the_run_comes_before_data_and_loads(recordings, logs, tm
         (tmp_path / "config.yaml").write_text(yaml.safe_dump(log.config))
         sensors = "clean" if path in recordings["clean"] else "paper"
         overrides = {**SmallSim.CHANGES, "episode.horizon_steps": HORIZON}
+        overrides |= {"world.obstacle_acceleration_m_s2": 0.5} if sensors == "clean" else {}
         assert load_resolved(tmp_path / "config.yaml") == load_config("pool", sensors, overrides=overrides)
         assert log.metadata["uuv.run"]["config_sha256"] == hashlib.sha256(log.config_text).hexdigest()
 
