@@ -2,12 +2,16 @@
 
 import json
 
+import numpy as np
 import pytest
+import torch
 
 from tests.command import Quiet
 from uuvtai.config.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
 from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.evaluate import Request, compare
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.sim.sim import Sim
 
 
 def test_a_stacks_name_is_an_agent_with_its_own_config_and_tree(tmp_path):
@@ -89,3 +93,18 @@ def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
         "paper_seed5_episode0.mcap",
     ]
     assert json.loads((folder / "eval/result.json").read_text())["agents"][1]["stack"]["preset"] == "paper"
+
+
+@pytest.mark.parametrize("stack", ["paper", "best"])
+def test_every_stack_plans_and_drives(small, stack):
+    """Their kernels differ from those of all other tests by more than numbers."""
+    config = with_stack(small.config, stack)
+    sim = Sim(config, small.N, read_tree(tree_of_stack(stack), config.behavior.max_node))
+    every = torch.ones(small.N, dtype=torch.int32)
+    sim.reset(every, 5 * every, torch.arange(small.N, dtype=torch.int32))
+    for _ in range(100):
+        sim.step()
+    assert (sim.rows(sim.s.route.n_way) > 0).all()
+    moved = sim.rows(sim.s.vehicle.pos_w) - sim.rows(sim.s.mission.start_w)
+    assert np.hypot(*moved[:, :2].T).min() > 0.3
+    sim.close()

@@ -13,7 +13,7 @@ from uuvtai.config.behavior import CAUTION, CLOSING, DOUBT, GROWTH, HORIZON, LAG
 from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3
 from uuvtai.kernels.core.grid import clearance_of, grid_origin
-from uuvtai.kernels.core.simd import filled
+from uuvtai.kernels.core.simd import filled, filled_int
 from uuvtai.kernels.core.stage import Bundle, Const, Out
 
 _SLACK_S = 1.0e-3
@@ -249,7 +249,7 @@ def clearance_lanes(env, x, y, io: Bundle[BehaviorIO]):
     n_row, n_col = ti.static(io.clearance.site.shape[1:])
     at_col = (x - x0) * ti.static(1.0 / io.mapping_cfg.cell_m)
     at_row = (y - y0) * ti.static(1.0 / io.mapping_cfg.cell_m)
-    site = filled(0, x.n)
+    site = filled_int(0, x.n)
     for i in ti.static(range(x.n)):
         row = ti.math.clamp(ti.cast(ti.floor(at_row[i]), ti.i32), 0, n_row - 1)
         col = ti.math.clamp(ti.cast(ti.floor(at_col[i]), ti.i32), 0, n_col - 1)

@@ -19,7 +19,7 @@ from uuvtai.common.enums import (
 )
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.grid import clearance_of, grid_origin
-from uuvtai.kernels.core.simd import filled, n_lane
+from uuvtai.kernels.core.simd import filled, filled_int, n_lane
 from uuvtai.kernels.core.stage import Bundle, FloatMatrix, loop_end
 from uuvtai.kernels.planning.io import RouteIO
 from uuvtai.kernels.planning.medial_axis import (
@@ -96,7 +96,7 @@ def _weigh_cells(slot, env, io: Bundle[RouteIO]):
     for row in range(io.voronoi.weight.shape[1]):
         for packet in range(io.voronoi.weight.shape[2] // lanes):
             first = packet * lanes
-            site, is_open = filled(0, lanes), filled(0.0, lanes)
+            site, is_open = filled_int(0, lanes), filled(0.0, lanes)
             for i in ti.static(range(lanes)):
                 site[i] = ti.cast(io.clearance.site[env, row, first + i], ti.i32)
             room = clearance_of(site, io.clearance_cfg, io.mapping_cfg.cell_m)
