@@ -27,7 +27,7 @@ def shown(show, width, wide=False):
 
 def evaluation():
     """Four agents with the longest figures that there are, one of them privileged."""
-    names = {"straight": 281, "planner": 290, "bt+truth": 500, "20261122-154501_curriculum": 0}
+    names = {"straight": 281, "planner": 290, "bt+truth": 500, "20261122-154501_constant_20": 0}
     agents = [
         samples.agent(name, k, 500 - k, 500, privileged=name == "bt+truth", env_steps_per_s=25123.4)
         for name, k in names.items()

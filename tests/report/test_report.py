@@ -350,10 +350,10 @@ def test_seeds_of_a_method_are_its_mean_and_its_range():
 
 
 def test_only_the_seed_makes_no_other_method():
-    other = Training("curriculum_0", "train:\n  seed: 0\n  iterations: 9\n", samples.metrics())
+    other = Training("constant_20_0", "train:\n  seed: 0\n  iterations: 9\n", samples.metrics())
     assert [(m.name, len(m.runs)) for m in grouped([*seeds_of("ppo", (0, 1)), other])] == [
         ("ppo", 2),
-        ("curriculum_0", 1),
+        ("constant_20_0", 1),
     ]
     same = [Training(f"run{i}", f"a: {i}\n", samples.metrics(), "best") for i in range(2)]
     assert [m.name for m in grouped(same)] == ["run0", "run1"], (

@@ -44,12 +44,10 @@ LEARNING = rows("Where the defaults differ: learning")
 
 
 def test_every_difference_is_listed_and_nothing_else():
-    default, paper, curriculum = LearningConfig(), load_training("paper"), load_training("curriculum")
+    default, paper = LearningConfig(), load_training("paper")
     assert not CLASSICAL.keys() & LEARNING.keys()
     assert set(CLASSICAL) == differing(load_config("pool"), with_stack(load_config("pool"), "paper"))
-    assert set(CLASSICAL) | set(LEARNING) == differing(default, paper) | differing(
-        curriculum, paper
-    ) | differing(default, curriculum)
+    assert set(CLASSICAL) | set(LEARNING) == differing(default, paper)
     assert {key.partition(".")[0] for key in CLASSICAL} <= set(STACK_SECTIONS)
 
 
@@ -66,12 +64,9 @@ def test_the_classical_half_is_as_listed(key):
 
 @pytest.mark.parametrize("key", LEARNING)
 def test_learning_is_as_listed(key):
-    _paper, default, curriculum, paper, _why = LEARNING[key]
-    answer = [json.loads(cell.strip("`")) for cell in (default, curriculum, paper)]
-    assert answer == [
-        values(config)[key]
-        for config in (LearningConfig(), load_training("curriculum"), load_training("paper"))
-    ]
+    _paper, default, paper, _why = LEARNING[key]
+    answer = [json.loads(cell.strip("`")) for cell in (default, paper)]
+    assert answer == [values(config)[key] for config in (LearningConfig(), load_training("paper"))]
 
 
 def test_values_that_the_page_names_are_those_of_the_preset():
