@@ -71,7 +71,9 @@ LOG = {
 CHECKS = [{"name": "kernel cache", "ok": False, "detail": "word " * 60}]
 CLAIMS = {
     "budget": "quick",
-    "claims": [{"text": "word " * 30, "theirs": "82.8 %", "ours": "96.5 % [95.1, 97.5]", "verdict": "holds"}],
+    "claims": [
+        {"text": "word " * 30, "theirs": "83 %", "ours": "96 % [95, 97]", "verdict": "holds", "reason": ""}
+    ],
 }
 SHOWS = {
     "eval": (lambda s: views.show_agents(s, evaluation()), ["agent", "success [95 %]", "collision [95 %]"]),
