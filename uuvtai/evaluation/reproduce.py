@@ -34,7 +34,7 @@ from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, r
 from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code
 from uuvtai.report.build import report
 from uuvtai.report.reproduction import claim_table
-from uuvtai.report.tables import Table, markdown, seconds, text_table
+from uuvtai.report.tables import Table, markdown, number, seconds, text_table
 from uuvtai.report.timing import ENVS, SPEEDS, density_table, latency_table
 
 # ---- A reproduction as sections of the report: what the page shows, in the order of the paper.
@@ -125,7 +125,11 @@ def mechanism_tables(document: dict[str, Any]) -> list[tuple[str, Rows]]:
 
 
 def _and_range(values: Sequence[float] | None) -> str:
-    return f"{fmean(values):.2f} ({min(values):.2f} to {max(values):.2f})" if values else "-"
+    if not values:
+        return "-"
+    digits = 2 if max(map(abs, values)) < 100 else 0
+    low, high = number(min(values), digits), number(max(values), digits)
+    return f"{number(fmean(values), digits)} ({low} to {high})"
 
 
 _SCALE = "The scale s_t of the distillation over a training: mean over the training seeds (range)."
