@@ -336,7 +336,7 @@ def keep_reproduction(run: Path, root: Path = ROOT) -> None:
     document, kept = _read(run / "reproduce.json"), _read(root / REPRODUCTION)
     small = {name: value for name, value in document.items() if name not in ("sections", "transfer")}
     for entries in small["table_main"].values():
-        entries[:] = [_packed(entry, "env_steps", *_TIMES) for entry in entries]
+        entries[:] = [_packed(entry, "trained_steps", *_TIMES) for entry in entries]
     if document["sweep"]:
         cells = document["sweep"]["cells"]
         small["sweep"] = {"cells": [_packed(cell, "agent", "S", "D", "v_m_s") for cell in cells]}

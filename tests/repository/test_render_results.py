@@ -150,7 +150,7 @@ def test_reproductions_are_kept_small_and_make_the_page_that_they_made(copy, tmp
     draws, found = random.Random(4), []
     for budget in ("tenfold", "paper"):
         words = ["".join(draws.choices("scxot", (75, 15, 5, 1, 4), k=500)) for _ in range(11)]
-        own = [ended(word, env_steps=614_912, return_mean=3.0) for word in words]
+        own = [ended(word, trained_steps=614_912, return_mean=3.0) for word in words]
         document = minimal(claims.Claim("it swims", "1", "2", claims.HOLDS, 0.03)) | {"budget": budget}
         document |= {"table_main": {"paper": own[:5], "ppo": own[5:10], "bt": own[10:]}, "sections": [{}]}
         if budget == "paper":

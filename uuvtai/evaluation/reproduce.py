@@ -107,7 +107,7 @@ def main_table(document: dict[str, Any]) -> Rows:
 
 def _rates(entries: Sequence[dict[str, Any]]) -> list[str]:
     """Of a method over its seeds, of an agent that is not trained over its episodes."""
-    if "env_steps" not in entries[0]:
+    if "trained_steps" not in entries[0]:
         return ["-", *(str(pooled(entries, *ends)) for ends in (("success",), COLLIDED))]
     by_seed = ", ".join(f"{100 * pooled([entry], 'success').rate:.1f}" for entry in entries)
     return [by_seed, *(str(of_method(entries, *ends)) for ends in (("success",), COLLIDED))]
@@ -186,7 +186,7 @@ def _claim_lines(document: dict[str, Any]) -> str:
 
 def _main(document: dict[str, Any]) -> str:
     entries = [entry for entries in document["table_main"].values() for entry in entries]
-    steps = sorted({entry["env_steps"] for entry in entries if "env_steps" in entry})
+    steps = sorted({entry["trained_steps"] for entry in entries if "trained_steps" in entry})
     trained = f"Env-steps of a training: {', '.join(f'{n:,}' for n in steps)}."
     title = f"{_titled('Table main and ablations', document)}\n`{document['commands']['eval/main']}`"
     return f"{title}\n\n{trained} {_TTS}\n\n" + text_table(*main_table(document))
@@ -384,7 +384,7 @@ def _by_method(
     }
     trained = {
         name: [
-            entries[f"{name}-{seed}"] | {"env_steps": round(rows[-1]["time/env_steps"]) if rows else 0}
+            entries[f"{name}-{seed}"] | {"trained_steps": round(rows[-1]["time/env_steps"]) if rows else 0}
             for seed, rows in enumerate(of_seeds)
         ]
         for name, of_seeds in metrics.items()
