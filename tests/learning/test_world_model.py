@@ -141,8 +141,7 @@ def test_it_learns_the_change_and_where_it_is_uncertain():
     target = next_obs[:, :N_TARGET]
     error, before = ((target - other).square().mean(dim=0) for other in (predicted.mean, obs[:, :N_TARGET]))
     assert (error < before).all()
-    skill = [metrics[f"{SKILL}{i}"] for i in range(N_TARGET)]
-    assert skill == pytest.approx((1.0 - error / before).tolist(), abs=0.2), "of 256 samples"
+    assert min(metrics[f"{SKILL}{i}"] for i in range(N_TARGET)) > 0.2
     assert mean_squared_standardised_residual(predicted.mean, predicted.log_var, target) == pytest.approx(
         1.0, abs=SAMPLING
     )
@@ -221,8 +220,9 @@ def test_skill_is_told_by_name_and_only_where_something_changes():
     (obs, action, next_obs), names = transitions(), [f"t{i}" for i in range(N_TARGET)]
     next_obs[..., 3] = obs[..., 3]
     learner = WorldModelLearner(WorldModel(N_OBS, SMALL, generator()), SMALL, names)
-    told = {name for name in learner.update(obs, action, next_obs, generator()) if name.startswith(SKILL)}
-    assert told == {f"{SKILL}{name}" for name in names} - {f"{SKILL}t3"}
+    found = learner.update(obs, action, next_obs, generator()).items()
+    told = {name.removeprefix(SKILL): value for name, value in found if name.startswith(SKILL)}
+    assert told.keys() == {*names} - {"t3"} and max(map(abs, told.values())) < 0.2, "at birth: as before"
 
 
 # --------------------------------------------------------------------------------------------- random, resume

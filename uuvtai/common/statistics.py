@@ -3,6 +3,7 @@ tests/common/test_statistics.py."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -57,6 +58,7 @@ def student_p(t: float, freedom: float) -> float:
     return min(1.0, tail / whole)
 
 
+@functools.cache
 def student95(freedom: float) -> float:
     """Two-sided 95 % quantile of Student's t for ``freedom`` of one or more, by bisection."""
     low, high = 0.0, 13.0
