@@ -32,7 +32,7 @@ _WORLDS = (("pool", "paper"), ("gauntlet", "harsh"), ("maze", "nominal"))
 _EVAL = ["eval", "--agent", "bt", "--episodes", "2", "--seeds", "77", "--num-envs", "4", "--record", "2"]
 _TRAIN = ["--device", "cpu", "--iterations", "4"]
 _SMALL = {
-    "curriculum": {
+    "paper": {
         "train.num_envs": 16,
         "ppo.rollout_steps": 16,
         "distillation.batch": 64,

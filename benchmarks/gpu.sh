@@ -66,6 +66,6 @@ step first_step 150 "$PY" benchmarks/run.py scale --device $DEVICE --num-envs 64
 for n in "${SIZES[@]}"; do # each its own process: an error at one size leaves the others
     step "rate_$n" 100 "$PY" benchmarks/run.py scale --device $DEVICE --num-envs "$n" --seconds 1 --out "$OUT/$n"
 done
-step train 60 "$PY" -m uuvtai train curriculum --iterations 3 --set train.num_envs="${SIZES[-1]}" \
+step train 60 "$PY" -m uuvtai train paper --iterations 3 --set stack=null --set train.num_envs="${SIZES[-1]}" \
     --device $DEVICE --run-dir "$OUT/train"
 echo "### done, $(left) s left; results in $OUT"

@@ -8,12 +8,14 @@
 from __future__ import annotations
 
 import argparse
+import base64
 import csv
 import difflib
 import json
 import re
 import shlex
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,7 @@ from uuvtai.common.enums import COLLIDED, FINAL_OUTCOMES, LETTERS
 from uuvtai.evaluation import claims
 from uuvtai.evaluation.claims import ends_of, pooled
 from uuvtai.evaluation.reproduce import results_page
-from uuvtai.evaluation.reproduce_steps import RETIRED_SEEDS
+from uuvtai.evaluation.reproduce_steps import BUDGETS, RETIRED_SEEDS
 from uuvtai.report.tables import cell_name, place_of, seconds, text_table
 from uuvtai.vehicle.safety import RULES
 
@@ -39,16 +41,14 @@ ROBUSTNESS, SAFETY, SPEEDS = "docs/robustness.md", "docs/safety.md", "benchmarks
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(?P<foot>^<!-- end -->)", re.M | re.S
 )
-LITERATURE = {"mppi", "dwa", "potential_field", "velocity_obstacle"}
-"""agents whose rows have a table of their own"""
-SHORT = {
+LITERATURE = {"mppi", "dwa", "potential_field", "velocity_obstacle"}  # rows with a table of their own
+SHORT = {  # rows of README's table
     "pool_6": "`pool`, 6 at 0.6 m/s",
     "gauntlet_9_fast": "`gauntlet`, 9 at 1.5 m/s",
     "maze_6": "`maze`, 6 at 0.6 m/s",
     "column_9_fast": "`column`, 9 at 1.5 m/s",
     "pool_6_harsh_estimated": "`pool`, 6 at 0.6 m/s, harsh sensors, position estimated",
 }
-"""rows of README's table"""
 
 
 # ------------------------------------------------------------------------------------------------ evaluations
@@ -293,7 +293,8 @@ def pages(root: Path = ROOT) -> dict[str, str]:
         )
         for page, made in TABLES.items()
     }
-    return found | {RESULTS: results_page(_read(root / REPRODUCTION))}
+    kept = json.loads((root / REPRODUCTION).read_text("utf-8"), object_hook=_unpacked)
+    return found | {RESULTS: results_page(*(kept[budget] for budget in BUDGETS if budget in kept))}
 
 
 def _read(path: Path) -> Document:
@@ -331,27 +332,34 @@ def keep_row(name: str, run: Path, root: Path = ROOT) -> None:
 
 
 def keep_reproduction(run: Path, root: Path = ROOT) -> None:
-    """Keep what the page of results needs of a reproduction."""
-    document = _read(run / "reproduce.json")
-    names = ("schema", "budget", "seed", "notes", "started", "git_sha", "hardware", "commands", "claims")
-    small = {name: document[name] for name in (*names, "inconsistencies") if name in document}
-    small["table_main"] = {
-        name: [_kept(entry) for entry in entries] for name, entries in document["table_main"].items()
-    }
-    small["ceilings"] = {"agents": [_kept(entry) for entry in document["ceilings"]["agents"]]}
-    small["sweeps"] = {name: _small_sweep(sweep) for name, sweep in document["sweeps"].items()}
-    small["profile"] = {
-        "paper_latency": document["profile"]["paper_latency"],
-        "paper_density": document["profile"]["paper_density"],
-        "rows": [
-            {name: row[name] for name in ("num_envs", "env_steps_per_s")}
-            for row in document["profile"]["rows"]
-        ],
-    }
-    _write(root / REPRODUCTION, small)
+    """Keep what the page needs of a reproduction, beside those of other budgets."""
+    document, kept = _read(run / "reproduce.json"), _read(root / REPRODUCTION)
+    small = {name: value for name, value in document.items() if name not in ("sections", "transfer")}
+    for entries in small["table_main"].values():
+        entries[:] = [_packed(entry, "trained_steps", *_TIMES) for entry in entries]
+    if document["sweep"]:
+        cells = document["sweep"]["cells"]
+        small["sweep"] = {"cells": [_packed(cell, "agent", "S", "D", "v_m_s") for cell in cells]}
+    kept.pop("quick", None)
+    _write(root / REPRODUCTION, kept | {document["budget"]: small})
 
 
-_KEPT = ("name", "episodes", "outcomes", "ends", "time_mean_s", "time_to_success_mean_s", "causes")
+def _packed(entry: Document, *names: str) -> Document:
+    """Of an agent or a cell these, and how each episode ended: compressed letters, for all its counts."""
+    word = base64.b64encode(zlib.compress(_ends(entry)["ends"].encode(), 9)).decode()
+    return {name: entry[name] for name in names if name in entry} | {"packed": word}
+
+
+def _unpacked(found: Document) -> Document:
+    if packed := found.pop("packed", None):
+        ends = zlib.decompress(base64.b64decode(packed)).decode()
+        counts = {end: ends.count(letter) for end, letter in LETTERS.items()}
+        return found | {"ends": ends, "episodes": len(ends), "outcomes": counts}
+    return found
+
+
+_TIMES = ("time_mean_s", "time_to_success_mean_s")
+_KEPT = ("name", "episodes", "outcomes", "ends", *_TIMES, "causes")
 
 
 def _kept(entry: Document) -> Document:
@@ -359,14 +367,6 @@ def _kept(entry: Document) -> Document:
     if "causes" in kept:
         kept["causes"] = [{name: cause[name] for name in ("label", "count")} for cause in kept["causes"]]
     return kept
-
-
-def _small_sweep(sweep: Document) -> Document:
-    names = {cell_name(axis) for axis in sweep["axes"]} | {"S", "D", "v_m_s", "agent", *_KEPT}
-    rest = {name: sweep[name] for name in ("axes", "one_at_a_time", "unchanged") if name in sweep}
-    return rest | {
-        "cells": [{k: cell[k] for k in cell if k in names} | _ends(cell) for cell in sweep["cells"]]
-    }
 
 
 def _ends(cell: Document) -> dict[str, str]:

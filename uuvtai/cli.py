@@ -155,7 +155,7 @@ def watch_live(
 # ----------------------------------------------------------------------------------------------------- Learn
 
 
-@app.command("train", epilog="Example: uuv train curriculum --iterations 20 --run-dir runs/first")
+@app.command("train", epilog="Example: uuv train paper --run-dir runs/first")
 @groups.grouped
 def train_policy(
     ctx: typer.Context,
@@ -437,7 +437,7 @@ def profile(
     output: groups.OutputGroup,
     num_envs: opt.BatchSizes = "1,64,1024",
     agent: opt.TickedTree = "bt",
-    preset: opt.ProfilePreset = "curriculum",
+    preset: opt.ProfilePreset = "paper",
     seconds: opt.ProfileSeconds = 10.0,
     density: opt.Density = False,
     device: opt.Device = "auto",

@@ -11,8 +11,9 @@ from uuvtai.common.statistics import (
     holm_adjusted,
     mcnemar_p,
     mean,
-    normal_p,
     rate,
+    student95,
+    student_p,
     time_to_success_s,
     wilson_interval,
 )
@@ -146,9 +147,12 @@ def test_fisher_and_binomial_agree_with_scipy():
         assert binomial_p(k, n, p) == pytest.approx(min(1.0, 2 * min(tails)), rel=1e-6)
 
 
-def test_normal_p_of_known_quantiles():
-    assert normal_p(1.959963984540054) == normal_p(-1.959963984540054) == pytest.approx(0.05)
-    assert normal_p(0.0) == 1.0
+def test_students_t_of_a_table_and_of_scipy():
+    assert [student95(freedom) for freedom in (1, 4, 30)] == pytest.approx([12.706, 2.776, 2.042], abs=1e-3)
+    assert student_p(0.0, 3.0) == 1.0 and student_p(-2.0, 3.0) == student_p(2.0, 3.0)
+    stats = pytest.importorskip("scipy.stats")
+    for t, freedom in ((0.3, 1.0), (2.1, 4.7), (9.0, 7.6), (25.0, 4.0), (1.96, 999.0), (6.0, 999.0)):
+        assert student_p(t, freedom) == pytest.approx(2 * stats.t.sf(t, freedom), rel=1e-3)
 
 
 def test_bootstrap_interval_of_known_samples():

@@ -73,7 +73,7 @@ from uuvtai.console.views import show_evaluation
         (["log", "render", "a.mcap", "--fps", "5"], "--speed, --fps: are of a video"),
         (["log", "render", "a.mcap", "--out", "a.gif", "--clearance"], "are of a picture"),
         (["eval", "--agent", "none"], "--agent none: is no preset"),
-        (["train", "curiculum"], "did you mean 'curriculum'"),
+        (["train", "constnt_20"], "did you mean 'constant_20'"),
         (["train", "nowhere.yaml"], "no such file"),
         (["train", "smoke", "--set", "ppo.gama=1"], "did you mean 'gamma'"),
         (["train", "smoke", "--iterations", "0"], "--iterations 0: at least 1"),
@@ -301,7 +301,7 @@ def test_presets_are_listed_and_shown(capfd):
     assert {"clean", "paper", "nominal", "harsh", "multibeam", "multibeam_image", "ping360"} == set(
         listed["sensors"]
     )
-    assert {"paper", "ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model", "smoke"} <= set(
+    assert {"paper", "ppo", "constant_20", "no_risk_scaling", "no_world_model", "smoke"} <= set(
         listed["train"]
     )
     code, out, _ = uuv(capfd, "presets", "show", "gauntlet", "--all")

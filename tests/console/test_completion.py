@@ -95,8 +95,8 @@ def test_what_may_be_typed_stands_beside_every_option(words):
         (["sweep", "--engine", "rai"], "--engine rai: use local or ray; did you mean 'ray'?"),
         (["reproduce", "--budget", "quik"], "did you mean 'quick'"),
         (["presets", "show", "gauntlt"], "did you mean 'gauntlet' (world)?"),
-        (["presets", "show", "curiculum"], "did you mean 'curriculum' (train)?"),
-        (["presets", "show", "train/curiculum"], "did you mean 'curriculum'"),
+        (["presets", "show", "constnt_20"], "did you mean 'constant_20' (train)?"),
+        (["presets", "show", "train/constnt_20"], "did you mean 'constant_20'"),
     ],
 )
 def test_a_wrong_word_is_refused_at_once_and_the_right_one_named(
@@ -146,7 +146,7 @@ def runs(tmp_path):
     (["eval", "--world", "ga"], ["gauntlet", "gauntlet_inertial"]),
     (["eval", "--world", "mi"], ["mixed", "mine.yaml"]),
     (["eval", "--sensors", "n"], ["nominal"]),
-    (["train", "curr"], ["curriculum"]),
+    (["train", "cons"], ["constant_20"]),
     (["profile", "--agent", "pl"], ["planner"]),
     (["profile", "--agent", "mi"], ["mine.xml"]),
     (["sweep", "--grid", "cau"], ["caution"]),

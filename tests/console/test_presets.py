@@ -70,5 +70,5 @@ def test_a_file_of_ones_own_is_shown(capfd, tmp_path):
 def test_the_nearest_name_of_any_kind_is_meant():
     assert near("gauntlt") == "; did you mean 'gauntlet' (world)?"
     assert near("nominl") == "; did you mean 'nominal' (sensors)?"
-    assert near("distill_2") == "; did you mean 'distill_20' (train)?"
+    assert near("constant_2") == "; did you mean 'constant_20' (train)?"
     assert near("zzzzzz") == ""

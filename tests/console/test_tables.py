@@ -27,7 +27,7 @@ def shown(show, width, wide=False):
 
 def evaluation():
     """Four agents with the longest figures that there are, one of them privileged."""
-    names = {"straight": 281, "planner": 290, "bt+truth": 500, "20261122-154501_curriculum": 0}
+    names = {"straight": 281, "planner": 290, "bt+truth": 500, "20261122-154501_constant_20": 0}
     agents = [
         samples.agent(name, k, 500 - k, 500, privileged=name == "bt+truth", env_steps_per_s=25123.4)
         for name, k in names.items()
@@ -71,7 +71,9 @@ LOG = {
 CHECKS = [{"name": "kernel cache", "ok": False, "detail": "word " * 60}]
 CLAIMS = {
     "budget": "quick",
-    "claims": [{"text": "word " * 30, "theirs": "82.8 %", "ours": "96.5 % [95.1, 97.5]", "verdict": "holds"}],
+    "claims": [
+        {"text": "word " * 30, "theirs": "83 %", "ours": "96 % [95, 97]", "verdict": "holds", "reason": ""}
+    ],
 }
 SHOWS = {
     "eval": (lambda s: views.show_agents(s, evaluation()), ["agent", "success [95 %]", "collision [95 %]"]),

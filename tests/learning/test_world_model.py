@@ -15,6 +15,7 @@ from uuvtai.learning.networks import moments_of
 from uuvtai.learning.world_model import (
     LOG_VAR_BOUNDS,
     N_TARGET,
+    SKILL,
     WorldModel,
     WorldModelLearner,
     coverage,
@@ -140,6 +141,7 @@ def test_it_learns_the_change_and_where_it_is_uncertain():
     target = next_obs[:, :N_TARGET]
     error, before = ((target - other).square().mean(dim=0) for other in (predicted.mean, obs[:, :N_TARGET]))
     assert (error < before).all()
+    assert min(metrics[f"{SKILL}{i}"] for i in range(N_TARGET)) > 0.2
     assert mean_squared_standardised_residual(predicted.mean, predicted.log_var, target) == pytest.approx(
         1.0, abs=SAMPLING
     )
@@ -212,6 +214,15 @@ def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the
         scales[unit] = uncertainty.scale
     assert scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02)
     assert scales["change"] == UncertaintyConfig().max_scale
+
+
+def test_skill_is_told_by_name_and_only_where_something_changes():
+    (obs, action, next_obs), names = transitions(), [f"t{i}" for i in range(N_TARGET)]
+    next_obs[..., 3] = obs[..., 3]
+    learner = WorldModelLearner(WorldModel(N_OBS, SMALL, generator()), SMALL, names)
+    found = learner.update(obs, action, next_obs, generator()).items()
+    told = {name.removeprefix(SKILL): value for name, value in found if name.startswith(SKILL)}
+    assert told.keys() == {*names} - {"t3"} and max(map(abs, told.values())) < 0.2, "at birth: as before"
 
 
 # --------------------------------------------------------------------------------------------- random, resume

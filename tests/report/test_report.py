@@ -350,10 +350,10 @@ def test_seeds_of_a_method_are_its_mean_and_its_range():
 
 
 def test_only_the_seed_makes_no_other_method():
-    other = Training("curriculum_0", "train:\n  seed: 0\n  iterations: 9\n", samples.metrics())
+    other = Training("constant_20_0", "train:\n  seed: 0\n  iterations: 9\n", samples.metrics())
     assert [(m.name, len(m.runs)) for m in grouped([*seeds_of("ppo", (0, 1)), other])] == [
         ("ppo", 2),
-        ("curriculum_0", 1),
+        ("constant_20_0", 1),
     ]
     same = [Training(f"run{i}", f"a: {i}\n", samples.metrics(), "best") for i in range(2)]
     assert [m.name for m in grouped(same)] == ["run0", "run1"], (
@@ -662,21 +662,10 @@ def test_a_reproduction_composes_verdicts_tables_and_runs(tmp_path):
         {"claim": "it swims", "verdict": "holds", "numbers": "3 of 3"},
         {"claim": "it flies", "verdict": "does not hold", "numbers": "0 of 3"},
     ]
-    point = {"collision_rate": 0.01, "success_rate": 0.9}
     folder = reproduced(
         tmp_path,
         {"kind": "verdicts", "items": verdicts},
-        {
-            "kind": "table",
-            "columns": ["what", "paper", "ours"],
-            "rows": [["bt", 0.8, None]],
-            "caption": "Table main",
-        },
-        {
-            "kind": "trade_off",
-            "series": [{"name": "bt", "points": [point]}],
-            "marks": [{"name": "paper", **point}],
-        },
+        {"kind": "table", "columns": ["what", "paper"], "rows": [["bt", None]], "caption": "Table main"},
         {"kind": "run", "path": "grid"},
         {"kind": "run", "path": "noise"},
         {"kind": "curves", "paths": ["a_0", "a_1"]},
@@ -687,9 +676,7 @@ def test_a_reproduction_composes_verdicts_tables_and_runs(tmp_path):
         samples.write_run(tmp_path / f"a_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(5))
     written = report([folder])
     page = Reader(written.page.read_text())
-    assert [path.stem for path in written.figures] == [
-        "trade_off", "grid_heat_map_bt", "noise_sweep_sensors", "training",
-    ]  # fmt: skip
+    assert [path.stem for path in written.figures] == ["grid_heat_map_bt", "noise_sweep_sensors", "training"]
     assert [item["class"] for item in page.of("li")] == ["holds", "fails"]
     assert "a (2 seeds)" in page.words
 

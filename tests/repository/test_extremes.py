@@ -14,7 +14,7 @@ EXTREMES = (
     0, -1, 5e-324, 1e-300, 1e-6, 1e300, 1e18, math.nan, math.inf, 2**31, 2**31 - 1, 2**63, -(2**63), 10**400,
     "", [], True, False,
 )  # fmt: skip
-TREE = load_training("curriculum").model_dump(mode="json")
+TREE = load_training("paper").model_dump(mode="json")
 
 
 def keys(tree, prefix=()):

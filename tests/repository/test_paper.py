@@ -44,34 +44,21 @@ LEARNING = rows("Where the defaults differ: learning")
 
 
 def test_every_difference_is_listed_and_nothing_else():
-    default, paper, curriculum = LearningConfig(), load_training("paper"), load_training("curriculum")
+    default, paper = LearningConfig(), load_training("paper")
     assert not CLASSICAL.keys() & LEARNING.keys()
     assert set(CLASSICAL) == differing(load_config("pool"), with_stack(load_config("pool"), "paper"))
-    assert set(CLASSICAL) | set(LEARNING) == differing(default, paper) | differing(
-        curriculum, paper
-    ) | differing(default, curriculum)
+    assert set(CLASSICAL) | set(LEARNING) == differing(default, paper)
     assert {key.partition(".")[0] for key in CLASSICAL} <= set(STACK_SECTIONS)
 
 
-@pytest.mark.parametrize("key", CLASSICAL)
-def test_the_classical_half_is_as_listed(key):
-    _paper, default, stack, _why = CLASSICAL[key]
-    assert json.loads(default.strip("`")) == values(load_config("pool"))[key] == values(LearningConfig())[key]
-    assert (
-        json.loads(stack.strip("`"))
-        == values(with_stack(load_config("pool"), "paper"))[key]
-        == values(load_training("paper"))[key]
-    )
-
-
-@pytest.mark.parametrize("key", LEARNING)
-def test_learning_is_as_listed(key):
-    _paper, default, curriculum, paper, _why = LEARNING[key]
-    answer = [json.loads(cell.strip("`")) for cell in (default, curriculum, paper)]
-    assert answer == [
-        values(config)[key]
-        for config in (LearningConfig(), load_training("curriculum"), load_training("paper"))
-    ]
+@pytest.mark.parametrize("key", CLASSICAL | LEARNING)
+def test_both_values_are_as_listed(key):
+    _paper, *cells, _why = (CLASSICAL | LEARNING)[key]
+    default, paper = (json.loads(cell.strip("`")) for cell in cells)
+    assert (default, paper) == (values(LearningConfig())[key], values(load_training("paper"))[key])
+    if key in CLASSICAL:
+        found = load_config("pool"), with_stack(load_config("pool"), "paper")
+        assert [default, paper] == [values(config)[key] for config in found]
 
 
 def test_values_that_the_page_names_are_those_of_the_preset():
@@ -81,11 +68,8 @@ def test_values_that_the_page_names_are_those_of_the_preset():
     v = load_training("paper").vehicle
     assert f"{thrust_limits(v)[0]:.1f} N at {v.rotor_max_rpm:.0f} rpm" in PAGE
     assert f"K_F n^2 is {4.4e-7 * v.rotor_max_rpm**2 * KGF:.1f} N" in PAGE
-    assert [high - low for low, high in (TankConfig().x_m, TankConfig().y_m, TankConfig().z_m)] == [
-        20,
-        6,
-        1.6,
-    ]
+    tank = TankConfig()
+    assert [high - low for low, high in (tank.x_m, tank.y_m, tank.z_m)] == [20, 6, 1.6]
     assert f"{LOG_VAR_BOUNDS[0]:.0f} .. {LOG_VAR_BOUNDS[1]:.0f}" in PAGE
 
 

@@ -3,6 +3,7 @@ tests/common/test_statistics.py."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -44,18 +45,27 @@ def design_effect(won: Sequence[int], trials: Sequence[int]) -> float:
         return n_all / max(1, m)
     p = k_all / n_all
     spread = m / (m - 1) * sum((k - p * n) ** 2 for k, n in zip(won, trials, strict=True))
-    return max(1.0, spread / (n_all * p * (1 - p))) * (_student95(m - 1) / Z95) ** 2
+    return max(1.0, spread / (n_all * p * (1 - p))) * (student95(m - 1) / Z95) ** 2
 
 
-def _student95(freedom: int) -> float:
-    """Two-sided 95 % quantile of Student's t (Abramowitz and Stegun 26.7.5), to 0.2 % from five on."""
-    z = Z95
-    terms = (
-        (z**3 + z) / 4,
-        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
-    )
-    return z + sum(term / freedom**power for power, term in enumerate(terms, start=1))
+def student_p(t: float, freedom: float) -> float:
+    """Two-sided p value of Student's t with any positive ``freedom``: the tail of cos^(freedom - 1), into
+    which t = sqrt(freedom) tan(angle) turns the density, by the midpoint rule."""
+    first = math.atan2(abs(t), math.sqrt(freedom))
+    width = (math.pi / 2 - first) / 4000
+    tail = float((np.cos(first + width * (np.arange(4000) + 0.5)) ** (freedom - 1)).sum()) * width
+    whole = math.exp(math.lgamma(freedom / 2) - math.lgamma((freedom + 1) / 2)) * math.sqrt(math.pi) / 2
+    return min(1.0, tail / whole)
+
+
+@functools.cache
+def student95(freedom: float) -> float:
+    """Two-sided 95 % quantile of Student's t for ``freedom`` of one or more, by bisection."""
+    low, high = 0.0, 13.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if student_p(middle, freedom) > 0.05 else (low, middle)
+    return low
 
 
 def rate(k: int, n: int) -> float | None:
@@ -134,11 +144,6 @@ def fisher_p(k_a: int, n_a: int, k_b: int, n_b: int) -> float:
 
 def _log_choose(n: int, k: int) -> float:
     return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
-
-
-def normal_p(z: float) -> float:
-    """Two-sided p value of a standard normal z."""
-    return math.erfc(abs(z) / math.sqrt(2.0))
 
 
 def holm_adjusted(p_values: Sequence[float]) -> list[float]:

@@ -260,7 +260,12 @@ ProfilePreset = Annotated[
 ProfileSeconds = Annotated[float, Option("--seconds", help="Measured time per batch size \\[s].")]
 Density = Annotated[bool, Option("--density", help="Also loop time against the number of obstacles.")]
 BudgetName = Annotated[
-    str, parsing.choice("--budget", ("quick", "full"), "Half an hour on two cores, or overnight.")
+    str,
+    parsing.choice(
+        "--budget",
+        ("quick", "paper", "tenfold"),
+        "Half an hour on two cores, the paper's env-steps, or ten times as many.",
+    ),
 ]
 OwnAgents = Annotated[
     list[str] | None,

@@ -1,9 +1,14 @@
 """The paper's claims against our results: each holds, does not hold, or cannot be judged, always with the
 numbers.
 
-A claim about rates has a test; all tests of a reproduction are one family, and Holm's adjustment (``judged``)
-bounds the chance that any of its verdicts is a false alarm by ``LEVEL``. Claims that set one number beside
-another have no test and no p value.
+A claim about a method of training counts training seeds: another seed is what another reader would train.
+Rates of success of two methods are compared by Welch's t (1947) over their seeds, which has 5 % of false
+alarms at five seeds; a bootstrap over so few has twice as many, whatever it resamples within them. All seeds
+meet the same episodes, so what is common to them cancels, and what is not is part of the spread over seeds.
+A claim about one agent, which is there once, counts its episodes.
+
+All tests of a page are one family, and Holm's adjustment (``judged``) bounds the chance that any of its
+verdicts is a false alarm by ``LEVEL``. Claims that set one number beside another have no test and no p value.
 """
 
 from __future__ import annotations
@@ -12,6 +17,7 @@ import math
 from collections import Counter
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean, median
 from typing import Any, NamedTuple
 
 from uuvtai.common.enums import COLLIDED, LETTERS
@@ -20,8 +26,9 @@ from uuvtai.common.statistics import (
     design_effect,
     fisher_p,
     holm_adjusted,
-    normal_p,
     rate,
+    student95,
+    student_p,
     time_to_success_s,
     wilson_interval,
 )
@@ -38,8 +45,8 @@ class PrintedRow(NamedTuple):
 
 TABLE_MAIN = {
     "ppo": PrintedRow(0.20, 0.40, 22.84, 114.2),
-    "distill_20": PrintedRow(0.46, 0.20, 13.44, 67.2),
-    "curriculum": PrintedRow(0.87, 0.15, 11.41, 15.8),
+    "constant_20": PrintedRow(0.46, 0.20, 13.44, 67.2),
+    "paper": PrintedRow(0.87, 0.15, 11.41, 15.8),
     "bt": PrintedRow(0.80, 0.10, 14.50, 32.5),
 }
 """by the names of our presets; 25 episodes an agent"""
@@ -77,32 +84,39 @@ class Finding:
 
     points_to: str
     p: float | None
+    reason: str = ""
+    """why it cannot be judged"""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim and what became of it. Before ``judged`` the verdict is what the numbers point to."""
+    """One claim and what became of it."""
 
     text: str
     theirs: str
     ours: str
-    verdict: str
+    points_to: str
     p: float | None = None  # of the claim's own test
-    p_holm: float | None = None  # adjusted for all tests of the reproduction
+    reason: str = ""
+    """why it cannot be judged"""
+    verdict: str = ""  # by ``judged``
+    p_holm: float | None = None  # adjusted for all tests of the page
 
 
 def claim(text: str, theirs: str, ours: str, finding: Finding) -> Claim:
-    return Claim(text, theirs, ours, finding.points_to, finding.p)
+    return Claim(text, theirs, ours, finding.points_to, finding.p, finding.reason)
 
 
 def judged(claims: Sequence[Claim]) -> list[Claim]:
     """The claims with verdicts: a test decides where its Holm-adjusted p is below ``LEVEL``."""
     adjusted = iter(holm_adjusted([c.p for c in claims if c.p is not None]))
-    return [_judged(c, next(adjusted)) if c.p is not None else c for c in claims]
+    return [replace(c, verdict=c.points_to) if c.p is None else _judged(c, next(adjusted)) for c in claims]
 
 
 def _judged(c: Claim, p_holm: float) -> Claim:
-    return replace(c, p_holm=p_holm, verdict=c.verdict if p_holm < LEVEL else OPEN)
+    if p_holm < LEVEL:
+        return replace(c, p_holm=p_holm, verdict=c.points_to, reason="")
+    return replace(c, p_holm=p_holm, verdict=OPEN, reason="may be chance")
 
 
 @dataclass(frozen=True)
@@ -172,16 +186,15 @@ def ends_of(entry: dict[str, Any]) -> dict[Hashable, str]:
     return dict(enumerate(entry.get("episode_outcomes") or [names[c] for c in entry.get("ends") or ""]))
 
 
+_NOT_KEPT = Finding(OPEN, None, "single episodes were not kept")
+
+
 def larger(a: Share, b: Share) -> Finding:
     """Whether a's rate is the larger one (Fisher's exact test)."""
-    return _by_fisher(a, b, a.rate > b.rate)
-
-
-def _by_fisher(a: Share, b: Share, holds: bool) -> Finding:
     ours, theirs = a.counts(), b.counts()
     if ours is None or theirs is None:
-        return Finding(OPEN, None)
-    return Finding(HOLDS if holds else FAILS, fisher_p(*ours, *theirs))
+        return _NOT_KEPT
+    return Finding(HOLDS if a.rate > b.rate else FAILS, fisher_p(*ours, *theirs))
 
 
 def at_least(a: Share, value: float) -> Finding:
@@ -196,118 +209,147 @@ def at_most(a: Share, value: float) -> Finding:
 
 def _by_binomial(a: Share, value: float, holds: bool) -> Finding:
     counts = a.counts(value)
-    return (
-        Finding(OPEN, None)
-        if counts is None
-        else Finding(HOLDS if holds else FAILS, binomial_p(*counts, value))
-    )
+    return _NOT_KEPT if counts is None else Finding(HOLDS if holds else FAILS, binomial_p(*counts, value))
 
 
-_MARGIN = 0.1  # how far a rate may fall behind another one that it is said to come near
+@dataclass(frozen=True)
+class Estimate:
+    """A mean with the variance of this mean, and the degrees of freedom of that."""
+
+    mean: float
+    variance: float
+    freedom: float
+    """0 = of one training seed, which says nothing about others"""
+    shown: str
+
+    def __str__(self) -> str:
+        return self.shown
 
 
-def near(a: Share, b: Share) -> Finding:
-    """Whether a's rate comes near b's or above: not inferior by more than 10 points, or else plainly the
-    smaller one (Fisher).
-
-    The margin is tested by z with the variances of Agresti and Caffo (2000), which small and one-sided
-    samples have too.
-    """
-    if a.rate < b.rate - _MARGIN or a.design is None or b.design is None:
-        return _by_fisher(a, b, False)
-    (p_a, var_a), (p_b, var_b) = _softened(a, a.design), _softened(b, b.design)
-    return Finding(HOLDS, normal_p(max(0.0, p_a - p_b + _MARGIN) / math.sqrt(var_a + var_b)))
-
-
-def _softened(a: Share, design: float) -> tuple[float, float]:
-    """Rate and its variance with one success and one failure more."""
-    n = a.n / design + 2
-    p = (a.k / design + 1) / n
-    return p, p * (1.0 - p) / n
+def over_seeds(values: Sequence[float], least: float = 0.0) -> Estimate:
+    """Of a method, one value a training seed, with Student's interval; ``least``: variance of the mean that
+    there is in any case."""
+    n, middle = len(values), fmean(values)
+    if n < 2:
+        return Estimate(middle, least, 0.0, f"{100 * middle:.1f} % (1 seed)")
+    variance = max(least, sum((value - middle) ** 2 for value in values) / (n - 1) / n)
+    half = student95(n - 1) * math.sqrt(variance)
+    low, high = 100 * max(0.0, middle - half), 100 * min(1.0, middle + half)
+    shown = f"{100 * middle:.1f} % [{low:.1f}, {high:.1f}] ({n} seeds)"
+    return Estimate(middle, variance, n - 1.0, shown)
 
 
-def times_as_large(a: Share, b: Share, factor: float) -> Finding:
-    """Whether a's rate is at least ``factor`` times b's: z of the log of their ratio (Katz et al. 1978)."""
-    if not a.k or not b.k or a.design is None or b.design is None:
-        return Finding(OPEN, None)
-    z = (math.log(a.rate / b.rate) - math.log(factor)) / math.sqrt(
-        a.design * (1 - a.rate) / a.k + b.design * (1 - b.rate) / b.k or 1e-12
-    )
-    return Finding(HOLDS if z >= 0 else FAILS, normal_p(z))
+def of_method(entries: Sequence[dict[str, Any]], *outcomes: str) -> Estimate:
+    """Rate of a method's episodes that ended in ``outcomes``; an entry of ``uuv eval`` a training seed. The
+    seeds of a rate near 0 or 1 may agree by chance: their episodes vary at the least."""
+    shares = [pooled([entry], *outcomes) for entry in entries]
+    all_of_them = Share(sum(share.k for share in shares), sum(share.n for share in shares))
+    return over_seeds([share.rate for share in shares], _softened(all_of_them))
+
+
+def of_agent(share: Share) -> Estimate:
+    """Rate of one agent over episodes (variance of Agresti and Caffo 2000, which is none too small for one-
+    sided samples)."""
+    return Estimate(share.rate, _softened(share), max(1.0, share.n - 1.0), str(share))
+
+
+def _softened(share: Share) -> float:
+    """Variance of a rate with one success and one failure more."""
+    p = (share.k + 1) / (share.n + 2)
+    return p * (1.0 - p) / (share.n + 2)
+
+
+MARGIN = 0.1
+"""how far a rate may fall behind another one that it is said to come near"""
+
+
+def compared(a: Estimate, b: Estimate, factor: float = 1.0, margin: float = 0.0) -> Finding:
+    """Whether a > factor b - margin, by Welch's t."""
+    if not a.freedom or not b.freedom:
+        return Finding(OPEN, None, "one training seed says nothing about others")
+    of_a, of_b = a.variance, factor * factor * b.variance
+    if not of_a + of_b:
+        return Finding(OPEN, None, "none of the training seeds differ")
+    ahead = a.mean - factor * b.mean + margin
+    freedom = (of_a + of_b) ** 2 / (of_a**2 / a.freedom + of_b**2 / b.freedom)
+    return Finding(HOLDS if ahead > 0.0 else FAILS, student_p(ahead / math.sqrt(of_a + of_b), freedom))
 
 
 # ------------------------------------------------------------------------------------------------- Table main
 
 
-def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
-    """Claims about the agents and ablations; entries of ``uuv eval`` by preset, one per training seed."""
-    success = {name: pooled(entries, "success") for name, entries in by_preset.items()}
-    collision = {name: pooled(entries, *COLLIDED) for name, entries in by_preset.items()}
-    ours, plain = success["curriculum"], success["ppo"]
-    ratio = ours.rate / plain.rate if plain.k else None
-    slow, fast = tts_s(by_preset["ppo"]), tts_s(by_preset["curriculum"])
-    return [
+def of_table_main(by_method: dict[str, list[dict[str, Any]]], note: str = "") -> list[Claim]:
+    """Claims about methods and ablations; entries of ``uuv eval`` by method, one per training seed. ``note``
+    goes behind each text."""
+    success = {name: of_method(entries, "success") for name, entries in by_method.items()}
+    collision = {name: of_method(entries, *COLLIDED) for name, entries in by_method.items()}
+    ours, plain, tree = success["paper"], success["ppo"], of_agent(pooled(by_method["bt"], "success"))
+    times = [_seconds(tts_s(by_method[name])) for name in ("paper", "ppo")]
+    without = "over PPO without distillation"
+    found = [
         claim(
-            "Curriculum distillation raises success over PPO without distillation",
+            f"Curriculum distillation raises success {without}",
             "0.87 against 0.20",
             f"{ours} against {plain}",
-            larger(ours, plain),
+            compared(ours, plain),
         ),
         claim(
-            "Success rises by nearly a factor of four (3.5 at least) over PPO without distillation",
+            f"Success rises by nearly a factor of four (3.5 at least) {without}",
             f"{0.87 / 0.20:.2f}",
-            "-" if ratio is None else f"{ratio:.2f}",
-            times_as_large(ours, plain, _NEARLY_FOUR),
-        ),
-        claim(
-            "Curriculum distillation beats a constant weight of 20 %",
-            "0.87 against 0.46",
-            f"{ours} against {success['distill_20']}",
-            larger(ours, success["distill_20"]),
+            f"{ours.mean / plain.mean:.2f}" if plain.mean else "-",
+            compared(ours, plain, _NEARLY_FOUR),
         ),
         claim(
             "Curriculum distillation collides less than PPO without distillation",
             "0.15 against 0.40",
-            f"{collision['curriculum']} against {collision['ppo']}",
-            larger(collision["ppo"], collision["curriculum"]),
+            f"{collision['paper']} against {collision['ppo']}",
+            compared(collision["ppo"], collision["paper"]),
         ),
         claim(
             "Time to success (mean time / success rate) falls far below (under half) that of PPO without "
             "distillation",
             "15.8 s against 114.2 s",
-            f"{_seconds(fast)} against {_seconds(slow)}",
-            _far_below(fast, slow, larger(ours, plain)),
+            " against ".join(times),
+            compared(_quickness(by_method["paper"]), _quickness(by_method["ppo"]), 2.0),
         ),
         claim(
-            "Curriculum distillation approaches the robustness of the behaviour tree (within 10 points)",
+            "Curriculum distillation approaches the robustness of the behavior tree (within 10 points)",
             "0.87 against 0.80",
-            f"{ours} against {success['bt']}",
-            near(ours, success["bt"]),
+            f"{ours} against {tree}",
+            compared(ours, tree, margin=MARGIN),
         ),
         *[
-            claim(
-                text,
-                "no table",
-                f"{success['curriculum']} against {success[name]}",
-                larger(success["curriculum"], success[name]),
-            )
-            for name, text in _ABLATIONS.items()
+            claim(text, theirs, f"{success[a]} against {success[b]}", compared(success[a], success[b]))
+            for a, b, text, theirs in _PAIRS
+            if a in success and b in success
         ],
     ]
+    return [replace(c, text=c.text + note) for c in found]
 
 
 _NEARLY_FOUR = 3.5
-_ABLATIONS = {
-    "no_risk_scaling": "Scaling the distillation by the world model's uncertainty raises success (ablation "
-    "'LWM risk')",
-    "no_world_model": "The world model's features raise success (ablation 'LWM')",
-}
+_PAIRS = (
+    ("paper", "constant_20", "Curriculum distillation beats a constant weight of 20 %", "0.87 against 0.46"),
+    (
+        "paper",
+        "no_risk_scaling",
+        "Scaling the distillation by the world model's uncertainty raises success (ablation 'LWM risk')",
+        "no table",
+    ),
+    ("paper", "no_world_model", "The world model's features raise success (ablation 'LWM')", "no table"),
+    (
+        "paper_10hz",
+        "ppo_10hz",
+        "Curriculum distillation raises success over PPO without distillation, decisions at 10 Hz",
+        "not tried",
+    ),
+)
 
 
-def _far_below(ours_s: float | None, theirs_s: float | None, finding: Finding) -> Finding:
-    """Less than half; None = nobody arrived, as slow as can be. Certainty follows from rates of success."""
-    slower = ours_s is None or (theirs_s is not None and ours_s >= theirs_s / 2)
-    return Finding(FAILS if slower else finding.points_to, finding.p)
+def _quickness(entries: Sequence[dict[str, Any]]) -> Estimate:
+    """1 / TTS by training seed: 0 where nobody arrives."""
+    times = [tts_s([entry]) for entry in entries]
+    return over_seeds([1.0 / time if time else 0.0 for time in times])
 
 
 def tts_s(entries: Sequence[dict[str, Any]]) -> float | None:
@@ -327,24 +369,46 @@ def _seconds(value: float | None) -> str:
 # --------------------------------------------------------------------------------------------------- training
 
 
-def of_training(metrics: Sequence[dict[str, Any]]) -> list[Claim]:
-    """Whether the world model's losses fall; rows of ``metrics.jsonl`` of the curriculum."""
+def of_training(trainings: Sequence[Sequence[dict[str, Any]]], note: str = "") -> list[Claim]:
+    """Whether the world model's losses fall; rows of ``metrics.jsonl`` of the method's trainings."""
     claims = []
     for key, name in (
         ("world_model/reconstruction_loss", "Reconstruction"),
         ("world_model/dynamics_loss", "Dynamics"),
     ):
-        values = [row[key] for row in metrics if key in row]
-        part = max(1, len(values) // 5)
-        if len(values) < 4:
-            claims.append(Claim(f"{name} loss falls and settles", "curve", "too few iterations", OPEN))
+        curves = [[row[key] for row in rows if row.get(key) is not None] for rows in trainings]
+        text = f"{name} loss falls and settles{note}"
+        if min(map(len, curves), default=0) < 4:
+            claims.append(Claim(text, "curve", "-", OPEN, reason="too few iterations"))
             continue
-        first, last = sum(values[:part]) / part, sum(values[-part:]) / part
-        text = f"first fifth {first:.3g}, last fifth {last:.3g}"
-        claims.append(
-            Claim(f"{name} loss falls and settles", "curve", text, HOLDS if last < 0.9 * first else FAILS)
-        )
+        ends = [(fmean(curve[: len(curve) // 4]), fmean(curve[-len(curve) // 4 :])) for curve in curves]
+        fallen = sum(last < first - 0.1 * abs(first) for first, last in ends)
+        first, last = (fmean(values) for values in zip(*ends, strict=True))
+        shown = f"in {fallen} of {len(ends)} trainings; first quarter {first:.3g}, last {last:.3g}"
+        claims.append(Claim(text, "curve", shown, HOLDS if fallen == len(ends) else FAILS))
     return claims
+
+
+def mechanism_of(trainings: Sequence[Sequence[dict[str, Any]]], limit: float) -> dict[str, Any]:
+    """What a method's trainings say of its mechanism: s_t (first, median, last, share of the iterations at
+    its ``limit``) by training, and the world model's skill, target by target: the median over the last
+    quarter, by training."""
+    scales = [[row["distillation/scale"] for row in rows] for rows in trainings]
+    scale = [
+        [values[0], median(values), values[-1], fmean(value >= limit - 1e-9 for value in values)]
+        for values in scales
+        if values
+    ]
+    skill: dict[str, list[float]] = {}
+    for rows in trainings:
+        late = rows[-max(1, len(rows) // 4) :]
+        for key in [key for key in (late[-1] if late else {}) if key.startswith(_SKILL)]:
+            found = [row[key] for row in late if row.get(key) is not None]
+            skill.setdefault(key.removeprefix(_SKILL), []).extend([median(found)] if found else [])
+    return {"scale": scale, "skill": skill}
+
+
+_SKILL = "world_model/skill/"  # that of learning.world_model, which takes torch to import
 
 
 # ------------------------------------------------------------------------------------------------------ sweep
@@ -376,7 +440,7 @@ def of_sweep(cells: Sequence[dict[str, Any]], agent: str) -> list[Claim]:
             f"{WITHOUT_COLLISION} of {MODERATE_CONDITIONS}",
             f"{spotless} of {len(moderate)} (D = 0 once per S), {moderate[0]['episodes'] if moderate else 0} "
             "episodes each",
-            Finding(OPEN, None),  # more episodes a cell leave fewer such cells, and theirs are not printed
+            Finding(OPEN, None, "more episodes a cell leave fewer such cells, and theirs are not printed"),
         ),
         claim(
             f"{agent}: collision for D <= 3 over all S and v",
@@ -410,6 +474,7 @@ def of_timing(profile: dict[str, Any]) -> list[Claim]:
             "0.17 against 8.55 ms",
             f"{inference:.2f} against {'-' if stages is None else f'{stages:.2f}'} ms",
             OPEN if stages is None else HOLDS if inference < 0.1 * stages else FAILS,
+            reason="no step planned anything" if stages is None else "",
         ),
         Claim(
             "A loop exceeds the 20 ms of 50 Hz",
@@ -441,6 +506,6 @@ def of_transfer(here: dict[str, Any], there: dict[str, Any]) -> list[Claim]:
             "points)",
             "shown, not counted",
             f"{b} there, {a} in pool",
-            near(b, a),
+            compared(of_agent(b), of_agent(a), margin=MARGIN),
         )
     ]

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Protocol
 
 from uuvtai.common.enums import COLLIDED, LETTERS
 from uuvtai.common.errors import SettingError
 from uuvtai.common.files import FileError, read_json
 from uuvtai.common.statistics import mean
-from uuvtai.config.loader import load_config
+from uuvtai.config.loader import load_config, load_training
 from uuvtai.evaluation import claims
 from uuvtai.evaluation.agents import load_agents
-from uuvtai.evaluation.claims import LEVEL, pooled, tts_s
+from uuvtai.evaluation.claims import LEVEL, Claim, of_method, pooled, tts_s
 from uuvtai.evaluation.reproduce_steps import (
     BUDGETS,
     EVALUATION_SEED,
+    METHODS,
     RETIRED_SEEDS,
-    TRAINED,
     Budget,
     Step,
     is_done,
@@ -32,141 +34,61 @@ from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, r
 from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code
 from uuvtai.report.build import report
 from uuvtai.report.reproduction import claim_table
-from uuvtai.report.tables import Table, change_name, markdown, seconds, text_table, varies_alone
+from uuvtai.report.tables import Table, markdown, number, seconds, text_table
 from uuvtai.report.timing import ENVS, SPEEDS, density_table, latency_table
 
 # ---- A reproduction as sections of the report: what the page shows, in the order of the paper.
 
 Described = dict[str, Any]
+Rows = tuple[list[str], list[list[str]]]
+"""columns and rows of a table"""
 
 
 def sections_of(document: dict[str, Any], budget: Budget) -> list[Described]:
     """``sections`` of ``reproduce.json`` (the format is told in ``uuvtai.report.reproduction``)."""
-    curves = [f"train/{preset}-{seed}" for preset in TRAINED for seed in range(budget.training_seeds)]
-    return [
-        _section(
-            "The paper's claims",
-            {"kind": "verdicts", "items": [_item(claim) for claim in document["claims"]]},
-        ),
-        _section("Table main and ablations", _main_table(document), *_notes()),
-        _section("Training", {"kind": "curves", "paths": curves}),
-        _section("Robustness over conditions", *_trade_off(document), {"kind": "run", "path": "sweep/pool"}),
-        *[
-            _section(f"Sweep: {name}", {"kind": "run", "path": f"sweep/{name}"})
-            for name in document["sweeps"]
-            if name != "pool"
-        ],
-        _section("Ceilings", {"kind": "prose", "text": _CEILINGS}, {"kind": "run", "path": "eval/ceilings"}),
-        _section("Transfer to a second scene", {"kind": "run", "path": "eval/transfer"}),
-        _section("Trajectories: scenario A", {"kind": "run", "path": "eval/scenario_a"}),
-        _section("Trajectories: scenario B", {"kind": "run", "path": "eval/scenario_b"}),
-        _section("Time", {"kind": "run", "path": "profile"}),
-        _section("Every agent in full", {"kind": "run", "path": "eval/main"}),
-    ]
+    curves = [run for method in budget.methods for run in budget.runs(method)]
+    verdicts = {"kind": "verdicts", "items": [_item(claim) for claim in document["claims"]]}
+    heading = {"kind": "heading", "text": "Where the paper's figures do not add up"}
+    notes = [heading, *({"kind": "prose", "text": text} for text in claims.INCONSISTENCIES)]
+    mechanism = [_described(table, caption) for caption, table in mechanism_tables(document)]
+    beside = {
+        "Robustness over conditions": "sweep/pool",
+        "Transfer to a second scene": "eval/transfer",
+        "Trajectories: scenario A": "eval/scenario_a",
+        "Trajectories: scenario B": "eval/scenario_b",
+        "Time": "profile",
+    }
+    found: dict[str, list[Described]] = {
+        "The paper's claims": [verdicts],
+        "Table main and ablations": [_described(main_table(document), _TTS), *notes],
+        "Training": [{"kind": "curves", "paths": curves}, *mechanism],
+    }
+    runs = {title: path for title, path in beside.items() if path in document["commands"]}
+    found |= {title: [{"kind": "run", "path": path}] for title, path in runs.items()}
+    return [{"title": title, "blocks": blocks} for title, blocks in found.items()]
 
 
-_CEILINGS = "bt+truth is told where every moving obstacle is, oracle knows the future: oracles, no agents."
-
-
-def _section(title: str, *blocks: Described) -> Described:
-    return {"title": title, "blocks": list(blocks)}
+def _described(table: Rows, caption: str) -> Described:
+    return {"kind": "table", "columns": table[0], "rows": table[1], "caption": caption, "n_left": 1}
 
 
 def _item(claim: dict[str, Any]) -> Described:
     tested = "" if claim["p_holm"] is None else f"; p = {claim['p']:.3g}, by Holm {claim['p_holm']:.3g}"
-    return {
-        "claim": claim["text"],
-        "verdict": claim["verdict"],
-        "numbers": f"here {claim['ours']}; the paper: {claim['theirs']}{tested}",
-    }
+    why = f"; {claim['reason']}" if claim["reason"] else ""
+    numbers = f"here {claim['ours']}; the paper: {claim['theirs']}{tested}{why}"
+    return {"claim": claim["text"], "verdict": claim["verdict"], "numbers": numbers}
 
 
-def _main_table(document: dict[str, Any]) -> Described:
-    rows = []
-    for name, entries in document["table_main"].items():
-        printed = claims.TABLE_MAIN.get(name)
-        theirs = ["-"] * 3
-        if printed:
-            theirs = [f"{printed.success:.2f}", f"{printed.collision:.2f}", f"{printed.tts_s}"]
-        own = tts_s(entries)
-        rates = [str(pooled(entries, "success")), str(pooled(entries, *COLLIDED))]
-        rows.append([name, str(len(entries)), *rates, "-" if own is None else f"{own:.1f}", *theirs])
-    measured = ["success", "collision", "TTS s"]
-    columns = ["agent", "training seeds", *measured, *(f"paper: {name}" for name in measured)]
-    caption = f"Table main, ours beside the paper's as printed; {document['commands']['eval/main']}"
-    return {"kind": "table", "columns": columns, "rows": rows, "caption": caption, "n_left": 1}
+# ---- Tables of a reproduction, and all of them as Markdown: docs/results.md is such a page.
+
+_TTS = (
+    "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the "
+    "episodes that arrive, has no peer in the paper."
+)
 
 
-def _notes() -> list[Described]:
-    heading = {"kind": "heading", "text": "Where the paper's figures do not add up"}
-    return [heading, *({"kind": "prose", "text": text} for text in claims.INCONSISTENCIES)]
-
-
-def _trade_off(document: dict[str, Any]) -> list[Described]:
-    """Success against collision from fast to careful, with the paper's point, where it was swept."""
-    sweep = document["sweeps"].get("caution")
-    if sweep is None:
-        return []
-    points = [_point(sweep["cells"], caution) for caution in sweep["axes"]["behavior.caution"]]
-    rates = {"collision_rate": claims.MODERATE_COLLISION, "success_rate": claims.MODERATE_SUCCESS}
-    block = {
-        "kind": "trade_off",
-        "series": [{"name": "bt, behavior.caution from fast to careful", "points": points}],
-        "marks": [{"name": "paper", **rates}],
-        "caption": "Mean over S <= 8, D <= 9, v <= 1.5 m/s (D = 0 once per S)",
-        "command": document["commands"]["sweep/caution"],
-    }
-    return [block]
-
-
-def _point(cells: Sequence[dict[str, Any]], caution: float) -> Described:
-    own = [cell for cell in cells if cell["behavior.caution"] == caution]
-    return {"collision_rate": pooled(own, *COLLIDED).rate, "success_rate": pooled(own, "success").rate}
-
-
-# ---- The key tables of a reproduction as Markdown: docs/results.md is one of these pages.
-
-
-def results_page(document: dict[str, Any]) -> str:
-    """The whole page of a ``uuv reproduce --json`` document."""
-    machine, seed = document["hardware"], document["seed"]
-    tuned = "was looked at while tuning" if seed in RETIRED_SEEDS else "was never trained or tuned on"
-    head = [
-        "# Results",
-        f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit "
-        f"{document['git_sha'] or 'unknown'}, {machine['cpu']}, {machine['cores']} cores. Intervals are 95 % "
-        f"(Wilson). RUN is the reproduction's folder; the evaluations' seed, {seed}, {tuned}.",
-        *document.get("notes", []),
-    ]
-    parts = [
-        _claim_lines(document),
-        _main(document),
-        _ceilings(document),
-        *(
-            f"## Sweep: {name}\n`{document['commands'][f'sweep/{name}']}`\n\n{_sweep_lines(sweep)}"
-            for name, sweep in document["sweeps"].items()
-        ),
-        _timing(document),
-        "## Where the paper's figures do not add up\n"
-        + "\n".join(f"- {text}" for text in document["inconsistencies"]),
-    ]
-    return "\n\n".join(["\n".join(head), *parts]) + "\n"
-
-
-def _claim_lines(document: dict[str, Any]) -> str:
-    note = (
-        "A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, is "
-        f"below {LEVEL}; else it cannot be judged. Rates are compared by Fisher's exact test, with a printed "
-        "value by the exact binomial test. Episodes of one number go together in all cells of a grid: only "
-        "as many count as independent ones would say the same. Where single episodes were not kept, there is "
-        "neither interval nor test. Claims without a p value set one number beside another: one run, one "
-        "machine, no test. The paper's rates are of another simulator: one that is reached says nothing "
-        "about who is better."
-    )
-    return f"## The paper's claims\n{note}\n\n{markdown(claim_table(document))}"
-
-
-def _main(document: dict[str, Any]) -> str:
+def main_table(document: dict[str, Any]) -> Rows:
+    """Every method with its training seeds, and the agents that are not trained."""
     rows = []
     for name, entries in document["table_main"].items():
         printed = claims.TABLE_MAIN.get(name)
@@ -174,66 +96,119 @@ def _main(document: dict[str, Any]) -> str:
         if printed:
             shares = f"{printed.success:.2f} / {printed.collision:.2f}"
             theirs = [shares, f"{printed.tts_s} s", f"{printed.mean_time_s} s"]
-        rates = [str(pooled(entries, "success")), str(pooled(entries, *COLLIDED))]
-        mean_s = mean([m["time_mean_s"] for m in entries if m["time_mean_s"] is not None])
-        arrived = mean(
-            [m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None]
-        )
-        times = [seconds(tts_s(entries)), theirs[1], seconds(mean_s), theirs[2], seconds(arrived)]
-        rows.append([f"`{name}`", str(len(entries)), *rates, theirs[0], *times])
-    note = (
-        "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the "
-        "episodes that arrive, has no peer in the paper."
-    )
-    columns = ["agent", "training seeds", "success", "collision", "the paper: success / collision"]
+        all_s = mean([m["time_mean_s"] for m in entries if m["time_mean_s"] is not None])
+        arrived = [m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None]
+        times = [seconds(tts_s(entries)), theirs[1], seconds(all_s), theirs[2], seconds(mean(arrived))]
+        rows.append([f"`{name}`", *_rates(entries), theirs[0], *times])
+    columns = ["agent", "success by training seed", "success", "collision", "the paper: success / collision"]
     columns += ["TTS", "the paper: TTS", "mean time", "the paper: mean time", "mean time of successes"]
-    return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n{note}\n\n" + text_table(
-        columns, rows
-    )
+    return columns, rows
 
 
-def _ceilings(document: dict[str, Any]) -> str:
-    rows = []
-    for m in document["ceilings"]["agents"]:
-        rates = [str(pooled([m], "success")), str(pooled([m], *COLLIDED))]
-        rows.append([f"`{m['name']}`", *rates, seconds(m["time_to_success_mean_s"])])
-    note = "`bt+truth` is told the true obstacles, `oracle` knows the future: privileged, no agents."
-    return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + text_table(
-        ["", "success", "collision", "mean time of successes"], rows
-    )
+def _rates(entries: Sequence[dict[str, Any]]) -> list[str]:
+    """Of a method over its seeds, of an agent that is not trained over its episodes."""
+    if "trained_steps" not in entries[0]:
+        return ["-", *(str(pooled(entries, *ends)) for ends in (("success",), COLLIDED))]
+    by_seed = ", ".join(f"{100 * pooled([entry], 'success').rate:.1f}" for entry in entries)
+    return [by_seed, *(str(of_method(entries, *ends)) for ends in (("success",), COLLIDED))]
 
 
-def _sweep_lines(sweep: dict[str, Any]) -> str:
-    """Rows: agent and every axis but the speed; columns: speeds; cells: success / collision in %."""
-    if varies_alone(sweep):
-        return _alone(sweep)
-    axes = [("v_m_s" if name == "v" else name) for name in sweep["axes"]]
-    across = "v_m_s" if "v_m_s" in axes else axes[-1]
-    down = [name for name in axes if name != across]
-    values = list(dict.fromkeys(cell.get(across) for cell in sweep["cells"]))
-    lines: dict[tuple[Any, ...], dict[Any, str]] = {}
-    for cell in sweep["cells"]:
-        key = (cell["agent"], *(str(cell.get(name, "")) for name in down))
-        lines.setdefault(key, {})[str(cell.get(across))] = _both(cell)
-    speeds = ["nothing moves" if value is None else f"{across} = {value}" for value in values]
-    rows = [
-        [*map(str, key), *(found.get(str(value), "") for value in values)] for key, found in lines.items()
+def mechanism_tables(document: dict[str, Any]) -> list[tuple[str, Rows]]:
+    """(what it says, table) of the scale s_t over time, and of the world model's skill by target."""
+    found = document["mechanism"]
+    scale = [[f"`{name}`", *map(_and_range, zip(*own["scale"], strict=True))] for name, own in found.items()]
+    skilled = {name: own["skill"] for name, own in found.items() if own["skill"]}
+    targets = dict.fromkeys(target for skill in skilled.values() for target in skill)
+    skill = [[target, *(_and_range(of.get(target)) for of in skilled.values())] for target in targets]
+    columns = ["training", "s_t: first", "median", "last", "share of iterations at its limit"]
+    return [(_SCALE, (columns, scale)), (_SKILL, (["target", *(f"`{name}`" for name in skilled)], skill))]
+
+
+def _and_range(values: Sequence[float] | None) -> str:
+    if not values:
+        return "-"
+    digits = 2 if max(map(abs, values)) < 100 else 0
+    low, high = number(min(values), digits), number(max(values), digits)
+    return f"{number(fmean(values), digits)} ({low} to {high})"
+
+
+_SCALE = "The scale s_t of the distillation over a training: mean over the training seeds (range)."
+_SKILL = (
+    "Skill of the world model in the last quarter of a training: 1 - mean squared error of its prediction / "
+    "that of saying *as before*, mean over the training seeds (range). Below 0 it is worse than no model."
+)
+
+
+def results_page(*documents: dict[str, Any]) -> str:
+    """The whole page of ``uuv reproduce --json`` documents; their claims are one family of tests."""
+    judged = iter(claims.judged([Claim(**claim) for document in documents for claim in document["claims"]]))
+    parts = [f"# Results\n{_HOW}"]
+    for document in documents:
+        own = document | {"claims": [vars(next(judged)) for _ in document["claims"]]}
+        parts += [_head(own), *(part(own) for name, part in _PARTS.items() if own.get(name))]
+    told = "\n".join(f"- {text}" for text in claims.INCONSISTENCIES)
+    return "\n\n".join([*parts, f"## Where the paper's figures do not add up\n{told}"]) + "\n"
+
+
+def _head(document: dict[str, Any]) -> str:
+    machine, seed = document["hardware"], document["seed"]
+    tuned = "was looked at while tuning" if seed in RETIRED_SEEDS else "was never trained or tuned on"
+    others = ", ".join(document["trained_at"])
+    trained = f" (trainings: {others})" if others else ""
+    lines = [
+        f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit "
+        f"{document['git_sha'] or 'unknown'}{trained}, {machine['cpu']}, {machine['cores']} cores. RUN is "
+        f"the reproduction's folder; the evaluations' seed, {seed}, {tuned}.",
+        *document.get("notes", []),
     ]
-    return "success / collision in %\n\n" + text_table(["agent", *down, *speeds], rows)
+    return "\n".join(lines)
 
 
-def _alone(sweep: dict[str, Any]) -> str:
-    """Rows: what is changed; columns: agents; cells: success / collision in %."""
-    agents = list(dict.fromkeys(cell["agent"] for cell in sweep["cells"]))
-    lines: dict[str, dict[str, str]] = {}
-    for cell in sweep["cells"]:
-        lines.setdefault(change_name(cell, sweep), {})[cell["agent"]] = _both(cell)
-    rows = [[name, *(found.get(agent, "") for agent in agents)] for name, found in lines.items()]
-    return "success / collision in %, one axis at a time\n\n" + text_table(["changed", *agents], rows)
+def _titled(title: str, document: dict[str, Any]) -> str:
+    return f"## {title}, budget {document['budget']}"
 
 
-def _both(cell: dict[str, Any]) -> str:
-    return f"{100 * pooled([cell], 'success').rate:.0f} / {100 * pooled([cell], *COLLIDED).rate:.0f}"
+_HOW = (
+    "A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, is "
+    f"below {LEVEL}; else it cannot be judged. Methods are compared by Welch's t over their training seeds "
+    "(intervals: Student's, 95 %), rates of one agent by Fisher's exact test, with a printed value by the "
+    "exact binomial test (intervals: Wilson's, 95 %). Episodes of one number go together in all cells of a "
+    "grid: only as many count as independent ones would say the same. Claims without a p value set one "
+    "number beside another: one run, one machine, no test. The paper's rates are of another simulator: one "
+    "that is reached says nothing about who is better."
+)
+
+
+def _claim_lines(document: dict[str, Any]) -> str:
+    title = _titled("The paper's claims", document)
+    return f"{title}\n{markdown(claim_table(document))}"
+
+
+def _main(document: dict[str, Any]) -> str:
+    entries = [entry for entries in document["table_main"].values() for entry in entries]
+    steps = sorted({entry["trained_steps"] for entry in entries if "trained_steps" in entry})
+    trained = f"Env-steps of a training: {', '.join(f'{n:,}' for n in steps)}."
+    title = f"{_titled('Table main and ablations', document)}\n`{document['commands']['eval/main']}`"
+    return f"{title}\n\n{trained} {_TTS}\n\n" + text_table(*main_table(document))
+
+
+def _mechanism(document: dict[str, Any]) -> str:
+    tables = [f"{caption}\n\n{text_table(*table)}" for caption, table in mechanism_tables(document)]
+    return "\n\n".join([_titled("Mechanism", document), *tables])
+
+
+def _sweep(document: dict[str, Any]) -> str:
+    """Rows: agent, S and D; columns: speeds; cells: success / collision in %."""
+    cells = document["sweep"]["cells"]
+    speeds = list(dict.fromkeys(cell["v_m_s"] for cell in cells))
+    lines: dict[tuple[Any, ...], dict[Any, str]] = {}
+    for cell in cells:
+        rates = f"{100 * pooled([cell], 'success').rate:.0f} / {100 * pooled([cell], *COLLIDED).rate:.0f}"
+        lines.setdefault((cell["agent"], cell["S"], cell["D"]), {})[cell["v_m_s"]] = rates
+    rows = [[*map(str, key), *(found.get(v, "") for v in speeds)] for key, found in lines.items()]
+    head = ["agent", "S", "D", *("nothing moves" if v is None else f"v = {v} m/s" for v in speeds)]
+    note = f"`{document['commands']['sweep/pool']}`\n\nsuccess / collision in %"
+    return f"## Sweep\n{note}\n\n" + text_table(head, rows)
 
 
 def _timing(document: dict[str, Any]) -> str:
@@ -242,7 +217,7 @@ def _timing(document: dict[str, Any]) -> str:
     note = (
         '"Global planner" is the mean over the steps that plan a route; "Planner stage, every step" over all '
         "steps, most of which plan none. "
-        '"Full loop" is a whole step (simulated truth and sensing, mapping, planning, behaviour tree) and '
+        '"Full loop" is a whole step (simulated truth and sensing, mapping, planning, behavior tree) and '
         "one decision of world model and policy; what the paper's loop contains it does not say."
     )
     return "\n\n".join(
@@ -255,6 +230,15 @@ def _timing(document: dict[str, Any]) -> str:
         ]
     )
 
+
+_PARTS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "claims": _claim_lines,
+    "table_main": _main,
+    "mechanism": _mechanism,
+    "sweep": _sweep,
+    "profile": _timing,
+}
+"""by what a document has"""
 
 REQUEST, RESULT, PAGE = "reproduce_request.json", "reproduce.json", "results.md"
 
@@ -329,7 +313,7 @@ def _run(folder: RunFolder, request: dict[str, Any], watch: ReproductionWatch) -
 
 
 def _step(step: Step, name: str, folder: RunFolder, watch: ReproductionWatch) -> None:
-    if is_done(step, folder.path) and result_file(step, folder.path).exists():
+    if is_done(step, folder.path):
         watch.note(f"{name}: done before")
         return
     watch.note(f"{name}: uuv {' '.join(step.argv(folder.path))}")
@@ -343,71 +327,85 @@ def _step(step: Step, name: str, folder: RunFolder, watch: ReproductionWatch) ->
 
 def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
     """The ``uuv reproduce --json`` document: results of every step by its folder, and the verdicts."""
-    results = {step.folder: read_json(result_file(step, root), folder=root) for step in steps}
+    trained = [step.folder for step in steps if step.command[0] == "train"]
+    results = {
+        step.folder: read_json(result_file(step, root), folder=root)
+        for step in steps
+        if step.folder not in trained
+    }
     record = read_json(root / "run.json", folder=root)
+    commits = {read_json(root / run / "run.json", folder=root).get("git_sha") for run in trained}
     budget = BUDGETS[request["budget"]]
     own = [plugin_spec(name).label for name in request["own"]]
-    by_preset = _by_preset(results["eval/main"], budget, own)
+    metrics = {name: [_metrics(root / run) for run in budget.runs(name)] for name in budget.methods}
+    by_method = _by_method(results["eval/main"], metrics, own)
+    limit = load_training(METHODS[0]).uncertainty.max_scale
     document = {
-        "schema": 1,
+        "schema": 2,
         "title": f"The paper reproduced, budget {request['budget']}",
         "budget": request["budget"],
         "seed": EVALUATION_SEED,
         "started": record["started"],
         "git_sha": record["git_sha"],
+        "trained_at": sorted(commits - {record["git_sha"], None}),
         "hardware": record["hardware"],
         "versions": record["versions"],
         "python": sys.version.split()[0],
-        "commands": {
-            step.folder: "uuv " + " ".join(_shown(part, root) for part in step.argv(root)) for step in steps
+        "commands": {step.folder: _shown(step, root) for step in steps if step.folder in results},
+        "table_main": by_method,
+        "claims": [vars(claim) for claim in _claims(results, by_method, metrics[METHODS[0]], budget, own)],
+        "mechanism": {
+            name: claims.mechanism_of(rows, limit)
+            for name, rows in metrics.items()
+            if name.startswith(METHODS[0]) and all(rows)
         },
-        "table_main": by_preset,
-        "claims": [vars(claim) for claim in _claims(root, results, by_preset, own)],
-        "inconsistencies": list(claims.INCONSISTENCIES),
-        "ceilings": results["eval/ceilings"],
-        "transfer": results["eval/transfer"],
-        "sweeps": {
-            folder.removeprefix("sweep/"): found
-            for folder, found in results.items()
-            if folder.startswith("sweep/")
-        },
-        "profile": results["profile"],
+        "transfer": results.get("eval/transfer"),
+        "sweep": results.get("sweep/pool"),
+        "profile": results.get("profile"),
     }
     return document | {"sections": sections_of(document, budget)}
 
 
-def _shown(part: str, root: Path) -> str:
-    """An argument without the machine's paths."""
-    return part.replace(str(root), "RUN")
+def _shown(step: Step, root: Path) -> str:
+    """Arguments without the machine's paths; NAME-SEED stands for all trainings where there are several."""
+    words = " ".join(["uuv", *step.argv(root)]).replace(str(root), "RUN")
+    return re.sub(r"(--agent RUN/train/\S+ ?){2,}", "--agent RUN/train/NAME-SEED ", words)
 
 
-def _by_preset(main: dict[str, Any], budget: Budget, own: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """Entries of the agents' table by preset; of their single episodes how each ended."""
+def _by_method(
+    main: dict[str, Any], metrics: dict[str, list[list[dict[str, Any]]]], own: Sequence[str]
+) -> dict[str, list[dict[str, Any]]]:
+    """Entries of the agents' table by method, a training seed each, with the env-steps of the training; of
+    their single episodes how each ended, a letter each."""
     entries = {
         entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"}
         | {"ends": "".join(LETTERS[e["outcome"]] for e in entry["episodes_detail"])}
         for entry in main["agents"]
     }
     trained = {
-        preset: [entries[f"{preset}-{seed}"] for seed in range(budget.training_seeds)] for preset in TRAINED
+        name: [
+            entries[f"{name}-{seed}"] | {"trained_steps": round(rows[-1]["time/env_steps"]) if rows else 0}
+            for seed, rows in enumerate(of_seeds)
+        ]
+        for name, of_seeds in metrics.items()
     }
     return trained | {name: [entries[name]] for name in ("bt", "planner", "straight", *own)}
 
 
 def _claims(
-    root: Path, results: dict[str, Any], by_preset: dict[str, Any], own: Sequence[str]
-) -> list[claims.Claim]:
-    cells = results["sweep/pool"]["cells"]
-    names = list(dict.fromkeys(cell["agent"] for cell in cells))
-    agent = next(name for name in names if name not in ("bt", *own))
-    there = next(entry for entry in results["eval/transfer"]["agents"] if entry["name"] not in ("bt", *own))
-    found = [
-        *claims.of_table_main(by_preset),
-        *claims.of_training(_metrics(root / "train" / "curriculum-0")),
-        *(claim for name in (agent, "bt") for claim in claims.of_sweep(cells, name)),
-        *claims.of_timing(results["profile"]),
-        *(claims.of_transfer(by_preset["curriculum"][0], there)),
-    ]
+    results: dict[str, Any],
+    by_method: dict[str, Any],
+    trainings: list[list[dict[str, Any]]],
+    budget: Budget,
+    own: Sequence[str],
+) -> list[Claim]:
+    found = [*claims.of_table_main(by_method, budget.note), *claims.of_training(trainings, budget.note)]
+    if "sweep/pool" in results:
+        cells = results["sweep/pool"]["cells"]
+        there = next(e for e in results["eval/transfer"]["agents"] if e["name"] not in ("bt", *own))
+        found += [claim for name in (there["name"], "bt") for claim in claims.of_sweep(cells, name)]
+        found += claims.of_timing(results["profile"])
+        found += claims.of_transfer(by_method[METHODS[0]][0], there)
     return claims.judged(found)
 
 

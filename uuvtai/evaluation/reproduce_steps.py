@@ -15,28 +15,37 @@ from pathlib import Path
 from uuvtai.common.files import FileError, read_json
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
 
-TRAINED = ("ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model")
-"""presets that are trained; in the ablation's table ``curriculum`` is "Full" and ``ppo`` is "BT distill\""""
-EVALUATION_SEED = 90009
+METHODS = ("paper", "ppo", "constant_20", "no_risk_scaling", "no_world_model")
+"""presets that are trained; in the ablation's table ``paper`` is "Full" and ``ppo`` is "BT distill\""""
+_TEN_HZ, _HOLD_STEPS = "_10hz", 5
+"""methods whose decisions last five control steps, on as many env-steps"""
+EVALUATION_SEED = 90010
 """never trained or tuned on; for published figures alone: do not look while you change things"""
-RETIRED_SEEDS = range(90001, 90009)  # test seeds of old that tuning has met since (``research/LOG.md``)
+RETIRED_SEEDS = range(90001, 90010)  # test seeds of old that tuning has met since (``research/LOG.md``)
 
 
 @dataclass(frozen=True)
 class Budget:
     iterations: int
-    """of 256 envs x 64 steps; 38 are 622,592 env-steps, the paper's budget, and 380 ten times as many"""
+    """of 8 envs x 64 decisions at 50 Hz: the paper's 1,200 are 614,400 env-steps"""
     training_seeds: int
     episodes: int  # per agent in Table main
-    ceiling_episodes: int
-    sweep_episodes: int  # per cell
-    profile_seconds: float
-    beyond: bool  # also trade-off, robustness and gauntlet sweeps
+    note: str = ""
+    """behind the claims about methods"""
+    methods: tuple[str, ...] = (*METHODS, f"paper{_TEN_HZ}", f"ppo{_TEN_HZ}")
+    sweep_episodes: int = 0
+    """per cell; 0 = trainings and Table main alone"""
+    profile_seconds: float = 0.0
+
+    def runs(self, method: str) -> list[str]:
+        """Folders of a method's trainings, by training seed."""
+        return [f"train/{method}-{seed}" for seed in range(self.training_seeds)]
 
 
 BUDGETS = {
-    "quick": Budget(38, 1, 200, 40, 8, 4.0, beyond=False),
-    "full": Budget(380, 3, 1000, 200, 64, 10.0, beyond=True),
+    "quick": Budget(120, 2, 100, sweep_episodes=8, profile_seconds=4.0),
+    "paper": Budget(1200, 5, 500, sweep_episodes=64, profile_seconds=10.0),
+    "tenfold": Budget(12_000, 3, 500, ", at ten times the env-steps", METHODS[:3]),
 }
 
 
@@ -60,91 +69,49 @@ class Step:
 
 
 def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
-    """All steps in their order; ``own``: plugins of the user's, beside ours wherever agents are compared."""
-    seeds = range(budget.training_seeds)
-    runs = {preset: [f"train/{preset}-{seed}" for seed in seeds] for preset in TRAINED}
+    """All steps in their order; ``own``: plugins of the user's, beside ours wherever agents are compared.
+
+    Everything drives on the paper's stack, on which the policies were trained. A training is evaluated as it
+    was at its end: the presets choose no checkpoint by its success.
+    """
     trainings = [
         Step(
-            f"train {preset}, seed {seed}",
-            _train(preset, seed, budget),
-            f"train/{preset}-{seed}",
+            f"train {method}, seed {seed}",
+            _train(method, seed, budget.iterations),
+            budget.runs(method)[seed],
             resumes=True,
         )
-        for seed in seeds
-        for preset in TRAINED
+        for seed in range(budget.training_seeds)
+        for method in budget.methods
     ]
-    at = ("--seeds", str(EVALUATION_SEED), "--episodes")
-    places = [str(root / place) for of_preset in runs.values() for place in of_preset]
-    agent = str(root / runs["curriculum"][0])
+    at = ("--set", "stack=paper", "--seeds", str(EVALUATION_SEED), "--episodes")
+    places = [str(root / run) for method in budget.methods for run in budget.runs(method)]
     judged = ("eval", *_agents("straight", "planner", "bt", *own, *places), *at, str(budget.episodes))
-    recorded = ("--record", "1", *at, "1")
-    agents = [str(root / runs[name][0]) for name in ("ppo", "distill_20", "curriculum")]
-    steps = [
-        *trainings,
-        Step("Table main and ablations", judged, "eval/main"),
-        Step(
-            "ceilings",
-            ("eval", *_agents("bt", "bt+truth", "oracle"), *at, str(budget.ceiling_episodes)),
-            "eval/ceilings",
-        ),
-        Step(
-            "transfer",
-            ("eval", *_agents("bt", *own, agent), "--world", "transfer", *at, str(budget.episodes)),
-            "eval/transfer",
-        ),
-        Step("scenario A", ("eval", *_agents("bt", *own, *agents), *recorded, "--video"), "eval/scenario_a"),
-        Step(
-            "scenario B",
-            ("eval", *_agents("bt", *own, *agents), "-S", "12", "-D", "9", *recorded, "--video"),
-            "eval/scenario_b",
-        ),
-        Step("sweep", _sweep(agent, "paper", budget.sweep_episodes, own=own), "sweep/pool", resumes=True),
-        Step(
-            "profile",
-            ("profile", "--num-envs", "1,64,1024", "--seconds", str(budget.profile_seconds), "--density"),
-            "profile",
-            to_file=True,
-        ),
-    ]
-    return steps + (_beyond(agent, budget, own) if budget.beyond else [])
+    steps = [*trainings, Step("Table main and ablations", judged, "eval/main")]
+    return steps + (_beside_training(budget, root, own, at) if budget.sweep_episodes else [])
 
 
-def _train(preset: str, seed: int, budget: Budget) -> tuple[str, ...]:
-    return ("train", preset, "--seed", str(seed), "--set", f"train.iterations={budget.iterations}")
+def _train(method: str, seed: int, iterations: int) -> tuple[str, ...]:
+    preset, slow, _ = method.partition(_TEN_HZ)
+    held = ("--set", f"policy.hold_steps={_HOLD_STEPS}") if slow else ()
+    rounds = iterations // _HOLD_STEPS if slow else iterations
+    return ("train", preset, "--seed", str(seed), *held, "--set", f"train.iterations={rounds}")
 
 
-def _sweep(agent: str, grid: str, episodes: int, *more: str, own: Sequence[str] = ()) -> tuple[str, ...]:
-    seed = ("--seeds", str(EVALUATION_SEED))
-    return ("sweep", *_agents("bt", *own, agent), "--grid", grid, "--episodes", str(episodes), *seed, *more)
-
-
-def _beyond(agent: str, budget: Budget, own: Sequence[str]) -> list[Step]:
-    few = max(1, budget.sweep_episodes // 2)
+def _beside_training(budget: Budget, root: Path, own: Sequence[str], at: tuple[str, ...]) -> list[Step]:
+    """The distilled policy in another scene and in other conditions, trajectories, times."""
+    policies = [str(root / budget.runs(method)[0]) for method in METHODS[:3]]
+    distilled, few = policies[0], str(budget.sweep_episodes)
+    recorded = ("eval", *_agents("bt", *own, *policies), "--record", "1", "--video", *at, "1")
+    moved = ("eval", *_agents("bt", *own, distilled), "--world", "transfer", *at, str(budget.episodes))
+    swept = ("sweep", *_agents("bt", *own, distilled), "--grid", "paper", *at, few)
+    timed = ("profile", "--num-envs", "1,64,1024", "--seconds", str(budget.profile_seconds), "--density")
     return [
-        Step(
-            "gauntlet",
-            _sweep(agent, "paper", few, "--world", "gauntlet", own=own),
-            "sweep/gauntlet",
-            resumes=True,
-        ),
-        Step(
-            "trade-off",
-            ("sweep", *_agents("bt"), "--grid", "caution", "--episodes", str(few)),
-            "sweep/caution",
-            resumes=True,
-        ),
-        Step(
-            "robustness",
-            _sweep(agent, "robustness", 4 * budget.sweep_episodes, own=own),
-            "sweep/robustness",
-            resumes=True,
-        ),
-        Step(
-            "dead reckoning",
-            _sweep(agent, "dead_reckoning", 4 * budget.sweep_episodes, own=own),
-            "sweep/dead_reckoning",
-            resumes=True,
-        ),
+        Step("transfer", moved, "eval/transfer"),
+        Step("scenario A", recorded, "eval/scenario_a"),
+        Step("scenario B", (*recorded, "-S", "12", "-D", "9"), "eval/scenario_b"),
+        Step("sweep", swept, "sweep/pool", resumes=True),
+        Step("profile", timed, "profile", to_file=True),
     ]
 
 
@@ -156,10 +123,13 @@ def _agents(*names: str) -> tuple[str, ...]:
 
 
 def is_done(step: Step, root: Path) -> bool:
-    if step.to_file:
-        return result_file(step, root).exists()
+    """Whether nothing is left to run. A training may have been made beforehand by its own command: it leaves
+    in its folder all that counts."""
+    if step.command[0] != "train" and not result_file(step, root).exists():
+        return False
     try:
-        return read_json(root / step.folder / "run.json", folder=root)["status"] == "finished"
+        record = {} if step.to_file else read_json(root / step.folder / "run.json", folder=root)
+        return step.to_file or record["status"] == "finished"
     except (FileError, OSError, KeyError, TypeError):
         return False
 

@@ -20,7 +20,7 @@ from uuvtai.learning.distillation import (
 from uuvtai.learning.networks import PREFIX, ActorCritic, Guard
 from uuvtai.learning.ppo import Ppo
 from uuvtai.learning.rollout import N_FEATURES, Collector, Recent, Rollout
-from uuvtai.learning.world_model import WorldModel, WorldModelLearner
+from uuvtai.learning.world_model import N_TARGET, WorldModel, WorldModelLearner
 
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import VectorEnv
@@ -51,7 +51,8 @@ class Trainer:
         self.world_model = (
             WorldModel(env.num_obs, world, self.generator).to(device) if world.enabled else None
         )
-        self.world_learner = self.world_model and WorldModelLearner(self.world_model, world)
+        names = [f"{c.name}_{i}" for c in env.observation_table for i in range(c.slice.stop - c.slice.start)]
+        self.world_learner = self.world_model and WorldModelLearner(self.world_model, world, names[:N_TARGET])
         self.collector = Collector(
             env, self.policy, self.world_model, self.rollout, self.guard, self.generator, world.as_features
         )

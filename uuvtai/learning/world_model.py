@@ -10,7 +10,7 @@ next observation plus beta
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -29,6 +29,8 @@ N_FEATURES = 2
 
 LOG_VAR_BOUNDS = (-12.0, 6.0)
 """of a target in the decoder's unit; approached smoothly, so that no gradient dies"""
+SKILL = "world_model/skill/"
+"""before the name of a target in metrics.jsonl"""
 MIN_DEVIATION = 1e-5
 """smallest running deviation of a target, in its own unit: below any sensor's resolution"""
 MAX_DEVIATIONS = 100.0
@@ -189,8 +191,10 @@ def mean_of(values: Iterable[Tensor]) -> float:
 class WorldModelLearner:
     """Adam on batches drawn from rollouts, with a guard against NaN."""
 
-    def __init__(self, world_model: WorldModel, config: WorldModelConfig) -> None:
+    def __init__(self, world_model: WorldModel, config: WorldModelConfig, names: Sequence[str] = ()) -> None:
+        """``names``: of the targets in metrics; their numbers where none are given."""
         self.model, self.config = world_model, config
+        self._names = names or [str(i) for i in range(N_TARGET)]
         self.optimiser = PlainAdam(world_model.parameters(), lr=config.learning_rate, fused=True)
         self.skipped = 0
         """steps left out because the gradient was not finite, or zero for want of valid samples"""
@@ -208,8 +212,9 @@ class WorldModelLearner:
 
         ``next_obs`` is the observation each step led to, ``info["final_obs"]``. Rows that are not finite are
         left out. ``generator`` (CPU) draws the batches. Returns metrics by their names in metrics.jsonl;
-        calibration is that of the first batch before its step: the model has not learned from this rollout
-        yet.
+        calibration and skill are those of the first batch before its step: the model has not learned from
+        this rollout yet. ``skill``, target by target: 1 - mean squared error / that of "as before"; left out
+        where nothing changed.
         """
         skipped, batches = (
             self.skipped,
@@ -265,7 +270,11 @@ class WorldModelLearner:
         inside = coverage(
             predicted.mean, predicted.log_var, target, torch.tensor([0.9], device=target.device)
         )
-        return {
+        error, before = (
+            (target - said).square().mean(dim=0).tolist() for said in (predicted.mean, obs[:, :N_TARGET])
+        )
+        found = zip(self._names, error, before, strict=True)
+        return {f"{SKILL}{name}": 1.0 - ours / theirs for name, ours, theirs in found if theirs > 0.0} | {
             "world_model/standardised_residual": mean_squared_standardised_residual(
                 predicted.mean, predicted.log_var, target
             ),

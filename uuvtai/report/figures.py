@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
-from uuvtai.common.colours import PALETTE, SERIES, agent_colours, ink_on, on_page, shade
+from uuvtai.common.colours import PALETTE, SERIES, ink_on, on_page, shade
 from uuvtai.report.blocks import Hover, Panel
 from uuvtai.report.tables import HeatMap, Place, axis_name, number, percent, place_of, rate, value_name
 
@@ -342,39 +342,6 @@ def _frame(axes: Axes, lines: Sequence[Line], share: bool, zero: bool) -> None:
         axes.set_yscale("log")
     if len(lines) > 1:
         axes.legend(loc="best")
-
-
-def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]]) -> Panel:
-    """Success over collision [shares] along one setting per line; ``marks``: (name, collision, success)."""
-
-    def draw(axes: Axes) -> Hover:
-        axes.set_xlabel("collision %")
-        axes.set_ylabel("success %")
-        colours = agent_colours([*(line.name for line in series), *(name for name, _, _ in marks)])
-        for line in series:
-            axes.plot(
-                [100 * x for x in line.x],
-                [100 * y for y in line.y],
-                color=colours[line.name],
-                marker="o",
-                markersize=4,
-                label=line.name,
-            )
-        for name, collision, success in marks:
-            axes.plot(
-                [100 * collision],
-                [100 * success],
-                marker="*",
-                markersize=12,
-                linestyle="none",
-                color=colours[name],
-                label=name,
-            )
-        axes.set_xlim(left=0)
-        axes.legend(loc="best")
-        return {}
-
-    return Panel(draw, 4.4, 3.4)
 
 
 # ------------------------------------------------------------------------------------------------------- time

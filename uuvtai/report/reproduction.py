@@ -7,24 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.config.loader import ConfigError
-from uuvtai.report.blocks import Block, Figure, Heading, Notice, PageSection, Paragraph, Verdict, Verdicts
-from uuvtai.report.figures import Line, trade_off
+from uuvtai.report.blocks import Block, Heading, Notice, PageSection, Paragraph, Verdict, Verdicts
 from uuvtai.report.tables import PAGE, Cell, Column, Data, Table, heads, probability, value_name
 
 _COLOURS = {"holds": "green", "does not hold": "red"}
 
 
 def _verdict(claim: dict[str, Any]) -> Cell:
-    return Cell(claim["verdict"], style=_COLOURS.get(claim["verdict"], "yellow"))
+    why = f": {claim['reason']}" if claim["reason"] else ""
+    return Cell(claim["verdict"] + why, style=_COLOURS.get(claim["verdict"], "yellow"))
 
 
 _CLAIMS = (
     Column("claim", prose=True, of=lambda c: c["text"]),
     Column("the paper", prose=True, of=lambda c: c["theirs"]),
     Column("here", prose=True, of=lambda c: c["ours"]),
-    Column(
-        "verdict", prose=True, of=lambda c: Cell(c["verdict"], style=_COLOURS.get(c["verdict"], "yellow"))
-    ),
+    Column("verdict", prose=True, of=_verdict),
     Column("p", only=PAGE, of=lambda c: probability(c["p"], ".4f")),
     Column("p (Holm)", only=PAGE, of=lambda c: probability(c["p_holm"], ".4f")),
 )
@@ -43,8 +41,6 @@ def claim_table(document: dict[str, Any]) -> Table:
 # - ``{"kind": "prose" | "heading" | "notice", "text": ".."}``
 # - ``{"kind": "table", "columns": [..], "rows": [[..], ..], "caption": "..", "n_left": 1}``
 # - ``{"kind": "verdicts", "items": [{"claim": "..", "verdict": one of RULINGS, "numbers": ".."}]}``
-# - ``{"kind": "trade_off", "series": [{"name": "..", "points": [{"collision_rate": 0, "success_rate": 0}]}],
-#   "marks": [{"name": "paper", "collision_rate": 0, "success_rate": 0}], "caption": "..", "command": ".."}``
 # - ``{"kind": "run", "path": ".."}``: all that a run folder inside this one has to show
 # - ``{"kind": "curves", "paths": ["..", ..]}``: curves of trainings inside this one, seeds as one band
 
@@ -123,32 +119,10 @@ def _verdicts(described: Described) -> Verdicts:
     return Verdicts(items)
 
 
-def _trade_off(described: Described) -> Figure:
-    series = [
-        Line(
-            str(one["name"]),
-            [p["collision_rate"] for p in one["points"]],
-            [p["success_rate"] for p in one["points"]],
-        )
-        for one in described["series"]
-    ]
-    marks = [
-        (str(mark["name"]), mark["collision_rate"], mark["success_rate"])
-        for mark in described.get("marks", [])
-    ]
-    rows = [[line.name, *point] for line in series for point in zip(line.x, line.y, strict=True)] + [
-        list(mark) for mark in marks
-    ]
-    data = Data(["series", "collision_rate", "success_rate"], rows)
-    caption = described.get("caption", "Success against collision along one setting")
-    return Figure("trade_off", [trade_off(series, marks)], caption, data, described.get("command", ""))
-
-
 _SIMPLE: dict[str, Callable[[Described], Block]] = {
     "prose": lambda described: Paragraph(str(described["text"])),
     "heading": lambda described: Heading(str(described["text"])),
     "notice": lambda described: Notice(str(described["text"])),
     "table": _table,
     "verdicts": _verdicts,
-    "trade_off": _trade_off,
 }
