@@ -354,7 +354,9 @@ def advanced_arc(number, arc, pos_w, route: AnyTensor):
     while i < route.shape[1] - 1 and route[number, first, 2] - route[number, i, 2] <= WINDOW_M:
         a = way_point(number, i, route)
         along = way_point(number, i + 1, route) - a
-        share = ti.math.clamp((pos_w - a).dot(along) / ti.max(along.norm_sqr(), 1e-12), 0.0, 1.0)
+        share = ti.math.clamp(
+            ti.math.dot(pos_w - a, along) / ti.max(ti.math.dot(along, along), 1e-12), 0.0, 1.0
+        )
         if i == first:
             share = ti.max(share, arc - first)
         gap = (pos_w - a - along * share).norm_sqr()
@@ -381,7 +383,8 @@ def aim(env, number, route: AnyTensor, ego: FloatMatrix, io: Bundle[SurrogateRul
     along = way_point(number, first + 1, route) - a
     off = ti.Vector([ego[env, AT_POS], ego[env, AT_POS + 1]]) - a - along * (arc - first)
     ego[env, AT_AHEAD], ego[env, AT_AHEAD + 1] = point[0], point[1]
-    ego[env, AT_ASIDE] = ti.select(along[0] * off[1] - along[1] * off[0] >= 0, off.norm(), -off.norm())
+    is_left = along[0] * off[1] - along[1] * off[0] >= 0  # type: ignore[index]
+    ego[env, AT_ASIDE] = ti.select(is_left, off.norm(), -off.norm())
 
 
 # ------------------------------------------------------------------------------------------------------------
