@@ -7,7 +7,7 @@ from tests.command import uuv
 from uuvtai.config.learning import PpoConfig
 from uuvtai.config.loader import load_training
 from uuvtai.learning import networks
-from uuvtai.learning.networks import in_bfloat16, multiplies_bfloat16
+from uuvtai.learning.networks import fast_products, fastest_precision, in_bfloat16, multiplies_bfloat16
 from uuvtai.learning.surrogate_trainer import coarse
 
 QUICK = load_training("quick")
@@ -58,3 +58,16 @@ def test_a_training_says_so(cpu, has, tmp_path, capfd):
     code, _, told = uuv(capfd, "train", "quick", "--iterations", "1", "--run-dir", tmp_path / "run", *words)
     assert code == 0, told
     assert ("float32" in told) == (not has)
+
+
+def test_the_other_library_multiplies_only_where_it_is_as_exact(monkeypatch):
+    with pytest.raises(ZeroDivisionError), fast_products():
+        assert torch.get_float32_matmul_precision() == fastest_precision()
+        a, b = torch.randn(300, 200), torch.randn(200, 100)
+        torch.testing.assert_close(a @ b, (a.double() @ b.double()).float(), atol=2e-4, rtol=0)
+        _ = 1 / 0
+    assert torch.get_float32_matmul_precision() == "highest"
+    monkeypatch.setattr(networks, "LARGEST_ERROR", 0.0)
+    fastest_precision.cache_clear()
+    assert fastest_precision() == "highest"
+    fastest_precision.cache_clear()

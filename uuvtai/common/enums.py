@@ -97,7 +97,7 @@ class Truth:
 
 N_OBSTACLE = 9  # moving obstacles that the policy sees, the nearest ones
 OBSTACLE_WIDTH = 22  # columns of an obstacle
-OWN_WIDTH = 17  # columns of the vehicle and its goal
+OWN_WIDTH = 22  # columns of the vehicle, its route and its goal
 N_RAY = 24  # rays of free distance around the vehicle
 EGO_COLUMNS = OWN_WIDTH + N_RAY  # columns of the vehicle's own, rays included
 

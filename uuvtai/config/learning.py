@@ -172,7 +172,7 @@ class SurrogateConfig(Section):
     head_hidden: PositiveCount = 128
     """width of the layers behind it"""
     goal_gain: NonNegative = 0.7
-    """the policy begins as this part of full speed straight to the goal"""
+    """the policy begins as this part of full speed along the route"""
     vertical_gap_m: Positive = 0.26
     """[m] heave is held back so that the centre stays so far from floor and surface"""
     progress: NonNegative = 0.05

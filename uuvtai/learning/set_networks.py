@@ -25,7 +25,7 @@ NUM_WISHES = 3
 MOST_WISH = 2.0
 """wishes beyond it are cut off before they are carried out"""
 AT_DIRECTION = slice(3, 5)
-"""columns of ``own`` with the unit vector to the goal"""
+"""columns of ``own`` with the unit vector to the look-ahead point of the route"""
 _SUM_SCALE = 0.3
 """sums over the obstacles are a few times as large as a maximum"""
 
@@ -76,7 +76,7 @@ class SetActor(nn.Module):
         self.log_std = nn.Parameter(torch.full((NUM_WISHES,), math.log(config.policy.initial_std)))
 
     def forward(self, obstacles: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
-        """(..., 3) mean wish; straight to the goal at birth."""
+        """(..., 3) mean wish; along the route at birth."""
         ahead = self.goal_gain * own[..., AT_DIRECTION]
         said = self.net(obstacles, own, obstacles[..., :1])
         return torch.cat([ahead + said[..., :2], said[..., 2:]], dim=-1)

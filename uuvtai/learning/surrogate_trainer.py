@@ -17,7 +17,7 @@ from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.agents import SetAgent
-from uuvtai.learning.networks import PlainAdam, in_bfloat16, log_prob
+from uuvtai.learning.networks import PlainAdam, fast_products, in_bfloat16, log_prob
 from uuvtai.learning.parameter_search import run_search_episodes, simulator_of
 from uuvtai.learning.policy_agent import AgentDecision
 from uuvtai.learning.ppo import ADAM_EPS, adapted_rate, approximate_kl, gae, surrogate_loss
@@ -368,7 +368,7 @@ class SurrogateTrainer:
     def iterate(self) -> dict[str, float]:
         """A rollout and what is learned from it; metrics by their names in metrics.jsonl."""
         warmed = self._imitate()
-        with torch_threads_rest():
+        with torch_threads_rest(), fast_products():
             began = time.perf_counter()
             sums = self._collect()
             between = time.perf_counter()

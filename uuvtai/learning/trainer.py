@@ -17,7 +17,7 @@ from uuvtai.learning.distillation import (
     piecewise_linear,
     weights_of,
 )
-from uuvtai.learning.networks import PREFIX, ActorCritic, Guard
+from uuvtai.learning.networks import PREFIX, ActorCritic, Guard, fast_products
 from uuvtai.learning.ppo import Ppo
 from uuvtai.learning.rollout import N_FEATURES, Collector, Recent, Rollout
 from uuvtai.learning.world_model import N_TARGET, WorldModel, WorldModelLearner
@@ -72,7 +72,8 @@ class Trainer:
             self._look_around()
         sums = self.collector.collect()
         began = time.perf_counter()
-        metrics = self._learn(self.iteration / self.config.train.iterations)
+        with fast_products():
+            metrics = self._learn(self.iteration / self.config.train.iterations)
         learn_s = time.perf_counter() - began
         self.iteration += 1
         self.env_steps += self._samples

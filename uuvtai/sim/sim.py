@@ -224,6 +224,15 @@ class Sim:
         """Draw the scenarios of a ``reset`` to look at them, and nothing more: no row is ready for a step."""
         self._draw(self._begin, mask, seed, number)
 
+    def draw_routes(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
+        """As ``draw``, with the route of each vehicle that knows where everything is that does not move."""
+        self._draw(self._begin_anew, mask, seed, number)
+        self.sensors.sense_motion(self.io)
+        stack.draw_true_map(self.io)
+        clearance.compute_clearance(self.io.clearance)
+        stack.plan(self.io, self.config, by_voronoi=True)
+        self.fallback.serve(self.io, self._plan_seed, self.rows, self.counts.number)
+
     def _draw(self, begin: Callable[[], None], *asked: torch.Tensor) -> None:
         for kept, given in zip(self._asked, asked, strict=True):
             kept.copy_(given)

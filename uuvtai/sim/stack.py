@@ -127,6 +127,11 @@ def draw_map(stages: Stages, config: Config) -> None:
         true_state.stamp_truth(stages.true_map)
 
 
+def draw_true_map(stages: Stages) -> None:
+    """The static layer as it truly is, for routes that are planned beforehand."""
+    true_state.stamp_static(stages.true_map)
+
+
 def plan(stages: Stages, config: Config, by_voronoi: bool) -> None:
     """Which envs want a route; ``by_voronoi``: plan them, else they wait for the host's planner."""
     triggers.fire_triggers(stages.route)

@@ -9,20 +9,31 @@ from uuvtai.config import (
     ClearanceConfig,
     EpisodeConfig,
     MappingConfig,
+    RouteConfig,
     TankConfig,
     TrackingConfig,
     VehicleConfig,
 )
 from uuvtai.config.learning import SurrogateConfig
 from uuvtai.kernels.core.stage import Const, In
-from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState, Proprioception, TrackState
+from uuvtai.state import (
+    ClearanceState,
+    ClockState,
+    ForecastState,
+    MissionState,
+    Proprioception,
+    RouteState,
+    TrackState,
+)
 
-AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL = (
-    0, 3, 6, 7, 8, 9, 12, 14, 17,
-)  # fmt: skip
+(
+    AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL, AT_AHEAD, AT_LEFT,
+    AT_ASIDE, AT_ARC,
+) = (0, 3, 6, 7, 8, 9, 12, 14, 17, 21, 23, 24, 25)  # fmt: skip
 """columns of an env's row: position in the world, velocity in the body frame, heading, yaw rate, time, goal,
-signs of the way to the goal, last action, integrals of the velocity loops"""
-EGO_WIDTH = 21
+signs of the way to the goal, last action, integrals of the velocity loops; of the route: look-ahead point,
+length left, place left of it, and the foot as a fractional waypoint"""
+EGO_WIDTH = 26
 TRACK_WIDTH = 9
 """of what the surrogate's tracker remembers of a body (``sensing_model.sense_surrogate``)"""
 RAW_WIDTH = 14
@@ -40,6 +51,7 @@ class SurrogateRules:
     actuation_cfg: Const[ActuationConfig]
     tank_cfg: Const[TankConfig]
     episode_cfg: Const[EpisodeConfig]
+    route_cfg: Const[RouteConfig]
     surrogate_cfg: Const[SurrogateConfig]
 
 
@@ -51,6 +63,7 @@ class ObserverIO:
     clock: In[ClockState]
     mission: In[MissionState]
     ego: In[Proprioception]
+    route: In[RouteState]
     tracks: In[TrackState]
     forecast: In[ForecastState]
     clearance: In[ClearanceState]

@@ -33,10 +33,14 @@ from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, Flo
 from uuvtai.kernels.vehicle.control import axis_loops, integrated
 from uuvtai.kernels.world.motion import corner_shift
 from uuvtai.surrogate.arrays import (
+    AT_AHEAD,
+    AT_ARC,
+    AT_ASIDE,
     AT_FLIP,
     AT_GOAL,
     AT_INTEGRAL,
     AT_LAST,
+    AT_LEFT,
     AT_POS,
     AT_RATE,
     AT_TIME,
@@ -284,8 +288,8 @@ def verdict_of(pos_w, axis_w, goal_w, clearance, ttc, t_s, io: Bundle[SurrogateR
 
 @ti.func
 def earned(nearer_m, nearest_m, ended, io: Bundle[SurrogateRules]):
-    """Reward of a decision that brought the vehicle ``nearer_m`` to its goal and, at the worst, within
-    ``nearest_m`` of anything."""
+    """Reward of a decision that brought the vehicle ``nearer_m`` to its goal along the route and, at the
+    worst, within ``nearest_m`` of anything."""
     held_s = ti.static(STEPS * io.episode_cfg.control_dt_s)
     close = ti.math.clamp(1.0 - nearest_m / io.surrogate_cfg.soft_clearance_m, 0.0, 1.0)
     out = io.surrogate_cfg.progress * nearer_m - held_s * (
@@ -312,12 +316,87 @@ def asked_speeds(wish, yaw, z, io: Bundle[SurrogateRules]):
     )
 
 
+# ------------------------------------------------------------------------------------------------------------
+# The route: planned once per scenario by the simulator's planner, which then knows all that stands still;
+# followed by the simulator's rules (``kernels/planning/route.py``). Its rows are x, y and the length left.
+
+
+WINDOW_M = 1.5
+"""so far ahead of the last foot the new one is looked for"""
+
+
+@ti.func
+def way_point(number, i, route: AnyTensor):
+    """(x, y) [m] of a waypoint."""
+    return ti.Vector([route[number, i, 0], route[number, i, 1]])
+
+
+@ti.func
+def segment_of(arc, route: AnyTensor):
+    """Index of the segment that a fractional waypoint lies on."""
+    return ti.math.clamp(ti.cast(ti.floor(arc), ti.i32), 0, route.shape[1] - 2)
+
+
+@ti.func
+def length_left(number, arc, route: AnyTensor):
+    """[m] from the foot to the goal."""
+    i = segment_of(arc, route)
+    return route[number, i, 2] + (route[number, i + 1, 2] - route[number, i, 2]) * (arc - i)
+
+
+@ti.func
+def advanced_arc(number, arc, pos_w, route: AnyTensor):
+    """Foot of the vehicle: the nearest point from the last foot on, within ``WINDOW_M``."""
+    first = segment_of(arc, route)
+    a = way_point(number, first, route)
+    foot = a + (way_point(number, first + 1, route) - a) * (arc - first)
+    nearest, out, i = (pos_w - foot).norm_sqr(), arc, first
+    while i < route.shape[1] - 1 and route[number, first, 2] - route[number, i, 2] <= WINDOW_M:
+        a = way_point(number, i, route)
+        along = way_point(number, i + 1, route) - a
+        share = ti.math.clamp(
+            ti.math.dot(pos_w - a, along) / ti.max(ti.math.dot(along, along), 1e-12), 0.0, 1.0
+        )
+        if i == first:
+            share = ti.max(share, arc - first)
+        gap = (pos_w - a - along * share).norm_sqr()
+        if gap < nearest:
+            nearest, out = gap, i + share
+        i += 1
+        if route[number, i, 2] <= 0.0:
+            break
+    return out
+
+
+@ti.func
+def aim(env, number, route: AnyTensor, ego: FloatMatrix, io: Bundle[SurrogateRules]):
+    """Look-ahead point and place beside the route, into the row of the vehicle."""
+    arc, first = ego[env, AT_ARC], segment_of(ego[env, AT_ARC], route)
+    wanted, i = ego[env, AT_LEFT] - io.route_cfg.lookahead_m, first
+    while i < route.shape[1] - 2 and route[number, i + 1, 2] > wanted:
+        i += 1
+    length = ti.max(route[number, i, 2] - route[number, i + 1, 2], 1e-9)
+    share = ti.math.clamp((route[number, i, 2] - wanted) / length, 0.0, 1.0)
+    point = way_point(number, i, route)
+    point += (way_point(number, i + 1, route) - point) * share
+    a = way_point(number, first, route)
+    along = way_point(number, first + 1, route) - a
+    off = ti.Vector([ego[env, AT_POS], ego[env, AT_POS + 1]]) - a - along * (arc - first)
+    ego[env, AT_AHEAD], ego[env, AT_AHEAD + 1] = point[0], point[1]
+    is_left = along[0] * off[1] - along[1] * off[0] >= 0  # type: ignore[index]
+    ego[env, AT_ASIDE] = ti.select(is_left, off.norm(), -off.norm())
+
+
+# ------------------------------------------------------------------------------------------------------------
+
+
 @ti.kernel
 def drive_surrogate(
     io: Bundle[SurrogateRules],
     action: FloatMatrix,
     obstacle: AnyTensor,
     path: AnyTensor,
+    route: AnyTensor,
     scenario: IntVector,
     ego: FloatMatrix,
     reward: FloatVector,
@@ -340,7 +419,6 @@ def drive_surrogate(
             ego[env, AT_FLIP + 1],
             io.vehicle_cfg,
         )
-        before = ti.math.length(goal_w - pos_w)
         nearest, ended = 9.0, RUNNING
         near = near_slots(number, pos_w, t_s, obstacle, path, io)
         for _ in range(STEPS):
@@ -365,14 +443,21 @@ def drive_surrogate(
         long = ti.max(1.0, ti.sqrt(action[env, 0] ** 2 + action[env, 1] ** 2))
         ego[env, AT_LAST], ego[env, AT_LAST + 1] = action[env, 0] / long, action[env, 1] / long
         ego[env, AT_LAST + 2] = ti.math.clamp(action[env, 2], -1.0, 1.0)
-        nearer = before - ti.math.length(goal_w - pos_w)
-        reward[env] = earned(nearer, nearest, ended, io)
+        arc = advanced_arc(number, ego[env, AT_ARC], ti.Vector([pos_w[0], pos_w[1]]), route)
+        left = length_left(number, arc, route)
+        reward[env] = earned(ego[env, AT_LEFT] - left, nearest, ended, io)
+        ego[env, AT_ARC], ego[env, AT_LEFT] = arc, left
         outcome[env] = ended
 
 
 @ti.kernel
 def begin_surrogate(
-    begun: IntVector, mission: FloatMatrix, scenario: IntVector, ego: FloatMatrix, track: AnyTensor
+    begun: IntVector,
+    mission: FloatMatrix,
+    route: AnyTensor,
+    scenario: IntVector,
+    ego: FloatMatrix,
+    track: AnyTensor,
 ):
     """At rest at the start of their scenarios, nothing seen, in the envs where ``begun`` is 1."""
     for env in range(ego.shape[0]):
@@ -383,7 +468,7 @@ def begin_surrogate(
             for i in ti.static(range(3)):
                 ego[env, AT_POS + i] = mission[number, i]
                 ego[env, AT_GOAL + i] = mission[number, 3 + i]
-            ego[env, AT_YAW] = mission[number, 6]
+            ego[env, AT_YAW], ego[env, AT_LEFT] = mission[number, 6], route[number, 0, 2]
             ego[env, AT_FLIP] = 1.0 if mission[number, 3] >= mission[number, 0] else -1.0
             ego[env, AT_FLIP + 1] = 1.0 if mission[number, 4] >= mission[number, 1] else -1.0
             for lane in range(track.shape[1]):

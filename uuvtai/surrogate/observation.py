@@ -9,9 +9,12 @@ from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
 from uuvtai.kernels.core.grid import cell_of, clearance_of
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, FloatMatrix, IntVector
 from uuvtai.surrogate.arrays import (
+    AT_AHEAD,
+    AT_ASIDE,
     AT_FLIP,
     AT_GOAL,
     AT_LAST,
+    AT_LEFT,
     AT_POS,
     AT_RATE,
     AT_VEL,
@@ -103,6 +106,10 @@ def observe_obstacles(
             for i in ti.static(range(2)):
                 ahead = io.mission.goal_w[env][i] >= io.mission.start_w[env][i]
                 ego[env, AT_FLIP + i] = 1.0 if ahead else -1.0
+                ego[env, AT_AHEAD + i] = io.route.lookahead_w[env][i]
+                if io.route.n_way[env] == 0:  # straight on
+                    ego[env, AT_AHEAD + i] = io.mission.goal_w[env][i]
+            ego[env, AT_LEFT], ego[env, AT_ASIDE] = io.route.remaining_m[env], io.route.cross_track_m[env]
             after, slot = -FAR_M, -1
             for lane in range(raw.shape[1]):
                 best, chosen = next_track(env, after, slot, io)
@@ -135,7 +142,7 @@ def command_hull(io: Bundle[ObserverIO], gap_m: float, action: FloatMatrix, comm
 def _table():
     """Columns of the policy's input: the vehicle's own, then one obstacle's after the other."""
     own = ObservationColumn(
-        "set_own", slice(0, OWN_WIDTH), "mixed", "mirrored world", "vehicle, goal, last action"
+        "set_own", slice(0, OWN_WIDTH), "mixed", "mirrored world", "vehicle, route, goal, last action"
     )
     rays = ObservationColumn(
         "set_rays", slice(OWN_WIDTH, EGO_COLUMNS), "1/m", "mirrored world", "nearness of walls"
@@ -164,7 +171,8 @@ HULL_M = 0.22
 
 @ti.func
 def mirrored(env, ego: FloatMatrix):
-    """Flips of x and y (1 or -1), then velocity [m/s] and way to the goal [m] in the mirrored frame."""
+    """Flips of x and y (1 or -1), then velocity [m/s] and the ways to the goal and to the look-ahead point
+    [m] in the mirrored frame."""
     flip = ti.Vector([ego[env, AT_FLIP], ego[env, AT_FLIP + 1]])
     c, s = ti.cos(ego[env, AT_YAW]), ti.sin(ego[env, AT_YAW])
     speed = ti.Vector(
@@ -179,7 +187,13 @@ def mirrored(env, ego: FloatMatrix):
             flip[1] * (ego[env, AT_GOAL + 1] - ego[env, AT_POS + 1]),
         ]
     )
-    return flip, speed, way
+    ahead = ti.Vector(
+        [
+            flip[0] * (ego[env, AT_AHEAD] - ego[env, AT_POS]),
+            flip[1] * (ego[env, AT_AHEAD + 1] - ego[env, AT_POS + 1]),
+        ]
+    )
+    return flip, speed, way, ahead
 
 
 @ti.func
@@ -189,9 +203,9 @@ def length_of(way):
 
 
 @ti.func
-def obstacle_columns(env, lane, flip, speed, way, ego: FloatMatrix, raw: AnyTensor):
-    """What the policy is told of a track; ``flip``, ``speed`` and ``way`` as ``mirrored`` gives them."""
-    fx, fy, to_goal = flip[0], flip[1], length_of(way)
+def obstacle_columns(env, lane, flip, speed, ahead, ego: FloatMatrix, raw: AnyTensor):
+    """What the policy is told of a track; ``flip``, ``speed`` and ``ahead`` as ``mirrored`` gives them."""
+    fx, fy, to_point = flip[0], flip[1], length_of(ahead)
     dx = fx * (raw[env, lane, 0] - ego[env, AT_POS])
     dy = fy * (raw[env, lane, 1] - ego[env, AT_POS + 1])
     bx, by = fx * raw[env, lane, 2], fy * raw[env, lane, 3]
@@ -221,23 +235,24 @@ def obstacle_columns(env, lane, flip, speed, way, ego: FloatMatrix, raw: AnyTens
             1.0 / (0.3 + ti.max(far - radius - HULL_M, 0.0)),
             when,
             ti.math.clamp(miss, -1.0, 3.0),
-            way[0] / to_goal,
-            way[1] / to_goal,
+            ahead[0] / to_point,
+            ahead[1] / to_point,
         ]
     )
 
 
 @ti.func
-def own_columns(env, flip, speed, way, ego: FloatMatrix):
-    """What the policy is told of the vehicle and its goal; as ``obstacle_columns``."""
+def own_columns(env, flip, speed, way, ahead, ego: FloatMatrix):
+    """What the policy is told of the vehicle, its route and its goal; as ``obstacle_columns``."""
     to_goal, yaw, z = length_of(way), ego[env, AT_YAW], ego[env, AT_POS + 2]
+    to_point = length_of(ahead)
     return ti.Vector(
         [
             way[0] / 10,
             way[1] / 4,
             ego[env, AT_GOAL + 2] - z,
-            way[0] / to_goal,
-            way[1] / to_goal,
+            ahead[0] / to_point,
+            ahead[1] / to_point,
             ti.min(to_goal, 4.0) / 4,
             speed[0],
             speed[1],
@@ -250,6 +265,11 @@ def own_columns(env, flip, speed, way, ego: FloatMatrix):
             flip[0] * flip[1] * ti.sin(4 * yaw),
             flip[1] * (ego[env, AT_POS + 1] - 3) / 3,
             flip[0] * (ego[env, AT_POS] - 10) / 10,
+            way[0] / to_goal,
+            way[1] / to_goal,
+            ti.min(to_point, 2.0),
+            ego[env, AT_LEFT] / 10,
+            ti.math.clamp(flip[0] * flip[1] * ego[env, AT_ASIDE], -2.0, 2.0),
         ]
     )
 
@@ -270,14 +290,14 @@ def write_columns_of(
     env, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, obstacles: AnyTensor, own: FloatMatrix
 ):
     """Columns of one row, as ``write_set_columns``."""
-    flip, speed, way = mirrored(env, ego)
+    flip, speed, way, ahead = mirrored(env, ego)
     for lane in range(raw.shape[1]):
         columns = ti.Vector.zero(ti.f32, OBSTACLE_WIDTH)
         if raw[env, lane, 13] > 0.5:
-            columns = obstacle_columns(env, lane, flip, speed, way, ego, raw)
+            columns = obstacle_columns(env, lane, flip, speed, ahead, ego, raw)
         for i in ti.static(range(OBSTACLE_WIDTH)):
             obstacles[env, lane, i] = columns[i]
-    values = own_columns(env, flip, speed, way, ego)
+    values = own_columns(env, flip, speed, way, ahead, ego)
     for i in ti.static(range(OWN_WIDTH)):
         own[env, i] = values[i]
     for i in range(N_RAY):

@@ -20,7 +20,7 @@ from uuvtai.surrogate.arrays import (
     TRUTH_WIDTH,
     SurrogateRules,
 )
-from uuvtai.surrogate.motion import path_places
+from uuvtai.surrogate.motion import aim, path_places
 from uuvtai.surrogate.observation import write_columns_of
 
 DT_S = 0.1
@@ -69,11 +69,17 @@ def is_hidden(number, slot_count, x, y, to_x, to_y, obstacle: AnyTensor):
     ux, uy = dx / far, dy / far
     out = 0
     for slot in range(slot_count):
-        if out == 0 and obstacle[number, slot, 0] > 0.5:
+        kind = ti.cast(obstacle[number, slot, 0], ti.i32)
+        if out == 0 and kind != NONE:
             rx, ry = obstacle[number, slot, 1] - x, obstacle[number, slot, 2] - y
+            wide, deep = obstacle[number, slot, 4], obstacle[number, slot, 5]
             along, across = rx * ux + ry * uy, ti.abs(rx * uy - ry * ux)
-            wide = 0.9 * ti.max(obstacle[number, slot, 4], obstacle[number, slot, 5])
-            if along > 0.0 and along < far and across < wide:
+            if kind == BOX:
+                if across < ti.sqrt(wide * wide + deep * deep):
+                    c, s = ti.cos(obstacle[number, slot, 7]), ti.sin(obstacle[number, slot, 7])
+                    if free_to_box(rx, ry, ti.Vector([ux, uy]), c, s, wide, deep) < far:
+                        out = 1
+            elif along > 0.0 and along < far and across < 0.9 * wide:
                 out = 1
     return out
 
@@ -290,6 +296,7 @@ def sense_surrogate(
     count: int,
     obstacle: AnyTensor,
     path: AnyTensor,
+    route: AnyTensor,
     scenario: IntVector,
     ego: FloatMatrix,
     track: AnyTensor,
@@ -341,4 +348,5 @@ def sense_surrogate(
                     write_raw(env, lane, new, places, is_known, turn_rate, over, under, radius, raw)
                 write_truth(env, lane, places, over, flip, x, y, truth)
         write_rays(env, number, n_rest, x, y, obstacle, ray, io)
+        aim(env, number, route, ego, io)
         write_columns_of(env, ego, raw, ray, obstacles, own)

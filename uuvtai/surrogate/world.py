@@ -40,6 +40,8 @@ class ScenarioBank:
     path: torch.Tensor
     """(B, n_lane, 16) corners (0 = circle), radius, length, phase, speed, corners' x and y; of a circle the
     first is its centre"""
+    route: torch.Tensor
+    """(B, n_way, 3) waypoints x, y and the length left [m], at its end the goal again and again"""
     mission: torch.Tensor
     """(B, 8) start (3), goal (3), heading at the start"""
     origin: torch.Tensor
@@ -50,8 +52,8 @@ class ScenarioBank:
 
 def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, count: int) -> ScenarioBank:
     """Episodes 0 .. count - 1 of ``seed`` for every pair of a world of ``surrogate.worlds`` and a scene (S,
-    D, v), drawn by ``Sim.draw``. Raises ConfigError for a world that is none, or has another tank than the
-    run's."""
+    D, v), drawn by ``Sim.draw_routes``. Raises ConfigError for a world that is none, or has another tank
+    than the run's."""
     parts, names = [], []
     for world in config.surrogate.worlds:
         most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
@@ -68,8 +70,12 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
     rest = max(part[0].shape[1] - part[1].shape[1] for part in parts)
     obstacle = torch.cat([_padded(part[0], rest + widest[1], part[1].shape[1], rest) for part in parts])
     path = torch.cat([torch.nn.functional.pad(p[1], (0, 0, 0, widest[1] - p[1].shape[1])) for p in parts])
-    mission, origin = (torch.cat([part[i] for part in parts]) for i in (2, 3))
-    return ScenarioBank(obstacle, path, mission, origin, tuple(names))
+    longest = max(part[2].shape[1] for part in parts)
+    route = torch.cat(
+        [torch.cat([p[2], p[2][:, -1:].expand(-1, longest - p[2].shape[1], -1)], dim=1) for p in parts]
+    )
+    mission, origin = (torch.cat([part[i] for part in parts]) for i in (3, 4))
+    return ScenarioBank(obstacle, path, route, mission, origin, tuple(names))
 
 
 def _refuse_other_tank(world: str, own: TankConfig, wanted: TankConfig) -> None:
@@ -89,26 +95,28 @@ def _padded(obstacle: torch.Tensor, width: int, lanes: int, rest: int) -> torch.
     return out
 
 
-def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(body, path, mission) as in a bank, of one scene's episodes; slots that are empty everywhere are left
-    out."""
+def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> list[torch.Tensor]:
+    """Obstacles, paths, routes and missions as in a bank, of one scene's episodes; slots that are empty
+    everywhere are left out."""
     sim.set_scenes([scene])
     found = []
     for first in range(0, count, sim.num_envs):
         number = torch.arange(first, first + sim.num_envs, dtype=torch.int32)
         mask = (number < count).int()
-        sim.draw(mask, torch.full_like(mask, seed), number)
+        sim.draw_routes(mask, torch.full_like(mask, seed), number)
         found.append([rows[: int(mask.sum())] for rows in scenario_rows(sim)])
-    obstacle, path, mission = (np.concatenate(part) for part in zip(*found, strict=True))
+    obstacle, path, route, mission = (np.concatenate(part) for part in zip(*found, strict=True))
     rest = obstacle.shape[1] - path.shape[1]
+    longest = 1 + int(np.argmax(route[..., 2] <= 0.0, axis=1).max())
     used = np.any(obstacle[:, :, 0] > 0, axis=0)
     moving = used[rest:]
-    kept = obstacle[:, used].copy(), path[:, moving].copy(), mission
-    return torch.from_numpy(kept[0]), torch.from_numpy(kept[1]), torch.from_numpy(kept[2])
+    kept = obstacle[:, used], path[:, moving], route[:, :longest], mission
+    return [torch.from_numpy(part.copy()) for part in kept]
 
 
 def scenario_rows(sim: Sim) -> list[np.ndarray]:
-    """(body, path, mission) of what every row of a simulator holds, float32."""
+    """Obstacles, paths, routes and missions of what every row of a simulator holds, float32; a row without a
+    route goes straight to its goal."""
     s = sim.s
     kind, pos, size, yaw = (sim.rows(f) for f in (s.world.kind, s.world.pos_w, s.world.size, s.world.yaw))
     way = sim.rows(s.path.way_w)
@@ -123,7 +131,20 @@ def scenario_rows(sim: Sim) -> list[np.ndarray]:
     )
     mission = np.concatenate([mission, np.zeros((len(mission), 1))], axis=1)
     obstacle = np.concatenate([kind[..., None], pos, size, yaw[..., None]], axis=-1)
-    return [np.ascontiguousarray(a, np.float32) for a in (obstacle, path, mission)]
+    parts = obstacle, path, _routes(sim, mission), mission
+    return [np.ascontiguousarray(a, np.float32) for a in parts]
+
+
+def _routes(sim: Sim, mission: np.ndarray) -> np.ndarray:
+    """(n, n_way, 3) as in a bank."""
+    planned, start, goal = sim.s.route, mission[:, :2], mission[:, 3:5]
+    count, straight_m = sim.rows(planned.n_way), np.hypot(*(goal - start).T)
+    route = np.concatenate([sim.rows(planned.way_w), sim.rows(planned.way_left_m)[..., None]], axis=-1)
+    straight = np.concatenate([start, straight_m[:, None]], axis=1)
+    route[:, 0] = np.where(count[:, None] > 0, route[:, 0], straight)
+    after = np.arange(route.shape[1]) >= np.maximum(count, 1)[:, None]
+    end = np.concatenate([goal, np.zeros((len(goal), 1))], axis=1)
+    return np.where(after[..., None], end[:, None], route)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -177,14 +198,15 @@ class Surrogate:
         """Begin the scenarios of these numbers (N,) in the envs (N,) where ``rows`` is true; ``look`` comes
         next."""
         self.scenario = torch.where(rows, scenario.int(), self.scenario)
-        motion.begin_surrogate(rows.int(), self.bank.mission, self.scenario, self.ego, self.track)
+        b = self.bank
+        motion.begin_surrogate(rows.int(), b.mission, b.route, self.scenario, self.ego, self.track)
 
     def look(self) -> SurrogateView:
         """Sense once more, after ``step`` and ``begin``."""
         b = self.bank
         sensing.sense_surrogate(
-            self.rules, self.seed, self.count, b.obstacle, b.path, self.scenario, self.ego, self.track,
-            self._raw, self._ray, self.view.truth, self.view.obstacles, self.view.own,
+            self.rules, self.seed, self.count, b.obstacle, b.path, b.route, self.scenario, self.ego,
+            self.track, self._raw, self._ray, self.view.truth, self.view.obstacles, self.view.own,
         )  # fmt: skip
         self.count = (self.count + 1) % 2**30
         return self.view
@@ -193,8 +215,8 @@ class Surrogate:
         """Carry out a decision (N, 3): (reward, outcome code), both (N,)."""
         b = self.bank
         motion.drive_surrogate(
-            self.rules, action.contiguous(), b.obstacle, b.path, self.scenario, self.ego, self.reward,
-            self.outcome,
+            self.rules, action.contiguous(), b.obstacle, b.path, b.route, self.scenario, self.ego,
+            self.reward, self.outcome,
         )  # fmt: skip
         return self.reward, self.outcome
 

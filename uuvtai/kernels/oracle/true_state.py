@@ -1,7 +1,7 @@
-"""Debugging aid: writes moving obstacles into the dynamic layer from the truth. Never part of a preset: it
-breaks observation-only sensing.
+"""The map as it truly is. Never part of a preset that drives: it breaks observation-only sensing.
 
-Launched only where ``mapping.stamp`` > 0 (default 0).
+Moving obstacles are stamped only where ``mapping.stamp`` > 0 (default 0), for debugging; static ones only
+where routes are planned beforehand, for a surrogate (``Sim.draw_routes``).
 """
 
 import taichi as ti
@@ -21,28 +21,28 @@ from uuvtai.kernels.world.motion import first_moving
 
 @ti.func
 def covers(env, obstacle, point, io: Bundle[TrueMapIO]):
-    """True where a moving obstacle lies over or under a horizontal point."""
+    """True where an obstacle lies over or under a horizontal point."""
     offset = point - ti.Vector([io.world.pos_w[env, obstacle][0], io.world.pos_w[env, obstacle][1]])
     size = io.world.size[env, obstacle]
     inside = offset.norm() <= size[0]
     if io.world.kind[env, obstacle] == BOX:
         local = turned_z(offset, -io.world.yaw[env, obstacle])
         inside = ti.abs(local[0]) <= size[0] and ti.abs(local[1]) <= size[1]
-    return inside and io.world.kind[env, obstacle] != NONE and io.world.vel_w[env, obstacle].norm() > 0.0
+    return inside and io.world.kind[env, obstacle] != NONE
 
 
 @ti.func
-def is_covered(env, point, io: Bundle[TrueMapIO]):
-    """1 where any moving obstacle does."""
+def is_covered(env, point, moving, io: Bundle[TrueMapIO]):
+    """1 where any obstacle does that moves, or that does not."""
     covered = 0
     for obstacle in range(ti.static(io.world.kind.shape[1])):
-        if covers(env, obstacle, point, io):
+        if moving == (io.world.vel_w[env, obstacle].norm() > 0.0) and covers(env, obstacle, point, io):
             covered = 1
     return covered
 
 
 @ti.func
-def stamp(env, row, col, io: Bundle[TrueMapIO]):
+def stamp_moving(env, row, col, io: Bundle[TrueMapIO]):
     """Add to one cell's occupancy, and keep the bits that follow from it."""
     stamped_occ = ti.min(1.0, occupancy_of(io.grid_map.dynamic_occ[env, row, col]) + io.mapping_cfg.stamp)
     io.grid_map.dynamic_occ[env, row, col] = ti.cast(stamped_occ * FULL, ti.u16)
@@ -59,8 +59,21 @@ def stamp_truth(io: Bundle[TrueMapIO]):
     for env, row in ti.ndrange(loop_end(n_env, io.clock), n_row):
         if io.clock.active[env] == 1:
             for col in range(n_col):
-                if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), io) == 1:
-                    stamp(env, row, col, io)
+                if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), True, io) == 1:
+                    stamp_moving(env, row, col, io)
+
+
+@ti.kernel
+def stamp_static(io: Bundle[TrueMapIO]):
+    """Fill the static layer in every cell whose centre an obstacle covers that does not move."""
+    n_env, n_row, n_col = ti.static(io.grid_map.static_occ.shape)
+    for env, row in ti.ndrange(loop_end(n_env, io.clock), n_row):
+        if io.clock.active[env] == 1:
+            for col in range(n_col):
+                if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), False, io) == 1:
+                    io.grid_map.static_occ[env, row, col] = ti.cast(FULL, ti.u16)
+                    put_bit(io.grid_map.alive, env, row, col)
+                    put_bit(io.grid_map.static_occupied, env, row, col)
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ Arrays = dict[str, np.ndarray]
 Layers = list[tuple[np.ndarray, np.ndarray]]
 
 AT_THERE, AT_DIRECTION = 0, slice(3, 5)
-"""columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the goal"""
+"""columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the look-ahead point"""
 SUM_SCALE = 0.3
 MOST_WISH = 2.0
 LEAST_M, LOG_BOUNDS = 0.03, (-6.0, math.log(4.0))

@@ -218,14 +218,14 @@ OBSTACLE_COLUMNS = [
     _column("nearness", "1/m", "1 / (0.3 + max(distance - radius - 0.22, 0))"),
     _column("closest_in", "s", "time of the closest approach on straight lines, clip(v, 0, 3)"),
     _column("closest_gap", "m", "distance then, less radius and 0.22, clip(v, -1, 3)"),
-    *_pair("goal_direction", "1", "unit vector from the vehicle to the goal"),
+    *_pair("route_direction", "1", "unit vector to the look-ahead point of the route"),
 ]
-"""Columns of a obstacle."""
+"""Columns of an obstacle."""
 OWN_COLUMNS = [
     _column("goal.x", "10 m", "from the vehicle to the goal, / 10"),
     _column("goal.y", "4 m", "the same, / 4"),
     _column("goal.z", "m", "height of the goal above the vehicle"),
-    *_pair("goal_direction", "1", "unit vector to the goal"),
+    *_pair("route_direction", "1", "unit vector to the look-ahead point, or to the goal"),
     _column("goal_distance", "4 m", "horizontal, at most 4 m, / 4"),
     *_pair("speed", "m/s", "of the vehicle"),
     _column("heave", "0.5 m/s", "upward velocity in the body frame, x 2"),
@@ -239,6 +239,10 @@ OWN_COLUMNS = [
     _column("sin_4_yaw", "1", "its sine, times flip.x flip.y"),
     _column("across", "3 m", "flip.y (y - 3) / 3, y in the tank"),
     _column("along", "10 m", "flip.x (x - 10) / 10, x in the tank"),
+    *_pair("goal_direction", "1", "unit vector to the goal"),
+    _column("route_distance", "m", "horizontal, to the look-ahead point, at most 2 m"),
+    _column("route_left", "10 m", "length of the route to the goal, / 10"),
+    _column("route_aside", "m", "place left of the route, times flip.x flip.y, clip(v, -2, 2)"),
     *[
         _column(f"ray[{i}]", "1/m", "1 / (0.3 + clip(free - 0.22, 0, 4)) - 0.5, free metres to the nearest "
                 f"wall or occupied cell (at most 4.3) at {360 * i / N_RAY:g} degrees from x towards y")
