@@ -21,7 +21,7 @@ _TEN_HZ, _HOLD_STEPS = "_10hz", 5
 """methods whose decisions last five control steps, on as many env-steps"""
 EVALUATION_SEED = 90010
 """never trained or tuned on; for published figures alone: do not look while you change things"""
-RETIRED_SEEDS = range(90001, 90010)  # test seeds of old that tuning has met since (``research/LOG.md``)
+RETIRED_SEEDS = range(90001, 90009)  # test seeds of old that tuning has met since (``research/LOG.md``)
 
 
 @dataclass(frozen=True)
