@@ -87,7 +87,7 @@ def clearance_of(site, clearance_cfg: Const[ClearanceConfig], cell_m: Const[floa
     rows, cols = away_of(site)
     found = ti.sqrt(ti.cast(rows * rows + cols * cols, ti.f32)) * cell_m
     if ti.static(clearance_cfg.inflate_m > 0):
-        found = ti.select(site & 1 == 1, ti.max(found - clearance_cfg.inflate_m, 0.0), found)
+        found = ti.select(ti.cast(site, ti.i32) & 1 == 1, ti.max(found - clearance_cfg.inflate_m, 0.0), found)
     return ti.min(found, clearance_cfg.max_m)
 
 
