@@ -113,12 +113,8 @@ class Simulated(Environment):
         """Call ``begin`` before anything else."""
         self.env, self.config = env, config
         self.num_envs, self.device = env.num_envs, env.device
-        self.observation_table, self.outcomes, self.reward_terms = (
-            env.observation_table,
-            env.outcomes,
-            env.reward_terms,
-        )
-        self.node_names = env.node_names
+        self.outcomes, self.reward_terms, self.node_names = env.outcomes, env.reward_terms, env.node_names
+        self.observation_table = env.observation_table
         self.hold = Hold(env, config.policy.hold_steps)
         self.steps = self.hold.steps
         n, n_in, device = self.num_envs, env.num_obs + N_FEATURES, self.device
@@ -183,10 +179,9 @@ class Simulated(Environment):
         self._bad |= self._cleaned(end.final_obs, self._final, end.ended)
         if self.world_model is not None:
             n = self.env.num_obs
-            found = self.world_model.features(self.view["x"][:, :n], action, self._final[:, :n])
-            self._features = found
+            self._features = self.world_model.features(self.view["x"][:, :n], action, self._final[:, :n])
             if self.config.world_model.as_features:
-                self._final[:, n:] = found
+                self._final[:, n:] = self._features
         self._reward.masked_fill_(self._bad, math.nan)  # PPO leaves such samples out
         self.view["x"].copy_(self._final).masked_fill_(end.ended[:, None], 0.0)
         self._arrive(end.obs, end.info)
@@ -277,8 +272,9 @@ class SimulatedSet(Environment):
         bad = self.guard.values("reward", reward, self._reward)
         self._reward.masked_fill_(bad, math.nan)
         self._look()
-        final = {name: part.clone() for name, part in self.view.items()}
+        final = None
         if bool(done.any()):
+            final = {name: part.clone() for name, part in self.view.items()}
             _, self.info = self.env.reset(mask=done)
             hull.reset(done)
             self._look()

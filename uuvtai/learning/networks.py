@@ -284,6 +284,7 @@ class Policy(nn.Module):
         mean, value = side_by_side(
             functools.partial(by_part, self.mean_of, inputs),
             functools.partial(by_part, self.value_of, inputs),
+            device=self.log_std.device.type,
         )
         noise = torch.randn(mean.shape, generator=generator).to(mean.device)
         action = torch.addcmul(mean, noise, self.log_std.exp())
@@ -406,8 +407,11 @@ def torch_threads_rest() -> Iterator[None]:
         _threads.reset(token)
 
 
-def side_by_side(*pieces: Callable[[], _T]) -> list[_T]:
-    """What each piece gives, in their order. Threads have no part in any result: a piece runs on one."""
+def side_by_side(*pieces: Callable[[], _T], device: str = "cpu") -> list[_T]:
+    """What each piece gives, in their order. Threads have no part in any result: a piece runs on one. On a
+    GPU one comes after the other."""
+    if device != "cpu":
+        return [piece() for piece in pieces]
     flushes = float(torch.tensor(1e-40) * 1.0) == 0.0
     pool = _pool(_threads.get(None) or torch.get_num_threads(), flushes)
     if pool is None:

@@ -220,14 +220,15 @@ class Ppo:
         changes no bit."""
         self.optimiser.zero_grad(set_to_none=True)
         count = samples["valid"][index].sum().clamp(min=1.0)
-        blocks = side_by_side(*(functools.partial(_rows, samples, part) for part in self._parts(index)))
+        together = functools.partial(side_by_side, device=self.rate.device.type)
+        blocks = together(*(functools.partial(_rows, samples, part) for part in self._parts(index)))
         pieces: list[Callable[[], Piece]] = []
         for block in blocks:
             pieces += [
                 functools.partial(self._of_actor, block, count, distillation_weight, surrogate),
                 functools.partial(self._of_critic, block, count),
             ]
-        found = side_by_side(*pieces)
+        found = together(*pieces)
         for parameters, mine in zip(self._nets, (found[::2], found[1::2]), strict=True):
             for parameter, *parts in zip(parameters, *(piece.gradients for piece in mine), strict=True):
                 parameter.grad = None if parts[0] is None else functools.reduce(torch.add, parts)
