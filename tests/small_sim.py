@@ -21,8 +21,8 @@ class SmallSim:
     """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py``
     compiles them beforehand)"""
     TRAIN = (
-        "train", "smoke", *OPTIONS, "--set", "episode.horizon_steps=400", "--set", "distillation.batch=32",
-        "--set", "world_model.batch=32",
+        "train", "smoke", *OPTIONS[2:], "--set", "train.num_envs=8", "--set", "episode.horizon_steps=400",
+        "--set", "distillation.batch=32", "--set", "world_model.batch=32",
     )  # fmt: skip
 
     def __init__(self, sensors="paper"):

@@ -164,7 +164,7 @@ def train_policy(
     preset: opt.TrainPreset = "paper",
     resume: opt.TrainResume = None,
     iterations: opt.Iterations = None,
-    num_envs: opt.TrainEnvs = None,
+    start: opt.TrainStart = None,
     seed: opt.TrainSeed = None,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
@@ -178,8 +178,8 @@ def train_policy(
     from uuvtai.learning.runner import TrainRequest, train
 
     if resume is None:
-        new = {"iterations": iterations, "device": device, "run_dir": run_dir}
-        request = TrainRequest.typed(scene, preset, num_envs, seed, **new)
+        new = {"start": start, "iterations": iterations, "device": device, "run_dir": run_dir}
+        request = TrainRequest.typed(scene, preset, seed, **new)
     else:
         parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides"))
         request = TrainRequest(

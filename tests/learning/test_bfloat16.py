@@ -7,10 +7,22 @@ from tests.command import uuv
 from uuvtai.config.learning import PpoConfig
 from uuvtai.config.loader import load_training
 from uuvtai.learning import networks
-from uuvtai.learning.networks import fast_products, fastest_precision, in_bfloat16, multiplies_bfloat16
-from uuvtai.learning.surrogate_trainer import coarse
+from uuvtai.learning.networks import (
+    ActorCritic,
+    fast_products,
+    fastest_precision,
+    in_bfloat16,
+    multiplies_bfloat16,
+)
+from uuvtai.learning.ppo import Ppo
 
 QUICK = load_training("quick")
+
+
+def product(a):
+    """As a policy that learns multiplies."""
+    with Ppo(ActorCritic(3, QUICK.policy, torch.Generator()), QUICK.ppo).policy.coarse():
+        return a @ a
 
 
 @pytest.fixture
@@ -37,11 +49,9 @@ def test_a_cpu_without_them_multiplies_in_float32(cpu):
     assert QUICK.ppo.bfloat16 and not in_bfloat16(QUICK.ppo, "cpu")
     assert in_bfloat16(QUICK.ppo, "cuda")
     a = torch.full((2, 2), 1.001)
-    with coarse(QUICK):
-        assert (a @ a).dtype == torch.float32
+    assert product(a).dtype == torch.float32
     cpu(avx512_bf16=True)
-    with coarse(QUICK):
-        assert (a @ a).dtype == torch.bfloat16
+    assert product(a).dtype == torch.bfloat16
 
 
 def test_a_torch_that_cannot_tell_counts_as_without(cpu, monkeypatch):

@@ -1,4 +1,4 @@
-"""Distillation by hand-computed numbers; batches teach by their strength and skip what is not finite."""
+"""Distillation, its schedule and its scale by hand-computed numbers; what is not finite is skipped."""
 
 import math
 
@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import nn
 
-from uuvtai.config.learning import DistillationConfig
+from uuvtai.config.learning import DistillationConfig, UncertaintyConfig
 from uuvtai.learning import distillation
+from uuvtai.learning.distillation import Uncertainty, piecewise_linear
 
 FLOAT32 = 1e-6
 """a handful of float32 operations on numbers near one"""
@@ -16,6 +17,8 @@ FLOAT32 = 1e-6
 class LinearPolicy(nn.Module):
     """Four actions linear in two inputs, and a critic that distillation must not touch."""
 
+    inputs = ("x",)
+
     def __init__(self):
         super().__init__()
         self.actor, self.critic = nn.Linear(2, 4), nn.Linear(2, 1)
@@ -23,8 +26,15 @@ class LinearPolicy(nn.Module):
             nn.init.constant_(layer.weight, 0.1)
             nn.init.zeros_(layer.bias)
 
-    def distribution(self, x):
-        return self.actor(x), torch.zeros(4)
+    def prepared(self, view):
+        return view
+
+    def mean_of(self, view):
+        return self.actor(view["x"])
+
+
+def samples_of(x, behavior, weight):
+    return {"x": x, "teacher_action": behavior, "weight": weight}
 
 
 @pytest.fixture
@@ -38,9 +48,6 @@ def test_the_error_is_the_squared_norm_over_the_four_actions():
     mean = torch.tensor([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5]])
     behavior = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -0.5]])
     assert distillation.imitation_error(mean, behavior).tolist() == [5.0, 1.0]
-    assert float(distillation.distillation_loss(mean, behavior, torch.tensor([0.5, 1.5]))) == pytest.approx(
-        (0.5 * 5 + 1.5 * 1) / 2
-    )
 
 
 def test_weights_have_mean_one_and_bounds():
@@ -77,9 +84,9 @@ def test_teacher_batches_teach_the_mean_and_leave_the_critic(lesson):
     critic = policy.critic.weight.clone()
     policy.critic(x).sum().backward()  # a gradient that PPO left behind
     batches = distillation.TeacherBatches(policy, DistillationConfig(batch=64, steps=300, learning_rate=1e-2))
-    before = distillation.imitation_error(policy.distribution(x)[0], behavior).mean()
-    batches.update(x, behavior, weight, 1.0, generator)
-    after = distillation.imitation_error(policy.distribution(x)[0], behavior).mean()
+    before = distillation.imitation_error(policy.actor(x), behavior).mean()
+    batches.update(samples_of(x, behavior, weight), 1.0, generator)
+    after = distillation.imitation_error(policy.actor(x), behavior).mean()
     assert after < 0.01 * before
     assert torch.equal(policy.critic.weight, critic)
 
@@ -90,7 +97,7 @@ def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
     def moved(strength):
         policy = LinearPolicy()
         distillation.TeacherBatches(policy, DistillationConfig(batch=64, steps=1)).update(
-            x, behavior, weight, strength, torch.Generator().manual_seed(0)
+            samples_of(x, behavior, weight), strength, torch.Generator().manual_seed(0)
         )
         return (policy.actor.weight - 0.1).detach()
 
@@ -98,7 +105,9 @@ def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
     assert torch.allclose(moved(0.2), 0.2 * moved(1.0), rtol=1e-2, atol=1e-9)
     state = generator.get_state()
     policy = LinearPolicy()
-    distillation.TeacherBatches(policy, DistillationConfig()).update(x, behavior, weight, 0.0, generator)
+    distillation.TeacherBatches(policy, DistillationConfig()).update(
+        samples_of(x, behavior, weight), 0.0, generator
+    )
     assert torch.equal(generator.get_state(), state)
     assert torch.equal(policy.actor.weight, torch.full((4, 2), 0.1))
 
@@ -107,7 +116,7 @@ def test_a_batch_that_is_not_finite_changes_nothing_and_is_counted(lesson):
     x, _teacher, weight, generator = lesson
     policy = LinearPolicy()
     batches = distillation.TeacherBatches(policy, DistillationConfig(batch=64, steps=2))
-    batches.update(x, torch.full((500, 4), math.nan), weight, 1.0, generator)
+    batches.update(samples_of(x, torch.full((500, 4), math.nan), weight), 1.0, generator)
     assert batches.skipped == 2
     assert torch.equal(policy.actor.weight, torch.full((4, 2), 0.1))
 
@@ -122,7 +131,7 @@ def test_teacher_batches_go_on_from_their_state(lesson):
             batches = distillation.TeacherBatches(policy, DistillationConfig(batch=32, steps=4 // parts))
             if state is not None:
                 batches.load_state_dict(state)
-            batches.update(x, behavior, weight, 0.7, generator)
+            batches.update(samples_of(x, behavior, weight), 0.7, generator)
             state = batches.state_dict()
         return policy.actor.weight
 
@@ -140,3 +149,75 @@ def test_errors_by_leaf():
         "distillation/loss": 16.0 / 5,
     }
     assert errors.take() == {}
+
+
+@pytest.mark.parametrize(
+    ("fraction", "value"),
+    [(-1.0, 2.0), (0.0, 2.0), (0.25, 3.0), (0.5, 4.0), (0.75, 3.0), (1.0, 2.0), (5.0, 2.0)],
+)
+def test_linear_in_between_constant_outside(fraction, value):
+    assert piecewise_linear([(0.0, 2.0), (0.5, 4.0), (1.0, 2.0)], fraction) == value
+
+
+def test_two_points_at_one_place_are_a_jump_to_the_later_value():
+    points = [(0.0, 1.0), (0.5, 1.0), (0.5, 0.2), (1.0, 0.2)]
+    assert [piecewise_linear(points, f) for f in (0.0, 0.499999, 0.5, 0.7, 1.0)] == [1.0, 1.0, 0.2, 0.2, 0.2]
+    assert piecewise_linear([(0.0, 1.0), (0.0, 3.0)], 0.0) == 3.0
+
+
+def test_one_point_is_a_constant():
+    assert [piecewise_linear([(0.3, 0.2)], f) for f in (0.0, 0.3, 1.0)] == [0.2] * 3
+
+
+@pytest.mark.parametrize(
+    ("iteration", "value"), [(0, 1.0), (799, 1.0), (800, 0.2), (1200, 0.1), (1600, 0.0), (1700, 0.0)]
+)
+def test_the_paper_s_schedule(iteration, value):
+    """lambda_t: 1 until 800, then 0.2 down to 0 at 1600, which a run of 1200 iterations never reaches."""
+    assert piecewise_linear(DistillationConfig().schedule, iteration / 1200) == pytest.approx(
+        value, abs=1e-12
+    )
+
+
+@pytest.mark.parametrize("points", [[], [(1.0, 0.0), (0.5, 1.0)]])
+def test_nonsense_is_refused(points):
+    with pytest.raises(ValueError, match="at least one"):
+        piecewise_linear(points, 0.5)
+
+
+def after(config, *batches):
+    uncertainty = Uncertainty(config)
+    for batch in batches:
+        uncertainty.update(torch.tensor(batch))
+    return uncertainty
+
+
+def test_mean_follows_the_papers_recursion_from_the_first_value_on():
+    config = UncertaintyConfig(ema=0.25)
+    assert float(after(config, [0.2, 0.6]).mean) == pytest.approx(0.4)
+    assert float(after(config, [0.2, 0.6], [0.8]).mean) == pytest.approx(0.75 * 0.4 + 0.25 * 0.8)
+
+
+@pytest.mark.parametrize(("sigma", "scale"), [(0.0, 1.0), (0.5, 1.4), (1.25, 2.0), (40.0, 2.0)])
+def test_scale_is_one_plus_gain_times_mean_and_capped(sigma, scale):
+    assert after(UncertaintyConfig(gain=0.8, max_scale=2.0), [sigma]).scale == pytest.approx(scale)
+
+
+def test_no_gain_and_no_batch_leave_the_distillation_alone():
+    assert after(UncertaintyConfig(gain=0.0), [3.0]).scale == 1.0
+    assert after(UncertaintyConfig()).scale == 1.0
+
+
+def test_values_that_are_not_finite_do_not_enter():
+    assert float(after(UncertaintyConfig(), [0.5, math.nan, math.inf]).mean) == 0.5
+    assert float(after(UncertaintyConfig(), [0.5], [math.nan]).mean) == 0.5
+
+
+def test_state_is_complete():
+    config = UncertaintyConfig(ema=0.25)
+    first = after(config, [0.3])
+    second = Uncertainty(config)
+    second.load_state_dict(first.state_dict())
+    for uncertainty in (first, second):
+        uncertainty.update(torch.tensor([0.9]))
+    assert torch.equal(first.mean, second.mean)

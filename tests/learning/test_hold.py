@@ -4,11 +4,10 @@ import pytest
 import torch
 
 from tests.learning.test_policy_agent import N_OBS, networks
-from tests.learning.test_train import config_of, same
+from tests.learning.test_train import config_of, same, trainer_of
+from uuvtai.learning.environments import Hold
 from uuvtai.learning.networks import NUM_ACTIONS
 from uuvtai.learning.policy_agent import PolicyAgent
-from uuvtai.learning.rollout import Hold
-from uuvtai.learning.trainer import Trainer
 
 N = 3
 
@@ -70,12 +69,12 @@ def test_a_training_counts_control_steps_and_goes_on_bit_for_bit():
     from tests.point_env import PointEnv
 
     config = config_of(policy={"hidden": [16, 16], "hold_steps": 3})
-    whole, first = Trainer(PointEnv(), config), Trainer(PointEnv(), config)
+    whole, first = trainer_of(PointEnv(), config), trainer_of(PointEnv(), config)
     answer = [whole.iterate() for _ in range(4)]
     assert answer[-1]["time/env_steps"] == 5 * 16 * 3 * 16, "four rollouts and one of the teacher's"
     for _ in range(2):
         first.iterate()
-    second = Trainer(PointEnv(), config)
+    second = trainer_of(PointEnv(), config)
     second.load_state(first.state())
     for _ in range(2):
         second.iterate()

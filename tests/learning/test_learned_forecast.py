@@ -25,10 +25,7 @@ from uuvtai.learning.runner import TrainRequest, train
 from uuvtai.sim.forecast_weights import packed_weights, read_weights
 from uuvtai.surrogate.world import scenario_rows
 
-SMALL = {
-    "train.num_envs": 8, "train.iterations": 4, "forecast_training.memory": 1024,
-    "forecast_training.minibatches": 20, "forecast_training.minibatch": 64,
-}  # fmt: skip
+SMALL = {"train.num_envs": 8, "train.iterations": 4, "forecast_training.minibatches": 20}
 
 
 def made_up(seed, n=400):
@@ -54,6 +51,8 @@ def config():
 @pytest.fixture
 def made(monkeypatch):
     """In place of simulators: moments that follow from seed and number of the first episode."""
+    monkeypatch.setattr(forecast_trainer, "MEMORY", 1024)
+    monkeypatch.setattr(forecast_trainer, "MINIBATCH", 64)
     monkeypatch.setattr(forecast_trainer, "simulator_of", lambda *_arguments: None)
     monkeypatch.setattr(
         forecast_trainer, "watch", lambda _sim, _scenes, seed, first, _steps: (made_up(seed + first), 100)

@@ -34,18 +34,18 @@ def test_densities_are_those_of_torch(x):
 
 def test_a_step_is_a_draw_from_the_distribution(x):
     policy = make()
-    step = policy.act(x, torch.Generator().manual_seed(9))
+    step = policy.act({"x": x}, torch.Generator().manual_seed(9))
     mean, log_std = policy.distribution(x)
     assert torch.allclose(step.mean, mean, atol=FLOAT32)
     assert torch.allclose(step.value, policy.value(x), atol=FLOAT32)
     assert torch.allclose(step.log_prob, log_prob(step.action, mean, log_std), atol=FLOAT32)
     assert not any(tensor.requires_grad for tensor in step)
-    many = policy.act(x[:1].expand(40_000, -1), torch.Generator().manual_seed(3))
+    many = policy.act({"x": x[:1].expand(40_000, -1)}, torch.Generator().manual_seed(3))
     spread = many.action - many.mean
     # 0.35 % is one standard error of 40,000
     assert torch.allclose(spread.std(0), torch.full((4,), 0.6), rtol=0.02)
     assert float(spread.mean(0).abs().max()) < 0.015  # five standard errors
-    again = policy.act(x, torch.Generator().manual_seed(9))
+    again = policy.act({"x": x}, torch.Generator().manual_seed(9))
     assert all(torch.equal(a, b) for a, b in zip(step, again, strict=True))
 
 
@@ -82,7 +82,7 @@ def test_input_that_is_no_number_does_not_reach_the_action(x):
     policy = make()
     policy.observation_norm.update(x)
     x[0, 1], x[1, 2] = math.nan, math.inf
-    step = policy.act(x, torch.Generator().manual_seed(0))
+    step = policy.act({"x": x}, torch.Generator().manual_seed(0))
     assert all(torch.isfinite(tensor).all() for tensor in step)
 
 
@@ -90,7 +90,7 @@ def test_everything_random_comes_from_the_generator(x):
     torch.manual_seed(1)
     state = torch.get_rng_state()
     policy, same, other = make(seed=4), make(seed=4), make(seed=5)
-    policy.act(x, torch.Generator().manual_seed(0))
+    policy.act({"x": x}, torch.Generator().manual_seed(0))
     assert torch.equal(torch.get_rng_state(), state)
     assert all(
         torch.equal(a, b)

@@ -4,23 +4,25 @@ import pytest
 import torch
 
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning import surrogate_trainer as pieces
-from uuvtai.learning.networks import log_prob
-from uuvtai.learning.ppo import surrogate_loss
-from uuvtai.learning.set_networks import MaxAndSum, SetActor, SetCritic
-from uuvtai.learning.surrogate_trainer import CACHE_ROWS, SetLosses, by_part, side_by_side
+from uuvtai.learning import networks
+from uuvtai.learning.networks import CACHE_ROWS, by_part, log_prob, side_by_side
+from uuvtai.learning.ppo import Ppo, surrogate_loss
+from uuvtai.learning.set_networks import MaxAndSum, SetPolicy
 
 ROWS, LANES, N_OBSTACLE, N_OWN, N_TRUTH = CACHE_ROWS + 77, 3, 5, 7, 4
 
 
 @pytest.fixture
-def nets():
+def ppo(monkeypatch):
+    """One that takes no step."""
     config = LearningConfig.model_validate(
-        {"surrogate": {"obstacle_hidden": 8, "head_hidden": 8}, "policy": {}}
+        {"surrogate": {"obstacle_hidden": 8, "head_hidden": 8}, "ppo": {"entropy_weight": 0.0}}
     )
-    generator = torch.Generator().manual_seed(0)
-    actor = SetActor(N_OBSTACLE, N_OWN, config, generator)
-    return config, actor, SetCritic(N_OBSTACLE, N_OWN, N_TRUTH, config, generator)
+    widths = {"obstacles": N_OBSTACLE, "own": N_OWN, "truth": N_TRUTH}
+    view = {name: torch.zeros(1, width) for name, width in widths.items()}
+    made = Ppo(SetPolicy(view, config, torch.Generator().manual_seed(0)), config.ppo)
+    monkeypatch.setattr(made, "_step", lambda: None)
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -32,40 +34,53 @@ def batch():
 
     obstacles = drawn(LANES, N_OBSTACLE)
     obstacles[..., 0] = (obstacles[..., 0] > 0).float()
-    return [obstacles, drawn(N_OWN), drawn(LANES, N_TRUTH), drawn(3), drawn() - 3.0, drawn(), drawn()]
+    return {
+        "obstacles": obstacles, "own": drawn(N_OWN), "truth": drawn(LANES, N_TRUTH), "action": drawn(3),
+        "log_prob": drawn() - 3.0, "advantage": drawn(), "target": drawn(), "valid": torch.ones(ROWS),
+    }  # fmt: skip
 
 
-def gradients(config, actor, critic, batch):
-    for parameter in (*actor.parameters(), *critic.parameters()):
-        parameter.grad = None
-    sums = SetLosses(config, actor, critic).backward(batch, torch.arange(len(batch[0])))
-    return [p.grad for p in actor.parameters()], [p.grad for p in critic.parameters()], sums
+def gradients(ppo, batch, index=slice(0, ROWS)):
+    """Of every parameter, and the sums."""
+    sums = ppo._learn(batch, index, 0.0, True)
+    return [p.grad for net in ppo._nets for p in net], sums
 
 
-def test_pieces_add_up_to_the_gradient_of_the_whole(nets, batch):
-    config, actor, critic = nets
-    of_actor, of_critic, sums = gradients(config, actor, critic, batch)
-    obstacles, own, truth, action, before, advantage, target = batch
-    mean, value = actor(obstacles, own), critic(obstacles, own, truth)
-    surrogate = surrogate_loss(
-        log_prob(action, mean, actor.log_std) - before, advantage, config.ppo.clip
-    ).mean()
-    error = (value - target).square().mean()
-    wanted = torch.autograd.grad(surrogate, list(actor.parameters()), retain_graph=True)
-    for found, asked in zip(of_actor, wanted, strict=True):
-        torch.testing.assert_close(found, asked, rtol=1e-3, atol=1e-5)
-    wanted = torch.autograd.grad(config.ppo.value_weight * error, list(critic.parameters()))
-    for found, asked in zip(of_critic, wanted, strict=True):
-        torch.testing.assert_close(found, asked, rtol=1e-3, atol=1e-5)
-    torch.testing.assert_close(sums[:2], torch.stack([surrogate, error]).detach(), rtol=1e-4, atol=1e-5)
+def test_pieces_add_up_to_the_gradient_of_the_whole(ppo, batch):
+    found, sums = gradients(ppo, batch)
+    policy, config = ppo.policy, ppo.config
+    ratio = log_prob(batch["action"], policy.mean_of(batch), policy.log_std) - batch["log_prob"]
+    surrogate = surrogate_loss(ratio, batch["advantage"], config.clip).mean()
+    error = (policy.value_of(batch) - batch["target"]).square().mean()
+    wanted = [
+        *torch.autograd.grad(surrogate, ppo._nets[0]),
+        *torch.autograd.grad(config.value_weight * error, ppo._nets[1]),
+    ]
+    for one, asked in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, asked, rtol=1e-3, atol=1e-5)
+    means = (sums[:2] / sums[-1]).float()
+    torch.testing.assert_close(means, torch.stack([surrogate, error]).detach(), rtol=1e-4, atol=1e-5)
 
 
-def test_a_minibatch_is_the_rows_that_were_chosen(nets, batch):
+def test_a_minibatch_is_the_rows_that_were_chosen(ppo, batch):
     chosen = torch.randperm(ROWS, generator=torch.Generator().manual_seed(3))[:500]
-    of_actor, of_critic, _ = gradients(*nets, [part[chosen] for part in batch])
-    SetLosses(*nets).backward(batch, chosen)
-    for net, wanted in zip(nets[1:], (of_actor, of_critic), strict=True):
-        assert all(torch.equal(p.grad, grad) for p, grad in zip(net.parameters(), wanted, strict=True))
+    alone, _ = gradients(ppo, {name: part[chosen] for name, part in batch.items()}, slice(0, 500))
+    found, _ = gradients(ppo, batch, chosen)
+    assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))
+
+
+def test_the_critics_gradient_is_cut_by_itself(ppo, batch):
+    """Its rate is its own, too."""
+    gradients(ppo, batch)
+    for parameter in ppo._nets[1]:
+        parameter.grad *= 1e4
+    actor = [p.grad.clone() for p in ppo._nets[0]]
+    Ppo._step(ppo)
+    assert [group["lr"] for group in ppo.optimiser.param_groups[1:]] == [SetPolicy.critic_rate]
+    norm = torch.linalg.vector_norm(torch.stack([grad.norm() for grad in actor]))
+    factor = min(1.0, ppo.config.max_grad_norm / float(norm))
+    for parameter, before in zip(ppo._nets[0], actor, strict=True):
+        torch.testing.assert_close(parameter.grad, factor * before, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])
@@ -87,11 +102,11 @@ def test_maximum_and_sum_have_the_gradient_of_torch(kind):
     assert bool((grad[(each == 0).detach()] == 0).all())
 
 
-def test_the_number_of_threads_changes_no_bit(nets, batch, monkeypatch):
+def test_the_number_of_threads_changes_no_bit(ppo, batch, monkeypatch):
     def found(threads):
-        monkeypatch.setattr(pieces.torch, "get_num_threads", lambda: threads)
-        of_actor, of_critic, sums = gradients(*nets, batch)
-        return [*of_actor, *of_critic, sums, by_part(nets[1], *batch[:2])]
+        monkeypatch.setattr(networks.torch, "get_num_threads", lambda: threads)
+        grads, sums = gradients(ppo, batch)
+        return [*grads, sums, by_part(ppo.policy.mean_of, batch)]
 
     one = found(1)
     assert all(tensor.abs().sum() > 0 for tensor in one)
@@ -100,7 +115,7 @@ def test_the_number_of_threads_changes_no_bit(nets, batch, monkeypatch):
 
 
 def test_what_goes_wrong_in_a_piece_is_told(monkeypatch):
-    monkeypatch.setattr(pieces.torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(networks.torch, "get_num_threads", lambda: 2)
     with pytest.raises(ZeroDivisionError):
         side_by_side(lambda: 1, lambda: 1 // 0)
     assert side_by_side(lambda: 1, lambda: 2) == [1, 2]

@@ -9,6 +9,7 @@ import torch
 from tests.point_env import PointEnv
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import pack
+from uuvtai.learning.environments import Simulated
 from uuvtai.learning.networks import Guard, TrainingError
 from uuvtai.learning.trainer import Trainer
 
@@ -44,6 +45,11 @@ def same(a, b):
         ), name
 
 
+def trainer_of(env, config):
+    """A trainer in an env with ``VectorEnv``'s interface."""
+    return Trainer(Simulated(env, config), config)
+
+
 def comparable(metrics):
     """All metrics but wall times."""
     return {name: value for name, value in metrics.items() if name not in WALL_TIMES}
@@ -51,7 +57,7 @@ def comparable(metrics):
 
 def test_it_learns_the_task_from_its_teacher_and_says_so():
     teaching = {"batch": 64, "steps": 16, "learning_rate": 3e-3, "schedule": [[0, 1], [1, 0.2]]}
-    trainer = Trainer(PointEnv(), config_of(train={"iterations": 12}, distillation=teaching))
+    trainer = trainer_of(PointEnv(), config_of(train={"iterations": 12}, distillation=teaching))
     first = trainer.iterate()
     for _ in range(11):
         last = trainer.iterate()
@@ -73,13 +79,13 @@ def test_it_learns_the_task_from_its_teacher_and_says_so():
 @pytest.mark.parametrize("more", [{}, {"ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16}}])
 def test_four_iterations_equal_two_and_two_more_after_a_resume(more):
     config = config_of(**more)
-    whole = Trainer(PointEnv(), config)
+    whole = trainer_of(PointEnv(), config)
     metrics = [comparable(whole.iterate()) for _ in range(4)]
-    first = Trainer(PointEnv(), config)
+    first = trainer_of(PointEnv(), config)
     assert [comparable(first.iterate()) for _ in range(2)] == metrics[:2]
     state = first.state()
     first.iterate()
-    second = Trainer(PointEnv(seed=9), config)
+    second = trainer_of(PointEnv(seed=9), config)
     second.iterate()
     second.load_state(state)
     assert [comparable(second.iterate()) for _ in range(2)] == metrics[2:]
@@ -89,7 +95,7 @@ def test_four_iterations_equal_two_and_two_more_after_a_resume(more):
 def test_nothing_draws_from_the_global_generator():
     torch.manual_seed(1)
     before = torch.get_rng_state()
-    Trainer(PointEnv(), config_of()).iterate()
+    trainer_of(PointEnv(), config_of()).iterate()
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -104,7 +110,7 @@ def test_nothing_draws_from_the_global_generator():
 )
 def test_what_is_not_finite_is_told_and_does_not_spread(poison, metric):
     env = PointEnv()
-    trainer = Trainer(env, config_of())
+    trainer = trainer_of(env, config_of())
     assert not any(name.startswith("non_finite/") for name in trainer.iterate())
     env.poison = {poison}
     metrics = trainer.iterate()
@@ -112,20 +118,19 @@ def test_what_is_not_finite_is_told_and_does_not_spread(poison, metric):
         assert metrics[metric] > 0
     assert metrics["train/invalid_samples"] >= 15
     assert metrics["train/skipped_updates"] == 0
+    state = trainer.state()
     for name in ("policy", "world_model", "uncertainty", "ppo"):
-        assert all(bool(t.isfinite().all()) for t in pack(getattr(trainer, name).state_dict())[1].values()), (
-            name
-        )
+        assert all(bool(t.isfinite().all()) for t in pack(state[name])[1].values()), name
     assert all(math.isfinite(value) for value in metrics.values())
     env.poison = set()
     trainer.iterate()  # its first sample is what the last poisoned step told
     trainer.iterate()
-    assert trainer.guard.bad_in_a_row == 0
+    assert trainer.env.guard.bad_in_a_row == 0
 
 
 def test_bad_iterations_in_a_row_are_an_error_that_names_them():
     env = PointEnv(seed=4)
-    trainer = Trainer(env, config_of(train={"patience": 3, "seed": 4}))
+    trainer = trainer_of(env, config_of(train={"patience": 3, "seed": 4}))
     trainer.iterate()
     env.poison = {"reward"}
     trainer.iterate()
@@ -137,7 +142,7 @@ def test_bad_iterations_in_a_row_are_an_error_that_names_them():
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
-    trainer = Trainer(
+    trainer = trainer_of(
         PointEnv(), config_of(distillation={"schedule": [[0, 0]]}, world_model={"enabled": False})
     )
     trainer.iterate()
@@ -145,11 +150,11 @@ def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
     before = [p.clone() for p in trainer.policy.actor.parameters()]
     assert trainer.iterate()["train/skipped_updates"] == 4
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.policy.actor.parameters(), strict=True))
-    assert trainer.guard.bad_in_a_row == 1
+    assert trainer.env.guard.bad_in_a_row == 1
 
 
 def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
-    trainer = Trainer(
+    trainer = trainer_of(
         PointEnv(), config_of(distillation={"schedule": [[0, 0]], "critic_warmup_iterations": 1})
     )
     actor, critic = trainer.policy.actor[0].weight.clone(), trainer.policy.critic[0].weight.clone()
@@ -161,27 +166,27 @@ def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
 
 
 def test_the_uncertainty_weighs_the_distillation():
-    trainer = Trainer(PointEnv(), config_of(distillation={"weighting": "uncertainty"}))
+    trainer = trainer_of(PointEnv(), config_of(distillation={"weighting": "uncertainty"}))
     for _ in range(4):
         trainer.iterate()
-    weight = trainer.rollout.weight
+    weight = trainer.rollout["weight"]
     assert float(weight.mean()) == pytest.approx(1.0, abs=1e-4) and float(weight.std()) > 0
 
 
 def test_the_world_models_columns_can_be_left_out():
-    trainer = Trainer(PointEnv(), config_of(world_model={"as_features": False}))
+    trainer = trainer_of(PointEnv(), config_of(world_model={"as_features": False}))
     trainer.iterate()
-    assert not trainer.rollout.x[..., -2:].any()
-    assert (trainer.collector.uncertainty > 0).all(), "the distillation is scaled all the same"
-    shown = Trainer(PointEnv(), config_of())
+    assert not trainer.rollout["x"][..., -2:].any()
+    assert (trainer.rollout["uncertainty"] > 0).all(), "the distillation is scaled all the same"
+    shown = trainer_of(PointEnv(), config_of())
     shown.iterate()
-    assert shown.rollout.x[1:, :, -2:].any()
+    assert shown.rollout["x"][1:, :, -2:].any()
 
 
 def test_first_inputs_of_an_episode_have_no_prediction_behind_them():
-    trainer = Trainer(PointEnv(), config_of())
+    trainer = trainer_of(PointEnv(), config_of())
     trainer.iterate()
-    ended, x = trainer.rollout.ended[:-1], trainer.rollout.x[1:]
+    ended, x = trainer.rollout["ended"][:-1], trainer.rollout["x"][1:]
     assert ended.any()
     assert not x[ended][:, -2:].any() and (x[~ended][:, -1] > 0).all()
 

@@ -18,6 +18,7 @@ from uuvtai.evaluation.evaluate import evaluate_now
 from uuvtai.learning import checkpoint
 from uuvtai.learning import runner as training
 from uuvtai.learning.checkpoint import pack
+from uuvtai.learning.environments import Simulated
 from uuvtai.learning.networks import TrainingError
 from uuvtai.learning.runner import TrainRequest, read_metrics
 from uuvtai.learning.trainer import Trainer
@@ -247,7 +248,7 @@ def test_an_evaluation_in_between_leaves_no_trace(small):
     states = []
     small.sim.set_scenes(config.train.scenes)
     for is_evaluated in (False, True):
-        trainer = Trainer(VectorEnv(small.sim), config)
+        trainer = Trainer(Simulated(VectorEnv(small.sim), config), config)
         with torch.no_grad():
             trainer.policy.actor[-1].bias[2] = 3.0  # down or up until something stops it: short episodes
         trainer.iterate()

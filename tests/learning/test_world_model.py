@@ -18,9 +18,7 @@ from uuvtai.learning.world_model import (
     SKILL,
     WorldModel,
     WorldModelLearner,
-    coverage,
-    mean_squared_standardised_residual,
-    standardised_residual,
+    calibration,
 )
 
 N_OBS, STEPS, N_ENV = 30, 16, 32
@@ -142,9 +140,8 @@ def test_it_learns_the_change_and_where_it_is_uncertain():
     error, before = ((target - other).square().mean(dim=0) for other in (predicted.mean, obs[:, :N_TARGET]))
     assert (error < before).all()
     assert min(metrics[f"{SKILL}{i}"] for i in range(N_TARGET)) > 0.2
-    assert mean_squared_standardised_residual(predicted.mean, predicted.log_var, target) == pytest.approx(
-        1.0, abs=SAMPLING
-    )
+    square, _ = calibration(predicted.mean, predicted.log_var, target)
+    assert square == pytest.approx(1.0, abs=SAMPLING)
     assert metrics["world_model/standardised_residual"] == pytest.approx(1.0, abs=SAMPLING)
     assert metrics["world_model/coverage_90"] == pytest.approx(0.9, abs=SAMPLING)
     assert metrics["world_model/latent_std"] > 0.1
@@ -313,32 +310,19 @@ SHARE_SAMPLING = 0.01
 """Four standard errors of a share of 100,000 samples are 0.0063 at most; of their mean square, 0.018 / 2."""
 
 
-def test_residual_of_a_variance_of_four():
+def test_residuals_by_hand():
     mean, log_var = torch.tensor([[1.0, 2.0]]), torch.tensor([[math.log(4.0), 0.0]])
-    target = torch.tensor([[3.0, 5.0]])
-    z = standardised_residual(mean, log_var, target)
-    np.testing.assert_allclose(z, [[1.0, 3.0]], rtol=1e-7)  # log(4) is a float32 here
-    assert mean_squared_standardised_residual(mean, log_var, target) == pytest.approx(5.0, rel=1e-7)
+    square, inside = calibration(mean, log_var, torch.tensor([[3.0, 5.0]]))  # 1 and 3 deviations
+    assert square == pytest.approx(5.0, rel=1e-7) and inside == 0.5
 
 
-def test_true_variance_gives_one_and_nominal_coverage():
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_true_variance_gives_one_and_nominal_coverage(factor):
+    """And deviations that are said to be half as large are too sure."""
     gen = torch.Generator().manual_seed(0)
     log_var = torch.randn(100_000, generator=gen)
     target = torch.exp(0.5 * log_var) * torch.randn(100_000, generator=gen) + 3.0
-    mean, levels = torch.full_like(target, 3.0), torch.tensor([0.5, 0.8, 0.9, 0.99])
-    assert mean_squared_standardised_residual(mean, log_var, target) == pytest.approx(
-        1.0, abs=2 * SHARE_SAMPLING
-    )
-    np.testing.assert_allclose(coverage(mean, log_var, target, levels), levels, atol=SHARE_SAMPLING)
-    too_sure = coverage(mean, log_var - math.log(4.0), target, levels)
-    inside = [2 * stats.norm.cdf(0.5 * stats.norm.ppf(0.5 + level / 2)) - 1 for level in levels.tolist()]
-    np.testing.assert_allclose(too_sure, inside, atol=SHARE_SAMPLING)
-
-
-def test_coverage_of_four_residuals():
-    zero = torch.zeros(4)
-    # |z| < 0.674, 1.645
-    inside = coverage(zero, zero, torch.tensor([0.5, -0.7, 1.5, 3.0]), torch.tensor([0.5, 0.9]))
-    assert inside.tolist() == [0.25, 0.75]
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        coverage(zero, zero, zero, torch.tensor([0.5, 1.0]))
+    found = calibration(torch.full_like(target, 3.0), log_var - 2 * math.log(factor), target)
+    inside = 2 * stats.norm.cdf(stats.norm.ppf(0.95) / factor) - 1
+    assert found[0] == pytest.approx(factor**2, abs=2 * factor**2 * SHARE_SAMPLING)
+    assert found[1] == pytest.approx(inside, abs=SHARE_SAMPLING)

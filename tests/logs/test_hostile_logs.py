@@ -420,6 +420,7 @@ def test_graphs_that_take_memory_or_time_never_reach_onnx_runtime(nodes, weights
                 f"pair_{name}": np.zeros(shape, bool if name == "has_last" else np.float32)
                 for name, shape in INPUTS.items()
             },
+            INPUTS,
         )
 
 
@@ -470,14 +471,14 @@ def test_a_pipe_in_an_exported_folder_is_not_waited_for(folder, name):
 
 
 @pytest.mark.parametrize("arrays", [
-    {"value": np.float32(1)},
-    {"obs": np.float32(1)},
-    {"begins": np.float32(1)},
-    {"obs": np.zeros((0, 40), np.float32), "begins": np.zeros(0, bool)},
-    {"obs": np.zeros((5, 3), np.float32)},
-    {"obs": np.array(["x"] * 40)},
-    {"action": np.array("word")},
-    {"obs": np.zeros((70_000, 40), np.float32), "begins": np.zeros(70_000, bool)},
+    {"pair_value": np.float32(1)},
+    {"pair_obs": np.float32(1)},
+    {"pair_has_last": np.float32(1)},
+    {"pair_obs": np.zeros((0, 40), np.float32), "pair_has_last": np.zeros(0, bool)},
+    {"pair_obs": np.zeros((64, 3), np.float32)},
+    {"pair_obs": np.array(["x"] * 64)},
+    {"pair_mean_action": np.array("word")},
+    {"pair_obs": np.zeros((70_000, 40), np.float32), "pair_has_last": np.zeros(70_000, bool)},
 ], ids=str)  # fmt: skip
 def test_golden_pairs_of_other_shapes_are_one_line(folder, arrays, capfd):
     golden = folder / "golden.npz"

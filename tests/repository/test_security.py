@@ -117,7 +117,7 @@ OWN_READS = {
     # what they have just written, or what lies in the package
     "logs/video.py": "os.open, av.open",
     "compile/cache.py": "path.read_bytes, json.loads",
-    "learning/export/folder.py": "Path(module.__file__ or '').read_bytes",
+    "learning/export/folder.py": "Path(run_policy.__file__).read_bytes",
     "vehicle/embedded/export.py": "out.read_bytes, (_ROOT / name).read_text",
     "console/doctor.py": "source.read_bytes",
     # one file of the system, by its name
@@ -680,8 +680,8 @@ SPECS = {
     b"{": "is not JSON",
     b"[" * 100_000: "is not JSON",
     b"[]": "is not the specification",
-    b'{"schema": 2}': "is not the specification of an exported policy of schema 3",
-    b'{"schema": 3, "files": {}}': "lists other files",
+    b'{"schema": 3}': "is not the specification of an exported policy of schema 4",
+    b'{"schema": 4, "files": {}}': "lists other files",
 }
 STRANGE = ["../../etc/passwd", "/etc/passwd", "sub/policy.onnx"]
 
@@ -766,9 +766,10 @@ def test_graphs_that_reach_beyond_themselves_are_refused():
             of_onnx(
                 helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)]).SerializeToString(),
                 pairs,
+                run_policy.Policy.inputs,
             )
     with pytest.raises(RuntimeError, match="is no ONNX graph"):
-        of_onnx(PICKLE, pairs)
+        of_onnx(PICKLE, pairs, run_policy.Policy.inputs)
 
 
 # ------------------------------------------------------------------------------------------------------- logs

@@ -7,6 +7,7 @@ import torch
 
 from tests.learning.test_train import config_of
 from tests.scripted_env import JUMP, N_TARGET, ScriptedEnv
+from uuvtai.learning.environments import Simulated
 from uuvtai.learning.trainer import Trainer
 
 STEPS, ITERATIONS = 16, 8
@@ -48,8 +49,8 @@ def trainer_of(script=SCRIPT, **sections):
         "train": {"iterations": ITERATIONS},
     }  # fmt: skip
     env = ScriptedEnv(script)
-    merged = {name: own.get(name, {}) | sections.get(name, {}) for name in {**own, **sections}}
-    trainer = Trainer(env, config_of(**merged))
+    config = config_of(**{name: own.get(name, {}) | sections.get(name, {}) for name in {**own, **sections}})
+    trainer = Trainer(Simulated(env, config), config)
     trainer.seen = watch_gradients(trainer.ppo)
     with torch.no_grad():  # or the residual and the uncertainty would both be near one
         trainer.world_model.decoder[-1].bias[N_TARGET:] += 1.0
@@ -80,13 +81,13 @@ def residual_and_uncertainty(model, obs, action, next_obs):
 
 def advantages(rollout, gamma=0.99, lam=0.95):
     """Standardised generalised advantages, sample by sample."""
-    out = torch.zeros_like(rollout.reward)
+    out = torch.zeros_like(rollout["reward"])
     for env in range(out.shape[1]):
         carried = 0.0
         for t in reversed(range(len(out))):
-            ahead = 0.0 if rollout.terminated[t, env] else gamma * float(rollout.next_value[t, env])
-            delta = float(rollout.reward[t, env]) + ahead - float(rollout.value[t, env])
-            carried = delta + (0.0 if rollout.ended[t, env] else gamma * lam * carried)
+            ahead = 0.0 if rollout["terminated"][t, env] else gamma * float(rollout["next_value"][t, env])
+            delta = float(rollout["reward"][t, env]) + ahead - float(rollout["value"][t, env])
+            carried = delta + (0.0 if rollout["ended"][t, env] else gamma * lam * carried)
             out[t, env] = carried
     return (out - out.mean()) / out.std(correction=0)
 
@@ -95,11 +96,11 @@ def gradients(policy, rollout, distilled):
     """Of the actor and of log_std by the textbook; ``distilled`` (T, N) multiplies imitation errors."""
     policy = copy.deepcopy(policy)
     advantage = advantages(rollout)
-    mean, log_std = policy.distribution(rollout.x)
+    mean, log_std = policy.distribution(rollout["x"])
     normal = torch.distributions.Normal(mean, log_std.exp())
-    ratio = (normal.log_prob(rollout.action).sum(-1) - rollout.log_prob).exp()
+    ratio = (normal.log_prob(rollout["action"]).sum(-1) - rollout["log_prob"]).exp()
     surrogate = -torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
-    imitation = ((mean - rollout.teacher_action) ** 2).sum(-1)
+    imitation = ((mean - rollout["teacher_action"]) ** 2).sum(-1)
     (surrogate - 0.01 * normal.entropy().sum(-1).mean() + (distilled * imitation).mean()).backward()
     return torch.cat([policy.log_std.grad, *(p.grad.flatten() for p in policy.actor.parameters())])
 
@@ -155,13 +156,14 @@ def test_the_scale_is_capped_and_follows_the_running_mean():
 def first_features(trainer, env):
     """Residual and uncertainty (T, N) that the first iteration of an equal trainer meets."""
     surrogate, env = trainer_of(uncertainty={"ema": 1.0, "max_scale": 50.0})
-    collect, models = surrogate.collector.collect, []
+    begin, models = surrogate._begin, []
 
     def note():
+        found = begin()
         models.append(copy.deepcopy(surrogate.world_model))
-        return collect()
+        return found
 
-    surrogate.collector.collect = note
+    surrogate._begin = note
     surrogate.iterate()
     return residual_and_uncertainty(
         models[0], *(joined(env.log[-STEPS:], name) for name in ("obs", "action", "final_obs"))
@@ -199,20 +201,20 @@ def test_the_rollout_is_what_happened():
         ("teacher_action", "behavior"),
         *((n, n) for n in ("action", "reward", "terminated", "ended")),
     ):
-        assert torch.equal(getattr(rollout, name), joined(moments, of_log)), name
-    assert torch.equal(rollout.x[..., :-2], joined(moments, "obs"))
-    assert rollout.ended.any() and (rollout.ended & ~rollout.terminated).any()
+        assert torch.equal(rollout[name], joined(moments, of_log)), name
+    assert torch.equal(rollout["x"][..., :-2], joined(moments, "obs"))
+    assert rollout["ended"].any() and (rollout["ended"] & ~rollout["terminated"]).any()
     features = torch.stack(
         residual_and_uncertainty(model, *(joined(moments, name) for name in ("obs", "action", "final_obs"))),
         -1,
     )
     led_to = torch.cat([joined(moments, "final_obs"), features], -1)
     with torch.no_grad():
-        expected = policy.value(led_to) * ~rollout.terminated
-    assert torch.allclose(rollout.next_value, expected, atol=1e-4), (
+        expected = policy.value(led_to) * ~rollout["terminated"]
+    assert torch.allclose(rollout["next_value"], expected, atol=1e-4), (
         "a timeout is bootstrapped from the observation it ended in"
     )
-    assert rollout.ended[-1].any() and expected.std() > 0.01
+    assert rollout["ended"][-1].any() and expected.std() > 0.01
 
 
 def test_the_world_models_columns_come_from_the_policys_own_action():
@@ -221,7 +223,7 @@ def test_the_world_models_columns_come_from_the_policys_own_action():
     obs, action, behavior, final = (
         joined(moments, name) for name in ("obs", "action", "behavior", "final_obs")
     )
-    found, on = trainer.rollout.x[1:, :, -2:], ~trainer.rollout.ended[:-1]
+    found, on = trainer.rollout["x"][1:, :, -2:], ~trainer.rollout["ended"][:-1]
 
     def columns(by):
         return torch.stack(residual_and_uncertainty(model, obs, by, final), -1)[:-1]

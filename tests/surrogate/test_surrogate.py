@@ -7,6 +7,7 @@ import pytest
 import taichi as ti
 import torch
 
+from tests.learning.test_train import comparable, same
 from tests.oracles import hull_rule as reference
 from tests.oracles.world import plan_distances
 from tests.repository.test_architecture import TRUTH
@@ -16,25 +17,31 @@ from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
+from uuvtai.evaluation.evaluate import evaluate_now
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
 from uuvtai.kernels.core.noise import episode_key
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
-from uuvtai.learning import checkpoint, surrogate_trainer
+from uuvtai.learning import checkpoint, distillation, environments, runner
 from uuvtai.learning.agents import load_set_agent
 from uuvtai.learning.checkpoint import CheckpointError
+from uuvtai.learning.distillation import Student, imitate, wish_of
+from uuvtai.learning.environments import InSurrogate, SimulatedSet
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.runner import TrainRequest, train
 from uuvtai.learning.set_networks import SetActor
-from uuvtai.learning.surrogate_trainer import Student, SurrogateTrainer, imitate, wish_of_command
+from uuvtai.learning.trainer import Trainer
 from uuvtai.sim.stages import bind, members_of
 from uuvtai.surrogate import motion, observation, sensing
 from uuvtai.surrogate.arrays import (
     AT_AHEAD,
     AT_ARC,
     AT_ASIDE,
+    AT_FLIP,
     AT_LEFT,
     AT_POS,
+    AT_YAW,
     EGO_WIDTH,
     TRACK_WIDTH,
     ObserverIO,
@@ -164,7 +171,7 @@ def bank(small):
 @pytest.fixture(scope="module")
 def trainer(config, bank):
     """After two iterations."""
-    made = SurrogateTrainer(config, bank)
+    made = Trainer(InSurrogate(config, bank), config)
     made.iterate()
     made.iterate()
     return made
@@ -466,20 +473,73 @@ def test_what_drives_knows_nothing_that_only_the_simulator_knows(saved):
 
 
 def test_the_critic_alone_feels_the_truth(trainer):
-    view = trainer.surrogate.look()
-    other = view.truth + torch.randn(view.truth.shape) * (view.truth[..., 2:3] > 0)
-    assert not torch.equal(trainer.critic(view.obstacles, view.own, other), trainer.critic(*view))
+    view, policy = trainer.env.view, trainer.policy
+    truth = view["truth"] + torch.randn(view["truth"].shape) * (view["truth"][..., 2:3] > 0)
+    other = view | {"truth": truth}
+    assert not torch.equal(policy.value_of(other), policy.value_of(view))
+    assert torch.equal(policy.mean_of(other), policy.mean_of(view))
 
 
 def test_learning_goes_on_from_a_state_bit_for_bit(trainer, config, bank):
-    other = SurrogateTrainer(config, bank)
+    other = Trainer(InSurrogate(config, bank), config)
     other.load_state(copy.deepcopy(trainer.state()))
     kept = copy.deepcopy(trainer.state())
     ours, theirs = trainer.iterate(), other.iterate()
+    same(trainer.state(), other.state())
     trainer.load_state(kept)
-    same = [name for name in ours if not name.startswith("time/")]
-    assert {n: ours[n] for n in same} == {n: theirs[n] for n in same}
+    assert comparable(ours) == comparable(theirs)
     assert theirs["train/std"] >= config.policy.min_std
+
+
+def simulated(small, config):
+    """A trainer of a policy over a set, in the small simulator."""
+    small.begin(range(small.N), seed=5)
+    return Trainer(SimulatedSet(VectorEnv(small.sim, autoreset=False), config), config)
+
+
+def test_another_runs_policy_goes_on_learning_in_the_simulator(small, saved):
+    """``--start RUN``, and from there bit for bit."""
+    found = saved()
+    changes = {
+        "world.dynamic_capacity": 9, "world_model.enabled": False, "policy.hold_steps": 5,
+        "ppo.rollout_steps": 4, "ppo.epochs": 1, "ppo.minibatches": 1, "train.num_envs": small.N,
+        "train.evaluate_episodes": 2,
+    }  # fmt: skip
+    _, config = runner._started(found.path, load_training("curriculum", changes), None)
+    assert config.encoder == "set" and config.surrogate.obstacle_hidden == 8
+    trainer = simulated(small, config)
+    trainer.start(found)
+    wanted = found.model()["policy"]
+    assert all(torch.equal(part, wanted[name]) for name, part in trainer.policy.actor.state_dict().items())
+    metrics = trainer.iterate()
+    assert metrics["time/env_steps"] == 4 * 5 * small.N and metrics["train/invalid_samples"] == 0
+    assert metrics["train/distill_loss"] > 0, "the tree says what it would wish"
+    assert "eval/success_rate" in evaluate_now(trainer, config)
+    state = copy.deepcopy(trainer.state())
+    ours = trainer.iterate()
+    after = trainer.state()
+    other = simulated(small, config)
+    other.load_state(state)
+    theirs = other.iterate()
+    assert comparable(ours) == comparable(theirs)
+    same(after, other.state())
+
+
+def test_what_cannot_be_begun_with_is_refused(bank, saved, tmp_path):
+    with pytest.raises(UserError, match="policies alone"):
+        runner._started(saved().path, load_training("best"), None)
+    config = load_training("surrogate", overrides=SMALL | {"policy.encoder": "mlp"})
+    with pytest.raises(UserError, match="no observation vectors"):
+        InSurrogate(config, bank)
+    with pytest.raises(UserError, match="holds no usable checkpoint"):
+        runner._started(tmp_path / "none", load_training("ppo"), type("Watch", (), {"note": print}))
+
+
+def test_the_critic_may_be_kept_from_the_truth(bank):
+    config = load_training("surrogate", overrides=SMALL | {"ppo.critic_sees_truth": False})
+    trainer = Trainer(InSurrogate(config, bank), config)
+    trainer.iterate()
+    assert trainer.policy.critic.net.obstacle[0].in_features == OBSTACLE_WIDTH
 
 
 # ------------------------------------------------------------------------------------- warm start
@@ -491,7 +551,9 @@ def test_a_command_becomes_the_wish_with_its_velocity():
     yaw = torch.from_numpy(rng.uniform(-np.pi, np.pi, 200).astype(np.float32))
     flip = torch.from_numpy(rng.choice([-1.0, 1.0], (200, 2)).astype(np.float32))
     out = torch.zeros(200, 3)
-    velocities(wish_of_command(command, yaw, flip, vehicle), flip, vehicle, out)
+    ego = torch.zeros(200, EGO_WIDTH)
+    ego[:, AT_YAW], ego[:, AT_FLIP : AT_FLIP + 2] = yaw, flip
+    velocities(wish_of(command, ego, vehicle), flip, vehicle, out)
     surge, sway = vehicle.max_surge_m_s * command[:, 0], vehicle.max_sway_m_s * command[:, 1]
     expected = [
         yaw.cos() * surge - yaw.sin() * sway,
@@ -502,13 +564,13 @@ def test_a_command_becomes_the_wish_with_its_velocity():
 
 
 def test_it_learns_what_the_tree_says(small, monkeypatch):
-    monkeypatch.setattr(surrogate_trainer, "PASSES", 1)
+    monkeypatch.setattr(distillation, "PASSES", 1)
     losses, decisions = [], []
     config = load_training(
         "surrogate", overrides=SMALL | {"train.num_envs": small.N, "surrogate.warm_start_waves": 2}
     )
     for passes in (1, 20):
-        monkeypatch.setattr(surrogate_trainer, "LAST_PASSES", passes)
+        monkeypatch.setattr(distillation, "LAST_PASSES", passes)
         actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
         std = actor.log_std.detach().clone()
         found = imitate(actor, config, ((8, 6, 0.6),), {"pool": small.sim})
@@ -589,7 +651,7 @@ def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
-        ("world_model.enabled", True, "the surrogate has none"),
+        ("world_model.enabled", True, "over a set of obstacles has none"),
         ("policy.hold_steps", 4, "decides every 0.1 s"),
         ("episode.control_dt_s", 0.01, "decides every 0.1 s"),
         ("ppo.minibatches", 200, "only 128 samples"),
@@ -597,12 +659,13 @@ def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
 )
 def test_what_the_surrogate_lacks_is_refused(bank, key, value, says):
     with pytest.raises(UserError, match=says):
-        SurrogateTrainer(load_training("surrogate", overrides=SMALL | {key: value}), bank)
+        config = load_training("surrogate", overrides=SMALL | {key: value})
+        Trainer(InSurrogate(config, bank), config)
 
 
 def test_the_trainer_knows_how_long_the_surrogate_holds_a_decision():
-    assert surrogate_trainer.HOLD_STEPS == motion.STEPS
-    assert surrogate_trainer.DECISION_S == sensing.DT_S
+    assert environments.HOLD_STEPS == motion.STEPS
+    assert environments.DECISION_S == sensing.DT_S
 
 
 def test_it_is_no_policy_of_one_observation(saved):

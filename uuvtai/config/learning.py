@@ -23,6 +23,8 @@ SearchScene = tuple[Annotated[str, Field(min_length=1, max_length=200)], Count, 
 class PolicyConfig(Section):
     """Actor and critic."""
 
+    encoder: Literal["mlp", "set"] | None = None
+    """of an observation vector, or over a set of obstacles; None = set in the surrogate, else mlp"""
     hidden: tuple[PositiveCount, ...] = (256, 256)
     """widths of both networks' layers (Table app_repro)"""
     activation: Literal["elu", "tanh", "relu"] = "elu"
@@ -50,6 +52,8 @@ class PpoConfig(Section):
     max_grad_norm: Positive = 1.0
     target_kl: NonNegative = 0.0
     """0 = fixed learning rate; else the rate follows the KL divergence of every update (as rsl_rl does)"""
+    critic_sees_truth: bool = True
+    """the critic is told where obstacles truly are and will be, where the environment can (the surrogate)"""
     shuffle: bool = False
     """draw minibatches at random instead of as contiguous blocks, each of all envs in a span of steps"""
     bfloat16: bool = False
@@ -222,12 +226,8 @@ class ForecastTrainingConfig(Section):
     """world presets whose episodes are run in turn, ``train.scenes`` dealt out to the envs"""
     episode_steps: PositiveCount = 1500
     """control steps after which an episode is left"""
-    memory: Annotated[int, Field(ge=1024, le=2**23)] = 2**21
-    """moments of tracks that are kept to learn from"""
     minibatches: PositiveCount = 3000
     """steps of the network per iteration"""
-    minibatch: PositiveCount = 512
-    """moments in one of them"""
     learning_rate: Positive = 2e-3
     """falls linearly over the run"""
 
@@ -247,11 +247,12 @@ class LearningConfig(Config):
 
     @property
     def learner(self) -> str:
-        """Section that says what is learned: forecast network, parameter_search or surrogate; else policy, in
-        the simulator."""
-        sections = {
-            "forecast_training": self.forecast_training,
-            "parameter_search": self.parameter_search,
-            "surrogate": self.surrogate,
-        }
-        return next((name for name, section in sections.items() if section.enabled), "policy")
+        """Which trainer learns (``learning/runner.py``): ppo, search or forecast."""
+        if self.forecast_training.enabled:
+            return "forecast"
+        return "search" if self.parameter_search.enabled else "ppo"
+
+    @property
+    def encoder(self) -> str:
+        """What a policy's network takes: mlp, an observation vector; set, a set of obstacles."""
+        return self.policy.encoder or ("set" if self.surrogate.enabled else "mlp")

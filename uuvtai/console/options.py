@@ -153,7 +153,7 @@ TrainResume = Annotated[Path | None, _resume("Continue this training with its ow
 Iterations = Annotated[
     int | None, Option("--iterations", help="Total iterations. Schedules still span train.iterations.")
 ]
-TrainEnvs = Annotated[int | None, Option("--num-envs", help="Parallel environments (train.num_envs).")]
+TrainStart = Annotated[Path | None, Option("--start", help="Run whose policy to begin with.")]
 TrainSeed = Annotated[int | None, Option("--seed", help="Random seed (train.seed).")]
 TrainWorld = Annotated[
     str | None, _preset("--world", "world", f"World: {_WORLDS}, or a YAML file \\[default: the preset's].")

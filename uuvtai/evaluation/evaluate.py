@@ -372,14 +372,12 @@ def _recorder(
 def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been."""
-    from uuvtai.learning.policy_agent import PolicyAgent
+    from uuvtai.learning.environments import Simulated, SimulatedSet
     from uuvtai.learning.trainer import Trainer
 
-    if not isinstance(trainer, Trainer):  # the others run episodes by themselves
-        return trainer.evaluate()
-    env = trainer.env
-    model = trainer.world_model if config.world_model.as_features else None
-    agent = PolicyAgent(trainer.policy, model, env.num_envs, env.device)
+    if not isinstance(trainer, Trainer) or not isinstance(trainer.env, Simulated | SimulatedSet):
+        return trainer.evaluate()  # the others run episodes by themselves
+    env, agent = trainer.env.env, trainer.env.agent(trainer.policy)  # type: ignore[arg-type]
     held = env.capture()
     try:
         env.sim.sleep()

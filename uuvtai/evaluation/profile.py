@@ -275,10 +275,11 @@ def _learning_rates(config: LearningConfig, sim: Sim) -> dict[str, float]:
     """Env-steps per second with a policy that decides, and with everything that learns as well: one iteration
     of the training preset."""
     from uuvtai.envs.vector_env import VectorEnv
+    from uuvtai.learning.environments import Simulated
     from uuvtai.learning.trainer import Trainer
 
     with VectorEnv(sim) as env:
-        trainer = Trainer(env, config)
+        trainer = Trainer(Simulated(env, config), config)
         trainer.iterate()  # allocates
         timed = trainer.iterate()
     samples = config.ppo.rollout_steps * config.policy.hold_steps * sim.num_envs

@@ -9,7 +9,7 @@ import torch
 
 from uuvtai.config.behavior import FAST, SLOW, TUNED
 from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
-from uuvtai.learning.policy_agent import AgentDecision, PolicyAgent, by_chunk, load_agent
+from uuvtai.learning.policy_agent import AgentDecision, HeldAgent, by_chunk, load_agent
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetActor, actor_of
 
 if TYPE_CHECKING:
@@ -21,36 +21,29 @@ _FEWEST = 25
 """numbers that a checkpoint holds; those that came later are not changed where it lacks them"""
 
 
-class TunedAgent:
-    """Lets the simulator's tree drive, with other numbers from the first decision after a reset on; used as
-    ``PolicyAgent`` is."""
-
-    world_model = None
+class TunedAgent(HeldAgent):
+    """Lets the simulator's tree drive, with other numbers from the first decision after a reset on."""
 
     def __init__(self, log_factor: torch.Tensor, sim: Sim) -> None:
         """``log_factor`` (n_tuned, 2) natural logarithms of the factors, in the order of ``TUNED``, for slow
         obstacles and for fast ones."""
+        super().__init__(sim.num_envs, 1, sim.device)
         self.simulator = sim
         rows = sim.s.behavior.tuned.shape[0]
         self.log_factor = log_factor.float().cpu().numpy()[None].repeat(rows, axis=0)
         """(rows, n_tuned, 2) of every row that is allocated"""
         nothing = torch.zeros(sim.num_envs, device=sim.device)
-        std = torch.zeros(4, device=sim.device)
-        self.decision = AgentDecision(sim.action, nothing, std, nothing, nothing)
+        self.decision = AgentDecision(sim.action, nothing, nothing.new_zeros(4), nothing, nothing)
         """value, residual and uncertainty are 0: nobody says them"""
 
     def reset(self, rows: torch.Tensor) -> None:
-        """New episodes have begun in the rows (num_envs,) where this is not 0: a reset has set their numbers
-        back."""
+        """As ``HeldAgent``: a reset has set the numbers of these rows back."""
         self.simulator.put(self.simulator.s.behavior.tuned, self.log_factor)
 
     def decide(self, obs: torch.Tensor) -> AgentDecision:
-        """What the tree has chosen; changes nothing."""
+        """What the tree has chosen."""
         self.decision = self.decision._replace(action=self.simulator.action.clone())
         return self.decision
-
-    def advance(self) -> None:
-        """The last decision has been carried out."""
 
 
 def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
@@ -102,11 +95,8 @@ def tree_row() -> ObservationColumn:
 # laid on the hull by the fixed rule in every control step.
 
 
-class SetAgent:
-    """Drives the rows of a simulator; used as ``PolicyAgent`` is, but it looks at tracks, map and pose
-    itself, as the vehicle has them."""
-
-    world_model = None
+class SetAgent(HeldAgent):
+    """Drives the rows of a simulator; it looks at tracks, map and pose itself, as the vehicle has them."""
 
     def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
         """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
@@ -114,63 +104,65 @@ class SetAgent:
         from uuvtai.sim.stages import bind
         from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO
 
-        self.actor, self._hold, self._gap_m = actor, hold_steps, gap_m
+        super().__init__(sim.num_envs, hold_steps, sim.device)
+        self.actor, self._gap_m = actor, gap_m
         self._io = bind(ObserverIO, sim.s, sim.config)
 
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(sim.num_envs, *shape, device=sim.device)
 
-        self._ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_OBSTACLE, RAW_WIDTH), zeros(N_RAY)
+        self.ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_OBSTACLE, RAW_WIDTH), zeros(N_RAY)
         self.obstacles, self.own = zeros(N_OBSTACLE, OBSTACLE_WIDTH), zeros(EGO_COLUMNS)
         """columns that the last decision was made from"""
         self.wish, self._last, self._command = zeros(NUM_WISHES), zeros(NUM_WISHES), zeros(4)
         """what is wished now, and what the vehicle is told of its last decision; (rows, NUM_WISHES)"""
-        self._age = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
         std = torch.cat([actor.log_std.detach().exp(), torch.zeros(1, device=sim.device)])
-        nothing = zeros()
-        self.decision = AgentDecision(self._command, nothing, std, nothing, nothing)
+        self.decision = AgentDecision(self._command, zeros(), std, zeros(), zeros())
         """value, residual and uncertainty are 0: what drives has no critic and no world model"""
 
     def reset(self, rows: torch.Tensor) -> None:
-        """New episodes have begun in the rows (num_envs,) where this is not 0."""
-        kept = rows.to(self._age.device) == 0
-        self._age *= kept
-        self._last *= kept[:, None]
+        """As ``HeldAgent``."""
+        super().reset(rows)
+        self._last *= (self._age > 0)[:, None]
 
     @torch.no_grad()
-    def decide(self, _obs: torch.Tensor) -> AgentDecision:
-        """Command for all rows; changes nothing that the next one depends on."""
-        from uuvtai.surrogate.observation import command_hull
-
+    def decide(self, obs: torch.Tensor) -> AgentDecision:
+        """As ``HeldAgent``; ``obs`` is not looked at."""
         due = self._due()
-        if bool(due.any()):
-            self._look(due)
-            rows = due.nonzero().flatten()
-            wish = by_chunk(self.actor, self.obstacles[rows], self.own[rows]).clamp(-MOST_WISH, MOST_WISH)
-            self.wish[rows] = wish
-        command_hull(self._io, self._gap_m, self.wish, self._command)
-        self.decision = self.decision._replace(action=self._command.clone())
+        if len(due):
+            self.look()
+            (wish,) = by_chunk(lambda *row: (self.actor(*row),), self.obstacles[due], self.own[due])
+            self.wish[due] = wish.clamp(-MOST_WISH, MOST_WISH)
+        self.decision = self.decision._replace(action=self.command())
         return self.decision
 
-    def advance(self) -> None:
-        """The last decision has been carried out."""
-        long = self.wish[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
-        done = torch.cat([self.wish[:, :2] / long, self.wish[:, 2:].clamp(-1.0, 1.0)], dim=1)
-        self._last = torch.where(self._due()[:, None], done, self._last)
-        self._age += 1
+    def command(self) -> torch.Tensor:
+        """(rows, 4) of the wish, by the hull rule, where each vehicle is now."""
+        from uuvtai.surrogate.observation import command_hull
 
-    def _look(self, due: torch.Tensor) -> None:
-        """Columns of the rows (num_envs,) bool where ``due``, as they are now."""
+        command_hull(self._io, self._gap_m, self.wish, self._command)
+        return self._command.clone()
+
+    def memory(self) -> dict[str, torch.Tensor]:
+        """What the next decisions depend on."""
+        return {"last": self._last, "age": self._age}
+
+    def advance(self) -> None:
+        """As ``HeldAgent``."""
+        due, wish = self._due(), self.wish
+        long = wish[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
+        self._last[due] = torch.cat([wish[:, :2] / long, wish[:, 2:].clamp(-1.0, 1.0)], dim=1)[due]
+        super().advance()
+
+    def look(self) -> None:
+        """Columns of the rows whose decision is due, as they are now."""
         from uuvtai.surrogate.arrays import AT_LAST
         from uuvtai.surrogate.observation import observe_obstacles, write_set_columns
 
-        self._ego[:, AT_LAST : AT_LAST + NUM_WISHES] = self._last
-        observe_obstacles(self._io, due.int(), self._ego, self._raw, self._ray)
-        write_set_columns(self._ego, self._raw, self._ray, self.obstacles, self.own)
-
-    def _due(self) -> torch.Tensor:
-        """(num_envs,) rows whose decision is not held any more."""
-        return self._age % self._hold == 0
+        self.ego[:, AT_LAST : AT_LAST + NUM_WISHES] = self._last
+        due = (self._age % self._hold == 0).int()
+        observe_obstacles(self._io, due, self.ego, self._raw, self._ray)
+        write_set_columns(self.ego, self._raw, self._ray, self.obstacles, self.own)
 
 
 def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:
@@ -186,15 +178,15 @@ def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:
 # ------------------------------------------------------------------------------------------------------------
 
 
-def load_trained(checkpoint: Checkpoint, sim: Sim) -> PolicyAgent | TunedAgent | SetAgent:
+def load_trained(checkpoint: Checkpoint, sim: Sim) -> HeldAgent:
     """The agent of a checkpoint, whatever learned it. Raises CheckpointError for one that does not fit."""
     from uuvtai.envs.vector_env import VectorEnv
 
-    learner = checkpoint.config.learner
-    if learner == "parameter_search":
+    config = checkpoint.config
+    if config.learner == "search":
         return load_tuned(checkpoint, sim)
-    if learner == "surrogate":
+    if config.learner == "ppo" and config.encoder == "set":
         return load_set_agent(checkpoint, sim)
-    if learner == "policy":
+    if config.learner == "ppo":
         checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
     return load_agent(checkpoint, sim.num_envs, sim.device)

@@ -10,15 +10,27 @@ batches lambda_t scales the learning rate instead.
 from __future__ import annotations
 
 import bisect
+import time
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from uuvtai.common.enums import SUCCESS
 from uuvtai.common.errors import SettingError
-from uuvtai.config.learning import DistillationConfig, UncertaintyConfig
-from uuvtai.learning.networks import PlainAdam
+from uuvtai.config.learning import DistillationConfig, LearningConfig, UncertaintyConfig
+from uuvtai.learning.agents import SetAgent
+from uuvtai.learning.networks import PlainAdam, Policy, PolicyStep, View
+from uuvtai.learning.parameter_search import run_search_episodes, simulator_of
+from uuvtai.learning.policy_agent import AgentDecision
+from uuvtai.learning.rollout import Rollout
+from uuvtai.learning.set_networks import NUM_WISHES, SetActor
+
+if TYPE_CHECKING:
+    from uuvtai.config import VehicleConfig
+    from uuvtai.sim.setup import Scene
+    from uuvtai.sim.sim import Sim
 
 MAX_WEIGHT_RATIO = 4.0
 """a sample counts at most this many times the mean signal, and at least its inverse, before the weights' mean
@@ -29,12 +41,6 @@ def imitation_error(mean: torch.Tensor, teacher_action: torch.Tensor) -> torch.T
     """||mean - teacher_action||^2 of every sample: (..., 4) and (..., 4) to (...,), in squared parts of the
     vehicle's limits."""
     return (mean - teacher_action).square().sum(dim=-1)
-
-
-def distillation_loss(mean: torch.Tensor, teacher_action: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Weighted mean of the imitation error, a scalar: means (B, 4), teacher actions (B, 4), weights (B,) of
-    mean one."""
-    return (weight * imitation_error(mean, teacher_action)).mean()
 
 
 def sample_weight(signal: torch.Tensor) -> torch.Tensor:
@@ -70,23 +76,15 @@ def weights_of(kind: Weighting, uncertainty: torch.Tensor) -> torch.Tensor:
 class TeacherBatches:
     """Gradient steps on batches of (input, teacher action) beside those of PPO."""
 
-    def __init__(self, policy: nn.Module, config: DistillationConfig) -> None:
-        """``policy.distribution(x)`` gives the means."""
+    def __init__(self, policy: Policy, config: DistillationConfig) -> None:
         self.policy, self.config = policy, config
         self.optimiser = PlainAdam(policy.parameters(), lr=config.learning_rate)
         self.skipped = 0
         """steps left out because the gradient was not finite"""
 
-    def update(
-        self,
-        x: torch.Tensor,
-        teacher_action: torch.Tensor,
-        weight: torch.Tensor,
-        strength: float,
-        generator: torch.Generator,
-    ) -> None:
-        """``config.steps`` steps on random batches of the rows of x (M, n_in), teacher_action (M, 4), weight
-        (M,).
+    def update(self, samples: View, strength: float, generator: torch.Generator) -> None:
+        """``config.steps`` steps on random batches of samples (M, ...): the policy's inputs,
+        ``teacher_action`` and ``weight``.
 
         ``strength`` is lambda_t; at 0 nothing happens, and nothing is drawn from the (CPU) generator.
         """
@@ -94,16 +92,17 @@ class TeacherBatches:
             return
         for group in self.optimiser.param_groups:
             group["lr"] = self.config.learning_rate * strength
+        teacher, weight = samples["teacher_action"], samples["weight"]
         for _ in range(self.config.steps):
-            rows = torch.randint(len(x), (self.config.batch,), generator=generator).to(x.device)
-            self._step(x[rows], teacher_action[rows], weight[rows])
+            rows = torch.randint(len(weight), (self.config.batch,), generator=generator).to(weight.device)
+            self._step({n: samples[n][rows] for n in self.policy.inputs}, teacher[rows], weight[rows])
 
-    def _step(self, x: torch.Tensor, teacher_action: torch.Tensor, weight: torch.Tensor) -> None:
+    def _step(self, view: View, teacher_action: torch.Tensor, weight: torch.Tensor) -> None:
         self.optimiser.zero_grad(
             set_to_none=True
         )  # the critic has no part in this loss: without a gradient Adam passes it over
-        mean = self.policy.distribution(x)[0]  # type: ignore[operator]
-        distillation_loss(mean, teacher_action, weight).backward()
+        mean = self.policy.mean_of(self.policy.prepared(view))
+        (weight * imitation_error(mean, teacher_action)).mean().backward()
         gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]
         if bool(torch.isfinite(torch.nn.utils.get_total_norm(gradients))):
             self.optimiser.step()
@@ -211,3 +210,165 @@ class Uncertainty(nn.Module):
     def scale(self) -> float:
         """s_t: factor of the distillation weight, in [1, max_scale]."""
         return min(max(1.0 + self.config.gain * float(self.mean), 1.0), self.config.max_scale)
+
+
+class Distillation:
+    """The loss as a part of a training: its weight, the teacher batches, and what is told of it."""
+
+    def __init__(self, policy: Policy, config: LearningConfig, node_names: Sequence[str]) -> None:
+        """``node_names``: of the tree that teaches."""
+        self.config, device = config.distillation, policy.log_std.device
+        self.uncertainty = Uncertainty(config.uncertainty).to(device)
+        self.teacher_batches = TeacherBatches(policy, config.distillation)
+        self.leaf_errors = LeafErrors(node_names, device)
+
+    def parts(self) -> dict[str, Any]:
+        """What is kept, by name in a checkpoint."""
+        return {"teacher_batches": self.teacher_batches, "uncertainty": self.uncertainty}
+
+    def watch(self, step: PolicyStep, view: View) -> None:
+        """Note the error of a decision."""
+        self.leaf_errors.add(imitation_error(step.mean, view["teacher_action"]), view["leaf"])
+
+    def weigh(self, rollout: Rollout, share: float) -> tuple[float, dict[str, float]]:
+        """Weigh the samples; lambda_t s_t when ``share`` of the run is over, and both for the log."""
+        sigma = rollout["uncertainty"]
+        rollout["weight"].copy_(weights_of(self.config.weighting, sigma))
+        self.uncertainty.update(sigma.nanmean().nan_to_num()[None])
+        weight, scale = piecewise_linear(self.config.schedule, share), self.uncertainty.scale
+        return weight * scale, {
+            "distillation/lambda": weight,
+            "distillation/scale": scale,
+            "distillation/lambda_risk": weight * scale,
+        }
+
+    def update(self, rollout: Rollout, strength: float, generator: torch.Generator) -> dict[str, float]:
+        """Learn from teacher batches, by lambda_t s_t; metrics of the rollout."""
+        samples = rollout.flat()
+        samples["weight"] = torch.where(torch.isfinite(samples["reward"]), samples["weight"], 0.0)
+        self.teacher_batches.update(samples, strength, generator)
+        return self.leaf_errors.take()
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Warm start of a policy over a set of obstacles: imitation of the behavior tree in the simulator.
+#
+# DAgger (Ross, Gordon & Bagnell 2011, AISTATS): whoever drives, the tree says what it would do, and the
+# actor's mean is fitted to all that was said so far. The tree drives in the first wave, the student more and
+# more.
+
+
+WAVE_EPISODES = 256
+"""episodes of a wave, at most ``train.num_envs``"""
+PASSES, LAST_PASSES = 2, 6
+"""through all samples after a wave, and after the last one"""
+MINIBATCH, RATE = 512, 1e-3
+SEED = 7_000_003
+"""added to ``train.seed`` for episodes and draws of the warm start"""
+
+
+class Sample(NamedTuple):
+    """Decisions to imitate."""
+
+    obstacles: torch.Tensor
+    """(n, lanes, OBSTACLE_WIDTH)"""
+    own: torch.Tensor
+    """(n, EGO_COLUMNS)"""
+    wish: torch.Tensor
+    """(n, 3) what the tree asks for, as the policy would say it"""
+
+
+def wish_of(command: torch.Tensor, ego: torch.Tensor, vehicle_cfg: VehicleConfig) -> torch.Tensor:
+    """(n, 3) wishes whose velocity is that of commands (n, 4) of vehicles (n, EGO_WIDTH); the yaw rate is
+    left out. The inverse of ``motion.wished_velocity``."""
+    from uuvtai.surrogate.arrays import AT_FLIP, AT_YAW
+
+    fastest = (vehicle_cfg.max_surge_m_s**2 + vehicle_cfg.max_sway_m_s**2) ** 0.5
+    surge, sway = vehicle_cfg.max_surge_m_s * command[:, 0], vehicle_cfg.max_sway_m_s * command[:, 1]
+    c, s = ego[:, AT_YAW].cos(), ego[:, AT_YAW].sin()
+    level = torch.stack([c * surge - s * sway, s * surge + c * sway], dim=1)
+    return torch.cat([ego[:, AT_FLIP : AT_FLIP + 2] * level / fastest, command[:, 2:3]], dim=1)
+
+
+class Student(SetAgent):
+    """Drives with the tree, drawn anew for every decision, and keeps what the tree says of each."""
+
+    def __init__(self, actor: SetActor, sim: Sim, config: LearningConfig, generator: torch.Generator) -> None:
+        super().__init__(actor, sim, config.policy.hold_steps, config.surrogate.vertical_gap_m)
+        self.simulator, self._generator = sim, generator
+        self.tree_share = 1.0
+        """chance that the tree drives, beta of DAgger"""
+        self.running = torch.ones(sim.num_envs, dtype=torch.bool)
+        """rows whose episode has not ended"""
+        self.number = torch.zeros(sim.num_envs, dtype=torch.int64)
+        """episode of every row"""
+        self.samples: list[Sample] = []
+        self._with_tree = torch.ones(sim.num_envs, dtype=torch.bool)
+
+    @torch.no_grad()
+    def decide(self, obs: torch.Tensor) -> AgentDecision:
+        """Command for all rows, the tree's or the student's."""
+        due = self._age % self._hold == 0
+        said = super().decide(obs)
+        tree = self.simulator.action
+        if bool(due.any()):
+            draw = torch.rand(len(due), generator=self._generator)
+            self._with_tree = torch.where(due, draw < self.tree_share, self._with_tree)
+            self._keep(due & self.running, tree)
+        return said._replace(action=torch.where(self._with_tree[:, None], tree, said.action))
+
+    def _keep(self, kept: torch.Tensor, tree: torch.Tensor) -> None:
+        wish = wish_of(tree[kept], self.ego[kept], self.simulator.config.vehicle)
+        self.samples.append(Sample(self.obstacles[kept], self.own[kept], wish))
+
+
+def imitate(
+    actor: SetActor, config: LearningConfig, scenes: tuple[Scene, ...], sims: dict[str, Sim] | None = None
+) -> dict[str, float]:
+    """``surrogate.warm_start_waves`` waves of DAgger; the actor's mean is then close to the tree. What was
+    spent, as metrics. ``sims``: simulators of worlds that are there already."""
+    began, sims = time.perf_counter(), dict(sims or {})
+    waves, rows = config.surrogate.warm_start_waves, min(WAVE_EPISODES, config.train.num_envs)
+    few = config.model_copy(update={"train": config.train.model_copy(update={"num_envs": rows})})
+    seed = config.train.seed + SEED
+    generator = torch.Generator().manual_seed(seed)
+    optimiser = PlainAdam(list(actor.net.parameters()), lr=RATE)
+    places = [(world, scene) for scene in scenes for world in config.surrogate.worlds]
+    samples, won, loss = [], 0.0, 0.0
+    for wave in range(waves):
+        world, scene = places[wave % len(places)]
+        if world not in sims:
+            sims[world] = simulator_of(few, world, scenes)
+        student = Student(actor, sims[world], config, generator)
+        student.tree_share = 1.0 - wave / max(1, waves - 1)
+        outcome, _ = run_search_episodes(student, scene, seed, wave * rows, rows)
+        samples += student.samples
+        won = float((outcome == SUCCESS).float().mean())
+        joined = Sample(*(torch.cat(parts) for parts in zip(*samples, strict=True)))
+        samples = [joined]
+        passes = LAST_PASSES if wave == waves - 1 else PASSES
+        loss = regress(actor, optimiser, joined, passes, generator)
+    return {
+        "warm_start/loss": loss,
+        "warm_start/success_rate_last_wave": won,
+        "warm_start/decisions": float(len(samples[0].wish)),
+        "warm_start/seconds": time.perf_counter() - began,
+    }
+
+
+def regress(
+    actor: SetActor, optimiser: torch.optim.Optimizer, sample: Sample, passes: int, generator: torch.Generator
+) -> float:
+    """Fit the actor's mean to the wishes; mean squared error of the last pass (``passes`` at least 1)."""
+    errors: list[float] = []
+    for _ in range(passes):
+        errors = []
+        for index in torch.randperm(len(sample.wish), generator=generator).split(MINIBATCH):
+            mean = actor(sample.obstacles[index], sample.own[index])
+            loss = (mean - sample.wish[index]).square().sum(dim=-1).mean()
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(actor.net.parameters(), 1.0)
+            optimiser.step()
+            errors.append(float(loss.detach()) / NUM_WISHES)
+    return sum(errors) / len(errors)

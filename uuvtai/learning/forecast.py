@@ -160,6 +160,8 @@ def _in_frame(place: np.ndarray, frame: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------------
 
 
+MEMORY, MINIBATCH = 2**21, 512
+"""moments of tracks that are kept to learn from, and of one step"""
 _LEAST_RATE = 0.02
 """part of the learning rate that is left at the end"""
 
@@ -184,9 +186,8 @@ class ForecastTrainer:
         self.optimiser = PlainAdam(
             self.net.parameters(), lr=config.forecast_training.learning_rate, eps=ADAM_EPS
         )
-        size = config.forecast_training.memory
-        self._columns = torch.zeros(size, N_COLUMN, dtype=torch.float16)
-        self._truth = torch.zeros(size, len(TIMES_S), 2)
+        self._columns = torch.zeros(MEMORY, N_COLUMN, dtype=torch.float16)
+        self._truth = torch.zeros(MEMORY, len(TIMES_S), 2)
         self.recent = Recent(OUTCOMES, ())
         self.iteration = self.env_steps = self.kept = self.seen = 0
         self._scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (config.world.own_scene,)
@@ -249,7 +250,7 @@ class ForecastTrainer:
         """One step of the network towards what came; the loss in nats."""
         config, share = self.config.forecast_training, self.iteration / self.config.train.iterations
         self.optimiser.param_groups[0]["lr"] = config.learning_rate * max(_LEAST_RATE, 1.0 - share)
-        at = torch.randint(self.kept, (config.minibatch,), generator=self.generator)
+        at = torch.randint(self.kept, (MINIBATCH,), generator=self.generator)
         columns, truth = self._columns[at].float(), self._truth[at]
         speed = columns[:, 0]
         if torch.rand(1, generator=self.generator) < 0.5:

@@ -7,9 +7,11 @@ import functools
 import itertools
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -186,73 +188,118 @@ _MEAN_GAIN, _VALUE_GAIN = (
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
+View = dict[str, torch.Tensor]
+"""what is known of N envs, by name, each (N, ...)"""
+CACHE_ROWS = 2048
+"""rows in one pass through a network on a CPU: their activations stay in the cache"""
+
+
 class PolicyStep(NamedTuple):
     """What the policy decided for N envs."""
 
     action: torch.Tensor
-    """(N, 4) drawn, in parts of the vehicle's limits, unclamped: the environment clamps"""
+    """(N, n_action) drawn, unclamped: the environment clamps"""
     log_prob: torch.Tensor
     """(N,) [nat]"""
     value: torch.Tensor
     """(N,) expected return"""
     mean: torch.Tensor
-    """(N, 4)"""
+    """(N, n_action)"""
 
 
 def log_prob(action: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
-    """Log density [nat] of actions (..., 4) under a diagonal Gaussian of mean (..., 4) and log deviation
-    (4,): (...,)."""
+    """Log density [nat] of actions (..., n) under a diagonal Gaussian of mean (..., n) and log deviation
+    (n,): (...,)."""
     scaled = (action - mean) * torch.exp(-log_std)
     return -0.5 * scaled.square().sum(dim=-1) - (log_std.sum() + log_std.shape[-1] * _HALF_LOG_2PI)
 
 
 def entropy(log_std: torch.Tensor) -> torch.Tensor:
-    """Differential entropy [nat] of a diagonal Gaussian of log deviation (4,), a scalar."""
+    """Differential entropy [nat] of a diagonal Gaussian of log deviation (n,), a scalar."""
     return log_std.sum() + log_std.shape[-1] * (0.5 + _HALF_LOG_2PI)
 
 
-class ActorCritic(nn.Module):
-    """Two separate networks on the normalised input; all it knows, statistics included, is in its
-    ``state_dict``. Inputs x are (..., n_in) raw."""
+class Policy(nn.Module):
+    """Actor and critic as PPO sees them: two separate networks on the same inputs."""
 
-    def __init__(self, n_in: int, config: PolicyConfig, generator: torch.Generator) -> None:
-        """ValueError for a deviation that begins below its floor."""
+    inputs: tuple[str, ...]
+    """of a ``View``, what actor and critic are told"""
+    actor: Any
+    critic: Any
+    log_std: nn.Parameter
+    """(n_action,), log deviation of the action"""
+    value_norm: RunningNorm
+    is_shuffled, most_std = False, math.inf
+    critic_rate: float | None = None
+    """whether minibatches are drawn at random in any case; the largest deviation; a learning rate of the
+    critic's own, whose gradient is then cut by itself"""
+    in_half = False
+    """products in half of the width (``ppo.bfloat16``)"""
+
+    def __init__(self, config: PolicyConfig) -> None:
+        """SettingError for a deviation that begins below its floor."""
         super().__init__()
         if config.initial_std < config.min_std:
             raise SettingError(
                 f"policy.initial_std {config.initial_std:g} lies below the floor policy.min_std "
                 f"{config.min_std:g}"
             )
-        self.config, self.n_in = config, n_in
-        self.actor = mlp((n_in, *config.hidden, NUM_ACTIONS), config.activation, generator, _MEAN_GAIN)
-        self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
-        self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
-        self.observation_norm = RunningNorm(n_in, CLIP_OBSERVATION)
-        self.value_norm = RunningNorm(1, math.inf)
+        self.config = config
 
-    def distribution(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(mean (..., 4), log_std (4,)) of the action."""
-        return self.actor(self.observation_norm(x)), self.log_std
+    def prepared(self, view: View) -> View:
+        """The inputs as ``mean_of`` and ``value_of`` want them."""
+        return {name: view[name] for name in self.inputs}
 
-    def value(self, x: torch.Tensor) -> torch.Tensor:
-        """(...,) expected return, in units of the reward."""
-        return self.value_norm.inverse(self.critic(self.observation_norm(x)).squeeze(-1))
+    def mean_of(self, inputs: View) -> torch.Tensor:
+        """(..., n_action) mean action, float32, of prepared inputs."""
+        raise NotImplementedError
+
+    def value_of(self, inputs: View) -> torch.Tensor:
+        """(...,) expected return in the critic's units, float32, of prepared inputs."""
+        raise NotImplementedError
+
+    def parts(self) -> dict[str, nn.Module]:
+        """What is kept of it, by name in a checkpoint: ``policy`` is what drives."""
+        return {"policy": self}
+
+    def actor_parameters(self) -> list[nn.Parameter]:
+        """Of what drives."""
+        raise NotImplementedError
+
+    def last_of_critic(self) -> nn.Linear:
+        """The critic's last layer."""
+        raise NotImplementedError
+
+    def observe(self, view: View) -> None:
+        """Take inputs into the statistics that they are scaled by, where there are some."""
+
+    def coarse(self) -> torch.autocast:
+        """Products in bfloat16 where it is asked for."""
+        return torch.autocast(self.log_std.device.type, torch.bfloat16, enabled=self.in_half)
 
     @torch.no_grad()
-    def act(self, x: torch.Tensor, generator: torch.Generator) -> PolicyStep:
-        """Draw actions for x (N, n_in) with noise from a CPU generator."""
-        normalised = self.observation_norm(x)
-        mean = self.actor(normalised)
+    def act(self, view: View, generator: torch.Generator) -> PolicyStep:
+        """Draw actions for N envs with noise from a CPU generator."""
+        inputs = self.prepared(view)
+        mean, value = side_by_side(
+            functools.partial(by_part, self.mean_of, inputs),
+            functools.partial(by_part, self.value_of, inputs),
+            device=self.log_std.device.type,
+        )
         noise = torch.randn(mean.shape, generator=generator).to(mean.device)
         action = torch.addcmul(mean, noise, self.log_std.exp())
-        value = self.value_norm.inverse(self.critic(normalised).squeeze(-1))
-        return PolicyStep(action, log_prob(action, mean, self.log_std), value, mean)
+        return PolicyStep(action, log_prob(action, mean, self.log_std), self.value_norm.inverse(value), mean)
+
+    @torch.no_grad()
+    def expected(self, view: View) -> torch.Tensor:
+        """(N,) expected return, in units of the reward."""
+        return self.value_norm.inverse(by_part(self.value_of, self.prepared(view)))
 
     @torch.no_grad()
     def floor_std(self) -> None:
-        """Lift deviations that a step took below ``config.min_std`` back onto it: clamping inside would stop
-        their gradient there."""
-        self.log_std.clamp_(min=math.log(self.config.min_std))
+        """Bring deviations that a step took out of their bounds back: clamping inside would stop their
+        gradient there."""
+        self.log_std.clamp_(math.log(self.config.min_std), math.log(self.most_std))
 
     @torch.no_grad()
     def learn_returns(self, moments: Moments) -> None:
@@ -265,10 +312,121 @@ class ActorCritic(nn.Module):
         old_mean, old_std = self.value_norm.mean.clone(), self.value_norm.std()
         self.value_norm.merge(moments)
         mean, std = self.value_norm.mean, self.value_norm.std()
-        last = self.critic[-1]
-        assert isinstance(last, nn.Linear)
+        last = self.last_of_critic()
         last.weight.copy_(last.weight * (old_std / std))
         last.bias.copy_((last.bias * old_std + old_mean - mean) / std)
+
+
+class ActorCritic(Policy):
+    """Perceptrons on the normalised input ``x`` (..., n_in), raw; all it knows, statistics included, is in
+    its ``state_dict``."""
+
+    inputs = ("x",)
+
+    def __init__(self, n_in: int, config: PolicyConfig, generator: torch.Generator) -> None:
+        super().__init__(config)
+        self.n_in = n_in
+        self.actor = mlp((n_in, *config.hidden, NUM_ACTIONS), config.activation, generator, _MEAN_GAIN)
+        self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
+        self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
+        self.observation_norm = RunningNorm(n_in, CLIP_OBSERVATION)
+        self.value_norm = RunningNorm(1, math.inf)
+
+    def prepared(self, view: View) -> View:
+        """The normalised input."""
+        return {"x": self.observation_norm(view["x"])}
+
+    def mean_of(self, inputs: View) -> torch.Tensor:
+        """As in ``Policy``."""
+        return self._output(self.actor, inputs["x"])
+
+    def value_of(self, inputs: View) -> torch.Tensor:
+        """As in ``Policy``."""
+        return self._output(self.critic, inputs["x"]).squeeze(-1)
+
+    def _output(self, net: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
+        """In bfloat16 all layers but the last, whose output is what the losses see."""
+        if not self.in_half:
+            return net(x)
+        with self.coarse():
+            hidden = net[:-1](x)
+        return net[-1](hidden.float())
+
+    def actor_parameters(self) -> list[nn.Parameter]:
+        """As in ``Policy``."""
+        return [self.log_std, *self.actor.parameters()]
+
+    def last_of_critic(self) -> nn.Linear:
+        """As in ``Policy``."""
+        return self.critic[-1]
+
+    def observe(self, view: View) -> None:
+        """As in ``Policy``."""
+        self.observation_norm.merge(moments_of(view["x"]))
+
+    def distribution(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(mean (..., 4), log_std (4,)) of the action."""
+        return self.mean_of(self.prepared({"x": x})), self.log_std
+
+    def value(self, x: torch.Tensor) -> torch.Tensor:
+        """(...,) expected return, in units of the reward."""
+        return self.value_norm.inverse(self.value_of(self.prepared({"x": x})))
+
+
+@torch.no_grad()
+def by_part(function: Callable[[View], torch.Tensor], inputs: View) -> torch.Tensor:
+    """A function of many rows, on a CPU ``CACHE_ROWS`` at a time; nothing of it can be learnt from."""
+    first = next(iter(inputs.values()))
+    if first.device.type != "cpu" or len(first) <= CACHE_ROWS:
+        return function(inputs)
+    rows = range(0, len(first), CACHE_ROWS)
+    return torch.cat([function({n: part[i : i + CACHE_ROWS] for n, part in inputs.items()}) for i in rows])
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Pieces of a training's work on all cores. Networks over a few thousand rows are too small for torch's own
+# threads, which wait for each other at every product; here each thread takes whole pieces.
+
+
+_T = TypeVar("_T")
+_threads: ContextVar[int] = ContextVar("threads")
+"""for pieces, while torch's own rest"""
+
+
+@contextlib.contextmanager
+def torch_threads_rest() -> Iterator[None]:
+    """Between the pieces torch computes on one thread: its own take ten times as long for a step of Adam on
+    networks of this size as one does alone."""
+    threads = torch.get_num_threads()
+    token = _threads.set(threads)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _threads.reset(token)
+
+
+def side_by_side(*pieces: Callable[[], _T], device: str = "cpu") -> list[_T]:
+    """What each piece gives, in their order. Threads have no part in any result: a piece runs on one. On a
+    GPU one comes after the other."""
+    if device != "cpu":
+        return [piece() for piece in pieces]
+    flushes = float(torch.tensor(1e-40) * 1.0) == 0.0
+    pool = _pool(_threads.get(None) or torch.get_num_threads(), flushes)
+    if pool is None:
+        return [piece() for piece in pieces]
+    return [begun.result() for begun in [pool.submit(piece) for piece in pieces]]
+
+
+@functools.cache
+def _pool(threads: int, flushes: bool) -> ThreadPoolExecutor | None:
+    return None if threads == 1 else ThreadPoolExecutor(threads, "uuvtai-learn", _begin, (flushes,))
+
+
+def _begin(flushes: bool) -> None:
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(flushes)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -503,17 +661,18 @@ class Guard:
         return {f"{PREFIX}{name}": float(count) for name, count in found.items() if count}
 
     def check(
-        self, iteration: int, complaints: Sequence[str], seed: torch.Tensor, episode: torch.Tensor
+        self, iteration: int, complaints: Sequence[str], scenarios: tuple[torch.Tensor, torch.Tensor]
     ) -> None:
         """Count an iteration with or without complaints; TrainingError after ``patience`` in a row with some.
 
-        ``seed`` and ``episode`` (N,): which scenarios the envs are in, for the message.
+        ``scenarios``: seed and episode (N,) that the envs are in, for the message.
         """
         rows = self._rows.nonzero().flatten().tolist()
         self._rows.zero_()
         self.bad_in_a_row = self.bad_in_a_row + 1 if complaints else 0
         if self.bad_in_a_row < self.patience:
             return
+        seed, episode = scenarios
         envs = "".join(
             f"; env {row} (seed {int(seed[row])}, episode {int(episode[row])})" for row in rows[:_ROWS_TOLD]
         )

@@ -40,58 +40,56 @@ class AgentDecision(NamedTuple):
     """(N,) of that prediction"""
 
 
-class PolicyAgent:
-    """Drives ``num_envs`` rows. ``decide`` looks, ``advance`` goes on to the next step; ``reset`` when a row
-    begins another episode."""
+class OneDecision(nn.Module):
+    """The networks for one decision, without memory."""
 
-    def __init__(
-        self,
-        policy: ActorCritic,
-        world_model: WorldModel | None,
-        num_envs: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
+    fill: torch.Tensor
+    """(n_obs,) what counts where a value is not finite"""
+
+    def __init__(self, policy: ActorCritic, world_model: WorldModel | None) -> None:
         """``world_model``: None where the policy was trained without its features. The networks are used, not
         copied."""
-        self.policy, self.world_model, self.device = policy, world_model, torch.device(device)
-        self._n_obs = policy.n_in - N_FEATURES
-        rows = num_envs
-        self._obs, self._last_obs = (torch.zeros(rows, self._n_obs, device=device) for _ in range(2))
-        self.mean_action, self._last_action = (
-            torch.zeros(rows, NUM_ACTIONS, device=device) for _ in range(2)
-        )
-        """(num_envs, 4) of the last decision, before it was cut off to [-1, 1]"""
-        self._has_last = torch.zeros(rows, dtype=torch.bool, device=device)
-        self._hold, self._age = policy.config.hold_steps, torch.zeros(rows, dtype=torch.int64, device=device)
-        self._said = torch.zeros(rows, 3, device=device)
-        self.decision = AgentDecision(*(torch.zeros(0) for _ in AgentDecision._fields))
-        """the last one; where an older one is held, what the networks said then"""
+        super().__init__()
+        self.policy, self.world_model = policy, world_model
+        self.register_buffer("fill", policy.observation_norm.mean[: policy.n_in - N_FEATURES].float())
+
+    def forward(
+        self, obs: torch.Tensor, last_obs: torch.Tensor, last_action: torch.Tensor, has_last: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """(mean action (N, 4), value (N,), residual and uncertainty (N, 2)) for the newest observations
+        (N, n_obs), those of the last decision, its action (N, 4), and whether (N,) bool there was one."""
+        obs, last_obs = (torch.where(torch.isfinite(seen), seen, self.fill) for seen in (obs, last_obs))
+        features = obs.new_zeros(obs.shape[0], N_FEATURES)
+        if self.world_model is not None:
+            found = self.world_model.features(last_obs, last_action, obs)
+            features = torch.where(has_last[:, None], found, features)
+        x = torch.cat([obs, features], dim=1)
+        return self.policy.distribution(x)[0], self.policy.value(x), features
+
+
+class HeldAgent:
+    """Drives rows by decisions that are held for some control steps. ``decide`` looks, ``advance`` goes on to
+    the next step; ``reset`` when a row begins another episode."""
+
+    world_model: WorldModel | None = None
+    decision: AgentDecision
+    """the last one; where an older one is held, what the networks said then"""
+
+    def __init__(self, num_envs: int, hold_steps: int, device: torch.device | str) -> None:
+        self.device, self._hold = torch.device(device), hold_steps
+        self._age = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        """control steps of every row's episode"""
 
     def reset(self, rows: torch.Tensor) -> None:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
-        kept = rows.to(self.device) == 0
-        self._has_last &= kept
-        self._age *= kept
+        self._age *= rows.to(self.device) == 0
 
-    @torch.no_grad()
     def decide(self, obs: torch.Tensor) -> AgentDecision:
         """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on."""
-        fill = self.policy.observation_norm.mean[: self._n_obs].float()
-        self._obs[:] = torch.where(torch.isfinite(obs), obs, fill)
-        due = self._due()
-        if len(due):
-            self._think(due)
-        value, residual, uncertainty = self._said.clone().T
-        self.decision = AgentDecision(
-            self.mean_action.clamp(-1.0, 1.0), value, self.policy.log_std.exp(), residual, uncertainty
-        )
-        return self.decision
+        raise NotImplementedError
 
     def advance(self) -> None:
         """The last decision has been carried out."""
-        due = self._due()
-        self._last_obs[due], self._last_action[due] = self._obs[due], self.mean_action[due]
-        self._has_last[due] = True
         self._age += 1
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
@@ -104,35 +102,59 @@ class PolicyAgent:
         """Rows whose decision is not held any more."""
         return (self._age % self._hold == 0).nonzero().flatten()
 
-    def _think(self, rows: torch.Tensor) -> None:
-        """Ask the networks about these rows."""
-        obs = self._obs[rows]
-        x = torch.cat([obs, self._features(rows, obs)], dim=1)
-        self.mean_action[rows] = by_chunk(lambda part: self.policy.distribution(part)[0], x)
-        self._said[rows] = torch.stack([by_chunk(self.policy.value, x), x[:, -2], x[:, -1]], dim=1)
 
-    def _features(self, rows: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-        if self.world_model is None:
-            return obs.new_zeros(len(obs), N_FEATURES)
-        found = by_chunk(self.world_model.features, self._last_obs[rows], self._last_action[rows], obs)
-        return torch.where(self._has_last[rows, None], found, 0.0)
+class PolicyAgent(HeldAgent):
+    """Drives ``num_envs`` rows by a policy on observation vectors."""
+
+    def __init__(
+        self,
+        policy: ActorCritic,
+        world_model: WorldModel | None,
+        num_envs: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """As ``OneDecision``."""
+        super().__init__(num_envs, policy.config.hold_steps, device)
+        self.policy, self.world_model = policy, world_model
+        self._one = OneDecision(policy, world_model)
+        n_obs, action = policy.n_in - N_FEATURES, torch.zeros(num_envs, NUM_ACTIONS, device=device)
+        self._obs, self._last_obs = (torch.zeros(num_envs, n_obs, device=device) for _ in range(2))
+        self._said = action, action[:, 0].clone(), torch.zeros(num_envs, N_FEATURES, device=device)
+        """mean action, before it was cut off to [-1, 1], value and features of the last decision"""
+        self._last_action = action.clone()
+        self.decision = AgentDecision(*(torch.zeros(0) for _ in AgentDecision._fields))
+
+    @torch.no_grad()
+    def decide(self, obs: torch.Tensor) -> AgentDecision:
+        """As ``HeldAgent``; what is not finite counts as its mean in training."""
+        self._obs[:] = torch.where(torch.isfinite(obs), obs, self._one.fill)
+        due = self._due()
+        if len(due):
+            row = self._obs[due], self._last_obs[due], self._last_action[due], self._age[due] > 0
+            for held, found in zip(self._said, by_chunk(self._one, *row), strict=True):
+                held[due] = found
+        mean, value, features = self._said
+        self.decision = AgentDecision(
+            mean.clamp(-1.0, 1.0), value.clone(), self.policy.log_std.exp(), *features.clone().T
+        )
+        return self.decision
+
+    def advance(self) -> None:
+        """As ``HeldAgent``."""
+        due = self._due()
+        self._last_obs[due], self._last_action[due] = self._obs[due], self._said[0][due]
+        super().advance()
 
 
-def by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> torch.Tensor:
-    """Function of inputs (n, ...), ``CHUNK`` rows at a time, the last chunk filled up with its first row."""
+def by_chunk(function: Callable[..., tuple[torch.Tensor, ...]], *inputs: torch.Tensor) -> list[torch.Tensor]:
+    """Outputs of a function of inputs (n, ...), ``CHUNK`` rows at a time, the last chunk filled up with its
+    first row."""
     parts = []
     for i in range(0, len(inputs[0]), CHUNK):
         chunk = [tensor[i : i + CHUNK] for tensor in inputs]
         missing = CHUNK - len(chunk[0])
-        parts.append(
-            function(
-                *(
-                    torch.cat([t, t[:1].expand(missing, *t.shape[1:])]) if missing else t.contiguous()
-                    for t in chunk
-                )
-            )
-        )
-    return torch.cat(parts)[: len(inputs[0])]
+        parts.append(function(*(torch.cat([t, t[:1].expand(missing, *t.shape[1:])]) for t in chunk)))
+    return [torch.cat(found)[: len(inputs[0])] for found in zip(*parts, strict=True)]
 
 
 def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> None:
@@ -160,22 +182,22 @@ def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> N
 
 
 _NO_NETWORK = {
-    "forecast_training": "forecasts and does not drive; give it to an agent that does: --set "
-    "forecast.learned=RUN",
-    "parameter_search": "numbers for the behaviour tree, no network that could be exported; they drive as "
+    "forecast": "forecasts and does not drive; give it to an agent that does: --set forecast.learned=RUN",
+    "search": "numbers for the behaviour tree, no network that could be exported; they drive as "
     "--agent best, or as stack.yaml of the run",
-    "surrogate": "a policy over a set of obstacles, which looks at the simulator itself; it drives in 'uuv "
+    "set": "a policy over a set of obstacles, which looks at the simulator itself; it drives in 'uuv "
     "eval' and 'uuv sweep', and is exported by 'uuv export'",
 }
-"""what cannot be a ``PolicyAgent``, by ``LearningConfig.learner``"""
+"""what cannot be a ``PolicyAgent``, by ``LearningConfig.learner``, or ``encoder`` of a policy"""
 
 
 def load_agent(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> PolicyAgent:
     """PolicyAgent with the networks of a checkpoint. Raises CheckpointError where they do not fit what its
     config says."""
     config = checkpoint.config
-    if config.learner in _NO_NETWORK:
-        raise CheckpointError(f"{checkpoint.path}: {_NO_NETWORK[config.learner]}")
+    kind = config.encoder if config.learner == "ppo" else config.learner
+    if kind in _NO_NETWORK:
+        raise CheckpointError(f"{checkpoint.path}: {_NO_NETWORK[kind]}")
     parts, generator = checkpoint.model(), torch.Generator()
     with fitting(checkpoint):
         n_obs = max(row["stop"] for row in checkpoint.manifest.observation_table)

@@ -1,5 +1,5 @@
 """Proximal policy optimisation (Schulman et al. 2017) with generalised advantages, an optional distillation
-term and a guard against NaN.
+term and a guard against NaN, for any ``Policy``.
 
 Statistics of the normalisers stand still from the first step of a rollout to the last minibatch of its
 update, so that the ratio of the first minibatch is one; only then do they take in the rollout.
@@ -7,28 +7,36 @@ update, so that the ratio of the first minibatch is one; only then do they take 
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import torch
-from torch import nn
 
-from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import PpoConfig
 from uuvtai.learning.distillation import imitation_error
-from uuvtai.learning.networks import ActorCritic, PlainAdam, entropy, in_bfloat16, log_prob, moments_of
+from uuvtai.learning.networks import (
+    CACHE_ROWS,
+    PlainAdam,
+    Policy,
+    View,
+    entropy,
+    in_bfloat16,
+    log_prob,
+    moments_of,
+    side_by_side,
+    torch_threads_rest,
+)
 from uuvtai.learning.rollout import Rollout
 
 ADAM_EPS = 1e-5
 """as in most PPO implementations (Huang et al. 2022, detail 3)"""
-RATE_FACTOR, RATE_BOUNDS = 1.5, (1e-5, 1e-2)
+RATE_FACTOR, RATE_BOUNDS = 1.5, (1e-5, 2e-3)
 """steps and bounds of the KL-adaptive learning rate (rsl_rl)"""
-CACHE_ROWS = 2048
-"""rows of a minibatch in one pass on a CPU, twice as many in bfloat16: their activations stay in the cache
-and in memory that is used again, and the gradients add up to the same sum"""
+DECAY_FROM, LEAST_RATE = 0.5, 0.1
+"""share of the run from which an adaptive rate falls, and the part of it that is left at the end"""
 
 
 def gae(
@@ -68,7 +76,7 @@ def approximate_kl(log_ratio: torch.Tensor) -> torch.Tensor:
 
 
 def adapted_rate(rate: torch.Tensor, kl: torch.Tensor, target_kl: float) -> torch.Tensor:
-    """Learning rate after a minibatch of this mean KL divergence: slower above twice the target, faster below
+    """Learning rate after an update of this mean KL divergence: slower above twice the target, faster below
     half of it (rsl_rl)."""
     slower, faster = rate / RATE_FACTOR, rate * RATE_FACTOR
     return torch.where(kl > 2.0 * target_kl, slower, torch.where(kl < 0.5 * target_kl, faster, rate)).clamp(
@@ -76,43 +84,36 @@ def adapted_rate(rate: torch.Tensor, kl: torch.Tensor, target_kl: float) -> torc
     )
 
 
-@dataclass(frozen=True)
-class Minibatch:
-    """Samples of a rollout as the losses want them: rows (M, ...), finite, with ``valid`` 1 or 0 for those
-    that were not finite."""
-
-    normalised: torch.Tensor
-    action: torch.Tensor
-    log_prob: torch.Tensor
-    advantage: torch.Tensor
-    """normalised over the valid samples"""
-    target: torch.Tensor
-    """return in the critic's units"""
-    teacher_action: torch.Tensor
-    weight: torch.Tensor
-    valid: torch.Tensor
-
-    def rows(self, index: slice | torch.Tensor) -> Minibatch:
-        """These samples: views for a slice, copies for an index."""
-        return Minibatch(**{name: value[index] for name, value in vars(self).items()})
-
-
 _SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distillation", "count")
+
+
+class Piece(NamedTuple):
+    """What some rows of a minibatch add to it."""
+
+    gradients: tuple[torch.Tensor | None, ...]
+    sums: torch.Tensor
+    """over the valid rows, in the order of ``_SUMS``, float64"""
 
 
 class Ppo:
     """Adam on the clipped surrogate, the value error, the entropy and the distillation term of one policy."""
 
-    def __init__(self, policy: ActorCritic, config: PpoConfig) -> None:
+    def __init__(self, policy: Policy, config: PpoConfig) -> None:
         self.policy, self.config = policy, config
         device = policy.log_std.device
+        policy.in_half = in_bfloat16(config, device.type)
         self.rate = torch.tensor(config.learning_rate, device=device)
-        self.optimiser = PlainAdam(policy.parameters(), lr=self.rate, eps=ADAM_EPS, fused=True)
+        self._rate_now = self.rate.clone()
+        actor, critic = policy.actor_parameters(), list(policy.critic.parameters())
+        groups: list[dict[str, Any]] = [{"params": actor + critic}]
+        if policy.critic_rate is not None:
+            groups = [{"params": actor}, {"params": critic, "lr": policy.critic_rate}]
+        self.optimiser = PlainAdam(groups, lr=self._rate_now, eps=ADAM_EPS, fused=True)
+        self._nets = actor, critic
         self.updates = 0
         """minibatches that changed the policy"""
         self.skipped = 0
         """minibatches left out because loss or gradient was not finite"""
-        self._normalised = torch.empty(0, device=device)
 
     def update(
         self,
@@ -120,34 +121,32 @@ class Ppo:
         distillation_weight: float = 0.0,
         surrogate: bool = True,
         generator: torch.Generator | None = None,
+        share: float = 0.0,
     ) -> dict[str, float]:
         """Learn from a closed rollout; metrics by their names in metrics.jsonl, means over all minibatches of
         the update.
 
         ``distillation_weight`` is lambda_t s_t of weight ||mean - teacher_action||^2; without ``surrogate``
         only the critic and the distillation learn (critic warm-up). ``generator`` (CPU) draws the minibatches
-        of
-        ``config.shuffle``. Samples that are not finite have no part in any of it and are counted. ValueError
-        for more minibatches than samples.
+        where they are random. ``share`` of the run is over. Samples that are not finite have no part in any
+        of it and are counted.
         """
-        batch, metrics = self._prepared(rollout)
-        if self.config.minibatches > len(batch.valid):
-            raise SettingError(
-                f"ppo.minibatches={self.config.minibatches}, but a rollout has only {len(batch.valid)} "
-                "samples: raise ppo.rollout_steps or train.num_envs"
-            )
-        skipped, sums = self.skipped, torch.zeros(len(_SUMS), dtype=torch.float64, device=batch.valid.device)
-        for _ in range(self.config.epochs):
-            for minibatch in self._minibatches(batch, generator):
-                self._learn(minibatch, distillation_weight, surrogate, sums)
-        if self.config.normalise_observations:
-            self.observe(rollout.x)
+        config = self.config
+        samples, metrics = self._prepared(rollout)
+        count = len(samples["valid"])
+        fade = min(1.0, (1.0 - share) / (1.0 - DECAY_FROM)) if config.target_kl > 0 else 1.0
+        self._rate_now.copy_(self.rate * max(LEAST_RATE, fade))
+        skipped, sums = self.skipped, torch.zeros(len(_SUMS), dtype=torch.float64, device=self.rate.device)
+        with torch_threads_rest():
+            for _ in range(config.epochs):
+                for index in self._minibatches(count, generator):
+                    sums += self._learn(samples, index, distillation_weight, surrogate)
+        if config.target_kl > 0 and surrogate:
+            kl = (sums[_SUMS.index("approx_kl")] / sums[-1].clamp(min=1.0)).float()
+            self.rate.copy_(adapted_rate(self.rate, kl, config.target_kl))
+        if config.normalise_observations:
+            self.policy.observe(rollout)
         return metrics | self._metrics(sums, skipped)
-
-    def observe(self, x: torch.Tensor) -> None:
-        """Take inputs x (..., n_in) into the normaliser's statistics; before the first rollout, so that it
-        does not begin unscaled."""
-        self.policy.observation_norm.merge(moments_of(x))
 
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments, the learning rate and the counters."""
@@ -161,143 +160,129 @@ class Ppo:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave."""
         self.optimiser.load_state_dict(state["optimiser"])
+        self.optimiser.param_groups[0]["lr"] = self._rate_now
         self.rate.copy_(state["learning_rate"])
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.rate
         self.updates, self.skipped = int(state["updates"]), int(state["skipped"])
 
     # ----------------------------------------------------------------------------------- what is learned from
 
     @torch.no_grad()
-    def _prepared(self, rollout: Rollout) -> tuple[Minibatch, dict[str, float]]:
-        valid = _valid(rollout)
-        reward, value, next_value = (
-            torch.where(valid, getattr(rollout, name), 0.0) for name in ("reward", "value", "next_value")
-        )
+    def _prepared(self, rollout: Rollout) -> tuple[View, dict[str, float]]:
+        """Samples as the losses want them, (T N, ...): what the rollout has, zero where a sample is not
+        finite; ``valid`` 1 or 0; ``advantage`` normalised over the valid samples; ``target``, the return in
+        the critic's units; the prepared inputs."""
+        valid = rollout.valid()
+        if not bool(valid.all()):
+            rollout = rollout.where(valid)
         advantage, returns = gae(
-            reward,
-            value,
-            next_value,
-            rollout.terminated,
-            rollout.ended | ~valid,
+            rollout["reward"],
+            rollout["value"],
+            rollout["next_value"],
+            rollout["terminated"],
+            rollout["ended"] | ~valid,
             self.config.gamma,
             self.config.gae_lambda,
         )
-        kept = returns[valid]
+        good = returns[valid]
         metrics = {
-            "train/explained_variance": _explained_variance(value[valid], kept),
-            "train/invalid_samples": float(valid.numel() - len(kept)),
+            "train/explained_variance": _explained_variance(rollout["value"][valid], good),
+            "train/invalid_samples": float(valid.numel() - len(good)),
         }
         if self.config.normalise_values:
-            self.policy.learn_returns(moments_of(kept[:, None]))
-        norm = self.policy.value_norm
-        flat_valid = valid.flatten()
-        zero_where_invalid = {
-            name: torch.where(
-                flat_valid.view(-1, *[1] * (rollout.flat(name).ndim - 1)), rollout.flat(name), 0.0
-            )
-            for name in ("action", "log_prob", "teacher_action", "weight")
+            self.policy.learn_returns(moments_of(good[:, None]))
+        found = {
+            "advantage": _standardised(advantage, valid).flatten(),
+            "target": self.policy.value_norm(returns.flatten()),
+            "valid": valid.flatten().float(),
         }
-        return Minibatch(
-            normalised=self._normalise(rollout.flat("x")),
-            advantage=_standardised(advantage, valid).flatten(),
-            target=norm(returns.flatten()),
-            valid=flat_valid.float(),
-            **zero_where_invalid,
-        ), metrics
+        flat = rollout.flat()
+        kept = {n: flat[n] for n in ("action", "log_prob", "teacher_action", "weight") if n in flat}
+        return kept | self.policy.prepared(flat) | found, metrics
 
-    def _normalise(self, x: torch.Tensor) -> torch.Tensor:
-        if self._normalised.shape != x.shape:
-            self._normalised = torch.empty_like(x)
-        return self.policy.observation_norm(x, out=self._normalised)
-
-    def _minibatches(self, batch: Minibatch, generator: torch.Generator | None) -> Iterator[Minibatch]:
-        """Blocks of neighbouring rows (all envs in a span of steps) as views, or random ones as copies."""
-        samples, parts = len(batch.valid), self.config.minibatches
-        bounds = [samples * part // parts for part in range(parts + 1)]
+    def _minibatches(self, count: int, generator: torch.Generator | None) -> Iterator[slice | torch.Tensor]:
+        """Blocks of neighbouring rows (all envs in a span of steps), or random ones."""
+        parts = self.config.minibatches
+        bounds = [count * part // parts for part in range(parts + 1)]
         order = None
-        if self.config.shuffle:
+        if self.config.shuffle or self.policy.is_shuffled:
             if generator is None:
                 raise ValueError("ppo.shuffle draws minibatches at random: pass update() a generator")
-            order = torch.randperm(samples, generator=generator).to(batch.valid.device)
+            order = torch.randperm(count, generator=generator).to(self.rate.device)
         for first, last in itertools.pairwise(bounds):
-            yield batch.rows(slice(first, last) if order is None else order[first:last])
+            yield slice(first, last) if order is None else order[first:last]
 
     # ------------------------------------------------------------------------------------------ one minibatch
 
     def _learn(
-        self, batch: Minibatch, distillation_weight: float, surrogate: bool, sums: torch.Tensor
-    ) -> None:
-        self.optimiser.zero_grad(set_to_none=True)
-        count = batch.valid.sum().clamp(min=1.0)
-        kl_before = sums[_SUMS.index("approx_kl")].clone()
-        device = self.rate.device.type
-        rows = CACHE_ROWS * (1 + in_bfloat16(self.config, device)) if device == "cpu" else len(batch.valid)
-        for first in range(0, len(batch.valid), rows):
-            block = batch.rows(slice(first, first + rows))
-            self._add_gradients(block, count, distillation_weight, surrogate, sums)
-        self._step((sums[_SUMS.index("approx_kl")] - kl_before).float() / count, surrogate)
-
-    def _add_gradients(
-        self,
-        batch: Minibatch,
-        count: torch.Tensor,
-        distillation_weight: float,
-        surrogate: bool,
-        sums: torch.Tensor,
-    ) -> None:
-        x = batch.normalised
-        bfloat16 = in_bfloat16(self.config, x.device.type)
-        value = _output(self.policy.critic, x, bfloat16)
-        acting = surrogate or distillation_weight != 0.0
-        mean = _output(self.policy.actor, x, bfloat16) if acting else batch.action
-        self._loss(batch, value, mean, count, distillation_weight, surrogate, sums).backward()
-
-    def _loss(
-        self,
-        batch: Minibatch,
-        value_out: torch.Tensor,
-        mean: torch.Tensor,
-        count: torch.Tensor,
-        distillation_weight: float,
-        surrogate: bool,
-        sums: torch.Tensor,
+        self, samples: View, index: slice | torch.Tensor, distillation_weight: float, surrogate: bool
     ) -> torch.Tensor:
-        """This block's share of the minibatch's loss by the networks' outputs; its sums are added to ``sums``
-        in the order of ``_SUMS``."""
-        config, share = self.config, batch.valid / count
-        value_error = (value_out.squeeze(-1) - batch.target).square()
-        loss = config.value_weight * (share * value_error).sum()
-        zero = torch.zeros_like(batch.valid)
-        policy_loss, kl, clipped, distill = zero, zero, zero, zero
-        if surrogate:
-            log_ratio = log_prob(batch.action, mean, self.policy.log_std) - batch.log_prob
-            policy_loss = surrogate_loss(log_ratio, batch.advantage, config.clip)
-            loss = (
-                loss
-                + (share * policy_loss).sum()
-                - config.entropy_weight * share.sum() * entropy(self.policy.log_std)
-            )
-            with torch.no_grad():
-                kl, clipped = approximate_kl(log_ratio), (log_ratio.expm1().abs() > config.clip).float()
-        if distillation_weight:
-            distill = batch.weight * imitation_error(mean, batch.teacher_action)
-            loss = loss + distillation_weight * (share * distill).sum()
-        with torch.no_grad():
-            terms = torch.stack([policy_loss, value_error, kl, clipped, distill, torch.ones_like(zero)])
-            sums += (terms @ batch.valid).double()
-        return loss
+        """A step by these samples; their sums. Pieces are added up in their order: the number of threads
+        changes no bit."""
+        self.optimiser.zero_grad(set_to_none=True)
+        count = samples["valid"][index].sum().clamp(min=1.0)
+        together = functools.partial(side_by_side, device=self.rate.device.type)
+        blocks = together(*(functools.partial(_rows, samples, part) for part in self._parts(index)))
+        pieces: list[Callable[[], Piece]] = []
+        for block in blocks:
+            pieces += [
+                functools.partial(self._of_actor, block, count, distillation_weight, surrogate),
+                functools.partial(self._of_critic, block, count),
+            ]
+        found = together(*pieces)
+        for parameters, mine in zip(self._nets, (found[::2], found[1::2]), strict=True):
+            for parameter, *parts in zip(parameters, *(piece.gradients for piece in mine), strict=True):
+                parameter.grad = None if parts[0] is None else functools.reduce(torch.add, parts)
+        self._step()
+        return torch.stack([piece.sums for piece in found]).sum(dim=0)
 
-    def _step(self, kl: torch.Tensor, surrogate: bool) -> None:
-        """Adapt the rate, cut the gradient's norm, step; or nothing where the gradient is not finite."""
-        parameters = [p for p in self.policy.parameters() if p.grad is not None]
-        norm = torch.nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
-        if not math.isfinite(float(norm)):
+    def _parts(self, index: slice | torch.Tensor) -> list[slice] | tuple[torch.Tensor, ...]:
+        """A minibatch in parts whose activations stay in the cache of a CPU."""
+        if self.rate.device.type != "cpu":
+            return (index,)  # type: ignore[return-value]
+        if isinstance(index, torch.Tensor):
+            return index.split(CACHE_ROWS)
+        starts = range(index.start, index.stop, CACHE_ROWS)
+        return [slice(first, min(first + CACHE_ROWS, index.stop)) for first in starts]
+
+    def _of_actor(
+        self, batch: View, count: torch.Tensor, distillation_weight: float, surrogate: bool
+    ) -> Piece:
+        config, valid, log_std = self.config, batch["valid"], self.policy.log_std
+        sums, share = {"count": torch.ones_like(valid)}, valid / count
+        if not (surrogate or distillation_weight != 0.0):
+            return Piece((None,) * len(self._nets[0]), _summed(sums, valid))
+        mean, loss = self.policy.mean_of(batch), torch.zeros((), device=valid.device)
+        if surrogate:
+            log_ratio = log_prob(batch["action"], mean, log_std) - batch["log_prob"]
+            policy_loss = surrogate_loss(log_ratio, batch["advantage"], config.clip)
+            loss = (share * policy_loss).sum() - config.entropy_weight * share.sum() * entropy(log_std)
+            with torch.no_grad():
+                clipped = (log_ratio.expm1().abs() > config.clip).float()
+                sums |= {"approx_kl": approximate_kl(log_ratio), "clip_fraction": clipped}
+                sums |= {"policy_loss": policy_loss}
+        if distillation_weight:
+            distill = batch["weight"] * imitation_error(mean, batch["teacher_action"])
+            loss = loss + distillation_weight * (share * distill).sum()
+            sums |= {"distillation": distill}
+        return Piece(torch.autograd.grad(loss, self._nets[0], allow_unused=True), _summed(sums, valid))
+
+    def _of_critic(self, batch: View, count: torch.Tensor) -> Piece:
+        error = (self.policy.value_of(batch) - batch["target"]).square()
+        loss = self.config.value_weight * (batch["valid"] / count * error).sum()
+        gradients = torch.autograd.grad(loss, self._nets[1])
+        return Piece(gradients, _summed({"value_loss": error}, batch["valid"]))
+
+    def _step(self) -> None:
+        """Cut the gradient's norm and step; or nothing where the gradient is not finite."""
+        most = self.config.max_grad_norm
+        norms = [
+            float(torch.nn.utils.clip_grad_norm_(group["params"], most))
+            for group in self.optimiser.param_groups
+        ]
+        if not all(map(math.isfinite, norms)):
             self.skipped += 1
             self.optimiser.zero_grad(set_to_none=True)
             return
-        if self.config.target_kl > 0 and surrogate:
-            self.rate.copy_(adapted_rate(self.rate, kl, self.config.target_kl))
         self.optimiser.step()
         self.policy.floor_std()
         self.updates += 1
@@ -312,29 +297,23 @@ class Ppo:
             "train/entropy": float(entropy(log_std)),
             "train/approx_kl": means["approx_kl"],
             "train/clip_fraction": means["clip_fraction"],
-            "train/learning_rate": float(self.rate),
+            "train/learning_rate": float(self._rate_now),
             "train/std": float(log_std.exp().mean()),
             "train/skipped_updates": float(self.skipped - skipped_before),
             "train/distill_loss": means["distillation"],
         }
 
 
-def _output(net: nn.Sequential, x: torch.Tensor, bfloat16: bool) -> torch.Tensor:
-    """Output (B, n_out) float32 of an ``mlp``; ``bfloat16``: the products of all layers but the last, whose
-    output is what the losses see, in half of the width."""
-    if not bfloat16:
-        return net(x)
-    with torch.autocast(x.device.type, torch.bfloat16):
-        hidden = net[:-1](x)
-    return net[-1](hidden.float())
+def _rows(samples: View, index: slice | torch.Tensor) -> View:
+    """These samples: views for a slice, copies next to each other for an index."""
+    return {name: part[index] for name, part in samples.items()}
 
 
-def _valid(rollout: Rollout) -> torch.Tensor:
-    """(T, N) bool: everything that the update reads of the sample is finite."""
-    total = rollout.x.sum(dim=-1) + rollout.action.sum(dim=-1) + rollout.teacher_action.sum(dim=-1)
-    for name in ("log_prob", "value", "reward", "next_value", "weight"):
-        total += getattr(rollout, name)
-    return torch.isfinite(total)
+@torch.no_grad()
+def _summed(terms: View, valid: torch.Tensor) -> torch.Tensor:
+    """Sums of terms (B,) over the valid rows, in the order of ``_SUMS``; those that are not there are 0."""
+    zero = torch.zeros_like(valid)
+    return (torch.stack([terms.get(name, zero) for name in _SUMS]) @ valid).double()
 
 
 def _standardised(advantage: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:

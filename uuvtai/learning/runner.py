@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from uuvtai.learning.checkpoint import Checkpoint
     from uuvtai.learning.forecast import ForecastTrainer
     from uuvtai.learning.parameter_search import ParameterSearchTrainer
-    from uuvtai.learning.surrogate_trainer import SurrogateTrainer
     from uuvtai.learning.trainer import Trainer
     from uuvtai.sim.scene import SceneOptions
 
@@ -46,6 +45,8 @@ class TrainRequest:
     config: LearningConfig | None = None
     preset: str = "run"
     """what a new run's folder is named after"""
+    start: Path | None = None
+    """run or checkpoint with whose policy a new run begins"""
     resume: Path | None = None
     overrides: Overrides | None = None
     """changes of the resumed run's config"""
@@ -56,12 +57,9 @@ class TrainRequest:
     run_dir: Path | None = None
 
     @classmethod
-    def typed(
-        cls, scene: SceneOptions, preset: str, num_envs: int | None, seed: int | None, **rest: Any
-    ) -> TrainRequest:
+    def typed(cls, scene: SceneOptions, preset: str, seed: int | None, **rest: Any) -> TrainRequest:
         """What a command line asks of a new run, with the scene as it was typed. Raises ConfigError."""
-        sizes = {"train.num_envs": num_envs, "train.seed": seed}
-        given = [(key, value) for key, value in sizes.items() if value is not None]
+        given = [] if seed is None else [("train.seed", seed)]
         return cls(config=scene.training(preset, given), preset=preset, **rest)
 
 
@@ -74,7 +72,7 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-AnyTrainer = Union["Trainer", "SurrogateTrainer", "ParameterSearchTrainer", "ForecastTrainer"]
+AnyTrainer = Union["Trainer", "ParameterSearchTrainer", "ForecastTrainer"]
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``evaluation.evaluate.evaluate_now``, which knows what learning does not)"""
@@ -110,6 +108,7 @@ def _train(
     from uuvtai.learning.networks import in_bfloat16
 
     found, config = _begin(request, watch)
+    start, config = _started(request.start, config, watch)
     total = request.iterations or config.train.iterations
     if found and found.step >= total:
         if folder:
@@ -122,12 +121,15 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    if config.learner == "surrogate" and config.surrogate.warm_start_waves and not found:
+    if config.surrogate.enabled and config.surrogate.warm_start_waves and not (found or start):
         watch.note(
             f"first {config.surrogate.warm_start_waves} waves of episodes in the simulator, in which the "
             "policy imitates the tree: about a minute each"
         )
-    trainer = _continued(_TRAINERS[config.learner](config, request.device), config, found)
+    trainer = _continued(TRAINERS[config.learner](config, request.device), config, found)
+    if start is not None:
+        start.check_table(trainer.observation_table, config)
+        trainer.start(start)  # type: ignore[union-attr]
     env = getattr(trainer, "env", None)  # of those that learn in the simulator
     device = env.device.type if env else "cpu"
     if config.ppo.bfloat16 and not in_bfloat16(config.ppo, device):
@@ -163,11 +165,46 @@ def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None,
     return checkpoint.newest(request.resume, watch.note, resumable=True), config
 
 
+def _started(
+    place: Path | None, config: LearningConfig, watch: TrainWatch
+) -> tuple[Checkpoint | None, LearningConfig]:
+    """The checkpoint to begin with (a run's best), and the config with its networks. Raises ConfigError for
+    one that holds no policy."""
+    from uuvtai.learning import checkpoint
+
+    if place is None:
+        return None, config
+    is_one = (place / checkpoint.MANIFEST).exists()
+    found = checkpoint.open_checkpoint(place) if is_one else checkpoint.best(place, watch.note)
+    if config.learner != "ppo" or found.config.learner != "ppo":
+        raise ConfigError(f"--start {place}: policies alone can be begun with, by a preset that trains one")
+    theirs, sizes = found.config, ("obstacle_hidden", "head_hidden", "goal_gain")
+    own = {name: getattr(theirs.policy, name) for name in ("hidden", "activation")}
+    update = {
+        "policy": config.policy.model_copy(update=own | {"encoder": theirs.encoder}),
+        "surrogate": config.surrogate.model_copy(update={n: getattr(theirs.surrogate, n) for n in sizes}),
+        "observation": theirs.observation,
+    }
+    return found, config.model_copy(update=update)
+
+
 def _refuse_no_run(place: Path) -> None:
     if not (place / CONFIG).is_file():
         raise ConfigError(
             f"{place}: is no run folder, it has no {CONFIG}; give the folder that 'uuv train' printed"
         )
+
+
+def _ppo(config: LearningConfig, device: str) -> AnyTrainer:
+    """A policy, in the simulator or in its surrogate."""
+    from uuvtai.learning.environments import InSurrogate, Simulated, SimulatedSet
+    from uuvtai.learning.trainer import Trainer
+
+    if config.surrogate.enabled:
+        _refuse_gpu("surrogate", device)
+        return Trainer(InSurrogate(config), config)
+    kind = SimulatedSet if config.encoder == "set" else Simulated
+    return Trainer(kind(_env(config, device), config), config)
 
 
 def _env(config: LearningConfig, device: str) -> VectorEnv:
@@ -177,51 +214,34 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
 
     sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.behavior.max_node), device)
     sim.set_scenes(config.train.scenes)
-    return VectorEnv(sim, config.train.seed)
+    return VectorEnv(sim, config.train.seed, autoreset=config.encoder != "set")
 
 
-def _policy(config: LearningConfig, device: str) -> AnyTrainer:
-    from uuvtai.learning.trainer import Trainer
-
-    return Trainer(_env(config, device), config)
-
-
-def _surrogate() -> Callable[[LearningConfig], AnyTrainer]:
-    from uuvtai.learning.surrogate_trainer import SurrogateTrainer
-
-    return SurrogateTrainer
-
-
-def _numbers() -> Callable[[LearningConfig], AnyTrainer]:
+def _search(config: LearningConfig, device: str) -> AnyTrainer:
+    """Numbers of the tree."""
     from uuvtai.learning.parameter_search import ParameterSearchTrainer
 
-    return ParameterSearchTrainer
+    _refuse_gpu("parameter_search", device)
+    return ParameterSearchTrainer(config)
 
 
-def _forecast() -> Callable[[LearningConfig], AnyTrainer]:
+def _forecast(config: LearningConfig, device: str) -> AnyTrainer:
+    """What moving obstacles will do."""
     from uuvtai.learning.forecast import ForecastTrainer
 
-    return ForecastTrainer
+    _refuse_gpu("forecast_training", device)
+    return ForecastTrainer(config)
 
 
-def _on_the_cpu(
-    trainer: Callable[[], Callable[[LearningConfig], AnyTrainer]],
-) -> Callable[[LearningConfig, str], AnyTrainer]:
-    """A trainer that brings its own environment. ConfigError for a GPU."""
-
-    def made(config: LearningConfig, device: str) -> AnyTrainer:
-        if device == "cuda":
-            raise ConfigError(f"{config.learner}.enabled: it learns on the CPU; leave out --device cuda")
-        return trainer()(config)
-
-    return made
+def _refuse_gpu(section: str, device: str) -> None:
+    if device == "cuda":
+        raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
 
 
-_TRAINERS: dict[str, Callable[[LearningConfig, str], AnyTrainer]] = {
-    "policy": _policy,
-    "surrogate": _on_the_cpu(_surrogate),
-    "parameter_search": _on_the_cpu(_numbers),
-    "forecast_training": _on_the_cpu(_forecast),
+TRAINERS: dict[str, Callable[[LearningConfig, str], AnyTrainer]] = {
+    "ppo": _ppo,
+    "search": _search,
+    "forecast": _forecast,
 }
 """by ``LearningConfig.learner``"""
 

@@ -11,7 +11,7 @@ from torch import nn
 from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.networks import MixtureNet, mlp
+from uuvtai.learning.networks import MixtureNet, Policy, RunningNorm, View, mlp
 from uuvtai.learning.policy_agent import finite, fitting
 
 # ------------------------------------------------------------------------------------------------------------
@@ -90,11 +90,61 @@ class SetCritic(nn.Module):
     ) -> None:
         super().__init__()
         self.net = SetEncoder(n_obstacle + n_truth, n_own, 1, config, 1.0, generator)
+        self.value_norm = RunningNorm(1, math.inf)
 
     def forward(self, obstacles: torch.Tensor, own: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         """(...,)."""
-        there = torch.maximum(obstacles[..., :1], truth[..., 2:3])
+        there = obstacles[..., :1]
+        if truth.shape[-1]:
+            there = torch.maximum(there, truth[..., 2:3])
         return self.net(torch.cat([obstacles, truth], dim=-1), own, there).squeeze(-1)
+
+
+class SetPolicy(Policy):
+    """Both of them, on ``obstacles`` (N, lanes, n_obstacle), ``own`` (N, n_own) and, for the critic alone,
+    ``truth`` (N, lanes, n_truth)."""
+
+    inputs = ("obstacles", "own", "truth")
+    is_shuffled, most_std, critic_rate = True, 1.0, 1e-3
+
+    def __init__(self, view: View, config: LearningConfig, generator: torch.Generator) -> None:
+        """``view``: any that it will be told."""
+        super().__init__(config.policy)
+        n_obstacle, n_own, n_truth = (view[name].shape[-1] for name in self.inputs)
+        self.actor = SetActor(n_obstacle, n_own, config, generator)
+        self.critic = SetCritic(n_obstacle, n_own, n_truth, config, generator)
+
+    @property
+    def log_std(self) -> nn.Parameter:  # type: ignore[override]
+        """The actor's."""
+        return self.actor.log_std
+
+    @property
+    def value_norm(self) -> RunningNorm:  # type: ignore[override]
+        """The critic's."""
+        return self.critic.value_norm
+
+    def mean_of(self, inputs: View) -> torch.Tensor:
+        """As in ``Policy``."""
+        with self.coarse():
+            return self.actor(inputs["obstacles"], inputs["own"]).float()
+
+    def value_of(self, inputs: View) -> torch.Tensor:
+        """As in ``Policy``."""
+        with self.coarse():
+            return self.critic(*(inputs[name] for name in self.inputs)).float()
+
+    def parts(self) -> dict[str, nn.Module]:
+        """As in ``Policy``; no file that drives holds the critic."""
+        return {"policy": self.actor, "critic": self.critic}
+
+    def actor_parameters(self) -> list[nn.Parameter]:
+        """As in ``Policy``."""
+        return list(self.actor.parameters())
+
+    def last_of_critic(self) -> nn.Linear:
+        """As in ``Policy``."""
+        return self.critic.net.head[-1]
 
 
 class MaxAndSum(torch.autograd.Function):

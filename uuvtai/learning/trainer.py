@@ -1,29 +1,24 @@
-"""The trainer: one iteration after the other, a rollout and what is learned from it. ``Trainer.iterate`` is
-the page to read first."""
+"""The trainer: an environment, a policy and losses, one iteration after the other. ``Trainer.iterate`` is the
+page to read first."""
 
 from __future__ import annotations
 
 import copy
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
+from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.distillation import (
-    TeacherBatches,
-    Uncertainty,
-    check_weighting,
-    piecewise_linear,
-    weights_of,
-)
-from uuvtai.learning.networks import PREFIX, ActorCritic, Guard, fast_products
+from uuvtai.learning.checkpoint import Checkpoint
+from uuvtai.learning.distillation import Distillation, check_weighting
+from uuvtai.learning.environments import InSurrogate
+from uuvtai.learning.networks import PREFIX, fast_products
+from uuvtai.learning.policy_agent import finite, fitting
 from uuvtai.learning.ppo import Ppo
-from uuvtai.learning.rollout import N_FEATURES, Collector, Recent, Rollout
+from uuvtai.learning.rollout import Environment, Recent, Rollout, collect
 from uuvtai.learning.world_model import N_TARGET, WorldModel, WorldModelLearner
-
-if TYPE_CHECKING:
-    from uuvtai.envs.vector_env import VectorEnv
 
 
 class Trainer:
@@ -33,53 +28,83 @@ class Trainer:
     CPU, bit for bit.
     """
 
-    def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
-        """Resets ``env``. ValueError for settings that do not fit each other."""
+    def __init__(self, env: Environment, config: LearningConfig) -> None:
+        """Begins the episodes of ``env``. ValueError for settings that do not fit each other."""
         check_weighting(config.distillation.weighting, config.world_model.enabled)
+        samples = config.ppo.rollout_steps * env.num_envs
+        if config.ppo.minibatches > samples:
+            raise SettingError(
+                f"ppo.minibatches={config.ppo.minibatches}, but a rollout has only {samples} samples: raise "
+                "ppo.rollout_steps or train.num_envs"
+            )
         self.env, self.config, self.observation_table = env, config, env.observation_table
         self.generator = torch.Generator().manual_seed(config.train.seed)
-        n_in, device = env.num_obs + N_FEATURES, env.device
-        self.policy = ActorCritic(n_in, config.policy, self.generator).to(device)
-        self.uncertainty = Uncertainty(config.uncertainty).to(device)
-        self.rollout = Rollout(config.ppo.rollout_steps, env.num_envs, n_in, device)
-        self.guard = Guard(
-            [(c.name, c.slice) for c in env.observation_table], env.num_envs, config.train.patience, device
-        )
+        self.policy = env.make_policy(self.generator)
+        self.distillation = Distillation(self.policy, config, env.node_names) if env.node_names else None
+        n_action = len(self.policy.log_std)
+        self.rollout = Rollout(config.ppo.rollout_steps, env.view, n_action, env.half)
         self.ppo = Ppo(self.policy, config.ppo)
-        self.teacher_batches = TeacherBatches(self.policy, config.distillation)
-        world = config.world_model
-        self.world_model = (
-            WorldModel(env.num_obs, world, self.generator).to(device) if world.enabled else None
-        )
-        names = [f"{c.name}_{i}" for c in env.observation_table for i in range(c.slice.stop - c.slice.start)]
-        self.world_learner = self.world_model and WorldModelLearner(self.world_model, world, names[:N_TARGET])
-        self.collector = Collector(
-            env, self.policy, self.world_model, self.rollout, self.guard, self.generator, world.as_features
-        )
+        world, self.world_model, self.world_learner = config.world_model, None, None
+        if world.enabled and "x" not in env.view:
+            raise SettingError(
+                "world_model.enabled: a policy over a set of obstacles has none, for it predicts observation "
+                "vectors; turn it off"
+            )
+        if world.enabled:
+            n_obs = max(column.slice.stop for column in self.observation_table)
+            self.world_model = WorldModel(n_obs, world, self.generator).to(env.device)
+            names = [
+                f"{column.name}_{i}"
+                for column in self.observation_table
+                for i in range(column.slice.stop - column.slice.start)
+            ]
+            self.world_learner = WorldModelLearner(self.world_model, world, names[:N_TARGET])
         self.recent = Recent(env.outcomes, env.reward_terms)
         self.iteration = self.env_steps = 0
-        self.collector.begin(*env.reset(config.train.seed))
+        self._is_started = False
+        env.begin(self.policy, self.world_model, self.generator)
 
+    @fast_products()
     def iterate(self) -> dict[str, float]:
         """One iteration; its metrics by their names in metrics.jsonl.
 
         Order: rollout, all statistics standing still; running uncertainty; PPO with the distillation term
         (value statistics before its minibatches, observation statistics after them); teacher batches; world
-        model. Before the first iteration the behaviour tree drives for one rollout, which only the
-        statistics see. TrainingError after too many bad iterations in a row.
+        model. Before the first iteration the behavior tree shows what it does: in the simulator for one
+        rollout, which only the statistics see, in the surrogate as the warm start. TrainingError after too
+        many bad iterations in a row.
         """
-        if self.iteration == 0:
-            self._look_around()
-        sums = self.collector.collect()
+        shown = self._begin() if self.iteration == 0 else {}
+        watch = self.distillation.watch if self.distillation else lambda _step, _view: None
+        sums, times = collect(self.env, self.policy, self.rollout, self.generator, watch)
         began = time.perf_counter()
-        with fast_products():
-            metrics = self._learn(self.iteration / self.config.train.iterations)
-        learn_s = time.perf_counter() - began
+        metrics = shown | self._learn(self.iteration / self.config.train.iterations)
+        times |= {"time/learn_s": time.perf_counter() - began}
         self.iteration += 1
         self.env_steps += self._samples
-        metrics |= self.guard.take() | self._times(learn_s) | self.recent.add(sums)
+        metrics |= self.env.guard.take() | times | self.recent.add(sums)
         self._judge(metrics)
-        return metrics | {"time/env_steps": float(self.env_steps)}
+        rate = self._samples / sum(times.values())
+        return metrics | {"time/env_steps_per_s": rate, "time/env_steps": float(self.env_steps)}
+
+    def start(self, found: Checkpoint) -> None:
+        """Begin with the policy of another run, and its world model where both have one; what the behavior
+        tree shows at the beginning then teaches the policy nothing. Raises CheckpointError for networks that
+        do not fit."""
+        parts = {"policy": self.policy.parts()["policy"]}
+        model = found.model()
+        if self.world_model is not None and "world_model" in model:
+            parts["world_model"] = self.world_model
+        with fitting(found):
+            for name, part in parts.items():
+                part.load_state_dict(model[name])
+                finite(part, found).train()
+        self._is_started = True
+
+    def evaluate(self) -> dict[str, float]:
+        """``eval/*`` of the policy as it is, by an environment that can tell."""
+        assert isinstance(self.env, InSurrogate)
+        return self.env.evaluate(self.policy)
 
     # ------------------------------------------------------------------------------------------------- resume
 
@@ -91,7 +116,7 @@ class Trainer:
             "counters": {
                 "iteration": self.iteration,
                 "env_steps": self.env_steps,
-                "bad_in_a_row": self.guard.bad_in_a_row,
+                "bad_in_a_row": self.env.guard.bad_in_a_row,
             },
             "env": self.env.capture(),
         }
@@ -99,82 +124,52 @@ class Trainer:
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from what ``state`` gave, bit for bit on a CPU. ValueError, with nothing changed, for the
         state of another env."""
-        obs, info = self.env.restore(state["env"])
+        self.env.restore(state["env"])
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
         self.generator.set_state(state["generator"])
-        self.collector.resume(obs, info)
         self.recent.rows = [list(row) for row in state["recent"]]
         counters = state["counters"]
-        self.iteration, self.env_steps, self.guard.bad_in_a_row = (
+        self.iteration, self.env_steps, self.env.guard.bad_in_a_row = (
             int(counters[n]) for n in ("iteration", "env_steps", "bad_in_a_row")
         )
 
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own, by its name in a checkpoint."""
-        parts = {
-            "policy": self.policy,
-            "world_model": self.world_model,
-            "ppo": self.ppo,
-            "teacher_batches": self.teacher_batches,
-            "world_learner": self.world_learner,
-            "uncertainty": self.uncertainty,
-            "collector": self.collector,
-        }
-        return {name: part for name, part in parts.items() if part is not None}
+        parts = {"world_model": self.world_model, "world_learner": self.world_learner, "ppo": self.ppo}
+        parts |= {"collector": self.env} | (self.distillation.parts() if self.distillation else {})
+        return {n: part for n, part in (self.policy.parts() | parts).items() if part is not None}
 
     # ------------------------------------------------------------------------------------------- an iteration
 
+    def _begin(self) -> dict[str, float]:
+        """Statistics begin with what the behavior tree meets: networks that begin unscaled learn from their
+        first rollout in vain."""
+        if self.env.look_around(self.rollout):
+            self.env_steps += self._samples
+            self._learn_world()
+            self.env.fill_model_features(self.rollout)
+            if not self._is_started:
+                self.policy.observe(self.rollout)
+        return {} if self._is_started else self.env.warm_start(self.policy)
+
     def _learn(self, share: float) -> dict[str, float]:
         """Everything that learns from the rollout; ``share`` of the run is over."""
-        strength, metrics = self._strength(share)
-        rollout, config = self.rollout, self.config.distillation
-        rollout.weight.copy_(weights_of(config.weighting, self.collector.uncertainty))
-        surrogate = self.iteration >= config.critic_warmup_iterations
-        metrics |= self.ppo.update(rollout, strength, surrogate, self.generator)
-        metrics |= self.collector.leaf_errors.take()
-        kept = torch.where(torch.isfinite(rollout.reward), rollout.weight, 0.0)
-        self.teacher_batches.update(
-            rollout.flat("x"), rollout.flat("teacher_action"), kept.flatten(), strength, self.generator
-        )
+        if self.distillation is None:
+            return self.ppo.update(self.rollout, generator=self.generator, share=share)
+        strength, metrics = self.distillation.weigh(self.rollout, share)
+        surrogate = self.iteration >= self.config.distillation.critic_warmup_iterations
+        metrics |= self.ppo.update(self.rollout, strength, surrogate, self.generator, share)
+        metrics |= self.distillation.update(self.rollout, strength, self.generator)
         return metrics | self._learn_world()
-
-    def _look_around(self) -> None:
-        """Statistics begin with what the behaviour tree meets: networks that begin unscaled learn from their
-        first rollout in vain."""
-        self.collector.look_around()
-        self._learn_world()
-        self.collector.fill_model_features()
-        self.ppo.observe(self.rollout.x)
-        self.env_steps += self._samples
 
     def _learn_world(self) -> dict[str, float]:
         """World model, from all transitions within the rollout that do not end an episode."""
         if self.world_learner is None:
             return {}
-        obs, valid = self.rollout.x[..., : self.env.num_obs], ~self.rollout.ended[:-1]
-        return self.world_learner.update(obs[:-1], self.rollout.action[:-1], obs[1:], self.generator, valid)
-
-    def _strength(self, share: float) -> tuple[float, dict[str, float]]:
-        """lambda_t s_t, and both for the log."""
-        mean = self.collector.uncertainty.nanmean().nan_to_num()[None]
-        self.uncertainty.update(mean)
-        weight, scale = piecewise_linear(self.config.distillation.schedule, share), self.uncertainty.scale
-        return weight * scale, {
-            "distillation/lambda": weight,
-            "distillation/scale": scale,
-            "distillation/lambda_risk": weight * scale,
-        }
-
-    def _times(self, learn_s: float) -> dict[str, float]:
-        simulate_s, infer_s = self.collector.simulate_s, self.collector.infer_s
-        rate = self._samples / (simulate_s + infer_s + learn_s)
-        return {
-            "time/simulate_s": simulate_s,
-            "time/infer_s": infer_s,
-            "time/learn_s": learn_s,
-            "time/env_steps_per_s": rate,
-        }
+        rollout = self.rollout
+        obs, valid = rollout["x"][..., : self.world_learner.model.n_obs], ~rollout["ended"][:-1]
+        return self.world_learner.update(obs[:-1], rollout["action"][:-1], obs[1:], self.generator, valid)
 
     def _judge(self, metrics: dict[str, float]) -> None:
         """Tell the guard what was bad in this iteration."""
@@ -186,11 +181,9 @@ class Trainer:
         skipped = metrics["train/skipped_updates"]
         if skipped:
             complaints.append(f"{int(skipped)} updates left out because loss or gradient was not finite")
-        self.guard.check(
-            self.iteration, complaints, self.collector.info["seed"], self.collector.info["episode"]
-        )
+        self.env.guard.check(self.iteration, complaints, self.env.scenarios)
 
     @property
     def _samples(self) -> int:
         """Env-steps of one rollout."""
-        return self.rollout.steps * self.collector.hold.steps * self.env.num_envs
+        return self.rollout.steps * self.env.steps * self.env.num_envs

@@ -9,7 +9,6 @@ next observation plus beta
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -267,18 +266,14 @@ class WorldModelLearner:
         obs = batch.obs[kept]
         predicted = self.model.predict(obs, batch.action[kept])
         target = batch.next_obs[kept, :N_TARGET]
-        inside = coverage(
-            predicted.mean, predicted.log_var, target, torch.tensor([0.9], device=target.device)
-        )
+        square, inside = calibration(predicted.mean, predicted.log_var, target)
         error, before = (
             (target - said).square().mean(dim=0).tolist() for said in (predicted.mean, obs[:, :N_TARGET])
         )
         found = zip(self._names, error, before, strict=True)
         return {f"{SKILL}{name}": 1.0 - ours / theirs for name, ours, theirs in found if theirs > 0.0} | {
-            "world_model/standardised_residual": mean_squared_standardised_residual(
-                predicted.mean, predicted.log_var, target
-            ),
-            "world_model/coverage_90": float(inside),
+            "world_model/standardised_residual": square,
+            "world_model/coverage_90": inside,
             "world_model/uncertainty": float(self.model.uncertainty(predicted).mean()),
             "world_model/latent_std": float(self.model.encode(obs).std(dim=0, correction=0).mean()),
         }
@@ -305,21 +300,12 @@ class ModelBatch(NamedTuple):
 # ------------------------------------------------------------------------------------------------ calibration
 
 
-def standardised_residual(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
-    """(target - mean) in predicted standard deviations, float64, same shape."""
-    return (target.double() - mean.double()) * torch.exp(-0.5 * log_var.double())
+INSIDE_90 = 1.6448536269514722
+"""standard deviations on either side of a Gaussian's mean that hold 90 % of it"""
 
 
-def mean_squared_standardised_residual(mean: Tensor, log_var: Tensor, target: Tensor) -> float:
-    """1 where predicted variances are right on average; above 1: too sure of itself."""
-    return float(standardised_residual(mean, log_var, target).square().mean())
-
-
-def coverage(mean: Tensor, log_var: Tensor, target: Tensor, levels: Tensor) -> Tensor:
-    """Share of targets inside the central Gaussian interval of each nominal level, (n_level,): equals
-    ``levels`` if calibrated."""
-    if bool(((levels <= 0) | (levels >= 1)).any()):
-        raise ValueError(f"coverage levels must lie between 0 and 1, got {levels.tolist()}")
-    size = standardised_residual(mean, log_var, target).abs().flatten()
-    half_width = math.sqrt(2.0) * torch.erfinv(levels.double())
-    return torch.stack([(size <= width).double().mean() for width in half_width])
+def calibration(mean: Tensor, log_var: Tensor, target: Tensor) -> tuple[float, float]:
+    """Mean square of (target - mean) in predicted standard deviations, 1 where variances are right on average
+    and above it where they are too small; share of targets within the central 90 % interval."""
+    z = (target.double() - mean.double()) * torch.exp(-0.5 * log_var.double())
+    return float(z.square().mean()), float((z.abs() <= INSIDE_90).double().mean())

@@ -479,7 +479,7 @@ def _smaller(config: Config, n_env: int, device: str, free: int) -> str:
         fitting > 1 and memory_bytes(config, fitting, device) > 0.9 * free
     ):  # what all envs share takes its part too
         fitting = fitting * 9 // 10
-    return f"use --num-envs {max(1, fitting)} or fewer"
+    return f"use --num-envs {max(1, fitting)} or fewer (to train: --set train.num_envs)"
 
 
 def _check_kernels(config: Config) -> None:

@@ -24,10 +24,10 @@ from uuvtai.learning.export import folder as deploy
 from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.card import evaluations_of
 from uuvtai.learning.export.folder import of_torch
-from uuvtai.learning.export.graph import TOLERANCE, OneDecision, golden_of, missing_packages
-from uuvtai.learning.export.spec import weights_of
+from uuvtai.learning.export.modules import TOLERANCE, golden_of, missing_packages, module_of, weights_of
+from uuvtai.learning.export.spec import specification
 from uuvtai.learning.networks import ActorCritic
-from uuvtai.learning.policy_agent import PolicyAgent, load_agent
+from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.world_model import N_TARGET, WorldModel
 from uuvtai.plugins.api import plugin_spec
 from uuvtai.plugins.loading import graph_of, onnx_policy
@@ -50,28 +50,29 @@ def config_of(**changes):
     )
 
 
-def networks(config, seed=0):
+def networks(config, seen=True):
     """Networks that have seen a batch and act decidedly, as a trainer's state."""
-    rng = torch.Generator().manual_seed(seed)
-    policy = ActorCritic(N_OBS + 2, config.policy, rng)
+    rng = torch.Generator().manual_seed(0)
+    policy, model = ActorCritic(N_OBS + 2, config.policy, rng), WorldModel(N_OBS, config.world_model, rng)
+    if not seen:
+        return {"policy": policy.state_dict(), "world_model": model.state_dict(), "env": {}}
     policy.observation_norm.update(3.0 * torch.randn(500, N_OBS + 2, generator=rng) + 1.0)
     policy.value_norm.update(20.0 * torch.randn(500, 1, generator=rng) + 5.0)
     with torch.no_grad():
         policy.actor[-1].weight.copy_(torch.randn(policy.actor[-1].weight.shape, generator=rng))
     state = {"policy": policy.state_dict(), "env": {}}
     if config.world_model.enabled:
-        model = WorldModel(N_OBS, config.world_model, rng)
         model.observation_norm.update(3.0 * torch.randn(500, N_OBS, generator=rng))
         model.change_norm.update(0.2 * torch.randn(500, N_TARGET, generator=rng))
         state["world_model"] = model.state_dict()
     return state
 
 
-def saved(folder, config=None, metrics=None, **changes):
+def saved(folder, config=None, metrics=None, seen=True, **changes):
     """A run folder with one checkpoint."""
     config = config or config_of(**changes)
     table = [Column(*row) for row in TABLE]
-    checkpoint.save(folder / "checkpoints", 3, networks(config), config, table, metrics=metrics)
+    checkpoint.save(folder / "checkpoints", 3, networks(config, seen), config, table, metrics=metrics)
     return checkpoint.newest(folder)
 
 
@@ -98,45 +99,48 @@ CASES = {
 }
 
 
+def driver(found, module):
+    arrays = {name: tensor.numpy() for name, tensor in weights_of(module).items()}
+    return run_policy.made(specification(found, module, "mine", False), arrays)
+
+
+def mission(policy, agent):
+    """(exported policy, agent) at every step of a mission that begins again in the middle: all they say."""
+    rng, rows = torch.Generator().manual_seed(3), []
+    for step, obs in enumerate(3.0 * torch.randn(90, N_OBS, generator=rng) + 1.0):
+        if step % 47 == 0:
+            policy.reset()
+            agent.reset(torch.ones(1))
+        obs[step % N_OBS] = (1.0, float("nan"), float("inf"))[step % 3]
+        rows.append((policy.act(obs.numpy()), agent.decide(obs[None])))
+        agent.advance()
+    names = "action", "value", "residual", "uncertainty"
+    return [
+        np.stack([np.concatenate([np.ravel(getattr(one, name)) for name in names]) for one in told])
+        for told in zip(*rows, strict=True)
+    ]
+
+
 @pytest.mark.parametrize("changes", CASES.values(), ids=CASES)
 def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, changes):
     found = saved(tmp_path, load_training("smoke", list((SMALL | changes).items())))
-    pilot = load_agent(found, 1)
-    golden = golden_of(pilot)
-    spec = {
-        "observation": {"width": N_OBS},
-        "action": found.manifest.action,
-        "rate": {"hold_steps": found.config.policy.hold_steps, "control_dt_s": 0.02},
-        "network": deploy.specification(found, pilot, "mine", False)["network"],
-    }
-    policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
-    answer = run_policy.replayed(policy, golden)
-    for name, values in answer.items():
-        assert run_policy.difference(values, golden[name]) <= TOLERANCE, name
-    assert of_torch(OneDecision(pilot), golden).agrees
-    has_model = pilot.world_model is not None
-    assert golden["action"].std() > 0.1 and np.abs(golden["action"]).max() <= 1.0
-    assert (golden["residual"] > 0).any() == has_model
-    first, hold = len(golden["obs"]) // 2 + 1, found.config.policy.hold_steps
-    assert len(golden["pair_obs"]) == -(-first // hold) + -(-(len(golden["obs"]) - first) // hold)
-    assert not np.isfinite(golden["obs"]).all(), "sensors that fail are among the golden pairs"
+    module, golden = module_of(found), golden_of(module_of(found))
+    policy = driver(found, module)
+    assert max(run_policy.differences(policy, golden).values()) <= TOLERANCE
+    assert of_torch(module, golden).agrees
+    has_model = module.world_model is not None
+    assert (golden["pair_features"] > 0).any() == has_model and (golden["pair_features"][0] == 0).all()
+    assert not np.isfinite(golden["pair_obs"]).all(), "sensors that fail are among the golden pairs"
+    said, done = mission(policy, load_agent(found, 1))
+    assert max(run_policy.difference(*columns) for columns in zip(said.T, done.T, strict=True)) <= TOLERANCE
+    assert done[:, :4].std() > 0.1 and np.abs(done[:, :4]).max() <= 1.0
+    assert (done[:, 5] > 0).any() == has_model
 
 
-def test_networks_that_have_seen_nothing_agree_too():
-    config, rng = config_of(), torch.Generator().manual_seed(0)
-    pilot = PolicyAgent(
-        ActorCritic(N_OBS + 2, config.policy, rng), WorldModel(N_OBS, config.world_model, rng), 1
-    )
-    golden = golden_of(pilot)
-    spec = {
-        "observation": {"width": N_OBS},
-        "action": [{"limit": 1.0}] * 4,
-        "rate": {"hold_steps": 1, "control_dt_s": 0.02},
-        "network": {"activation": "elu", "predict_change": True},
-    }
-    policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
-    answer = run_policy.replayed(policy, golden)
-    assert max(run_policy.difference(values, golden[name]) for name, values in answer.items()) <= TOLERANCE
+def test_networks_that_have_seen_nothing_agree_too(tmp_path):
+    found = saved(tmp_path, seen=False)
+    module = module_of(found)
+    assert max(run_policy.differences(driver(found, module), golden_of(module)).values()) <= TOLERANCE
 
 
 def test_a_held_action_does_not_follow_the_newest_observation(tmp_path, no_onnx):
@@ -213,7 +217,7 @@ def test_the_folder_drives_where_there_is_numpy_alone(folder):
         [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert "uncertainty: largest difference" in done.stdout and "p50" in done.stdout
+    assert "features: largest difference" in done.stdout and "p50" in done.stdout
     roots = {
         (node.module or "").split(".")[0]
         if isinstance(node, ast.ImportFrom)
@@ -378,7 +382,7 @@ def resigned(folder, name, content):
 
 
 def test_other_weights_with_the_right_sha256_are_exit_3(folder, tmp_path, capfd):
-    weights = weights_of(load_agent(saved(tmp_path / "other", config_of(), metrics={"a": 1.0}), 1))
+    weights = weights_of(module_of(saved(tmp_path / "other", config_of(), metrics={"a": 1.0})))
     weights["actor.4.bias"] += 0.01
     resigned(folder, "policy.safetensors", save(weights))
     assert run_cli("export", "--check", folder) == 3

@@ -53,7 +53,7 @@ def during_training(checkpoint: Checkpoint) -> Evaluation | None:
     success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
     if not isinstance(success, float | int) or not isinstance(collision, float | int):
         return None
-    is_twin = config.learner == "surrogate"
+    is_twin = config.surrogate.enabled
     where, n = _held_out_in_worlds(config) if is_twin else _held_out(config)
     where += f", seed {config.train.evaluate_seed}"
     repeated = is_twin and len(config.surrogate.worlds) * max(1, len(config.train.scenes)) > 1
@@ -150,10 +150,10 @@ def _rate(k: int, n: int, bare: bool) -> str:
 # ------------------------------------------------------------------------------------------------------------
 
 
-_TEXT = """# {name}
+_CARD = """# {name}
 
-A policy that drives an underwater vehicle of the BlueROV2 class from sensor features, trained in the
-simulator of uuvtai {version}.
+{what}
+Trained with uuvtai {version}.
 
 ## What it was trained on
 {training}
@@ -163,45 +163,99 @@ simulator of uuvtai {version}.
 
 ## How to run it
 `python run_policy.py` (NumPy alone) replays the golden pairs and prints the latency. In a program:
-`load(folder)`, `reset()` when a mission begins, `act(observation)` at every control step ({control_hz:g} Hz).
-A decision is made every {hold_steps} control step(s);
-in between the action is kept. `policy_spec.json` lists every column of the observation
-with unit, frame and scaling, the limits of the actions, the rate and the sha256 of every file.{graph}
+`from run_policy import load`, then `policy = load(folder)`.
+{how}
+`policy_spec.json` says what every column is, and the sha256 of every file.{graph}
 
-## What it is for
-Research in simulation, and trials on a vehicle in a tank with an operator who can stop it. The observation
-has to come from the same stack (sonar, map, route, tracking{tree}) with the same meaning; a column that
-means something else makes the policy worthless.
+{rule}## What it is for
+Research in simulation, and trials on a vehicle in a tank with an operator who can stop it. Columns have to
+come from the same stack ({stack}) with the same meaning.
 
 ## What it is not for
 - It has been judged in this simulator alone. Nothing here says how it does on a real vehicle, in other water,
   or with other sensors.
-- It does not guarantee clearance and does not say when it is in danger. Keep a separate safety stop.
-- It expects the vehicle's inner velocity loop with the limits of `policy_spec.json`; it never commands
-  thrusters.
+{limits}
 """
+_WHAT = {
+    "mlp": "A policy that drives an underwater vehicle of the BlueROV2 class from sensor features.",
+    "set": "A policy that drives an underwater vehicle by a wish for a velocity, from tracked obstacles and "
+    "free distances.",
+    "forecast": "A forecast of tracked moving obstacles: a mixture of Gaussians over the places in the next "
+    "seconds.",
+}
+_HOW = {
+    "mlp": """`policy.reset()` when a mission begins, `policy.act(observation)` at every control step
+({control_hz:g} Hz). A decision is made every {hold_steps} control step(s); in between the action is kept.""",
+    "set": """`said = policy.act(obstacles, own)` {decision_hz:g} times a second, and at every control step
+({control_hz:g} Hz) `policy.command(said.wish, flip, yaw_rad, z_m)`. It remembers nothing; the last wish that
+was carried out is among the columns.""",
+    "forecast": """`policy.futures(columns, speed)` for each track: `log_weight` of each future, `place` [m]
+along and across the track's course after {times} s, and `sigma` [m].""",
+}
+_STACK = {
+    "mlp": "sonar, map, route, tracking{tree}", "set": "tracks, map, pose", "forecast": "the tracker",
+}  # fmt: skip
+_GRAPH = {
+    "mlp": """
 
+`policy.onnx` is one decision without memory: remember the last decision yourself, as `graph` in the
+specification says.""",
+    "set": " `policy.onnx` is the same for any number of rows.",
+}
+_LIMITS = """- It does not guarantee clearance and does not say when it is in danger. Keep a separate safety
+  stop.
+- It expects the vehicle's inner velocity loop with these limits; it never commands thrusters."""
+_LIMITS_FORECAST = "- Its probabilities are those of obstacles as they move in this simulator."
+_RULE = """## The hull rule
+A wish (x, y, up) becomes a command at every control step, by the heading and the height of that moment;
+numbers are `hull_rule` of `policy_spec.json`, and `command` in `run_policy.py` is this rule.
+
+1. Velocity wanted in the world: (flip.x x, flip.y y) times {fastest_m_s:.3f} m/s, shortened to that
+   length where (x, y) is longer than 1; upward `up`, within +-1, times {heave:g} m/s. A flip is -1
+   where the goal lies at a smaller coordinate than the start, else 1.
+2. In the body frame (turned by the heading) the two become parts of {surge:g} m/s surge and {sway:g}
+   m/s sway. Where one is beyond 1 both are divided by the larger one.
+3. Heave: the upward velocity is at most what leads to {gap_m:g} m below the surface in one second, and
+   at least what leads to {gap_m:g} m above the floor in one second; then in parts of {heave:g} m/s,
+   within +-1. Height 0 is the surface, the floor lies at {floor:g} m.
+4. Yaw rate: the nearest diagonal of the hull (45, 135, 225 or 315 degrees) turns to the motion, for
+   there surge and sway add up: the angle times {turn_gain_1_s:g} 1/s, in parts of
+   {max_yaw_rate_rad_s:g} rad/s, within +-1. Slower than {least_speed_m_s:g} m/s the heading stays.
+
+"""
+_NONE = "No evaluation was at hand."
 _COUNTED = """
 Rates are counts with 95 % Wilson intervals. Collision counts contacts, time-to-collision stops and leaving
 the tank."""
-_GRAPH = """
-
-`policy.onnx` is one decision without memory: remember the last decision yourself, as `graph`
-in the specification says."""
 
 
 def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
     """The card as Markdown."""
-    return _TEXT.format(
+    kind, rule = spec["kind"], spec.get("hull_rule")
+    is_forecast = kind == "forecast"
+    times = ", ".join(f"{time:g}" for time in spec["network"].get("times_s", ()))
+    return _CARD.format(
         name=spec["name"],
+        what=_WHAT[kind],
         version=checkpoint.manifest.version,
         training=training_text(checkpoint),
-        results=results_text(checkpoint, evaluations),
-        control_hz=spec["rate"]["control_hz"],
-        hold_steps=spec["rate"]["hold_steps"],
-        tree=", behaviour tree" if checkpoint.config.observation.behavior else "",
-        graph=_GRAPH if spec["graph"] else "",
+        results=forecast_text(checkpoint) if is_forecast else results_text(checkpoint, evaluations),
+        how=_HOW[kind].format(**spec.get("rate", {}), times=times),
+        graph=_GRAPH.get(kind, _GRAPH["set"]) if spec["graph"] else "",
+        rule=_RULE.format(**rule, **rule["limits_m_s"], floor=rule["z_m"][0]) if rule else "",
+        stack=_STACK[kind].format(tree=", behavior tree" if checkpoint.config.observation.behavior else ""),
+        limits=_LIMITS_FORECAST if is_forecast else _LIMITS,
     )
+
+
+def forecast_text(checkpoint: Checkpoint) -> str:
+    """Scores of a forecast on held-out episodes, as a list."""
+    rows = [
+        f"- {name.removeprefix('eval/')}: {value:.3g}"
+        for name, value in sorted(checkpoint.manifest.metrics.items())
+        if name.startswith("eval/") and isinstance(value, float)
+    ]
+    return "\n".join(["On held-out episodes of the training's worlds:", *rows] if rows else [_NONE])
 
 
 def training_text(checkpoint: Checkpoint) -> str:
@@ -240,121 +294,7 @@ def results_text(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
         [(own, " (chose the checkpoint: too good by selection)")] if own else []
     )
     if not rows:
-        return (
-            "No evaluation was at hand. Evaluate it with `uuv eval RUN` and export again with "
-            "`--evaluation FOLDER`."
-        )
+        return f"{_NONE} Evaluate it with `uuv eval RUN` and export again with `--evaluation FOLDER`."
     lines = ["| where | success | collision |", "|---|---|---|"]
     lines += ["| " + " | ".join((row.where + remark, *row.rates())) + " |" for row, remark in rows]
     return "\n".join([*lines, _COUNTED])
-
-
-# ------------------------------------------------------------------------------------------------------------
-# README.md of an exported policy over a set of obstacles or of a learned forecast: how a stranger drives by
-# it, what it learnt from, how it did, and what it is not for.
-
-
-_CARD = """# {name}
-
-{what}
-Trained with uuvtai {version}.
-
-## What it was trained on
-{training}
-
-## How it did
-{results}
-
-## How to run it
-`python run_set_policy.py` (NumPy alone) replays the golden pairs and prints the latency.
-{how}
-`policy_spec.json` says what every column is.{graph}
-
-{rule}## What it is not for
-- It has been judged in this simulator alone. Nothing here says how it does on a real vehicle, in other water,
-  or with other sensors.
-{limits}
-"""
-_SET = (
-    "A policy that drives an underwater vehicle by a wish for a velocity, from tracked obstacles and free "
-    "distances."
-)
-_FORECAST = (
-    "A forecast of tracked moving obstacles: a mixture of Gaussians over the places in the next seconds."
-)
-_HOW_SET = """In a program: `from run_set_policy import load`, `policy = load(folder)`, then {rate:g} times a
-second `said = policy.act(obstacles, own)`, and at every control step ({control_hz:g} Hz)
-`policy.command(said.wish, flip, yaw_rad, z_m)`. It remembers nothing; the last wish that was carried out is
-among the columns."""
-_HOW_FORECAST = """In a program: `from run_set_policy import load`, `forecast = load(folder)`, then
-`forecast.futures(columns, speed)` for each track: `log_weight` of each future, `place` [m] along and
-across the track's course after {times} s, and `sigma` [m]."""
-_SET_GRAPH = " `policy.onnx` is the same for any number of rows."
-_RULE = """## The hull rule
-A wish (x, y, up) becomes a command at every control step, by the heading and the height of that moment;
-numbers are `hull_rule` of `policy_spec.json`, and `command` in `run_set_policy.py` is this rule.
-
-1. Velocity wanted in the world: (flip.x x, flip.y y) times {fastest_m_s:.3f} m/s, shortened to that
-   length where (x, y) is longer than 1; upward `up`, within +-1, times {heave:g} m/s. A flip is -1
-   where the goal lies at a smaller coordinate than the start, else 1.
-2. In the body frame (turned by the heading) the two become parts of {surge:g} m/s surge and {sway:g}
-   m/s sway. Where one is beyond 1 both are divided by the larger one.
-3. Heave: the upward velocity is at most what leads to {gap_m:g} m below the surface in one second, and
-   at least what leads to {gap_m:g} m above the floor in one second; then in parts of {heave:g} m/s,
-   within +-1. Height 0 is the surface, the floor lies at {floor:g} m.
-4. Yaw rate: the nearest diagonal of the hull (45, 135, 225 or 315 degrees) turns to the motion, for
-   there surge and sway add up: the angle times {turn_gain_1_s:g} 1/s, in parts of
-   {max_yaw_rate_rad_s:g} rad/s, within +-1. Slower than {least_speed_m_s:g} m/s the heading stays.
-
-"""
-_LIMITS = """- It does not guarantee clearance. Keep a separate safety stop.
-- Columns have to come from the same stack (tracks, map, pose) with the same meaning.
-- It expects the vehicle's inner velocity loop with these limits; it never commands thrusters."""
-_LIMITS_FORECAST = """- Its probabilities are those of obstacles as they move in this simulator.
-- Columns have to come from the same tracker with the same meaning."""
-
-
-def set_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
-    """The card as Markdown."""
-    kind = spec["kind"]
-    parts = _forecast_parts(spec, checkpoint) if kind == "forecast" else _set_parts(spec)
-    results = {"results": results_text(checkpoint, evaluations)} | parts
-    return _CARD.format(
-        name=spec["name"],
-        version=checkpoint.manifest.version,
-        training=training_text(checkpoint),
-        graph=_SET_GRAPH if spec["graph"] else "",
-        **results,
-    )
-
-
-def _set_parts(spec: dict[str, Any]) -> dict[str, str]:
-    rate = spec["rate"]
-    return {
-        "what": _SET,
-        "how": _HOW_SET.format(rate=rate["decision_hz"], control_hz=rate["control_hz"]),
-        "rule": _rule(spec["hull_rule"]),
-        "limits": _LIMITS,
-    }
-
-
-def _rule(rule: dict[str, Any]) -> str:
-    return _RULE.format(**rule, **rule["limits_m_s"], floor=rule["z_m"][0])
-
-
-def _forecast_parts(spec: dict[str, Any], checkpoint: Checkpoint) -> dict[str, str]:
-    rows = [
-        f"- {name.removeprefix('eval/')}: {value:.3g}"
-        for name, value in sorted(checkpoint.manifest.metrics.items())
-        if name.startswith("eval/") and isinstance(value, float)
-    ]
-    times = ", ".join(f"{time:g}" for time in spec["network"]["times_s"])
-    return {
-        "what": _FORECAST,
-        "how": _HOW_FORECAST.format(times=times),
-        "rule": "",
-        "limits": _LIMITS_FORECAST,
-        "results": "\n".join(["On held-out episodes of the training's worlds:", *rows])
-        if rows
-        else "No evaluation was at hand.",
-    }

@@ -3,51 +3,39 @@ of such a folder."""
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import safetensors.torch
 import torch
-from torch import Tensor
 
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import unfinished, whole_folder
 from uuvtai.config.loader import ConfigError
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.export import graph as onnx_session
-from uuvtai.learning.export import run_policy, run_set_policy
-from uuvtai.learning.export.card import Evaluation, evaluations_of, model_card, set_card
-from uuvtai.learning.export.graph import (
-    INPUTS,
-    OUTPUTS,
-    SET_OUTPUTS,
+from uuvtai.learning.export import run_policy
+from uuvtai.learning.export.card import evaluations_of, model_card
+from uuvtai.learning.export.graph import GraphError, refuse_strange
+from uuvtai.learning.export.modules import (
     TOLERANCE,
     Arrays,
     ExportedModule,
-    GraphError,
-    OneDecision,
     golden_of,
-    golden_rows,
-    inputs_of,
-    kind_of,
     missing_packages,
     module_of,
     npz_bytes,
     onnx_bytes,
-    refuse_strange,
-    set_weights,
+    weights_of,
 )
 from uuvtai.learning.export.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, PolicyError
-from uuvtai.learning.export.spec import ONNX, set_specification, specification, weights_of
-from uuvtai.learning.policy_agent import load_agent
+from uuvtai.learning.export.spec import ONNX, specification
 from uuvtai.logs.container import sync_folder
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
 
@@ -78,38 +66,31 @@ class Agreement:
         return asdict(self) | {"difference": differences, "agrees": self.agrees}
 
 
-def of_numpy(policy: run_policy.Policy, golden: Arrays) -> Agreement:
-    """``run_policy.py`` flies the golden mission."""
-    found = run_policy.replayed(policy, golden)
-    worst = {name: run_policy.difference(values, golden[name]) for name, values in found.items()}
-    return Agreement("NumPy", worst, **run_policy.decision_latency_ms(policy, golden["obs"]))
+def of_numpy(policy: run_policy.Exported, golden: Arrays) -> Agreement:
+    """``run_policy.py`` answers the golden inputs."""
+    worst = run_policy.differences(policy, golden)
+    return Agreement("NumPy", worst, **run_policy.latency_ms(policy.said, _inputs(golden, policy.inputs)))
 
 
-def of_set_numpy(
-    policy: run_set_policy.SetPolicy | run_set_policy.TrackForecast, golden: Arrays
-) -> Agreement:
-    """``run_set_policy.py`` answers the golden inputs."""
-    worst = run_set_policy.differences(policy, golden)
-    return Agreement("NumPy", worst, **run_set_policy.latency_ms(policy, golden))
+def of_torch(module: ExportedModule, golden: Arrays) -> Agreement:
+    """The networks themselves, one decision at a time."""
 
+    def said(row: Arrays) -> list[np.ndarray]:
+        return [part.numpy() for part in module(*map(torch.from_numpy, row.values()))]
 
-def of_torch(decision: ExportedModule, golden: Arrays) -> Agreement:
-    """The networks themselves, one decision at a time without memory, against the agent that flew the golden
-    mission with its own."""
-    tensors = [torch.from_numpy(array) for array in inputs_of(golden, decision.inputs).values()]
-    rows = [[tensor[i : i + 1] for tensor in tensors] for i in range(len(tensors[0]))]
+    inputs = _inputs(golden, module.inputs)
+    count = len(next(iter(inputs.values())))
     with torch.inference_mode():
-        outputs = [torch.cat(parts).numpy() for parts in zip(*(decision(*row) for row in rows), strict=True)]
-        time_ms = _in_turn(lambda row: decision(*row), rows)
-    return Agreement(
-        "torch", _differences(dict(zip(decision.outputs, outputs, strict=True)), golden), **time_ms
-    )
+        rows = [said({name: part[i : i + 1] for name, part in inputs.items()}) for i in range(count)]
+        time_ms = run_policy.latency_ms(said, inputs)
+    outputs = dict(zip(module.outputs, map(np.concatenate, zip(*rows, strict=True)), strict=True))
+    return Agreement("torch", _differences(outputs, golden, inputs), **time_ms)
 
 
-def of_onnx(graph: bytes, golden: Arrays, names: Iterable[str] = INPUTS) -> Agreement:
+def of_onnx(graph: bytes, golden: Arrays, names: Iterable[str]) -> Agreement:
     """ONNX Runtime on one thread, told the golden inputs of these names. Raises GraphError for a graph that
     is not ours or that it cannot use."""
-    inputs = inputs_of(golden, names)
+    inputs = _inputs(golden, names)
     count = {len(array) if array.ndim else 0 for array in inputs.values()}
     if len(count) != 1 or 0 in count:
         raise GraphError("its golden pairs are no rows of inputs")
@@ -120,29 +101,24 @@ def of_onnx(graph: bytes, golden: Arrays, names: Iterable[str] = INPUTS) -> Agre
         outputs = [np.asarray(output) for output in session.run(names, inputs)]
     except Exception as error:  # its own errors share no base class beyond this
         raise GraphError(f"ONNX Runtime cannot use it ({error})") from None
-    rows = [{name: array[i : i + 1] for name, array in inputs.items()} for i in range(count.pop())]
-    found = _differences(dict(zip(names, outputs, strict=True)), golden)
-    return Agreement("ONNX Runtime", found, **_in_turn(lambda row: session.run(names, row), rows))
+    found = _differences(dict(zip(names, outputs, strict=True)), golden, inputs)
+    return Agreement(
+        "ONNX Runtime", found, **run_policy.latency_ms(lambda row: session.run(names, row), inputs)
+    )
 
 
-def _differences(found: Arrays, golden: Arrays) -> dict[str, float]:
+def _inputs(golden: Arrays, names: Iterable[str]) -> Arrays:
+    return {name: golden[f"pair_{name}"] for name in names}
+
+
+def _differences(said: Arrays, golden: Arrays, inputs: Arrays) -> dict[str, float]:
     """Of every output that the golden pairs have; one that is missing differs without end."""
-    wanted = [name for name in (*OUTPUTS, *SET_OUTPUTS) if f"pair_{name}" in golden]
+    wanted = [name.removeprefix("pair_") for name in golden]
     return {
-        name: run_policy.difference(found[name], golden[f"pair_{name}"]) if name in found else np.inf
+        name: run_policy.difference(said[name], golden[f"pair_{name}"]) if name in said else np.inf
         for name in wanted
+        if name not in inputs
     }
-
-
-def _in_turn(step: Callable[[Any], Any], rows: list[Any]) -> dict[str, float]:
-    turn = 0
-
-    def once() -> None:
-        nonlocal turn
-        step(rows[turn % len(rows)])
-        turn += 1
-
-    return run_policy.latency_ms(once)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -188,56 +164,31 @@ class Export:
 def export(
     checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note, force: bool = False
 ) -> Export:
-    """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks. ``force``
-    replaces an exported policy.
+    """Write the policy or forecast of a checkpoint into a new folder ``out``; ``note`` is told what it lacks.
+    ``force`` replaces an exported policy.
 
     Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive,
     RunFolderError where the disk refuses.
     """
     _refuse_place(out, force)
-    exporter, rows = _exporter_of(checkpoint, name), evaluations_of(checkpoint, evaluations)
-    decision, golden, graph = exporter.decision, exporter.golden, None
+    module, rows = module_of(checkpoint), evaluations_of(checkpoint, evaluations)
+    golden, graph = golden_of(module), None
     if missing := missing_packages():
         note(
             f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', "
             "then export again"
         )
     else:
-        graph = onnx_bytes(decision)
-    spec = exporter.spec(graph is not None)
+        graph = onnx_bytes(module)
+    spec = specification(checkpoint, module, name, graph is not None)
     files = {
-        WEIGHTS: safetensors.torch.save(exporter.weights),
+        WEIGHTS: safetensors.torch.save(weights_of(module)),
         GOLDEN: npz_bytes(golden),
-        "README.md": exporter.card(spec, checkpoint, rows).encode(),
-        "run_policy.py": _source_of(run_policy),
+        "README.md": model_card(spec, checkpoint, rows).encode(),
+        "run_policy.py": Path(run_policy.__file__).read_bytes(),
     } | ({} if graph is None else {ONNX: graph})
-    if "kind" in spec:
-        files["run_set_policy.py"] = _source_of(run_set_policy)
     _publish(out, files, spec)
-    return Export(out, (of_torch(decision, golden), *_replayed(out, run_policy.read_spec(out), note)))
-
-
-@dataclass(frozen=True)
-class _Exporter:
-    """What of a checkpoint goes into a folder."""
-
-    decision: ExportedModule
-    golden: Arrays
-    weights: dict[str, Tensor]
-    spec: Callable[[bool], dict[str, Any]]
-    """of whether there is a graph"""
-    card: Callable[[dict[str, Any], Checkpoint, list[Evaluation]], str]
-
-
-def _exporter_of(checkpoint: Checkpoint, name: str) -> _Exporter:
-    """Raises CheckpointError for networks that cannot drive."""
-    if (kind := kind_of(checkpoint)) is None:
-        agent = load_agent(checkpoint, 1)
-        decision, spec = OneDecision(agent), functools.partial(specification, checkpoint, agent, name)
-        return _Exporter(decision.eval(), golden_of(agent), weights_of(agent), spec, model_card)
-    decision = module_of(checkpoint, kind)
-    spec = functools.partial(set_specification, checkpoint, decision, kind, name)
-    return _Exporter(decision.eval(), golden_rows(decision), set_weights(decision), spec, set_card)
+    return Export(out, (of_torch(module, golden), *_replayed(out, run_policy.read_spec(out), note)))
 
 
 def check(folder: Path, note: Note) -> Export:
@@ -255,25 +206,16 @@ def check(folder: Path, note: Note) -> Export:
         raise ExportError(str(error)) from None
 
 
-def _source_of(module: ModuleType) -> bytes:
-    """A exporter's own text."""
-    return Path(module.__file__ or "").read_bytes()
-
-
 def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[Agreement]:
     """What NumPy and, where it is here, ONNX Runtime make of the folder's files."""
     golden = run_policy.read_golden(folder / GOLDEN)
     try:
-        arrays, names = run_policy.read_safetensors(folder / WEIGHTS), tuple(INPUTS)
-        if "kind" in spec:
-            policy = run_set_policy.made(spec, arrays)
-            found, names = [of_set_numpy(policy, golden)], policy.inputs
-        else:
-            found = [of_numpy(run_policy.Policy(spec, arrays), golden)]
+        policy = run_policy.made(spec, run_policy.read_safetensors(folder / WEIGHTS))
+        found = [of_numpy(policy, golden)]
         if ONNX not in spec["files"]:
             return found
         if onnx_session.is_installed():
-            return [*found, of_onnx(run_policy.content_of(folder / ONNX), golden, names)]
+            return [*found, of_onnx(run_policy.content_of(folder / ONNX), golden, policy.inputs)]
     except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
         raise PolicyError(
             f"{folder}: its golden pairs do not fit its policy ({error!r}); export it again"

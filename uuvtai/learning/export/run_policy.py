@@ -1,11 +1,15 @@
-"""Drive by an exported policy with NumPy alone: no torch, no Taichi, no uuvtai. ``uuv export`` puts a copy of
-this file in its folder.
+"""Drive by an exported policy, or ask an exported forecast, with NumPy alone: no torch, no Taichi, no uuvtai.
+``uuv export`` puts a copy of this file in its folder.
 
     from run_policy import load
     policy = load("FOLDER")               # checks the sha256 of every file
-    policy.reset()                        # at the start of a mission
-    decision = policy.act(observation)    # every control step: (n_obs,) in raw SI units, as policy_spec.json
-    says
+
+What it is stands as ``kind`` in policy_spec.json, with every column of its inputs:
+
+    mlp       policy.reset() at the start of a mission, policy.act(observation) at every control step
+    set       said = policy.act(obstacles, own) ten times a second, and at every control step
+              policy.command(said.wish, flip, yaw_rad, z_m), the hull rule
+    forecast  policy.futures(columns, speed) of a track
 
 ``python run_policy.py [FOLDER]`` replays the golden pairs, prints the differences and the latency, and exits
 3 where they differ. Nothing in the folder can make this file execute code: safetensors and npz are read as
@@ -23,25 +27,29 @@ import stat
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 SPEC, WEIGHTS, GOLDEN = "policy_spec.json", "policy.safetensors", "golden.npz"
-SCHEMA = 3
+SCHEMA = 4
 """of the folder; another one is refused"""
-FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py", "run_set_policy.py")
+FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py")
 """names that the spec may list; nothing else is ever opened"""
-KINDS = ("set", "forecast")
-"""of policies that ``run_set_policy.py`` drives by; a specification without ``kind`` is this file's"""
 N_TARGET, N_ACTION = 24, 4
+AT_THERE, AT_DIRECTION = 0, slice(3, 5)
+"""columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the goal"""
+SUM_SCALE = 0.3
+MOST_WISH = 2.0
+LEAST_M, LOG_BOUNDS = 0.03, (-6.0, math.log(4.0))
+"""of a forecast's deviations"""
 MAX_BYTES = 64 << 20
 """of any file of the folder: sixteen million parameters"""
 CALLS = 330
 """decisions that a latency is measured with"""
-MAX_STEPS, MAX_WORK = 1 << 16, 1 << 34
+MAX_ROWS, MAX_WORK = 1 << 16, 1 << 34
 """of the golden pairs, and multiplications to replay them: seconds"""
 
 _OPEN = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
@@ -51,10 +59,52 @@ _MAX_HEADER = 1 << 20
 _DTYPES = {"F32": np.dtype("<f4"), "F64": np.dtype("<f8")}
 
 Arrays = dict[str, np.ndarray]
+Layers = list[tuple[np.ndarray, np.ndarray]]
+Activation = Callable[[np.ndarray], np.ndarray]
 
 
 class PolicyError(RuntimeError):
     """A folder that cannot be used: which file, and why."""
+
+
+class Exported:
+    """What every kind can: ``said`` gives outputs for rows of inputs, by name, and remembers nothing."""
+
+    inputs: tuple[str, ...]
+
+    def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
+        """``spec`` is policy_spec.json, ``arrays`` policy.safetensors. Raises PolicyError where they do not
+        fit together."""
+        self.work = sum(array.size for array in arrays.values())
+        """multiplications of a row, of one obstacle"""
+        try:
+            self._read(spec, arrays)
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            raise PolicyError(
+                f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again"
+            ) from None
+
+    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None:
+        raise NotImplementedError
+
+    def said(self, given: Arrays) -> Arrays:
+        """Outputs by name, one row each for rows of inputs. Raises ValueError for inputs of other shapes."""
+        raise NotImplementedError
+
+    def _rows(self, given: Arrays, *shapes: tuple[int | None, ...]) -> list[np.ndarray]:
+        """The inputs as float32 of these shapes behind the rows, None = any size but 0. Raises ValueError."""
+        found = [np.asarray(given[name], np.float32) for name in self.inputs]
+        for name, rows, shape in zip(self.inputs, found, shapes, strict=True):
+            fits = rows.ndim == 1 + len(shape) and len(rows) == len(found[0])
+            if not fits or any(
+                n == 0 or w not in (None, n) for n, w in zip(rows.shape[1:], shape, strict=True)
+            ):
+                wanted = ", ".join("n" if width is None else str(width) for width in shape)
+                comma = "," if len(shape) == 1 else ""
+                raise ValueError(
+                    f"{name} must have shape ({wanted}{comma}), got {rows.shape[1:]}; see {SPEC}"
+                )
+        return found
 
 
 class Decision(NamedTuple):
@@ -72,39 +122,41 @@ class Decision(NamedTuple):
     """of that prediction"""
 
 
-class Policy:
+class Policy(Exported):
     """One vehicle's policy with its memory. ``act`` once per control step; ``reset`` when a mission
     begins."""
 
-    def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
-        """``spec`` is policy_spec.json, ``arrays`` policy.safetensors. Raises PolicyError where they do not
-        fit together."""
-        try:
-            self._network, self._limits = (
-                spec["network"],
-                np.array([row["limit"] for row in spec["action"]], np.float32),
-            )
-            self.n_obs, self.hold_steps = int(spec["observation"]["width"]), int(spec["rate"]["hold_steps"])
-            self.control_dt_s = float(spec["rate"]["control_dt_s"])
-            self._a = arrays
-            self._nets = {
-                name: layers_of(arrays, name)
-                for name in ("actor", "critic", "encoder", "dynamics", "decoder")
-            }
-            self._check_widths()
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise PolicyError(
-                f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again"
-            ) from None
-        self.work = sum(weight.size for layers in self._nets.values() for weight, _ in layers)
-        """multiplications of a decision"""
+    inputs = ("obs", "last_obs", "last_action", "has_last")
+
+    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None:
+        self._limits = np.array([row["limit"] for row in spec["action"]], np.float32)
+        self.n_obs, self.hold_steps = int(spec["observation"]["width"]), int(spec["rate"]["hold_steps"])
+        self._a, self._act = arrays, _ACTIVATIONS[spec["network"]["activation"]]
+        self._predicts_change = bool(spec["network"]["predict_change"])
+        names = ("actor", "critic", "encoder", "dynamics", "decoder")
+        self._nets = {name: layers_of(arrays, name) for name in names}
+        n_in = self.n_obs + 2
+        _check_widths(self._nets["actor"], n_in, N_ACTION)
+        _check_widths(self._nets["critic"], n_in, 1)
+        if self._nets["encoder"]:
+            latent = len(self._nets["encoder"][-1][1])
+            _check_widths(self._nets["encoder"], self.n_obs, latent)
+            _check_widths(self._nets["dynamics"], latent + N_ACTION, latent)
+            _check_widths(self._nets["decoder"], latent, 2 * N_TARGET)
+        if self.hold_steps < 1:
+            raise ValueError("hold_steps")
+        self.said(
+            {name: np.zeros((1, *shape)) for name, shape in zip(self.inputs, self._shapes, strict=True)}
+        )
         self.reset()
+
+    @property
+    def _shapes(self) -> tuple[tuple[int, ...], ...]:
+        return (self.n_obs,), (self.n_obs,), (N_ACTION,), ()
 
     def reset(self) -> None:
         """Forget the last step: another mission begins."""
-        self._age = 0
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._mean, self._said = np.zeros(N_ACTION, np.float32), np.zeros(3, np.float32)
+        self._age, self._last = 0, (np.zeros(self.n_obs), np.zeros(N_ACTION))
 
     def act(self, observation: Any) -> Decision:
         """Decision for the newest observation (n_obs,), carried out: call it every control step, also while a
@@ -115,114 +167,256 @@ class Policy:
                 f"the observation must have shape ({self.n_obs},), got {obs.shape}; its columns are listed "
                 f"in {SPEC}"
             )
-        obs = np.where(np.isfinite(obs), obs, self._a["norm.mean"][: self.n_obs])
         if self._age % self.hold_steps == 0:
-            self._think(obs)
-            self._last = obs, self._mean
+            row = (obs, *self._last, self._age > 0)
+            rows = self.said({n: np.asarray(part)[None] for n, part in zip(self.inputs, row, strict=True)})
+            self._said = {name: found[0] for name, found in rows.items()}
+            self._last = obs, self._said["mean_action"]
         self._age += 1
-        value, residual, uncertainty = (float(said) for said in self._said)
-        action = np.clip(self._mean, -1.0, 1.0)
-        return Decision(action, action * self._limits, value, residual, uncertainty)
+        action = np.clip(self._said["mean_action"], -1.0, 1.0)
+        thought = (float(part) for part in (self._said["value"], *self._said["features"]))
+        return Decision(action, action * self._limits, *thought)
 
-    def _think(self, obs: np.ndarray) -> None:
-        """Ask the networks: what is held until the next decision, and what they say."""
-        x = np.concatenate([obs, self._features(obs)])
-        scaled = self._scaled(x, "norm")
-        self._mean = self._through("actor", scaled)
-        value = self._a["value.mean"][0] + self._through("critic", scaled)[0] * self._a["value.std"][0]
-        self._said = np.array([value, x[-2], x[-1]], np.float32)
-
-    def _features(self, obs: np.ndarray) -> np.ndarray:
-        """(2,) residual and uncertainty of the world model's prediction from the last decision; 0 where there
-        is none."""
-        if self._last is None or not self._nets["encoder"]:
-            return np.zeros(2, np.float32)
-        last, action = self._last
-        a, lowest, highest = self._a, *_LOG_VAR
-        latent = self._through("encoder", self._scaled(last, "world_norm"))
-        ahead = self._through("dynamics", np.concatenate([latent, np.clip(action, -1.0, 1.0)]))
-        mean, raw = np.split(self._through("decoder", ahead), 2)
-        spread = np.float32(highest) - _softplus(
-            np.float32(highest - lowest) - _softplus(raw - np.float32(lowest))
+    def said(self, given: Arrays) -> Arrays:
+        """``mean_action`` (N, 4), not cut off, ``value`` (N,), and ``features`` (N, 2): residual and
+        uncertainty, 0 where ``has_last`` is. What is not finite counts as its mean in training."""
+        obs, last, action, has_last = self._rows(given, *self._shapes)
+        obs, last = (
+            np.where(np.isfinite(seen), seen, self._a["norm.mean"][: self.n_obs]) for seen in (obs, last)
         )
-        log_var = spread + 2.0 * np.log(a["target.scale"])
-        base = last[:N_TARGET] if self._network["predict_change"] else a["target.base"]
-        error = (obs[:N_TARGET] - (base + a["target.scale"] * mean)) / a["change.unit"]
-        residual = np.sqrt(np.mean(np.clip(error, -_MAX_DEVIATIONS, _MAX_DEVIATIONS) ** 2))
-        uncertainty = np.mean(np.exp(log_var - 2.0 * np.log(a["change.unit"])))
-        return np.nan_to_num(np.array([residual, uncertainty], np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+        features = np.zeros((len(obs), 2), np.float32)
+        if self._nets["encoder"]:
+            features = np.where(has_last[:, None] > 0, self._features(obs, last, action), features)
+        x = self._scaled(np.concatenate([obs, features], 1), "norm")
+        value = _through(self._nets["critic"], x, self._act)[:, 0]
+        return {
+            "mean_action": _through(self._nets["actor"], x, self._act),
+            "value": self._a["value.mean"][0] + value * self._a["value.std"][0],
+            "features": features,
+        }
+
+    def _features(self, obs: np.ndarray, last: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """(N, 2) residual and uncertainty of the world model's prediction from the last decision."""
+        a, (lowest, highest) = self._a, map(np.float32, _LOG_VAR)
+        latent = _through(self._nets["encoder"], self._scaled(last, "world_norm"), _elu)
+        ahead = np.concatenate([latent, np.clip(action, -1.0, 1.0)], 1)
+        ahead = _through(self._nets["dynamics"], ahead, _elu)
+        mean, raw = np.split(_through(self._nets["decoder"], ahead, _elu), 2, axis=1)
+        log_var = (
+            highest - _softplus(highest - lowest - _softplus(raw - lowest)) + 2 * np.log(a["target.scale"])
+        )
+        base = last[:, :N_TARGET] if self._predicts_change else a["target.base"]
+        error = (obs[:, :N_TARGET] - (base + a["target.scale"] * mean)) / a["change.unit"]
+        residual = np.sqrt(np.mean(np.clip(error, -_MAX_DEVIATIONS, _MAX_DEVIATIONS) ** 2, axis=1))
+        uncertainty = np.mean(np.exp(log_var - 2 * np.log(a["change.unit"])), axis=1)
+        return np.nan_to_num(np.stack([residual, uncertainty], 1), nan=0.0, posinf=0.0, neginf=0.0)
 
     def _scaled(self, x: np.ndarray, name: str) -> np.ndarray:
         """Normalised columns, cut off beyond the clip."""
         limit = self._a[f"{name}.limit"][0]
         return np.clip((x - self._a[f"{name}.mean"]) * self._a[f"{name}.scale"], -limit, limit)
 
-    def _through(self, name: str, x: np.ndarray) -> np.ndarray:
-        """Output of one network, its activation after every layer but the last."""
-        layers = self._nets[name]
-        act = _ACTIVATIONS[self._network["activation"] if name in ("actor", "critic") else "elu"]
-        for weight, bias in layers[:-1]:
-            x = act(weight @ x + bias)
-        weight, bias = layers[-1]
-        return weight @ x + bias
 
-    def _check_widths(self) -> None:
-        """Raise ValueError where a network does not take what it is given or does not give what is read."""
-        nets, n_in = self._nets, self.n_obs + 2
-        wanted = {"actor": (n_in, N_ACTION), "critic": (n_in, 1)}
-        if nets["encoder"]:
-            latent = len(nets["encoder"][-1][1])
-            wanted |= {
-                "encoder": (self.n_obs, latent),
-                "dynamics": (latent + N_ACTION, latent),
-                "decoder": (latent, 2 * N_TARGET),
-            }
-        for name, (first, last) in wanted.items():
-            if not nets[name] or nets[name][0][0].shape[1] != first or len(nets[name][-1][1]) != last:
-                raise ValueError(f"{name} is not a network from {first} to {last}")
-        if self.hold_steps < 1 or self._network["activation"] not in _ACTIVATIONS:
-            raise ValueError("hold_steps or activation")
+class SetDecision(NamedTuple):
+    """What the policy wishes."""
+
+    wish: np.ndarray
+    """(3,) ahead, left, up in the mirrored world, in parts of the fastest velocity, within +-2"""
+    mean_wish: np.ndarray
+    """(3,) the same, not cut off"""
 
 
-_ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
-    "tanh": np.tanh,
-    "relu": lambda x: np.maximum(x, 0),
-}
+class SetPolicy(Exported):
+    """A policy over a set of obstacles; it remembers nothing."""
+
+    inputs = ("obstacles", "own")
+
+    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None:
+        self.rule = spec["hull_rule"]
+        self.widths = {name: len(spec["observation"][name]["columns"]) for name in self.inputs}
+        self._gain = np.float32(spec["network"]["goal_gain"])
+        self._each, self._own, self._head = (
+            layers_of(arrays, f"actor.{part}") for part in ("obstacle", "own", "head")
+        )
+        _check_widths(self._each, self.widths["obstacles"])
+        _check_widths(self._own, self.widths["own"])
+        _check_widths(self._head, 2 * len(self._each[-1][1]) + len(self._own[-1][1]), 3)
+
+    def act(self, obstacles: Any, own: Any) -> SetDecision:
+        """Decision for the newest columns: obstacles (n, width), any n; own (width,).
+
+        Raises ValueError for other shapes, numbers that are not finite, or a first column of an obstacle that
+        is neither 0 nor 1.
+        """
+        mean = self.said({"obstacles": np.asarray(obstacles)[None], "own": np.asarray(own)[None]})[
+            "mean_wish"
+        ][0]
+        return SetDecision(np.clip(mean, -MOST_WISH, MOST_WISH), mean)
+
+    def said(self, given: Arrays) -> Arrays:
+        """``mean_wish`` (N, 3): every obstacle through the same layers, then maximum and sum over those that
+        are there, so that neither their order nor their number matters. Raises ValueError as ``act``."""
+        obstacles, own = self._rows(given, (None, self.widths["obstacles"]), (self.widths["own"],))
+        if not (np.isfinite(obstacles).all() and np.isfinite(own).all()):
+            raise ValueError(
+                "columns hold numbers that are not finite; leave out obstacles that are not known"
+            )
+        there = obstacles[..., AT_THERE]
+        if not np.isin(there, (0.0, 1.0)).all():
+            raise ValueError(
+                "obstacles: the first column is 1 where there is an obstacle, else all columns are 0"
+            )
+        each = _relu(_through(self._each, obstacles, _relu)) * there[..., None]
+        mine = _relu(_through(self._own, own, _relu))
+        pooled = np.concatenate([each.max(-2), np.float32(SUM_SCALE) * each.sum(-2), mine], -1)
+        mean = _through(self._head, pooled, _relu)
+        mean[:, :2] += self._gain * own[:, AT_DIRECTION]
+        return {"mean_wish": mean}
+
+    def command(self, wish: Any, flip: Any, yaw_rad: float, z_m: float) -> np.ndarray:
+        """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame: the hull rule.
+
+        ``wish`` (3,) is held between decisions, ``flip`` (2,) are the signs of the way from start to goal
+        along x and y (1 where it is 0), ``yaw_rad`` and ``z_m`` the heading and the height now (0 = surface).
+        """
+        rule, (x, y, up) = self.rule, (float(part) for part in wish)
+        limit, long = rule["limits_m_s"], max(1.0, math.hypot(x, y))
+        ahead, left = (
+            rule["fastest_m_s"] * sign * part / long for sign, part in zip(flip, (x, y), strict=True)
+        )
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        surge, sway = (c * ahead + s * left) / limit["surge"], (c * left - s * ahead) / limit["sway"]
+        over = max(1.0, abs(surge), abs(sway))
+        low, high = (end + sign * rule["gap_m"] - z_m for end, sign in zip(rule["z_m"], (1, -1), strict=True))
+        rise = min(max(limit["heave"] * min(max(up, -1.0), 1.0), min(low, 0.0)), max(high, 0.0))
+        turn = 0.0
+        if math.hypot(ahead, left) > rule["least_speed_m_s"]:
+            off, quarter = math.remainder(math.atan2(left, ahead) - yaw_rad, 2.0 * math.pi), 0.5 * math.pi
+            turn = off - quarter * (math.floor(off / quarter) + 0.5)
+        rate = rule["turn_gain_1_s"] * turn / rule["max_yaw_rate_rad_s"]
+        out = (surge / over, sway / over, rise / limit["heave"], rate)
+        return np.clip(np.array(out, np.float32), -1.0, 1.0)
+
+
+class Futures(NamedTuple):
+    """What may come of a track, in its frame."""
+
+    log_weight: np.ndarray
+    """(modes,) logarithm of the probability of each future"""
+    place: np.ndarray
+    """(modes, times, 2) [m] along and across the course"""
+    sigma: np.ndarray
+    """(modes, times, 2) [m] standard deviations"""
+
+
+class TrackForecast(Exported):
+    """What a tracked obstacle may do next; it remembers nothing."""
+
+    inputs = ("columns", "speed")
+
+    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None:
+        self._modes = int(spec["network"]["modes"])
+        self._times = np.array(spec["network"]["times_s"], np.float32)
+        self.width, n_place = int(spec["observation"]["columns"]["width"]), 2 * self._modes * len(self._times)
+        into, middle, said, spread = (
+            (arrays[f"{name}.weight"], arrays[f"{name}.bias"])
+            for name in ("into", "middle", "said", "spread")
+        )
+        self._told, self._spread = [into, middle, said], [into, middle, spread]
+        _check_widths(self._told, self.width, self._modes + n_place)
+        _check_widths(self._spread, self.width, n_place)
+
+    def futures(self, columns: Any, speed: float) -> Futures:
+        """Futures of one track: columns (width,), speed [m/s]. Raises ValueError for another shape or numbers
+        that are not finite."""
+        found = self.said({"columns": np.asarray(columns)[None], "speed": np.asarray([speed])})
+        return Futures(*(found[name][0] for name in Futures._fields))
+
+    def said(self, given: Arrays) -> Arrays:
+        """The fields of ``Futures`` by name, each with an axis of tracks in front."""
+        columns, speed = self._rows(given, (self.width,), ())
+        if not (np.isfinite(columns).all() and np.isfinite(speed).all()):
+            raise ValueError("columns or speed hold numbers that are not finite")
+        said, shape = _through(self._told, columns, _relu), (-1, self._modes, len(self._times), 2)
+        reach = (speed[:, None] * self._times)[:, None, :, None]
+        raw = said[:, : self._modes] - said[:, : self._modes].max(-1, keepdims=True)
+        spread = _through(self._spread, columns, _relu).reshape(shape)
+        return {
+            "log_weight": raw - np.log(np.exp(raw).sum(-1, keepdims=True)),
+            "place": said[:, self._modes :].reshape(shape) * reach,
+            "sigma": np.float32(LEAST_M) + np.exp(np.clip(spread, *LOG_BOUNDS).astype(np.float32)) * reach,
+        }
+
+
+KINDS: dict[str, type[Exported]] = {"mlp": Policy, "set": SetPolicy, "forecast": TrackForecast}
+"""by ``kind`` of policy_spec.json"""
+
+
+# ----------------------------------------------------------------------------------------------------- layers
+
+
+def _elu(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+
+
+def _relu(x: np.ndarray) -> np.ndarray:
+    return np.maximum(x, 0)
 
 
 def _softplus(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
 
 
-def layers_of(arrays: Arrays, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(weight, bias) of a network's layers in order; ValueError where one does not follow the other."""
+_ACTIVATIONS: dict[str, Activation] = {"elu": _elu, "tanh": np.tanh, "relu": _relu}
+
+
+def layers_of(arrays: Arrays, name: str) -> Layers:
+    """(weight, bias) of a network's layers in order."""
     numbers = sorted(
         int(key[len(name) + 1 :].partition(".")[0])
         for key in arrays
         if key.startswith(f"{name}.") and key.endswith(".weight")
     )
-    layers = [(arrays[f"{name}.{i}.weight"], arrays[f"{name}.{i}.bias"]) for i in numbers]
-    widths = [weight.shape[1] for weight, _ in layers[1:]]
-    if any(weight.ndim != 2 or bias.shape != weight.shape[:1] for weight, bias in layers) or widths != [
-        len(b) for _, b in layers[:-1]
-    ]:
-        raise ValueError(f"layers of {name}")
-    return layers
+    return [(arrays[f"{name}.{i}.weight"], arrays[f"{name}.{i}.bias"]) for i in numbers]
+
+
+def _check_widths(layers: Layers, first: int, last: int | None = None) -> None:
+    """Raise ValueError where layers do not follow each other from this input to this output."""
+    for weight, bias in layers:
+        if weight.ndim != 2 or weight.shape[1] != first or bias.shape != weight.shape[:1]:
+            raise ValueError(f"a layer of {weight.shape} and {bias.shape} behind {first}")
+        first = len(bias)
+    if not layers or last not in (None, first):
+        raise ValueError(f"{len(layers)} layers give {first} instead of {last}")
+
+
+def _through(layers: Layers, x: np.ndarray, act: Activation) -> np.ndarray:
+    """Output (..., n_out) of a network for x (..., n_in), ``act`` after every layer but the last."""
+    for weight, bias in layers[:-1]:
+        x = act(x @ weight.T + bias)
+    weight, bias = layers[-1]
+    return x @ weight.T + bias
 
 
 # -------------------------------------------------------------------------------------- reading without trust
 
 
-def load(folder: str | Path = ".") -> Policy:
-    """The policy of an exported folder, every file checked against its sha256. Raises PolicyError."""
+def load(folder: str | Path = ".") -> Any:
+    """``Policy``, ``SetPolicy`` or ``TrackForecast`` of an exported folder, every file checked against its
+    sha256. Raises PolicyError."""
     folder = Path(folder)
     spec = read_spec(folder)
-    if kind := spec.get("kind"):
-        raise PolicyError(f"{folder}: holds a policy of kind {kind!r}; drive by run_set_policy.py instead")
     if wrong := changed_files(folder, spec):
         raise PolicyError(f"{folder}: {'; '.join(wrong)}; export the policy again")
-    return Policy(spec, read_safetensors(folder / WEIGHTS))
+    return made(spec, read_safetensors(folder / WEIGHTS))
+
+
+def made(spec: dict[str, Any], arrays: Arrays) -> Exported:
+    """What a specification's ``kind`` stands for. Raises PolicyError."""
+    kind = spec.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise PolicyError(f"{SPEC}: holds {kind!r}, not one of {', '.join(KINDS)}")
+    return KINDS[kind](spec, arrays)
 
 
 def read_spec(folder: Path) -> dict[str, Any]:
@@ -344,27 +538,27 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------- golden pairs
 
 
-def replayed(policy: Policy, golden: Arrays) -> Arrays:
-    """What the policy says to the golden observations, under the names of the golden outputs that it has.
-
-    Raises PolicyError for golden pairs of another shape, or that would take minutes.
-    """
-    steps = golden["obs"].shape[:1]
-    if (
-        golden["obs"].shape != (*steps, policy.n_obs)
-        or golden["begins"].shape != steps
-        or not 0 < steps[0] <= MAX_STEPS
-    ):
-        raise PolicyError(f"{GOLDEN}: has no missions of this policy; export the policy again")
-    if policy.work * (steps[0] // policy.hold_steps + golden["begins"].sum() + CALLS) > MAX_WORK:
+def replayed(policy: Exported, golden: Arrays) -> Arrays:
+    """What the policy says to the golden inputs, by name. Raises PolicyError for golden pairs of another
+    shape, or that would take minutes."""
+    rows = {name: golden[f"pair_{name}"] for name in policy.inputs}
+    first = rows[policy.inputs[0]]
+    count, obstacles = len(first) if first.ndim else 0, first.shape[1] if first.ndim == 3 else 1
+    if not 0 < count <= MAX_ROWS:
+        raise PolicyError(f"{GOLDEN}: has no rows of this policy; export the policy again")
+    if policy.work * obstacles * (count + CALLS) > MAX_WORK:
         raise PolicyError(f"{GOLDEN}: would take minutes to replay; no exported policy does")
-    decisions = []
-    for obs, begins in zip(golden["obs"], golden["begins"], strict=True):
-        if begins:
-            policy.reset()
-        decisions.append(policy.act(obs))
-    columns = ("action", "value", "residual", "uncertainty")
-    return {name: np.array([getattr(d, name) for d in decisions], np.float32) for name in columns}
+    try:
+        found = [policy.said({name: part[i : i + 1] for name, part in rows.items()}) for i in range(count)]
+    except (ValueError, TypeError) as error:
+        raise PolicyError(f"{GOLDEN}: {error}; export the policy again") from None
+    return {name: np.concatenate([each[name] for each in found]) for name in found[0]}
+
+
+def differences(policy: Exported, golden: Arrays) -> dict[str, float]:
+    """Largest difference of every output from the golden one."""
+    found = replayed(policy, golden)
+    return {name: difference(values, golden[f"pair_{name}"]) for name, values in found.items()}
 
 
 def difference(found: np.ndarray, expected: np.ndarray) -> float:
@@ -375,32 +569,16 @@ def difference(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.max(np.abs(found - expected), initial=0.0) / np.max(np.abs(expected), initial=1.0))
 
 
-def latency_ms(step: Callable[[], Any], count: int = CALLS - 30, warm_up: int = 30) -> dict[str, float]:
-    """p50 and p99 [ms] of a call, over ``count`` calls after ``warm_up``."""
-    times = []
-    for _ in range(warm_up + count):
+def latency_ms(step: Callable[[Arrays], Any], rows: Arrays) -> dict[str, float]:
+    """p50 and p99 [ms] of a call with one row of inputs, the rows in turn, after 30 calls that do not
+    count."""
+    times, count = [], len(next(iter(rows.values())))
+    for call in range(CALLS):
+        row = {name: part[call % count : call % count + 1] for name, part in rows.items()}
         begun = time.perf_counter()
-        step()
+        step(row)
         times.append(1e3 * (time.perf_counter() - begun))
-    return {
-        "p50_ms": float(np.percentile(times[warm_up:], 50)),
-        "p99_ms": float(np.percentile(times[warm_up:], 99)),
-    }
-
-
-def decision_latency_ms(policy: Policy, obs: Iterable[np.ndarray]) -> dict[str, float]:
-    """p50 and p99 [ms] of a decision for the observations in turn; steps that only hold one are left out."""
-    rows, turn = list(obs), 0
-
-    def decide() -> None:
-        nonlocal turn
-        policy._age = 0  # due
-        policy.act(rows[turn % len(rows)])
-        turn += 1
-
-    found = latency_ms(decide)
-    policy.reset()
-    return found
+    return {f"p{share}_ms": float(np.percentile(times[30:], share)) for share in (50, 99)}
 
 
 def main(arguments: list[str]) -> int:
@@ -408,24 +586,13 @@ def main(arguments: list[str]) -> int:
     folder = Path(arguments[0]) if arguments else Path(__file__).resolve().parent
     try:
         policy, spec, golden = load(folder), read_spec(folder), read_golden(folder / GOLDEN)
-        found = replayed(policy, golden)
-        worst = {name: difference(values, golden[name]) for name, values in found.items()}
-        tolerance = float(spec["golden"]["tolerance"])
-    except (
-        PolicyError,
-        KeyError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        IndexError,
-        ArithmeticError,
-    ) as error:
+        worst, tolerance = differences(policy, golden), float(spec["golden"]["tolerance"])
+        time_ms = latency_ms(policy.said, {name: golden[f"pair_{name}"] for name in policy.inputs})
+    except (PolicyError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         print(f"{folder}: {error}", file=sys.stderr)
         return 1
-    steps = len(golden["obs"])
     for name, value in worst.items():
-        print(f"{name}: largest difference {value:.2g} over {steps} steps (tolerance {tolerance:g})")
-    time_ms = decision_latency_ms(policy, golden["obs"])
+        print(f"{name}: largest difference {value:.2g} (tolerance {tolerance:g})")
     print(f"decision: p50 {time_ms['p50_ms']:.3f} ms, p99 {time_ms['p99_ms']:.3f} ms")
     return 0 if max(worst.values()) <= tolerance else 3
 

@@ -1,14 +1,10 @@
-"""policy_spec.json: what every column of the observation is, what an action means, how often to decide, and
-what the files hold."""
+"""policy_spec.json: what every column of the inputs is, what an output means, how often to decide, and what
+the files hold."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
-
-import torch
-from torch import Tensor, nn
 
 from uuvtai.common.enums import (
     AHEAD_STEPS,
@@ -27,20 +23,10 @@ from uuvtai.common.enums import (
 from uuvtai.common.version import __version__
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.export.graph import (
-    INPUTS,
-    OPSET,
-    OUTPUTS,
-    SET_OUTPUTS,
-    TOLERANCE,
-    ExportedModule,
-    OneDecision,
-    OneWish,
-)
+from uuvtai.learning.export.modules import OPSET, TOLERANCE, ExportedModule, OneAction, OneWish
 from uuvtai.learning.export.run_policy import GOLDEN, SCHEMA, WEIGHTS
-from uuvtai.learning.networks import CLIP_OBSERVATION, TIMES_S, ActorCritic, RunningNorm
-from uuvtai.learning.policy_agent import PolicyAgent
-from uuvtai.learning.world_model import N_FEATURES, WorldModel
+from uuvtai.learning.networks import TIMES_S
+from uuvtai.learning.world_model import N_FEATURES
 
 ONNX = "policy.onnx"
 
@@ -49,118 +35,130 @@ _OBSERVATION = (
     "counts as the mean of training. Frames: body is the vehicle's (x ahead, y left, z up); level is the "
     "same without roll and pitch; route follows the planned path; world has z up and 0 at the surface."
 )
+_ACTION = (
+    "parts of the limits within [-1, 1]; velocities in the body frame, wanted of the inner velocity loop"
+)
 _HOLD = (
     "The networks decide at the first control step of a mission and then at every hold_steps-th one. In "
     "between the action is held. It is carried out cut off to [-1, 1]. last_obs and last_action are those of "
     "the last decision."
 )
+_WISH = (
+    "ahead, left, up in the mirrored world: the first two in parts of fastest_m_s, shortened to length 1 "
+    "where they are longer, the third in parts of the heave limit; held until the next decision"
+)
 
 
-def origin_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    """What the folder came from: part of the document."""
+def specification(
+    checkpoint: Checkpoint, module: ExportedModule, name: str, has_onnx: bool
+) -> dict[str, Any]:
+    """The document without ``files``, which ``export`` adds."""
+    graph = {"file": ONNX, "opset": OPSET, "inputs": module.inputs, "outputs": module.outputs}
+    if isinstance(module, OneAction):
+        about = _action_parts(checkpoint, module)
+    else:
+        about = _set_parts(checkpoint.config) if isinstance(module, OneWish) else _forecast_parts()
     return {
+        "schema": SCHEMA,
+        "kind": module.kind,
+        "name": name,
         "uuvtai": __version__,
         "checkpoint": {
             "sha256": checkpoint.sha256,
             "step": checkpoint.step,
             "created": checkpoint.manifest.created,
         },
-    }
-
-
-def specification(checkpoint: Checkpoint, agent: PolicyAgent, name: str, has_onnx: bool) -> dict[str, Any]:
-    """The document without ``files``, which ``export`` adds."""
-    config, policy = checkpoint.config, agent.policy
-    return {
-        "schema": SCHEMA,
-        "name": name,
-        **origin_of(checkpoint),
-        "observation": {
-            "width": policy.n_in - N_FEATURES,
-            "meaning": _OBSERVATION,
-            "columns": _columns(checkpoint, agent),
-        },
-        "features": _features(agent),
-        "action": checkpoint.manifest.action,
-        "action_meaning": "parts of the limits within [-1, 1]; velocities in the body frame, wanted of the "
-        "inner velocity loop",
-        "rate": _rate(config.episode.control_dt_s, policy.config.hold_steps),
-        "network": _network(agent),
-        "graph": _graph(agent) if has_onnx else None,
+        **about,
+        "graph": graph if has_onnx else None,
         "golden": {"file": GOLDEN, "tolerance": TOLERANCE},
         "weights": WEIGHTS,
     }
 
 
-def _columns(checkpoint: Checkpoint, agent: PolicyAgent) -> list[dict[str, Any]]:
+def _action_parts(checkpoint: Checkpoint, module: OneAction) -> dict[str, Any]:
+    policy, world = module.policy, module.world_model
+    scales = list(
+        zip(policy.observation_norm.mean.tolist(), policy.observation_norm.std().tolist(), strict=True)
+    )
+    features = zip(("residual", "uncertainty"), scales[-N_FEATURES:], strict=True)
+    return {
+        "observation": {
+            "width": policy.n_in - N_FEATURES,
+            "meaning": _OBSERVATION,
+            "columns": _columns(checkpoint, scales),
+        },
+        "features": [
+            {"name": name, "unit": "1", "mean": mean, "std": std, "used": world is not None}
+            for name, (mean, std) in features
+        ],
+        "action": checkpoint.manifest.action,
+        "action_meaning": _ACTION,
+        "rate": _rate(checkpoint.config) | {"meaning": _HOLD},
+        "network": {
+            "hidden": list(policy.config.hidden),
+            "activation": policy.config.activation,
+            "predict_change": world is None or world.config.predict_change,
+        },
+    }
+
+
+def _columns(checkpoint: Checkpoint, scales: list[tuple[float, float]]) -> list[dict[str, Any]]:
     """Every single column with its place, name, unit, frame and what it is scaled by."""
-    norm = agent.policy.observation_norm
-    mean, std = norm.mean.tolist(), norm.std().tolist()
     found = []
     for row in checkpoint.manifest.observation_table:
-        width = row["stop"] - row["first"]
-        for i in range(width):
-            at = row["first"] + i
-            name = row["name"] if width == 1 else f"{row['name']}[{i}]"
-            found.append(
-                {
-                    "index": at,
-                    "name": name,
-                    "unit": row["unit"],
-                    "frame": row["frame"],
-                    "mean": mean[at],
-                    "std": std[at],
-                }
-            )
+        first, stop = row["first"], row["stop"]
+        for at in range(first, stop):
+            name = row["name"] if stop - first == 1 else f"{row['name']}[{at - first}]"
+            about = {"index": at, "name": name, "unit": row["unit"], "frame": row["frame"]}
+            found.append(about | {"mean": scales[at][0], "std": scales[at][1]})
     return found
 
 
-def _features(agent: PolicyAgent) -> list[dict[str, Any]]:
-    """The two inputs that the policy makes itself."""
-    norm = agent.policy.observation_norm
-    names = ("residual", "uncertainty")
-    rows = zip(names, norm.mean[-N_FEATURES:].tolist(), norm.std()[-N_FEATURES:].tolist(), strict=True)
-    return [
-        {"name": name, "unit": "1", "mean": mean, "std": std, "used": agent.world_model is not None}
-        for name, mean, std in rows
-    ]
+def _rate(config: LearningConfig) -> dict[str, Any]:
+    dt_s, hold = config.episode.control_dt_s, config.policy.hold_steps
+    hertz = 1.0 / dt_s
+    return {"control_dt_s": dt_s, "control_hz": hertz, "hold_steps": hold, "decision_hz": hertz / hold}
 
 
-def _rate(control_dt_s: float, hold_steps: int) -> dict[str, Any]:
-    hertz = 1.0 / control_dt_s
+def _set_parts(config: LearningConfig) -> dict[str, Any]:
     return {
-        "control_dt_s": control_dt_s,
-        "control_hz": hertz,
-        "hold_steps": hold_steps,
-        "decision_hz": hertz / hold_steps,
-        "meaning": _HOLD,
+        "observation": {
+            "meaning": MEANING,
+            "obstacles": {"most": N_OBSTACLE, "columns": OBSTACLE_COLUMNS},
+            "own": {"columns": OWN_COLUMNS},
+        },
+        "action": {"columns": ["ahead", "left", "up"], "meaning": _WISH},
+        "rate": _rate(config),
+        "hull_rule": hull_rule_of(config),
+        "network": {"goal_gain": config.surrogate.goal_gain},
     }
 
 
-def _network(agent: PolicyAgent) -> dict[str, Any]:
-    """What ``run_policy.py`` has to know beside the arrays."""
-    config = agent.policy.config
+def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
+    """Numbers of the rule that lays a wish on the hull, as the card's README tells it."""
+    vehicle = config.vehicle
+    limits = {"surge": vehicle.max_surge_m_s, "sway": vehicle.max_sway_m_s, "heave": vehicle.max_heave_m_s}
     return {
-        "hidden": list(config.hidden),
-        "activation": config.activation,
-        "predict_change": agent.world_model is None or agent.world_model.config.predict_change,
-        "clip_observation": CLIP_OBSERVATION,
+        "fastest_m_s": math.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s),
+        "limits_m_s": limits,
+        "max_yaw_rate_rad_s": vehicle.max_yaw_rate_rad_s,
+        "turn_gain_1_s": TURN_GAIN,
+        "least_speed_m_s": LEAST_SPEED_M_S,
+        "z_m": list(config.world.tank.z_m),
+        "gap_m": config.surrogate.vertical_gap_m,
     }
 
 
-def _graph(agent: PolicyAgent) -> dict[str, Any]:
-    names = OneDecision(agent).outputs
+def _forecast_parts() -> dict[str, Any]:
     return {
-        "file": ONNX,
-        "opset": OPSET,
-        "inputs": INPUTS,
-        "outputs": {name: OUTPUTS[name] for name in names},
+        "observation": {"columns": {"width": COLUMNS}, "meaning": MOTION_MEANING},
+        "network": {"modes": N_MODE, "times_s": [float(time) for time in TIMES_S]},
     }
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What every column of a policy over a set of obstacles is, in words, for policy_spec.json
-# (``surrogate/observation.py`` writes them).
+# What every column of a policy over a set of obstacles is, in words (``surrogate/observation.py`` writes
+# them).
 
 
 MEANING = (
@@ -250,127 +248,3 @@ OWN_COLUMNS = [
     ],
 ]  # fmt: skip
 """Columns of the vehicle's own."""
-
-
-# ------------------------------------------------------------------------------------------------------------
-# policy_spec.json of policies over a set of obstacles and of learned forecasts: every column, the hull rule,
-# and what the networks are.
-
-
-_WISH = (
-    "ahead, left, up in the mirrored world: the first two in parts of fastest_m_s, shortened to length 1 "
-    "where they are longer, the third in parts of the heave limit; held until the next decision"
-)
-
-
-def set_specification(
-    checkpoint: Checkpoint, decision: ExportedModule, kind: str, name: str, has_onnx: bool
-) -> dict[str, Any]:
-    """The document without ``files``, which ``export`` adds."""
-    about = _set_parts(checkpoint.config) if isinstance(decision, OneWish) else _forecast_parts()
-    graph = {
-        "file": ONNX,
-        "opset": OPSET,
-        "inputs": decision.inputs,
-        "outputs": {output: SET_OUTPUTS[output] for output in decision.outputs},
-    }
-    return {
-        "schema": SCHEMA,
-        "kind": kind,
-        "name": name,
-        **origin_of(checkpoint),
-        **about,
-        "graph": graph if has_onnx else None,
-        "golden": {"file": GOLDEN, "tolerance": TOLERANCE},
-        "weights": WEIGHTS,
-    }
-
-
-def _set_parts(config: LearningConfig) -> dict[str, Any]:
-    columns = {
-        "obstacles": {"most": N_OBSTACLE, "columns": OBSTACLE_COLUMNS},
-        "own": {"columns": OWN_COLUMNS},
-    }
-    dt_s, hold = config.episode.control_dt_s, config.policy.hold_steps
-    return {
-        "observation": {"meaning": MEANING, **columns},
-        "action": {"columns": ["ahead", "left", "up"], "meaning": _WISH},
-        "rate": {
-            "control_dt_s": dt_s,
-            "control_hz": 1.0 / dt_s,
-            "hold_steps": hold,
-            "decision_hz": 1.0 / dt_s / hold,
-        },
-        "hull_rule": hull_rule_of(config),
-        "network": {"goal_gain": config.surrogate.goal_gain},
-    }
-
-
-def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
-    """Numbers of the rule that lays a wish on the hull, as the card's README tells it."""
-    vehicle = config.vehicle
-    limits = {"surge": vehicle.max_surge_m_s, "sway": vehicle.max_sway_m_s, "heave": vehicle.max_heave_m_s}
-    return {
-        "fastest_m_s": math.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s),
-        "limits_m_s": limits,
-        "max_yaw_rate_rad_s": vehicle.max_yaw_rate_rad_s,
-        "turn_gain_1_s": TURN_GAIN,
-        "least_speed_m_s": LEAST_SPEED_M_S,
-        "z_m": list(config.world.tank.z_m),
-        "gap_m": config.surrogate.vertical_gap_m,
-    }
-
-
-def _forecast_parts() -> dict[str, Any]:
-    return {
-        "observation": {"columns": {"width": COLUMNS}, "meaning": MOTION_MEANING},
-        "network": {"modes": N_MODE, "times_s": [float(time) for time in TIMES_S]},
-    }
-
-
-# ------------------------------------------------------------------------------------------------------------
-# The networks of an agent as float32 arrays under plain names, with everything that they scale by: what
-# ``run_policy.py`` computes with.
-
-
-NO_LIMIT = float(torch.finfo(torch.float32).max)
-"""of a normaliser that has seen nothing and therefore cuts nothing off"""
-
-
-def weights_of(agent: PolicyAgent) -> dict[str, Tensor]:
-    """Arrays of policy and world model, on the host, contiguous."""
-    found = dict(_policy(agent.policy))
-    if agent.world_model is not None:
-        found |= dict(_world_model(agent.world_model))
-    return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in found.items()}
-
-
-def _policy(policy: ActorCritic) -> Iterator[tuple[str, Tensor]]:
-    yield from _net("actor", policy.actor)
-    yield from _net("critic", policy.critic)
-    yield from _norm("norm", policy.observation_norm)
-    yield "value.mean", policy.value_norm.mean.float()
-    yield "value.std", policy.value_norm.std().float()
-
-
-def _world_model(world_model: WorldModel) -> Iterator[tuple[str, Tensor]]:
-    for name in ("encoder", "dynamics", "decoder"):
-        yield from _net(name, getattr(world_model, name))
-    yield from _norm("world_norm", world_model.observation_norm)
-    yield "target.scale", world_model.scale()
-    yield (
-        "target.base",
-        world_model.base(torch.zeros(world_model.n_obs, device=world_model.change_norm.mean.device)),
-    )
-    yield "change.unit", world_model.error_unit()
-
-
-def _net(name: str, net: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    for key, tensor in net.state_dict().items():
-        yield f"{name}.{key}", tensor.float()
-
-
-def _norm(name: str, norm: RunningNorm) -> Iterator[tuple[str, Tensor]]:
-    yield f"{name}.mean", norm.mean.float()
-    yield f"{name}.scale", (1.0 / norm.std()).float()
-    yield f"{name}.limit", torch.tensor([norm.clip if float(norm.count) > 0 else NO_LIMIT])
