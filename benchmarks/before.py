@@ -38,7 +38,7 @@ _SMALL = {
         "distillation.batch": 64,
         "world_model.batch": 64,
     },
-    "quick": {"train.num_envs": 64, "surrogate.scenarios": 64},
+    "policy": {"train.num_envs": 64, "surrogate.scenarios": 64},
 }
 """trainings in the simulator and in the surrogate, as small as they go"""
 _OLDER = (("--agent", "--controller"), ("distillation.", "distill."), ("surrogate.", "twin."))

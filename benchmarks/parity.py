@@ -57,11 +57,11 @@ def measure(job: Job) -> list[Row]:
 def _policy(run: str) -> Checkpoint:
     if not run:
         raise SystemExit(
-            "parity: give a policy that learnt in the surrogate: --policy RUN (uuv train surrogate)"
+            "parity: give a policy that learnt in the surrogate: --policy RUN (uuv train policy)"
         )
     found = find_policy(run)
     if not found.config.surrogate.enabled:
-        raise SystemExit(f"parity: {run} did not learn in the surrogate; train one: uuv train surrogate")
+        raise SystemExit(f"parity: {run} did not learn in the surrogate; train one: uuv train policy")
     return found
 
 

@@ -59,7 +59,7 @@ def main() -> int:
         "--seconds", type=float, help="measured time per side of a comparison [s] (default 4)"
     )
     parser.add_argument("--against", default="", help="commit to compare with (default: HEAD)")
-    parser.add_argument("--policy", default="", help="run folder for parity (uuv train surrogate)")
+    parser.add_argument("--policy", default="", help="run folder for parity (uuv train policy)")
     parser.add_argument("--out", type=Path, help="folder of the results (default benchmarks/results)")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     chosen = parser.parse_args()

@@ -20,7 +20,7 @@ LONGEST_S = 5400
 _TURNS, _LEFT_OUT = 5, 2
 _SHORT = ["--device", "cpu", "--set", "train.evaluate_every=1000", "--set", "train.evaluate_episodes=16"]
 _SIMULATOR = ["--sensors", "nominal", "--iterations", "5", "--set=stack=null", "--set=train.num_envs=1024"]
-_RECIPES = {"paper": _SIMULATOR, "quick": ["--iterations", "10"]}
+_RECIPES = {"paper": _SIMULATOR, "policy": ["--iterations", "10"]}
 _QUICK = [
     *("--iterations", "3", "--set", "train.num_envs=16", "--set", "ppo.minibatches=1"),
     *("--set", "surrogate.scenarios=16"),

@@ -155,13 +155,13 @@ def watch_live(
 # ----------------------------------------------------------------------------------------------------- Learn
 
 
-@app.command("train", epilog="Example: uuv train paper --run-dir runs/first")
+@app.command("train", epilog="Example: uuv train --run-dir runs/first")
 @groups.grouped
 def train_policy(
     ctx: typer.Context,
     scene: groups.TrainSceneGroup,
     output: groups.PlainOutputGroup,
-    preset: opt.TrainPreset = "paper",
+    preset: opt.TrainPreset = "policy",
     resume: opt.TrainResume = None,
     iterations: opt.Iterations = None,
     start: opt.TrainStart = None,

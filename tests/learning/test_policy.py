@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from uuvtai.config.learning import PolicyConfig
+from uuvtai.learning import networks
 from uuvtai.learning.networks import ActorCritic, entropy, log_prob, mlp, moments_of
 
 N_IN = 7
@@ -122,3 +123,16 @@ def test_networks_have_the_widths_and_activations_asked_for(activation):
     assert all(torch.equal(layer.bias, torch.zeros_like(layer.bias)) for layer in linears)
     with pytest.raises(ValueError, match="at least"):
         mlp((5,), activation, torch.Generator())
+
+
+def test_the_other_library_multiplies_only_where_it_is_as_exact(monkeypatch):
+    with pytest.raises(ZeroDivisionError), networks.fast_products():
+        assert torch.get_float32_matmul_precision() == networks.fastest_precision()
+        a, b = torch.randn(300, 200), torch.randn(200, 100)
+        torch.testing.assert_close(a @ b, (a.double() @ b.double()).float(), atol=2e-4, rtol=0)
+        _ = 1 / 0
+    assert torch.get_float32_matmul_precision() == "highest"
+    monkeypatch.setattr(networks, "LARGEST_ERROR", 0.0)
+    networks.fastest_precision.cache_clear()
+    assert networks.fastest_precision() == "highest"
+    networks.fastest_precision.cache_clear()

@@ -12,14 +12,7 @@ from tests.oracles import world_model as reference
 from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
 from uuvtai.learning.distillation import Uncertainty
 from uuvtai.learning.networks import moments_of
-from uuvtai.learning.world_model import (
-    LOG_VAR_BOUNDS,
-    N_TARGET,
-    SKILL,
-    WorldModel,
-    WorldModelLearner,
-    calibration,
-)
+from uuvtai.learning.world_model import LOG_VAR_BOUNDS, N_TARGET, WorldModel, WorldModelLearner, calibration
 
 N_OBS, STEPS, N_ENV = 30, 16, 32
 SMALL = WorldModelConfig(hidden=(32, 32), latent=16, batch=256, steps=2, learning_rate=3e-3)
@@ -139,7 +132,7 @@ def test_it_learns_the_change_and_where_it_is_uncertain():
     target = next_obs[:, :N_TARGET]
     error, before = ((target - other).square().mean(dim=0) for other in (predicted.mean, obs[:, :N_TARGET]))
     assert (error < before).all()
-    assert min(metrics[f"{SKILL}{i}"] for i in range(N_TARGET)) > 0.2
+    assert min(metrics[f"world_model/skill/{i}"] for i in range(N_TARGET)) > 0.2
     square, _ = calibration(predicted.mean, predicted.log_var, target)
     assert square == pytest.approx(1.0, abs=SAMPLING)
     assert metrics["world_model/standardised_residual"] == pytest.approx(1.0, abs=SAMPLING)
@@ -218,7 +211,7 @@ def test_skill_is_told_by_name_and_only_where_something_changes():
     next_obs[..., 3] = obs[..., 3]
     learner = WorldModelLearner(WorldModel(N_OBS, SMALL, generator()), SMALL, names)
     found = learner.update(obs, action, next_obs, generator()).items()
-    told = {name.removeprefix(SKILL): value for name, value in found if name.startswith(SKILL)}
+    told = {name.split("/")[-1]: value for name, value in found if "/skill/" in name}
     assert told.keys() == {*names} - {"t3"} and max(map(abs, told.values())) < 0.2, "at birth: as before"
 
 

@@ -33,22 +33,10 @@ from uuvtai.learning.runner import TrainRequest, train
 from uuvtai.learning.set_networks import SetActor
 from uuvtai.learning.trainer import Trainer
 from uuvtai.sim.stages import bind, members_of
-from uuvtai.surrogate import motion, observation, sensing
-from uuvtai.surrogate.arrays import (
-    AT_AHEAD,
-    AT_ARC,
-    AT_ASIDE,
-    AT_FLIP,
-    AT_LEFT,
-    AT_POS,
-    AT_YAW,
-    EGO_WIDTH,
-    TRACK_WIDTH,
-    ObserverIO,
-    SurrogateRules,
-)
+from uuvtai.surrogate import arrays, motion, observation, sensing
 from uuvtai.surrogate.world import draw_bank, scenario_rows
 
+Rules = arrays.SurrogateRules
 CLEARANCE_TOL_M = 0.01
 """the simulator's hull leans by a few degrees, the surrogate's does not"""
 TTC_TOL_S = 0.1
@@ -81,7 +69,7 @@ def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
 
 
 @ti.kernel
-def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[SurrogateRules], ray: FloatMatrix):
+def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[Rules], ray: FloatMatrix):
     for i in range(place.shape[0]):
         sensing.write_rays(i, i, body.shape[1], place[i, 0], place[i, 1], body, ray, io)
 
@@ -91,7 +79,7 @@ def threats(
     near_only: int,
     pose: FloatMatrix,
     moved: FloatMatrix,
-    io: Bundle[SurrogateRules],
+    io: Bundle[Rules],
     body: AnyTensor,
     path: AnyTensor,
     out: FloatMatrix,
@@ -116,18 +104,18 @@ def watch(at: FloatMatrix, is_seen: int, steps: int, bend_m: float, track: AnyTe
         place = ti.Vector([at[i, 0], at[i, 1], at[i, 2], at[i, 3]])
         for step in range(steps):
             key = episode_key(step // sensing.SPELL, i)
-            old = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
+            old = ti.Vector([track[i, 0, k] for k in ti.static(range(arrays.TRACK_WIDTH))])
             new = sensing.updated_track(
                 old, 0, place, bend_m, 1.0, ti.Vector([0.0, 0.0]), is_seen == 1, 0, 1, key
             )
-            for k in ti.static(range(TRACK_WIDTH)):
+            for k in ti.static(range(arrays.TRACK_WIDTH)):
                 track[i, 0, k] = new[k]
 
 
 @ti.kernel
 def tracked(track: AnyTensor, out: AnyTensor):
     for i in range(track.shape[0]):
-        row = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
+        row = ti.Vector([track[i, 0, k] for k in ti.static(range(arrays.TRACK_WIDTH))])
         out[i] = sensing.is_tracked(row)
 
 
@@ -140,26 +128,24 @@ def velocities(wish: FloatMatrix, flip: FloatMatrix, vehicle: Const[VehicleConfi
 
 
 @ti.kernel
-def earn(
-    nearer: FloatVector, nearest: FloatVector, ended: IntVector, io: Bundle[SurrogateRules], out: FloatVector
-):
+def earn(nearer: AnyTensor, nearest: AnyTensor, ended: IntVector, io: Bundle[Rules], out: FloatVector):
     for i in range(out.shape[0]):
         out[i] = motion.earned(nearer[i], nearest[i], ended[i], io)
 
 
 @ti.kernel
-def follow(io: Bundle[SurrogateRules], route: AnyTensor, ego: FloatMatrix):
+def follow(io: Bundle[Rules], route: AnyTensor, ego: FloatMatrix):
     """The terms of the route of vehicles that have moved on, each on its own."""
     for i in range(ego.shape[0]):
-        at = ti.Vector([ego[i, AT_POS], ego[i, AT_POS + 1]])
-        ego[i, AT_ARC] = motion.advanced_arc(i, ego[i, AT_ARC], at, route)
-        ego[i, AT_LEFT] = motion.length_left(i, ego[i, AT_ARC], route)
+        at = ti.Vector([ego[i, arrays.AT_POS], ego[i, arrays.AT_POS + 1]])
+        ego[i, arrays.AT_ARC] = motion.advanced_arc(i, ego[i, arrays.AT_ARC], at, route)
+        ego[i, arrays.AT_LEFT] = motion.length_left(i, ego[i, arrays.AT_ARC], route)
         motion.aim(i, i, route, ego, io)
 
 
 @pytest.fixture(scope="module")
 def config():
-    return load_training("surrogate", overrides=SMALL)
+    return load_training("policy", overrides=SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +239,7 @@ def test_the_referee_is_the_simulators(small, bank, config):
     """Clearance, time to collision and verdict, along rides through whatever is in the way."""
     small.sim.use_tree(small.trees["straight"])
     small.begin(range(small.N), seed=5)
-    rules, compared, verdicts = bind(SurrogateRules, config), 0, set()
+    rules, compared, verdicts = bind(Rules, config), 0, set()
     for step in range(500):
         small.sim.step()
         if step % 5:
@@ -277,7 +263,7 @@ def test_the_referee_is_the_simulators(small, bank, config):
 
 
 def test_far_obstacles_are_left_out(config):
-    rules, far = bind(SurrogateRules, config), torch.zeros(1, 1, 8)
+    rules, far = bind(Rules, config), torch.zeros(1, 1, 8)
     far[0, 0] = torch.tensor([1.0, 15.0, 3.0, -0.8, 0.2, 0.2, 0.2, 0.0])
     pose = torch.tensor([[5.0, 3.0, -0.8, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 18.0, 3.0, -0.8]])
     seen, outcome = torch.zeros(1, 2), torch.zeros(1, dtype=torch.int32)
@@ -291,7 +277,7 @@ def test_no_obstacle_that_can_come_near_is_left_out(bank, config, slots):
     """Nothing changes where those alone are looked at that were near when the decision began, however the
     hull has moved since; nor where there are more slots than an integer has bits."""
     rng, count = np.random.default_rng(3), len(bank.obstacle)
-    rules, changed = bind(SurrogateRules, config), 0
+    rules, changed = bind(Rules, config), 0
     body = torch.cat([torch.zeros(count, slots, 8), bank.obstacle], dim=1).contiguous()
     for _ in range(200):
         pose, moved = rng.uniform(0, 1, (count, 4)), rng.uniform(-1, 1, (count, 4))
@@ -311,28 +297,28 @@ def test_a_route_is_followed_as_in_the_simulator(small, config):
     """Foot, look-ahead point, length left and the place beside it, while no new one is planned."""
     small.sim.use_tree(small.trees["bt"])
     small.begin(range(small.N), seed=5)
-    s, rows, rules, compared = small.sim.s, small.sim.rows, bind(SurrogateRules, config), 0
-    io = bind(ObserverIO, s, small.sim.config)
+    s, rows, rules, compared = small.sim.s, small.sim.rows, bind(Rules, config), 0
+    io = bind(arrays.ObserverIO, s, small.sim.config)
     for _ in range(400):
         planned, arc = rows(s.route.plan_step), rows(s.route.arc)
         small.sim.step()
-        ego, seen = torch.zeros(small.N, EGO_WIDTH), torch.zeros(small.N, EGO_WIDTH)
+        ego, seen = torch.zeros(small.N, arrays.EGO_WIDTH), torch.zeros(small.N, arrays.EGO_WIDTH)
         raw, ray = torch.zeros(small.N, 9, 14), torch.zeros(small.N, N_RAY)
         observation.observe_obstacles(io, torch.ones(small.N, dtype=torch.int32), seen, raw, ray)
-        ego[:, AT_POS : AT_POS + 3] = torch.from_numpy(rows(s.ego.pos_w))
-        ego[:, AT_ARC] = torch.from_numpy(arc)
+        ego[:, arrays.AT_POS : arrays.AT_POS + 3] = torch.from_numpy(rows(s.ego.pos_w))
+        ego[:, arrays.AT_ARC] = torch.from_numpy(arc)
         follow(rules, torch.from_numpy(scenario_rows(small.sim)[2]), ego)
         same = (planned == rows(s.route.plan_step)) & (rows(s.clock.running) == 1)
-        at_corner = abs(ego[:, AT_ARC] - ego[:, AT_ARC].round()).numpy() < 1e-3
-        ego[at_corner, AT_ASIDE], seen[at_corner, AT_ASIDE] = 0.0, 0.0  # either segment tells the side
-        for column in (AT_AHEAD, AT_AHEAD + 1, AT_LEFT, AT_ASIDE):
+        at_corner = abs(ego[:, arrays.AT_ARC] - ego[:, arrays.AT_ARC].round()).numpy() < 1e-3
+        ego[at_corner, arrays.AT_ASIDE] = seen[at_corner, arrays.AT_ASIDE] = 0.0  # on either side
+        for column in (arrays.AT_AHEAD, arrays.AT_AHEAD + 1, arrays.AT_LEFT, arrays.AT_ASIDE):
             np.testing.assert_allclose(ego[same, column], seen[same, column], atol=1e-4)
         compared += int((same & ~at_corner).sum())
     assert compared > 200 * small.N
 
 
 def test_routes_are_planned_around_all_that_does_not_move(config):
-    world = load_training("surrogate", overrides=SMALL | {"surrogate.worlds": ["maze"]})
+    world = load_training("policy", overrides=SMALL | {"surrogate.worlds": ["maze"]})
     bank = draw_bank(world, ((8, 6, 0.6),), 3, 8)
     rest = bank.obstacle.shape[1] - bank.path.shape[1]
     assert (bank.route[:, 0, :2] - bank.mission[:, :2]).norm(dim=1).max() < 0.3, "begin at the start"
@@ -384,7 +370,7 @@ def test_rays_meet_what_stands_in_their_way(config):
     body[..., 4:6], body[..., 7] = rng.uniform(0.1, 0.8, (count, 5, 2)), rng.uniform(-7, 7, (count, 5))
     ray = torch.zeros(count, N_RAY)
     place, body = (torch.from_numpy(a.astype(np.float32)) for a in (place, body))
-    look_along(place, body, bind(SurrogateRules, config), ray)
+    look_along(place, body, bind(Rules, config), ray)
     wanted = [
         free_m(*at, row, tank) for at, row in zip(place.double().numpy(), body.double().numpy(), strict=True)
     ]
@@ -398,7 +384,7 @@ def test_rewards_by_hand(config):
     nearer, nearest = torch.tensor([0.08, 0.0, -0.02, 0.1]), torch.tensor([9.0, 0.25, 0.05, 2.0])
     ended = torch.tensor([RUNNING, TIMEOUT, COLLISION, SUCCESS], dtype=torch.int32)
     reward, surrogate = torch.zeros(4), config.surrogate
-    earn(nearer, nearest, ended, bind(SurrogateRules, config), reward)
+    earn(nearer, nearest, ended, bind(Rules, config), reward)
     close = (1.0 - nearest / surrogate.soft_clearance_m).clamp(0.0, 1.0)
     expected = surrogate.progress * nearer - 0.1 * (surrogate.time_cost + surrogate.closeness_cost * close)
     assert torch.allclose(reward, expected + torch.tensor([0.0, 0.0, -1.0, 1.0]), atol=1e-6)
@@ -407,7 +393,7 @@ def test_rewards_by_hand(config):
 def watched(far_m, steps, is_seen=1, count=4000, radius_m=None, track=None):
     """Tracks (count, 9) of far obstacles that go across at 1 m/s, on a circle where they have a radius."""
     at = torch.tensor([[far_m, 0.0, 0.0, 1.0]]).repeat(count, 1)
-    track = torch.zeros(count, 1, TRACK_WIDTH) if track is None else track
+    track = torch.zeros(count, 1, arrays.TRACK_WIDTH) if track is None else track
     watch(at, is_seen, steps, radius_m or 0.0, track)
     return track[:, 0]
 
@@ -464,7 +450,7 @@ def test_neither_order_nor_empty_rows_matter(config):
 
 
 def test_what_drives_knows_nothing_that_only_the_simulator_knows(saved):
-    assert not set(members_of(ObserverIO).values()) & TRUTH
+    assert not set(members_of(arrays.ObserverIO).values()) & TRUTH
     found = saved()
     assert list(found.model()) == ["policy"]
     own = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, found.config, torch.Generator()).state_dict()
@@ -528,7 +514,7 @@ def test_another_runs_policy_goes_on_learning_in_the_simulator(small, saved):
 def test_what_cannot_be_begun_with_is_refused(bank, saved, tmp_path):
     with pytest.raises(UserError, match="policies alone"):
         runner._started(saved().path, load_training("best"), None)
-    config = load_training("surrogate", overrides=SMALL | {"policy.encoder": "mlp"})
+    config = load_training("policy", overrides=SMALL | {"policy.encoder": "mlp"})
     with pytest.raises(UserError, match="no observation vectors"):
         InSurrogate(config, bank)
     with pytest.raises(UserError, match="holds no usable checkpoint"):
@@ -536,7 +522,7 @@ def test_what_cannot_be_begun_with_is_refused(bank, saved, tmp_path):
 
 
 def test_the_critic_may_be_kept_from_the_truth(bank):
-    config = load_training("surrogate", overrides=SMALL | {"ppo.critic_sees_truth": False})
+    config = load_training("policy", overrides=SMALL | {"ppo.critic_sees_truth": False})
     trainer = Trainer(InSurrogate(config, bank), config)
     trainer.iterate()
     assert trainer.policy.critic.net.obstacle[0].in_features == OBSTACLE_WIDTH
@@ -551,8 +537,8 @@ def test_a_command_becomes_the_wish_with_its_velocity():
     yaw = torch.from_numpy(rng.uniform(-np.pi, np.pi, 200).astype(np.float32))
     flip = torch.from_numpy(rng.choice([-1.0, 1.0], (200, 2)).astype(np.float32))
     out = torch.zeros(200, 3)
-    ego = torch.zeros(200, EGO_WIDTH)
-    ego[:, AT_YAW], ego[:, AT_FLIP : AT_FLIP + 2] = yaw, flip
+    ego = torch.zeros(200, arrays.EGO_WIDTH)
+    ego[:, arrays.AT_YAW], ego[:, arrays.AT_FLIP : arrays.AT_FLIP + 2] = yaw, flip
     velocities(wish_of(command, ego, vehicle), flip, vehicle, out)
     surge, sway = vehicle.max_surge_m_s * command[:, 0], vehicle.max_sway_m_s * command[:, 1]
     expected = [
@@ -567,7 +553,7 @@ def test_it_learns_what_the_tree_says(small, monkeypatch):
     monkeypatch.setattr(distillation, "PASSES", 1)
     losses, decisions = [], []
     config = load_training(
-        "surrogate", overrides=SMALL | {"train.num_envs": small.N, "surrogate.warm_start_waves": 2}
+        "policy", overrides=SMALL | {"train.num_envs": small.N, "surrogate.warm_start_waves": 2}
     )
     for passes in (1, 20):
         monkeypatch.setattr(distillation, "LAST_PASSES", passes)
@@ -581,7 +567,7 @@ def test_it_learns_what_the_tree_says(small, monkeypatch):
 
 
 def test_the_tree_alone_drives_as_without_a_student(small):
-    config = load_training("surrogate", overrides=SMALL)
+    config = load_training("policy", overrides=SMALL)
     actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
     student = Student(actor, small.sim, config, torch.Generator().manual_seed(0))
     small.begin(range(small.N), seed=9)
@@ -592,12 +578,6 @@ def test_the_tree_alone_drives_as_without_a_student(small):
         expected = student.decision.action if agent is None else agent
         assert torch.equal(said, expected)
     assert len(student.samples) == 2 and len(student.samples[0].wish) == small.N
-
-
-def test_what_clearly_pays_is_the_presets():
-    surrogate, quick = load_training("surrogate").surrogate, load_training("quick").surrogate
-    assert surrogate.warm_start_waves > 0
-    assert quick.warm_start_waves == 0, "it learns from nothing"
 
 
 # ------------------------------------------------------------------------------------------ in the simulator
@@ -624,8 +604,8 @@ def test_asking_again_changes_nothing(small, saved):
 
 def test_rays_end_at_the_walls(small):
     small.begin(range(small.N), seed=5)
-    io = bind(ObserverIO, small.sim.s, small.sim.config)
-    ego, raw, ray = torch.zeros(small.N, EGO_WIDTH), torch.zeros(small.N, 9, 14), torch.zeros(small.N, 24)
+    io = bind(arrays.ObserverIO, small.sim.s, small.sim.config)
+    ego, raw, ray = (torch.zeros(small.N, *shape) for shape in ((arrays.EGO_WIDTH,), (9, 14), (24,)))
     observation.observe_obstacles(io, torch.ones(small.N, dtype=torch.int32), ego, raw, ray)
     y = small.sim.rows(small.sim.s.ego.pos_w)[:, 1]
     assert (ray[:, 6].numpy() <= 6.0 - y + 0.2).all() and (ray[:, 18].numpy() <= y + 0.2).all()
@@ -659,7 +639,7 @@ def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
 )
 def test_what_the_surrogate_lacks_is_refused(bank, key, value, says):
     with pytest.raises(UserError, match=says):
-        config = load_training("surrogate", overrides=SMALL | {key: value})
+        config = load_training("policy", overrides=SMALL | {key: value})
         Trainer(InSurrogate(config, bank), config)
 
 
@@ -675,7 +655,7 @@ def test_it_is_no_policy_of_one_observation(saved):
 
 @pytest.mark.parametrize("world", ["netpen", "transfer"])
 def test_worlds_of_another_tank_are_refused(world):
-    other = load_training("surrogate", overrides=SMALL | {"surrogate.worlds": [world]})
+    other = load_training("policy", overrides=SMALL | {"surrogate.worlds": [world]})
     with pytest.raises(ConfigError, match=f"{world} has another tank"):
         draw_bank(other, ((8, 6, 0.6),), 0, 1)
 

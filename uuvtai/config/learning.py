@@ -56,9 +56,6 @@ class PpoConfig(Section):
     """the critic is told where obstacles truly are and will be, where the environment can (the surrogate)"""
     shuffle: bool = False
     """draw minibatches at random instead of as contiguous blocks, each of all envs in a span of steps"""
-    bfloat16: bool = False
-    """products of the hidden layers in bfloat16 during the update, where the CPU has instructions for it:
-    faster, and the gradient is coarser; in float32 where it has none"""
     normalise_observations: bool = True
     normalise_values: bool = True
 

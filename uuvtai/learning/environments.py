@@ -14,7 +14,7 @@ from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.agents import SetAgent
 from uuvtai.learning.distillation import imitate, wish_of
-from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic, Guard, Policy, View, by_part, in_bfloat16
+from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic, Guard, Policy, View, by_part
 from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.rollout import Environment, Rollout, RolloutSums, Step
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetPolicy
@@ -341,7 +341,6 @@ class InSurrogate(Environment):
         self.view: View = self.surrogate.view._asdict()
         if not config.ppo.critic_sees_truth:
             self.view["truth"] = self.view["truth"][..., :0]
-        self.half = ("obstacles", "truth") if in_bfloat16(config.ppo, "cpu") else ()
         self.guard = Guard((), self.num_envs, config.train.patience, self.device)
         self._returns = torch.zeros(self.num_envs)
         self._held_out: ScenarioBank | None = None

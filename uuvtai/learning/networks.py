@@ -1,4 +1,4 @@
-"""Networks and what they need: perceptrons, actor and critic, normalisation, Adam, bfloat16, a NaN guard."""
+"""Networks and what they need: perceptrons, actor, critic, normalisation, Adam, products, a NaN guard."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from uuvtai.common.errors import SettingError, UserError
 from uuvtai.config.learning import PolicyConfig
 
 if TYPE_CHECKING:
-    from uuvtai.config.learning import PpoConfig
+    pass
 
 
 Activation = Literal["elu", "tanh", "relu"]
@@ -233,8 +233,6 @@ class Policy(nn.Module):
     critic_rate: float | None = None
     """whether minibatches are drawn at random in any case; the largest deviation; a learning rate of the
     critic's own, whose gradient is then cut by itself"""
-    in_half = False
-    """products in half of the width (``ppo.bfloat16``)"""
 
     def __init__(self, config: PolicyConfig) -> None:
         """SettingError for a deviation that begins below its floor."""
@@ -272,10 +270,6 @@ class Policy(nn.Module):
 
     def observe(self, view: View) -> None:
         """Take inputs into the statistics that they are scaled by, where there are some."""
-
-    def coarse(self) -> torch.autocast:
-        """Products in bfloat16 where it is asked for."""
-        return torch.autocast(self.log_std.device.type, torch.bfloat16, enabled=self.in_half)
 
     @torch.no_grad()
     def act(self, view: View, generator: torch.Generator) -> PolicyStep:
@@ -338,19 +332,11 @@ class ActorCritic(Policy):
 
     def mean_of(self, inputs: View) -> torch.Tensor:
         """As in ``Policy``."""
-        return self._output(self.actor, inputs["x"])
+        return self.actor(inputs["x"])
 
     def value_of(self, inputs: View) -> torch.Tensor:
         """As in ``Policy``."""
-        return self._output(self.critic, inputs["x"]).squeeze(-1)
-
-    def _output(self, net: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
-        """In bfloat16 all layers but the last, whose output is what the losses see."""
-        if not self.in_half:
-            return net(x)
-        with self.coarse():
-            hidden = net[:-1](x)
-        return net[-1](hidden.float())
+        return self.critic(inputs["x"]).squeeze(-1)
 
     def actor_parameters(self) -> list[nn.Parameter]:
         """As in ``Policy``."""
@@ -430,27 +416,7 @@ def _begin(flushes: bool) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Products in bfloat16 (``ppo.bfloat16``), where that is faster: a CPU without the instructions takes ten
-# times as long for them.
-
-
-INSTRUCTIONS = ("avx512_bf16", "amx_bf16", "bf16")
-"""of CPUs, as torch names them"""
-
-
-def in_bfloat16(config: PpoConfig, device: str) -> bool:
-    """Whether products are made in bfloat16 on this device ("cpu" or "cuda")."""
-    return config.bfloat16 and multiplies_bfloat16(device)
-
-
-@functools.cache
-def multiplies_bfloat16(device: str) -> bool:
-    """Whether this device has the instructions. A torch that cannot tell of a CPU, before 2.13, is taken for
-    no."""
-    if device != "cpu":
-        return True
-    known = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(known.get(name, False) for name in INSTRUCTIONS)
+# Float32 products by the faster of torch's libraries.
 
 
 LARGEST_ERROR = 1e-5

@@ -23,7 +23,6 @@ from uuvtai.learning.networks import (
     Policy,
     View,
     entropy,
-    in_bfloat16,
     log_prob,
     moments_of,
     side_by_side,
@@ -101,7 +100,6 @@ class Ppo:
     def __init__(self, policy: Policy, config: PpoConfig) -> None:
         self.policy, self.config = policy, config
         device = policy.log_std.device
-        policy.in_half = in_bfloat16(config, device.type)
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._rate_now = self.rate.clone()
         actor, critic = policy.actor_parameters(), list(policy.critic.parameters())

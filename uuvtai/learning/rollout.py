@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,8 +36,6 @@ class Environment:
     """of control that a decision counts as"""
     view: View
     """what is known now; written anew by ``step``"""
-    half: Collection[str] = ()
-    """names of the view that a rollout may keep in half of the width"""
     node_names: Sequence[str] = ()
     """of the tree that teaches: ``teacher_action`` and ``leaf`` are then in the view"""
     outcomes: Sequence[str] = OUTCOMES
@@ -102,8 +100,8 @@ class Rollout(dict[str, torch.Tensor]):
     beside it, and, where a teacher says its action, the ``weight`` of the sample in the distillation.
     """
 
-    def __init__(self, steps: int, view: View, n_action: int, half: Collection[str] = ()) -> None:
-        """``steps`` = T; ``view``: any of N envs; ``half``: its names that are kept in bfloat16."""
+    def __init__(self, steps: int, view: View, n_action: int) -> None:
+        """``steps`` = T; ``view``: any of N envs."""
         super().__init__()
         self.steps, (num_envs, *_) = steps, next(iter(view.values())).shape
         device = next(iter(view.values())).device
@@ -112,7 +110,7 @@ class Rollout(dict[str, torch.Tensor]):
             return torch.zeros(steps, num_envs, *more, dtype=dtype, device=device)
 
         for name, part in view.items():
-            self[name] = zeros(*part.shape[1:], dtype=torch.bfloat16 if name in half else part.dtype)
+            self[name] = zeros(*part.shape[1:], dtype=part.dtype)
         self["action"] = zeros(n_action)
         for name in ("log_prob", "value", "reward", "next_value"):
             self[name] = zeros()

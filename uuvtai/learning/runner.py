@@ -105,8 +105,6 @@ def _train(
     request: TrainRequest, folder: RunFolder | None, watch: TrainWatch, evaluate: Evaluate
 ) -> tuple[dict[str, Any], Path]:
     """As ``train``; ``folder`` is the folder of the run to go on with."""
-    from uuvtai.learning.networks import in_bfloat16
-
     found, config = _begin(request, watch)
     start, config = _started(request.start, config, watch)
     total = request.iterations or config.train.iterations
@@ -130,10 +128,6 @@ def _train(
     if start is not None:
         start.check_table(trainer.observation_table, config)
         trainer.start(start)  # type: ignore[union-attr]
-    env = getattr(trainer, "env", None)  # of those that learn in the simulator
-    device = env.device.type if env else "cpu"
-    if config.ppo.bfloat16 and not in_bfloat16(config.ppo, device):
-        watch.note("ppo.bfloat16: this CPU has no instructions for it (or torch is too old to tell): float32")
     place = _folder(request, config, found, folder)
     run = _Run(trainer, config, place, watch, evaluate, total)
     status, code = "failed", 1

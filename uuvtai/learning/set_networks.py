@@ -126,13 +126,11 @@ class SetPolicy(Policy):
 
     def mean_of(self, inputs: View) -> torch.Tensor:
         """As in ``Policy``."""
-        with self.coarse():
-            return self.actor(inputs["obstacles"], inputs["own"]).float()
+        return self.actor(inputs["obstacles"], inputs["own"])
 
     def value_of(self, inputs: View) -> torch.Tensor:
         """As in ``Policy``."""
-        with self.coarse():
-            return self.critic(*(inputs[name] for name in self.inputs)).float()
+        return self.critic(*(inputs[name] for name in self.inputs))
 
     def parts(self) -> dict[str, nn.Module]:
         """As in ``Policy``; no file that drives holds the critic."""
@@ -160,7 +158,7 @@ class MaxAndSum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, said: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """As the class says."""
-        each = torch.relu(said).mul_(mask.to(said.dtype).unsqueeze(-1))
+        each = torch.relu(said).mul_(mask.unsqueeze(-1))
         highest = each.amax(dim=0)
         ctx.save_for_backward(each, highest)
         return highest, _sum(each)
@@ -177,8 +175,8 @@ class MaxAndSum(torch.autograd.Function):
 
 
 def _sum(each: torch.Tensor) -> torch.Tensor:
-    """Over the obstacles. Torch adds up in float32 in any case, and twice as fast where it is told."""
-    return each.sum(dim=0, dtype=torch.float32).to(each.dtype)
+    """Over the obstacles. Torch adds up twice as fast where it is told in what."""
+    return each.sum(dim=0, dtype=torch.float32)
 
 
 def actor_of(checkpoint: Checkpoint) -> SetActor:

@@ -42,7 +42,7 @@ class Trainer:
         self.policy = env.make_policy(self.generator)
         self.distillation = Distillation(self.policy, config, env.node_names) if env.node_names else None
         n_action = len(self.policy.log_std)
-        self.rollout = Rollout(config.ppo.rollout_steps, env.view, n_action, env.half)
+        self.rollout = Rollout(config.ppo.rollout_steps, env.view, n_action)
         self.ppo = Ppo(self.policy, config.ppo)
         world, self.world_model, self.world_learner = config.world_model, None, None
         if world.enabled and "x" not in env.view:

@@ -761,15 +761,9 @@ def polar(degrees, length=1.0):
 
 
 def turns(
-    scene,
-    xml,
-    yaw: Any = 0.0,
-    gaze: Any = None,
-    way: Any = None,
-    way_of="follow_vel_w",
-    speed=0.5,
+    scene, xml, yaw: Any = 0.0, gaze: Any = None, way: Any = None, way_of="follow_vel_w", speed=0.5,
     room_m=2.0,
-):
+):  # fmt: skip
     """[degree] that the nose is told to turn by; bearings of the gaze and of the velocity, None = none."""
     for name, degrees, length in (("heading_w", gaze, 1.5), (way_of, way, speed)):
         field = getattr(scene.behavior, name)

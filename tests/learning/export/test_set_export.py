@@ -42,7 +42,7 @@ def filled(module, seed, spread=0.3):
 
 def saved(kind, folder, change=None):
     """A run folder with one checkpoint of a kind, after ``change`` of its state."""
-    preset, table = ("surrogate", SET_TABLE) if kind == "set" else ("forecast", (column_row(),))
+    preset, table = ("policy", SET_TABLE) if kind == "set" else ("forecast", (column_row(),))
     config = load_training(preset, overrides=NET)
     if kind == "set":
         rng = torch.Generator().manual_seed(1)
@@ -186,7 +186,7 @@ def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp
 
 
 def test_the_hull_rule_is_that_of_the_oracle():
-    config = load_training("surrogate", overrides=NET)
+    config = load_training("policy", overrides=NET)
     decision = module_policy()
     rng = np.random.default_rng(0)
     low, high = [-1.5, -1.5, -1.5, -np.pi, -1.6], [1.5, 1.5, 1.5, np.pi, 0.0]
@@ -203,7 +203,7 @@ def test_the_hull_rule_is_that_of_the_oracle():
 
 def module_policy():
     """A policy of made-up weights, without a folder."""
-    config = load_training("surrogate", overrides=NET)
+    config = load_training("policy", overrides=NET)
     actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
     spec = {
         "observation": {

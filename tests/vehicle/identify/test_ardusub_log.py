@@ -169,15 +169,8 @@ def test_a_hole_takes_no_memory_and_a_parameter_that_is_no_number_says_nothing(t
 
 
 def tlog(
-    boot_s=5.0,
-    system=1,
-    seconds=SECONDS,
-    written_s=1_700_000_000.0,
-    dvl=(1, 1),
-    speed=0.3,
-    rates=(),
-    armed=True,
-):
+    boot_s=5.0, system=1, seconds=SECONDS, written_s=1.7e9, dvl=(1, 1), speed=0.3, rates=(), armed=True
+):  # fmt: skip
     """A ground station's clock before every message; the DVL has none, the autopilot's has 32 bits."""
     link = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
     others = {one: mavlink.MAVLink(None, srcSystem=one[0], srcComponent=one[1]) for one in (dvl, *rates)}
