@@ -474,14 +474,14 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     assert code == 2 and "bt: is no run folder" in err
 
 
-def test_without_a_preset_the_papers_learner_trains(capfd, monkeypatch):
+def test_without_a_preset_the_policy_trains(capfd, monkeypatch):
     asked = []
     monkeypatch.setattr(
         "uuvtai.learning.runner.train", lambda request, *_: (asked.append(request) or {}, Path())
     )
     assert uuv(capfd, "train")[0] == 0
     assert [(request.preset, request.config) for request in asked] == [
-        ("paper", loader.load_training("paper"))
+        ("policy", loader.load_training("policy"))
     ]
 
 

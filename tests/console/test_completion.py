@@ -156,7 +156,7 @@ def runs(tmp_path):
     (["presets", "show", "bt", "--run", "runs/"], ["runs/first/", "runs/first_eval"]),
     (["eval", "--device", ""], ["auto", "cpu", "cuda"]),
     (["presets", "show", "gau"], ["gauntlet", "gauntlet_inertial"]),
-    (["presets", "show", "train/p"], ["train/paper", "train/ppo"]),
+    (["presets", "show", "train/p"], ["train/paper", "train/policy", "train/ppo"]),
 ], ids=" ".join)  # fmt: skip
 def test_the_shell_is_offered_names_and_folders(words, offers, runs):
     found, modules = completed(words, runs)

@@ -491,7 +491,7 @@ def test_another_runs_policy_goes_on_learning_in_the_simulator(small, saved):
         "ppo.rollout_steps": 4, "ppo.epochs": 1, "ppo.minibatches": 1, "train.num_envs": small.N,
         "train.evaluate_episodes": 2,
     }  # fmt: skip
-    _, config = runner._started(found.path, load_training("curriculum", changes), None)
+    _, config = runner._started(found.path, load_training("smoke", changes), None)
     assert config.encoder == "set" and config.surrogate.obstacle_hidden == 8
     trainer = simulated(small, config)
     trainer.start(found)

@@ -99,10 +99,10 @@ def test_the_card_says_where_it_was_judged(whole, kind):
     card = (whole[1] / "README.md").read_text()
     if kind == "set":
         assert (
-            "the kinematic surrogate, pool and gauntlet, S = 8, D = 9, v = 1.5 m/s; S = 8, D = 9, v = 1 m/s; "
+            "the kinematic surrogate, pool, gauntlet and maze, S = 8, D = 9, v = 1.5 m/s; S = 8, D = 9, v = 1 m/s; "
             in card
         )
-        assert "| 768/1536 = 50.0 % | 384/1536 = 25.0 % |" in card, (
+        assert "| 770/1539 = 50.0 % | 385/1539 = 25.0 % |" in card, (
             "no interval: scenes share their episodes' numbers"
         )
     assert "own world" not in card
@@ -235,7 +235,7 @@ def test_words_and_constants_are_those_of_the_package():
         EGO_COLUMNS,
     ]
     names = [row["name"] for columns in (text.OBSTACLE_COLUMNS, text.OWN_COLUMNS) for row in columns]
-    assert names[12] == "way_in_1s.x" and names[OBSTACLE_WIDTH + 3] == "goal_direction.x"
+    assert names[12] == "way_in_1s.x" and names[OBSTACLE_WIDTH + 3] == "route_direction.x"
     for own, theirs in (
         (run_policy.AT_DIRECTION, set_networks.AT_DIRECTION),
         (run_policy.SUM_SCALE, set_networks._SUM_SCALE),
@@ -269,7 +269,7 @@ def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
         (lambda b, o: (b[:, 1:], o), r"obstacles must have shape \(n, 22\)"),
         (lambda b, o: (b[0], o), r"obstacles must have shape \(n, 22\)"),
         (lambda b, o: (b[:0], o), r"obstacles must have shape \(n, 22\)"),
-        (lambda b, o: (b, o[1:]), r"own must have shape \(41,\), got \(40,\)"),
+        (lambda b, o: (b, o[1:]), r"own must have shape \(46,\), got \(45,\)"),
         (lambda b, o: (b * np.nan, o), "not finite"),
         (lambda b, o: (b, o * np.inf), "not finite"),
         (lambda b, o: (b * 0.5, o), "first column"),

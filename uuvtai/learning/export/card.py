@@ -74,7 +74,8 @@ def _held_out_in_worlds(config: LearningConfig) -> tuple[str, int]:
     worlds = config.surrogate.worlds
     groups = len(worlds) * max(1, len(config.train.scenes))
     each = -(-config.train.evaluate_episodes // groups)
-    return f"the kinematic surrogate, {' and '.join(map(_word, worlds))}, {scenes_of(config)}", groups * each
+    told = " and ".join(", ".join(map(_word, worlds)).rsplit(", ", 1))
+    return f"the kinematic surrogate, {told}, {scenes_of(config)}", groups * each
 
 
 def scenes_of(config: LearningConfig) -> str:
