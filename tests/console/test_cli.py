@@ -66,6 +66,7 @@ from uuvtai.console.views import show_evaluation
         (["eval", "--policy=model.onnx"], "No such option: --policy; now it is --agent FILE"),
         (["eval", "-v", "1"], "No such option: -v; now it is --speed"),
         (["train", "--stack", "paper"], "No such option: --stack; now it is --agent NAME, or --set stack="),
+        (["train", "--num-envs", "4"], "No such option: --num-envs; now it is --set train.num_envs=N"),
         (["warm"], "No such command 'warm'; now it is uuv doctor --compile"),
         (["tree", "--dot"], "No such command 'tree'; now it is uuv presets show bt"),
         (["log", "video", "a.mcap"], "now it is uuv log render FILE --out NAME.webm"),

@@ -122,14 +122,15 @@ def test_without_scores_the_best_is_the_newest(tmp_path):
 
 
 def test_a_damaged_newest_one_is_left_out_and_told(tmp_path):
-    saved(tmp_path, 1)
-    damaged = saved(tmp_path, 2) / "simulator.zst"
+    older, damaged = saved(tmp_path, 1), saved(tmp_path, 2) / "simulator.zst"
     content = bytearray(damaged.read_bytes())
     content[len(content) // 2] ^= 1
     damaged.write_bytes(content)
-    answer = []
-    assert checkpoint.newest(tmp_path, answer.append, resumable=True).step == 1
-    assert "simulator.zst: is damaged" in answer[0]
+    told = []
+    assert checkpoint.newest(tmp_path, told.append, resumable=True).step == 1 and "is damaged" in told[0]
+    (older / "manifest.json").unlink()
+    with pytest.raises(CheckpointError, match=r"no usable checkpoint \(.*simulator.zst: is damaged"):
+        checkpoint.newest(tmp_path, resumable=True)
 
 
 def test_a_run_without_checkpoints(tmp_path):
@@ -163,7 +164,7 @@ def test_a_config_key_that_is_younger_than_a_checkpoint_has_its_default(tmp_path
     path = saved(tmp_path)
 
     def older(document):
-        del document["config"]["world_model"]["error_unit"]
+        del document["config"]["train"]["patience"]
         document["config_sha256"] = checkpoint.config_sha256(document["config"])
 
     rewritten(path, older)

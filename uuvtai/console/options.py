@@ -33,8 +33,8 @@ def _agents(help_text: str) -> Any:
     return Option("--agent", metavar=_NAME, help=help_text, autocompletion=parsing.agent_names)
 
 
-def _resume(help_text: str) -> Any:
-    return Option("--resume", metavar="RUN", help=help_text, autocompletion=parsing.runs)
+def _resume(help_text: str, name: str = "--resume") -> Any:
+    return Option(name, metavar="RUN", help=help_text, autocompletion=parsing.runs)
 
 
 def _out(help_text: str) -> Any:
@@ -153,7 +153,7 @@ TrainResume = Annotated[Path | None, _resume("Continue this training with its ow
 Iterations = Annotated[
     int | None, Option("--iterations", help="Total iterations. Schedules still span train.iterations.")
 ]
-TrainStart = Annotated[Path | None, Option("--start", help="Run whose policy to begin with.")]
+TrainStart = Annotated[Path | None, _resume("Run whose policy to begin with.", "--start")]
 TrainSeed = Annotated[int | None, Option("--seed", help="Random seed (train.seed).")]
 TrainWorld = Annotated[
     str | None, _preset("--world", "world", f"World: {_WORLDS}, or a YAML file \\[default: the preset's].")
@@ -264,7 +264,7 @@ BudgetName = Annotated[
     parsing.choice(
         "--budget",
         ("quick", "paper", "tenfold"),
-        "Half an hour on two cores, the paper's env-steps, or ten times as many.",
+        "A tenth of the paper's env-steps, all of them, or ten times as many.",
     ),
 ]
 OwnAgents = Annotated[

@@ -132,6 +132,7 @@ OF_A_SWEEP_RESUMED = (
 
 _TODAY = {
     "--controller": "--agent NAME",
+    "--num-envs": "--set train.num_envs=N",
     "--policy": "--agent FILE",
     "--stack": "--agent NAME, or --set stack=NAME for all agents; of 'uuv export': --out",
     "-v": "--speed",
@@ -149,7 +150,7 @@ def telling_new_names(app: Callable[..., Any], arguments: list[str] | None) -> A
     try:
         return app(args=arguments, prog_name="uuv", standalone_mode=False)
     except UsageError as error:
-        found = re.match(r"No such (?:option: |command ')(-*\w+)|Got unexpected extra", error.message)
+        found = re.match(r"No such (?:option: |command ')(-*[\w-]+)|Got unexpected extra", error.message)
         drives = error.ctx is not None and any(p.name == "agent" for p in error.ctx.command.params)
         if found and (now := _TODAY.get(found[1]) if found[1] else "--agent NAME|FILE" if drives else None):
             error.message = f"{error.message.rstrip('.')}; now it is {now}"

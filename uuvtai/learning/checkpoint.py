@@ -626,19 +626,18 @@ def newest(
 ) -> Checkpoint:
     """Newest checkpoint of a run folder that passes verification; ``note`` is told of newer ones that do not.
     Raises CheckpointError."""
-    checkpoints = run / "checkpoints"
+    checkpoints, reasons = run / "checkpoints", list[str]()
     for path in _folders(checkpoints):
         try:
             found = _open_below(run, path)
+            if not resumable or found.is_resumable:
+                return found
+            reasons.append(f"{path} has no simulator state to go on from")
         except CheckpointError as error:
-            note(f"left out: {error}")
-            continue
-        if not resumable or found.is_resumable:
-            return found
-        note(f"left out: {path} has no simulator state to go on from")
-    raise CheckpointError(
-        f"{checkpoints}: holds no usable checkpoint; give the folder of a run that 'uuv train' has written"
-    )
+            reasons.append(str(error))
+        note(f"left out: {reasons[-1]}")
+    why = f" ({reasons[0]})" if reasons else ""
+    raise CheckpointError(f"{checkpoints}: holds no usable checkpoint{why}; give a run of 'uuv train'")
 
 
 def best(run: Path, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:

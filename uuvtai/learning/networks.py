@@ -7,6 +7,7 @@ import functools
 import itertools
 import math
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
@@ -219,7 +220,7 @@ def entropy(log_std: torch.Tensor) -> torch.Tensor:
     return log_std.sum() + log_std.shape[-1] * (0.5 + _HALF_LOG_2PI)
 
 
-class Policy(nn.Module):
+class Policy(nn.Module, ABC):
     """Actor and critic as PPO sees them: two separate networks on the same inputs."""
 
     inputs: tuple[str, ...]
@@ -248,25 +249,25 @@ class Policy(nn.Module):
         """The inputs as ``mean_of`` and ``value_of`` want them."""
         return {name: view[name] for name in self.inputs}
 
+    @abstractmethod
     def mean_of(self, inputs: View) -> torch.Tensor:
         """(..., n_action) mean action, float32, of prepared inputs."""
-        raise NotImplementedError
 
+    @abstractmethod
     def value_of(self, inputs: View) -> torch.Tensor:
         """(...,) expected return in the critic's units, float32, of prepared inputs."""
-        raise NotImplementedError
 
     def parts(self) -> dict[str, nn.Module]:
         """What is kept of it, by name in a checkpoint: ``policy`` is what drives."""
         return {"policy": self}
 
+    @abstractmethod
     def actor_parameters(self) -> list[nn.Parameter]:
         """Of what drives."""
-        raise NotImplementedError
 
+    @abstractmethod
     def last_of_critic(self) -> nn.Linear:
         """The critic's last layer."""
-        raise NotImplementedError
 
     def observe(self, view: View) -> None:
         """Take inputs into the statistics that they are scaled by, where there are some."""

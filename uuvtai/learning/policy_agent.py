@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
@@ -67,7 +68,7 @@ class OneDecision(nn.Module):
         return self.policy.distribution(x)[0], self.policy.value(x), features
 
 
-class HeldAgent:
+class HeldAgent(ABC):
     """Drives rows by decisions that are held for some control steps. ``decide`` looks, ``advance`` goes on to
     the next step; ``reset`` when a row begins another episode."""
 
@@ -84,9 +85,9 @@ class HeldAgent:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
         self._age *= rows.to(self.device) == 0
 
+    @abstractmethod
     def decide(self, obs: torch.Tensor) -> AgentDecision:
         """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on."""
-        raise NotImplementedError
 
     def advance(self) -> None:
         """The last decision has been carried out."""

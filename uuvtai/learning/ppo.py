@@ -33,7 +33,7 @@ from uuvtai.learning.rollout import Rollout
 ADAM_EPS = 1e-5
 """as in most PPO implementations (Huang et al. 2022, detail 3)"""
 RATE_FACTOR, RATE_BOUNDS = 1.5, (1e-5, 2e-3)
-"""steps and bounds of the KL-adaptive learning rate (rsl_rl)"""
+"""steps of the KL-adaptive learning rate (rsl_rl), and its bounds (EC)"""
 DECAY_FROM, LEAST_RATE = 0.5, 0.1
 """share of the run from which an adaptive rate falls, and the part of it that is left at the end"""
 

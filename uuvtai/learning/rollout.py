@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -27,7 +28,7 @@ class Step(NamedTuple):
     """more of the step that the rollout keeps"""
 
 
-class Environment:
+class Environment(ABC):
     """Where a policy learns: the simulator or its surrogate (``environments.py``). ``begin`` comes first."""
 
     num_envs: int
@@ -43,19 +44,19 @@ class Environment:
     observation_table: Sequence[Any]
     guard: Guard
 
+    @abstractmethod
     def make_policy(self, generator: torch.Generator) -> Policy:
         """One that fits the view."""
-        raise NotImplementedError
 
+    @abstractmethod
     def begin(self, policy: Any, world_model: Any, generator: torch.Generator) -> None:
         """First episodes, for the policy that was made; ``generator`` draws all that follow."""
-        raise NotImplementedError
 
     def look_around(self, _rollout: Rollout) -> bool:
         """Fill a rollout with what the statistics of the policy begin with; whether there is any."""
         return False
 
-    def fill_model_features(self, rollout: Rollout) -> None:
+    def fill_model_features(self, rollout: Rollout) -> None:  # noqa: B027 - most have none
         """The world model has learned from what ``look_around`` filled: say what it makes of it."""
 
     def warm_start(self, _policy: Any) -> dict[str, float]:
@@ -63,29 +64,29 @@ class Environment:
         return {}
 
     @property
+    @abstractmethod
     def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Seed and number, both (N,), of what every env is in."""
-        raise NotImplementedError
 
+    @abstractmethod
     def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
         """Carry out a decision (N, n_action), and count it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def state_dict(self) -> dict[str, torch.Tensor]:
         """What is carried beside ``capture``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """What ``state_dict`` gave, after ``restore``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def capture(self) -> dict[str, Any]:
         """The episodes."""
-        raise NotImplementedError
 
+    @abstractmethod
     def restore(self, arrays: dict[str, Any]) -> None:
         """Go on with what ``capture`` gave; ValueError, with nothing changed, for that of another env."""
-        raise NotImplementedError
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -54,9 +54,7 @@ class Trainer:
             n_obs = max(column.slice.stop for column in self.observation_table)
             self.world_model = WorldModel(n_obs, world, self.generator).to(env.device)
             names = [
-                f"{column.name}_{i}"
-                for column in self.observation_table
-                for i in range(column.slice.stop - column.slice.start)
+                f"{c.name}_{i}" for c in env.observation_table for i in range(c.slice.stop - c.slice.start)
             ]
             self.world_learner = WorldModelLearner(self.world_model, world, names[:N_TARGET])
         self.recent = Recent(env.outcomes, env.reward_terms)

@@ -22,6 +22,7 @@ from uuvtai.kernels.core.geometry import (
     FAR_M,
     NONE,
     PI,
+    foot_on,
     hull_to_floor_or_surface,
     hull_to_obstacle,
     hull_to_side_wall,
@@ -354,12 +355,7 @@ def advanced_arc(number, arc, pos_w, route: AnyTensor):
     while i < route.shape[1] - 1 and route[number, first, 2] - route[number, i, 2] <= WINDOW_M:
         a = way_point(number, i, route)
         along = way_point(number, i + 1, route) - a
-        share = ti.math.clamp(
-            ti.math.dot(pos_w - a, along) / ti.max(ti.math.dot(along, along), 1e-12), 0.0, 1.0
-        )
-        if i == first:
-            share = ti.max(share, arc - first)
-        gap = (pos_w - a - along * share).norm_sqr()
+        share, gap = foot_on(pos_w, a, along, arc - first if i == first else 0.0)
         if gap < nearest:
             nearest, out = gap, i + share
         i += 1

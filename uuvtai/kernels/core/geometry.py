@@ -280,6 +280,14 @@ def corner_of(shape, i):
 
 
 @ti.func
+def foot_on(point, start, along, least):
+    """Nearest point of a segment, as a share of it from ``least`` on, and its squared distance [m^2]."""
+    share = ti.math.clamp((point - start).dot(along) / ti.max(along.norm_sqr(), 1e-12), 0.0, 1.0)
+    share = ti.max(share, least)
+    return share, (point - start - along * share).norm_sqr()
+
+
+@ti.func
 def nearest_squared(shape, point):
     """Squared distance [m^2] from a point to the unrounded rectangle, 0 inside."""
     ahead = ti.Vector([shape[2], shape[3]])

@@ -5,7 +5,7 @@ import taichi as ti
 
 from uuvtai.common.enums import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.compile.launch import quick_launch
-from uuvtai.kernels.core.geometry import wrapped_angle
+from uuvtai.kernels.core.geometry import foot_on, wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, occupancy_of
 from uuvtai.kernels.core.stage import Bundle, FloatMatrix, In, n_envs
 from uuvtai.kernels.planning.io import RouteIO
@@ -76,10 +76,7 @@ def advanced_arc(route: In[RouteState], env, pos_w):
     out, i = arc, first
     while i < route.n_way[env] - 1 and route.way_left_m[env, first] - route.way_left_m[env, i] <= _WINDOW_M:
         a, along = route.way_w[env, i], route.way_w[env, i + 1] - route.way_w[env, i]
-        share = ti.math.clamp((pos_w - a).dot(along) / ti.max(along.norm_sqr(), 1e-12), 0.0, 1.0)
-        if i == first:
-            share = ti.max(share, arc - first)
-        gap = (pos_w - a - along * share).norm_sqr()
+        share, gap = foot_on(pos_w, a, along, arc - first if i == first else 0.0)
         if gap < nearest:
             nearest, out = gap, i + share
         i += 1

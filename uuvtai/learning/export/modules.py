@@ -8,6 +8,7 @@ import io
 import logging
 import math
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 
 import numpy as np
@@ -36,7 +37,7 @@ Arrays = dict[str, np.ndarray]
 Named = Iterator[tuple[str, Tensor]]
 
 
-class ExportedModule(nn.Module):
+class ExportedModule(nn.Module, ABC):
     """What is exported: rows of inputs to rows of outputs, by name."""
 
     kind: str
@@ -45,13 +46,13 @@ class ExportedModule(nn.Module):
     """what each one is, in the order of ``forward``"""
     outputs: dict[str, str]
 
+    @abstractmethod
     def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
         """Made-up inputs, spread as training had them."""
-        raise NotImplementedError
 
+    @abstractmethod
     def named(self) -> Named:
         """Arrays of ``policy.safetensors`` by the names that ``run_policy.py`` knows."""
-        raise NotImplementedError
 
     def sizes(self) -> dict[str, dict[int, torch.export.Dim]]:
         """Axes of the inputs that may have any size."""

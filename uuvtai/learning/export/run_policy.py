@@ -27,6 +27,7 @@ import stat
 import sys
 import time
 import zipfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,7 +68,7 @@ class PolicyError(RuntimeError):
     """A folder that cannot be used: which file, and why."""
 
 
-class Exported:
+class Exported(ABC):
     """What every kind can: ``said`` gives outputs for rows of inputs, by name, and remembers nothing."""
 
     inputs: tuple[str, ...]
@@ -84,12 +85,12 @@ class Exported:
                 f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again"
             ) from None
 
-    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None: ...
 
+    @abstractmethod
     def said(self, given: Arrays) -> Arrays:
         """Outputs by name, one row each for rows of inputs. Raises ValueError for inputs of other shapes."""
-        raise NotImplementedError
 
     def _rows(self, given: Arrays, *shapes: tuple[int | None, ...]) -> list[np.ndarray]:
         """The inputs as float32 of these shapes behind the rows, None = any size but 0. Raises ValueError."""
