@@ -139,8 +139,8 @@ def decide(stage):
     tick(stage)
 
 
-def tick(stage, sonar=CFG.sensors.sonar):
-    parts = (CFG.behavior, sonar, CFG.vehicle, TANK, CFG.episode)
+def tick(stage, cfg=CFG.behavior, sonar=CFG.sensors.sonar):
+    parts = (cfg, sonar, CFG.vehicle, TANK, CFG.episode)
     tree.tick_tree(stage.io(BehaviorIO, *parts), stage.action)
     ti.sync()
 
@@ -762,7 +762,7 @@ def polar(degrees, length=1.0):
 
 def turns(
     scene, xml, yaw: Any = 0.0, gaze: Any = None, way: Any = None, way_of="follow_vel_w", speed=0.5,
-    room_m=2.0,
+    room_m=2.0, **changes,
 ):  # fmt: skip
     """[degree] that the nose is told to turn by; bearings of the gaze and of the velocity, None = none."""
     for name, degrees, length in (("heading_w", gaze, 1.5), (way_of, way, speed)):
@@ -778,7 +778,7 @@ def turns(
     )
     scene.tree = parse_tree(f'<root BTCPP_format="4"><BehaviorTree ID="main">{xml}</BehaviorTree></root>')
     load_tree(scene.table, scene.tree)
-    tick(scene)
+    tick(scene, CFG.behavior.model_copy(update=changes))
     return np.degrees(scene.action[:, 3].numpy() * CFG.vehicle.max_yaw_rate_rad_s / CFG.behavior.yaw_gain)
 
 
@@ -852,6 +852,18 @@ def test_in_danger_a_diagonal_goes_along_the_way_near_the_gaze(scene):
     narrow = turns(scene, "<Evade/>", 0, None, [20, 100, 150, 200, -20, 0], "evade_vel_w", room_m=0.3)
     # no tail first: any diagonal is as good
     np.testing.assert_allclose(narrow[:5], [-25, -35, 15, -25, 25], atol=ANGLE_TOLERANCE)
+
+
+def test_a_diagonal_goes_along_an_open_way_whatever_is_looked_at(scene):
+    """The diagonals are 45 degrees off the way: 20 gives -25, 60 gives 15, 10 to the left gives -35."""
+    way, gaze, yaw = [20, 60, 100, 20, None, 60], [90, -60, None, 20, 30, 0], [0, 0, 90, 0, 0, 0]
+    wanted = [-25, 15, -35, -25, 30, 15]
+    found = turns(scene, "<FollowRoute/>", yaw, gaze, way, travel_diagonal=True)
+    np.testing.assert_allclose(found, wanted, atol=ANGLE_TOLERANCE)
+    narrow = {"room_m": 0.59}
+    for xml, more in (("<FollowRoute/>", narrow), ("<Evade/>", {"way_of": "evade_vel_w"})):
+        as_ever = turns(scene, xml, yaw, gaze, way, **more)
+        np.testing.assert_allclose(turns(scene, xml, yaw, gaze, way, **more, travel_diagonal=True), as_ever)
 
 
 def test_backing_off_the_nose_keeps_to_the_diagonal_near_the_gaze(scene):
