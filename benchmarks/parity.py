@@ -15,10 +15,9 @@ from benchmarks.common import Job, Row
 from uuvtai.common.enums import RUNNING, SUCCESS
 from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
-from uuvtai.evaluation.agents import find_policy
 from uuvtai.evaluation.episodes import Job as Episode
 from uuvtai.evaluation.episodes import run_episodes
-from uuvtai.learning.agents import load_set_agent
+from uuvtai.learning.agents import find_policy, load_set_agent
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.parameter_search import simulator_of
 from uuvtai.learning.set_networks import MOST_WISH, SetActor, actor_of

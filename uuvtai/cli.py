@@ -174,6 +174,7 @@ def train_policy(
 
     Ctrl-C saves a checkpoint; --resume continues."""
     from uuvtai.console.screen import TrainingProgress
+    from uuvtai.console.views import show_training
     from uuvtai.evaluation.evaluate import evaluate_now
     from uuvtai.learning.runner import TrainRequest, train
 
@@ -187,7 +188,7 @@ def train_policy(
         )
     result, folder = train(request, TrainingProgress(), evaluate_now)
     _report_if(with_report, folder)
-    output.show(result, lambda _screen: None)
+    output.show(result, lambda screen: show_training(screen, result))
 
 
 @app.command("export", epilog="Example: uuv export runs/mine --out runs/mine_export")

@@ -142,9 +142,11 @@ def test_a_sweep_that_goes_on_counts_its_own_cells_only(lines):
 
 def test_the_first_iteration_of_a_training_has_no_speed():
     metrics = samples.metrics(1)[0]
-    assert "900" not in training_rows(metrics, None, None, True)["env-steps/s"]
-    rows = training_rows(metrics, (0.1, 0.3), 150.0, False)
-    assert rows["env-steps/s"].startswith("900 (") and rows["ETA"] == "2 min"
+    assert training_rows(metrics, None, None, True)["env-steps"] == "1,000"
+    rows = training_rows(
+        metrics | {"time/decisions": 200, "time/decisions_per_s": 180}, (0.1, 0.3), 150.0, False
+    )
+    assert rows["decisions"].startswith("200, 180/s (simulate") and rows["ETA"] == "2 min"
     assert "[10, 30]" in rows["success"]
     assert "ETA" not in training_rows(metrics, None, None, False)
 

@@ -33,8 +33,8 @@ class LinearPolicy(nn.Module):
         return self.actor(view["x"])
 
 
-def samples_of(x, behavior, weight):
-    return {"x": x, "teacher_action": behavior, "weight": weight}
+def samples_of(x, behavior, valid):
+    return {"x": x, "teacher_action": behavior, "valid": valid}
 
 
 @pytest.fixture
@@ -48,34 +48,6 @@ def test_the_error_is_the_squared_norm_over_the_four_actions():
     mean = torch.tensor([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5]])
     behavior = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -0.5]])
     assert distillation.imitation_error(mean, behavior).tolist() == [5.0, 1.0]
-
-
-def test_weights_have_mean_one_and_bounds():
-    signal = torch.tensor([1.0, 2.0, 3.0])
-    assert torch.allclose(distillation.sample_weight(signal), torch.tensor([0.5, 1.0, 1.5]), atol=FLOAT32)
-    weight = distillation.sample_weight(torch.cat([torch.full((999,), 1e-3), torch.tensor([1e9])]))
-    assert float(weight.mean()) == pytest.approx(1.0, abs=1e-5)
-    assert float(weight.max() / weight.min()) == pytest.approx(distillation.MAX_WEIGHT_RATIO**2)
-
-
-def test_weights_survive_zeros_and_what_is_not_finite():
-    assert distillation.sample_weight(torch.zeros(4)).tolist() == [1.0] * 4
-    weight = distillation.sample_weight(torch.tensor([1.0, math.nan, 3.0, math.inf]))
-    assert torch.isfinite(weight).all()
-    assert weight[1] == weight[3] and weight[0] < weight[1] < weight[2]
-
-
-def test_weighting_by_name():
-    uncertainty = torch.tensor([1.0, 3.0])
-    assert distillation.weights_of("none", uncertainty).tolist() == [1.0, 1.0]
-    assert distillation.weights_of("uncertainty", uncertainty).tolist() == [0.5, 1.5]
-
-
-def test_a_weighting_needs_its_signal():
-    distillation.check_weighting("none", False)
-    distillation.check_weighting("uncertainty", True)
-    with pytest.raises(ValueError, match=r"world_model\.enabled=true"):
-        distillation.check_weighting("uncertainty", False)
 
 
 def test_teacher_batches_teach_the_mean_and_leave_the_critic(lesson):

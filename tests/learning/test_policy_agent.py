@@ -5,12 +5,17 @@ import json
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
+from tests.command import run_cli
+from uuvtai.common.presets import PRESET_DIR
 from uuvtai.config.loader import load_training
 from uuvtai.envs.vector_env import VectorEnv
-from uuvtai.evaluation.agents import AgentSpec, find_policy, load_agents, observation_of
+from uuvtai.evaluation.agents import AgentSpec, load_agents, observation_of
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
-from uuvtai.learning import checkpoint
+from uuvtai.learning import agents, checkpoint
+from uuvtai.learning.agents import find_policy
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.networks import ActorCritic
 from uuvtai.learning.policy_agent import CHUNK, PolicyAgent, load_agent
@@ -29,7 +34,6 @@ def networks(n_obs=N_OBS, seed=0, **config):
     model = WorldModel(n_obs, learning.world_model, rng)
     policy.observation_norm.update(3.0 * torch.randn(500, n_obs + 2, generator=rng))
     model.observation_norm.update(3.0 * torch.randn(500, n_obs, generator=rng))
-    model.change_norm.update(torch.randn(500, 24, generator=rng))
     with torch.no_grad():
         policy.actor[-1].weight.mul_(30.0)
     return policy, model
@@ -219,7 +223,7 @@ def test_networks_that_cannot_drive_are_refused(small, trained, tmp_path, change
 
 def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
     folder, config = trained
-    by_run, by_step = find_policy(str(folder)), find_policy(str(folder / "checkpoints" / "step_000005"))
+    by_run, by_step = (find_policy(str(folder)), find_policy(str(folder / "checkpoints" / "step_000005")))
     assert (
         by_run.sha256
         == by_step.sha256
@@ -227,6 +231,25 @@ def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
     )
     assert load_agents([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
     assert observation_of([str(folder)]) == [("observation", config.observation.model_dump(mode="json"))]
+
+
+def test_the_built_in_policy_arrives(tmp_path, capfd):
+    assert (
+        run_cli("eval", "--agent=policy", "--episodes=8", "--seeds=3", "--json", "--run-dir", tmp_path) == 0
+    )
+    (agent,) = json.loads(capfd.readouterr().out)["agents"]
+    assert agent["outcomes"]["success"] >= 7 and agent["checkpoint"]["path"] == "built-in"
+
+
+def test_the_built_in_policy_drives_on_when_keys_are_renamed(tmp_path, monkeypatch):
+    with safe_open(PRESET_DIR / "policy" / checkpoint.MODEL, "pt") as file:
+        manifest = json.loads(file.metadata()["manifest"]) | {"config": {"twin": {"gap_m": 1}}}
+    (tmp_path / "policy").mkdir()
+    arrays = load_file(PRESET_DIR / "policy" / checkpoint.MODEL)
+    save_file(arrays, tmp_path / "policy" / checkpoint.MODEL, {"manifest": json.dumps(manifest)})
+    monkeypatch.setattr(agents, "PRESET_DIR", tmp_path)
+    found = find_policy("policy")
+    assert found.config == load_training("policy") and "policy" in found.model()
 
 
 def test_names_that_are_no_policy(trained, tmp_path):

@@ -14,7 +14,9 @@ from uuvtai.learning.networks import Guard, TrainingError
 from uuvtai.learning.trainer import Trainer
 
 ROOT = Path(__file__).parents[2]
-WALL_TIMES = "time/simulate_s", "time/infer_s", "time/learn_s", "time/env_steps_per_s"
+WALL_TIMES = tuple(
+    f"time/{n}" for n in ("simulate_s", "infer_s", "learn_s", "env_steps_per_s", "decisions_per_s")
+)
 SUMMED_APART = 1e-4
 """float32 gradients of one minibatch added up in another order, over two iterations of a few Adam steps
 each"""
@@ -23,7 +25,7 @@ each"""
 def config_of(**sections):
     """A small run: 16 steps, narrow networks, the world model on."""
     small = {
-        "policy": {"hidden": [16, 16]},
+        "policy": {"hidden": [16, 16], "hold_steps": 1},
         "ppo": {"rollout_steps": 16, "epochs": 2, "minibatches": 2, "learning_rate": 1e-3},
         "distillation": {"batch": 64, "schedule": [[0, 1], [1, 0.2]]},
         "world_model": {"hidden": [16], "latent": 8, "batch": 64},
@@ -76,7 +78,7 @@ def test_it_learns_the_task_from_its_teacher_and_says_so():
     assert set(WALL_TIMES) < set(last)
 
 
-@pytest.mark.parametrize("more", [{}, {"ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16}}])
+@pytest.mark.parametrize("more", [{}, {"ppo": {"target_kl": 0.01, "rollout_steps": 16}}])
 def test_four_iterations_equal_two_and_two_more_after_a_resume(more):
     config = config_of(**more)
     whole = trainer_of(PointEnv(), config)
@@ -151,26 +153,6 @@ def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
     assert trainer.iterate()["train/skipped_updates"] == 4
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.policy.actor.parameters(), strict=True))
     assert trainer.env.guard.bad_in_a_row == 1
-
-
-def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
-    trainer = trainer_of(
-        PointEnv(), config_of(distillation={"schedule": [[0, 0]], "critic_warmup_iterations": 1})
-    )
-    actor, critic = trainer.policy.actor[0].weight.clone(), trainer.policy.critic[0].weight.clone()
-    trainer.iterate()
-    assert torch.equal(trainer.policy.actor[0].weight, actor)
-    assert not torch.equal(trainer.policy.critic[0].weight, critic)
-    trainer.iterate()
-    assert not torch.equal(trainer.policy.actor[0].weight, actor)
-
-
-def test_the_uncertainty_weighs_the_distillation():
-    trainer = trainer_of(PointEnv(), config_of(distillation={"weighting": "uncertainty"}))
-    for _ in range(4):
-        trainer.iterate()
-    weight = trainer.rollout["weight"]
-    assert float(weight.mean()) == pytest.approx(1.0, abs=1e-4) and float(weight.std()) > 0
 
 
 def test_the_world_models_columns_can_be_left_out():

@@ -9,9 +9,7 @@ import torch
 from scipy import stats
 
 from tests.oracles import world_model as reference
-from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
-from uuvtai.learning.distillation import Uncertainty
-from uuvtai.learning.networks import moments_of
+from uuvtai.config.learning import WorldModelConfig
 from uuvtai.learning.world_model import LOG_VAR_BOUNDS, N_TARGET, WorldModel, WorldModelLearner, calibration
 
 N_OBS, STEPS, N_ENV = 30, 16, 32
@@ -29,15 +27,15 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def transitions(seed=0, steps=STEPS, n_env=N_ENV, unit=1.0):
-    """obs, action, next_obs: targets follow the action, with tenfold noise where column 24 is positive."""
+def transitions(seed=0, steps=STEPS, n_env=N_ENV, noisy=0.2):
+    """obs, action, next_obs: targets follow the action, with ``noisy`` noise where column 24 is positive."""
     gen = generator(seed)
     obs = torch.randn(steps, n_env, N_OBS, generator=gen)
     action = torch.rand(steps, n_env, 4, generator=gen) * 2 - 1
-    noise = torch.where(obs[..., 24:25] > 0, 0.2, 0.02) * torch.randn(steps, n_env, N_TARGET, generator=gen)
+    noise = torch.where(obs[..., 24:25] > 0, noisy, 0.02) * torch.randn(steps, n_env, N_TARGET, generator=gen)
     next_obs = obs.clone()
     next_obs[..., :N_TARGET] += 0.2 * action.repeat(1, 1, 6) + 0.1 * obs[..., 25:26] + noise
-    return obs * unit, action, next_obs * unit
+    return obs, action, next_obs
 
 
 def trained(updates, config=SMALL, data=None, seed=0):
@@ -54,19 +52,8 @@ def parameters(model):
     return torch.cat([p.detach().flatten() for p in model.parameters()])
 
 
-SWITCHES = [
-    {},
-    {"predict_change": False},
-    {"normalise_targets": False},
-    {"predict_change": False, "normalise_targets": False},
-    {"beta_nll": 0.0},
-    {"likelihood": False},
-]
-
-
-@pytest.mark.parametrize("switches", SWITCHES, ids=str)
-def test_losses_are_those_of_the_oracle(switches):
-    config = SMALL.model_copy(update={"reconstruction_weight": 0.7, "dynamics_weight": 0.3, **switches})
+def test_losses_are_those_of_the_oracle():
+    config = SMALL.model_copy(update={"reconstruction_weight": 0.7, "dynamics_weight": 0.3})
     model, _, _ = trained(2, config)
     obs, action, next_obs = (part[0] for part in transitions(1))
     action = 2.0 * action  # half of them beyond what the environment clamps
@@ -83,35 +70,6 @@ def test_losses_are_those_of_the_oracle(switches):
     assert losses.total.item() == pytest.approx(0.7 * expected[0] + 0.3 * expected[1], rel=ROUNDING)
 
 
-def test_prediction_is_the_decoders_in_si_units():
-    """Likelihoods in the decoder's unit and in SI differ by the logarithm of the units."""
-    for config in (SMALL, SMALL.model_copy(update={"predict_change": False})):
-        model, _, _ = trained(2, config.model_copy(update={"beta_nll": 0.0}))
-        obs, action, next_obs = (part[0] for part in transitions(1))
-        predicted = model.predict(obs, action)
-        nll = (
-            0.5
-            * ((next_obs[:, :N_TARGET] - predicted.mean) ** 2 / predicted.log_var.exp() + predicted.log_var)
-            .sum(1)
-            .mean()
-        )
-        inside = model.loss(obs, action, next_obs, torch.ones(N_ENV, dtype=torch.bool)).reconstruction
-        assert (nll - inside).item() == pytest.approx(model.scale().log().sum().item(), rel=1e-4)
-
-
-@pytest.mark.parametrize("stopped", [True, False])
-def test_no_gradient_reaches_the_encoder_through_the_target_when_it_is_stopped(stopped):
-    """With dynamics that ignore their input the target is the only way from the loss to the encoder."""
-    config = SMALL.model_copy(update={"reconstruction_weight": 0.0, "stop_target_gradient": stopped})
-    model = WorldModel(N_OBS, config, generator())
-    with torch.no_grad():
-        model.dynamics[-1].weight.zero_()
-    obs, action, next_obs = (part[0] for part in transitions())
-    model.loss(obs, action, next_obs, torch.ones(N_ENV, dtype=torch.bool)).total.backward()
-    reached = sum(p.grad.abs().sum().item() for p in model.encoder.parameters())
-    assert (reached == 0.0) == stopped
-
-
 def test_log_variance_stays_in_bounds_with_a_gradient_everywhere():
     model = WorldModel(N_OBS, SMALL, generator())
     with torch.no_grad():
@@ -123,87 +81,36 @@ def test_log_variance_stays_in_bounds_with_a_gradient_everywhere():
     assert (model.decoder[-1].bias.grad[N_TARGET:] > 0).all()
 
 
-def test_it_learns_the_change_and_where_it_is_uncertain():
-    """Below "as before" in every target on unseen data, calibrated, and surer where the noise is weak."""
-    model, _, metrics = trained(150, data=transitions(steps=256))
-    obs, action, next_obs = (part.flatten(0, 1) for part in transitions(7, steps=64))
+def test_it_learns_what_follows_and_where_it_is_uncertain():
+    """Far below the targets' variance on unseen data, calibrated, and surer where the noise is weak."""
+    config = SMALL.model_copy(update={"latent": 48, "hidden": (64, 64)})
+    model, _, metrics = trained(300, config, transitions(steps=256, noisy=1.0))
+    obs, action, next_obs = (part.flatten(0, 1) for part in transitions(7, steps=64, noisy=1.0))
     with torch.no_grad():
         predicted = model.predict(obs, action)
-    target = next_obs[:, :N_TARGET]
-    error, before = ((target - other).square().mean(dim=0) for other in (predicted.mean, obs[:, :N_TARGET]))
-    assert (error < before).all()
-    assert min(metrics[f"world_model/skill/{i}"] for i in range(N_TARGET)) > 0.2
+    target, quiet = next_obs[:, :N_TARGET], obs[:, 24] < 0
+    assert ((target - predicted.mean)[quiet].square().mean(dim=0) < 0.2 * target[quiet].var(dim=0)).all()
     square, _ = calibration(predicted.mean, predicted.log_var, target)
     assert square == pytest.approx(1.0, abs=SAMPLING)
     assert metrics["world_model/standardised_residual"] == pytest.approx(1.0, abs=SAMPLING)
     assert metrics["world_model/coverage_90"] == pytest.approx(0.9, abs=SAMPLING)
-    assert metrics["world_model/latent_std"] > 0.1
+    assert metrics["world_model/latent_std"] > 0.01
     sigma = model.features(obs, action, next_obs)[:, 1]
-    assert 0 < sigma.max() < 3
-    assert stats.spearmanr(sigma, obs[:, 24] > 0).statistic > 0.8, "the noise is ten times stronger there"
+    assert stats.spearmanr(sigma, obs[:, 24] > 0).statistic > 0.8, "the noise is far stronger there"
 
 
-def test_features_do_not_depend_on_units():
-    """Lengths in eighths of a metre are exact in binary: only roots and logarithms differ."""
-    metres, _, _ = trained(3)
-    eighths, _, _ = trained(3, data=transitions(unit=8.0))
-    obs, action, next_obs = (part[0] for part in transitions(5))
-    found = metres.features(obs, action, next_obs), eighths.features(8.0 * obs, action, 8.0 * next_obs)
-    torch.testing.assert_close(*found, rtol=1e-3, atol=1e-4)
-    assert found[0].std(dim=0).min() > 1e-3, "they vary at all"
-
-
-def test_residual_is_the_error_in_deviations_of_the_change():
+def test_features_are_the_papers_to_the_letter():
+    """The root mean square of what was predicted wrongly, and sigma_t = mean(exp(log variance))."""
     model, _, _ = trained(3)
     obs, action, next_obs = (part[0] for part in transitions(5))
     with torch.no_grad():
-        predicted = model.predict(obs, action)
-    change = (transitions()[2] - transitions()[0])[..., :N_TARGET].reshape(-1, N_TARGET).std(dim=0)
-    expected = ((next_obs[:, :N_TARGET] - predicted.mean) / change).square().mean(dim=1).sqrt()
-    sigma = (predicted.log_var.exp() / change**2).mean(dim=1)
-    drawn_twice = 0.1  # statistics are of drawn samples, not of all of them
-    torch.testing.assert_close(
-        model.features(obs, action, next_obs), torch.stack([expected, sigma], 1), rtol=drawn_twice, atol=0.0
-    )
-
-
-def test_in_the_decoders_unit_the_uncertainty_is_the_papers_to_the_letter():
-    """sigma_t = mean(exp(log variance)) as the decoder says it, whatever the one-step changes are."""
-    for switches in (
-        {},
-        {"normalise_targets": False},
-        {"predict_change": False},
-        {"predict_change": False, "normalise_targets": False},
-    ):
-        model, _, _ = trained(3, SMALL.model_copy(update={"error_unit": "decoder", **switches}))
-        obs, action, next_obs = (part[0] for part in transitions(5))
-        with torch.no_grad():
-            mean, log_var = model.decode(model.advance(model.encode(obs), action))
-            target = (next_obs[:, :N_TARGET] - model.base(obs)) / model.scale()
-        expected = torch.stack([(target - mean).square().mean(1).sqrt(), log_var.exp().mean(1)], 1)
-        torch.testing.assert_close(model.features(obs, action, next_obs), expected, rtol=ROUNDING, atol=1e-5)
-
-
-def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the_cap():
-    """ "0.2 m" of targets that change by 0.01 m: sigma_t is 0.04 in its own unit, 400 in changes."""
-    scales = {}
-    for unit in ("decoder", "change"):
-        config = SMALL.model_copy(
-            update={"predict_change": False, "normalise_targets": False, "error_unit": unit}
-        )
-        model = WorldModel(N_OBS, config, generator())
-        rows = 0.01 * torch.randn(4000, N_TARGET, generator=generator(3))
-        model.observe(moments_of(torch.zeros(10, N_OBS)), moments_of(rows))
-        with torch.no_grad():
-            model.decoder[-1].weight.zero_()
-            model.decoder[-1].bias[N_TARGET:] = math.log(0.04)
-        uncertainty = Uncertainty(UncertaintyConfig())
-        uncertainty.update(
-            model.features(torch.zeros(5, N_OBS), torch.zeros(5, 4), torch.zeros(5, N_OBS))[:, 1]
-        )
-        scales[unit] = uncertainty.scale
-    assert scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02)
-    assert scales["change"] == UncertaintyConfig().max_scale
+        mean, log_var = model.decode(model.advance(model.encode(obs), action))
+    error = next_obs[:, :N_TARGET] - mean
+    expected = torch.stack([error.square().mean(1).sqrt(), log_var.exp().mean(1)], 1)
+    torch.testing.assert_close(model.features(obs, action, next_obs), expected, rtol=ROUNDING, atol=1e-5)
+    assert expected.std(dim=0).min() > 1e-3, "they vary at all"
+    obs[0, 0] = next_obs[0, 0] = 1e9
+    assert model.features(obs, action, next_obs)[0, 0] <= 100.0, "a jump is cut off"
 
 
 def test_skill_is_told_by_name_and_only_where_something_changes():
@@ -212,7 +119,10 @@ def test_skill_is_told_by_name_and_only_where_something_changes():
     learner = WorldModelLearner(WorldModel(N_OBS, SMALL, generator()), SMALL, names)
     found = learner.update(obs, action, next_obs, generator()).items()
     told = {name.split("/")[-1]: value for name, value in found if "/skill/" in name}
-    assert told.keys() == {*names} - {"t3"} and max(map(abs, told.values())) < 0.2, "at birth: as before"
+    assert told.keys() == {*names} - {"t3"}
+    before = (next_obs - obs)[..., :N_TARGET].square().mean((0, 1))
+    expected = 1.0 - (next_obs[..., :N_TARGET].square().mean((0, 1)) / before).numpy()
+    assert list(told.values()) == pytest.approx(np.delete(expected, 3), rel=0.4), "at birth it says 0"
 
 
 # --------------------------------------------------------------------------------------------- random, resume

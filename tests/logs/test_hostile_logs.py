@@ -15,6 +15,7 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC as MAGIC
+from safetensors.numpy import save
 
 from tests.command import run_cli
 from tests.learning.export import test_deploy as deployed
@@ -460,7 +461,9 @@ def folder(exported, tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
-@pytest.mark.parametrize("name", ["policy_spec.json", "policy.safetensors", "golden.npz", "README.md"])
+@pytest.mark.parametrize(
+    "name", ["policy_spec.json", "policy.safetensors", "golden.safetensors", "README.md"]
+)
 def test_a_pipe_in_an_exported_folder_is_not_waited_for(folder, name):
     (folder / name).unlink()
     os.mkfifo(folder / name)
@@ -471,18 +474,18 @@ def test_a_pipe_in_an_exported_folder_is_not_waited_for(folder, name):
 
 
 @pytest.mark.parametrize("arrays", [
-    {"pair_value": np.float32(1)},
-    {"pair_obs": np.float32(1)},
-    {"pair_has_last": np.float32(1)},
+    {"pair_value": np.array(1, np.float32)},
+    {"pair_obs": np.array(1, np.float32)},
+    {"pair_has_last": np.array(1, np.float32)},
     {"pair_obs": np.zeros((0, 40), np.float32), "pair_has_last": np.zeros(0, bool)},
     {"pair_obs": np.zeros((64, 3), np.float32)},
-    {"pair_obs": np.array(["x"] * 64)},
-    {"pair_mean_action": np.array("word")},
+    {"pair_obs": np.zeros(64, bool)},
+    {"pair_mean_action": np.array(True)},
     {"pair_obs": np.zeros((70_000, 40), np.float32), "pair_has_last": np.zeros(70_000, bool)},
 ], ids=str)  # fmt: skip
 def test_golden_pairs_of_other_shapes_are_one_line(folder, arrays, capfd):
-    golden = folder / "golden.npz"
-    np.savez(golden, **(run_policy.read_golden(golden) | arrays))
+    golden = folder / "golden.safetensors"
+    golden.write_bytes(save(run_policy.read_safetensors(golden) | arrays))
     deployed.resigned(folder, golden.name, golden.read_bytes())
     assert run_policy.main([str(folder)]) in (1, 3)
     assert "Traceback" not in capfd.readouterr().err

@@ -27,19 +27,8 @@ def encode(model, obs):
 
 def losses(model, obs, action, next_obs):
     """(reconstruction, dynamics) of every sample, each (B,)."""
-    config, norm, change = model.config, model.observation_norm, model.change_norm
     ahead = _mlp(model.dynamics, np.concatenate([encode(model, obs), np.clip(action, -1, 1)], axis=1))
     out = _mlp(model.decoder, ahead)
     mean, log_var = out[:, :24], HIGH - _softplus(HIGH - LOW - _softplus(out[:, 24:] - LOW))
-    if config.predict_change:
-        target, std = next_obs[:, :24] - obs[:, :24], np.sqrt(change.m2.numpy() / change.count.item())
-        middle = 0.0
-    else:
-        target, std = next_obs[:, :24], np.sqrt(norm.m2.numpy() / norm.count.item())[:24]
-        middle = norm.mean.numpy()[:24]
-    if config.normalise_targets:
-        target = (target - middle) / std
-    error = (target - mean) ** 2
-    if config.likelihood:
-        error = 0.5 * (error * np.exp(-log_var) + log_var) * np.exp(config.beta_nll * log_var)
+    error = 0.5 * ((next_obs[:, :24] - mean) ** 2 * np.exp(-log_var) + log_var)
     return error.sum(axis=1), ((encode(model, next_obs) - ahead) ** 2).sum(axis=1)

@@ -491,7 +491,7 @@ def test_another_runs_policy_goes_on_learning_in_the_simulator(small, saved):
         "ppo.rollout_steps": 4, "ppo.epochs": 1, "ppo.minibatches": 1, "train.num_envs": small.N,
         "train.evaluate_episodes": 2,
     }  # fmt: skip
-    _, config = runner._started(found.path, load_training("smoke", changes), None)
+    _, config = runner._started(found.path, load_training("smoke", changes), print)
     assert config.encoder == "set" and config.surrogate.obstacle_hidden == 8
     trainer = simulated(small, config)
     trainer.start(found)
@@ -513,12 +513,12 @@ def test_another_runs_policy_goes_on_learning_in_the_simulator(small, saved):
 
 def test_what_cannot_be_begun_with_is_refused(bank, saved, tmp_path):
     with pytest.raises(UserError, match="policies alone"):
-        runner._started(saved().path, load_training("best"), None)
+        runner._started(saved().path, load_training("best"), print)
     config = load_training("policy", overrides=SMALL | {"policy.encoder": "mlp"})
     with pytest.raises(UserError, match="no observation vectors"):
         InSurrogate(config, bank)
-    with pytest.raises(UserError, match="holds no usable checkpoint"):
-        runner._started(tmp_path / "none", load_training("ppo"), type("Watch", (), {"note": print}))
+    with pytest.raises(UserError, match="is no trained policy"):
+        runner._started(tmp_path / "none", load_training("ppo"), print)
 
 
 def test_the_critic_may_be_kept_from_the_truth(bank):
@@ -551,7 +551,7 @@ def test_a_command_becomes_the_wish_with_its_velocity():
 
 def test_it_learns_what_the_tree_says(small, monkeypatch):
     monkeypatch.setattr(distillation, "PASSES", 1)
-    losses, decisions = [], []
+    losses, decisions, told = [], [], []
     config = load_training(
         "policy", overrides=SMALL | {"train.num_envs": small.N, "surrogate.warm_start_waves": 2}
     )
@@ -559,11 +559,12 @@ def test_it_learns_what_the_tree_says(small, monkeypatch):
         monkeypatch.setattr(distillation, "LAST_PASSES", passes)
         actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
         std = actor.log_std.detach().clone()
-        found = imitate(actor, config, ((8, 6, 0.6),), {"pool": small.sim})
+        found = imitate(actor, config, ((8, 6, 0.6),), told.append, {"pool": small.sim})
         losses.append(found["warm_start/loss"])
         decisions.append(found["warm_start/decisions"])
         assert torch.equal(actor.log_std, std), "its mean alone is fitted"
     assert losses[1] < 0.95 * losses[0] and decisions[0] > 100 * small.N / 2
+    assert len(told) == 4 and told[3].startswith("imitating the tree, wave 2 of 2: ")
 
 
 def test_the_tree_alone_drives_as_without_a_student(small):

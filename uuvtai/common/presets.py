@@ -15,6 +15,8 @@ KINDS = {
     "grid": "grids",
 }
 """kind -> folder in ``PRESET_DIR``"""
+POLICY = "policy"
+"""agent whose network is built in, and the preset that trained it"""
 TRAINING_TREE = "bt"
 """tree beside a policy: what it was distilled from, and what its observation's teacher columns come from"""
 
@@ -23,6 +25,11 @@ def preset_names(kind: str) -> list[str]:
     """Names of what is built in of a kind (``KINDS``)."""
     folder = PRESET_DIR / KINDS[kind]
     return sorted(path.stem for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
+
+
+def built_in_agents() -> list[str]:
+    """Who drives by what is built in: trees, stacks, the policy."""
+    return [*preset_names("tree"), *preset_names("stack"), POLICY]
 
 
 def built_in_file(kind: str, name: str) -> Path:

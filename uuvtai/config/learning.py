@@ -32,9 +32,9 @@ class PolicyConfig(Section):
     """of the action, in parts of the vehicle's limits (EC)"""
     min_std: Positive = 0.05
     """floor: the policy never stops exploring altogether (EC)"""
-    hold_steps: PositiveCount = 1
-    """control steps that an action is held. Noise drawn anew every 0.02 s averages out before the vehicle has
-    moved; held, it explores, and the networks run that much less often"""
+    hold_steps: PositiveCount = 5
+    """control steps that an action is held: 10 Hz. Noise drawn anew every 0.02 s averages out before the
+    vehicle has moved; held, it explores, and the networks run that much less often"""
 
 
 class PpoConfig(Section):
@@ -54,8 +54,6 @@ class PpoConfig(Section):
     """0 = fixed learning rate; else the rate follows the KL divergence of every update (as rsl_rl does)"""
     critic_sees_truth: bool = True
     """the critic is told where obstacles truly are and will be, where the environment can (the surrogate)"""
-    shuffle: bool = False
-    """draw minibatches at random instead of as contiguous blocks, each of all envs in a span of steps"""
     normalise_observations: bool = True
     normalise_values: bool = True
 
@@ -69,11 +67,6 @@ class DistillationConfig(Section):
     steps: Count = 2
     """gradient steps on teacher batches after every update; 0 = none"""
     learning_rate: Positive = 1.5e-4
-    critic_warmup_iterations: Count = 0
-    """iterations in which only critic and distillation learn: an untrained critic destroys a distilled
-    policy"""
-    weighting: Literal["none", "uncertainty"] = "none"
-    """weight of a sample: equal, or by the world model's uncertainty (mean one)"""
 
     @field_validator("schedule")
     @classmethod
@@ -110,21 +103,6 @@ class WorldModelConfig(Section):
     reconstruction_weight: NonNegative = 1.0
     dynamics_weight: NonNegative = 0.2
     """beta"""
-    predict_change: bool = True
-    """the decoder says how the targets change (residual decoder); false = their values, as in the paper,
-    which is further off than saying "as before": in one step of 0.02 s little changes"""
-    likelihood: bool = True
-    """Gaussian negative log-likelihood; false = mean squared error"""
-    beta_nll: Fraction = 0.5
-    """weight of each term by its variance to this power (Seitzer 2022); 0 = plain likelihood"""
-    normalise_targets: bool = True
-    """metres, radians and m/s do not average: targets by their running mean and deviation"""
-    error_unit: Literal["change", "decoder"] = "change"
-    """what the features, residual and uncertainty, count errors in: deviations of each target's one-step
-    change, in which an uncertainty of 1 is no better than "as before"; or the decoder's own unit, as in the
-    paper: mean(exp(log variance)) as the decoder says it"""
-    stop_target_gradient: bool = True
-    """no gradient through the encoding of the next observation, or the latent collapses"""
 
 
 class TrainConfig(Section):
@@ -248,6 +226,16 @@ class LearningConfig(Config):
         if self.forecast_training.enabled:
             return "forecast"
         return "search" if self.parameter_search.enabled else "ppo"
+
+    @property
+    def worlds(self) -> tuple[str, ...]:
+        """World presets that are learnt in; none = the config's own world."""
+        own = {
+            "ppo": self.surrogate.worlds if self.surrogate.enabled else (),
+            "search": dict.fromkeys(scene[0] for scene in self.parameter_search.scenes),
+            "forecast": self.forecast_training.worlds,
+        }
+        return tuple(own[self.learner])
 
     @property
     def encoder(self) -> str:

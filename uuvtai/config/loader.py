@@ -84,7 +84,7 @@ def load_config(
 
 
 def load_training(
-    preset: str = "best",
+    preset: str,
     overrides: Overrides | None = None,
     world: str | None = None,
     sensors: str | None = None,

@@ -12,7 +12,7 @@ from typing import Any
 import typer
 
 from uuvtai.common.exits import UsageError
-from uuvtai.common.presets import KINDS, preset_names
+from uuvtai.common.presets import KINDS, built_in_agents, preset_names
 
 
 def integers(option: str, text: str) -> list[int]:
@@ -234,9 +234,8 @@ def presets(kind: str, *more: str, suffix: str = ".yaml") -> Complete:
 def agent_names(incomplete: str) -> list[str]:
     """Trees, stacks, the oracle, files and run folders; after a comma the next one."""
     before, comma, last = incomplete.rpartition(",")
-    trees = preset_names("tree")
     found = _starting(
-        [*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle"], last
+        [*built_in_agents(), *(f"{tree}+truth" for tree in preset_names("tree")), "oracle"], last
     ) + _paths(
         last, lambda path: path.suffix in (".xml", ".yaml", ".py", ".onnx") or (path / "checkpoints").is_dir()
     )

@@ -326,10 +326,9 @@ class TrainingProgress:
         """``done`` of ``total`` iterations are over as the run begins in ``folder``."""
         say(f"run folder: {folder}")
         self._folder, self._total, self._pace = folder, total, None
-        world = config.world
-        self._title = (
-            f"{config.train.num_envs} envs, {obstacles(world.obstacles)}, v = {world.dynamic_speed_m_s} m/s"
-        )
+        own = f"{obstacles(config.world.obstacles)}, v = {config.world.dynamic_speed_m_s} m/s"
+        worlds = ", ".join(config.worlds)
+        self._title = f"{config.train.num_envs} envs, {worlds or own}"
         if sys.stderr.isatty():
             from rich.live import Live
 
@@ -391,16 +390,16 @@ def training_rows(
     split = " / ".join(
         f"{name} {100 * spent / max(1e-9, sum(times.values())):.0f} %" for name, spent in times.items()
     )
+    unit = "decisions" if "time/decisions" in metrics else "env_steps"
+    per_s = "" if is_first else f", {of(f'time/{unit}_per_s', 0.0):,.0f}/s ({split})"
     rows = {
-        "reward": number(of("rollout/ep_rew_mean"), 2),
         "success": percent(of("rollout/success_rate"), 0) + interval,
         "collision": percent(of("rollout/collision_rate"), 0),
-        "env-steps/s": "from the second iteration on"
-        if is_first
-        else f"{of('time/env_steps_per_s', 0.0):,.0f} ({split})",
-        "env-steps": f"{of('time/env_steps', 0.0):,.0f}",
-        "lambda": number(of("distillation/lambda_risk"), 3),
+        "reward": number(of("rollout/ep_rew_mean"), 2),
+        unit.replace("_", "-"): f"{of(f'time/{unit}', 0.0):,.0f}{per_s}",
     }
+    if "distillation/lambda_risk" in metrics:
+        rows["lambda"] = number(of("distillation/lambda_risk"), 3)
     if left_s is not None:
         rows["ETA"] = time_left(left_s).removeprefix("ETA ")
     if "eval/success_rate" in metrics:

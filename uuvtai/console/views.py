@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import json
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,17 @@ from uuvtai.common.tree_codes import ACTION, LEAVES
 from uuvtai.console.screen import Screen, print_heat_maps
 from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, paired_table
 from uuvtai.report.sweep import cell_table
-from uuvtai.report.tables import Column, Table, number, obstacles, sensing, varies_alone, varying, vehicle
+from uuvtai.report.tables import (
+    Column,
+    Table,
+    number,
+    obstacles,
+    percent,
+    sensing,
+    varies_alone,
+    varying,
+    vehicle,
+)
 from uuvtai.report.timing import density_table, latency_table
 
 if TYPE_CHECKING:
@@ -34,6 +45,17 @@ def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> Non
     if any("causes" in agent for agent in result["agents"]):
         show_causes(screen, result)
         say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
+
+
+def show_training(screen: Screen, result: dict[str, Any]) -> None:
+    """What a ``uuv train --json`` document leads on to: checkpoint, TensorBoard, the next command."""
+    run, events = shlex.quote(result["run"]), shlex.quote(f"{result['run']}/tensorboard")
+    learner, score = result["learner"], result["score"]
+    told = "" if score is None or learner != "ppo" else f" ({percent(score)} in its evaluation)"
+    given = {"search": f"--agent {run}/stack.yaml", "forecast": f"--set forecast.learned={run}"}
+    screen.line(f"best checkpoint: {result['checkpoint']}{told}")
+    screen.line(f"TensorBoard: tensorboard --logdir {events}")
+    screen.line(f"next: uuv eval {given.get(learner, f'--agent {run}')} --agent bt")
 
 
 def show_agents(screen: Screen, result: dict[str, Any]) -> None:

@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.common.errors import SettingError
-from uuvtai.common.presets import TRAINING_TREE, preset_names
+from uuvtai.common.presets import POLICY, TRAINING_TREE, built_in_agents, preset_names
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
+from uuvtai.learning.agents import find_policy
+from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.export.folder import Export, export
 from uuvtai.plugins.api import is_plugin, plugin_spec
 from uuvtai.sim.behavior_tree import FlatTree, read_tree
 
 if TYPE_CHECKING:
-    from uuvtai.learning.checkpoint import Checkpoint
     from uuvtai.logs.writer import PolicyNote
     from uuvtai.plugins.loading import LoadedPlugin
     from uuvtai.sim.rrt import RoutePlanner
@@ -89,7 +90,7 @@ class AgentSpec:
         found = self.checkpoint
         return {
             "checkpoint": {
-                "path": str(found.path),
+                "path": "built-in" if self.name == POLICY else str(found.path),
                 "sha256": found.sha256,
                 "step": found.step,
                 "version": found.manifest.version,
@@ -140,8 +141,9 @@ def _plugin_agent(name: str, max_node: int) -> AgentSpec:
 
 
 def is_trained(name: str) -> bool:
-    """Whether an agent's name is that of a run folder or a checkpoint folder; names of presets come first."""
-    return name not in (*preset_names("tree"), *preset_names("stack")) and Path(name).is_dir()
+    """Whether a network drives: the built-in one, or one of a run folder or a checkpoint folder; names of
+    what is built in come first."""
+    return name == POLICY or (name not in built_in_agents() and Path(name).is_dir())
 
 
 def _is_stack(name: str) -> bool:
@@ -155,29 +157,11 @@ def _is_stack(name: str) -> bool:
         return True
     if name not in trees and not name.endswith(".xml"):
         raise ConfigError(
-            f"--agent {name}: is no preset, file or run folder{nearest(name, [*trees, *stacks])}; presets: "
-            f"{', '.join([*trees, *stacks])}; or give a tree's .xml, a stack's .yaml, mine.py:act, "
+            f"--agent {name}: is no preset, file or run folder{nearest(name, built_in_agents())}; presets: "
+            f"{', '.join(built_in_agents())}; or give a tree's .xml, a stack's .yaml, mine.py:act, "
             "mine.py:load, model.onnx, or the run folder of 'uuv train'"
         )
     return False
-
-
-def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
-    """Checkpoint of a checkpoint folder, or of a run folder (its best one, else its newest).
-
-    Raises ConfigError for what is none of them, CheckpointError for what cannot be used.
-    """
-    from uuvtai.learning import checkpoint
-    from uuvtai.learning import checkpoint as manifest
-
-    path = Path(name)
-    if (path / manifest.MANIFEST).exists():
-        return checkpoint.open_checkpoint(path)
-    if (path / "checkpoints").is_dir():
-        return checkpoint.best(path, note)
-    raise ConfigError(
-        f"{name!r} is no trained policy: give the run folder of 'uuv train', or one of its checkpoints/step_N"
-    )
 
 
 def observation_of(names: Sequence[str]) -> list[tuple[str, Any]]:

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.common.enums import COLLIDED, FINAL_OUTCOMES, PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.files import open_to_append, read_bytes, read_text, refuse_links, truncate
-from uuvtai.common.presets import preset_names
+from uuvtai.common.presets import built_in_agents
 from uuvtai.common.statistics import (
     bootstrap_interval,
     mcnemar_p,
@@ -432,7 +432,7 @@ def _found_again(request: Request, cwd: Path) -> Request:
         if is_plugin(name):
             return plugin_spec(name).located(cwd).text
         file = name.removesuffix("+truth")
-        is_shipped = file in (ORACLE, *preset_names("tree"), *preset_names("stack"))
+        is_shipped = file in (ORACLE, *built_in_agents())
         return name if is_shipped or Path(file).exists() else str(cwd / name)
 
     return replace(request, agents=list(map(seen, request.agents)))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.common import signals
 from uuvtai.common.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
+from uuvtai.common.presets import built_in_agents
 from uuvtai.common.processes import ATTEMPTS, EngineError, Item, LocalEngine, Work
 from uuvtai.evaluation.grid import (
     Grid,
@@ -201,12 +202,10 @@ def resolved(request: SweepRequest, watch: SweepWatch) -> tuple[SweepRequest, li
 
 def _located(name: str) -> str:
     """An agent's name as a worker in any folder finds it."""
-    from uuvtai.evaluation.agents import is_trained
-
     if is_plugin(name):
         return plugin_spec(name).absolute().text
-    is_file = name.endswith((".xml", ".yaml", ".yml")) or is_trained(name)
-    return str(Path(name).resolve()) if is_file else name
+    is_folder = name not in built_in_agents() and Path(name).is_dir()
+    return str(Path(name).resolve()) if is_folder or name.endswith((".xml", ".yaml", ".yml")) else name
 
 
 def _sha256_of(agents: Sequence[AgentSpec]) -> dict[str, str]:

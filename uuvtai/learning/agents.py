@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from safetensors import safe_open
 
+from uuvtai.common.presets import POLICY, PRESET_DIR
 from uuvtai.config.behavior import FAST, SLOW, TUNED
-from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
+from uuvtai.config.loader import ConfigError, load_training
+from uuvtai.learning.checkpoint import (
+    MANIFEST,
+    MODEL,
+    Checkpoint,
+    CheckpointError,
+    best,
+    entry_of,
+    open_checkpoint,
+    parsed,
+    refused,
+)
 from uuvtai.learning.policy_agent import AgentDecision, HeldAgent, by_chunk, load_agent
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetActor, actor_of
 
@@ -176,6 +191,34 @@ def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:
 
 
 # ------------------------------------------------------------------------------------------------------------
+
+
+def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
+    """The built-in policy, or the checkpoint of a checkpoint folder or of a run folder (its best, else its
+    newest).
+
+    Raises ConfigError for what is none of them, CheckpointError for what cannot be used.
+    """
+    path = Path(name)
+    if name == POLICY:
+        return _built_in()
+    if (path / MANIFEST).exists():
+        return open_checkpoint(path)
+    if (path / "checkpoints").is_dir():
+        return best(path, note)
+    raise ConfigError(
+        f"{name!r} is no trained policy: give the run folder of 'uuv train', or one of its checkpoints/step_N"
+    )
+
+
+def _built_in() -> Checkpoint:
+    """The policy that comes with the package: one file, the manifest of its checkpoint inside. It has today's
+    config of its preset, so that it drives whatever keys were renamed since."""
+    path = PRESET_DIR / POLICY
+    with refused(path / MODEL), safe_open(path / MODEL, "pt") as file:
+        manifest = parsed(file.metadata()["manifest"].encode())
+        manifest.files = {MODEL: entry_of(path / MODEL)}
+    return Checkpoint(path, manifest, load_training(POLICY), manifest.files[MODEL].sha256)
 
 
 def load_trained(checkpoint: Checkpoint, sim: Sim) -> HeldAgent:

@@ -517,7 +517,7 @@ def save(
             config_sha256=config_sha256(config.model_dump(mode="json")),
             observation_table=table_rows(table),
             action=action_rows(config),
-            files={path.name: _entry(path) for path in sorted(partial.iterdir())},
+            files={path.name: entry_of(path) for path in sorted(partial.iterdir())},
             **described,
         )
         _publish(partial, target, manifest)
@@ -593,7 +593,8 @@ def _write(path: Path, content: bytes) -> None:
         file.write(content)
 
 
-def _entry(path: Path) -> FileEntry:
+def entry_of(path: Path) -> FileEntry:
+    """Size and sha256 of a file."""
     return FileEntry(bytes=path.stat().st_size, sha256=sha256_of(path))
 
 

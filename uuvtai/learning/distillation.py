@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import bisect
 import time
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from uuvtai.common.enums import SUCCESS
-from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import DistillationConfig, LearningConfig, UncertaintyConfig
 from uuvtai.learning.agents import SetAgent
 from uuvtai.learning.networks import PlainAdam, Policy, PolicyStep, View
@@ -32,45 +31,11 @@ if TYPE_CHECKING:
     from uuvtai.sim.setup import Scene
     from uuvtai.sim.sim import Sim
 
-MAX_WEIGHT_RATIO = 4.0
-"""a sample counts at most this many times the mean signal, and at least its inverse, before the weights' mean
-is made one"""
-
 
 def imitation_error(mean: torch.Tensor, teacher_action: torch.Tensor) -> torch.Tensor:
     """||mean - teacher_action||^2 of every sample: (..., 4) and (..., 4) to (...,), in squared parts of the
     vehicle's limits."""
     return (mean - teacher_action).square().sum(dim=-1)
-
-
-def sample_weight(signal: torch.Tensor) -> torch.Tensor:
-    """Weight of every sample in proportion to a signal >= 0 of any shape: mean one, bounded.
-
-    Weights differ by at most ``MAX_WEIGHT_RATIO`` squared; a sample whose signal is not finite counts as an
-    average one; where the signal is zero everywhere all weights are one.
-    """
-    known = torch.isfinite(signal)
-    mean = torch.where(known, signal, 0.0).sum() / known.sum().clamp(min=1)
-    ratio = torch.where(known & (mean > 0), signal / mean.clamp(min=torch.finfo(signal.dtype).tiny), 1.0)
-    ratio = ratio.clamp(1.0 / MAX_WEIGHT_RATIO, MAX_WEIGHT_RATIO)
-    return ratio / ratio.mean()
-
-
-Weighting = Literal["none", "uncertainty"]
-
-
-def check_weighting(kind: Weighting, has_world_model: bool) -> None:
-    """Raise ValueError for a ``distillation.weighting`` whose signal this run does not have."""
-    if kind == "uncertainty" and not has_world_model:
-        raise SettingError(
-            "distillation.weighting=uncertainty needs the world model: set world_model.enabled=true, or "
-            "distillation.weighting=none"
-        )
-
-
-def weights_of(kind: Weighting, uncertainty: torch.Tensor) -> torch.Tensor:
-    """Weights by ``distillation.weighting``, of the shape of the uncertainties."""
-    return sample_weight(uncertainty) if kind == "uncertainty" else torch.ones_like(uncertainty)
 
 
 class TeacherBatches:
@@ -83,8 +48,8 @@ class TeacherBatches:
         """steps left out because the gradient was not finite"""
 
     def update(self, samples: View, strength: float, generator: torch.Generator) -> None:
-        """``config.steps`` steps on random batches of samples (M, ...): the policy's inputs,
-        ``teacher_action`` and ``weight``.
+        """``config.steps`` steps on random batches of samples (M, ...): the policy's inputs and
+        ``teacher_action``; those that are not ``valid`` (M,) count as 0.
 
         ``strength`` is lambda_t; at 0 nothing happens, and nothing is drawn from the (CPU) generator.
         """
@@ -92,17 +57,17 @@ class TeacherBatches:
             return
         for group in self.optimiser.param_groups:
             group["lr"] = self.config.learning_rate * strength
-        teacher, weight = samples["teacher_action"], samples["weight"]
+        teacher, valid = samples["teacher_action"], samples["valid"]
         for _ in range(self.config.steps):
-            rows = torch.randint(len(weight), (self.config.batch,), generator=generator).to(weight.device)
-            self._step({n: samples[n][rows] for n in self.policy.inputs}, teacher[rows], weight[rows])
+            rows = torch.randint(len(valid), (self.config.batch,), generator=generator).to(valid.device)
+            self._step({n: samples[n][rows] for n in self.policy.inputs}, teacher[rows], valid[rows])
 
-    def _step(self, view: View, teacher_action: torch.Tensor, weight: torch.Tensor) -> None:
+    def _step(self, view: View, teacher_action: torch.Tensor, valid: torch.Tensor) -> None:
         self.optimiser.zero_grad(
             set_to_none=True
         )  # the critic has no part in this loss: without a gradient Adam passes it over
         mean = self.policy.mean_of(self.policy.prepared(view))
-        (weight * imitation_error(mean, teacher_action)).mean().backward()
+        (valid * imitation_error(mean, teacher_action)).mean().backward()
         gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]
         if bool(torch.isfinite(torch.nn.utils.get_total_norm(gradients))):
             self.optimiser.step()
@@ -231,10 +196,8 @@ class Distillation:
         self.leaf_errors.add(imitation_error(step.mean, view["teacher_action"]), view["leaf"])
 
     def weigh(self, rollout: Rollout, share: float) -> tuple[float, dict[str, float]]:
-        """Weigh the samples; lambda_t s_t when ``share`` of the run is over, and both for the log."""
-        sigma = rollout["uncertainty"]
-        rollout["weight"].copy_(weights_of(self.config.weighting, sigma))
-        self.uncertainty.update(sigma.nanmean().nan_to_num()[None])
+        """lambda_t s_t when ``share`` of the run is over, and both for the log."""
+        self.uncertainty.update(rollout["uncertainty"].nanmean().nan_to_num()[None])
         weight, scale = piecewise_linear(self.config.schedule, share), self.uncertainty.scale
         return weight * scale, {
             "distillation/lambda": weight,
@@ -245,7 +208,7 @@ class Distillation:
     def update(self, rollout: Rollout, strength: float, generator: torch.Generator) -> dict[str, float]:
         """Learn from teacher batches, by lambda_t s_t; metrics of the rollout."""
         samples = rollout.flat()
-        samples["weight"] = torch.where(torch.isfinite(samples["reward"]), samples["weight"], 0.0)
+        samples["valid"] = torch.isfinite(samples["reward"]).float()
         self.teacher_batches.update(samples, strength, generator)
         return self.leaf_errors.take()
 
@@ -323,10 +286,14 @@ class Student(SetAgent):
 
 
 def imitate(
-    actor: SetActor, config: LearningConfig, scenes: tuple[Scene, ...], sims: dict[str, Sim] | None = None
+    actor: SetActor,
+    config: LearningConfig,
+    scenes: tuple[Scene, ...],
+    note: Callable[[str], None],
+    sims: dict[str, Sim] | None = None,
 ) -> dict[str, float]:
-    """``surrogate.warm_start_waves`` waves of DAgger; the actor's mean is then close to the tree. What was
-    spent, as metrics. ``sims``: simulators of worlds that are there already."""
+    """``surrogate.warm_start_waves`` waves of DAgger, each told to ``note``; the actor's mean is then close
+    to the tree. What was spent, as metrics. ``sims``: simulators of worlds that are there already."""
     began, sims = time.perf_counter(), dict(sims or {})
     waves, rows = config.surrogate.warm_start_waves, min(WAVE_EPISODES, config.train.num_envs)
     few = config.model_copy(update={"train": config.train.model_copy(update={"num_envs": rows})})
@@ -348,6 +315,8 @@ def imitate(
         samples = [joined]
         passes = LAST_PASSES if wave == waves - 1 else PASSES
         loss = regress(actor, optimiser, joined, passes, generator)
+        done = f"imitating the tree, wave {wave + 1} of {waves}"
+        note(f"{done}: {100 * won:.0f} % arrived in {world}, error {loss:.3f}")
     return {
         "warm_start/loss": loss,
         "warm_start/success_rate_last_wave": won,

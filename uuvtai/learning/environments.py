@@ -325,7 +325,7 @@ class InSurrogate(Environment):
     """The kinematic surrogate for a policy over a set of obstacles. Its view: ``obstacles`` and ``own``, as
     the vehicle knows them, and ``truth``, for a critic."""
 
-    device = torch.device("cpu")
+    device, steps = torch.device("cpu"), HOLD_STEPS
 
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
         """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
@@ -359,10 +359,10 @@ class InSurrogate(Environment):
         found = torch.randint(self.surrogate.num_scenarios, (self.num_envs,), generator=self._generator)
         self.surrogate.begin(rows, found)
 
-    def warm_start(self, policy: SetPolicy) -> dict[str, float]:
+    def warm_start(self, policy: SetPolicy, note: Callable[[str], None]) -> dict[str, float]:
         """Learn from the tree first, where ``surrogate.warm_start_waves`` says so; metrics."""
         waves = self.config.surrogate.warm_start_waves
-        return imitate(policy.actor, self.config, self.scenes) if waves else {}
+        return imitate(policy.actor, self.config, self.scenes, note) if waves else {}
 
     @property
     def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -380,7 +380,7 @@ class InSurrogate(Environment):
         if bool(ended.any()):
             sums.outcomes += torch.bincount(outcome[ended], minlength=len(OUTCOMES)).double()
             sums.episode_return += self._returns[ended].double().sum()
-            sums.episode_steps += (surrogate.time_s[ended] / DECISION_S).round().double().sum()
+            sums.episode_steps += (surrogate.time_s[ended] * (HOLD_STEPS / DECISION_S)).round().double().sum()
             self._returns[ended] = 0.0
             if bool(late.any()):
                 surrogate.look()

@@ -89,7 +89,7 @@ _SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distillatio
 class Piece(NamedTuple):
     """What some rows of a minibatch add to it."""
 
-    gradients: tuple[torch.Tensor | None, ...]
+    gradients: tuple[torch.Tensor, ...]
     sums: torch.Tensor
     """over the valid rows, in the order of ``_SUMS``, float64"""
 
@@ -117,17 +117,15 @@ class Ppo:
         self,
         rollout: Rollout,
         distillation_weight: float = 0.0,
-        surrogate: bool = True,
         generator: torch.Generator | None = None,
         share: float = 0.0,
     ) -> dict[str, float]:
         """Learn from a closed rollout; metrics by their names in metrics.jsonl, means over all minibatches of
         the update.
 
-        ``distillation_weight`` is lambda_t s_t of weight ||mean - teacher_action||^2; without ``surrogate``
-        only the critic and the distillation learn (critic warm-up). ``generator`` (CPU) draws the minibatches
-        where they are random. ``share`` of the run is over. Samples that are not finite have no part in any
-        of it and are counted.
+        ``distillation_weight`` is lambda_t s_t of ||mean - teacher_action||^2. ``generator`` (CPU) draws the
+        minibatches where they are random. ``share`` of the run is over. Samples that are not finite have no
+        part in any of it and are counted.
         """
         config = self.config
         samples, metrics = self._prepared(rollout)
@@ -138,8 +136,8 @@ class Ppo:
         with torch_threads_rest():
             for _ in range(config.epochs):
                 for index in self._minibatches(count, generator):
-                    sums += self._learn(samples, index, distillation_weight, surrogate)
-        if config.target_kl > 0 and surrogate:
+                    sums += self._learn(samples, index, distillation_weight)
+        if config.target_kl > 0:
             kl = (sums[_SUMS.index("approx_kl")] / sums[-1].clamp(min=1.0)).float()
             self.rate.copy_(adapted_rate(self.rate, kl, config.target_kl))
         if config.normalise_observations:
@@ -194,7 +192,7 @@ class Ppo:
             "valid": valid.flatten().float(),
         }
         flat = rollout.flat()
-        kept = {n: flat[n] for n in ("action", "log_prob", "teacher_action", "weight") if n in flat}
+        kept = {n: flat[n] for n in ("action", "log_prob", "teacher_action") if n in flat}
         return kept | self.policy.prepared(flat) | found, metrics
 
     def _minibatches(self, count: int, generator: torch.Generator | None) -> Iterator[slice | torch.Tensor]:
@@ -202,18 +200,16 @@ class Ppo:
         parts = self.config.minibatches
         bounds = [count * part // parts for part in range(parts + 1)]
         order = None
-        if self.config.shuffle or self.policy.is_shuffled:
+        if self.policy.is_shuffled:
             if generator is None:
-                raise ValueError("ppo.shuffle draws minibatches at random: pass update() a generator")
+                raise ValueError("this policy's minibatches are drawn at random: pass update() a generator")
             order = torch.randperm(count, generator=generator).to(self.rate.device)
         for first, last in itertools.pairwise(bounds):
             yield slice(first, last) if order is None else order[first:last]
 
     # ------------------------------------------------------------------------------------------ one minibatch
 
-    def _learn(
-        self, samples: View, index: slice | torch.Tensor, distillation_weight: float, surrogate: bool
-    ) -> torch.Tensor:
+    def _learn(self, samples: View, index: slice | torch.Tensor, distillation_weight: float) -> torch.Tensor:
         """A step by these samples; their sums. Pieces are added up in their order: the number of threads
         changes no bit."""
         self.optimiser.zero_grad(set_to_none=True)
@@ -223,13 +219,13 @@ class Ppo:
         pieces: list[Callable[[], Piece]] = []
         for block in blocks:
             pieces += [
-                functools.partial(self._of_actor, block, count, distillation_weight, surrogate),
+                functools.partial(self._of_actor, block, count, distillation_weight),
                 functools.partial(self._of_critic, block, count),
             ]
         found = together(*pieces)
         for parameters, mine in zip(self._nets, (found[::2], found[1::2]), strict=True):
             for parameter, *parts in zip(parameters, *(piece.gradients for piece in mine), strict=True):
-                parameter.grad = None if parts[0] is None else functools.reduce(torch.add, parts)
+                parameter.grad = functools.reduce(torch.add, parts)
         self._step()
         return torch.stack([piece.sums for piece in found]).sum(dim=0)
 
@@ -242,27 +238,21 @@ class Ppo:
         starts = range(index.start, index.stop, CACHE_ROWS)
         return [slice(first, min(first + CACHE_ROWS, index.stop)) for first in starts]
 
-    def _of_actor(
-        self, batch: View, count: torch.Tensor, distillation_weight: float, surrogate: bool
-    ) -> Piece:
+    def _of_actor(self, batch: View, count: torch.Tensor, distillation_weight: float) -> Piece:
         config, valid, log_std = self.config, batch["valid"], self.policy.log_std
-        sums, share = {"count": torch.ones_like(valid)}, valid / count
-        if not (surrogate or distillation_weight != 0.0):
-            return Piece((None,) * len(self._nets[0]), _summed(sums, valid))
-        mean, loss = self.policy.mean_of(batch), torch.zeros((), device=valid.device)
-        if surrogate:
-            log_ratio = log_prob(batch["action"], mean, log_std) - batch["log_prob"]
-            policy_loss = surrogate_loss(log_ratio, batch["advantage"], config.clip)
-            loss = (share * policy_loss).sum() - config.entropy_weight * share.sum() * entropy(log_std)
-            with torch.no_grad():
-                clipped = (log_ratio.expm1().abs() > config.clip).float()
-                sums |= {"approx_kl": approximate_kl(log_ratio), "clip_fraction": clipped}
-                sums |= {"policy_loss": policy_loss}
+        share, mean = valid / count, self.policy.mean_of(batch)
+        log_ratio = log_prob(batch["action"], mean, log_std) - batch["log_prob"]
+        policy_loss = surrogate_loss(log_ratio, batch["advantage"], config.clip)
+        loss = (share * policy_loss).sum() - config.entropy_weight * share.sum() * entropy(log_std)
+        with torch.no_grad():
+            clipped = (log_ratio.expm1().abs() > config.clip).float()
+            sums = {"count": torch.ones_like(valid), "policy_loss": policy_loss}
+            sums |= {"approx_kl": approximate_kl(log_ratio), "clip_fraction": clipped}
         if distillation_weight:
-            distill = batch["weight"] * imitation_error(mean, batch["teacher_action"])
+            distill = imitation_error(mean, batch["teacher_action"])
             loss = loss + distillation_weight * (share * distill).sum()
             sums |= {"distillation": distill}
-        return Piece(torch.autograd.grad(loss, self._nets[0], allow_unused=True), _summed(sums, valid))
+        return Piece(torch.autograd.grad(loss, self._nets[0]), _summed(sums, valid))
 
     def _of_critic(self, batch: View, count: torch.Tensor) -> Piece:
         error = (self.policy.value_of(batch) - batch["target"]).square()

@@ -59,8 +59,8 @@ class Environment(ABC):
     def fill_model_features(self, rollout: Rollout) -> None:  # noqa: B027 - most have none
         """The world model has learned from what ``look_around`` filled: say what it makes of it."""
 
-    def warm_start(self, _policy: Any) -> dict[str, float]:
-        """Teach the policy what can be taught before its first rollout; metrics."""
+    def warm_start(self, _policy: Any, _note: Callable[[str], None]) -> dict[str, float]:
+        """Teach the policy what can be before its first rollout, tell ``note`` how far it is; metrics."""
         return {}
 
     @property
@@ -98,7 +98,7 @@ class Rollout(dict[str, torch.Tensor]):
 
     Row t of env n: the view, what was done (``action``, ``log_prob``, ``value``) and what came of it
     (``reward``, ``next_value`` of the true next view, ``terminated``, ``ended``), what the environment told
-    beside it, and, where a teacher says its action, the ``weight`` of the sample in the distillation.
+    beside it.
     """
 
     def __init__(self, steps: int, view: View, n_action: int) -> None:
@@ -117,8 +117,6 @@ class Rollout(dict[str, torch.Tensor]):
             self[name] = zeros()
         for name in ("terminated", "ended"):
             self[name] = zeros(dtype=torch.bool)
-        if "teacher_action" in view:
-            self["weight"] = zeros() + 1.0
 
     def note(self, t: int, view: View, step: PolicyStep) -> None:
         """Copy what is known in step t, and what was decided."""

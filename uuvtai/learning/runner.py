@@ -106,7 +106,7 @@ def _train(
 ) -> tuple[dict[str, Any], Path]:
     """As ``train``; ``folder`` is the folder of the run to go on with."""
     found, config = _begin(request, watch)
-    start, config = _started(request.start, config, watch)
+    start, config = _started(request.start, config, watch.note)
     total = request.iterations or config.train.iterations
     if found and found.step >= total:
         if folder:
@@ -119,12 +119,8 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    if config.surrogate.enabled and config.surrogate.warm_start_waves and not (found or start):
-        watch.note(
-            f"first {config.surrogate.warm_start_waves} waves of episodes in the simulator, in which the "
-            "policy imitates the tree: about a minute each"
-        )
     trainer = _continued(TRAINERS[config.learner](config, request.device), config, found)
+    trainer.note = watch.note
     if start is not None:
         start.check_table(trainer.observation_table, config)
         trainer.start(start)  # type: ignore[union-attr]
@@ -160,16 +156,15 @@ def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None,
 
 
 def _started(
-    place: Path | None, config: LearningConfig, watch: TrainWatch
+    place: Path | None, config: LearningConfig, note: Callable[[str], None]
 ) -> tuple[Checkpoint | None, LearningConfig]:
-    """The checkpoint to begin with (a run's best), and the config with its networks. Raises ConfigError for
-    one that holds no policy."""
-    from uuvtai.learning import checkpoint
+    """The checkpoint to begin with (``find_policy``), and the config with its networks. Raises ConfigError
+    for one that holds no policy."""
+    from uuvtai.learning.agents import find_policy
 
     if place is None:
         return None, config
-    is_one = (place / checkpoint.MANIFEST).exists()
-    found = checkpoint.open_checkpoint(place) if is_one else checkpoint.best(place, watch.note)
+    found = find_policy(str(place), note)
     if config.learner != "ppo" or found.config.learner != "ppo":
         raise ConfigError(f"--start {place}: policies alone can be begun with, by a preset that trains one")
     theirs, sizes = found.config, ("obstacle_hidden", "head_hidden", "goal_gain")
@@ -295,14 +290,18 @@ class _Run:
 
     def document(self) -> dict[str, Any]:
         """What ``uuv train --json`` prints."""
-        from uuvtai.learning.checkpoint import finite
+        from uuvtai.learning import checkpoint
 
+        best = checkpoint.best(self._folder.path, self._watch.note)
         return {
             "schema": 1,
             "run": str(self._folder.path),
+            "learner": self._config.learner,
             "iterations": self._trainer.iteration,
             "env_steps": self._trainer.env_steps,
-            "metrics": finite(self._metrics),
+            "checkpoint": str(best.path),
+            "score": best.manifest.score,
+            "metrics": checkpoint.finite(self._metrics),
         }
 
     def close(self) -> None:

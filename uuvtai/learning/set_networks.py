@@ -1,4 +1,4 @@
-"""The networks of a checkpoint that learnt in the surrogate or to forecast: made, filled, checked."""
+"""The networks of a policy over a set of obstacles: made, filled, checked."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import nn
 from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.networks import MixtureNet, Policy, RunningNorm, View, mlp
+from uuvtai.learning.networks import Policy, RunningNorm, View, mlp
 from uuvtai.learning.policy_agent import finite, fitting
 
 # ------------------------------------------------------------------------------------------------------------
@@ -190,11 +190,3 @@ def actor_of(checkpoint: Checkpoint) -> SetActor:
         actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator())
         actor.load_state_dict(part)
     return finite(actor, checkpoint)
-
-
-def mixture_net_of(checkpoint: Checkpoint) -> MixtureNet:
-    """A learned forecast. Raises as ``actor_of``."""
-    with fitting(checkpoint):
-        net = MixtureNet(torch.Generator())
-        net.load_state_dict(checkpoint.model()["forecast"])
-    return finite(net, checkpoint)

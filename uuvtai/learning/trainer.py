@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ import torch
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.distillation import Distillation, check_weighting
+from uuvtai.learning.distillation import Distillation
 from uuvtai.learning.environments import InSurrogate
 from uuvtai.learning.networks import PREFIX, fast_products
 from uuvtai.learning.policy_agent import finite, fitting
@@ -28,9 +29,11 @@ class Trainer:
     CPU, bit for bit.
     """
 
+    note: Callable[[str], None] = print
+    """told how far the warm start is"""
+
     def __init__(self, env: Environment, config: LearningConfig) -> None:
         """Begins the episodes of ``env``. ValueError for settings that do not fit each other."""
-        check_weighting(config.distillation.weighting, config.world_model.enabled)
         samples = config.ppo.rollout_steps * env.num_envs
         if config.ppo.minibatches > samples:
             raise SettingError(
@@ -82,8 +85,9 @@ class Trainer:
         self.env_steps += self._samples
         metrics |= self.env.guard.take() | times | self.recent.add(sums)
         self._judge(metrics)
-        rate = self._samples / sum(times.values())
-        return metrics | {"time/env_steps_per_s": rate, "time/env_steps": float(self.env_steps)}
+        found = {"env_steps": float(self.env_steps), "env_steps_per_s": self._samples / sum(times.values())}
+        decisions = {name.replace("env_steps", "decisions"): n / self.env.steps for name, n in found.items()}
+        return metrics | {f"time/{name}": n for name, n in (found | decisions).items()}
 
     def start(self, found: Checkpoint) -> None:
         """Begin with the policy of another run, and its world model where both have one; what the behavior
@@ -149,15 +153,14 @@ class Trainer:
             self.env.fill_model_features(self.rollout)
             if not self._is_started:
                 self.policy.observe(self.rollout)
-        return {} if self._is_started else self.env.warm_start(self.policy)
+        return {} if self._is_started else self.env.warm_start(self.policy, self.note)
 
     def _learn(self, share: float) -> dict[str, float]:
         """Everything that learns from the rollout; ``share`` of the run is over."""
         if self.distillation is None:
             return self.ppo.update(self.rollout, generator=self.generator, share=share)
         strength, metrics = self.distillation.weigh(self.rollout, share)
-        surrogate = self.iteration >= self.config.distillation.critic_warmup_iterations
-        metrics |= self.ppo.update(self.rollout, strength, surrogate, self.generator, share)
+        metrics |= self.ppo.update(self.rollout, strength, self.generator, share)
         metrics |= self.distillation.update(self.rollout, strength, self.generator)
         return metrics | self._learn_world()
 

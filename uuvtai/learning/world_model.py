@@ -2,9 +2,7 @@
 "Latent World Model").
 
 z = f(o), z' = g(z, a), o' = h(z') with a mean and a log-variance per target. Loss: reconstruction of the true
-next observation plus beta
-|f(o') - z'|^2, both summed over their dimensions. What goes beyond the paper is a switch of
-``WorldModelConfig`` each.
+next observation plus beta |f(o') - z'|^2, both summed over their dimensions.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from torch import Tensor, nn
 
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import WorldModelConfig
-from uuvtai.learning.networks import Moments, PlainAdam, RunningNorm, guarded_step, mlp, moments_of
+from uuvtai.learning.networks import PlainAdam, RunningNorm, guarded_step, mlp, moments_of
 
 N_TARGET = 24
 """first columns of the observation: goal, heading error, velocity, yaw rate, depth, tilt, 12 sector ranges"""
@@ -27,15 +25,13 @@ N_FEATURES = 2
 """residual, uncertainty"""
 
 LOG_VAR_BOUNDS = (-12.0, 6.0)
-"""of a target in the decoder's unit; approached smoothly, so that no gradient dies"""
+"""of a target in SI units; approached smoothly, so that no gradient dies"""
 SKILL = "world_model/skill/"
 """before the name of a target in metrics.jsonl"""
-MIN_DEVIATION = 1e-5
-"""smallest running deviation of a target, in its own unit: below any sensor's resolution"""
-MAX_DEVIATIONS = 100.0
-"""a jump counts as at most this many running deviations; replanned routes reach about 50"""
+LARGEST_ERROR = 100.0
+"""of a target, in SI units: one that is further off counts as so far"""
 _OUT_GAIN = 0.01
-"""of the decoder: at birth it says "as ever" with variance one"""
+"""of the decoder: at birth it says 0 with variance one"""
 
 
 class Prediction(NamedTuple):
@@ -54,19 +50,14 @@ class Losses(NamedTuple):
 
     total: Tensor
     reconstruction: Tensor
-    """[nat] if ``likelihood``, else squared decoder units; summed over the targets"""
+    """[nat], summed over the targets"""
     dynamics: Tensor
     """squared distance in the latent space"""
 
 
 class WorldModel(nn.Module):
-    """Encoder, latent dynamics and decoder with the statistics they scale by; inputs are raw observations in
-    SI units.
-
-    The decoder's unit is the running deviation of what it decodes, the one-step change (``predict_change``)
-    or the target itself, so that metres, radians and m/s weigh the same; 1 without ``normalise_targets``.
-    Actions are clamped to [-1, 1], as the environment does.
-    """
+    """Encoder, latent dynamics and decoder with the statistics that the encoder scales by; raw observations
+    in, targets out, both in SI units. Actions are clamped to [-1, 1], as the environment does."""
 
     def __init__(self, n_obs: int, config: WorldModelConfig, generator: torch.Generator) -> None:
         """``n_obs`` columns of the observation, at least 24 (ValueError); initial weights come from the CPU
@@ -81,7 +72,7 @@ class WorldModel(nn.Module):
         self.encoder = mlp((n_obs, *config.hidden, config.latent), "elu", generator)
         self.dynamics = mlp((config.latent + N_ACTION, *config.hidden, config.latent), "elu", generator)
         self.decoder = mlp((config.latent, *config.hidden, 2 * N_TARGET), "elu", generator, _OUT_GAIN)
-        self.observation_norm, self.change_norm = RunningNorm(n_obs), RunningNorm(N_TARGET)
+        self.observation_norm = RunningNorm(n_obs)
 
     def encode(self, obs: Tensor) -> Tensor:
         """z (..., latent) of raw observations (..., n_obs)."""
@@ -92,7 +83,7 @@ class WorldModel(nn.Module):
         return self.dynamics(torch.cat([latent, action.clamp(-1.0, 1.0)], dim=-1))
 
     def decode(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """(mean, log-variance), each (..., 24), in the decoder's unit."""
+        """(mean, log-variance), each (..., 24), in SI units."""
         mean, raw = self.decoder(latent).split(N_TARGET, dim=-1)
         low, high = LOG_VAR_BOUNDS
         return mean, high - fn.softplus(high - low - fn.softplus(raw - low))
@@ -100,86 +91,29 @@ class WorldModel(nn.Module):
     def predict(self, obs: Tensor, action: Tensor) -> Prediction:
         """What follows observations (..., n_obs) and actions (..., 4)."""
         latent = self.advance(self.encode(obs), action)
-        mean, log_var = self.decode(latent)
-        scale = self.scale()
-        return Prediction(latent, self.base(obs) + scale * mean, log_var + 2.0 * scale.log())
+        return Prediction(latent, *self.decode(latent))
 
     @torch.no_grad()
     def features(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
         """Columns of the policy's input at ``next_obs``, (N, 2): one-step residual and uncertainty of the
-        prediction made before it.
-
-        Errors are counted in ``error_unit``: the residual is the root mean square of the errors, the
-        uncertainty sigma_t = mean(exp(log_var)) the mean predicted variance. In deviations of the one-step
-        change 1 = no better than saying "as before". What is not finite becomes 0.
+        prediction made before it: the root mean square of the errors, and sigma_t = mean(exp(log_var)). What
+        is not finite becomes 0.
         """
-        predicted = self.predict(obs, action)
-        error = ((next_obs[..., :N_TARGET] - predicted.mean) / self.error_unit()).clamp(
-            -MAX_DEVIATIONS, MAX_DEVIATIONS
-        )
-        residual = error.square().mean(dim=-1).sqrt()
-        return torch.stack([residual, self.uncertainty(predicted)], dim=-1).nan_to_num_(0.0, 0.0, 0.0)
-
-    def uncertainty(self, predicted: Prediction) -> Tensor:
-        """sigma_t (...,): mean over the targets of predicted variance in squares of ``error_unit``."""
-        return torch.exp(predicted.log_var - 2.0 * self.error_unit().log()).mean(dim=-1)
+        _, mean, log_var = self.predict(obs, action)
+        error = (next_obs[..., :N_TARGET] - mean).clamp(-LARGEST_ERROR, LARGEST_ERROR)
+        found = error.square().mean(dim=-1).sqrt(), log_var.exp().mean(dim=-1)
+        return torch.stack(found, dim=-1).nan_to_num_(0.0, 0.0, 0.0)
 
     def loss(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor) -> Losses:
         """Losses of a batch: obs, next_obs (B, n_obs), action (B, 4), valid (B,) bool. ``next_obs`` is the
         true one, also at an end."""
         config, weight = self.config, valid / valid.sum().clamp(min=1)
-        ahead = self.advance(self.encode(obs), action)
-        mean, log_var = self.decode(ahead)
-        target = ((next_obs[:, :N_TARGET] - self.base(obs)) / self.scale()).clamp(
-            -MAX_DEVIATIONS, MAX_DEVIATIONS
-        )
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not config.stop_target_gradient):
-            following = self.encode(next_obs)
-        reconstruction = self._reconstruction(mean, log_var, target).sum(dim=-1) @ weight
-        dynamics = (following - ahead).square().sum(dim=-1) @ weight
+        ahead, mean, log_var = self.predict(obs, action)
+        nll = 0.5 * ((next_obs[:, :N_TARGET] - mean).square() * torch.exp(-log_var) + log_var)
+        reconstruction = nll.sum(dim=-1) @ weight
+        dynamics = (self.encode(next_obs) - ahead).square().sum(dim=-1) @ weight
         total = config.reconstruction_weight * reconstruction + config.dynamics_weight * dynamics
         return Losses(total, reconstruction, dynamics)
-
-    def observe(self, obs: Moments, change: Moments) -> None:
-        """Take in the moments of observations (n_obs columns) and of one-step changes of the targets (24
-        columns)."""
-        self.observation_norm.merge(obs)
-        self.change_norm.merge(change)
-
-    def _reconstruction(self, mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
-        error = (target - mean).square()
-        if not self.config.likelihood:
-            return error
-        nll = 0.5 * (error * torch.exp(-log_var) + log_var)
-        return nll * torch.exp(self.config.beta_nll * log_var).detach() if self.config.beta_nll else nll
-
-    def base(self, obs: Tensor) -> Tensor:
-        """What the decoder's mean is added to."""
-        if self.config.predict_change:
-            return obs[..., :N_TARGET]
-        return (
-            self.observation_norm.mean[:N_TARGET].float()
-            if self.config.normalise_targets
-            else obs.new_zeros(N_TARGET)
-        )
-
-    def scale(self) -> Tensor:
-        """(24,) decoder's unit in SI units."""
-        if not self.config.normalise_targets:
-            return torch.ones_like(self.change_norm.mean, dtype=torch.float32)
-        if self.config.predict_change:
-            return deviation(self.change_norm.moments)
-        return deviation(self.observation_norm.moments)[:N_TARGET]
-
-    def error_unit(self) -> Tensor:
-        """(24,) SI units that the features count errors in (``config.error_unit``)."""
-        return deviation(self.change_norm.moments) if self.config.error_unit == "change" else self.scale()
-
-
-def deviation(moments: Moments) -> Tensor:
-    """(width,) float32 running deviation, at least ``MIN_DEVIATION``; 1 before the first sample."""
-    variance = torch.where(moments.count > 0, moments.m2 / moments.count.clamp(min=1.0), 1.0)
-    return variance.sqrt().clamp(min=MIN_DEVIATION).float()
 
 
 def mean_of(values: Iterable[Tensor]) -> float:
@@ -254,9 +188,8 @@ class WorldModelLearner:
     def _observe(self, batches: list[ModelBatch]) -> None:
         """Statistics of what was drawn: a rollout's neighbouring steps are alike, so that all of it would say
         little more."""
-        obs = torch.cat([batch.obs[batch.valid] for batch in batches])
-        following = torch.cat([batch.next_obs[batch.valid, :N_TARGET] for batch in batches])
-        self.model.observe(moments_of(obs), moments_of(following - obs[:, :N_TARGET]))
+        rows = torch.cat([batch.obs[batch.valid] for batch in batches])
+        self.model.observation_norm.merge(moments_of(rows))
 
     @torch.no_grad()
     def _calibration(self, batch: ModelBatch) -> dict[str, float]:
@@ -274,7 +207,7 @@ class WorldModelLearner:
         return {f"{SKILL}{name}": 1.0 - ours / theirs for name, ours, theirs in found if theirs > 0.0} | {
             "world_model/standardised_residual": square,
             "world_model/coverage_90": inside,
-            "world_model/uncertainty": float(self.model.uncertainty(predicted).mean()),
+            "world_model/uncertainty": float(predicted.log_var.exp().mean()),
             "world_model/latent_std": float(self.model.encode(obs).std(dim=0, correction=0).mean()),
         }
 

@@ -28,7 +28,7 @@ from uuvtai.learning.export.modules import TOLERANCE, golden_of, missing_package
 from uuvtai.learning.export.spec import specification
 from uuvtai.learning.networks import ActorCritic
 from uuvtai.learning.policy_agent import load_agent
-from uuvtai.learning.world_model import N_TARGET, WorldModel
+from uuvtai.learning.world_model import WorldModel
 from uuvtai.plugins.api import plugin_spec
 from uuvtai.plugins.loading import graph_of, onnx_policy
 
@@ -63,7 +63,6 @@ def networks(config, seen=True):
     state = {"policy": policy.state_dict(), "env": {}}
     if config.world_model.enabled:
         model.observation_norm.update(3.0 * torch.randn(500, N_OBS, generator=rng))
-        model.change_norm.update(0.2 * torch.randn(500, N_TARGET, generator=rng))
         state["world_model"] = model.state_dict()
     return state
 
@@ -91,11 +90,6 @@ CASES = {
         "policy.hold_steps": 3,
     },
     "relu": {"policy.activation": "relu"},
-    "world model as in the paper": {
-        "world_model.predict_change": False,
-        "world_model.normalise_targets": True,
-    },
-    "targets as they are": {"world_model.predict_change": False, "world_model.normalise_targets": False},
 }
 
 
@@ -199,7 +193,11 @@ def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
     )
     assert spec["checkpoint"]["sha256"] == found.sha256
     listed = {path.name for path in (tmp_path / "out").iterdir()} - {"policy_spec.json"}
-    assert set(spec["files"]) == listed == {"policy.safetensors", "golden.npz", "README.md", "run_policy.py"}
+    assert (
+        set(spec["files"])
+        == listed
+        == {"policy.safetensors", "golden.safetensors", "README.md", "run_policy.py"}
+    )
 
 
 def test_the_folder_drives_where_there_is_numpy_alone(folder):
@@ -230,9 +228,9 @@ def test_the_folder_drives_where_there_is_numpy_alone(folder):
 
 def test_constants_that_the_driver_repeats_are_those_of_the_package():
     assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, world_model.N_ACTION)
-    assert (run_policy._LOG_VAR, run_policy._MAX_DEVIATIONS) == (
+    assert (run_policy._LOG_VAR, run_policy._LARGEST_ERROR) == (
         world_model.LOG_VAR_BOUNDS,
-        world_model.MAX_DEVIATIONS,
+        world_model.LARGEST_ERROR,
     )
 
 
@@ -251,7 +249,7 @@ def test_a_place_that_is_taken_is_refused_and_a_full_disk_leaves_nothing(tmp_pat
         exported(found, tmp_path / "out")
 
     def full(path, content):
-        if path.name == "golden.npz":
+        if path.name == "golden.safetensors":
             raise OSError(28, "No space left on device")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
@@ -364,7 +362,7 @@ def test_the_command_exports_prints_and_checks(tmp_path, no_onnx, capfd):
     assert "agrees" in capfd.readouterr().out
 
 
-@pytest.mark.parametrize("name", ["policy.safetensors", "golden.npz", "README.md", "run_policy.py"])
+@pytest.mark.parametrize("name", ["policy.safetensors", "golden.safetensors", "README.md", "run_policy.py"])
 def test_a_changed_file_is_exit_3(folder, name, capfd):
     content = bytearray((folder / name).read_bytes())
     content[-1] ^= 1

@@ -6,24 +6,23 @@ import json
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import save
 
 from tests.command import run_cli
 from tests.learning.export.test_deploy import resigned
 from tests.oracles import hull_rule as reference
-from uuvtai.common.enums import COLUMNS, EGO_COLUMNS, N_COLUMN, N_OBSTACLE, OBSTACLE_WIDTH
+from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, OBSTACLE_WIDTH
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.config.loader import load_training
-from uuvtai.learning import checkpoint, networks, set_networks
+from uuvtai.learning import checkpoint, set_networks
 from uuvtai.learning.agents import load_set_agent
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.export import folder as deploy
 from uuvtai.learning.export import run_policy
 from uuvtai.learning.export import spec as set_columns_text
 from uuvtai.learning.export.graph import session
-from uuvtai.learning.export.modules import TOLERANCE, golden_of, missing_packages, module_of, npz_bytes
+from uuvtai.learning.export.modules import TOLERANCE, golden_of, missing_packages, module_of
 from uuvtai.learning.export.spec import hull_rule_of
-from uuvtai.learning.forecast import column_row
-from uuvtai.learning.networks import MixtureNet
 from uuvtai.learning.set_networks import SetActor, SetCritic
 from uuvtai.surrogate.arrays import TRUTH_WIDTH
 from uuvtai.surrogate.observation import SET_TABLE
@@ -40,114 +39,89 @@ def filled(module, seed, spread=0.3):
     return module
 
 
-def saved(kind, folder, change=None):
-    """A run folder with one checkpoint of a kind, after ``change`` of its state."""
-    preset, table = ("policy", SET_TABLE) if kind == "set" else ("forecast", (column_row(),))
-    config = load_training(preset, overrides=NET)
-    if kind == "set":
-        rng = torch.Generator().manual_seed(1)
-        actor = filled(SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, rng), 2)
-        critic = SetCritic(OBSTACLE_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, rng)
-        state = {"policy": actor.state_dict(), "critic": critic.state_dict(), "counters": {}, "env": {}}
-    else:
-        net = filled(MixtureNet(torch.Generator().manual_seed(6)), 7, 0.05)
-        state = {"forecast": net.state_dict(), "counters": {}, "env": {}}
+def saved(folder, change=None):
+    """A run folder with one checkpoint, after ``change`` of its state."""
+    config, rng = load_training("policy", overrides=NET), torch.Generator().manual_seed(1)
+    actor = filled(SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, rng), 2)
+    critic = SetCritic(OBSTACLE_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, rng)
+    state = {"policy": actor.state_dict(), "critic": critic.state_dict(), "counters": {}, "env": {}}
     state = copy.deepcopy(state)
     if change:
         change(state)
-    metrics = {"eval/nll_pool": -3.25, "eval/success_rate": 0.5, "eval/collision_rate": 0.25}
-    checkpoint.save(folder / "checkpoints", 3, state, config, table, metrics=metrics)
+    metrics = {"eval/success_rate": 0.5, "eval/collision_rate": 0.25}
+    checkpoint.save(folder / "checkpoints", 3, state, config, SET_TABLE, metrics=metrics)
     return checkpoint.newest(folder)
 
 
-def exported(kind, folder):
+def exported(folder):
     """(checkpoint, what was exported, into which folder)."""
-    found, out = saved(kind, folder / "run"), folder / "out"
+    found, out = saved(folder / "run"), folder / "out"
     return found, deploy.export(found, "mine", out, (), lambda _text: None), out
 
 
-KINDS = ("set", "forecast")
-
-
-@pytest.fixture(scope="module", params=KINDS)
-def kind(request):
-    return request.param
-
-
 @pytest.fixture(scope="module")
-def whole(kind, tmp_path_factory):
+def whole(tmp_path_factory):
     """(checkpoint, exported folder without a graph)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(deploy, "missing_packages", lambda: ["onnx"])
-        found, done, out = exported(kind, tmp_path_factory.mktemp(kind))
+        found, done, out = exported(tmp_path_factory.mktemp("set"))
     assert [each.engine for each in done.agreements] == ["torch", "NumPy"] and done.agrees
     return found, out
 
 
-def test_a_folder_has_its_driver_and_checks_itself(kind, whole, capfd):
+def test_a_folder_has_its_driver_and_checks_itself(whole, capfd):
     _, folder = whole
     spec = run_policy.read_spec(folder)
     listed = {path.name for path in folder.iterdir()} - {"policy_spec.json", "__pycache__"}
-    assert set(spec["files"]) == listed == {"policy.safetensors", "golden.npz", "README.md", "run_policy.py"}
-    assert spec["kind"] == kind and spec["graph"] is None
+    assert (
+        set(spec["files"])
+        == listed
+        == {"policy.safetensors", "golden.safetensors", "README.md", "run_policy.py"}
+    )
+    assert spec["kind"] == "set" and spec["graph"] is None
     assert run_cli("export", "--check", folder) == 0
     assert "agrees" in capfd.readouterr().out
 
 
-def test_the_card_says_where_it_was_judged(whole, kind):
+def test_the_card_says_where_it_was_judged(whole):
     """Not in the config's own world: in all worlds and scenes that it learnt in."""
     card = (whole[1] / "README.md").read_text()
-    if kind == "set":
-        told = "the kinematic surrogate, pool, gauntlet and maze, S = 8, D = 9, v = 1.5 m/s; "
-        assert told in card
-        assert "| 770/1539 = 50.0 % | 385/1539 = 25.0 % |" in card, (
-            "no interval: scenes share their episodes' numbers"
-        )
+    assert "the kinematic surrogate, pool, gauntlet and maze, S = 8, D = 9, v = 1.5 m/s; " in card
+    told = "| 770/1539 = 50.0 % | 385/1539 = 25.0 % |"
+    assert told in card, "no interval: scenes share their episodes' numbers"
     assert "own world" not in card
 
 
-def test_the_golden_pairs_say_something(kind, whole):
-    golden = run_policy.read_golden(whole[1] / "golden.npz")
-    if kind == "forecast":
-        assert golden["pair_columns"].shape == (64, COLUMNS) and np.ptp(golden["pair_log_weight"]) > 0.1
-        assert (golden["pair_sigma"] > 0).all() and golden["pair_place"].shape == (64, 6, 5, 2)
-        return
+def test_the_golden_pairs_say_something(whole):
+    golden = run_policy.read_safetensors(whole[1] / "golden.safetensors")
     there = golden["pair_obstacles"][..., 0]
     assert set(there.sum(1).astype(int)) >= {0, 1, N_OBSTACLE} and np.ptp(golden["pair_mean_wish"]) > 0.5
     assert (golden["pair_obstacles"][there == 0] == 0).all()
 
 
-def test_no_critic_and_no_truth_is_exported(kind, whole):
+def test_no_critic_and_no_truth_is_exported(whole):
     """Every array is one of the networks that drive, and every input what the vehicle knows."""
     found, folder = whole
     arrays = run_policy.read_safetensors(folder / "policy.safetensors")
-    module = module_of(found)
-    driving = module.actor.net if kind == "set" else module.net
-    assert len(arrays) == len(driving.state_dict())
-    parts = {"set": {"actor"}, "forecast": {"into", "middle", "said", "spread"}}
-    assert {name.split(".")[0] for name in arrays} == parts[kind]
+    assert set(arrays) == {f"actor.{name}" for name in module_of(found).actor.net.state_dict()}
     assert not any("critic" in name or "log_std" in name for name in arrays)
     text = (folder / "policy_spec.json").read_text() + (folder / "README.md").read_text()
     assert "critic" not in text and "truth" not in text
-    if kind != "forecast":
-        assert arrays["actor.obstacle.0.weight"].shape[1] == OBSTACLE_WIDTH
-        assert arrays["actor.own.0.weight"].shape[1] == EGO_COLUMNS
+    assert arrays["actor.obstacle.0.weight"].shape[1] == OBSTACLE_WIDTH
+    assert arrays["actor.own.0.weight"].shape[1] == EGO_COLUMNS
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_graph_says_the_same(kind, tmp_path):
+def test_the_graph_says_the_same(tmp_path):
     if missing_packages():
         pytest.skip("needs the extra uuvtai[export]")
-    _, done, out = exported(kind, tmp_path)
+    _, done, out = exported(tmp_path)
     assert [each.engine for each in done.agreements] == ["torch", "NumPy", "ONNX Runtime"] and done.agrees
     spec = run_policy.read_spec(out)
     policy = run_policy.load(out)
     assert set(spec["graph"]["inputs"]) == set(policy.inputs)
-    golden = run_policy.read_golden(out / "golden.npz")
+    golden = run_policy.read_safetensors(out / "golden.safetensors")
     said = policy.said({name: golden[f"pair_{name}"] for name in policy.inputs})
     assert set(spec["graph"]["outputs"]) == set(said)
-    if kind == "forecast":
-        return
     rng = np.random.default_rng(0)
     few = {name: rng.normal(size=(3, policy.widths[name])).astype(np.float32) for name in policy.inputs[1:]}
     few["obstacles"] = rng.normal(size=(3, 2, OBSTACLE_WIDTH)).astype(np.float32)
@@ -161,7 +135,7 @@ def test_the_graph_says_the_same(kind, tmp_path):
 
 def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp_path, no_onnx):
     """Columns that the pilot wrote, the wish, and the hull rule where each vehicle then is."""
-    found, _, out = exported("set", tmp_path)
+    found, _, out = exported(tmp_path)
     policy, pilot = run_policy.load(out), load_set_agent(found, small.sim)
     small.begin(range(small.N), seed=5)
     pilot.reset(torch.ones(small.N))
@@ -238,24 +212,8 @@ def test_words_and_constants_are_those_of_the_package():
         (run_policy.AT_DIRECTION, set_networks.AT_DIRECTION),
         (run_policy.SUM_SCALE, set_networks._SUM_SCALE),
         (run_policy.MOST_WISH, set_networks.MOST_WISH),
-        (run_policy.LEAST_M, networks._LEAST_M),
-        (run_policy.LOG_BOUNDS[1], np.log(networks._MOST)),
     ):
         assert own == theirs
-
-
-def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
-    found, _, out = exported("forecast", tmp_path)
-    forecast, net = run_policy.load(out), module_of(found).net
-    columns = torch.zeros(4, N_COLUMN)
-    columns[:, :COLUMNS] = torch.randn(4, COLUMNS, generator=torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        wanted = net(columns, torch.full((4,), 0.8))
-    for i in range(4):
-        said = forecast.futures(columns[i, :COLUMNS].numpy(), 0.8)
-        for own, theirs in zip(said, wanted, strict=True):
-            np.testing.assert_allclose(own, theirs[i].numpy(), atol=1e-5)
-    assert "nll_pool: -3.25" in (out / "README.md").read_text()
 
 
 # -------------------------------------------------------------------------------------------------- bad input
@@ -279,49 +237,29 @@ def test_bad_columns_are_refused(change, says):
 
 
 @pytest.mark.parametrize(
-    ("columns", "speed"), [(np.ones(3), 1.0), (np.full(COLUMNS, np.nan), 1.0), (np.ones(COLUMNS), np.inf)]
-)
-def test_bad_tracks_are_refused(columns, speed):
-    forecast = run_policy.TrackForecast(
-        {
-            "network": {"modes": 6, "times_s": [0.5, 1, 1.5, 2, 2.5]},
-            "observation": {"columns": {"width": COLUMNS}},
-        },
-        {name: tensor.numpy() for name, tensor in MixtureNet(torch.Generator()).state_dict().items()}
-        | {"into.weight": np.zeros((64, COLUMNS), np.float32)},
-    )
-    with pytest.raises(ValueError, match=r"must have shape|not finite"):
-        forecast.futures(columns, speed)
-
-
-@pytest.mark.parametrize(
-    ("kind", "change"),
+    "change",
     [
-        ("set", lambda s: s["policy"]["net.own.0.bias"].fill_(float("nan"))),
-        ("forecast", lambda s: s["forecast"]["into.bias"].fill_(float("nan"))),
-        ("set", lambda s: s["policy"].pop("net.own.0.bias")),
-        ("forecast", lambda s: s["forecast"].update({"into.bias": torch.zeros(3)})),
+        lambda s: s["policy"]["net.own.0.bias"].fill_(float("nan")),
+        lambda s: s["policy"].pop("net.own.0.bias"),
     ],
 )
-def test_networks_that_cannot_drive_are_not_exported(kind, change, tmp_path, no_onnx):
-    found = saved(kind, tmp_path / "run", change)
+def test_networks_that_cannot_drive_are_not_exported(change, tmp_path, no_onnx):
+    found = saved(tmp_path / "run", change)
     with pytest.raises(CheckpointError, match=r"is not finite|not those of its config"):
         deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("kind", "change"),
+    "change",
     [
-        ("set", lambda a: a.pop("actor.own.0.bias")),
-        ("set", lambda a: a.update({"actor.obstacle.0.weight": a["actor.obstacle.0.weight"][:, 1:]})),
-        ("set", lambda a: a.clear()),
-        ("forecast", lambda a: a.update({"said.weight": a["said.weight"][1:]})),
-        ("forecast", lambda a: a.pop("spread.bias")),
+        lambda a: a.pop("actor.own.0.bias"),
+        lambda a: a.update({"actor.obstacle.0.weight": a["actor.obstacle.0.weight"][:, 1:]}),
+        lambda a: a.clear(),
     ],
 )
-def test_arrays_that_do_not_fit_the_specification(kind, change, tmp_path, no_onnx):
-    *_, out = exported(kind, tmp_path)
+def test_arrays_that_do_not_fit_the_specification(change, tmp_path, no_onnx):
+    *_, out = exported(tmp_path)
     arrays = dict(run_policy.read_safetensors(out / "policy.safetensors"))
     change(arrays)
     with pytest.raises(run_policy.PolicyError, match="do not fit together"):
@@ -330,11 +268,11 @@ def test_arrays_that_do_not_fit_the_specification(kind, change, tmp_path, no_onn
 
 @pytest.mark.parametrize("other", ["tree", 3, [], None])
 def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
-    *_, out = exported("set", tmp_path)
+    *_, out = exported(tmp_path)
     spec = json.loads((out / "policy_spec.json").read_text()) | {"kind": other}
     (out / "policy_spec.json").write_text(json.dumps(spec))
     assert run_cli("export", "--check", out) == 2
-    assert "not one of mlp, set, forecast" in capfd.readouterr().err
+    assert "not one of mlp, set" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -344,16 +282,16 @@ def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
         lambda g: g.update({"pair_own": g["pair_own"][:5]}),
         lambda g: g.update({"pair_obstacles": g["pair_obstacles"] * np.float32(0.5)}),
         lambda g: g.update({"pair_obstacles": np.zeros((0, 9, OBSTACLE_WIDTH), np.float32)}),
-        lambda g: g.update({"pair_obstacles": np.float32(3)}),
+        lambda g: g.update({"pair_obstacles": np.array(3, np.float32)}),
         lambda g: g.update({name: np.repeat(g[name], 2000, 0) for name in ("pair_obstacles", "pair_own")}),
     ],
 )
 def test_golden_pairs_are_read_without_trust(change, tmp_path, no_onnx, capfd):
-    found, _, out = exported("set", tmp_path)
+    found, _, out = exported(tmp_path)
     golden = golden_of(module_of(found))
     assert max(run_policy.differences(run_policy.load(out), golden).values()) <= TOLERANCE
     change(golden)
-    resigned(out, "golden.npz", npz_bytes(golden))
+    resigned(out, "golden.safetensors", save(golden))
     assert run_cli("export", "--check", out) in (2, 3)
     assert run_policy.main([str(out)]) in (1, 3)
     capfd.readouterr()

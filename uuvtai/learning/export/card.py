@@ -175,14 +175,14 @@ come from the same stack ({stack}) with the same meaning.
 ## What it is not for
 - It has been judged in this simulator alone. Nothing here says how it does on a real vehicle, in other water,
   or with other sensors.
-{limits}
+- It does not guarantee clearance and does not say when it is in danger. Keep a separate safety
+  stop.
+- It expects the vehicle's inner velocity loop with these limits; it never commands thrusters.
 """
 _WHAT = {
     "mlp": "A policy that drives an underwater vehicle of the BlueROV2 class from sensor features.",
     "set": "A policy that drives an underwater vehicle by a wish for a velocity, from tracked obstacles and "
     "free distances.",
-    "forecast": "A forecast of tracked moving obstacles: a mixture of Gaussians over the places in the next "
-    "seconds.",
 }
 _HOW = {
     "mlp": """`policy.reset()` when a mission begins, `policy.act(observation)` at every control step
@@ -190,12 +190,8 @@ _HOW = {
     "set": """`said = policy.act(obstacles, own)` {decision_hz:g} times a second, and at every control step
 ({control_hz:g} Hz) `policy.command(said.wish, flip, yaw_rad, z_m)`. It remembers nothing; the last wish that
 was carried out is among the columns.""",
-    "forecast": """`policy.futures(columns, speed)` for each track: `log_weight` of each future, `place` [m]
-along and across the track's course after {times} s, and `sigma` [m].""",
 }
-_STACK = {
-    "mlp": "sonar, map, route, tracking{tree}", "set": "tracks, map, pose", "forecast": "the tracker",
-}  # fmt: skip
+_STACK = {"mlp": "sonar, map, route, tracking{tree}", "set": "tracks, map, route, pose"}
 _GRAPH = {
     "mlp": """
 
@@ -203,10 +199,6 @@ _GRAPH = {
 specification says.""",
     "set": " `policy.onnx` is the same for any number of rows.",
 }
-_LIMITS = """- It does not guarantee clearance and does not say when it is in danger. Keep a separate safety
-  stop.
-- It expects the vehicle's inner velocity loop with these limits; it never commands thrusters."""
-_LIMITS_FORECAST = "- Its probabilities are those of obstacles as they move in this simulator."
 _RULE = """## The hull rule
 A wish (x, y, up) becomes a command at every control step, by the heading and the height of that moment;
 numbers are `hull_rule` of `policy_spec.json`, and `command` in `run_policy.py` is this rule.
@@ -233,38 +225,26 @@ the tank."""
 def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
     """The card as Markdown."""
     kind, rule = spec["kind"], spec.get("hull_rule")
-    is_forecast = kind == "forecast"
-    times = ", ".join(f"{time:g}" for time in spec["network"].get("times_s", ()))
     return _CARD.format(
         name=spec["name"],
         what=_WHAT[kind],
         version=checkpoint.manifest.version,
         training=training_text(checkpoint),
-        results=forecast_text(checkpoint) if is_forecast else results_text(checkpoint, evaluations),
-        how=_HOW[kind].format(**spec.get("rate", {}), times=times),
-        graph=_GRAPH.get(kind, _GRAPH["set"]) if spec["graph"] else "",
+        results=results_text(checkpoint, evaluations),
+        how=_HOW[kind].format(**spec["rate"]),
+        graph=_GRAPH[kind] if spec["graph"] else "",
         rule=_RULE.format(**rule, **rule["limits_m_s"], floor=rule["z_m"][0]) if rule else "",
         stack=_STACK[kind].format(tree=", behavior tree" if checkpoint.config.observation.behavior else ""),
-        limits=_LIMITS_FORECAST if is_forecast else _LIMITS,
     )
-
-
-def forecast_text(checkpoint: Checkpoint) -> str:
-    """Scores of a forecast on held-out episodes, as a list."""
-    rows = [
-        f"- {name.removeprefix('eval/')}: {value:.3g}"
-        for name, value in sorted(checkpoint.manifest.metrics.items())
-        if name.startswith("eval/") and isinstance(value, float)
-    ]
-    return "\n".join(["On held-out episodes of the training's worlds:", *rows] if rows else [_NONE])
 
 
 def training_text(checkpoint: Checkpoint) -> str:
     """How long, on what, and which checkpoint, as a list."""
     config, metrics = checkpoint.config, checkpoint.manifest.metrics
-    steps = metrics.get("time/env_steps")
+    unit = "decisions" if "time/decisions" in metrics else "env-steps"
+    steps = metrics.get(f"time/{unit.replace('-', '_')}")
     trained = f"{checkpoint.step} iterations" + (
-        f", {steps / 1e6:.2f} million env-steps" if isinstance(steps, float) else ""
+        f", {steps / 1e6:.2f} million {unit}" if isinstance(steps, float) else ""
     )
     lines = [
         f"{trained}, seed {config.train.seed}, {config.train.num_envs} vehicles at once.",

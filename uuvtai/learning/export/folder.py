@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
 import safetensors.torch
 import torch
 
@@ -30,7 +31,6 @@ from uuvtai.learning.export.modules import (
     golden_of,
     missing_packages,
     module_of,
-    npz_bytes,
     onnx_bytes,
     weights_of,
 )
@@ -164,7 +164,7 @@ class Export:
 def export(
     checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note, force: bool = False
 ) -> Export:
-    """Write the policy or forecast of a checkpoint into a new folder ``out``; ``note`` is told what it lacks.
+    """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks.
     ``force`` replaces an exported policy.
 
     Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive,
@@ -183,7 +183,7 @@ def export(
     spec = specification(checkpoint, module, name, graph is not None)
     files = {
         WEIGHTS: safetensors.torch.save(weights_of(module)),
-        GOLDEN: npz_bytes(golden),
+        GOLDEN: safetensors.numpy.save(golden),
         "README.md": model_card(spec, checkpoint, rows).encode(),
         "run_policy.py": Path(run_policy.__file__).read_bytes(),
     } | ({} if graph is None else {ONNX: graph})
@@ -208,7 +208,7 @@ def check(folder: Path, note: Note) -> Export:
 
 def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[Agreement]:
     """What NumPy and, where it is here, ONNX Runtime make of the folder's files."""
-    golden = run_policy.read_golden(folder / GOLDEN)
+    golden = run_policy.read_safetensors(folder / GOLDEN)
     try:
         policy = run_policy.made(spec, run_policy.read_safetensors(folder / WEIGHTS))
         found = [of_numpy(policy, golden)]

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from uuvtai.common.enums import COLUMNS, EGO_COLUMNS, N_OBSTACLE, OBSTACLE_WIDTH
+from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, OBSTACLE_WIDTH
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.export.graph import without_telemetry
-from uuvtai.learning.networks import NUM_ACTIONS, MixtureNet, RunningNorm
+from uuvtai.learning.networks import NUM_ACTIONS, RunningNorm
 from uuvtai.learning.policy_agent import OneDecision, load_agent
-from uuvtai.learning.set_networks import SetActor, actor_of, mixture_net_of
-from uuvtai.learning.world_model import N_FEATURES, N_TARGET, deviation
+from uuvtai.learning.set_networks import SetActor, actor_of
+from uuvtai.learning.world_model import N_FEATURES, N_TARGET
 
 PACKAGES = ("onnx", "onnxscript")
 """what torch's exporter needs"""
@@ -83,9 +83,10 @@ class OneAction(OneDecision, ExportedModule):
         norm, n_obs = self.policy.observation_norm, self.policy.n_in - N_FEATURES
         mean, std = norm.mean[:n_obs].float(), norm.std()[:n_obs].float()
         last, obs = (mean + std * torch.randn(count, n_obs, generator=rng) for _ in range(2))
-        if self.world_model is not None:
-            change = deviation(self.world_model.change_norm.moments)
-            obs[:, :N_TARGET] = last[:, :N_TARGET] + change * torch.randn(count, N_TARGET, generator=rng)
+        if self.world_model is not None:  # a step later little has changed
+            obs[:, :N_TARGET] = last[:, :N_TARGET] + 0.1 * std[:N_TARGET] * torch.randn(
+                count, N_TARGET, generator=rng
+            )
         for row, column, bad in ((0, 0, math.nan), (1, -1, math.inf), (1, n_obs // 2, -math.inf)):
             obs[row, column], last[-1 - row, column] = bad, bad
         action = torch.randn(count, NUM_ACTIONS, generator=rng)
@@ -101,9 +102,6 @@ class OneAction(OneDecision, ExportedModule):
         if world is not None:
             nets |= {name: getattr(world, name) for name in ("encoder", "dynamics", "decoder")}
             yield from _norm("world_norm", world.observation_norm)
-            yield "target.scale", world.scale()
-            yield "target.base", world.base(torch.zeros(world.n_obs))
-            yield "change.unit", world.error_unit()
         for name, net in nets.items():
             for key, tensor in net.state_dict().items():
                 yield f"{name}.{key}", tensor
@@ -159,46 +157,8 @@ class OneWish(ExportedModule):
         return sizes
 
 
-class OneForecast(ExportedModule):
-    """Futures of tracks. The network's columns beyond COLUMNS are padding, which is 0."""
-
-    kind = "forecast"
-    inputs = {
-        "columns": f"(N, {COLUMNS}) float32: how a track moves, moved and turned",
-        "speed": "(N,) float32: its speed [m/s]",
-    }
-    outputs = {
-        "log_weight": "(N, modes) float32: logarithm of the probability of each future",
-        "place": "(N, modes, times, 2) float32: [m] along and across the track's course",
-        "sigma": "(N, modes, times, 2) float32: [m] standard deviations",
-    }
-
-    def __init__(self, net: MixtureNet) -> None:
-        super().__init__()
-        self.net = net
-
-    def forward(self, columns: Tensor, speed: Tensor) -> tuple[Tensor, ...]:
-        """Shapes as ``inputs`` and ``outputs`` say."""
-        padding = columns.new_zeros(columns.shape[0], self.net.into.in_features - COLUMNS)
-        return tuple(self.net(torch.cat([columns, padding], dim=1), speed))
-
-    def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
-        """Between 0.1 and 2 m/s."""
-        speed = 0.1 + 1.9 * torch.rand(count, generator=rng)
-        told = 0.5 * torch.randn(count, COLUMNS, generator=rng)
-        told[:, 0] = speed
-        return told, speed
-
-    def named(self) -> Named:
-        """All layers, without the padding."""
-        for name, tensor in self.net.state_dict().items():
-            yield name, tensor[:, :COLUMNS] if name == "into.weight" else tensor
-
-
 def module_of(checkpoint: Checkpoint) -> ExportedModule:
-    """What of a checkpoint drives or forecasts. Raises CheckpointError where it cannot."""
-    if checkpoint.config.learner == "forecast":
-        return OneForecast(mixture_net_of(checkpoint)).eval()
+    """What of a checkpoint drives. Raises CheckpointError where nothing does."""
     if checkpoint.config.learner == "ppo" and checkpoint.config.encoder == "set":
         return OneWish(actor_of(checkpoint)).eval()
     agent = load_agent(checkpoint, 1)
@@ -217,13 +177,6 @@ def golden_of(module: ExportedModule) -> Arrays:
         said = module(*inputs)
     named = zip((*module.inputs, *module.outputs), (*inputs, *said), strict=True)
     return {f"pair_{name}": tensor.numpy() for name, tensor in named}
-
-
-def npz_bytes(arrays: Arrays) -> bytes:
-    """golden.npz: stored, not compressed, as ``run_policy.read_golden`` wants it."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-    return buffer.getvalue()
 
 
 # ------------------------------------------------------------------------------------------------------- ONNX

@@ -1,4 +1,4 @@
-"""Drive by an exported policy, or ask an exported forecast, with NumPy alone: no torch, no Taichi, no uuvtai.
+"""Drive by an exported policy with NumPy alone: no torch, no Taichi, no uuvtai.
 ``uuv export`` puts a copy of this file in its folder.
 
     from run_policy import load
@@ -6,27 +6,24 @@
 
 What it is stands as ``kind`` in policy_spec.json, with every column of its inputs:
 
-    mlp       policy.reset() at the start of a mission, policy.act(observation) at every control step
-    set       said = policy.act(obstacles, own) ten times a second, and at every control step
-              policy.command(said.wish, flip, yaw_rad, z_m), the hull rule
-    forecast  policy.futures(columns, speed) of a track
+    mlp   policy.reset() at the start of a mission, policy.act(observation) at every control step
+    set   said = policy.act(obstacles, own) ten times a second, and at every control step
+          policy.command(said.wish, flip, yaw_rad, z_m), the hull rule
 
 ``python run_policy.py [FOLDER]`` replays the golden pairs, prints the differences and the latency, and exits
-3 where they differ. Nothing in the folder can make this file execute code: safetensors and npz are read as
-bytes of checked length, never as pickles.
+3 where they differ. Nothing in the folder can make this file execute code: safetensors are read as bytes of
+checked length, never as pickles.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 import os
 import stat
 import sys
 import time
-import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
@@ -34,8 +31,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-SPEC, WEIGHTS, GOLDEN = "policy_spec.json", "policy.safetensors", "golden.npz"
-SCHEMA = 4
+SPEC, WEIGHTS, GOLDEN = "policy_spec.json", "policy.safetensors", "golden.safetensors"
+SCHEMA = 5
 """of the folder; another one is refused"""
 FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py")
 """names that the spec may list; nothing else is ever opened"""
@@ -44,8 +41,6 @@ AT_THERE, AT_DIRECTION = 0, slice(3, 5)
 """columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the goal"""
 SUM_SCALE = 0.3
 MOST_WISH = 2.0
-LEAST_M, LOG_BOUNDS = 0.03, (-6.0, math.log(4.0))
-"""of a forecast's deviations"""
 MAX_BYTES = 64 << 20
 """of any file of the folder: sixteen million parameters"""
 CALLS = 330
@@ -55,9 +50,9 @@ MAX_ROWS, MAX_WORK = 1 << 16, 1 << 34
 
 _OPEN = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 _LOG_VAR = (-12.0, 6.0)  # bounds of the world model's log-variance
-_MAX_DEVIATIONS = 100.0  # a residual counts as at most this many deviations
+_LARGEST_ERROR = 100.0  # of a target that the world model predicts
 _MAX_HEADER = 1 << 20
-_DTYPES = {"F32": np.dtype("<f4"), "F64": np.dtype("<f8")}
+_DTYPES = {"F32": np.dtype("<f4"), "F64": np.dtype("<f8"), "BOOL": np.dtype("?")}
 
 Arrays = dict[str, np.ndarray]
 Layers = list[tuple[np.ndarray, np.ndarray]]
@@ -133,7 +128,6 @@ class Policy(Exported):
         self._limits = np.array([row["limit"] for row in spec["action"]], np.float32)
         self.n_obs, self.hold_steps = int(spec["observation"]["width"]), int(spec["rate"]["hold_steps"])
         self._a, self._act = arrays, _ACTIVATIONS[spec["network"]["activation"]]
-        self._predicts_change = bool(spec["network"]["predict_change"])
         names = ("actor", "critic", "encoder", "dynamics", "decoder")
         self._nets = {name: layers_of(arrays, name) for name in names}
         n_in = self.n_obs + 2
@@ -198,18 +192,14 @@ class Policy(Exported):
 
     def _features(self, obs: np.ndarray, last: np.ndarray, action: np.ndarray) -> np.ndarray:
         """(N, 2) residual and uncertainty of the world model's prediction from the last decision."""
-        a, (lowest, highest) = self._a, map(np.float32, _LOG_VAR)
+        lowest, highest = map(np.float32, _LOG_VAR)
         latent = _through(self._nets["encoder"], self._scaled(last, "world_norm"), _elu)
         ahead = np.concatenate([latent, np.clip(action, -1.0, 1.0)], 1)
         ahead = _through(self._nets["dynamics"], ahead, _elu)
         mean, raw = np.split(_through(self._nets["decoder"], ahead, _elu), 2, axis=1)
-        log_var = (
-            highest - _softplus(highest - lowest - _softplus(raw - lowest)) + 2 * np.log(a["target.scale"])
-        )
-        base = last[:, :N_TARGET] if self._predicts_change else a["target.base"]
-        error = (obs[:, :N_TARGET] - (base + a["target.scale"] * mean)) / a["change.unit"]
-        residual = np.sqrt(np.mean(np.clip(error, -_MAX_DEVIATIONS, _MAX_DEVIATIONS) ** 2, axis=1))
-        uncertainty = np.mean(np.exp(log_var - 2 * np.log(a["change.unit"])), axis=1)
+        log_var = highest - _softplus(highest - lowest - _softplus(raw - lowest))
+        error = np.clip(obs[:, :N_TARGET] - mean, -_LARGEST_ERROR, _LARGEST_ERROR)
+        residual, uncertainty = np.sqrt(np.mean(error**2, axis=1)), np.mean(np.exp(log_var), axis=1)
         return np.nan_to_num(np.stack([residual, uncertainty], 1), nan=0.0, posinf=0.0, neginf=0.0)
 
     def _scaled(self, x: np.ndarray, name: str) -> np.ndarray:
@@ -299,57 +289,7 @@ class SetPolicy(Exported):
         return np.clip(np.array(out, np.float32), -1.0, 1.0)
 
 
-class Futures(NamedTuple):
-    """What may come of a track, in its frame."""
-
-    log_weight: np.ndarray
-    """(modes,) logarithm of the probability of each future"""
-    place: np.ndarray
-    """(modes, times, 2) [m] along and across the course"""
-    sigma: np.ndarray
-    """(modes, times, 2) [m] standard deviations"""
-
-
-class TrackForecast(Exported):
-    """What a tracked obstacle may do next; it remembers nothing."""
-
-    inputs = ("columns", "speed")
-
-    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None:
-        self._modes = int(spec["network"]["modes"])
-        self._times = np.array(spec["network"]["times_s"], np.float32)
-        self.width, n_place = int(spec["observation"]["columns"]["width"]), 2 * self._modes * len(self._times)
-        into, middle, said, spread = (
-            (arrays[f"{name}.weight"], arrays[f"{name}.bias"])
-            for name in ("into", "middle", "said", "spread")
-        )
-        self._told, self._spread = [into, middle, said], [into, middle, spread]
-        _check_widths(self._told, self.width, self._modes + n_place)
-        _check_widths(self._spread, self.width, n_place)
-
-    def futures(self, columns: Any, speed: float) -> Futures:
-        """Futures of one track: columns (width,), speed [m/s]. Raises ValueError for another shape or numbers
-        that are not finite."""
-        found = self.said({"columns": np.asarray(columns)[None], "speed": np.asarray([speed])})
-        return Futures(*(found[name][0] for name in Futures._fields))
-
-    def said(self, given: Arrays) -> Arrays:
-        """The fields of ``Futures`` by name, each with an axis of tracks in front."""
-        columns, speed = self._rows(given, (self.width,), ())
-        if not (np.isfinite(columns).all() and np.isfinite(speed).all()):
-            raise ValueError("columns or speed hold numbers that are not finite")
-        said, shape = _through(self._told, columns, _relu), (-1, self._modes, len(self._times), 2)
-        reach = (speed[:, None] * self._times)[:, None, :, None]
-        raw = said[:, : self._modes] - said[:, : self._modes].max(-1, keepdims=True)
-        spread = _through(self._spread, columns, _relu).reshape(shape)
-        return {
-            "log_weight": raw - np.log(np.exp(raw).sum(-1, keepdims=True)),
-            "place": said[:, self._modes :].reshape(shape) * reach,
-            "sigma": np.float32(LEAST_M) + np.exp(np.clip(spread, *LOG_BOUNDS).astype(np.float32)) * reach,
-        }
-
-
-KINDS: dict[str, type[Exported]] = {"mlp": Policy, "set": SetPolicy, "forecast": TrackForecast}
+KINDS: dict[str, type[Exported]] = {"mlp": Policy, "set": SetPolicy}
 """by ``kind`` of policy_spec.json"""
 
 
@@ -403,8 +343,8 @@ def _through(layers: Layers, x: np.ndarray, act: Activation) -> np.ndarray:
 
 
 def load(folder: str | Path = ".") -> Any:
-    """``Policy``, ``SetPolicy`` or ``TrackForecast`` of an exported folder, every file checked against its
-    sha256. Raises PolicyError."""
+    """``Policy`` or ``SetPolicy`` of an exported folder, every file checked against its sha256. Raises
+    PolicyError."""
     folder = Path(folder)
     spec = read_spec(folder)
     if wrong := changed_files(folder, spec):
@@ -475,14 +415,14 @@ def content_of(file: Path) -> bytes:
 
 
 def read_safetensors(file: Path) -> Arrays:
-    """Arrays of a safetensors file (F32 and F64), every length checked, all finite. Raises PolicyError."""
+    """Arrays of a safetensors file, every length checked, weights finite. Raises PolicyError."""
     try:
-        return _tensors(content_of(file))
+        return _tensors(content_of(file), file.name == WEIGHTS)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise PolicyError(f"{file}: is not a safetensors file of an exported policy ({error})") from None
 
 
-def _tensors(content: bytes) -> Arrays:
+def _tensors(content: bytes, is_finite: bool) -> Arrays:
     """Source of the format: https://huggingface.co/docs/safetensors (8 bytes of length, JSON header, raw
     bytes without gaps)."""
     length = int.from_bytes(content[:8], "little")
@@ -503,37 +443,12 @@ def _tensors(content: bytes) -> Arrays:
         if last - first != math.prod(shape) * dtype.itemsize:
             raise ValueError(f"{name} has {last - first} bytes, its shape {shape} needs others")
         arrays[name] = np.frombuffer(data[first:last], dtype).reshape(shape)
-        if not np.isfinite(arrays[name]).all():
+        if is_finite and not np.isfinite(arrays[name]).all():
             raise ValueError(f"{name} is not finite")
         end = last
     if end != len(data):
         raise ValueError("it holds more bytes than arrays")
     return arrays
-
-
-def read_golden(file: Path) -> Arrays:
-    """Arrays of golden.npz: members must be stored, not compressed, so that nothing unfolds. Raises
-    PolicyError."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content_of(file))) as archive:
-            return {
-                member.filename.removesuffix(".npy"): _member(archive, member)
-                for member in archive.infolist()
-            }
-    except (ValueError, zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
-        raise PolicyError(f"{file}: is not the golden pairs of an exported policy ({error})") from None
-
-
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
-        raise ValueError(f"{member.filename} is compressed")
-    stream = io.BytesIO(archive.read(member))
-    if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError(f"{member.filename} is no array of version 1.0")
-    shape, by_column, dtype = np.lib.format.read_array_header_1_0(stream)
-    if dtype.hasobject or by_column:
-        raise ValueError(f"{member.filename} holds objects or is stored by column")
-    return np.frombuffer(stream.read(), dtype).reshape(shape)
 
 
 # ----------------------------------------------------------------------------------------------- golden pairs
@@ -586,7 +501,7 @@ def main(arguments: list[str]) -> int:
     """Replay the golden pairs of a folder; 0 = they agree, 3 = they differ, 1 = the folder cannot be used."""
     folder = Path(arguments[0]) if arguments else Path(__file__).resolve().parent
     try:
-        policy, spec, golden = load(folder), read_spec(folder), read_golden(folder / GOLDEN)
+        policy, spec, golden = load(folder), read_spec(folder), read_safetensors(folder / GOLDEN)
         worst, tolerance = differences(policy, golden), float(spec["golden"]["tolerance"])
         time_ms = latency_ms(policy.said, {name: golden[f"pair_{name}"] for name in policy.inputs})
     except (PolicyError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:

@@ -6,26 +6,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from uuvtai.common.enums import (
-    AHEAD_STEPS,
-    COLUMNS,
-    FAR,
-    LEAST_SPEED_M_S,
-    LENGTH_M,
-    N_BEND,
-    N_MODE,
-    N_OBSTACLE,
-    N_PAST,
-    N_RAY,
-    PAST_S,
-    TURN_GAIN,
-)
+from uuvtai.common.enums import LEAST_SPEED_M_S, N_OBSTACLE, N_RAY, TURN_GAIN
 from uuvtai.common.version import __version__
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.export.modules import OPSET, TOLERANCE, ExportedModule, OneAction, OneWish
+from uuvtai.learning.export.modules import OPSET, TOLERANCE, ExportedModule, OneAction
 from uuvtai.learning.export.run_policy import GOLDEN, SCHEMA, WEIGHTS
-from uuvtai.learning.networks import TIMES_S
 from uuvtai.learning.world_model import N_FEATURES
 
 ONNX = "policy.onnx"
@@ -54,10 +40,8 @@ def specification(
 ) -> dict[str, Any]:
     """The document without ``files``, which ``export`` adds."""
     graph = {"file": ONNX, "opset": OPSET, "inputs": module.inputs, "outputs": module.outputs}
-    if isinstance(module, OneAction):
-        about = _action_parts(checkpoint, module)
-    else:
-        about = _set_parts(checkpoint.config) if isinstance(module, OneWish) else _forecast_parts()
+    is_set = not isinstance(module, OneAction)
+    about = _set_parts(checkpoint.config) if is_set else _action_parts(checkpoint, module)
     return {
         "schema": SCHEMA,
         "kind": module.kind,
@@ -94,11 +78,7 @@ def _action_parts(checkpoint: Checkpoint, module: OneAction) -> dict[str, Any]:
         "action": checkpoint.manifest.action,
         "action_meaning": _ACTION,
         "rate": _rate(checkpoint.config) | {"meaning": _HOLD},
-        "network": {
-            "hidden": list(policy.config.hidden),
-            "activation": policy.config.activation,
-            "predict_change": world is None or world.config.predict_change,
-        },
+        "network": {"hidden": list(policy.config.hidden), "activation": policy.config.activation},
     }
 
 
@@ -149,13 +129,6 @@ def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
     }
 
 
-def _forecast_parts() -> dict[str, Any]:
-    return {
-        "observation": {"columns": {"width": COLUMNS}, "meaning": MOTION_MEANING},
-        "network": {"modes": N_MODE, "times_s": [float(time) for time in TIMES_S]},
-    }
-
-
 # ------------------------------------------------------------------------------------------------------------
 # What every column of a policy over a set of obstacles is, in words (``surrogate/observation.py`` writes
 # them).
@@ -169,18 +142,6 @@ MEANING = (
     "obstacle; "
     "one row each, at most the nearest ones; a row of zeros is no obstacle. Numbers that are not finite are "
     "refused."
-)
-MOTION_MEANING = (
-    "float32, in the track's frame: its place now, x along its course, y to the left. Lengths are "
-    f"divided by {LENGTH_M:g} m and cut off to +-{FAR:g}. In this order: speed [m/s], turn rate [rad/s] "
-    "within +-4, its standard deviation, 1 where it is known, standard deviations of place [m] and "
-    "velocity [m/s] at most 2, time unseen [s] at most 3, log(1 + scans) / 5, radius [m], 1 where it "
-    "was tracked from the beginning of this straight way, 1 where it turned into it, way gone straight; "
-    "walls ahead, behind, left, right; way to the next remembered turn of this water, course behind it "
-    "(2; 0 = none), turns back and other turns seen in this water / 8 at most 2; the analytic forecast "
-    f"after {', '.join(map(str, AHEAD_STEPS))} tenths of a second (2 each); the last {N_BEND} turns of "
-    f"this track (2, and 1 where known); its last {N_PAST} places, {PAST_S:g} s apart (2 each), and "
-    "seconds since the newest."
 )
 
 
