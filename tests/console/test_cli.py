@@ -476,11 +476,17 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
 
 
 def test_without_a_preset_the_policy_trains(capfd, monkeypatch):
-    asked = []
+    asked, run = [], "runs/my first"
+    done = {"run": run, "learner": "ppo", "score": 0.5, "checkpoint": f"{run}/checkpoints/step_000006"}
     monkeypatch.setattr(
-        "uuvtai.learning.runner.train", lambda request, *_: (asked.append(request) or {}, Path())
+        "uuvtai.learning.runner.train", lambda request, *_: (asked.append(request) or done, Path())
     )
-    assert uuv(capfd, "train")[0] == 0
+    code, out, _ = uuv(capfd, "train")
+    assert code == 0 and out.splitlines() == [
+        f"best checkpoint: {run}/checkpoints/step_000006 (50.0 % in its evaluation)",
+        f"TensorBoard: tensorboard --logdir '{run}/tensorboard'",
+        f"next: uuv eval --agent '{run}' --agent bt",
+    ]
     assert [(request.preset, request.config) for request in asked] == [
         ("policy", loader.load_training("policy"))
     ]
