@@ -42,7 +42,7 @@ def batch():
 
 def gradients(ppo, batch, index=slice(0, ROWS)):
     """Of every parameter, and the sums."""
-    sums = ppo._learn(batch, index, 0.0, True)
+    sums = ppo._learn(batch, index, 0.0)
     return [p.grad for net in ppo._nets for p in net], sums
 
 

@@ -308,7 +308,7 @@ def test_a_killed_run_goes_on_bit_for_bit_in_another_process(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     out, err = uuv(*RUN, "--run-dir", str(whole), "--json")
     assert json.loads(out)["iterations"] == 6
-    assert "6/6: reward" in err
+    assert "6/6: success" in err
     killed_between_checkpoints(killed, *RUN)
     assert run_json(killed)["status"] == "running", "nobody was there to say otherwise"
     assert checkpoint.newest(killed, resumable=True).step in (2, 3, 4)

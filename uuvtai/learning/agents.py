@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from safetensors import safe_open
 
+from uuvtai.common.files import parsed_json, read_bytes
 from uuvtai.common.presets import POLICY, PRESET_DIR
 from uuvtai.config.behavior import FAST, SLOW, TUNED
 from uuvtai.config.loader import ConfigError, load_training
 from uuvtai.learning.checkpoint import (
+    LARGEST,
     MANIFEST,
     MODEL,
     Checkpoint,
@@ -215,8 +216,10 @@ def _built_in() -> Checkpoint:
     """The policy that comes with the package: one file, the manifest of its checkpoint inside. It has today's
     config of its preset, so that it drives whatever keys were renamed since."""
     path = PRESET_DIR / POLICY
-    with refused(path / MODEL), safe_open(path / MODEL, "pt") as file:
-        manifest = parsed(file.metadata()["manifest"].encode())
+    with refused(path / MODEL):
+        content = read_bytes(path / MODEL, LARGEST[MODEL], path)
+        header = parsed_json(content[8 : 8 + int.from_bytes(content[:8], "little")], MODEL)
+        manifest = parsed(header["__metadata__"]["manifest"].encode())
         manifest.files = {MODEL: entry_of(path / MODEL)}
     return Checkpoint(path, manifest, load_training(POLICY), manifest.files[MODEL].sha256)
 
