@@ -33,7 +33,7 @@ def _agents(help_text: str) -> Any:
     return Option("--agent", metavar=_NAME, help=help_text, autocompletion=parsing.agent_names)
 
 
-def _resume(help_text: str, name: str = "--resume") -> Any:
+def _run(help_text: str, name: str = "--resume") -> Any:
     return Option(name, metavar="RUN", help=help_text, autocompletion=parsing.runs)
 
 
@@ -107,7 +107,7 @@ ExplainRecord = Annotated[
     int | None,
     _more("--explain-record", help="With --explain: record N of an agent's worst failures \\[default: 3]."),
 ]
-EvalResume = Annotated[Path | None, _resume("Continue an interrupted evaluation.")]
+EvalResume = Annotated[Path | None, _run("Continue an interrupted evaluation.")]
 GridAxes = Annotated[
     list[str] | None,
     Option(
@@ -125,7 +125,7 @@ EngineName = Annotated[
 ]
 Workers = Annotated[int, Option("--workers", help="Processes of the local engine.")]
 Address = Annotated[str, _more("--address", help="Ray cluster: host:port, auto, or local (this process).")]
-SweepResume = Annotated[Path | None, _resume("Continue an interrupted sweep.")]
+SweepResume = Annotated[Path | None, _run("Continue an interrupted sweep.")]
 WatchEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed; 0 = until Ctrl-C.")]
 Rate = Annotated[float, Option("--rate", help="Episode seconds per second; 0 = as fast as possible.")]
 Host = Annotated[str, _more("--host", help="Address to serve at; 0.0.0.0 = to the whole network.")]
@@ -149,11 +149,13 @@ TrainPreset = Annotated[
         autocompletion=parsing.presets("train"),
     ),
 ]
-TrainResume = Annotated[Path | None, _resume("Continue this training with its own config.")]
+TrainResume = Annotated[Path | None, _run("Continue this training with its own config.")]
 Iterations = Annotated[
     int | None, Option("--iterations", help="Total iterations. Schedules still span train.iterations.")
 ]
-TrainStart = Annotated[Path | None, _resume("Run whose policy to begin with.", "--start")]
+TrainStart = Annotated[
+    Path | None, _run("Run whose policy to begin with, or policy: the built-in one.", "--start")
+]
 TrainSeed = Annotated[int | None, Option("--seed", help="Random seed (train.seed).")]
 TrainWorld = Annotated[
     str | None, _preset("--world", "world", f"World: {_WORLDS}, or a YAML file \\[default: the preset's].")
@@ -277,7 +279,7 @@ OwnAgents = Annotated[
         autocompletion=parsing.files(".py", ".onnx"),
     ),
 ]
-ReproduceResume = Annotated[Path | None, _resume("Continue an interrupted reproduction.")]
+ReproduceResume = Annotated[Path | None, _run("Continue an interrupted reproduction.")]
 
 # ------------------------------------------------------------------------------------------------ pilot, sitl
 

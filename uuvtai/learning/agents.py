@@ -208,7 +208,8 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
     if (path / "checkpoints").is_dir():
         return best(path, note)
     raise ConfigError(
-        f"{name!r} is no trained policy: give the run folder of 'uuv train', or one of its checkpoints/step_N"
+        f"{name!r} is no trained policy: give {POLICY}, which is built in, the run folder of 'uuv train', or "
+        "one of its checkpoints/step_N"
     )
 
 

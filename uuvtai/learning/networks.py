@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -32,10 +32,6 @@ from uuvtai.common.enums import (
 )
 from uuvtai.common.errors import SettingError, UserError
 from uuvtai.config.learning import PolicyConfig
-
-if TYPE_CHECKING:
-    pass
-
 
 Activation = Literal["elu", "tanh", "relu"]
 
@@ -182,10 +178,7 @@ class RunningNorm(nn.Module):
 NUM_ACTIONS = 4
 CLIP_OBSERVATION = 10.0
 """standard deviations beyond which an observation is cut off"""
-_MEAN_GAIN, _VALUE_GAIN = (
-    0.01,
-    1.0,
-)  # small first actions (Andrychowicz et al. 2021, choice of the last layer's scale)
+_MEAN_GAIN, _VALUE_GAIN = 0.01, 1.0  # of the last layers: small first actions (Andrychowicz et al. 2021)
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
