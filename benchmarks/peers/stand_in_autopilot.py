@@ -79,7 +79,7 @@ class StandIn:
     def _speak(self, told: dict, roll: float, pitch: float, yaw: float) -> None:
         time_s = told["timestamp"]
         boot, micro = round(1e3 * time_s), round(1e6 * time_s)
-        milli = [round(1e3 * value / 9.80665) for value in told["imu"]["accel_obstacle"]]
+        milli = [round(1e3 * value / 9.80665) for value in told["imu"]["accel_body"]]
         position, velocity = told["position"], told["velocity"]
         depth_hpa = position[2] * 997.0 * 9.81 / 100
         self._send(mav.MAVLink_attitude_message(boot, roll, pitch, yaw, *told["imu"]["gyro"]))

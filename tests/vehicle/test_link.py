@@ -5,6 +5,7 @@ import json
 import math
 import re
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -806,3 +807,11 @@ def test_without_pymavlink_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(mavlink, "_NEEDED", "pymavlink_is_not_here.dialects")
     with pytest.raises(LinkError, match=r"pip install 'uuvtai\[mavlink\]'"):
         MavCodec(1, 191)
+
+
+def test_names_of_mavlink_are_mavlinks():
+    """A word of ours in such a name once told ArduSub nothing."""
+    root = Path(__file__).parents[2]
+    files = *root.glob("uuvtai/vehicle/**/*.py"), root / "docs/safety.md", root / "docs/on_a_vehicle.md"
+    names = {name for file in files for name in re.findall(r"\bMAV_[A-Z0-9_]+[A-Z0-9]\b", file.read_text())}
+    assert len(names) > 5 and [name for name in names if not (hasattr(mav, name) or name in mav.enums)] == []

@@ -33,7 +33,7 @@ GOLDEN_PACKET = bytes.fromhex(
 )
 """magic 18458, 1200 Hz, frame 7, channels 1380 1500 1500 1900 1500 1500 and ten that are off"""
 GOLDEN_REPLY = (
-    b'\n{"timestamp":1.250000,"imu":{"gyro":[0.1,-0.2,-0.3],"accel_obstacle":[0.5,-0.25,-9.81]},'
+    b'\n{"timestamp":1.250000,"imu":{"gyro":[0.1,-0.2,-0.3],"accel_body":[0.5,-0.25,-9.81]},'
     b'"position":[2,-3,0.8],"quaternion":[0.5,0.5,-0.5,0.5],"velocity":[0.25,0.125,-0.0625],"rng_1":0.8000,'
     b'"battery":{"voltage":16.000,"current":1.000}}\n'
 )
@@ -74,8 +74,9 @@ def ardusub_reads(line, section, key):
 
 
 def test_ardusubs_parser_finds_every_key():
+    """Names as in ArduPilot, libraries/SITL/SIM_JSON.h."""
     assert ardusub_reads(GOLDEN_REPLY, "", "timestamp") == [1.25]
-    assert ardusub_reads(GOLDEN_REPLY, "imu", "accel_obstacle") == [0.5, -0.25, -9.81]
+    assert ardusub_reads(GOLDEN_REPLY, "imu", "accel_body") == [0.5, -0.25, -9.81]
     assert ardusub_reads(GOLDEN_REPLY, "", "quaternion") == [0.5, 0.5, -0.5, 0.5]
     assert ardusub_reads(GOLDEN_REPLY, "", "rng_1")[0] == 0.8
     assert GOLDEN_REPLY.startswith(b"\n") and GOLDEN_REPLY.endswith(b"\n") and b": " not in GOLDEN_REPLY
@@ -373,7 +374,7 @@ def test_an_episode_begins_as_uuv_eval_has_it_and_the_referee_judges(small, wate
 
 def test_at_rest_the_accelerometer_feels_gravity(water):
     water.begin(1)
-    force = json.loads(reply_of(water.motion(1, 0.0)))["imu"]["accel_obstacle"]
+    force = json.loads(reply_of(water.motion(1, 0.0)))["imu"]["accel_body"]
     assert force == pytest.approx([0, 0, -water.config.vehicle.gravity_m_s2], abs=1e-4)
 
 

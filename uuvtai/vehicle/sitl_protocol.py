@@ -45,7 +45,7 @@ def reply_of(motion: Motion) -> bytes:
     text = (
         f'\n{{"timestamp":{motion.time_s:.6f},'
         f'"imu":{{"gyro":{_vector(turned_over(motion.rate_b))},'
-        f'"accel_obstacle":{_vector(turned_over(motion.specific_force_b))}}},'
+        f'"accel_body":{_vector(turned_over(motion.specific_force_b))}}},'
         f'"position":{_vector(turned_over(motion.pos_w))},'
         f'"quaternion":{_vector((w, x, 0.0 - y, 0.0 - z))},'
         f'"velocity":{_vector(turned_over(motion.vel_w))},'
@@ -65,7 +65,7 @@ def _vector(values: Sequence[float]) -> str:
 
 LEAST_STEPS = 5  # control steps between two reports, at least: 10 Hz, as of an A50 and a multibeam
 _SONAR, _DOWN, _BOW = 1, 25, 12
-"""MAV_DISTANCE_SENSOR_ULTRASOUND, MAV_SENSOR_ROTATION_PITCH_270, MAV_FRAME_OBSTACLE_FRD"""
+"""MAV_DISTANCE_SENSOR_ULTRASOUND, MAV_SENSOR_ROTATION_PITCH_270, MAV_FRAME_BODY_FRD"""
 _MOST_ALTITUDE_CM = 5000
 
 Value = Callable[[str], np.ndarray]

@@ -507,7 +507,7 @@ class Intake:
     def _obstacles(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         if fields["frame"] != 12:
             return self.refuse(
-                "OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_OBSTACLE_FRD)"
+                "OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_BODY_FRD)"
             )
         increment = float(fields.get("increment_f", 0.0)) or float(fields["increment"])
         distances = np.array(list(fields["distances"])[:SECTORS], dtype=int)
