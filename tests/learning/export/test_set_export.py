@@ -21,7 +21,7 @@ from uuvtai.learning.export import folder as deploy
 from uuvtai.learning.export import run_policy
 from uuvtai.learning.export import spec as set_columns_text
 from uuvtai.learning.export.graph import session
-from uuvtai.learning.export.modules import TOLERANCE, golden_of, missing_packages, module_of
+from uuvtai.learning.export.modules import golden_of, missing_packages, module_of
 from uuvtai.learning.export.spec import hull_rule_of
 from uuvtai.learning.set_networks import SetActor, SetCritic
 from uuvtai.surrogate.arrays import TRUTH_WIDTH
@@ -65,7 +65,7 @@ def whole(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(deploy, "missing_packages", lambda: ["onnx"])
         found, done, out = exported(tmp_path_factory.mktemp("set"))
-    assert [each.engine for each in done.agreements] == ["torch", "NumPy"] and done.agrees
+    assert [each["engine"] for each in done["engines"]] == ["torch", "NumPy"] and done["agrees"]
     return found, out
 
 
@@ -115,7 +115,8 @@ def test_the_graph_says_the_same(tmp_path):
     if missing_packages():
         pytest.skip("needs the extra uuvtai[export]")
     _, done, out = exported(tmp_path)
-    assert [each.engine for each in done.agreements] == ["torch", "NumPy", "ONNX Runtime"] and done.agrees
+    assert [one["engine"] for one in done["engines"]] == ["torch", "NumPy", "ONNX Runtime"]
+    assert done["agrees"]
     spec = run_policy.read_spec(out)
     policy = run_policy.load(out)
     assert set(spec["graph"]["inputs"]) == set(policy.inputs)
@@ -123,8 +124,8 @@ def test_the_graph_says_the_same(tmp_path):
     said = policy.said({name: golden[f"pair_{name}"] for name in policy.inputs})
     assert set(spec["graph"]["outputs"]) == set(said)
     rng = np.random.default_rng(0)
-    few = {name: rng.normal(size=(3, policy.widths[name])).astype(np.float32) for name in policy.inputs[1:]}
-    few["obstacles"] = rng.normal(size=(3, 2, OBSTACLE_WIDTH)).astype(np.float32)
+    few = {"obstacles": rng.normal(size=(3, 2, OBSTACLE_WIDTH)), "own": rng.normal(size=(3, EGO_COLUMNS))}
+    few = {name: array.astype(np.float32) for name, array in few.items()}
     few["obstacles"][..., 0] = 1.0
     (wish, *_) = session((out / "policy.onnx").read_bytes()).run(["mean_wish"], few)
     np.testing.assert_allclose(wish, policy.said(few)["mean_wish"], atol=1e-5)
@@ -289,7 +290,7 @@ def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
 def test_golden_pairs_are_read_without_trust(change, tmp_path, no_onnx, capfd):
     found, _, out = exported(tmp_path)
     golden = golden_of(module_of(found))
-    assert max(run_policy.differences(run_policy.load(out), golden).values()) <= TOLERANCE
+    assert run_policy.of_numpy(run_policy.load(out), golden)["agrees"]
     change(golden)
     resigned(out, "golden.safetensors", save(golden))
     assert run_cli("export", "--check", out) in (2, 3)

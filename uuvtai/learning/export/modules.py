@@ -9,7 +9,6 @@ import logging
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, OBSTACLE_WIDTH
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.export.graph import without_telemetry
-from uuvtai.learning.networks import NUM_ACTIONS, RunningNorm
+from uuvtai.learning.networks import NUM_ACTIONS
 from uuvtai.learning.policy_agent import OneDecision, load_agent
 from uuvtai.learning.set_networks import SetActor, actor_of
 from uuvtai.learning.world_model import N_FEATURES, N_TARGET
@@ -26,15 +25,11 @@ from uuvtai.learning.world_model import N_FEATURES, N_TARGET
 PACKAGES = ("onnx", "onnxscript")
 """what torch's exporter needs"""
 OPSET = 20
-TOLERANCE = 1e-5
-"""largest difference between torch, NumPy and ONNX Runtime, in parts of the output's largest value where that
-is beyond 1"""
 NO_LIMIT = float(torch.finfo(torch.float32).max)
 """of a normaliser that has seen nothing and therefore cuts nothing off"""
 _ROWS, _SEED = 64, 6
 
 Arrays = dict[str, np.ndarray]
-Named = Iterator[tuple[str, Tensor]]
 
 
 class ExportedModule(nn.Module, ABC):
@@ -51,13 +46,14 @@ class ExportedModule(nn.Module, ABC):
         """Made-up inputs, spread as training had them."""
 
     @abstractmethod
-    def named(self) -> Named:
+    def weights(self) -> dict[str, Tensor]:
         """Arrays of ``policy.safetensors`` by the names that ``run_policy.py`` knows."""
 
-    def sizes(self) -> dict[str, dict[int, torch.export.Dim]]:
-        """Axes of the inputs that may have any size."""
-        rows = torch.export.Dim("rows", min=1)
-        return {name: {0: rows} for name in self.inputs}
+    @torch.inference_mode()
+    def said(self, rows: Arrays) -> Arrays:
+        """Outputs by name for rows of the inputs, in their order."""
+        found = self(*(torch.from_numpy(part) for part in rows.values()))
+        return {name: part.numpy() for name, part in zip(self.outputs, found, strict=True)}
 
 
 class OneAction(OneDecision, ExportedModule):
@@ -84,33 +80,28 @@ class OneAction(OneDecision, ExportedModule):
         mean, std = norm.mean[:n_obs].float(), norm.std()[:n_obs].float()
         last, obs = (mean + std * torch.randn(count, n_obs, generator=rng) for _ in range(2))
         if self.world_model is not None:  # a step later little has changed
-            obs[:, :N_TARGET] = last[:, :N_TARGET] + 0.1 * std[:N_TARGET] * torch.randn(
-                count, N_TARGET, generator=rng
-            )
+            step = 0.1 * std[:N_TARGET] * torch.randn(count, N_TARGET, generator=rng)
+            obs[:, :N_TARGET] = last[:, :N_TARGET] + step
         for row, column, bad in ((0, 0, math.nan), (1, -1, math.inf), (1, n_obs // 2, -math.inf)):
             obs[row, column], last[-1 - row, column] = bad, bad
         action = torch.randn(count, NUM_ACTIONS, generator=rng)
         return obs, last, action, torch.arange(count) > 0
 
-    def named(self) -> Named:
+    def weights(self) -> dict[str, Tensor]:
         """Networks, and what they scale by."""
         policy, world = self.policy, self.world_model
+        norms = {"norm": policy.observation_norm}
         nets = {"actor": policy.actor, "critic": policy.critic}
-        yield from _norm("norm", policy.observation_norm)
-        yield "value.mean", policy.value_norm.mean
-        yield "value.std", policy.value_norm.std()
         if world is not None:
-            nets |= {name: getattr(world, name) for name in ("encoder", "dynamics", "decoder")}
-            yield from _norm("world_norm", world.observation_norm)
+            norms["world_norm"] = world.observation_norm
+            nets |= {"encoder": world.encoder, "dynamics": world.dynamics, "decoder": world.decoder}
+        found = {"value.mean": policy.value_norm.mean, "value.std": policy.value_norm.std()}
+        for name, norm in norms.items():
+            limit = torch.tensor([norm.clip if float(norm.count) > 0 else NO_LIMIT])
+            found |= {f"{name}.mean": norm.mean, f"{name}.scale": 1.0 / norm.std(), f"{name}.limit": limit}
         for name, net in nets.items():
-            for key, tensor in net.state_dict().items():
-                yield f"{name}.{key}", tensor
-
-
-def _norm(name: str, norm: RunningNorm) -> Named:
-    yield f"{name}.mean", norm.mean
-    yield f"{name}.scale", 1.0 / norm.std()
-    yield f"{name}.limit", torch.tensor([norm.clip if float(norm.count) > 0 else NO_LIMIT])
+            found |= {f"{name}.{key}": tensor for key, tensor in net.state_dict().items()}
+        return found
 
 
 class OneWish(ExportedModule):
@@ -146,15 +137,9 @@ class OneWish(ExportedModule):
         obstacles[..., 0] = there.float()
         return obstacles, own
 
-    def named(self) -> Named:
+    def weights(self) -> dict[str, Tensor]:
         """The actor's layers."""
-        return ((f"actor.{name}", tensor) for name, tensor in self.actor.net.state_dict().items())
-
-    def sizes(self) -> dict[str, dict[int, torch.export.Dim]]:
-        """As in ``ExportedModule``, and of obstacles."""
-        sizes = super().sizes()
-        sizes["obstacles"][1] = torch.export.Dim("obstacles", min=1)
-        return sizes
+        return {f"actor.{name}": tensor for name, tensor in self.actor.net.state_dict().items()}
 
 
 def module_of(checkpoint: Checkpoint) -> ExportedModule:
@@ -167,16 +152,15 @@ def module_of(checkpoint: Checkpoint) -> ExportedModule:
 
 def weights_of(module: ExportedModule) -> dict[str, Tensor]:
     """Arrays by name, float32, on the host, contiguous."""
-    return {name: tensor.detach().float().cpu().contiguous().clone() for name, tensor in module.named()}
+    found = module.weights().items()
+    return {name: tensor.detach().float().cpu().contiguous().clone() for name, tensor in found}
 
 
 def golden_of(module: ExportedModule) -> Arrays:
     """``pair_<input>`` and ``pair_<output>``, 64 rows of made-up inputs and what the module says to them."""
-    inputs = module.rows(_ROWS, torch.Generator().manual_seed(_SEED))
-    with torch.no_grad():
-        said = module(*inputs)
-    named = zip((*module.inputs, *module.outputs), (*inputs, *said), strict=True)
-    return {f"pair_{name}": tensor.numpy() for name, tensor in named}
+    made_up = module.rows(_ROWS, torch.Generator().manual_seed(_SEED))
+    inputs = {name: tensor.numpy() for name, tensor in zip(module.inputs, made_up, strict=True)}
+    return {f"pair_{name}": array for name, array in (inputs | module.said(inputs)).items()}
 
 
 # ------------------------------------------------------------------------------------------------------- ONNX
@@ -190,29 +174,24 @@ def missing_packages() -> list[str]:
 def onnx_bytes(module: ExportedModule) -> bytes:
     """The ONNX graph with its weights inside, any number of rows at once. Needs PACKAGES."""
     without_telemetry()
-    with _quiet():
-        program = torch.onnx.export(
-            module,
-            module.rows(2, torch.Generator().manual_seed(_SEED)),
-            input_names=list(module.inputs),
-            output_names=list(module.outputs),
-            dynamic_shapes=module.sizes(),
-            opset_version=OPSET,
-            dynamo=True,
-            verbose=False,
-        )
+    rows, obstacles = torch.export.Dim("rows", min=1), torch.export.Dim("obstacles", min=1)
+    sizes = {name: {0: rows, 1: obstacles} if name == "obstacles" else {0: rows} for name in module.inputs}
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # the exporter talks on every channel; what it cannot do it raises
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                module,
+                module.rows(2, torch.Generator().manual_seed(_SEED)),
+                input_names=list(module.inputs),
+                output_names=list(module.outputs),
+                dynamic_shapes=sizes,
+                opset_version=OPSET,
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        logging.disable(before)
     assert program is not None
     return program.model_proto.SerializeToString()
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """The exporter talks about itself on every channel there is; what it cannot do it raises."""
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        before = logging.root.manager.disable
-        logging.disable(logging.WARNING)
-        try:
-            yield
-        finally:
-            logging.disable(before)
