@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import difflib
 import json
+import math
 import re
 import shlex
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

@@ -24,8 +24,7 @@ from uuvtai.learning.export import folder as deploy
 from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.card import evaluations_of
 from uuvtai.learning.export.folder import of_torch
-from uuvtai.learning.export.modules import golden_of, missing_packages, module_of, weights_of
-from uuvtai.learning.export.spec import specification
+from uuvtai.learning.export.modules import golden_of, missing_packages, module_of, specification, weights_of
 from uuvtai.learning.networks import ActorCritic
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.world_model import WorldModel

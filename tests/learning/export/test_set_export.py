@@ -19,10 +19,15 @@ from uuvtai.learning.agents import load_set_agent
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.export import folder as deploy
 from uuvtai.learning.export import run_policy
-from uuvtai.learning.export import spec as set_columns_text
 from uuvtai.learning.export.graph import session
-from uuvtai.learning.export.modules import golden_of, missing_packages, module_of
-from uuvtai.learning.export.spec import hull_rule_of
+from uuvtai.learning.export.modules import (
+    OBSTACLE_COLUMNS,
+    OWN_COLUMNS,
+    golden_of,
+    hull_rule_of,
+    missing_packages,
+    module_of,
+)
 from uuvtai.learning.set_networks import SetActor, SetCritic
 from uuvtai.surrogate.arrays import TRUTH_WIDTH
 from uuvtai.surrogate.observation import SET_TABLE
@@ -202,12 +207,8 @@ def test_order_and_number_of_obstacles_do_not_matter():
 
 
 def test_words_and_constants_are_those_of_the_package():
-    text = set_columns_text
-    assert [len(columns) for columns in (text.OBSTACLE_COLUMNS, text.OWN_COLUMNS)] == [
-        OBSTACLE_WIDTH,
-        EGO_COLUMNS,
-    ]
-    names = [row["name"] for columns in (text.OBSTACLE_COLUMNS, text.OWN_COLUMNS) for row in columns]
+    assert (len(OBSTACLE_COLUMNS), len(OWN_COLUMNS)) == (OBSTACLE_WIDTH, EGO_COLUMNS)
+    names = [row["name"] for row in OBSTACLE_COLUMNS + OWN_COLUMNS]
     assert names[12] == "way_in_1s.x" and names[OBSTACLE_WIDTH + 3] == "route_direction.x"
     for own, theirs in (
         (run_policy.AT_DIRECTION, set_networks.AT_DIRECTION),
@@ -280,6 +281,8 @@ def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
     "change",
     [
         lambda g: g.pop("pair_own"),
+        lambda g: g.pop("pair_mean_wish"),
+        lambda g: g.update({"pair_more": g["pair_own"]}),
         lambda g: g.update({"pair_own": g["pair_own"][:5]}),
         lambda g: g.update({"pair_obstacles": g["pair_obstacles"] * np.float32(0.5)}),
         lambda g: g.update({"pair_obstacles": np.zeros((0, 9, OBSTACLE_WIDTH), np.float32)}),

@@ -14,30 +14,21 @@ from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.report.tables import sensing
-
-# ------------------------------------------------------------------------------------------------------------
-# How often a policy arrived and collided, from the evaluations that are at hand: the counts behind every
-# rate of the model card.
-
+from uuvtai.report.tables import rate, sensing, text_table
 
 RESULT = Path("eval/result.json")
 """what ``uuv eval`` leaves in its run folder"""
 _MAX_BYTES = 256 << 20
 
 
-def _row(where: str, n: int, successes: int, collisions: int, together: bool = False) -> str:
-    """A row of the card's table: k/n with their 95 % Wilson intervals. Without, where episodes go
-    ``together``: worlds or scenes had episodes of the same numbers, and single ends were not kept."""
-    cells = [where]
-    for k in (successes, collisions):
-        bounds = wilson_interval(k, n)
-        interval = "" if bounds is None or together else f" [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"
-        cells.append(f"{k}/{n} = {100 * k / n:.1f} %{interval}" if n else "-")
-    return f"| {' | '.join(cells)} |"
+def _row(where: str, n: int, successes: int, collisions: int, together: bool = False) -> list[str]:
+    """A row of the card's table. Without intervals where episodes go ``together``: worlds or scenes had
+    episodes of the same numbers, and single ends were not kept."""
+    counts = successes, collisions
+    return [where, *(str(rate(k, n, None if together else wilson_interval(k, n))) for k in counts)]
 
 
-def _row_of_training(checkpoint: Checkpoint) -> list[str]:
+def _row_of_training(checkpoint: Checkpoint) -> list[list[str]]:
     """The evaluation by which training chose this checkpoint; empty where there was none at this step."""
     metrics, config = checkpoint.manifest.metrics, checkpoint.config
     success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
@@ -64,7 +55,7 @@ def _scene(n_static: int, n_moving: int, speed_m_s: float) -> str:
     return f"S = {n_static}, D = {n_moving}, v = {speed_m_s:g} m/s"
 
 
-def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[str]:
+def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[list[str]]:
     """This checkpoint's rows in the results of ``uuv eval`` below the run folder and in ``folders``.
 
     Raises ConfigError for one of ``folders`` that does not hold any.
@@ -84,7 +75,7 @@ def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[str]
     return found
 
 
-def _rows_of_result(file: Path, folder: Path, sha256: str) -> list[str]:
+def _rows_of_result(file: Path, folder: Path, sha256: str) -> list[list[str]]:
     """Rows of the agents that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is
     no result."""
     rows = []
@@ -116,16 +107,17 @@ def _word(name: Any) -> str:
     return "".join(c for c in Path(str(name)).stem if c.isalnum() or c in "-_ ") or "unnamed"
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 _CARD = """# {name}
 
 {what}
-Trained with uuvtai {version}.
+Trained with uuvtai {checkpoint.manifest.version}.
 
 ## What it was trained on
-{training}
+- {checkpoint.step} iterations{steps}, seed {config.train.seed}, {config.train.num_envs} vehicles at once.
+- Checkpoint {checkpoint.sha256} of {checkpoint.manifest.created}.
+- Tank of {extent} m, sonar with {sonar.n_ray} beams to {sonar.max_range_m:g} m, all numbers in the \
+checkpoint's config.
+- Static obstacles S, moving ones D, their speed v: {scenes}.
 
 ## How it did
 {results}
@@ -188,42 +180,30 @@ _NONE = (
     "No evaluation was at hand. Evaluate it with `uuv eval RUN` and export again with `--evaluation FOLDER`."
 )
 _COUNTED = """
+
 Rates are counts with 95 % Wilson intervals. Collision counts contacts, time-to-collision stops and leaving
 the tank."""
 
 
-def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[str]) -> str:
+def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[list[str]]) -> str:
     """The card as Markdown, with the rows of ``evaluations_of``."""
     kind, rule = spec["kind"], spec.get("hull_rule")
+    config, metrics = checkpoint.config, checkpoint.manifest.metrics
     rows = evaluations + _row_of_training(checkpoint)
-    table = "\n".join(["| where | success | collision |", "|---|---|---|", *rows, _COUNTED])
+    unit = "decisions" if "time/decisions" in metrics else "env-steps"
+    steps, tank = metrics.get(f"time/{unit.replace('-', '_')}"), config.world.tank
     return _CARD.format(
         name=spec["name"],
         what=_WHAT[kind],
-        version=checkpoint.manifest.version,
-        training=_training(checkpoint),
-        results=table if rows else _NONE,
+        checkpoint=checkpoint,
+        config=config,
+        steps=f", {steps / 1e6:.2f} million {unit}" if isinstance(steps, float) else "",
+        extent=" x ".join(f"{high - low:g}" for low, high in (tank.x_m, tank.y_m, tank.z_m)),
+        sonar=config.sensors.sonar,
+        scenes=_scenes(config),
+        results=text_table(("where", "success", "collision"), rows) + _COUNTED if rows else _NONE,
         how=_HOW[kind].format(**spec["rate"]),
         graph=_GRAPH[kind] if spec["graph"] else "",
         rule=_RULE.format(**rule, **rule["limits_m_s"], floor=rule["z_m"][0]) if rule else "",
-        stack=_STACK[kind].format(tree=", behavior tree" if checkpoint.config.observation.behavior else ""),
+        stack=_STACK[kind].format(tree=", behavior tree" if config.observation.behavior else ""),
     )
-
-
-def _training(checkpoint: Checkpoint) -> str:
-    """How long, on what, and which checkpoint, as a list."""
-    config, metrics = checkpoint.config, checkpoint.manifest.metrics
-    unit = "decisions" if "time/decisions" in metrics else "env-steps"
-    steps = metrics.get(f"time/{unit.replace('-', '_')}")
-    trained = f", {steps / 1e6:.2f} million {unit}" if isinstance(steps, float) else ""
-    tank, sonar = config.world.tank, config.sensors.sonar
-    extent = " x ".join(f"{high - low:g}" for low, high in (tank.x_m, tank.y_m, tank.z_m))
-    train, made = config.train, checkpoint.manifest.created
-    lines = [
-        f"{checkpoint.step} iterations{trained}, seed {train.seed}, {train.num_envs} vehicles at once.",
-        f"Checkpoint {checkpoint.sha256} of {made}.",
-        f"Tank of {extent} m, sonar with {sonar.n_ray} beams to {sonar.max_range_m:g} m, all numbers in the "
-        "checkpoint's config.",
-        f"Static obstacles S, moving ones D, their speed v: {_scenes(config)}.",
-    ]
-    return "\n".join(f"- {line}" for line in lines)

@@ -23,16 +23,17 @@ from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.card import evaluations_of, model_card
 from uuvtai.learning.export.graph import GraphError, refuse_strange
 from uuvtai.learning.export.modules import (
+    ONNX,
     Arrays,
     ExportedModule,
     golden_of,
     missing_packages,
     module_of,
     onnx_bytes,
+    specification,
     weights_of,
 )
 from uuvtai.learning.export.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, PolicyError
-from uuvtai.learning.export.spec import ONNX, specification
 from uuvtai.logs.container import sync_folder
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
 

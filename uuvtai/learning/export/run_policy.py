@@ -76,20 +76,12 @@ class Exported(ABC):
     shapes: tuple[tuple[int | None, ...], ...]
     """of the inputs behind the rows; None = any size but 0"""
 
+    @abstractmethod
     def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
-        """``spec`` is policy_spec.json, ``arrays`` policy.safetensors. Raises PolicyError where they do not
-        fit together."""
+        """``spec`` is policy_spec.json, ``arrays`` policy.safetensors; ``made`` says where they do not fit
+        together."""
         self.work = sum(array.size for array in arrays.values())
         """multiplications of a row, of one obstacle"""
-        try:
-            self._read(spec, arrays)
-        except _MISFITS as error:
-            raise PolicyError(
-                f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again"
-            ) from None
-
-    @abstractmethod
-    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None: ...
 
     @abstractmethod
     def said(self, given: Arrays) -> Arrays:
@@ -128,7 +120,8 @@ class Policy(Exported):
 
     inputs = ("obs", "last_obs", "last_action", "has_last")
 
-    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None:
+    def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
+        super().__init__(spec, arrays)
         self._limits = np.array([row["limit"] for row in spec["action"]], np.float32)
         self.n_obs, self.hold_steps = int(spec["observation"]["width"]), int(spec["rate"]["hold_steps"])
         self.shapes = (self.n_obs,), (self.n_obs,), (N_ACTION,), ()
@@ -215,7 +208,8 @@ class SetPolicy(Exported):
 
     inputs = ("obstacles", "own")
 
-    def _read(self, spec: dict[str, Any], arrays: Arrays) -> None:
+    def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
+        super().__init__(spec, arrays)
         self.rule = spec["hull_rule"]
         n_obstacle, n_own = (len(spec["observation"][name]["columns"]) for name in self.inputs)
         self.shapes = (None, n_obstacle), (n_own,)
@@ -239,14 +233,10 @@ class SetPolicy(Exported):
         are there, so that neither their order nor their number matters. Raises ValueError as ``act``."""
         obstacles, own = self._rows(given)
         if not (np.isfinite(obstacles).all() and np.isfinite(own).all()):
-            raise ValueError(
-                "columns hold numbers that are not finite; leave out obstacles that are not known"
-            )
+            raise ValueError("columns are not finite; leave out obstacles that are not known")
         there = obstacles[..., AT_THERE]
         if not np.isin(there, (0.0, 1.0)).all():
-            raise ValueError(
-                "obstacles: the first column is 1 where there is an obstacle, else all columns are 0"
-            )
+            raise ValueError("the first column of obstacles is 1; where there is none all columns are 0")
         each = _relu(_through(self._each, obstacles, _relu)) * there[..., None]
         mine = _relu(_through(self._own, own, _relu))
         pooled = np.concatenate([each.max(-2), np.float32(SUM_SCALE) * each.sum(-2), mine], -1)
@@ -338,11 +328,16 @@ def load(folder: str | Path = ".") -> Any:
 
 
 def made(spec: dict[str, Any], arrays: Arrays) -> Exported:
-    """What a specification's ``kind`` stands for. Raises PolicyError."""
+    """What a specification's ``kind`` stands for. Raises PolicyError, also where the arrays do not fit."""
     kind = spec.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
         raise PolicyError(f"{SPEC}: holds {kind!r}, not one of {', '.join(KINDS)}")
-    return KINDS[kind](spec, arrays)
+    try:
+        return KINDS[kind](spec, arrays)
+    except _MISFITS as error:
+        raise PolicyError(
+            f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again"
+        ) from None
 
 
 def read_spec(folder: Path) -> dict[str, Any]:
