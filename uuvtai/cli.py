@@ -217,8 +217,8 @@ def export_policy(
         written = export_log(Path(run), out, machines.split(","))
         return output.show(written, lambda _: show_stack(written))
     found = export.check(check, say) if check else export_run(run or "", out, evaluation or [], say, force)
-    output.show(found.document(), lambda screen: show_export(screen, found))
-    if not found.agrees:
+    output.show(found, lambda screen: show_export(screen, found))
+    if not found["agrees"]:
         raise typer.Exit(GATE)
 
 

@@ -497,7 +497,7 @@ def test_only_an_exported_policy_is_replaced(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(deployed.deploy, "missing_packages", lambda: ["onnx"])
     found = deployed.saved(tmp_path / "run")
     (folder / "policy_spec.json").write_text("{}")
-    assert deployed.deploy.export(found, "mine", folder, (), lambda _text: None, force=True).agrees
+    assert deployed.deploy.export(found, "mine", folder, (), lambda _text: None, force=True)["agrees"]
     assert json.loads((folder / "policy_spec.json").read_text())["name"] == "mine"
     (folder / "thesis.txt").write_text("precious")
     with pytest.raises(UserError, match="is not just an exported policy"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import json
+import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -514,17 +515,17 @@ def show_watched(screen: Screen, watched: list[dict[str, Any]]) -> None:
 # What was exported, in the terminal: do a policy's engines agree, and how long does each take.
 
 
-def _largest(agreement: Any) -> str:
-    worst = max(agreement.difference, key=lambda name: agreement.difference[name])
-    return f"{agreement.difference[worst]:.1e} ({worst})"
+def _largest(engine: dict[str, Any]) -> str:
+    value, name = max((math.inf if n is None else n, name) for name, n in engine["difference"].items())
+    return f"{value:.1e} ({name})"
 
 
 _ENGINES = (
-    Column("engine", left=True, of=lambda one: one.engine),
-    Column("", left=True, of=lambda one: "agrees" if one.agrees else "DIFFERS"),
+    Column("engine", left=True, of=lambda one: one["engine"]),
+    Column("", left=True, of=lambda one: "agrees" if one["agrees"] else "DIFFERS"),
     Column("largest difference", 1, of=_largest),
-    Column("p50 ms", 2, of=lambda one: f"{one.p50_ms:.3f}"),
-    Column("p99 ms", 3, of=lambda one: f"{one.p99_ms:.3f}"),
+    Column("p50 ms", 2, of=lambda one: f"{one['p50_ms']:.3f}"),
+    Column("p99 ms", 3, of=lambda one: f"{one['p99_ms']:.3f}"),
 )
 
 
@@ -536,12 +537,12 @@ def show_stack(document: dict[str, Any]) -> None:
     say(f"there: python3 -m uuv_stack decides {document['checked_steps']} steps of the log anew")
 
 
-def show_export(screen: Screen, found: Any) -> None:
+def show_export(screen: Screen, found: dict[str, Any]) -> None:
     """One row per engine of a ``learning.export`` result, where any could run, and what is damaged."""
-    for damage in found.damages:
+    for damage in found["damages"]:
         say(damage)
-    if found.agreements:
-        screen.table(Table(_ENGINES, found.agreements, str(found.folder)))
+    if found["engines"]:
+        screen.table(Table(_ENGINES, found["engines"], found["folder"]))
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
 from uuvtai.learning.agents import find_policy
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.export.folder import Export, export
+from uuvtai.learning.export.folder import export
 from uuvtai.plugins.api import is_plugin, plugin_spec
 from uuvtai.sim.behavior_tree import FlatTree, read_tree
 
@@ -220,7 +220,7 @@ def _label(name: str) -> str:
 
 def export_run(
     run: str, out: Path | None, evaluations: list[Path], note: Callable[[str], None], force: bool
-) -> Export:
+) -> dict[str, Any]:
     """Export to ``out`` or runs/NAME_export. Raises as ``find_policy`` and ``export``."""
     checkpoint = find_policy(run, note)
     name = policy_name(run, checkpoint)

@@ -4,7 +4,6 @@ what it is not for."""
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,84 +14,58 @@ from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.report.tables import sensing
-
-# ------------------------------------------------------------------------------------------------------------
-# How often a policy arrived and collided, from the evaluations that are at hand: the counts behind every
-# rate of the model card.
-
+from uuvtai.report.tables import rate, sensing, text_table
 
 RESULT = Path("eval/result.json")
 """what ``uuv eval`` leaves in its run folder"""
 _MAX_BYTES = 256 << 20
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """One row of the card's table."""
-
-    where: str
-    """world, obstacles, sensing, seeds"""
-    episodes: int
-    successes: int
-    collisions: int
-    """contacts, TTC stops and leaving the tank"""
-    repeated: bool = False
-    """worlds or scenes had episodes of the same numbers, which go together; single ends were not kept"""
-
-    def rates(self) -> tuple[str, str]:
-        """Success and collision as k/n with their 95 % Wilson intervals; without where episodes are
-        ``repeated``."""
-        n, bare = self.episodes, self.repeated
-        return _rate(self.successes, n, bare), _rate(self.collisions, n, bare)
+def _row(where: str, n: int, successes: int, collisions: int, together: bool = False) -> list[str]:
+    """A row of the card's table. Without intervals where episodes go ``together``: worlds or scenes had
+    episodes of the same numbers, and single ends were not kept."""
+    counts = successes, collisions
+    return [where, *(str(rate(k, n, None if together else wilson_interval(k, n))) for k in counts)]
 
 
-def during_training(checkpoint: Checkpoint) -> Evaluation | None:
-    """The evaluation by which training chose this checkpoint; None where there was none at this step."""
+def _row_of_training(checkpoint: Checkpoint) -> list[list[str]]:
+    """The evaluation by which training chose this checkpoint; empty where there was none at this step."""
     metrics, config = checkpoint.manifest.metrics, checkpoint.config
     success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
     if not isinstance(success, float | int) or not isinstance(collision, float | int):
-        return None
-    is_twin = config.surrogate.enabled
-    where, n = _held_out_in_worlds(config) if is_twin else _held_out(config)
-    where += f", seed {config.train.evaluate_seed}"
-    repeated = is_twin and len(config.surrogate.worlds) * max(1, len(config.train.scenes)) > 1
-    return Evaluation(where, n, round(success * n), round(collision * n), repeated)
+        return []
+    n, groups = config.train.evaluate_episodes, 1
+    if config.surrogate.enabled:  # as many of every world and scene
+        groups = len(config.surrogate.worlds) * max(1, len(config.train.scenes))
+        n = groups * -(-n // groups)
+        worlds = " and ".join(", ".join(map(_word, config.surrogate.worlds)).rsplit(", ", 1))
+        where = f"the kinematic surrogate, {worlds}, {_scenes(config)}"
+    else:
+        where = f"the training's own world and sensing, {_scene(*config.world.own_scene)}"
+    where += f", seed {config.train.evaluate_seed} (chose the checkpoint: too good by selection)"
+    return [_row(where, n, round(success * n), round(collision * n), groups > 1)]
 
 
-def _held_out(config: LearningConfig) -> tuple[str, int]:
-    """(conditions, number of episodes) of a training in its own world."""
-    world = config.world
-    return (
-        f"the training's own world and sensing, S = {world.n_static}, D = {world.n_dynamic}, v = "
-        f"{world.dynamic_speed_m_s:g} m/s"
-    ), config.train.evaluate_episodes
-
-
-def _held_out_in_worlds(config: LearningConfig) -> tuple[str, int]:
-    """As ``_held_out``, of a policy over a set of obstacles: as many of every world and scene."""
-    worlds = config.surrogate.worlds
-    groups = len(worlds) * max(1, len(config.train.scenes))
-    each = -(-config.train.evaluate_episodes // groups)
-    told = " and ".join(", ".join(map(_word, worlds)).rsplit(", ", 1))
-    return f"the kinematic surrogate, {told}, {scenes_of(config)}", groups * each
-
-
-def scenes_of(config: LearningConfig) -> str:
+def _scenes(config: LearningConfig) -> str:
     """Numbers and speeds of the obstacles that were learnt among."""
-    scenes = config.train.scenes or (config.world.own_scene,)
-    return "; ".join(f"S = {s}, D = {d}, v = {v:g} m/s" for s, d, v in scenes)
+    return "; ".join(_scene(*each) for each in config.train.scenes or (config.world.own_scene,))
 
 
-def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[Evaluation]:
+def _scene(n_static: int, n_moving: int, speed_m_s: float) -> str:
+    return f"S = {n_static}, D = {n_moving}, v = {speed_m_s:g} m/s"
+
+
+def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[list[str]]:
     """This checkpoint's rows in the results of ``uuv eval`` below the run folder and in ``folders``.
 
     Raises ConfigError for one of ``folders`` that does not hold any.
     """
-    run = checkpoint.path.parent.parent
-    found = [row for file in _own_results(checkpoint) for row in _rows(file, run, checkpoint.sha256)]
+    run, found = checkpoint.path.parent.parent, []
+    if checkpoint.path.parent.name == "checkpoints":
+        for file in sorted((run / RESULT, *run.glob(f"*/{RESULT}"))):
+            found += _rows_of_result(file, run, checkpoint.sha256) if file.is_file() else []
     for folder in folders:
-        rows = _rows(folder / RESULT, folder, checkpoint.sha256)
+        rows = _rows_of_result(folder / RESULT, folder, checkpoint.sha256)
         if not rows:
             raise ConfigError(
                 f"--evaluation {folder}: does not evaluate this checkpoint; give the run folder that 'uuv "
@@ -102,37 +75,31 @@ def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[Eval
     return found
 
 
-def _own_results(checkpoint: Checkpoint) -> list[Path]:
-    run = checkpoint.path.parent.parent
-    if checkpoint.path.parent.name != "checkpoints":
-        return []
-    return sorted(file for file in (run / RESULT, *run.glob(f"*/{RESULT}")) if file.is_file())
-
-
-def _rows(file: Path, folder: Path, sha256: str) -> list[Evaluation]:
+def _rows_of_result(file: Path, folder: Path, sha256: str) -> list[list[str]]:
     """Rows of the agents that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is
     no result."""
+    rows = []
     try:
         result = read_json(file, _MAX_BYTES, folder)
-        return [_row(result, m) for m in result["agents"] if m.get("checkpoint", {}).get("sha256") == sha256]
+        for agent in result["agents"]:
+            if agent.get("checkpoint", {}).get("sha256") != sha256:
+                continue
+            speed = f", v = {float(result['v_m_s']):g} m/s" if result["D"] else ""
+            seeds = ", ".join(str(int(seed)) for seed in result["seeds"])
+            where = (
+                f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, "
+                f"{sensing({**result, 'sensors': _word(result['sensors'])})}, seed {seeds}"
+            )
+            k, n = int(agent["outcomes"]["success"]), int(agent["episodes"])
+            collisions = sum(int(agent["outcomes"][name]) for name in COLLIDED)
+            if min(k, collisions) < 0 or k + collisions > n:
+                raise ValueError(f"{k} successes and {collisions} collisions of {n} episodes")
+            rows.append(_row(where, n, k, collisions))
     except (UserError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(
             f"{file}: is no result of uuv eval ({error!r}); give the run folder that 'uuv eval RUN' printed"
         ) from None
-
-
-def _row(result: dict[str, Any], agent: dict[str, Any]) -> Evaluation:
-    speed = f", v = {float(result['v_m_s']):g} m/s" if result["D"] else ""
-    seeds = ", ".join(str(int(seed)) for seed in result["seeds"])
-    where = (
-        f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, "
-        f"{sensing({**result, 'sensors': _word(result['sensors'])})}, seed {seeds}"
-    )
-    k, n = int(agent["outcomes"]["success"]), int(agent["episodes"])
-    collisions = sum(int(agent["outcomes"][name]) for name in COLLIDED)
-    if min(k, collisions) < 0 or k + collisions > n:
-        raise ValueError(f"{k} successes and {collisions} collisions of {n} episodes")
-    return Evaluation(where, n, k, collisions)
+    return rows
 
 
 def _word(name: Any) -> str:
@@ -140,24 +107,17 @@ def _word(name: Any) -> str:
     return "".join(c for c in Path(str(name)).stem if c.isalnum() or c in "-_ ") or "unnamed"
 
 
-def _rate(k: int, n: int, bare: bool) -> str:
-    bounds = wilson_interval(k, n)
-    if bounds is None:
-        return "-"
-    share = f"{k}/{n} = {100 * k / n:.1f} %"
-    return share if bare else f"{share} [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"
-
-
-# ------------------------------------------------------------------------------------------------------------
-
-
 _CARD = """# {name}
 
 {what}
-Trained with uuvtai {version}.
+Trained with uuvtai {checkpoint.manifest.version}.
 
 ## What it was trained on
-{training}
+- {checkpoint.step} iterations{steps}, seed {config.train.seed}, {config.train.num_envs} vehicles at once.
+- Checkpoint {checkpoint.sha256} of {checkpoint.manifest.created}.
+- Tank of {extent} m, sonar with {sonar.n_ray} beams to {sonar.max_range_m:g} m, all numbers in the \
+checkpoint's config.
+- Static obstacles S, moving ones D, their speed v: {scenes}.
 
 ## How it did
 {results}
@@ -216,66 +176,34 @@ numbers are `hull_rule` of `policy_spec.json`, and `command` in `run_policy.py` 
    {max_yaw_rate_rad_s:g} rad/s, within +-1. Slower than {least_speed_m_s:g} m/s the heading stays.
 
 """
-_NONE = "No evaluation was at hand."
+_NONE = (
+    "No evaluation was at hand. Evaluate it with `uuv eval RUN` and export again with `--evaluation FOLDER`."
+)
 _COUNTED = """
+
 Rates are counts with 95 % Wilson intervals. Collision counts contacts, time-to-collision stops and leaving
 the tank."""
 
 
-def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
-    """The card as Markdown."""
+def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[list[str]]) -> str:
+    """The card as Markdown, with the rows of ``evaluations_of``."""
     kind, rule = spec["kind"], spec.get("hull_rule")
+    config, metrics = checkpoint.config, checkpoint.manifest.metrics
+    rows = evaluations + _row_of_training(checkpoint)
+    unit = "decisions" if "time/decisions" in metrics else "env-steps"
+    steps, tank = metrics.get(f"time/{unit.replace('-', '_')}"), config.world.tank
     return _CARD.format(
         name=spec["name"],
         what=_WHAT[kind],
-        version=checkpoint.manifest.version,
-        training=training_text(checkpoint),
-        results=results_text(checkpoint, evaluations),
+        checkpoint=checkpoint,
+        config=config,
+        steps=f", {steps / 1e6:.2f} million {unit}" if isinstance(steps, float) else "",
+        extent=" x ".join(f"{high - low:g}" for low, high in (tank.x_m, tank.y_m, tank.z_m)),
+        sonar=config.sensors.sonar,
+        scenes=_scenes(config),
+        results=text_table(("where", "success", "collision"), rows) + _COUNTED if rows else _NONE,
         how=_HOW[kind].format(**spec["rate"]),
         graph=_GRAPH[kind] if spec["graph"] else "",
         rule=_RULE.format(**rule, **rule["limits_m_s"], floor=rule["z_m"][0]) if rule else "",
-        stack=_STACK[kind].format(tree=", behavior tree" if checkpoint.config.observation.behavior else ""),
+        stack=_STACK[kind].format(tree=", behavior tree" if config.observation.behavior else ""),
     )
-
-
-def training_text(checkpoint: Checkpoint) -> str:
-    """How long, on what, and which checkpoint, as a list."""
-    config, metrics = checkpoint.config, checkpoint.manifest.metrics
-    unit = "decisions" if "time/decisions" in metrics else "env-steps"
-    steps = metrics.get(f"time/{unit.replace('-', '_')}")
-    trained = f"{checkpoint.step} iterations" + (
-        f", {steps / 1e6:.2f} million {unit}" if isinstance(steps, float) else ""
-    )
-    lines = [
-        f"{trained}, seed {config.train.seed}, {config.train.num_envs} vehicles at once.",
-        f"Checkpoint {checkpoint.sha256} of {checkpoint.manifest.created}.",
-        _tank(config),
-        _obstacles(config),
-    ]
-    return "\n".join(f"- {line}" for line in lines)
-
-
-def _tank(config: LearningConfig) -> str:
-    tank, sonar = config.world.tank, config.sensors.sonar
-    extent = " x ".join(f"{high - low:g}" for low, high in (tank.x_m, tank.y_m, tank.z_m))
-    return (
-        f"Tank of {extent} m, sonar with {sonar.n_ray} beams to {sonar.max_range_m:g} m, all numbers in "
-        "the checkpoint's config."
-    )
-
-
-def _obstacles(config: LearningConfig) -> str:
-    return f"Static obstacles S, moving ones D, their speed v: {scenes_of(config)}."
-
-
-def results_text(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
-    """Counts of all evaluations as a table, and what they count."""
-    own = during_training(checkpoint)
-    rows = [(row, "") for row in evaluations] + (
-        [(own, " (chose the checkpoint: too good by selection)")] if own else []
-    )
-    if not rows:
-        return f"{_NONE} Evaluate it with `uuv eval RUN` and export again with `--evaluation FOLDER`."
-    lines = ["| where | success | collision |", "|---|---|---|"]
-    lines += ["| " + " | ".join((row.where + remark, *row.rates())) + " |" for row, remark in rows]
-    return "\n".join([*lines, _COUNTED])

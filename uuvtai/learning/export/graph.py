@@ -16,21 +16,27 @@ from uuvtai.common.errors import UserError
 # What an ONNX graph of a stranger may hold before ONNX Runtime sees it: our operators, and memory and work
 # that are reckoned first.
 
-
-_OURS = """
-Add And Cast Clip Concat ConstantOfShape Div Elu Exp Floor GatherND Gemm Greater IsInf IsNaN Less Min Mul Not
-LogSoftmax Pow Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin Relu Shape Slice Softplus Split Sqrt Squeeze
-Sub Tanh Unsqueeze Where
+_NAMES = """
+Abs Add And Cast Celu Clip Concat Constant ConstantOfShape Div Elu Equal Erf Exp Expand Flatten Floor Gather
+GatherND Gelu Gemm Greater GreaterOrEqual HardSigmoid HardSwish Identity IsInf IsNaN LayerNormalization
+LeakyRelu Less LessOrEqual Log LogSoftmax MatMul Max Min Mish Mul Neg Not Or PRelu Pow Reciprocal ReduceL2
+ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape Selu Shape Sigmoid Sign
+Slice Softmax Softplus Softsign Split Sqrt Squeeze Sub Swish Tanh Transpose Unsqueeze Where
 """
-_LIKE_OURS = """
-Abs Celu Constant Equal Erf Expand Flatten Gather Gelu GreaterOrEqual HardSigmoid HardSwish Identity
-LayerNormalization LeakyRelu LessOrEqual Log MatMul Max Mish Neg Or PRelu ReduceProd ReduceSum ReduceSumSquare
-Reshape Selu Sigmoid Sign Softmax Softsign Swish Transpose
-"""
-OPERATORS = frozenset((_OURS + _LIKE_OURS).split())
+OPERATORS = frozenset(_NAMES.split())
 """What torch's exporter makes of a policy, and what other versions of it make of the same. No loops,
 branches, random numbers or functions. What ConstantOfShape (ours too: features before the first decision) and
 Expand make is bounded like all else, by its shape."""
+_INNER = {
+    "functions",
+    "training_info",
+    "g",
+    "graphs",
+    "sparse_initializer",
+    "sparse_tensor",
+    "sparse_tensors",
+}
+"""fields of a model, a graph or an attribute that no policy needs"""
 OPSETS = range(9, 27)
 _DTYPES = {1: np.float32, 10: np.float16, 11: np.float64}
 MAX_NODES = 5000
@@ -51,21 +57,11 @@ class GraphError(UserError, RuntimeError):
         self.reason = reason
 
 
-class GraphInput(NamedTuple):
-    """What is to be given."""
-
-    width: int | None
-    """of the last axis; None = any"""
-    rows: int | None
-    """of the first axis; None = any"""
-    dtype: Any
-    """NumPy's; None = no float"""
-
-
 class GraphHead(NamedTuple):
     """What a graph says of itself; nothing of it is believed but names."""
 
-    inputs: dict[str, GraphInput]
+    inputs: dict[str, tuple[int | None, int | None, Any]]
+    """size of the last axis, size of the first one (None = any), NumPy's dtype (None = no float)"""
     outputs: list[str]
     metadata: dict[str, str]
 
@@ -79,8 +75,8 @@ def head_of(graph: bytes) -> GraphHead:
         if value.name not in weights:
             told = value.type.tensor_type
             sizes = [size.dim_value if size.HasField("dim_value") else None for size in told.shape.dim]
-            rows = sizes[0] if len(sizes) > 1 else None
-            inputs[value.name] = GraphInput(sizes[-1] if sizes else None, rows, _DTYPES.get(told.elem_type))
+            ends = sizes[-1] if sizes else None, sizes[0] if len(sizes) > 1 else None
+            inputs[value.name] = (*ends, _DTYPES.get(told.elem_type))
     outputs = [value.name for value in model.graph.output]
     if not outputs:
         raise GraphError("gives nothing")
@@ -90,6 +86,8 @@ def head_of(graph: bytes) -> GraphHead:
 def with_weights(graph: bytes, read: Callable[[str], bytes]) -> bytes:
     """A graph whose weights lie in files beside it, whole: ``read`` gives the content of such a file by its
     plain name. GraphError where a name leads elsewhere, or a weight is not in its file."""
+    import onnx
+
     model, files = _parsed(graph), {}
     for tensor in _tensors(model.graph):
         if not (tensor.external_data or tensor.data_location):
@@ -100,8 +98,12 @@ def with_weights(graph: bytes, read: Callable[[str], bytes]) -> bytes:
             raise GraphError(f"has weights in {name[:100]!r}; they may lie beside it, in no other folder")
         if name not in files:
             files[name] = read(name)
-        offset, n_bytes = _number(told.get("offset", "0")), math.prod(tensor.dims) * _item_bytes(tensor)
-        content = files[name][offset : offset + n_bytes]
+        try:
+            item_bytes = onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
+            offset, n_bytes = int(told.get("offset", "0")), math.prod(tensor.dims) * item_bytes
+        except (KeyError, TypeError, ValueError):
+            raise GraphError(f"has weights {tensor.name[:100]} of no known kind or place") from None
+        content = files[name][offset : offset + n_bytes] if offset >= 0 else b""
         if len(content) != n_bytes or told.get("length", str(n_bytes)) != str(n_bytes):
             raise GraphError(f"has weights {tensor.name[:100]} that are not whole in {name[:100]}")
         if sum(map(len, files.values())) > MAX_BYTES:
@@ -115,33 +117,16 @@ def with_weights(graph: bytes, read: Callable[[str], bytes]) -> bytes:
 def only(graph: bytes, output: str) -> bytes:
     """The part of a graph that gives this output: value and log-probability of an exported actor are nobody's
     business here."""
-    model = _parsed(graph)
-    needed, nodes = {output}, []
-    for node in reversed(model.graph.node):  # they stand in the order of their use
-        if needed & {*node.output}:
-            needed |= {*node.input}
-            nodes.append(node)
-    kept = {"node": nodes[::-1]}
-    for part in ("initializer", "input", "output"):
-        kept[part] = [value for value in getattr(model.graph, part) if value.name in needed]
-    for part, values in kept.items():
-        copies = [type(value).FromString(value.SerializeToString()) for value in values]
-        model.graph.ClearField(part)
-        getattr(model.graph, part).extend(copies)
+    model, needed = _parsed(graph), {output}
+    for part in ("node", "output", "initializer", "input"):
+        values = getattr(model.graph, part)
+        for at in reversed(range(len(values))):  # operators stand in the order of their use
+            value = values[at]
+            if needed.isdisjoint(value.output if part == "node" else [value.name]):
+                del values[at]
+            elif part == "node":
+                needed |= {*value.input}
     return model.SerializeToString()
-
-
-def _number(text: str) -> int:
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 12 else 1 << 40
-
-
-def _item_bytes(tensor: Any) -> int:
-    import onnx
-
-    try:
-        return onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
-    except (KeyError, TypeError, ValueError):
-        raise GraphError(f"has weights {tensor.name[:100]} of no known kind") from None
 
 
 def refuse_strange(
@@ -155,11 +140,12 @@ def refuse_strange(
     """
     model = _parsed(graph)
     _refuse_parts(model)
-    _refuse_interface(model, set(inputs))
-    work = 0
-    for rows, calls in ((None, 1), (rows_of_one, single_calls)):
-        shapes = _shapes(model, {name: (rows or shape[0], *shape[1:]) for name, shape in inputs.items()})
-        work += calls * _work(model, shapes)
+    found = {value.name for value in model.graph.input} - {tensor.name for tensor in model.graph.initializer}
+    if found != set(inputs):
+        told = ", ".join(sorted(found)) or "nothing"
+        raise GraphError(f"takes {told} instead of {', '.join(sorted(inputs))}")
+    single = {name: (rows_of_one, *shape[1:]) for name, shape in inputs.items()}
+    work = _work(model, inputs) + single_calls * _work(model, single)
     if work > MAX_WORK:
         raise GraphError(f"takes {work:.1e} multiplications")
 
@@ -178,42 +164,23 @@ def _parsed(graph: bytes) -> Any:
 def _refuse_parts(model: Any) -> None:
     """Operators, domains, functions, graphs within graphs, other files."""
     graph = model.graph
-    strange = {
-        f"{node.domain or 'onnx'}.{node.op_type}"
-        for node in graph.node
-        if node.domain or node.op_type not in OPERATORS
-    }
-    strange |= {
-        f"a graph in {node.op_type}"
-        for node in graph.node
-        for a in node.attribute
-        if a.HasField("g") or a.graphs
-    }
+    attributes = [attribute for node in graph.node for attribute in node.attribute]
+    fields = {field.name for part in (model, graph, *attributes) for field, _ in part.ListFields()}
+    strange = {name.replace("_", " ") for name in fields & _INNER}
+    for node in graph.node:
+        if node.domain or node.op_type not in OPERATORS:
+            strange.add(f"{node.domain or 'onnx'}.{node.op_type}")
+    for opset in model.opset_import:
+        if opset.domain or opset.version not in OPSETS:
+            strange.add(f"opset {opset.domain or 'onnx'} {opset.version}")
     strange |= {tensor.name for tensor in _tensors(graph) if tensor.external_data or tensor.data_location}
-    strange |= {function.name for function in model.functions}
-    strange |= {"training" for _ in model.training_info}
-    strange |= {"sparse weights" for _ in graph.sparse_initializer}
-    strange |= {
-        "sparse weights"
-        for node in graph.node
-        for a in node.attribute
-        if a.HasField("sparse_tensor") or a.sparse_tensors
-    }
-    strange |= {
-        f"opset {o.domain or 'onnx'} {o.version}"
-        for o in model.opset_import
-        if o.domain or o.version not in OPSETS
-    }
     if strange:
         raise GraphError(f"is no policy's, it has {', '.join(sorted(strange)[:5])}")
     if len(graph.node) > MAX_NODES or len(graph.initializer) > MAX_NODES:
         raise GraphError(f"has more than {MAX_NODES:,} operators or weights")
     for tensor in _tensors(graph):
-        if (
-            len(tensor.dims) > _RANK
-            or not all(size >= 0 for size in tensor.dims)
-            or math.prod(tensor.dims) > MAX_BYTES
-        ):
+        is_small = len(tensor.dims) <= _RANK and math.prod(tensor.dims) <= MAX_BYTES
+        if not is_small or min(tensor.dims, default=0) < 0:
             raise GraphError(f"has weights {tensor.name} of shape {list(tensor.dims)[:_RANK]}")
 
 
@@ -226,25 +193,13 @@ def _tensors(graph: Any) -> Iterator[Any]:
             yield from attribute.tensors
 
 
-def _refuse_interface(model: Any, wanted: set[str]) -> None:
-    """Inputs are those that will be given; nothing else is asked for."""
-    weights = {tensor.name for tensor in model.graph.initializer}
-    found = {value.name for value in model.graph.input} - weights
-    if found != wanted:
-        raise GraphError(
-            f"takes {', '.join(sorted(found)) or 'nothing'} instead of {', '.join(sorted(wanted))}"
-        )
-
-
-def _shapes(model: Any, inputs: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """Shape of every value for these inputs, reckoned without what the file itself says about them;
-    GraphError where one is unknown."""
-    import onnx
+def _work(model: Any, inputs: dict[str, tuple[int, ...]]) -> int:
+    """Multiplications of the matrix products, and values of everything, of a call with inputs of these
+    shapes. They are reckoned without what the file itself says about them, which is taken out of ``model``.
+    GraphError where a shape is unknown, or where all values together take too much memory."""
     from onnx import shape_inference
 
-    bare = onnx.ModelProto()
-    bare.CopyFrom(model)
-    graph = bare.graph
+    graph = model.graph
     del graph.value_info[:]
     for value in graph.output:
         value.type.tensor_type.ClearField("shape")
@@ -255,34 +210,29 @@ def _shapes(model: Any, inputs: dict[str, tuple[int, ...]]) -> dict[str, tuple[i
             for size in inputs[value.name]:
                 shape.dim.add().dim_value = size
     try:
-        inferred = shape_inference.infer_shapes(bare, check_type=True, strict_mode=True, data_prop=True).graph
+        inferred = shape_inference.infer_shapes(
+            model, check_type=True, strict_mode=True, data_prop=True
+        ).graph
     except Exception as error:  # onnx's own, or protobuf's
         raise GraphError(f"does not fit together ({str(error).strip().splitlines()[-1][:200]})") from None
-    found = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer} | dict(inputs)
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer} | inputs
     for value in (*inferred.value_info, *inferred.output):
-        shape = value.type.tensor_type.shape
-        if value.type.tensor_type.HasField("shape") and all(size.HasField("dim_value") for size in shape.dim):
-            found[value.name] = tuple(size.dim_value for size in shape.dim)
-    values = [name for node in graph.node for name in node.output if name]
-    for name in values:
-        if name not in found or min(found[name], default=0) < 0:
-            raise GraphError(f"has a value whose shape cannot be told: {name[:100]}")
-    if 8 * sum(math.prod(found[name]) for name in values) > MAX_VALUES:
-        raise GraphError(f"would take more than {MAX_VALUES >> 20} MiB to run")
-    return found
-
-
-def _work(model: Any, shapes: dict[str, tuple[int, ...]]) -> int:
-    """Multiplications of the matrix products and values of everything."""
-    total = 0
-    for node in model.graph.node:
+        told = value.type.tensor_type
+        if told.HasField("shape") and all(size.HasField("dim_value") for size in told.shape.dim):
+            shapes[value.name] = tuple(size.dim_value for size in told.shape.dim)
+    n_values, n_taken = 0, 0
+    for node in graph.node:
+        for name in filter(None, node.output):
+            if min(shapes.get(name, (-1,)), default=0) < 0:
+                raise GraphError(f"has a value whose shape cannot be told: {name[:100]}")
         size = sum(math.prod(shapes[name]) for name in node.output if name)
-        taken = sum(math.prod(shapes.get(name, ())) for name in node.input if name)
-        total += size + taken
+        n_values += size
+        n_taken += sum(math.prod(shapes.get(name, ())) for name in node.input if name)
         if node.op_type in ("Gemm", "MatMul"):
-            first = shapes.get(node.input[0], ())
-            total += size * max(first, default=1)
-    return total
+            n_taken += size * max(shapes.get(node.input[0], ()), default=1)
+    if 8 * n_values > MAX_VALUES:
+        raise GraphError(f"would take more than {MAX_VALUES >> 20} MiB to run")
+    return n_values + n_taken
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,5 @@
-"""What drives as torch modules without memory, as an ONNX graph, as plain arrays, and its golden pairs."""
+"""What is exported of a checkpoint: networks without memory as torch modules, their weights as plain arrays,
+golden pairs, and policy_spec.json, which says what every column is."""
 
 from __future__ import annotations
 
@@ -9,32 +10,50 @@ import logging
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, OBSTACLE_WIDTH
+from uuvtai.common.enums import EGO_COLUMNS, LEAST_SPEED_M_S, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH, TURN_GAIN
+from uuvtai.common.version import __version__
+from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.export.graph import without_telemetry
-from uuvtai.learning.networks import NUM_ACTIONS, RunningNorm
+from uuvtai.learning.export.run_policy import GOLDEN, SCHEMA, TOLERANCE, WEIGHTS
+from uuvtai.learning.networks import NUM_ACTIONS
 from uuvtai.learning.policy_agent import OneDecision, load_agent
 from uuvtai.learning.set_networks import SetActor, actor_of
 from uuvtai.learning.world_model import N_FEATURES, N_TARGET
 
+ONNX = "policy.onnx"
+OPSET = 20
 PACKAGES = ("onnx", "onnxscript")
 """what torch's exporter needs"""
-OPSET = 20
-TOLERANCE = 1e-5
-"""largest difference between torch, NumPy and ONNX Runtime, in parts of the output's largest value where that
-is beyond 1"""
 NO_LIMIT = float(torch.finfo(torch.float32).max)
 """of a normaliser that has seen nothing and therefore cuts nothing off"""
 _ROWS, _SEED = 64, 6
 
 Arrays = dict[str, np.ndarray]
-Named = Iterator[tuple[str, Tensor]]
+
+_OBSERVATION = (
+    "float32, raw SI units, in this order; the scaling is inside the policy. A value that is not finite "
+    "counts as the mean of training. Frames: body is the vehicle's (x ahead, y left, z up); level is the "
+    "same without roll and pitch; route follows the planned path; world has z up and 0 at the surface."
+)
+_ACTION = (
+    "parts of the limits within [-1, 1]; velocities in the body frame, wanted of the inner velocity loop"
+)
+_HOLD = (
+    "The networks decide at the first control step of a mission and then at every hold_steps-th one. In "
+    "between the action is held. It is carried out cut off to [-1, 1]. last_obs and last_action are those of "
+    "the last decision."
+)
+_WISH = (
+    "ahead, left, up in the mirrored world: the first two in parts of fastest_m_s, shortened to length 1 "
+    "where they are longer, the third in parts of the heave limit; held until the next decision"
+)
 
 
 class ExportedModule(nn.Module, ABC):
@@ -51,13 +70,18 @@ class ExportedModule(nn.Module, ABC):
         """Made-up inputs, spread as training had them."""
 
     @abstractmethod
-    def named(self) -> Named:
+    def weights(self) -> dict[str, Tensor]:
         """Arrays of ``policy.safetensors`` by the names that ``run_policy.py`` knows."""
 
-    def sizes(self) -> dict[str, dict[int, torch.export.Dim]]:
-        """Axes of the inputs that may have any size."""
-        rows = torch.export.Dim("rows", min=1)
-        return {name: {0: rows} for name in self.inputs}
+    @abstractmethod
+    def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
+        """Entries of policy_spec.json that only this kind has."""
+
+    @torch.inference_mode()
+    def said(self, rows: Arrays) -> Arrays:
+        """Outputs by name for rows of the inputs, in their order."""
+        found = self(*(torch.from_numpy(part) for part in rows.values()))
+        return {name: part.numpy() for name, part in zip(self.outputs, found, strict=True)}
 
 
 class OneAction(OneDecision, ExportedModule):
@@ -84,33 +108,51 @@ class OneAction(OneDecision, ExportedModule):
         mean, std = norm.mean[:n_obs].float(), norm.std()[:n_obs].float()
         last, obs = (mean + std * torch.randn(count, n_obs, generator=rng) for _ in range(2))
         if self.world_model is not None:  # a step later little has changed
-            obs[:, :N_TARGET] = last[:, :N_TARGET] + 0.1 * std[:N_TARGET] * torch.randn(
-                count, N_TARGET, generator=rng
-            )
+            step = 0.1 * std[:N_TARGET] * torch.randn(count, N_TARGET, generator=rng)
+            obs[:, :N_TARGET] = last[:, :N_TARGET] + step
         for row, column, bad in ((0, 0, math.nan), (1, -1, math.inf), (1, n_obs // 2, -math.inf)):
             obs[row, column], last[-1 - row, column] = bad, bad
         action = torch.randn(count, NUM_ACTIONS, generator=rng)
         return obs, last, action, torch.arange(count) > 0
 
-    def named(self) -> Named:
+    def weights(self) -> dict[str, Tensor]:
         """Networks, and what they scale by."""
         policy, world = self.policy, self.world_model
+        norms = {"norm": policy.observation_norm}
         nets = {"actor": policy.actor, "critic": policy.critic}
-        yield from _norm("norm", policy.observation_norm)
-        yield "value.mean", policy.value_norm.mean
-        yield "value.std", policy.value_norm.std()
         if world is not None:
-            nets |= {name: getattr(world, name) for name in ("encoder", "dynamics", "decoder")}
-            yield from _norm("world_norm", world.observation_norm)
+            norms["world_norm"] = world.observation_norm
+            nets |= {"encoder": world.encoder, "dynamics": world.dynamics, "decoder": world.decoder}
+        found = {"value.mean": policy.value_norm.mean, "value.std": policy.value_norm.std()}
+        for name, norm in norms.items():
+            limit = torch.tensor([norm.clip if float(norm.count) > 0 else NO_LIMIT])
+            found |= {f"{name}.mean": norm.mean, f"{name}.scale": 1.0 / norm.std(), f"{name}.limit": limit}
         for name, net in nets.items():
-            for key, tensor in net.state_dict().items():
-                yield f"{name}.{key}", tensor
+            found |= {f"{name}.{key}": tensor for key, tensor in net.state_dict().items()}
+        return found
 
-
-def _norm(name: str, norm: RunningNorm) -> Named:
-    yield f"{name}.mean", norm.mean
-    yield f"{name}.scale", 1.0 / norm.std()
-    yield f"{name}.limit", torch.tensor([norm.clip if float(norm.count) > 0 else NO_LIMIT])
+    def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
+        """Every single column with its place, name, unit, frame and what it is scaled by."""
+        policy, norm = self.policy, self.policy.observation_norm
+        pairs = zip(norm.mean.tolist(), norm.std().tolist(), strict=True)
+        scales = [{"mean": mean, "std": std} for mean, std in pairs]
+        columns = []
+        for row in checkpoint.manifest.observation_table:
+            first, stop = row["first"], row["stop"]
+            for at in range(first, stop):
+                name = row["name"] if stop - first == 1 else f"{row['name']}[{at - first}]"
+                about = {"index": at, "name": name, "unit": row["unit"], "frame": row["frame"]}
+                columns.append(about | scales[at])
+        used = {"unit": "1", "used": self.world_model is not None}
+        features = zip(("residual", "uncertainty"), scales[-N_FEATURES:], strict=True)
+        return {
+            "observation": {"width": policy.n_in - N_FEATURES, "meaning": _OBSERVATION, "columns": columns},
+            "features": [{"name": name, **used, **scale} for name, scale in features],
+            "action": checkpoint.manifest.action,
+            "action_meaning": _ACTION,
+            "rate": _rate(checkpoint.config) | {"meaning": _HOLD},
+            "network": {"hidden": list(policy.config.hidden), "activation": policy.config.activation},
+        }
 
 
 class OneWish(ExportedModule):
@@ -146,15 +188,21 @@ class OneWish(ExportedModule):
         obstacles[..., 0] = there.float()
         return obstacles, own
 
-    def named(self) -> Named:
+    def weights(self) -> dict[str, Tensor]:
         """The actor's layers."""
-        return ((f"actor.{name}", tensor) for name, tensor in self.actor.net.state_dict().items())
+        return {f"actor.{name}": tensor for name, tensor in self.actor.net.state_dict().items()}
 
-    def sizes(self) -> dict[str, dict[int, torch.export.Dim]]:
-        """As in ``ExportedModule``, and of obstacles."""
-        sizes = super().sizes()
-        sizes["obstacles"][1] = torch.export.Dim("obstacles", min=1)
-        return sizes
+    def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
+        """Columns in words, and the rule that lays a wish on the hull."""
+        config = checkpoint.config
+        obstacles = {"most": N_OBSTACLE, "columns": OBSTACLE_COLUMNS}
+        return {
+            "observation": {"meaning": MEANING, "obstacles": obstacles, "own": {"columns": OWN_COLUMNS}},
+            "action": {"columns": ["ahead", "left", "up"], "meaning": _WISH},
+            "rate": _rate(config),
+            "hull_rule": hull_rule_of(config),
+            "network": {"goal_gain": config.surrogate.goal_gain},
+        }
 
 
 def module_of(checkpoint: Checkpoint) -> ExportedModule:
@@ -167,19 +215,15 @@ def module_of(checkpoint: Checkpoint) -> ExportedModule:
 
 def weights_of(module: ExportedModule) -> dict[str, Tensor]:
     """Arrays by name, float32, on the host, contiguous."""
-    return {name: tensor.detach().float().cpu().contiguous().clone() for name, tensor in module.named()}
+    found = module.weights().items()
+    return {name: tensor.detach().float().cpu().contiguous().clone() for name, tensor in found}
 
 
 def golden_of(module: ExportedModule) -> Arrays:
     """``pair_<input>`` and ``pair_<output>``, 64 rows of made-up inputs and what the module says to them."""
-    inputs = module.rows(_ROWS, torch.Generator().manual_seed(_SEED))
-    with torch.no_grad():
-        said = module(*inputs)
-    named = zip((*module.inputs, *module.outputs), (*inputs, *said), strict=True)
-    return {f"pair_{name}": tensor.numpy() for name, tensor in named}
-
-
-# ------------------------------------------------------------------------------------------------------- ONNX
+    made_up = module.rows(_ROWS, torch.Generator().manual_seed(_SEED))
+    inputs = {name: tensor.numpy() for name, tensor in zip(module.inputs, made_up, strict=True)}
+    return {f"pair_{name}": array for name, array in (inputs | module.said(inputs)).items()}
 
 
 def missing_packages() -> list[str]:
@@ -190,29 +234,139 @@ def missing_packages() -> list[str]:
 def onnx_bytes(module: ExportedModule) -> bytes:
     """The ONNX graph with its weights inside, any number of rows at once. Needs PACKAGES."""
     without_telemetry()
-    with _quiet():
-        program = torch.onnx.export(
-            module,
-            module.rows(2, torch.Generator().manual_seed(_SEED)),
-            input_names=list(module.inputs),
-            output_names=list(module.outputs),
-            dynamic_shapes=module.sizes(),
-            opset_version=OPSET,
-            dynamo=True,
-            verbose=False,
-        )
+    rows, obstacles = torch.export.Dim("rows", min=1), torch.export.Dim("obstacles", min=1)
+    sizes = {name: {0: rows, 1: obstacles} if name == "obstacles" else {0: rows} for name in module.inputs}
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # the exporter talks on every channel; what it cannot do it raises
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                module,
+                module.rows(2, torch.Generator().manual_seed(_SEED)),
+                input_names=list(module.inputs),
+                output_names=list(module.outputs),
+                dynamic_shapes=sizes,
+                opset_version=OPSET,
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        logging.disable(before)
     assert program is not None
     return program.model_proto.SerializeToString()
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """The exporter talks about itself on every channel there is; what it cannot do it raises."""
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        before = logging.root.manager.disable
-        logging.disable(logging.WARNING)
-        try:
-            yield
-        finally:
-            logging.disable(before)
+def specification(
+    checkpoint: Checkpoint, module: ExportedModule, name: str, has_onnx: bool
+) -> dict[str, Any]:
+    """policy_spec.json without ``files``, which ``export`` adds."""
+    graph = {"file": ONNX, "opset": OPSET, "inputs": module.inputs, "outputs": module.outputs}
+    made = checkpoint.manifest.created
+    return {
+        "schema": SCHEMA,
+        "kind": module.kind,
+        "name": name,
+        "uuvtai": __version__,
+        "checkpoint": {"sha256": checkpoint.sha256, "step": checkpoint.step, "created": made},
+        **module.about(checkpoint),
+        "graph": graph if has_onnx else None,
+        "golden": {"file": GOLDEN, "tolerance": TOLERANCE},
+        "weights": WEIGHTS,
+    }
+
+
+def _rate(config: LearningConfig) -> dict[str, Any]:
+    dt_s, hold = config.episode.control_dt_s, config.policy.hold_steps
+    hertz = 1.0 / dt_s
+    return {"control_dt_s": dt_s, "control_hz": hertz, "hold_steps": hold, "decision_hz": hertz / hold}
+
+
+def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
+    """Numbers of the rule that lays a wish on the hull, as the card's README tells it."""
+    vehicle = config.vehicle
+    limits = {"surge": vehicle.max_surge_m_s, "sway": vehicle.max_sway_m_s, "heave": vehicle.max_heave_m_s}
+    return {
+        "fastest_m_s": math.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s),
+        "limits_m_s": limits,
+        "max_yaw_rate_rad_s": vehicle.max_yaw_rate_rad_s,
+        "turn_gain_1_s": TURN_GAIN,
+        "least_speed_m_s": LEAST_SPEED_M_S,
+        "z_m": list(config.world.tank.z_m),
+        "gap_m": config.surrogate.vertical_gap_m,
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------
+# What every column of a policy over a set of obstacles is, in words (``surrogate/observation.py`` writes
+# them).
+
+
+MEANING = (
+    "float32. Mirrored world: x is turned round where the goal lies at smaller x than the start, y "
+    "where it lies at smaller y (flip is -1 there, else 1), so that the goal lies ahead and to the left "
+    "at the start; flips do not change during a mission. Each column is the quantity in its unit, "
+    "computed as its meaning says. clip(v, a, b) cuts off to [a, b]. An obstacle is a tracked moving "
+    "obstacle; one row each, at most the nearest ones; a row of zeros is no obstacle. Numbers that are not "
+    "finite are refused."
+)
+
+
+def _columns(table: str) -> list[dict[str, str]]:
+    """Rows of "names | unit | meaning"."""
+    rows = [line.split(" | ") for line in table.strip().splitlines()]
+    return [
+        {"name": name, "unit": unit, "meaning": meaning}
+        for names, unit, meaning in rows
+        for name in names.split()
+    ]
+
+
+OBSTACLE_COLUMNS = _columns("""
+there | 1 | 1 = an obstacle
+way.x way.y | 4 m | from the vehicle to the obstacle, in metres, / 4
+relative_velocity.x relative_velocity.y | m/s | the obstacle's less the vehicle's
+velocity.x velocity.y | m/s | of the obstacle
+width | m | twice its radius
+water_above | m | from the vehicle's depth up to the obstacle's top, where known: clip(v, 0, 1.6)
+water_below | m | from the obstacle's bottom up to the vehicle's depth, where known: clip(v, 0, 1.6)
+unseen | 2 s | seconds since it was seen, at most 4, / 2
+turn | 2 rad/s | rate of its course, mirrored by flip.x flip.y, clip(v, -3, 3) / 2; 0 = a corner
+way_in_1s.x way_in_1s.y | 4 m | from the vehicle now to where the obstacle is forecast in 1 s, / 4
+way_in_2s.x way_in_2s.y | 4 m | the same in 2 s
+gap | 4 m | distance less the obstacle's radius, at most 8 m, / 4
+nearness | 1/m | 1 / (0.3 + max(distance - radius - 0.22, 0))
+closest_in | s | time of the closest approach on straight lines, clip(v, 0, 3)
+closest_gap | m | distance then, less radius and 0.22, clip(v, -1, 3)
+route_direction.x route_direction.y | 1 | unit vector to the look-ahead point of the route
+""")
+"""Columns of an obstacle."""
+OWN_COLUMNS = _columns("""
+goal.x | 10 m | from the vehicle to the goal, / 10
+goal.y | 4 m | the same, / 4
+goal.z | m | height of the goal above the vehicle
+route_direction.x route_direction.y | 1 | unit vector to the look-ahead point, or to the goal
+goal_distance | 4 m | horizontal, at most 4 m, / 4
+speed.x speed.y | m/s | of the vehicle
+heave | 0.5 m/s | upward velocity in the body frame, x 2
+height | m | z + 0.8, z = 0 at the surface
+last_wish.x last_wish.y last_wish.z | 1 | carried out last: x and y shortened to length 1, \
+z within +-1; 0 at the start
+cos_4_yaw | 1 | cosine of four times the heading
+sin_4_yaw | 1 | its sine, times flip.x flip.y
+across | 3 m | flip.y (y - 3) / 3, y in the tank
+along | 10 m | flip.x (x - 10) / 10, x in the tank
+goal_direction.x goal_direction.y | 1 | unit vector to the goal
+route_distance | m | horizontal, to the look-ahead point, at most 2 m
+route_left | 10 m | length of the route to the goal, / 10
+route_aside | m | place left of the route, times flip.x flip.y, clip(v, -2, 2)
+""") + [
+    {
+        "name": f"ray[{i}]",
+        "unit": "1/m",
+        "meaning": "1 / (0.3 + clip(free - 0.22, 0, 4)) - 0.5, free metres to the nearest wall or occupied "
+        f"cell (at most 4.3) at {360 * i / N_RAY:g} degrees from x towards y",
+    }
+    for i in range(N_RAY)
+]
+"""Columns of the vehicle's own."""
