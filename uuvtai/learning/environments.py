@@ -151,9 +151,9 @@ class Simulated(Environment):
         """Let the behavior tree drive for T steps and keep inputs, actions and endings: what the statistics
         begin with."""
         for t in range(rollout.steps):
-            rollout["x"][t].copy_(self.view["x"])
-            rollout["action"][t].copy_(self.view["teacher_action"])
-            rollout["ended"][t].copy_(self.step(self.view["teacher_action"].clone(), None).ended)
+            action = self.view["teacher_action"].clone()
+            rollout.note(t, {"x": self.view["x"], "action": action})
+            rollout.note(t, {"ended": self.step(action, None).ended})
         return True
 
     @torch.no_grad()

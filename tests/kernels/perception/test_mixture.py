@@ -12,7 +12,7 @@ from uuvtai.config import Config
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import prediction_network
 from uuvtai.kernels.perception.io import TrackingIO
-from uuvtai.learning.networks import TIMES_S, MixtureNet, mirrored
+from uuvtai.learning.forecast import TIMES_S, MixtureNet, mirrored
 from uuvtai.sim.forecast_weights import SHAPES, SPREADS, packed_weights, put_weights, read_weights
 
 CFG = Config()
