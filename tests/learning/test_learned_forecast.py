@@ -192,11 +192,10 @@ def test_what_is_watched_is_what_came(learned):
     assert ahead.median() < 0.1, "most obstacles go on as they are tracked"
     sim, s = learned.sim, learned.sim.s
     there = sim.rows(s.forecast.radius_m)[..., 0] >= 0
-    columns, frame, share = (
-        torch.from_numpy(sim.rows(field)[there])
-        for field in (s.mixture.column, s.mixture.frame, s.futures.share)
+    columns, share = (
+        torch.from_numpy(sim.rows(field)[there]) for field in (s.mixture.column, s.futures.share)
     )
-    said = learned.net(columns, frame[:, 4]).log_weight.exp()
+    said = learned.net(columns).log_weight.exp()
     likeliest = torch.nn.functional.one_hot(said.argmax(-1), N_MODE) == 1
     torch.testing.assert_close(share, said.masked_fill(likeliest, 0.0), atol=2e-5, rtol=0)
 

@@ -86,11 +86,11 @@ class MixtureNet(nn.Module):
             self.said.bias[N_MODE:] = ways[:N_MODE, None].expand(-1, ANCHORS, -1).reshape(-1)
             self.spread.bias.fill_(math.log(0.3))
 
-    def forward(self, columns: torch.Tensor, speed: torch.Tensor) -> Mixture:
-        """``columns`` (n, N_COLUMN), ``speed`` (n,) [m/s]."""
+    def forward(self, columns: torch.Tensor) -> Mixture:
+        """``columns`` (n, N_COLUMN), of which the first is the speed [m/s]."""
         hidden = torch.relu(self.middle(torch.relu(self.into(columns))))
         said = self.said(hidden)
-        reach = (speed[:, None] * TIMES_S)[:, None, :, None]
+        reach = (columns[:, :1] * TIMES_S)[:, None, :, None]
         place = said[:, N_MODE:].view(-1, N_MODE, ANCHORS, 2) * reach
         part = self.spread(hidden).view(-1, N_MODE, ANCHORS, 2).clamp(-6.0, math.log(_MOST)).exp()
         return Mixture(torch.log_softmax(said[:, :N_MODE], -1), place, _LEAST_M + part * reach)
@@ -133,9 +133,8 @@ def scores_of(mixture: Mixture, truth: torch.Tensor) -> dict[str, float]:
     likeliest future is said to be, and how often it is the nearest."""
     last = (mixture.place[:, :, -1] - truth[:, None, -1]).norm(dim=-1)
     likeliest = mixture.log_weight.argmax(-1)
-    nearest = (
-        (mixture.place - truth[:, None]).norm(dim=-1).mean(-1).argmin(-1)
-    )  # by the mean of the whole way
+    # by the mean of the whole way
+    nearest = (mixture.place - truth[:, None]).norm(dim=-1).mean(-1).argmin(-1)
     one = last.gather(1, likeliest[:, None])[:, 0]
     return {
         "nll": float(negative_log_likelihood(mixture, truth).mean()),
@@ -180,7 +179,10 @@ def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int
     sim.reset(torch.ones_like(rows), torch.full_like(rows, seed), first + rows)
     field = functools.cache(lambda name: sim.rows(attrgetter(name)(sim.s)))
     scenarios = [describe_scenario(lambda name, env=env: field(name)[env]) for env in range(sim.num_envs)]
-    paths = [[body["path"] for body in scenario["obstacles"] if body["path"]] for scenario in scenarios]
+    paths = [
+        [path for body in scenario["obstacles"] if (path := body["path"]) and path["speed_m_s"] > 0]
+        for scenario in scenarios
+    ]
     found, running, done = [], np.ones(sim.num_envs, bool), 0
     for step in range(1, steps + 1):
         done += int(running.sum())
@@ -196,12 +198,11 @@ def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int
 
 def _moments(sim: Sim, envs: list[int], paths: list[list[dict[str, Any]]], now_s: float) -> TrackMoments:
     """Of the tracks of these envs that have a forecast and an obstacle, which move along ``paths``."""
-    s = sim.s
-    there = sim.rows(s.forecast.radius_m, envs)[..., 0] >= 0
-    frame = sim.rows(s.mixture.frame, envs)
+    there = sim.rows(sim.s.forecast.radius_m, envs)[..., 0] >= 0
+    frame = sim.rows(sim.s.mixture.frame, envs)
     """(env, track, 5) [m, m, -, -, m/s] place, unit course, speed"""
     times = now_s + np.array([-0.05, 0.0, 0.05, *TIMES_S.tolist()])
-    obstacles = np.full((len(envs), max(map(len, paths)), len(times), 2), np.nan)
+    obstacles = np.full((len(envs), max(1, *map(len, paths)), len(times), 2), np.nan)
     for row, env in enumerate(envs):
         for lane, path in enumerate(paths[env]):
             obstacles[row, lane] = path_positions(path, times)
@@ -246,9 +247,8 @@ class ForecastTrainer(EpisodeTrainer):
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.net = MixtureNet(self.generator)
-        self.learner = AdamLearner(
-            self.net.parameters(), lr=config.forecast_training.learning_rate, eps=ADAM_EPS
-        )
+        rate = config.forecast_training.learning_rate
+        self.learner = AdamLearner(self.net.parameters(), lr=rate, eps=ADAM_EPS)
         self._columns = torch.zeros(MEMORY, N_COLUMN, dtype=torch.float16)
         self._truth = torch.zeros(MEMORY, len(TIMES_S), 2)
         self.kept = self.seen = 0
@@ -276,7 +276,7 @@ class ForecastTrainer(EpisodeTrainer):
         train, metrics = self.config.train, {}
         for world in self.config.forecast_training.worlds:
             found, _ = self._watched(world, train.evaluate_seed, 0)
-            scores = scores_of(self.net(found.columns, found.columns[:, 0]), found.truth)
+            scores = scores_of(self.net(found.columns), found.truth)
             metrics |= {f"eval/{name}_{world}": value for name, value in scores.items()}
         return metrics
 
@@ -302,10 +302,9 @@ class ForecastTrainer(EpisodeTrainer):
         self.learner.optimiser.param_groups[0]["lr"] = config.learning_rate * max(_LEAST_RATE, 1.0 - share)
         at = torch.randint(self.kept, (MINIBATCH,), generator=self.generator)
         columns, truth = self._columns[at].float(), self._truth[at]
-        speed = columns[:, 0]
         if torch.rand(1, generator=self.generator) < 0.5:
             columns, truth = mirrored(columns, truth)
-        loss = negative_log_likelihood(self.net(columns, speed), truth).mean()
+        loss = negative_log_likelihood(self.net(columns), truth).mean()
         self.learner.step(loss, 5.0)
         return float(loss.detach())
 

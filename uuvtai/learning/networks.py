@@ -106,7 +106,7 @@ class RunningNorm(nn.Module):
     count: torch.Tensor
 
     def __init__(self, width: int, clip: float = 10.0) -> None:
-        """``clip``: normalised values are cut off beyond +-clip."""
+        """``clip``: standard deviations beyond which normalised values are cut off."""
         super().__init__()
         self.clip = clip
         self.register_buffer("mean", torch.zeros(width, dtype=torch.float64))
@@ -146,8 +146,6 @@ class RunningNorm(nn.Module):
 
 
 NUM_ACTIONS = 4
-CLIP_OBSERVATION = 10.0
-"""standard deviations beyond which an observation is cut off"""
 _MEAN_GAIN, _VALUE_GAIN = 0.01, 1.0  # of the last layers: small first actions (Andrychowicz et al. 2021)
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -279,7 +277,7 @@ class ActorCritic(Policy):
         self.actor = mlp((n_in, *config.hidden, NUM_ACTIONS), config.activation, generator, _MEAN_GAIN)
         self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
         self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
-        self.observation_norm = RunningNorm(n_in, CLIP_OBSERVATION)
+        self.observation_norm = RunningNorm(n_in)
         self.value_norm = RunningNorm(1, math.inf)
 
     def prepared(self, view: View) -> View:
@@ -344,18 +342,16 @@ def torch_threads_rest() -> Iterator[None]:
 def side_by_side(*pieces: Callable[[], _T], device: str = "cpu") -> list[_T]:
     """What each piece gives, in their order. Threads have no part in any result: a piece runs on one. On a
     GPU one comes after the other."""
-    if device != "cpu":
+    threads = _threads.get(None) or torch.get_num_threads()
+    if device != "cpu" or threads == 1:
         return [piece() for piece in pieces]
     flushes = float(torch.tensor(1e-40) * 1.0) == 0.0
-    pool = _pool(_threads.get(None) or torch.get_num_threads(), flushes)
-    if pool is None:
-        return [piece() for piece in pieces]
-    return [begun.result() for begun in [pool.submit(piece) for piece in pieces]]
+    return list(_pool(threads, flushes).map(lambda piece: piece(), pieces))
 
 
 @functools.cache
-def _pool(threads: int, flushes: bool) -> ThreadPoolExecutor | None:
-    return None if threads == 1 else ThreadPoolExecutor(threads, "uuvtai-learn", _begin, (flushes,))
+def _pool(threads: int, flushes: bool) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "uuvtai-learn", _begin, (flushes,))
 
 
 def _begin(flushes: bool) -> None:
@@ -462,6 +458,8 @@ class AdamLearner:
 
 PREFIX = "non_finite/"
 """of the metrics that count what was replaced; they are there only when something was"""
+OBSERVATION = "observation"
+_ROWS_TOLD = 4
 
 
 class TrainingError(UserError, RuntimeError):
@@ -483,13 +481,6 @@ class Guard:
         """of what was replaced, column by column"""
         self.bad_in_a_row = 0
 
-    def observation(
-        self, obs: torch.Tensor, fill: torch.Tensor, out: torch.Tensor, counted: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        """As ``values``, with ``fill`` (n_obs,) in place of what is not finite; of the rows ``counted`` (N,)
-        alone (default: all) it is counted."""
-        return self.values(_OBSERVATION, obs, out, fill, counted)
-
     def values(
         self,
         name: str,
@@ -498,8 +489,11 @@ class Guard:
         fill: torch.Tensor | None = None,
         counted: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Copy ``values`` (N, ...) into ``out`` with 0 in place of what is not finite; returns which rows
-        were bad, (N,)."""
+        """Copy ``values`` (N, ...) into ``out`` with ``fill`` (default: 0) in place of what is not finite;
+        returns which rows were bad, (N,).
+
+        ``name``: ``OBSERVATION`` is counted by columns. ``counted`` (N,): rows that count (default: all).
+        """
         if _is_sound(values):
             out.copy_(values)
             return self._none
@@ -514,7 +508,7 @@ class Guard:
     def take(self) -> dict[str, float]:
         """Counts since the last call by name, those above zero only: ``non_finite/<column>``,
         ``non_finite/reward`` and so on."""
-        by_column = self._counts.pop(_OBSERVATION, torch.zeros(0))
+        by_column = self._counts.pop(OBSERVATION, torch.zeros(0))
         found = {name: by_column[place] for name, place in self.columns} | self._counts
         self._counts = {}
         return {f"{PREFIX}{name}": float(n) for name, part in found.items() if (n := part.sum())}
@@ -547,7 +541,3 @@ def _is_sound(values: torch.Tensor) -> bool:
     """Whether everything is finite, asked where that is no wait for a device: whatever is not makes the sum
     so, and so may large numbers, which are then looked at one by one."""
     return values.device.type == "cpu" and math.isfinite(values.sum())
-
-
-_ROWS_TOLD = 4
-_OBSERVATION = "observation"

@@ -49,15 +49,10 @@ class NumberSearch:
         self.centre = centre.clone()
         self.low, self.high = bounds
         self.spread = spread * (self.high - self.low)
-        self.trials = 0
+        self.size, self.trials = size, 0
         self._generator = torch.Generator().manual_seed(seed)
         self._place, self._score = torch.zeros(size, len(centre)), torch.zeros(size)
         self._group = torch.zeros(size, dtype=torch.int64)
-
-    @property
-    def size(self) -> int:
-        """The most trials there will be."""
-        return len(self._score)
 
     def drawn(self, count: int) -> torch.Tensor:
         """(count, n) numbers to try, by pairs for one episode each: anywhere within ``spread``, the second of

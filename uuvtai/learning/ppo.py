@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -96,8 +96,7 @@ class Ppo(AdamLearner):
         self.rate = torch.tensor(config.learning_rate, device=policy.log_std.device)
         self._rate_now = self.rate.clone()
         critic = list(policy.critic.parameters())
-        known = set(critic)
-        actor = [parameter for parameter in policy.parameters() if parameter not in known]
+        actor = [parameter for parameter in policy.parameters() if parameter not in {*critic}]
         groups: list[dict[str, Any]] = [{"params": actor + critic}]
         if policy.critic_rate is not None:
             groups = [{"params": actor}, {"params": critic, "lr": policy.critic_rate}]
@@ -221,10 +220,10 @@ class Ppo(AdamLearner):
             self.updates += 1
         return torch.stack([sums for _, sums in found]).sum(dim=0)
 
-    def _parts(self, index: slice | torch.Tensor) -> list[slice] | tuple[torch.Tensor, ...]:
+    def _parts(self, index: slice | torch.Tensor) -> Sequence[slice | torch.Tensor]:
         """A minibatch in parts whose activations stay in the cache of a CPU."""
         if self.rate.device.type != "cpu":
-            return (index,)  # type: ignore[return-value]
+            return [index]
         if isinstance(index, torch.Tensor):
             return index.split(CACHE_ROWS)
         starts = range(index.start, index.stop, CACHE_ROWS)
