@@ -2,7 +2,6 @@
 
 import copy
 import math
-from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -13,17 +12,24 @@ from tests.sim.test_observation_only import compared
 from tests.small_sim import SmallSim
 from uuvtai.common.enums import ANCHORS, COLUMNS, N_COLUMN, N_MODE
 from uuvtai.common.errors import UserError
-from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config.loader import ConfigError, load_training
 from uuvtai.learning import checkpoint
 from uuvtai.learning import forecast as forecast_trainer
 from uuvtai.learning.checkpoint import CheckpointError
-from uuvtai.learning.forecast import ForecastTrainer, TrackMoments, column_row, path_places, scores_of, watch
-from uuvtai.learning.networks import TIMES_S, Mixture, MixtureNet, negative_log_likelihood
+from uuvtai.learning.forecast import (
+    TIMES_S,
+    ForecastTrainer,
+    Mixture,
+    MixtureNet,
+    TrackMoments,
+    column_row,
+    negative_log_likelihood,
+    scores_of,
+    watch,
+)
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.runner import TrainRequest, train
 from uuvtai.sim.forecast_weights import packed_weights, read_weights
-from uuvtai.surrogate.world import scenario_rows
 
 SMALL = {"train.num_envs": 8, "train.iterations": 4, "forecast_training.minibatches": 20}
 
@@ -40,7 +46,7 @@ def made_up(seed, n=400):
         * torch.where(torch.rand(n, generator=generator) < 0.5, 1.0, -1.0)[:, None]
     )
     truth = torch.stack([way, torch.zeros_like(way)], -1)
-    return TrackMoments(columns, torch.cat([torch.zeros(n, 4), columns[:, :1]], -1), truth)
+    return TrackMoments(columns, truth)
 
 
 @pytest.fixture
@@ -53,7 +59,7 @@ def made(monkeypatch):
     """In place of simulators: moments that follow from seed and number of the first episode."""
     monkeypatch.setattr(forecast_trainer, "MEMORY", 1024)
     monkeypatch.setattr(forecast_trainer, "MINIBATCH", 64)
-    monkeypatch.setattr(forecast_trainer, "simulator_of", lambda *_arguments: None)
+    monkeypatch.setattr(ForecastTrainer, "simulator", lambda *_arguments: None)
     monkeypatch.setattr(
         forecast_trainer, "watch", lambda _sim, _scenes, seed, first, _steps: (made_up(seed + first), 100)
     )
@@ -174,42 +180,22 @@ def test_what_cannot_be_learnt_is_refused(config, tmp_path):
 # ---------------------------------------------------------------------------------------------- the simulator
 
 
-def test_obstacles_are_where_the_closed_form_has_them(small):
-    small.begin(range(small.N), seed=5)
-    path = scenario_rows(small.sim)[1]
-    times = np.random.default_rng(1).uniform(0, 30, (small.N, 7))
-    found, compared_obstacles = path_places(path, times), 0
-    for row in range(small.N):
-        s = small.sim.s
-        scenario = describe_scenario(lambda name: small.sim.rows(attrgetter(name)(s), [row])[0])  # noqa: B023
-        moving = [body for body in scenario["obstacles"] if body["path"]]
-        first = min(body["slot"] for body in moving)
-        for body in moving:
-            own = path_positions(body["path"], times[row])
-            np.testing.assert_allclose(found[row, body["slot"] - first], own, atol=1e-4)
-            compared_obstacles += 1
-    assert compared_obstacles == 8 * 6
-    assert np.isnan(found).any(), "empty slots are nowhere"
-
-
 def test_what_is_watched_is_what_came(learned):
     learned.forget()
     moments, steps = watch(learned.sim, ((8, 6, 0.6),), 7, 0, 300)
     assert steps <= 8 * 300
     assert len(moments.truth) > 50
     assert moments.columns[:, :COLUMNS].isfinite().all() and (moments.columns[:, COLUMNS:] == 0).all()
-    assert torch.equal(moments.columns[:, 0], moments.frame[:, 4])
     far = moments.truth[:, -1].norm(dim=-1)
     assert far.max() < 2.5 * 0.6 + 0.5 + 1e-3, "no obstacle is faster than its scene says"
-    ahead = (moments.truth[:, 0] - torch.stack([0.5 * moments.frame[:, 4], 0 * far], -1)).norm(dim=-1)
+    ahead = (moments.truth[:, 0] - torch.stack([0.5 * moments.columns[:, 0], 0 * far], -1)).norm(dim=-1)
     assert ahead.median() < 0.1, "most obstacles go on as they are tracked"
     sim, s = learned.sim, learned.sim.s
     there = sim.rows(s.forecast.radius_m)[..., 0] >= 0
-    columns, frame, share = (
-        torch.from_numpy(sim.rows(field)[there])
-        for field in (s.mixture.column, s.mixture.frame, s.futures.share)
+    columns, share = (
+        torch.from_numpy(sim.rows(field)[there]) for field in (s.mixture.column, s.futures.share)
     )
-    said = learned.net(columns, frame[:, 4]).log_weight.exp()
+    said = learned.net(columns).log_weight.exp()
     likeliest = torch.nn.functional.one_hot(said.argmax(-1), N_MODE) == 1
     torch.testing.assert_close(share, said.masked_fill(likeliest, 0.0), atol=2e-5, rtol=0)
 

@@ -14,6 +14,8 @@ from uuvtai.learning.rollout import Rollout, Step, final_value
 FLOAT32 = 1e-5
 """relative and absolute; a few hundred float32 operations on numbers near one"""
 T, N, N_IN = 8, 6, 5
+DRAWS = torch.Generator()
+"""where nothing is drawn"""
 
 
 def column(*values):
@@ -119,28 +121,25 @@ def make_ppo(seed=0, **config):
     return Ppo(make_policy(seed), PpoConfig(**{"rollout_steps": T, "epochs": 2, "minibatches": 4, **config}))
 
 
-def memory(steps, num_envs, n_in=N_IN):
-    return Rollout(steps, {"x": torch.zeros(num_envs, n_in), "teacher_action": torch.zeros(num_envs, 4)}, 4)
-
-
 def add(rollout, t, policy, x, step, came):
     """A step of ``came``: reward, terminated, ended, input that it led to."""
     end = Step(*came[:3], {"x": came[3]}, {})
-    rollout.note(t, {"x": x, "teacher_action": torch.zeros_like(step.action)}, step)
-    rollout.add(t, end, final_value(policy, end))
+    view = {"x": x, "teacher_action": torch.zeros_like(step.action)}
+    told = {"reward": came[0], "terminated": came[1], "ended": came[2]}
+    rollout.note(t, view | step._asdict() | told | {"next_value": final_value(policy, end)})
 
 
 def fill(rollout, policy, seed=0):
     """Random inputs and rewards, actions of the policy, an ending now and then."""
-    generator, n = torch.Generator().manual_seed(seed), rollout["x"].shape[1]
+    generator = torch.Generator().manual_seed(seed)
     for t in range(rollout.steps):
-        x = torch.randn(n, N_IN, generator=generator) * 2 + 1
-        ended = torch.rand(n, generator=generator) < 0.2
-        terminated = ended & (torch.rand(n, generator=generator) < 0.5)
+        x = torch.randn(N, N_IN, generator=generator) * 2 + 1
+        ended = torch.rand(N, generator=generator) < 0.2
+        terminated = ended & (torch.rand(N, generator=generator) < 0.5)
         step = policy.act({"x": x}, generator)
         reward = -step.action.square().sum(-1) + x[:, 0]
         add(rollout, t, policy, x, step, (reward, terminated, ended, x + 1))
-    rollout.close(policy.expected({"x": torch.randn(n, N_IN, generator=generator)}))
+    rollout.close(policy.expected({"x": torch.randn(N, N_IN, generator=generator)}))
     return rollout
 
 
@@ -154,7 +153,7 @@ def weights(policy):
 
 
 def test_next_values_are_those_of_the_true_next_observation():
-    policy, rollout = make_policy(), memory(2, 3)
+    policy, rollout = make_policy(), Rollout(2)
     x = torch.randn(4, 3, N_IN, generator=torch.Generator().manual_seed(0))
     generator = torch.Generator().manual_seed(1)
     ended = torch.tensor([False, True, True])
@@ -181,7 +180,7 @@ def test_next_values_are_those_of_the_true_next_observation():
 def test_minibatches_cover_every_sample_once(minibatches, shuffle):
     ppo = make_ppo(minibatches=minibatches)
     ppo.policy.is_shuffled = shuffle
-    rollout = fill(memory(T, N), ppo.policy)
+    rollout = fill(Rollout(T), ppo.policy)
     rollout["log_prob"].copy_(torch.arange(T * N).view(T, N))
     batch, _ = ppo._prepared(rollout)
     index = list(ppo._minibatches(T * N, torch.Generator().manual_seed(0)))
@@ -198,9 +197,9 @@ def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):
     monkeypatch.setattr(ppo_module, "CACHE_ROWS", 7)
     ppo = make_ppo(epochs=1, minibatches=1, entropy_weight=0.01, normalise_values=False)
     reference = make_policy()
-    rollout = fill(memory(T, N), ppo.policy)
+    rollout = fill(Rollout(T), ppo.policy)
     rollout["teacher_action"].normal_(generator=torch.Generator().manual_seed(1))
-    metrics = ppo.update(rollout, distillation_weight=0.3)
+    metrics = ppo.update(rollout, DRAWS, distillation_weight=0.3)
 
     advantage, target = gae_of(rollout)
     advantage = ((advantage - advantage.mean()) / advantage.std(correction=0)).flatten()
@@ -231,8 +230,8 @@ def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):
 
 def test_metrics_have_their_names_and_statistics_follow_the_rollout():
     ppo = make_ppo()
-    rollout = fill(memory(T, N), ppo.policy)
-    metrics = ppo.update(rollout)
+    rollout = fill(Rollout(T), ppo.policy)
+    metrics = ppo.update(rollout, DRAWS)
     assert set(metrics) == {
         "train/policy_loss", "train/value_loss", "train/entropy", "train/approx_kl", "train/clip_fraction",
         "train/explained_variance",
@@ -249,29 +248,29 @@ def test_metrics_have_their_names_and_statistics_follow_the_rollout():
 def test_values_keep_their_meaning_while_their_statistics_move():
     """Pop-Art: an update that hardly steps leaves every value, however far off the returns are."""
     ppo = make_ppo(learning_rate=1e-12, epochs=1, minibatches=1, normalise_observations=False)
-    rollout = fill(memory(T, N), ppo.policy)
+    rollout = fill(Rollout(T), ppo.policy)
     for reward in (0.0, 50.0):
         rollout["reward"] += reward
         value, mean = ppo.policy.value(rollout["x"]).detach(), float(ppo.policy.value_norm.mean)
-        ppo.update(rollout)
+        ppo.update(rollout, DRAWS)
         assert abs(float(ppo.policy.value_norm.mean) - mean) > 0.5
         assert torch.allclose(ppo.policy.value(rollout["x"]), value, atol=1e-3)
 
 
 def test_switches_of_the_normalisers():
     ppo = make_ppo(normalise_observations=False, normalise_values=False)
-    ppo.update(fill(memory(T, N), ppo.policy))
+    ppo.update(fill(Rollout(T), ppo.policy), DRAWS)
     assert float(ppo.policy.observation_norm.count) == 0
     assert float(ppo.policy.value_norm.count) == 0
 
 
 def test_distillation_draws_the_mean_to_the_teacher():
     ppo = make_ppo(epochs=20, learning_rate=3e-3, max_grad_norm=100.0)
-    rollout = fill(memory(T, N), ppo.policy)
+    rollout = fill(Rollout(T), ppo.policy)
     rollout["teacher_action"].fill_(0.5)
     x = rollout["x"].clone()
     for _ in range(4):
-        ppo.update(rollout, distillation_weight=1e3)
+        ppo.update(rollout, DRAWS, distillation_weight=1e3)
     error = (ppo.policy.distribution(x)[0] - 0.5).detach().abs().mean()
     assert float(error) < 0.05
     before = (make_policy().distribution(x)[0] - 0.5).detach().abs().mean()
@@ -289,9 +288,9 @@ def test_equal_generators_give_equal_bits_and_a_saved_state_goes_on(shuffle):
             ppo.policy.load_state_dict(policy_state)
             ppo.load_state_dict(ppo_state)
             generator.set_state(generator_state)
-        rollout = memory(T, N)
+        rollout = Rollout(T)
         for number in range(first, first + updates):
-            ppo.update(fill(rollout, ppo.policy, seed=number), distillation_weight=0.1, generator=generator)
+            ppo.update(fill(rollout, ppo.policy, seed=number), generator, distillation_weight=0.1)
         return ppo, generator
 
     whole, _ = run(4)
@@ -309,7 +308,7 @@ def test_equal_generators_give_equal_bits_and_a_saved_state_goes_on(shuffle):
 def test_a_saved_state_is_a_copy_of_the_rate():
     ppo = make_ppo(target_kl=0.01)
     state = ppo.state_dict()
-    ppo.update(fill(memory(T, N), ppo.policy))
+    ppo.update(fill(Rollout(T), ppo.policy), DRAWS)
     assert float(state["learning_rate"]) == pytest.approx(3e-4)
 
 
@@ -322,9 +321,9 @@ def test_a_saved_state_is_a_copy_of_the_rate():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_samples_that_are_not_finite_have_no_part_and_are_counted(name, bad):
     ppo = make_ppo()
-    rollout = fill(memory(T, N), ppo.policy)
+    rollout = fill(Rollout(T), ppo.policy)
     rollout[name][3, 2] = bad
-    metrics = ppo.update(rollout, distillation_weight=0.5)
+    metrics = ppo.update(rollout, DRAWS, distillation_weight=0.5)
     assert metrics["train/invalid_samples"] == 1
     assert metrics["train/skipped_updates"] == 0
     assert all(math.isfinite(value) for value in metrics.values())
@@ -334,7 +333,7 @@ def test_samples_that_are_not_finite_have_no_part_and_are_counted(name, bad):
 
 def test_a_bad_reward_changes_nothing_but_its_own_episode():
     ppo = make_ppo()
-    rollout = fill(memory(T, N), ppo.policy)
+    rollout = fill(Rollout(T), ppo.policy)
     clean = gae_of(rollout)[1]
     rollout["reward"][3, 2] = math.nan
     ppo.policy.value_norm.count.zero_()
@@ -347,9 +346,9 @@ def test_a_bad_reward_changes_nothing_but_its_own_episode():
 
 def test_a_rollout_of_nothing_but_nan_leaves_a_finite_policy():
     ppo = make_ppo()
-    rollout = fill(memory(T, N), ppo.policy)
+    rollout = fill(Rollout(T), ppo.policy)
     rollout["reward"].fill_(math.nan)
-    assert ppo.update(rollout)["train/invalid_samples"] == T * N
+    assert ppo.update(rollout, DRAWS)["train/invalid_samples"] == T * N
     assert torch.isfinite(weights(ppo.policy)).all()
 
 
@@ -361,8 +360,8 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
         return torch.full_like(gradient, math.nan) if len(calls) in (2, 3) else gradient
 
     ppo.policy.log_std.register_hook(poisoned)
-    rollout = fill(memory(T, N), ppo.policy)
-    assert ppo.update(rollout)["train/skipped_updates"] == 2
+    rollout = fill(Rollout(T), ppo.policy)
+    assert ppo.update(rollout, DRAWS)["train/skipped_updates"] == 2
     assert (ppo.updates, ppo.skipped) == (2, 2)
     assert torch.isfinite(weights(ppo.policy)).all()
     assert all(
@@ -373,16 +372,9 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
 def test_a_loss_that_is_not_finite_changes_nothing():
     ppo = make_ppo(normalise_values=False)
     before = weights(ppo.policy)
-    rollout = fill(memory(T, N), ppo.policy)
-    assert ppo.update(rollout, distillation_weight=math.nan)["train/skipped_updates"] == 8
+    rollout = fill(Rollout(T), ppo.policy)
+    assert ppo.update(rollout, DRAWS, distillation_weight=math.nan)["train/skipped_updates"] == 8
     assert torch.equal(weights(ppo.policy), before)
-
-
-def test_random_minibatches_need_a_generator():
-    ppo = make_ppo()
-    ppo.policy.is_shuffled = True
-    with pytest.raises(ValueError, match="generator"):
-        ppo.update(fill(memory(T, N), ppo.policy))
 
 
 # ----------------------------------------------------------------------------------------------------- a task
@@ -413,7 +405,7 @@ class PointTask:
 
 def play(policy, ppo, task, generator, rollouts):
     """Mean reward of each rollout; learns unless ``ppo`` is None."""
-    rollout, means = memory(32, task.n, 4), []
+    rollout, means = Rollout(32), []
     never = torch.zeros(task.n, dtype=torch.bool)
     for _ in range(rollouts):
         for t in range(rollout.steps):
@@ -424,7 +416,7 @@ def play(policy, ppo, task, generator, rollouts):
         rollout.close(policy.value(task.place).detach())
         means.append(float(rollout["reward"].mean()))
         if ppo is not None:
-            ppo.update(rollout)
+            ppo.update(rollout, DRAWS)
     return means
 
 

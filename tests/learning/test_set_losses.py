@@ -21,7 +21,7 @@ def ppo(monkeypatch):
     widths = {"obstacles": N_OBSTACLE, "own": N_OWN, "truth": N_TRUTH}
     view = {name: torch.zeros(1, width) for name, width in widths.items()}
     made = Ppo(SetPolicy(view, config, torch.Generator().manual_seed(0)), config.ppo)
-    monkeypatch.setattr(made, "_step", lambda: None)
+    monkeypatch.setattr(made, "step", lambda **_options: False)
     return made
 
 
@@ -75,7 +75,7 @@ def test_the_critics_gradient_is_cut_by_itself(ppo, batch):
     for parameter in ppo._nets[1]:
         parameter.grad *= 1e4
     actor = [p.grad.clone() for p in ppo._nets[0]]
-    Ppo._step(ppo)
+    Ppo.step(ppo, most=ppo.config.max_grad_norm)
     assert [group["lr"] for group in ppo.optimiser.param_groups[1:]] == [SetPolicy.critic_rate]
     norm = torch.linalg.vector_norm(torch.stack([grad.norm() for grad in actor]))
     factor = min(1.0, ppo.config.max_grad_norm / float(norm))

@@ -10,7 +10,7 @@ from tests.point_env import PointEnv
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import pack
 from uuvtai.learning.environments import Simulated
-from uuvtai.learning.networks import Guard, TrainingError
+from uuvtai.learning.networks import OBSERVATION, Guard, TrainingError
 from uuvtai.learning.trainer import Trainer
 
 ROOT = Path(__file__).parents[2]
@@ -173,14 +173,11 @@ def test_first_inputs_of_an_episode_have_no_prediction_behind_them():
     assert not x[ended][:, -2:].any() and (x[~ended][:, -1] > 0).all()
 
 
-@pytest.mark.parametrize("of_all", [False, True])
-def test_large_numbers_whose_sum_is_infinite_are_sound(of_all):
+@pytest.mark.parametrize("name", [OBSERVATION, "reward"])
+def test_large_numbers_whose_sum_is_infinite_are_sound(name):
     guard = Guard([("range", slice(0, 3))], 2, 3, torch.device("cpu"))
     large, out = torch.tensor([[3e38, 3e38, 1.0], [0.0, 2.0, -4.0]]), torch.zeros(2, 3)
-    if of_all:
-        bad = guard.observation(large, torch.zeros(3), out)
-    else:
-        bad = guard.values("reward", large, out)
+    bad = guard.values(name, large, out)
     assert bad.tolist() == [False, False] and torch.equal(out, large) and guard.take() == {}
 
 
@@ -188,7 +185,7 @@ def test_what_is_sound_clears_what_was_there():
     """The rows that the guard says are bad are no longer so a step later."""
     guard = Guard([("range", slice(0, 2))], 2, 3, torch.device("cpu"))
     out, fill = torch.zeros(2, 2), torch.full((2,), 7.0)
-    bad = guard.observation(torch.tensor([[1.0, math.inf], [2.0, 3.0]]), fill, out).clone()
+    bad = guard.values(OBSERVATION, torch.tensor([[1.0, math.inf], [2.0, 3.0]]), out, fill).clone()
     assert bad.tolist() == [True, False] and out.tolist() == [[1.0, 7.0], [2.0, 3.0]]
-    assert guard.observation(torch.ones(2, 2), fill, out).tolist() == [False, False]
+    assert guard.values(OBSERVATION, torch.ones(2, 2), out, fill).tolist() == [False, False]
     assert out.tolist() == [[1.0, 1.0], [1.0, 1.0]] and guard.take() == {"non_finite/range": 1.0}

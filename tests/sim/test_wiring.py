@@ -27,13 +27,13 @@ SCRIPT = [
 
 def watch_gradients(ppo):
     """A dict that has the gradients of its newest step by parameter, before their norm is cut."""
-    seen, step = {}, ppo._step
+    seen, step = {}, ppo.step
 
-    def watched(*arguments):
+    def watched(**options):
         seen.update({name: p.grad.clone() for name, p in ppo.policy.named_parameters()})
-        step(*arguments)
+        return step(**options)
 
-    ppo._step = watched
+    ppo.step = watched
     return seen
 
 
@@ -70,10 +70,10 @@ def close(found, expected):
 def residual_and_uncertainty(model, obs, action, next_obs):
     """Both (T, N) by the paper's equations."""
     with torch.no_grad():
-        predicted = model.predict(obs, action)
-    error = (next_obs[..., :N_TARGET] - predicted.mean).clamp(-100.0, 100.0)
+        _, mean, log_var = model.predict(obs, action)
+    error = (next_obs[..., :N_TARGET] - mean).clamp(-100.0, 100.0)
     residual = error.square().mean(-1).sqrt()
-    return residual, predicted.log_var.exp().mean(-1)
+    return residual, log_var.exp().mean(-1)
 
 
 # --------------------------------------------------------------------------- what the actor's loss is made of

@@ -578,7 +578,7 @@ def test_the_tree_alone_drives_as_without_a_student(small):
         said = student.decide(small.sim.action).action
         expected = student.decision.action if agent is None else agent
         assert torch.equal(said, expected)
-    assert len(student.samples) == 2 and len(student.samples[0].wish) == small.N
+    assert len(student.samples) == 2 and len(student.samples[0][-1]) == small.N
 
 
 # ------------------------------------------------------------------------------------------ in the simulator

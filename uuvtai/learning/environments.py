@@ -14,7 +14,7 @@ from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.agents import SetAgent
 from uuvtai.learning.distillation import imitate, wish_of
-from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic, Guard, Policy, View, by_part
+from uuvtai.learning.networks import NUM_ACTIONS, OBSERVATION, ActorCritic, Guard, Policy, View, by_part
 from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.rollout import Environment, Rollout, RolloutSums, Step
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetPolicy
@@ -151,9 +151,9 @@ class Simulated(Environment):
         """Let the behavior tree drive for T steps and keep inputs, actions and endings: what the statistics
         begin with."""
         for t in range(rollout.steps):
-            rollout["x"][t].copy_(self.view["x"])
-            rollout["action"][t].copy_(self.view["teacher_action"])
-            rollout["ended"][t].copy_(self.step(self.view["teacher_action"].clone(), None).ended)
+            action = self.view["teacher_action"].clone()
+            rollout.note(t, {"x": self.view["x"], "action": action})
+            rollout.note(t, {"ended": self.step(action, None).ended})
         return True
 
     @torch.no_grad()
@@ -219,7 +219,7 @@ class Simulated(Environment):
         """Write the observation into an input, the column's mean in place of what is not finite; which rows
         were bad."""
         n = self.env.num_obs
-        return self.guard.observation(obs, self._norm.mean[:n].float(), x[:, :n], counted)
+        return self.guard.values(OBSERVATION, obs, x[:, :n], self._norm.mean[:n].float(), counted)
 
 
 class SimulatedSet(Environment):

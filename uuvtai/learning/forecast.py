@@ -7,34 +7,120 @@ network to what the obstacles behind the tracks then did, by likelihood.
 
 from __future__ import annotations
 
+import functools
+import math
 import time
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import nn
 
-from uuvtai.common.enums import COLUMNS, N_COLUMN, OUTCOMES, RUNNING
-from uuvtai.common.errors import SettingError
-from uuvtai.common.obstacle_motion import path_document, path_positions
-from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.networks import (
-    TIMES_S,
-    Mixture,
-    MixtureNet,
-    PlainAdam,
-    mirrored,
-    negative_log_likelihood,
+from uuvtai.common.enums import (
+    ANCHOR_S,
+    ANCHORS,
+    COLUMNS,
+    FAR_COLUMNS,
+    N_COLUMN,
+    N_HIDDEN,
+    N_MODE,
+    N_SAID,
+    N_SPREAD,
+    N_TOLD,
+    RUNNING,
+    SIDE_COLUMNS,
 )
-from uuvtai.learning.parameter_search import simulator_of
+from uuvtai.common.errors import SettingError
+from uuvtai.common.obstacle_motion import describe_scenario, path_positions
+from uuvtai.config.learning import LearningConfig
+from uuvtai.learning.networks import AdamLearner, linear
+from uuvtai.learning.parameter_search import EpisodeTrainer
 from uuvtai.learning.ppo import ADAM_EPS
-from uuvtai.learning.rollout import Recent
 from uuvtai.sim.forecast_weights import WEIGHTS, packed_weights
 
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import ObservationColumn
     from uuvtai.sim.setup import Scene
     from uuvtai.sim.sim import Sim
+
+
+# ------------------------------------------------------------------------------------------------------------
+# The network of a learned forecast, its likelihood, and what it says in metres.
+#
+# A mixture of ``N_MODE`` Gaussians over the places at ``ANCHORS`` times, along and across the track's course
+# (Bishop 1994). Each future is a whole way: its places share one weight.
+
+
+TIMES_S = torch.arange(1, ANCHORS + 1) * ANCHOR_S
+"""[s] ahead, of the places that it tells"""
+_LEAST_M, _MOST = 0.03, 4.0
+"""[m] smallest deviation; largest, as a part of the way that an obstacle can go"""
+_HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
+
+
+class Mixture(NamedTuple):
+    """What may come of n tracks, in their frames."""
+
+    log_weight: torch.Tensor
+    """(n, N_MODE) logarithm of the probability of each future"""
+    place: torch.Tensor
+    """(n, N_MODE, ANCHORS, 2) [m] along and across the course"""
+    sigma: torch.Tensor
+    """(n, N_MODE, ANCHORS, 2) [m] standard deviations"""
+
+
+class MixtureNet(nn.Module):
+    """Columns of a track to its futures: two hidden layers of rectified units."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__()
+        gain = math.sqrt(2.0)
+        self.into = linear(N_COLUMN, N_HIDDEN, gain, generator)
+        self.middle = linear(N_HIDDEN, N_HIDDEN, gain, generator)
+        self.said = linear(N_HIDDEN, N_TOLD, 0.1, generator)
+        self.spread = linear(N_HIDDEN, N_SPREAD, 0.1, generator)
+        with torch.no_grad():  # the futures begin apart: straight on, slower, back, left and right
+            ways = torch.tensor([[1.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [-0.8, 0.0], [0.5, 0.5], [0.5, -0.5]])
+            self.said.bias[N_MODE:] = ways[:N_MODE, None].expand(-1, ANCHORS, -1).reshape(-1)
+            self.spread.bias.fill_(math.log(0.3))
+
+    def forward(self, columns: torch.Tensor) -> Mixture:
+        """``columns`` (n, N_COLUMN), of which the first is the speed [m/s]."""
+        hidden = torch.relu(self.middle(torch.relu(self.into(columns))))
+        said = self.said(hidden)
+        reach = (columns[:, :1] * TIMES_S)[:, None, :, None]
+        place = said[:, N_MODE:].view(-1, N_MODE, ANCHORS, 2) * reach
+        part = self.spread(hidden).view(-1, N_MODE, ANCHORS, 2).clamp(-6.0, math.log(_MOST)).exp()
+        return Mixture(torch.log_softmax(said[:, :N_MODE], -1), place, _LEAST_M + part * reach)
+
+    def weights(self) -> dict[str, np.ndarray]:
+        """Arrays of a forecast's file (``mixture_weights``)."""
+        out, bias = torch.zeros(N_HIDDEN, N_SAID), torch.zeros(N_SAID)
+        out[:, :N_TOLD], bias[:N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
+        found = {"weight_out": out, "bias_out": bias}
+        layers = {"in": self.into, "mid": self.middle, "spread": self.spread}  # the last one is padded there
+        for name, layer in layers.items():
+            found |= {f"weight_{name}": layer.weight.T, f"bias_{name}": layer.bias}
+        return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
+
+
+def negative_log_likelihood(mixture: Mixture, truth: torch.Tensor) -> torch.Tensor:
+    """(n,) of the true places (n, ANCHORS, 2) [m] in the tracks' frames, in nats of all of them together."""
+    off = (truth[:, None] - mixture.place) / mixture.sigma
+    log_density = -(0.5 * off * off + mixture.sigma.log() + _HALF_LOG_TAU).sum((-1, -2))
+    return -torch.logsumexp(mixture.log_weight + log_density, -1)
+
+
+def mirrored(columns: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same tracks seen in a mirror along their course: left is right."""
+    flip = torch.ones(N_COLUMN)
+    flip[list(SIDE_COLUMNS)] = -1.0
+    order = torch.arange(N_COLUMN)
+    for one, other in FAR_COLUMNS:
+        order[one], order[other] = other, one
+    return (columns * flip)[:, order], truth * torch.tensor([1.0, -1.0])
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -47,9 +133,8 @@ def scores_of(mixture: Mixture, truth: torch.Tensor) -> dict[str, float]:
     likeliest future is said to be, and how often it is the nearest."""
     last = (mixture.place[:, :, -1] - truth[:, None, -1]).norm(dim=-1)
     likeliest = mixture.log_weight.argmax(-1)
-    nearest = (
-        (mixture.place - truth[:, None]).norm(dim=-1).mean(-1).argmin(-1)
-    )  # by the mean of the whole way
+    # by the mean of the whole way
+    nearest = (mixture.place - truth[:, None]).norm(dim=-1).mean(-1).argmin(-1)
     one = last.gather(1, likeliest[:, None])[:, 0]
     return {
         "nll": float(negative_log_likelihood(mixture, truth).mean()),
@@ -80,35 +165,24 @@ class TrackMoments(NamedTuple):
     """n moments of tracks that an obstacle is behind."""
 
     columns: torch.Tensor
-    """(n, N_COLUMN) what a network is told"""
-    frame: torch.Tensor
-    """(n, 5) [m, m, -, -, m/s] place, unit course, speed of the track"""
+    """(n, N_COLUMN) what a network is told; the first is the track's speed [m/s]"""
     truth: torch.Tensor
     """(n, ANCHORS, 2) [m] where the body then was, in the track's frame"""
-
-
-def path_places(path: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """(n, n_lane, t, 2) [m] of the obstacles of n scenarios, ``path`` (n, n_lane, 16) as in a bank of the
-    surrogate's, at times (n, t) [s]; NaN where there is no obstacle."""
-    names = ("n_way", "radius_m", "length_m", "phase_m", "speed_m_s")
-    out = np.full((*path.shape[:2], time_s.shape[1], 2), np.nan)
-    for i, lane in zip(*np.nonzero(path[..., 4] > 0), strict=True):
-        row = path[i, lane].astype(float)
-        told = dict(zip(names, row, strict=False)) | {"way_w": row[5:15].reshape(5, 2), "easing_m": row[15]}
-        out[i, lane] = path_positions(path_document(told), time_s[i])
-    return out
 
 
 def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int) -> tuple[TrackMoments, int]:
     """Moments of episodes ``first`` .. of ``seed``, one in every env, the scenes dealt out in turn, driven by
     the simulator's tree for at most ``steps``; and the env steps that it took."""
-    from uuvtai.surrogate.world import scenario_rows
-
     sim.set_scenes(scenes)
     rows = torch.arange(sim.num_envs, dtype=torch.int32)
     sim.sleep()
     sim.reset(torch.ones_like(rows), torch.full_like(rows, seed), first + rows)
-    path = scenario_rows(sim)[1]
+    field = functools.cache(lambda name: sim.rows(attrgetter(name)(sim.s)))
+    scenarios = [describe_scenario(lambda name, env=env: field(name)[env]) for env in range(sim.num_envs)]
+    paths = [
+        [path for body in scenario["obstacles"] if (path := body["path"]) and path["speed_m_s"] > 0]
+        for scenario in scenarios
+    ]
     found, running, done = [], np.ones(sim.num_envs, bool), 0
     for step in range(1, steps + 1):
         done += int(running.sum())
@@ -118,43 +192,32 @@ def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int
             break
         sim.deactivate_ended()
         if step % EVERY_STEPS == 0:
-            found.append(_moments(sim, np.flatnonzero(running), path, step * _STEP_S))
-    return joined(found), done
+            found.append(_moments(sim, np.flatnonzero(running).tolist(), paths, step * _STEP_S))
+    return TrackMoments(*(torch.cat(parts) for parts in zip(*found, strict=True))), done
 
 
-def joined(parts: list[TrackMoments]) -> TrackMoments:
-    """All of them, one after the other."""
-    return TrackMoments(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
-
-
-def _moments(sim: Sim, rows: np.ndarray, path: np.ndarray, now_s: float) -> TrackMoments:
-    """Of the tracks of these rows that have a forecast and a obstacle."""
-    s, envs = sim.s, [int(row) for row in rows]
-    there = sim.rows(s.forecast.radius_m, envs)[..., 0] >= 0
-    frame = sim.rows(s.mixture.frame, envs)
-    times = np.broadcast_to(
-        now_s + np.array([-0.05, 0.0, 0.05, *TIMES_S.tolist()]), (len(rows), 3 + len(TIMES_S))
-    )
-    obstacles = path_places(path[rows], times)
+def _moments(sim: Sim, envs: list[int], paths: list[list[dict[str, Any]]], now_s: float) -> TrackMoments:
+    """Of the tracks of these envs that have a forecast and an obstacle, which move along ``paths``."""
+    there = sim.rows(sim.s.forecast.radius_m, envs)[..., 0] >= 0
+    frame = sim.rows(sim.s.mixture.frame, envs)
+    """(env, track, 5) [m, m, -, -, m/s] place, unit course, speed"""
+    times = now_s + np.array([-0.05, 0.0, 0.05, *TIMES_S.tolist()])
+    obstacles = np.full((len(envs), max(1, *map(len, paths)), len(times), 2), np.nan)
+    for row, env in enumerate(envs):
+        for lane, path in enumerate(paths[env]):
+            obstacles[row, lane] = path_positions(path, times)
     velocity = (obstacles[:, :, 2] - obstacles[:, :, 0]) / 0.1
     own_velocity = frame[..., 2:4] * frame[..., 4:]
     away = np.linalg.norm(obstacles[:, None, :, 1] - frame[:, :, None, :2], axis=-1)
     cost = away + _SPEED_S * np.linalg.norm(velocity[:, None] - own_velocity[:, :, None], axis=-1)
     cost = np.where(away < _OBSTACLE_M, cost, np.inf)
     body = np.argmin(np.nan_to_num(cost, nan=np.inf, posinf=np.inf), -1)
-    env, track = np.nonzero(there & np.isfinite(np.min(cost, -1)))
-    chosen = frame[env, track]
-    column = sim.rows(s.mixture.column, envs)[env, track]
-    parts = (column, chosen, _in_frame(obstacles[env, body[env, track], 3:], chosen))
+    row, track = np.nonzero(there & np.isfinite(np.min(cost, -1)))
+    chosen = frame[row, track]
+    x, y = np.moveaxis(obstacles[row, body[row, track], 3:] - chosen[:, None, :2], -1, 0)
+    c, s = chosen[:, 2, None], chosen[:, 3, None]
+    parts = sim.rows(sim.s.mixture.column, envs)[row, track], np.stack([c * x + s * y, c * y - s * x], -1)
     return TrackMoments(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in parts))
-
-
-def _in_frame(place: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Places (n, ..., 2) in the world, in the frames (n, 5) of their tracks."""
-    shape = (len(frame), *(1,) * (place.ndim - 2))
-    x, y = place[..., 0] - frame[:, 0].reshape(shape), place[..., 1] - frame[:, 1].reshape(shape)
-    c, s = frame[:, 2].reshape(shape), frame[:, 3].reshape(shape)
-    return np.stack([c * x + s * y, c * y - s * x], -1)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -166,32 +229,30 @@ _LEAST_RATE = 0.02
 """part of the learning rate that is left at the end"""
 
 
-class ForecastTrainer:
-    """Everything that learning to forecast carries from one iteration to the next. Episodes begin and end
-    within an iteration: the simulators carry nothing."""
+class ForecastTrainer(EpisodeTrainer):
+    """Everything that learning to forecast carries from one iteration to the next."""
+
+    counters = ("iteration", "env_steps", "kept", "seen")
 
     def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None = None) -> None:
-        """``sims``: simulators of worlds that are there already. Raises SettingError where the stack already
-        forecasts by a network."""
+        """Raises SettingError where the stack already forecasts by a network."""
         if config.forecast.learned:
             raise SettingError(
                 "forecast.learned: a forecast is learnt beside the one by arcs and turn history; leave it "
                 "empty"
             )
-        self.config = config
+        forecast = config.forecast.model_copy(update={"keep_columns": True})
+        super().__init__(config.model_copy(update={"forecast": forecast}), sims)
         self.observation_table = (column_row(),)
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.net = MixtureNet(self.generator)
-        self.optimiser = PlainAdam(
-            self.net.parameters(), lr=config.forecast_training.learning_rate, eps=ADAM_EPS
-        )
+        rate = config.forecast_training.learning_rate
+        self.learner = AdamLearner(self.net.parameters(), lr=rate, eps=ADAM_EPS)
         self._columns = torch.zeros(MEMORY, N_COLUMN, dtype=torch.float16)
         self._truth = torch.zeros(MEMORY, len(TIMES_S), 2)
-        self.recent = Recent(OUTCOMES, ())
-        self.iteration = self.env_steps = self.kept = self.seen = 0
+        self.kept = self.seen = 0
         self._scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (config.world.own_scene,)
-        self._sims: dict[str, Sim] = dict(sims or {})
 
     def iterate(self) -> dict[str, float]:
         """Run episodes of one world, learn from all that is kept; metrics by their names in metrics.jsonl."""
@@ -203,19 +264,11 @@ class ForecastTrainer:
         self._keep(found)
         between = time.perf_counter()
         losses = [self._fit() for _ in range(config.forecast_training.minibatches)]
-        learn_s = time.perf_counter() - between
-        self.iteration += 1
-        self.env_steps += steps
         return {
             "train/nll": sum(losses) / len(losses),
-            "train/learning_rate": self.optimiser.param_groups[0]["lr"],
+            "train/learning_rate": self.learner.optimiser.param_groups[0]["lr"],
             "train/moments": float(self.kept),
-            "time/simulate_s": between - began,
-            "time/infer_s": 0.0,
-            "time/learn_s": learn_s,
-            "time/env_steps_per_s": steps / (between - began + learn_s),
-            "time/env_steps": float(self.env_steps),
-        }
+        } | self._done(steps, began, between)
 
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
@@ -223,7 +276,7 @@ class ForecastTrainer:
         train, metrics = self.config.train, {}
         for world in self.config.forecast_training.worlds:
             found, _ = self._watched(world, train.evaluate_seed, 0)
-            scores = scores_of(self.net(found.columns, found.frame[:, 4]), found.truth)
+            scores = scores_of(self.net(found.columns), found.truth)
             metrics |= {f"eval/{name}_{world}": value for name, value in scores.items()}
         return metrics
 
@@ -232,11 +285,8 @@ class ForecastTrainer:
         return {WEIGHTS: packed_weights(self.net.weights())}
 
     def _watched(self, world: str, seed: int, first: int) -> tuple[TrackMoments, int]:
-        if world not in self._sims:
-            self._sims[world] = _simulator_of(self.config, world, self._scenes)
-        return watch(
-            self._sims[world], self._scenes, seed, first, self.config.forecast_training.episode_steps
-        )
+        sim = self.simulator(world, self._scenes)
+        return watch(sim, self._scenes, seed, first, self.config.forecast_training.episode_steps)
 
     def _keep(self, seen: TrackMoments) -> None:
         """Remember moments, the newest in the place of the oldest."""
@@ -249,47 +299,34 @@ class ForecastTrainer:
     def _fit(self) -> float:
         """One step of the network towards what came; the loss in nats."""
         config, share = self.config.forecast_training, self.iteration / self.config.train.iterations
-        self.optimiser.param_groups[0]["lr"] = config.learning_rate * max(_LEAST_RATE, 1.0 - share)
+        self.learner.optimiser.param_groups[0]["lr"] = config.learning_rate * max(_LEAST_RATE, 1.0 - share)
         at = torch.randint(self.kept, (MINIBATCH,), generator=self.generator)
         columns, truth = self._columns[at].float(), self._truth[at]
-        speed = columns[:, 0]
         if torch.rand(1, generator=self.generator) < 0.5:
             columns, truth = mirrored(columns, truth)
-        loss = negative_log_likelihood(self.net(columns, speed), truth).mean()
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
-        self.optimiser.step()
+        loss = negative_log_likelihood(self.net(columns), truth).mean()
+        self.learner.step(loss, 5.0)
         return float(loss.detach())
 
     # ------------------------------------------------------------------------------------------------- resume
 
     def state(self) -> dict[str, Any]:
         """All that the next iterations depend on. What forecasts is the part ``forecast``."""
-        return {
+        return super().state() | {
             "forecast": {name: tensor.clone() for name, tensor in self.net.state_dict().items()},
-            "optimiser": self.optimiser.state_dict(),
+            "optimiser": self.learner.optimiser.state_dict(),
             "generator": self.generator.get_state(),
-            "counters": {name: getattr(self, name) for name in ("iteration", "env_steps", "kept", "seen")},
             "env": {"columns": self._columns, "truth": self._truth},
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from what ``state`` gave."""
+        super().load_state(state)
         self.net.load_state_dict(state["forecast"])
-        self.optimiser.load_state_dict(state["optimiser"])
+        self.learner.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"])
-        for name, value in state["counters"].items():
-            setattr(self, name, int(value))
         self._columns.copy_(state["env"]["columns"])
         self._truth.copy_(state["env"]["truth"])
-
-
-def _simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
-    """A simulator that keeps columns, with room for every scene, on the run's sensors and stack. Raises
-    ConfigError."""
-    forecast = config.forecast.model_copy(update={"keep_columns": True})
-    return simulator_of(config.model_copy(update={"forecast": forecast}), world, scenes)
 
 
 def column_row() -> ObservationColumn:

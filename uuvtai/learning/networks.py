@@ -8,28 +8,14 @@ import itertools
 import math
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeVar
 
-import numpy as np
 import torch
 from torch import nn
 
-from uuvtai.common.enums import (
-    ANCHOR_S,
-    ANCHORS,
-    FAR_COLUMNS,
-    N_COLUMN,
-    N_HIDDEN,
-    N_MODE,
-    N_SAID,
-    N_SPREAD,
-    N_TOLD,
-    SIDE_COLUMNS,
-)
 from uuvtai.common.errors import SettingError, UserError
 from uuvtai.config.learning import PolicyConfig
 
@@ -46,16 +32,13 @@ def mlp(
     zero.
 
     Weights are orthogonal with gain sqrt 2, the last layer's with ``out_gain`` (0 = its output is zero at
-    birth). ``generator`` is a CPU generator. ValueError for fewer than two widths.
+    birth). ``generator`` is a CPU generator.
     """
-    if len(sizes) < 2:
-        raise ValueError(f"an mlp needs at least an input and an output width, got {list(sizes)}")
+    *hidden, last = itertools.pairwise(sizes)
     layers: list[nn.Module] = []
-    for number, (n_in, n_out) in enumerate(itertools.pairwise(sizes), start=2):
-        last = number == len(sizes)
-        layer = linear(n_in, n_out, out_gain if last else _HIDDEN_GAIN, generator)
-        layers += [layer] if last else [layer, _ACTIVATIONS[activation]()]
-    return nn.Sequential(*layers)
+    for n_in, n_out in hidden:
+        layers += [linear(n_in, n_out, _HIDDEN_GAIN, generator), _ACTIVATIONS[activation]()]
+    return nn.Sequential(*layers, linear(*last, out_gain, generator))
 
 
 def linear(n_in: int, n_out: int, gain: float, generator: torch.Generator) -> nn.Linear:
@@ -79,15 +62,14 @@ MIN_STD = 1e-2
 noise"""
 
 
-@dataclass(frozen=True)
-class Moments:
+class Moments(NamedTuple):
     """Moments of samples of ``width`` columns, float64."""
 
     mean: torch.Tensor
     """(width,)"""
     m2: torch.Tensor
     """(width,), sum of squared differences from the mean"""
-    count: torch.Tensor
+    n: torch.Tensor
     """(), number of samples"""
 
 
@@ -97,25 +79,22 @@ def moments_of(x: torch.Tensor) -> Moments:
     kept = torch.isfinite(rows.sum(dim=1))
     if not bool(kept.all()):
         rows = rows[kept]
-    width = rows.shape[1]
-    zeros = torch.zeros(2 * width + 1, dtype=torch.float64, device=x.device)
-    total = Moments(zeros[:width], zeros[width:-1], zeros[-1])
+    zeros = functools.partial(torch.zeros, dtype=torch.float64, device=x.device)
+    total = Moments(zeros(rows.shape[1]), zeros(rows.shape[1]), zeros(()))
     for first in range(0, len(rows), _ROWS_AT_ONCE):
-        total = combined(total, _moments_of_part(rows[first : first + _ROWS_AT_ONCE].double()))
+        part = rows[first : first + _ROWS_AT_ONCE].double()
+        mean = part.mean(dim=0)
+        m2 = (part - mean).square().sum(dim=0)
+        total = combined(total, Moments(mean, m2, part.new_tensor(float(len(part)))))
     return total
-
-
-def _moments_of_part(rows: torch.Tensor) -> Moments:
-    mean = rows.mean(dim=0)
-    return Moments(mean, (rows - mean).square().sum(dim=0), rows.new_tensor(float(len(rows))))
 
 
 def combined(a: Moments, b: Moments) -> Moments:
     """Moments of the samples of both, as if they had been taken together (Chan et al., equation 1.5)."""
-    count = a.count + b.count
-    share = b.count / count.clamp(min=1.0)
+    n = a.n + b.n
+    share = b.n / n.clamp(min=1.0)
     difference = b.mean - a.mean
-    return Moments(a.mean + share * difference, a.m2 + b.m2 + difference.square() * (a.count * share), count)
+    return Moments(a.mean + share * difference, a.m2 + b.m2 + difference.square() * (a.n * share), n)
 
 
 class RunningNorm(nn.Module):
@@ -127,7 +106,7 @@ class RunningNorm(nn.Module):
     count: torch.Tensor
 
     def __init__(self, width: int, clip: float = 10.0) -> None:
-        """``clip``: normalised values are cut off beyond +-clip."""
+        """``clip``: standard deviations beyond which normalised values are cut off."""
         super().__init__()
         self.clip = clip
         self.register_buffer("mean", torch.zeros(width, dtype=torch.float64))
@@ -141,26 +120,17 @@ class RunningNorm(nn.Module):
 
     def update(self, x: torch.Tensor) -> None:
         """Add the rows of x (..., width); rows that are not finite are left out."""
-        self.merge(moments_of(x))
-
-    def merge(self, moments: Moments) -> None:
-        """Add samples whose moments are known."""
-        united = combined(self.moments, moments)
-        self.mean.copy_(united.mean)
-        self.m2.copy_(united.m2)
-        self.count.copy_(united.count)
+        for own, united in zip(self.moments, combined(self.moments, moments_of(x)), strict=True):
+            own.copy_(united)
 
     def std(self) -> torch.Tensor:
         """(width,) deviation, float64, at least ``MIN_STD``; 1 before the first sample."""
         variance = torch.where(self.count > 0, self.m2 / self.count.clamp(min=1.0), 1.0)
         return variance.sqrt().clamp(min=MIN_STD)
 
-    def forward(self, x: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Normalised x (..., width), float32, within +-clip; what is not a number becomes 0, the mean.
-
-        ``out``: written to instead of a new tensor.
-        """
-        y = torch.sub(x, self.mean.float(), out=out)
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Normalised x (..., width), float32, within +-clip; what is not a number becomes 0, the mean."""
+        y = x - self.mean.float()
         limit = torch.where(self.count > 0, self.clip, math.inf).float()
         y.mul_((1.0 / self.std()).float()).clamp_(-limit, limit)
         return y.nan_to_num_(nan=0.0, posinf=self.clip, neginf=-self.clip)
@@ -176,8 +146,6 @@ class RunningNorm(nn.Module):
 
 
 NUM_ACTIONS = 4
-CLIP_OBSERVATION = 10.0
-"""standard deviations beyond which an observation is cut off"""
 _MEAN_GAIN, _VALUE_GAIN = 0.01, 1.0  # of the last layers: small first actions (Andrychowicz et al. 2021)
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -254,14 +222,6 @@ class Policy(nn.Module, ABC):
         """What is kept of it, by name in a checkpoint: ``policy`` is what drives."""
         return {"policy": self}
 
-    @abstractmethod
-    def actor_parameters(self) -> list[nn.Parameter]:
-        """Of what drives."""
-
-    @abstractmethod
-    def last_of_critic(self) -> nn.Linear:
-        """The critic's last layer."""
-
     def observe(self, view: View) -> None:
         """Take inputs into the statistics that they are scaled by, where there are some."""
 
@@ -290,17 +250,17 @@ class Policy(nn.Module, ABC):
         self.log_std.clamp_(math.log(self.config.min_std), math.log(self.most_std))
 
     @torch.no_grad()
-    def learn_returns(self, moments: Moments) -> None:
-        """Add the moments of returns (width 1) to the value's statistics and change the critic's last layer
+    def learn_returns(self, returns: torch.Tensor) -> None:
+        """Add returns (n, 1) to the value's statistics and change the critic's last layer
         so that no value changes.
 
         Source: van Hasselt et al. 2016, "Learning values across many orders of magnitude" (Pop-Art), equation
         9.
         """
         old_mean, old_std = self.value_norm.mean.clone(), self.value_norm.std()
-        self.value_norm.merge(moments)
+        self.value_norm.update(returns)
         mean, std = self.value_norm.mean, self.value_norm.std()
-        last = self.last_of_critic()
+        *_, last = (layer for layer in self.critic.modules() if isinstance(layer, nn.Linear))
         last.weight.copy_(last.weight * (old_std / std))
         last.bias.copy_((last.bias * old_std + old_mean - mean) / std)
 
@@ -317,7 +277,7 @@ class ActorCritic(Policy):
         self.actor = mlp((n_in, *config.hidden, NUM_ACTIONS), config.activation, generator, _MEAN_GAIN)
         self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
         self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
-        self.observation_norm = RunningNorm(n_in, CLIP_OBSERVATION)
+        self.observation_norm = RunningNorm(n_in)
         self.value_norm = RunningNorm(1, math.inf)
 
     def prepared(self, view: View) -> View:
@@ -332,17 +292,9 @@ class ActorCritic(Policy):
         """As in ``Policy``."""
         return self.critic(inputs["x"]).squeeze(-1)
 
-    def actor_parameters(self) -> list[nn.Parameter]:
-        """As in ``Policy``."""
-        return [self.log_std, *self.actor.parameters()]
-
-    def last_of_critic(self) -> nn.Linear:
-        """As in ``Policy``."""
-        return self.critic[-1]
-
     def observe(self, view: View) -> None:
         """As in ``Policy``."""
-        self.observation_norm.merge(moments_of(view["x"]))
+        self.observation_norm.update(view["x"])
 
     def distribution(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(mean (..., 4), log_std (4,)) of the action."""
@@ -390,18 +342,16 @@ def torch_threads_rest() -> Iterator[None]:
 def side_by_side(*pieces: Callable[[], _T], device: str = "cpu") -> list[_T]:
     """What each piece gives, in their order. Threads have no part in any result: a piece runs on one. On a
     GPU one comes after the other."""
-    if device != "cpu":
+    threads = _threads.get(None) or torch.get_num_threads()
+    if device != "cpu" or threads == 1:
         return [piece() for piece in pieces]
     flushes = float(torch.tensor(1e-40) * 1.0) == 0.0
-    pool = _pool(_threads.get(None) or torch.get_num_threads(), flushes)
-    if pool is None:
-        return [piece() for piece in pieces]
-    return [begun.result() for begun in [pool.submit(piece) for piece in pieces]]
+    return list(_pool(threads, flushes).map(lambda piece: piece(), pieces))
 
 
 @functools.cache
-def _pool(threads: int, flushes: bool) -> ThreadPoolExecutor | None:
-    return None if threads == 1 else ThreadPoolExecutor(threads, "uuvtai-learn", _begin, (flushes,))
+def _pool(threads: int, flushes: bool) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "uuvtai-learn", _begin, (flushes,))
 
 
 def _begin(flushes: bool) -> None:
@@ -468,81 +418,37 @@ def _spare_compiler() -> None:
             inner.__dynamo_disable = inner
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The network of a learned forecast, its likelihood, and what it says in metres.
-#
-# A mixture of ``N_MODE`` Gaussians over the places at ``ANCHORS`` times, along and across the track's course
-# (Bishop 1994). Each future is a whole way: its places share one weight.
+class AdamLearner:
+    """Steps of Adam, but for those that would spoil the networks."""
 
+    def __init__(self, parameters: Iterable[Any], **options: Any) -> None:
+        """``parameters`` and ``options`` of ``torch.optim.Adam``."""
+        self.optimiser = PlainAdam(parameters, **options)
+        self.skipped = 0
+        """steps left out because the gradient was not finite, or zero for want of valid samples"""
 
-TIMES_S = torch.arange(1, ANCHORS + 1) * ANCHOR_S
-"""[s] ahead, of the places that it tells"""
-_LEAST_M, _MOST = 0.03, 4.0
-"""[m] smallest deviation; largest, as a part of the way that an obstacle can go"""
-_HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
+    def step(self, loss: torch.Tensor | None = None, most: float = math.inf) -> bool:
+        """One step on ``loss`` (a scalar; None: by gradients that are there), the norm of every group's
+        gradient cut to ``most``; False where nothing was changed."""
+        if loss is not None:
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+        groups = self.optimiser.param_groups
+        norms = [float(nn.utils.clip_grad_norm_(group["params"], most)) for group in groups]
+        is_sound = 0.0 < sum(norms) < math.inf
+        if is_sound:
+            self.optimiser.step()
+        self.skipped += not is_sound
+        return is_sound
 
+    def state_dict(self) -> dict[str, Any]:
+        """Adam's moments and the count of steps left out."""
+        return {"optimiser": self.optimiser.state_dict(), "skipped": self.skipped}
 
-class Mixture(NamedTuple):
-    """What may come of n tracks, in their frames."""
-
-    log_weight: torch.Tensor
-    """(n, N_MODE) logarithm of the probability of each future"""
-    place: torch.Tensor
-    """(n, N_MODE, ANCHORS, 2) [m] along and across the course"""
-    sigma: torch.Tensor
-    """(n, N_MODE, ANCHORS, 2) [m] standard deviations"""
-
-
-class MixtureNet(nn.Module):
-    """Columns of a track to its futures: two hidden layers of rectified units."""
-
-    def __init__(self, generator: torch.Generator) -> None:
-        super().__init__()
-        gain = math.sqrt(2.0)
-        self.into = linear(N_COLUMN, N_HIDDEN, gain, generator)
-        self.middle = linear(N_HIDDEN, N_HIDDEN, gain, generator)
-        self.said = linear(N_HIDDEN, N_TOLD, 0.1, generator)
-        self.spread = linear(N_HIDDEN, N_SPREAD, 0.1, generator)
-        with torch.no_grad():  # the futures begin apart: straight on, slower, back, left and right
-            ways = torch.tensor([[1.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [-0.8, 0.0], [0.5, 0.5], [0.5, -0.5]])
-            self.said.bias[N_MODE:] = ways[:N_MODE, None].expand(-1, ANCHORS, -1).reshape(-1)
-            self.spread.bias.fill_(math.log(0.3))
-
-    def forward(self, columns: torch.Tensor, speed: torch.Tensor) -> Mixture:
-        """``columns`` (n, N_COLUMN), ``speed`` (n,) [m/s]."""
-        hidden = torch.relu(self.middle(torch.relu(self.into(columns))))
-        said = self.said(hidden)
-        reach = (speed[:, None] * TIMES_S)[:, None, :, None]
-        place = said[:, N_MODE:].view(-1, N_MODE, ANCHORS, 2) * reach
-        part = self.spread(hidden).view(-1, N_MODE, ANCHORS, 2).clamp(-6.0, math.log(_MOST)).exp()
-        return Mixture(torch.log_softmax(said[:, :N_MODE], -1), place, _LEAST_M + part * reach)
-
-    def weights(self) -> dict[str, np.ndarray]:
-        """Arrays of a forecast's file (``mixture_weights``)."""
-        out, bias = torch.zeros(N_HIDDEN, N_SAID), torch.zeros(N_SAID)
-        out[:, :N_TOLD], bias[:N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
-        found = {"weight_out": out, "bias_out": bias}
-        layers = {"in": self.into, "mid": self.middle, "spread": self.spread}  # the last one is padded there
-        for name, layer in layers.items():
-            found |= {f"weight_{name}": layer.weight.T, f"bias_{name}": layer.bias}
-        return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
-
-
-def negative_log_likelihood(mixture: Mixture, truth: torch.Tensor) -> torch.Tensor:
-    """(n,) of the true places (n, ANCHORS, 2) [m] in the tracks' frames, in nats of all of them together."""
-    off = (truth[:, None] - mixture.place) / mixture.sigma
-    log_density = -(0.5 * off * off + mixture.sigma.log() + _HALF_LOG_TAU).sum((-1, -2))
-    return -torch.logsumexp(mixture.log_weight + log_density, -1)
-
-
-def mirrored(columns: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same tracks seen in a mirror along their course: left is right."""
-    flip = torch.ones(N_COLUMN)
-    flip[list(SIDE_COLUMNS)] = -1.0
-    order = torch.arange(N_COLUMN)
-    for one, other in FAR_COLUMNS:
-        order[one], order[other] = other, one
-    return (columns * flip)[:, order], truth * torch.tensor([1.0, -1.0])
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """What ``state_dict`` gave."""
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.skipped = int(state["skipped"])
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -552,6 +458,8 @@ def mirrored(columns: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, 
 
 PREFIX = "non_finite/"
 """of the metrics that count what was replaced; they are there only when something was"""
+OBSERVATION = "observation"
+_ROWS_TOLD = 4
 
 
 class TrainingError(UserError, RuntimeError):
@@ -567,58 +475,43 @@ class Guard:
         """``columns``: names of the observation's columns; ``patience``: iterations in a row with something
         bad before it is an error."""
         self.columns, self.patience = tuple(columns), patience
-        width = max((place.stop for _, place in self.columns), default=0)
-        self._observation = torch.zeros(width, dtype=torch.int64, device=device)
         self._rows = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._none = torch.zeros_like(self._rows)
-        self._other: dict[str, torch.Tensor] = {
-            name: torch.zeros((), dtype=torch.int64, device=device) for name in _NAMES
-        }
+        self._counts: dict[str, torch.Tensor] = {}
+        """of what was replaced, column by column"""
         self.bad_in_a_row = 0
 
-    def observation(
-        self, obs: torch.Tensor, fill: torch.Tensor, out: torch.Tensor, counted: torch.Tensor | None = None
+    def values(
+        self,
+        name: str,
+        values: torch.Tensor,
+        out: torch.Tensor,
+        fill: torch.Tensor | None = None,
+        counted: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Copy obs (N, n_obs) into ``out``, with ``fill`` (n_obs,) in place of what is not finite; returns
-        which rows were bad, (N,).
+        """Copy ``values`` (N, ...) into ``out`` with ``fill`` (default: 0) in place of what is not finite;
+        returns which rows were bad, (N,).
 
-        ``counted`` (N,): rows that count (default: all).
+        ``name``: ``OBSERVATION`` is counted by columns. ``counted`` (N,): rows that count (default: all).
         """
-        if _is_sound(obs):
-            out.copy_(obs)
-            return self._none
-        bad = ~torch.isfinite(obs)
-        torch.where(bad, fill, obs, out=out)
-        counting = bad if counted is None else bad & counted[:, None]
-        self._observation += counting.sum(dim=0)
-        rows = bad.any(dim=1)
-        self._rows |= counting.any(dim=1)
-        return rows
-
-    def values(self, name: str, values: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
-        """Copy ``values`` (N, ...) into ``out`` with 0 in place of what is not finite; returns which rows
-        were bad, (N,)."""
         if _is_sound(values):
             out.copy_(values)
             return self._none
         bad = ~torch.isfinite(values)
-        out.copy_(values).masked_fill_(bad, 0.0)
-        rows = bad if bad.dim() == 1 else bad.any(dim=1)
-        self._other[name] += bad.sum()
-        self._rows |= rows
-        return rows
+        torch.where(bad, values.new_zeros(()) if fill is None else fill, values, out=out)
+        rows = bad.view(len(bad), -1)
+        counting = rows if counted is None else rows & counted[:, None]
+        self._counts[name] = counting.sum(dim=0) + self._counts.get(name, 0)
+        self._rows |= counting.any(dim=1)
+        return rows.any(dim=1)
 
     def take(self) -> dict[str, float]:
         """Counts since the last call by name, those above zero only: ``non_finite/<column>``,
         ``non_finite/reward`` and so on."""
-        counts = self._observation.tolist()
-        found = {name: sum(counts[place]) for name, place in self.columns} | {
-            n: int(t) for n, t in self._other.items()
-        }
-        self._observation.zero_()
-        for counter in self._other.values():
-            counter.zero_()
-        return {f"{PREFIX}{name}": float(count) for name, count in found.items() if count}
+        by_column = self._counts.pop(OBSERVATION, torch.zeros(0))
+        found = {name: by_column[place] for name, place in self.columns} | self._counts
+        self._counts = {}
+        return {f"{PREFIX}{name}": float(n) for name, part in found.items() if (n := part.sum())}
 
     def check(
         self, iteration: int, complaints: Sequence[str], scenarios: tuple[torch.Tensor, torch.Tensor]
@@ -644,23 +537,7 @@ class Guard:
         )
 
 
-def guarded_step(loss: torch.Tensor, module: torch.nn.Module, optimiser: torch.optim.Optimizer) -> bool:
-    """One gradient step on ``loss`` (a scalar); False where the gradient is zero or not finite, and nothing
-    was changed."""
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    gradients = [p.grad for p in module.parameters() if p.grad is not None]
-    sound = 0.0 < float(torch.nn.utils.get_total_norm(gradients)) < math.inf
-    if sound:
-        optimiser.step()
-    return sound
-
-
 def _is_sound(values: torch.Tensor) -> bool:
     """Whether everything is finite, asked where that is no wait for a device: whatever is not makes the sum
     so, and so may large numbers, which are then looked at one by one."""
     return values.device.type == "cpu" and math.isfinite(values.sum())
-
-
-_ROWS_TOLD = 4
-_NAMES = ("reward", "teacher_action", "world_model_features")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from uuvtai.learning.agents import TunedAgent, tree_row, tuned_sections
 from uuvtai.learning.rollout import Recent, RolloutSums
 
 if TYPE_CHECKING:
-    from uuvtai.learning.policy_agent import AgentDecision
+    from uuvtai.learning.policy_agent import HeldAgent
     from uuvtai.sim.setup import Scene
     from uuvtai.sim.sim import Sim
 
@@ -49,15 +49,10 @@ class NumberSearch:
         self.centre = centre.clone()
         self.low, self.high = bounds
         self.spread = spread * (self.high - self.low)
-        self.trials = 0
+        self.size, self.trials = size, 0
         self._generator = torch.Generator().manual_seed(seed)
         self._place, self._score = torch.zeros(size, len(centre)), torch.zeros(size)
         self._group = torch.zeros(size, dtype=torch.int64)
-
-    @property
-    def size(self) -> int:
-        """The most trials there will be."""
-        return len(self._score)
 
     def drawn(self, count: int) -> torch.Tensor:
         """(count, n) numbers to try, by pairs for one episode each: anywhere within ``spread``, the second of
@@ -171,69 +166,90 @@ def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) 
 # Episodes of one scene in a trainer's simulator, so many at once as there are rows.
 
 
-class WaveAgent(Protocol):
-    """Who drives."""
-
-    @property
-    def simulator(self) -> Sim: ...
-
-    running: torch.Tensor
-    """(num_envs,) rows whose episode has not ended"""
-    number: torch.Tensor
-    """(num_envs,) episode of every row"""
-
-    def reset(self, rows: torch.Tensor) -> None: ...
-    def decide(self, obs: torch.Tensor, /) -> AgentDecision: ...
-    def advance(self) -> None: ...
-
-
 def run_search_episodes(
-    agent: WaveAgent, scene: Scene, seed: int, first: int, count: int, times: int = 1
+    sim: Sim, agent: HeldAgent, scene: Scene, seed: int, first: int, count: int, times: int = 1
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(outcome code, control steps), both (count,), of episodes from ``first`` on of a seed, each run
-    ``times`` times in a row."""
-    sim = agent.simulator
+    ``times`` times in a row, driven by an agent of this simulator."""
     outcome, steps = (torch.zeros(count, dtype=torch.int64) for _ in range(2))
     sim.set_scenes([scene])
+    rows = torch.arange(sim.num_envs)
     for begin in range(0, count, sim.num_envs):
-        rows = torch.arange(sim.num_envs)
-        mask = (rows < count - begin).int()
-        agent.running, agent.number = mask == 1, begin + rows
+        running = rows < count - begin
+        mask = running.int()
         sim.sleep()
         sim.reset(mask, torch.full_like(mask, seed), (first + (begin + rows) // times).int())
         agent.reset(mask)
         action = agent.decide(sim.action).action
-        while bool(agent.running.any()):
-            steps[agent.number[agent.running]] += 1
+        while bool(running.any()):
+            steps[begin + rows[running]] += 1
             sim.step(action)
             agent.advance()
             now = torch.from_numpy(sim.rows(sim.s.termination.outcome).astype("int64"))
-            ended = agent.running & (now != RUNNING)
+            ended = running & (now != RUNNING)
             if bool(ended.any()):
-                outcome[agent.number[ended]] = now[ended]
-                agent.running &= ~ended
+                outcome[begin + rows[ended]] = now[ended]
+                running = running & ~ended
                 sim.deactivate_ended()
             action = agent.decide(sim.action).action
     return outcome, steps
 
 
+class EpisodeTrainer:
+    """What a trainer has whose episodes begin and end within an iteration: its simulators carry nothing from
+    one to the next."""
+
+    counters: tuple[str, ...] = ("iteration", "env_steps")
+
+    def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None) -> None:
+        """``sims``: simulators of worlds that are there already."""
+        self.config, self._sims = config, dict(sims or {})
+        self.recent = Recent(OUTCOMES, ())
+        self.iteration = self.env_steps = 0
+
+    def simulator(self, world: str, scenes: tuple[Scene, ...]) -> Sim:
+        """That of a world, with room for every scene. Raises ConfigError."""
+        if world not in self._sims:
+            self._sims[world] = simulator_of(self.config, world, scenes)
+        return self._sims[world]
+
+    def _done(self, steps: int, began: float, between: float) -> dict[str, float]:
+        """Count an iteration of so many env steps, and what it took: simulating from ``began`` to ``between``
+        [s], then learning."""
+        self.iteration += 1
+        self.env_steps += steps
+        now = time.perf_counter()
+        return {
+            "time/simulate_s": between - began,
+            "time/infer_s": 0.0,
+            "time/learn_s": now - between,
+            "time/env_steps_per_s": steps / (now - began),
+            "time/env_steps": float(self.env_steps),
+        }
+
+    def state(self) -> dict[str, Any]:
+        """All that the next iterations depend on."""
+        return {"counters": {name: getattr(self, name) for name in self.counters}}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what ``state`` gave."""
+        for name, value in state["counters"].items():
+            setattr(self, name, int(value))
+
+
 # ------------------------------------------------------------------------------------------------------------
 
 
-class ParameterSearchTrainer:
-    """Everything that the search carries from one iteration to the next. Episodes begin and end within an
-    iteration: the simulators carry nothing."""
+class ParameterSearchTrainer(EpisodeTrainer):
+    """Everything that the search carries from one iteration to the next."""
 
     def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None = None) -> None:
-        """``sims``: simulators of worlds that are there already. Raises ConfigError."""
-        self.config = config
+        """Raises ConfigError."""
+        super().__init__(config, sims)
         self.observation_table = (tree_row(),)
         self._scenes = config.parameter_search.scenes
         self._part = [self._part_of(scene) for scene in self._scenes]
         self.searches = tuple(self._search(part) for part in (SLOW, FAST))
-        self.recent = Recent(OUTCOMES, ())
-        self.iteration = self.env_steps = 0
-        self._sims = dict(sims or {})
 
     def _part_of(self, scene: SearchScene) -> int:
         """``SLOW`` or ``FAST``."""
@@ -276,28 +292,17 @@ class ParameterSearchTrainer:
         nth = self.iteration % len(self._scenes)
         scene, part = self._scenes[nth], self._part[nth]
         search = self.searches[part]
-        place = self.centre.repeat(self.config.train.num_envs, 1, 1)
-        place[:, :, part] = search.drawn(len(place))
-        outcome, steps = self._played(scene, place, self.config.train.seed, search.trials // 2, 2)
+        count = self.config.train.num_envs
+        place = self.centre.repeat(count, 1, 1)
+        place[:, :, part] = search.drawn(count)
+        outcome, steps = self._played(scene, place, self.config.train.seed, search.trials // 2, count, 2)
         between = time.perf_counter()
         search.take(place[:, :, part], self._scored(outcome, steps, part), nth)
         if search.trials >= self.config.parameter_search.warm_up * search.size:
             search.move()
-        learn_s = time.perf_counter() - between
-        self.iteration += 1
         env_steps = int(steps.sum())
-        self.env_steps += env_steps
-        return (
-            self._counted(outcome, env_steps)
-            | self.factors()
-            | {
-                "time/simulate_s": between - began,
-                "time/infer_s": 0.0,
-                "time/learn_s": learn_s,
-                "time/env_steps_per_s": env_steps / (between - began + learn_s),
-                "time/env_steps": float(self.env_steps),
-            }
-        )
+        times = self._done(env_steps, began, between)
+        return self._counted(outcome, env_steps) | self.factors() | times
 
     def factors(self) -> dict[str, float]:
         """The factors that trials are drawn around, by their names in metrics.jsonl."""
@@ -308,14 +313,15 @@ class ParameterSearchTrainer:
         }
 
     def _played(
-        self, scene: SearchScene, place: torch.Tensor, seed: int, first: int, times: int = 1
+        self, scene: SearchScene, place: torch.Tensor, seed: int, first: int, count: int, times: int = 1
     ) -> tuple[torch.Tensor, torch.Tensor]:
+        """As ``run_search_episodes``, by the numbers at ``place`` (n_tuned, 2), or (num_envs, n_tuned, 2) by
+        those of every row."""
         world, s, d, v = scene
-        if world not in self._sims:
-            here = tuple(other[1:] for other in self._scenes if other[0] == world)
-            self._sims[world] = simulator_of(self.config, world, here)
-        agent = _TrialAgent(place, self._sims[world])
-        return run_search_episodes(agent, (s, d, v), seed, first, len(place), times)
+        sim = self.simulator(world, tuple(other[1:] for other in self._scenes if other[0] == world))
+        agent = TunedAgent(self.centre, sim)
+        agent.log_factor[: sim.num_envs] = place.numpy()
+        return run_search_episodes(sim, agent, (s, d, v), seed, first, count, times)
 
     def _scored(self, outcome: torch.Tensor, steps: torch.Tensor, part: int) -> torch.Tensor:
         """1 for an arrival at once, less for a late one, 0 for none."""
@@ -325,7 +331,7 @@ class ParameterSearchTrainer:
         return (outcome == SUCCESS).float() * (1.0 - late)
 
     def _counted(self, outcome: torch.Tensor, steps: int) -> dict[str, float]:
-        sums = RolloutSums.zeros(len(OUTCOMES), 0, torch.device("cpu"))
+        sums = RolloutSums(len(OUTCOMES), 0, torch.device("cpu"))
         sums.outcomes += torch.bincount(outcome, minlength=len(OUTCOMES)).double()
         sums.episode_steps += steps
         sums.samples += steps
@@ -338,7 +344,7 @@ class ParameterSearchTrainer:
         train, scenes = self.config.train, list(dict.fromkeys(self._scenes))
         each, won, metrics = -(-train.evaluate_episodes // len(scenes)), [], {}
         for scene in scenes:
-            outcome, steps = self._played(scene, self.centre.repeat(each, 1, 1), train.evaluate_seed, 0)
+            outcome, steps = self._played(scene, self.centre, train.evaluate_seed, 0, each)
             arrived = outcome == SUCCESS
             won.append(arrived.float())
             name = f"{Path(scene[0]).stem}_{scene[2]}_{scene[3]:g}"
@@ -352,35 +358,16 @@ class ParameterSearchTrainer:
 
     def state(self) -> dict[str, Any]:
         """All that the next iterations depend on. What drives is the part ``tree``."""
-        return {
+        return super().state() | {
             "tree": {"log_factor": self.centre},
             "recent": list(self.recent.rows),
-            "counters": {name: getattr(self, name) for name in ("iteration", "env_steps")},
             "searches": [search.state() for search in self.searches],
             "env": [search.memory() for search in self.searches],
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from what ``state`` gave."""
+        super().load_state(state)
         self.recent.rows = [list(row) for row in state["recent"]]
-        for name, value in state["counters"].items():
-            setattr(self, name, int(value))
         for search, own, memory in zip(self.searches, state["searches"], state["env"], strict=True):
             search.load_state(own, memory)
-
-
-class _TrialAgent(TunedAgent):
-    """Drives every episode with numbers of its own."""
-
-    def __init__(self, place: torch.Tensor, sim: Sim) -> None:
-        """``place`` (count, n_tuned, 2) of the episodes, in their order."""
-        super().__init__(torch.zeros(len(TUNED), 2), sim)
-        self._place = place.numpy()
-        self.running = torch.ones(sim.num_envs, dtype=torch.bool)
-        self.number = torch.zeros(sim.num_envs, dtype=torch.int64)
-
-    def reset(self, rows: torch.Tensor) -> None:
-        """As ``TunedAgent.reset``."""
-        of_row = np.minimum(self.number.numpy(), len(self._place) - 1)
-        self.log_factor[: len(of_row)] = self._place[of_row]
-        super().reset(rows)

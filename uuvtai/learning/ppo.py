@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 
@@ -19,7 +18,7 @@ from uuvtai.config.learning import PpoConfig
 from uuvtai.learning.distillation import imitation_error
 from uuvtai.learning.networks import (
     CACHE_ROWS,
-    PlainAdam,
+    AdamLearner,
     Policy,
     View,
     entropy,
@@ -83,82 +82,76 @@ def adapted_rate(rate: torch.Tensor, kl: torch.Tensor, target_kl: float) -> torc
     )
 
 
-_SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distillation", "count")
+_SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distill_loss", "count")
+Piece = tuple[tuple[torch.Tensor, ...], torch.Tensor]
+"""what some rows of a minibatch add to it: gradients; sums over the valid rows, in the order of ``_SUMS``,
+float64"""
 
 
-class Piece(NamedTuple):
-    """What some rows of a minibatch add to it."""
-
-    gradients: tuple[torch.Tensor, ...]
-    sums: torch.Tensor
-    """over the valid rows, in the order of ``_SUMS``, float64"""
-
-
-class Ppo:
+class Ppo(AdamLearner):
     """Adam on the clipped surrogate, the value error, the entropy and the distillation term of one policy."""
 
     def __init__(self, policy: Policy, config: PpoConfig) -> None:
         self.policy, self.config = policy, config
-        device = policy.log_std.device
-        self.rate = torch.tensor(config.learning_rate, device=device)
+        self.rate = torch.tensor(config.learning_rate, device=policy.log_std.device)
         self._rate_now = self.rate.clone()
-        actor, critic = policy.actor_parameters(), list(policy.critic.parameters())
+        critic = list(policy.critic.parameters())
+        actor = [parameter for parameter in policy.parameters() if parameter not in {*critic}]
         groups: list[dict[str, Any]] = [{"params": actor + critic}]
         if policy.critic_rate is not None:
             groups = [{"params": actor}, {"params": critic, "lr": policy.critic_rate}]
-        self.optimiser = PlainAdam(groups, lr=self._rate_now, eps=ADAM_EPS, fused=True)
+        super().__init__(groups, lr=self._rate_now, eps=ADAM_EPS, fused=True)
         self._nets = actor, critic
         self.updates = 0
         """minibatches that changed the policy"""
-        self.skipped = 0
-        """minibatches left out because loss or gradient was not finite"""
 
     def update(
         self,
         rollout: Rollout,
+        generator: torch.Generator,
         distillation_weight: float = 0.0,
-        generator: torch.Generator | None = None,
         share: float = 0.0,
     ) -> dict[str, float]:
         """Learn from a closed rollout; metrics by their names in metrics.jsonl, means over all minibatches of
         the update.
 
-        ``distillation_weight`` is lambda_t s_t of ||mean - teacher_action||^2. ``generator`` (CPU) draws the
-        minibatches where they are random. ``share`` of the run is over. Samples that are not finite have no
+        ``generator`` (CPU) draws the minibatches where they are random. ``distillation_weight`` is lambda_t
+        s_t of ||mean - teacher_action||^2. ``share`` of the run is over. Samples that are not finite have no
         part in any of it and are counted.
         """
         config = self.config
         samples, metrics = self._prepared(rollout)
-        count = len(samples["valid"])
         fade = min(1.0, (1.0 - share) / (1.0 - DECAY_FROM)) if config.target_kl > 0 else 1.0
         self._rate_now.copy_(self.rate * max(LEAST_RATE, fade))
         skipped, sums = self.skipped, torch.zeros(len(_SUMS), dtype=torch.float64, device=self.rate.device)
         with torch_threads_rest():
             for _ in range(config.epochs):
-                for index in self._minibatches(count, generator):
+                for index in self._minibatches(len(samples["valid"]), generator):
                     sums += self._learn(samples, index, distillation_weight)
+        means = dict(zip(_SUMS[:-1], sums / sums[-1].clamp(min=1.0), strict=False))
         if config.target_kl > 0:
-            kl = (sums[_SUMS.index("approx_kl")] / sums[-1].clamp(min=1.0)).float()
-            self.rate.copy_(adapted_rate(self.rate, kl, config.target_kl))
+            self.rate.copy_(adapted_rate(self.rate, means["approx_kl"].float(), config.target_kl))
         if config.normalise_observations:
             self.policy.observe(rollout)
-        return metrics | self._metrics(sums, skipped)
+        log_std = self.policy.log_std.detach()
+        metrics |= {f"train/{name}": float(mean) for name, mean in means.items()}
+        return metrics | {
+            "train/entropy": float(entropy(log_std)),
+            "train/learning_rate": float(self._rate_now),
+            "train/std": float(log_std.exp().mean()),
+            "train/skipped_updates": float(self.skipped - skipped),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments, the learning rate and the counters."""
-        return {
-            "optimiser": self.optimiser.state_dict(),
-            "learning_rate": self.rate.clone(),
-            "updates": self.updates,
-            "skipped": self.skipped,
-        }
+        return super().state_dict() | {"learning_rate": self.rate.clone(), "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave."""
-        self.optimiser.load_state_dict(state["optimiser"])
+        super().load_state_dict(state)
         self.optimiser.param_groups[0]["lr"] = self._rate_now
         self.rate.copy_(state["learning_rate"])
-        self.updates, self.skipped = int(state["updates"]), int(state["skipped"])
+        self.updates = int(state["updates"])
 
     # ----------------------------------------------------------------------------------- what is learned from
 
@@ -185,7 +178,7 @@ class Ppo:
             "train/invalid_samples": float(valid.numel() - len(good)),
         }
         if self.config.normalise_values:
-            self.policy.learn_returns(moments_of(good[:, None]))
+            self.policy.learn_returns(good[:, None])
         found = {
             "advantage": _standardised(advantage, valid).flatten(),
             "target": self.policy.value_norm(returns.flatten()),
@@ -195,16 +188,12 @@ class Ppo:
         kept = {n: flat[n] for n in ("action", "log_prob", "teacher_action") if n in flat}
         return kept | self.policy.prepared(flat) | found, metrics
 
-    def _minibatches(self, count: int, generator: torch.Generator | None) -> Iterator[slice | torch.Tensor]:
+    def _minibatches(self, count: int, generator: torch.Generator) -> Iterator[slice | torch.Tensor]:
         """Blocks of neighbouring rows (all envs in a span of steps), or random ones."""
-        parts = self.config.minibatches
-        bounds = [count * part // parts for part in range(parts + 1)]
-        order = None
+        parts, order = self.config.minibatches, None
         if self.policy.is_shuffled:
-            if generator is None:
-                raise ValueError("this policy's minibatches are drawn at random: pass update() a generator")
             order = torch.randperm(count, generator=generator).to(self.rate.device)
-        for first, last in itertools.pairwise(bounds):
+        for first, last in itertools.pairwise(count * part // parts for part in range(parts + 1)):
             yield slice(first, last) if order is None else order[first:last]
 
     # ------------------------------------------------------------------------------------------ one minibatch
@@ -224,15 +213,17 @@ class Ppo:
             ]
         found = together(*pieces)
         for parameters, mine in zip(self._nets, (found[::2], found[1::2]), strict=True):
-            for parameter, *parts in zip(parameters, *(piece.gradients for piece in mine), strict=True):
+            for parameter, *parts in zip(parameters, *(gradients for gradients, _ in mine), strict=True):
                 parameter.grad = functools.reduce(torch.add, parts)
-        self._step()
-        return torch.stack([piece.sums for piece in found]).sum(dim=0)
+        if self.step(most=self.config.max_grad_norm):
+            self.policy.floor_std()
+            self.updates += 1
+        return torch.stack([sums for _, sums in found]).sum(dim=0)
 
-    def _parts(self, index: slice | torch.Tensor) -> list[slice] | tuple[torch.Tensor, ...]:
+    def _parts(self, index: slice | torch.Tensor) -> Sequence[slice | torch.Tensor]:
         """A minibatch in parts whose activations stay in the cache of a CPU."""
         if self.rate.device.type != "cpu":
-            return (index,)  # type: ignore[return-value]
+            return [index]
         if isinstance(index, torch.Tensor):
             return index.split(CACHE_ROWS)
         starts = range(index.start, index.stop, CACHE_ROWS)
@@ -251,45 +242,14 @@ class Ppo:
         if distillation_weight:
             distill = imitation_error(mean, batch["teacher_action"])
             loss = loss + distillation_weight * (share * distill).sum()
-            sums |= {"distillation": distill}
-        return Piece(torch.autograd.grad(loss, self._nets[0]), _summed(sums, valid))
+            sums |= {"distill_loss": distill}
+        return torch.autograd.grad(loss, self._nets[0]), _summed(sums, valid)
 
     def _of_critic(self, batch: View, count: torch.Tensor) -> Piece:
         error = (self.policy.value_of(batch) - batch["target"]).square()
         loss = self.config.value_weight * (batch["valid"] / count * error).sum()
         gradients = torch.autograd.grad(loss, self._nets[1])
-        return Piece(gradients, _summed({"value_loss": error}, batch["valid"]))
-
-    def _step(self) -> None:
-        """Cut the gradient's norm and step; or nothing where the gradient is not finite."""
-        most = self.config.max_grad_norm
-        norms = [
-            float(torch.nn.utils.clip_grad_norm_(group["params"], most))
-            for group in self.optimiser.param_groups
-        ]
-        if not all(map(math.isfinite, norms)):
-            self.skipped += 1
-            self.optimiser.zero_grad(set_to_none=True)
-            return
-        self.optimiser.step()
-        self.policy.floor_std()
-        self.updates += 1
-
-    def _metrics(self, sums: torch.Tensor, skipped_before: int) -> dict[str, float]:
-        *totals, count = sums.tolist()
-        means = dict(zip(_SUMS, (total / max(count, 1.0) for total in totals), strict=False))
-        log_std = self.policy.log_std.detach()
-        return {
-            "train/policy_loss": means["policy_loss"],
-            "train/value_loss": means["value_loss"],
-            "train/entropy": float(entropy(log_std)),
-            "train/approx_kl": means["approx_kl"],
-            "train/clip_fraction": means["clip_fraction"],
-            "train/learning_rate": float(self._rate_now),
-            "train/std": float(log_std.exp().mean()),
-            "train/skipped_updates": float(self.skipped - skipped_before),
-            "train/distill_loss": means["distillation"],
-        }
+        return gradients, _summed({"value_loss": error}, batch["valid"])
 
 
 def _rows(samples: View, index: slice | torch.Tensor) -> View:
@@ -307,7 +267,7 @@ def _summed(terms: View, valid: torch.Tensor) -> torch.Tensor:
 def _standardised(advantage: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """Mean 0, deviation 1 by the moments of the valid samples; the others become 0."""
     moments = moments_of(advantage[valid][:, None])
-    std = (moments.m2 / moments.count.clamp(min=1.0)).sqrt()
+    std = (moments.m2 / moments.n.clamp(min=1.0)).sqrt()
     return torch.where(valid, (advantage - moments.mean.float()) / (std.float() + 1e-8), 0.0)
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 
 from uuvtai.common.enums import COLLIDED, OUTCOMES
-from uuvtai.learning.networks import Guard, Policy, PolicyStep, View
+from uuvtai.learning.networks import Guard, Policy, View
 
 
 class Step(NamedTuple):
@@ -96,50 +96,27 @@ class Environment(ABC):
 class Rollout(dict[str, torch.Tensor]):
     """Tensors (T, N, ...) by name, in order of time.
 
-    Row t of env n: the view, what was done (``action``, ``log_prob``, ``value``) and what came of it
-    (``reward``, ``next_value`` of the true next view, ``terminated``, ``ended``), what the environment told
-    beside it.
+    Row t of env n: the view, what was decided (``PolicyStep``) and what came of it (``reward``,
+    ``next_value`` of the true next view, ``terminated``, ``ended``), what the environment told beside it.
     """
 
-    def __init__(self, steps: int, view: View, n_action: int) -> None:
-        """``steps`` = T; ``view``: any of N envs."""
+    def __init__(self, steps: int) -> None:
+        """``steps`` = T."""
         super().__init__()
-        self.steps, (num_envs, *_) = steps, next(iter(view.values())).shape
-        device = next(iter(view.values())).device
+        self.steps = steps
 
-        def zeros(*more: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-            return torch.zeros(steps, num_envs, *more, dtype=dtype, device=device)
-
-        for name, part in view.items():
-            self[name] = zeros(*part.shape[1:], dtype=part.dtype)
-        self["action"] = zeros(n_action)
-        for name in ("log_prob", "value", "reward", "next_value"):
-            self[name] = zeros()
-        for name in ("terminated", "ended"):
-            self[name] = zeros(dtype=torch.bool)
-
-    def note(self, t: int, view: View, step: PolicyStep) -> None:
-        """Copy what is known in step t, and what was decided."""
-        told = {"action": step.action, "log_prob": step.log_prob, "value": step.value}
-        for name, part in (view | told).items():
-            self[name][t].copy_(part)
-        if t > 0:
-            self._bridge(t - 1, step.value)
-
-    def add(self, t: int, step: Step, final_value: torch.Tensor) -> None:
-        """Copy what came of step t; ``final_value`` (N,) is the value of the view in which an episode was cut
-        off, read where it ended."""
-        came = {"reward": step.reward, "terminated": step.terminated, "ended": step.ended}
-        for name, part in (came | {"next_value": final_value}).items():
-            self[name][t].copy_(part)
-        for name, part in step.told.items():
+    def note(self, t: int, row: View) -> None:
+        """Copy what is known of step t, each (N, ...)."""
+        for name, part in row.items():
             if name not in self:
                 self[name] = part.new_zeros(self.steps, *part.shape)
             self[name][t].copy_(part)
 
     def close(self, last_value: torch.Tensor) -> None:
-        """Give the value (N,) of the view after the last step."""
-        self._bridge(self.steps - 1, last_value)
+        """``next_value``, so far that of the views in which episodes were cut off, is that of the next view
+        where the episode went on; ``last_value`` (N,) is that of the view after the last step."""
+        following = torch.cat([self["value"][1:], last_value[None]])
+        torch.where(self["ended"], self["next_value"], following, out=self["next_value"])
 
     def flat(self) -> View:
         """Everything as (T N, ...), views: a run of rows is a block of memory."""
@@ -155,41 +132,31 @@ class Rollout(dict[str, torch.Tensor]):
 
     def where(self, valid: torch.Tensor) -> Rollout:
         """A copy that is 0 where ``valid`` (T, N) is not."""
-        found = Rollout.__new__(Rollout)
-        found.steps = self.steps
+        found = Rollout(self.steps)
         for name, part in self.items():
             rows = valid.view(*valid.shape, *[1] * (part.dim() - 2))
             found[name] = torch.where(rows, part, torch.zeros_like(part[:1]))
         return found
 
-    def _bridge(self, t: int, value: torch.Tensor) -> None:
-        """The value of the view after step t, where the episode went on."""
-        torch.where(self["ended"][t], self["next_value"][t], value, out=self["next_value"][t])
-
 
 @torch.no_grad()
 def collect(
-    env: Environment,
-    policy: Policy,
-    rollout: Rollout,
-    generator: torch.Generator,
-    watch: Callable[[PolicyStep, View], None] = lambda _step, _view: None,
+    env: Environment, policy: Policy, rollout: Rollout, generator: torch.Generator
 ) -> tuple[RolloutSums, dict[str, float]]:
     """Fill the rollout; what is counted, and the wall time [s] of simulating and of inferring.
 
-    ``generator`` (CPU) draws the exploration. ``watch`` is told of every decision and of what it was made
-    from.
+    ``generator`` (CPU) draws the exploration.
     """
     began, simulate_s = time.perf_counter(), 0.0
-    sums = RolloutSums.zeros(len(env.outcomes), len(env.reward_terms), env.device)
+    sums = RolloutSums(len(env.outcomes), len(env.reward_terms), env.device)
     for t in range(rollout.steps):
         step = policy.act(env.view, generator)
-        rollout.note(t, env.view, step)
-        watch(step, env.view)
+        rollout.note(t, env.view | step._asdict())
         between = time.perf_counter()
         end = env.step(step.action, sums)
         simulate_s += time.perf_counter() - between
-        rollout.add(t, end, final_value(policy, end))
+        came = {"reward": end.reward, "terminated": end.terminated, "ended": end.ended}
+        rollout.note(t, came | {"next_value": final_value(policy, end)} | end.told)
     rollout.close(policy.expected(env.view))
     infer_s = time.perf_counter() - began - simulate_s
     return sums, {"time/simulate_s": simulate_s, "time/infer_s": infer_s}
@@ -213,20 +180,20 @@ WINDOW = 100
 """episodes at least that a figure is the mean of, once there were so many (as other trainers do)"""
 
 
-@dataclass
 class RolloutSums:
     """Sums over one rollout, kept on the device until its end."""
 
-    outcomes: torch.Tensor
-    """(n_outcome,) episodes that ended, by outcome"""
-    episode_return: torch.Tensor
-    """() sum over the episodes that ended"""
-    episode_steps: torch.Tensor
-    """() the same of their lengths"""
-    terms: torch.Tensor
-    """(n_term,) every weighted reward term, sum over all steps"""
-    samples: torch.Tensor
-    """() steps taken"""
+    def __init__(self, n_outcome: int, n_term: int, device: torch.device) -> None:
+        """Nothing counted yet."""
+        zeros = functools.partial(torch.zeros, dtype=torch.float64, device=device)
+        self.outcomes = zeros(n_outcome)
+        """(n_outcome,) episodes that ended, by outcome"""
+        self.episode_return, self.episode_steps = zeros(()), zeros(())
+        """() sums over the episodes that ended"""
+        self.terms = zeros(n_term)
+        """(n_term,) every weighted reward term, sum over all steps"""
+        self.samples = zeros(())
+        """() steps taken"""
 
     def count(self, ended: torch.Tensor, info: View) -> None:
         """Add one control step of all envs, of which these (N,) ended: ``info`` of ``VectorEnv.step``."""
@@ -235,16 +202,6 @@ class RolloutSums:
         self.episode_steps += (info["episode_steps"] * ended).sum()
         self.terms += info["reward_terms"].nansum(dim=0)
         self.samples += len(ended)
-
-    @classmethod
-    def zeros(cls, n_outcome: int, n_term: int, device: torch.device) -> RolloutSums:
-        """Nothing counted yet."""
-        return cls(
-            *(
-                torch.zeros(size, dtype=torch.float64, device=device)
-                for size in ((n_outcome,), (), (), (n_term,), ())
-            )
-        )
 
 
 class Recent:
@@ -260,12 +217,10 @@ class Recent:
         """Take in a rollout; ``rollout/*`` over the window (none before the first episode has ended),
         ``reward/*`` over the rollout."""
         self.rows.append([float(sums.episode_return), float(sums.episode_steps), *sums.outcomes.tolist()])
-        while sum(self._episodes(row) for row in self.rows[1:]) >= WINDOW:
+        while sum(sum(row[2:]) for row in self.rows[1:]) >= WINDOW:
             self.rows.pop(0)
-        metrics = {
-            f"reward/{n}": v / float(sums.samples)
-            for n, v in zip(self.terms, sums.terms.tolist(), strict=True)
-        }
+        by_term = zip(self.terms, (sums.terms / sums.samples).tolist(), strict=True)
+        metrics = {f"reward/{name}": mean for name, mean in by_term}
         total, steps, *counts = (sum(column) for column in zip(*self.rows, strict=True))
         episodes = sum(counts)
         if not episodes:
@@ -277,14 +232,10 @@ class Recent:
             "rollout/success_rate": by_name["success"] / episodes,
             "rollout/collision_rate": sum(by_name[name] for name in COLLIDED) / episodes,
             "rollout/timeout_rate": by_name["timeout"] / episodes,
-            "rollout/episodes": self._episodes(self.rows[-1]),
+            "rollout/episodes": float(sums.outcomes.sum()),
         }
 
     @property
     def episodes(self) -> float:
         """Episodes that the figures are the mean of."""
-        return sum(self._episodes(row) for row in self.rows)
-
-    @staticmethod
-    def _episodes(row: list[float]) -> float:
-        return sum(row[2:])
+        return sum(sum(row[2:]) for row in self.rows)

@@ -136,14 +136,6 @@ class SetPolicy(Policy):
         """As in ``Policy``; no file that drives holds the critic."""
         return {"policy": self.actor, "critic": self.critic}
 
-    def actor_parameters(self) -> list[nn.Parameter]:
-        """As in ``Policy``."""
-        return list(self.actor.parameters())
-
-    def last_of_critic(self) -> nn.Linear:
-        """As in ``Policy``."""
-        return self.critic.net.head[-1]
-
 
 class MaxAndSum(torch.autograd.Function):
     """(highest, sum), both (rows, wide), over the obstacles of relu(said) where ``mask`` is 1; 0 where no

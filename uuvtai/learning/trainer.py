@@ -44,8 +44,7 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.policy = env.make_policy(self.generator)
         self.distillation = Distillation(self.policy, config, env.node_names) if env.node_names else None
-        n_action = len(self.policy.log_std)
-        self.rollout = Rollout(config.ppo.rollout_steps, env.view, n_action)
+        self.rollout = Rollout(config.ppo.rollout_steps)
         self.ppo = Ppo(self.policy, config.ppo)
         world, self.world_model, self.world_learner = config.world_model, None, None
         if world.enabled and "x" not in env.view:
@@ -76,8 +75,7 @@ class Trainer:
         many bad iterations in a row.
         """
         shown = self._begin() if self.iteration == 0 else {}
-        watch = self.distillation.watch if self.distillation else lambda _step, _view: None
-        sums, times = collect(self.env, self.policy, self.rollout, self.generator, watch)
+        sums, times = collect(self.env, self.policy, self.rollout, self.generator)
         began = time.perf_counter()
         metrics = shown | self._learn(self.iteration / self.config.train.iterations)
         times |= {"time/learn_s": time.perf_counter() - began}
@@ -158,9 +156,9 @@ class Trainer:
     def _learn(self, share: float) -> dict[str, float]:
         """Everything that learns from the rollout; ``share`` of the run is over."""
         if self.distillation is None:
-            return self.ppo.update(self.rollout, generator=self.generator, share=share)
+            return self.ppo.update(self.rollout, self.generator, share=share)
         strength, metrics = self.distillation.weigh(self.rollout, share)
-        metrics |= self.ppo.update(self.rollout, strength, self.generator, share)
+        metrics |= self.ppo.update(self.rollout, self.generator, strength, share)
         metrics |= self.distillation.update(self.rollout, strength, self.generator)
         return metrics | self._learn_world()
 

@@ -7,8 +7,7 @@ next observation plus beta |f(o') - z'|^2, both summed over their dimensions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as fn
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import WorldModelConfig
-from uuvtai.learning.networks import PlainAdam, RunningNorm, guarded_step, mlp, moments_of
+from uuvtai.learning.networks import AdamLearner, RunningNorm, mlp
 
 N_TARGET = 24
 """first columns of the observation: goal, heading error, velocity, yaw rate, depth, tilt, 12 sector ranges"""
@@ -32,27 +31,6 @@ LARGEST_ERROR = 100.0
 """of a target, in SI units: one that is further off counts as so far"""
 _OUT_GAIN = 0.01
 """of the decoder: at birth it says 0 with variance one"""
-
-
-class Prediction(NamedTuple):
-    """Next observation's targets, raw SI units."""
-
-    latent: Tensor
-    """(..., latent) z'"""
-    mean: Tensor
-    """(..., 24)"""
-    log_var: Tensor
-    """(..., 24), natural logarithm of the variance in squared SI units"""
-
-
-class Losses(NamedTuple):
-    """Means over the valid samples, scalars."""
-
-    total: Tensor
-    reconstruction: Tensor
-    """[nat], summed over the targets"""
-    dynamics: Tensor
-    """squared distance in the latent space"""
 
 
 class WorldModel(nn.Module):
@@ -88,10 +66,11 @@ class WorldModel(nn.Module):
         low, high = LOG_VAR_BOUNDS
         return mean, high - fn.softplus(high - low - fn.softplus(raw - low))
 
-    def predict(self, obs: Tensor, action: Tensor) -> Prediction:
-        """What follows observations (..., n_obs) and actions (..., 4)."""
+    def predict(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What follows observations (..., n_obs) and actions (..., 4): (z' (..., latent), mean (..., 24) of
+        the next observation's targets in SI units, natural logarithm of their variance)."""
         latent = self.advance(self.encode(obs), action)
-        return Prediction(latent, *self.decode(latent))
+        return latent, *self.decode(latent)
 
     @torch.no_grad()
     def features(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
@@ -104,33 +83,29 @@ class WorldModel(nn.Module):
         found = error.square().mean(dim=-1).sqrt(), log_var.exp().mean(dim=-1)
         return torch.stack(found, dim=-1).nan_to_num_(0.0, 0.0, 0.0)
 
-    def loss(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor) -> Losses:
-        """Losses of a batch: obs, next_obs (B, n_obs), action (B, 4), valid (B,) bool. ``next_obs`` is the
-        true one, also at an end."""
+    def loss(
+        self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(total, reconstruction [nat] summed over the targets, dynamics: squared distance in the latent
+        space), means over the valid samples of a batch: obs, next_obs (B, n_obs), action (B, 4), valid (B,)
+        bool. ``next_obs`` is the true one, also at an end."""
         config, weight = self.config, valid / valid.sum().clamp(min=1)
         ahead, mean, log_var = self.predict(obs, action)
         nll = 0.5 * ((next_obs[:, :N_TARGET] - mean).square() * torch.exp(-log_var) + log_var)
         reconstruction = nll.sum(dim=-1) @ weight
         dynamics = (self.encode(next_obs) - ahead).square().sum(dim=-1) @ weight
         total = config.reconstruction_weight * reconstruction + config.dynamics_weight * dynamics
-        return Losses(total, reconstruction, dynamics)
+        return total, reconstruction, dynamics
 
 
-def mean_of(values: Iterable[Tensor]) -> float:
-    """Mean of scalars that carry a gradient."""
-    return float(torch.stack([value.detach() for value in values]).mean())
-
-
-class WorldModelLearner:
+class WorldModelLearner(AdamLearner):
     """Adam on batches drawn from rollouts, with a guard against NaN."""
 
     def __init__(self, world_model: WorldModel, config: WorldModelConfig, names: Sequence[str] = ()) -> None:
         """``names``: of the targets in metrics; their numbers where none are given."""
+        super().__init__(world_model.parameters(), lr=config.learning_rate, fused=True)
         self.model, self.config = world_model, config
         self._names = names or [str(i) for i in range(N_TARGET)]
-        self.optimiser = PlainAdam(world_model.parameters(), lr=config.learning_rate, fused=True)
-        self.skipped = 0
-        """steps left out because the gradient was not finite, or zero for want of valid samples"""
 
     def update(
         self,
@@ -149,32 +124,27 @@ class WorldModelLearner:
         this rollout yet. ``skill``, target by target: 1 - mean squared error / that of "as before"; left out
         where nothing changed.
         """
-        skipped, batches = (
-            self.skipped,
-            [self._drawn(obs, action, next_obs, valid, generator) for _ in range(self.config.steps)],
-        )
-        self._observe(batches)
-        metrics = self._calibration(batches[0])
-        learned = [self._learn(batch) for batch in batches]
+        skipped, losses = self.skipped, []
+        batches = [self._drawn(obs, action, next_obs, valid, generator) for _ in range(self.config.steps)]
+        # a rollout's neighbouring steps are alike: all of it would say little more than what was drawn
+        self.model.observation_norm.update(torch.cat([seen[good] for seen, _, _, good in batches]))
+        metrics = self._calibration(*batches[0])
+        for batch in batches:
+            total, *parts = self.model.loss(*batch)
+            self.step(total)
+            losses.append(torch.stack(parts).detach())
+        reconstruction, dynamics = torch.stack(losses).mean(dim=0).tolist()
         return metrics | {
-            "world_model/reconstruction_loss": mean_of(losses.reconstruction for losses in learned),
-            "world_model/dynamics_loss": mean_of(losses.dynamics for losses in learned),
+            "world_model/reconstruction_loss": reconstruction,
+            "world_model/dynamics_loss": dynamics,
             "world_model/skipped_updates": float(self.skipped - skipped),
         }
 
-    def state_dict(self) -> dict[str, Any]:
-        """Adam's moments and the counter; the model keeps its own."""
-        return {"optimiser": self.optimiser.state_dict(), "skipped": self.skipped}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """What ``state_dict`` gave."""
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.skipped = int(state["skipped"])
-
     def _drawn(
         self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor | None, generator: torch.Generator
-    ) -> ModelBatch:
-        """Random samples; rows with anything that is not finite are zero and not valid."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Random samples: obs, action, next_obs and whether they are valid; rows with anything that is not
+        finite are zero and not valid."""
         steps, num_envs = action.shape[:2]
         drawn = torch.randint(steps * num_envs, (self.config.batch,), generator=generator).to(obs.device)
         t, env = drawn // num_envs, drawn % num_envs
@@ -183,51 +153,23 @@ class WorldModelLearner:
         if valid is not None:
             good &= valid[t, env]
         kept = [torch.where(good[:, None], row, 0.0) for row in rows]
-        return ModelBatch(kept[0], kept[1], kept[2], good)
-
-    def _observe(self, batches: list[ModelBatch]) -> None:
-        """Statistics of what was drawn: a rollout's neighbouring steps are alike, so that all of it would say
-        little more."""
-        rows = torch.cat([batch.obs[batch.valid] for batch in batches])
-        self.model.observation_norm.merge(moments_of(rows))
+        return kept[0], kept[1], kept[2], good
 
     @torch.no_grad()
-    def _calibration(self, batch: ModelBatch) -> dict[str, float]:
-        kept = batch.valid
-        if not bool(kept.any()):
+    def _calibration(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor) -> dict[str, float]:
+        if not bool(valid.any()):
             return {}
-        obs = batch.obs[kept]
-        predicted = self.model.predict(obs, batch.action[kept])
-        target = batch.next_obs[kept, :N_TARGET]
-        square, inside = calibration(predicted.mean, predicted.log_var, target)
-        error, before = (
-            (target - said).square().mean(dim=0).tolist() for said in (predicted.mean, obs[:, :N_TARGET])
-        )
+        obs, target = obs[valid], next_obs[valid, :N_TARGET]
+        _, mean, log_var = self.model.predict(obs, action[valid])
+        square, inside = calibration(mean, log_var, target)
+        error, before = ((target - said).square().mean(dim=0).tolist() for said in (mean, obs[:, :N_TARGET]))
         found = zip(self._names, error, before, strict=True)
         return {f"{SKILL}{name}": 1.0 - ours / theirs for name, ours, theirs in found if theirs > 0.0} | {
             "world_model/standardised_residual": square,
             "world_model/coverage_90": inside,
-            "world_model/uncertainty": float(predicted.log_var.exp().mean()),
+            "world_model/uncertainty": float(log_var.exp().mean()),
             "world_model/latent_std": float(self.model.encode(obs).std(dim=0, correction=0).mean()),
         }
-
-    def _learn(self, batch: ModelBatch) -> Losses:
-        losses = self.model.loss(*batch)
-        self.skipped += not guarded_step(losses.total, self.model, self.optimiser)
-        return losses
-
-
-class ModelBatch(NamedTuple):
-    """Samples of a gradient step."""
-
-    obs: Tensor
-    """(B, n_obs)"""
-    action: Tensor
-    """(B, 4)"""
-    next_obs: Tensor
-    """(B, n_obs)"""
-    valid: Tensor
-    """(B,) bool"""
 
 
 # ------------------------------------------------------------------------------------------------ calibration

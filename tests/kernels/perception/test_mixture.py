@@ -12,7 +12,7 @@ from uuvtai.config import Config
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.perception import prediction_network
 from uuvtai.kernels.perception.io import TrackingIO
-from uuvtai.learning.networks import TIMES_S, MixtureNet, mirrored
+from uuvtai.learning.forecast import TIMES_S, MixtureNet, mirrored
 from uuvtai.sim.forecast_weights import SHAPES, SPREADS, packed_weights, put_weights, read_weights
 
 CFG = Config()
@@ -93,11 +93,11 @@ def test_the_kernel_says_what_the_network_says(stage, net):
     rng = np.random.default_rng(1)
     told = rng.normal(0, 0.5, (N_ENV, N_TRACK, enums.N_COLUMN)).astype(np.float32)
     course, speed = rng.uniform(-np.pi, np.pi, (N_ENV, N_TRACK)), rng.uniform(0.3, 1.5, (N_ENV, N_TRACK))
-    place = rng.uniform(1, 5, (N_ENV, N_TRACK, 2))
+    told[..., 0], place = speed, rng.uniform(1, 5, (N_ENV, N_TRACK, 2))
     frame = np.concatenate([place, np.stack([np.cos(course), np.sin(course), speed], -1)], -1)
     put(stage.mixture, column=told, frame=frame)
     share, pos, forecast = stage.mix()
-    said = net(torch.from_numpy(told).view(-1, told.shape[-1]), torch.from_numpy(speed).float().view(-1))
+    said = net(torch.from_numpy(told).view(-1, told.shape[-1]))
     weight = said.log_weight.exp().detach().numpy().reshape(share.shape)
     likeliest = weight.argmax(-1)
     others = np.arange(enums.N_MODE) != likeliest[..., None]
