@@ -63,12 +63,8 @@ class TunedAgent(HeldAgent):
 
 
 def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
-    """PolicyAgent of a checkpoint that holds numbers of the tree. Raises CheckpointError for others."""
-    return TunedAgent(checkpoint_factors(checkpoint), sim)
-
-
-def checkpoint_factors(checkpoint: Checkpoint) -> torch.Tensor:
-    """(n_tuned, 2) of a checkpoint. Raises CheckpointError where they are none that a training can leave."""
+    """PolicyAgent of a checkpoint that holds numbers of the tree. Raises CheckpointError where they are none
+    that a training can leave."""
     try:
         found = checkpoint.model()["tree"]["log_factor"]
         known = len(found)
@@ -83,7 +79,7 @@ def checkpoint_factors(checkpoint: Checkpoint) -> torch.Tensor:
         raise CheckpointError(
             f"{checkpoint.path / MODEL}: holds no numbers of the tree ({error}); take another one"
         ) from None
-    return found
+    return TunedAgent(found, sim)
 
 
 def tuned_sections(log_factor: torch.Tensor) -> dict[str, dict[str, float]]:

@@ -16,7 +16,7 @@ from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.distillation import Distillation
 from uuvtai.learning.environments import InSurrogate
 from uuvtai.learning.networks import PREFIX, fast_products
-from uuvtai.learning.policy_agent import finite, fitting
+from uuvtai.learning.policy_agent import network
 from uuvtai.learning.ppo import Ppo
 from uuvtai.learning.rollout import Environment, Recent, Rollout, collect
 from uuvtai.learning.world_model import N_TARGET, WorldModel, WorldModelLearner
@@ -93,14 +93,10 @@ class Trainer:
         """Begin with the policy of another run, and its world model where both have one; what the behavior
         tree shows at the beginning then teaches the policy nothing. Raises CheckpointError for networks that
         do not fit."""
-        parts = {"policy": self.policy.parts()["policy"]}
-        model = found.model()
-        if self.world_model is not None and "world_model" in model:
-            parts["world_model"] = self.world_model
-        with fitting(found):
-            for name, part in parts.items():
-                part.load_state_dict(model[name])
-                finite(part, found).train()
+        parts = {"policy": self.policy.parts()["policy"], "world_model": self.world_model}
+        for name, part in parts.items():
+            if part is not None and (name == "policy" or name in found.model()):
+                network(found, name, lambda part=part: part).train()
         self._is_started = True
 
     def evaluate(self) -> dict[str, float]:
