@@ -96,27 +96,22 @@ def pack(state: Any, name: str = "state") -> tuple[Any, dict[str, torch.Tensor]]
 def unpack(plain: Any, tensors: dict[str, torch.Tensor]) -> Any:
     """The state that ``pack`` was given. Raises FileError."""
 
-    def unpacked(node: Any) -> Any:
-        if isinstance(node, list):
-            return [unpacked(value) for value in node]
-        if not isinstance(node, dict):
-            return node
+    def unpacked(node: dict[str, Any]) -> Any:
         match list(node.items()):
             case [("$tensor", name)]:
                 return tensors[name]
             case [("$array", name)]:
                 return tensors[name].numpy()
             case [("$items", items)]:
-                return {unpacked(key): unpacked(value) for key, value in items}
+                return dict(items)
             case [("$tuple", values)]:
-                return tuple(unpacked(value) for value in values)
+                return tuple(values)
             case [("$float", text)]:
                 return float(text)
-            case items:
-                return {key: unpacked(value) for key, value in items}
+        return node
 
     try:
-        return unpacked(plain)
+        return json.loads(json.dumps(plain), object_hook=unpacked)
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise FileError(f"the packed state does not fit together ({error!r})") from None
 
@@ -167,12 +162,8 @@ SCHEMA = 1
 READABLE_VERSIONS = ("0.1",)
 """uuvtai's series whose checkpoints mean the same to this one: same networks, same columns, same units"""
 
-MANIFEST, MODEL, TRAINING, SIMULATOR = (
-    "manifest.json",
-    "model.safetensors",
-    "training.safetensors",
-    "simulator.zst",
-)
+MANIFEST = "manifest.json"
+MODEL, TRAINING, SIMULATOR = "model.safetensors", "training.safetensors", "simulator.zst"
 LARGEST = {MODEL: 256 << 20, TRAINING: 512 << 20, SIMULATOR: 8 << 30}
 """[bytes] most that a file may have; the first two are read into memory, the last one as far as its reader
 expects. A policy drives by the first one alone"""
@@ -220,7 +211,7 @@ def manifest_content(path: Path) -> bytes:
     file = path / MANIFEST
     if not path.is_dir():
         raise CheckpointError(f"{path}: no such folder; give a run folder or one of its checkpoints/step_N")
-    if file.is_symlink() or not file.is_file():
+    if not file.is_file():
         raise CheckpointError(f"{file}: is missing; the folder is no checkpoint, or its writing was cut off")
     with refused(file):
         return read_bytes(file, _MAX_BYTES, path)
@@ -366,10 +357,6 @@ class Checkpoint:
         """State of the networks, by the names of MODEL_PARTS that were saved. Raises CheckpointError."""
         return self._part(MODEL, self.manifest.model)
 
-    def training(self) -> dict[str, Any]:
-        """What training needs beside the networks that drive and the simulator. Raises CheckpointError."""
-        return self._part(TRAINING, self.manifest.training)
-
     def state(self, like: Mapping[str, Any]) -> dict[str, Any]:
         """The trainer's whole state. ``like`` is the state of the trainer it is meant for: a simulator of
         another size is refused."""
@@ -386,7 +373,8 @@ class Checkpoint:
             )
         with refused(self.path / SIMULATOR):
             simulator = unpack(plain, read_stream(self.path / SIMULATOR, expected))
-        return self.model() | self.training() | {SIMULATOR_PART: simulator}
+        training = self._part(TRAINING, self.manifest.training)
+        return self.model() | training | {SIMULATOR_PART: simulator}
 
     def check_table(self, table: Sequence[ObservationColumn], config: Config) -> None:
         """Raise CheckpointError where an environment's observation or action is not what the policy was
@@ -525,14 +513,19 @@ def open_checkpoint(path: Path) -> Checkpoint:
 
 
 def newest(
-    run: Path, note: Callable[[str], None] = lambda _text: None, resumable: bool = False
+    run: Path,
+    note: Callable[[str], None] = lambda _text: None,
+    resumable: bool = False,
+    first: Path | None = None,
 ) -> Checkpoint:
-    """Newest checkpoint of a run folder that passes verification; ``note`` is told of newer ones that do not.
-    Raises CheckpointError."""
+    """Newest checkpoint of a run folder that passes verification, ``first`` looked at before all others;
+    ``note`` is told of those that do not pass. Raises CheckpointError."""
     checkpoints, reasons = run / "checkpoints", list[str]()
-    for path in _folders(checkpoints):
+    for path in sorted(_folders(checkpoints), key=lambda path: path != first):
         try:
-            found = _open_below(run, path)
+            with refused(path):
+                refuse_links(run, path)  # to another folder, which is none of the run's own
+            found = open_checkpoint(path)
             if not resumable or found.is_resumable:
                 return found
             reasons.append(f"{path} has no simulator state to go on from")
@@ -545,20 +538,7 @@ def newest(
 
 def best(run: Path, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
     """The checkpoint with the highest score, else the newest one. Raises CheckpointError."""
-    found = _best_folder(_folders(run / "checkpoints"))
-    if found is not None:
-        try:
-            return _open_below(run, found)
-        except CheckpointError as error:
-            note(f"left out: {error}")
-    return newest(run, note)
-
-
-def _open_below(run: Path, path: Path) -> Checkpoint:
-    """As ``open_checkpoint``, of a run's own folder; a link to another one is none of its own."""
-    with refused(path):
-        refuse_links(run, path)
-    return open_checkpoint(path)
+    return newest(run, note, first=_best_folder(_folders(run / "checkpoints")))
 
 
 def _folders(checkpoints: Path) -> list[Path]:

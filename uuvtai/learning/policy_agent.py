@@ -70,13 +70,16 @@ class HeldAgent(ABC):
     the next step; ``reset`` when a row begins another episode."""
 
     world_model: WorldModel | None = None
-    decision: AgentDecision
-    """the last one; where an older one is held, what the networks said then"""
 
     def __init__(self, num_envs: int, hold_steps: int, device: torch.device | str) -> None:
         self.device, self._hold = torch.device(device), hold_steps
         self._age = torch.zeros(num_envs, dtype=torch.int64, device=device)
         """control steps of every row's episode"""
+        std = torch.zeros(NUM_ACTIONS, device=device)
+        self.decision = AgentDecision(
+            self._zeros(NUM_ACTIONS), self._zeros(), std, self._zeros(), self._zeros()
+        )
+        """the last one; where an older one is held, what the networks said then; 0 is what nobody says"""
 
     def reset(self, rows: torch.Tensor) -> None:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
@@ -95,6 +98,10 @@ class HeldAgent(ABC):
         action = self.decide(obs).action
         self.advance()
         return action
+
+    def _zeros(self, *shape: int) -> torch.Tensor:
+        """(num_envs, *shape)."""
+        return torch.zeros(len(self._age), *shape, device=self.device)
 
     def _due(self) -> torch.Tensor:
         """Rows whose decision is not held any more."""
@@ -115,17 +122,15 @@ class PolicyAgent(HeldAgent):
         super().__init__(num_envs, policy.config.hold_steps, device)
         self.policy, self.world_model = policy, world_model
         self._one = OneDecision(policy, world_model)
-        n_obs, action = policy.n_in - N_FEATURES, torch.zeros(num_envs, NUM_ACTIONS, device=device)
-        self._obs, self._last_obs = (torch.zeros(num_envs, n_obs, device=device) for _ in range(2))
-        self._said = action, action[:, 0].clone(), torch.zeros(num_envs, N_FEATURES, device=device)
+        zeros, n_obs = self._zeros, policy.n_in - N_FEATURES
+        self._obs, self._last_obs, self._last_action = zeros(n_obs), zeros(n_obs), zeros(NUM_ACTIONS)
+        self._said = zeros(NUM_ACTIONS), zeros(), zeros(N_FEATURES)
         """mean action, before it was cut off to [-1, 1], value and features of the last decision"""
-        self._last_action = action.clone()
-        self.decision = AgentDecision(*(torch.zeros(0) for _ in AgentDecision._fields))
 
     @torch.no_grad()
     def decide(self, obs: torch.Tensor) -> AgentDecision:
         """As ``HeldAgent``; what is not finite counts as its mean in training."""
-        self._obs[:] = torch.where(torch.isfinite(obs), obs, self._one.fill)
+        self._obs[:] = obs
         due = self._due()
         if len(due):
             row = self._obs[due], self._last_obs[due], self._last_action[due], self._age[due] > 0

@@ -54,11 +54,9 @@ class Trainer:
                 "vectors; turn it off"
             )
         if world.enabled:
-            n_obs = max(column.slice.stop for column in self.observation_table)
-            self.world_model = WorldModel(n_obs, world, self.generator).to(env.device)
-            names = [
-                f"{c.name}_{i}" for c in env.observation_table for i in range(c.slice.stop - c.slice.start)
-            ]
+            widths = {c.name: c.slice.stop - c.slice.start for c in env.observation_table}
+            names = [f"{name}_{i}" for name, width in widths.items() for i in range(width)]
+            self.world_model = WorldModel(len(names), world, self.generator).to(env.device)
             self.world_learner = WorldModelLearner(self.world_model, world, names[:N_TARGET])
         self.recent = Recent(env.outcomes, env.reward_terms)
         self.iteration = self.env_steps = 0
