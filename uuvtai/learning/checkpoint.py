@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import safetensors.numpy
@@ -46,9 +46,6 @@ from uuvtai.common.version import __version__
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import renamed
-
-if TYPE_CHECKING:
-    from uuvtai.envs.vector_env import ObservationColumn
 
 
 class CheckpointError(UserError, RuntimeError):
@@ -291,8 +288,8 @@ def refused(file: Path) -> Iterator[None]:
 # ----------------------------------------------------------------------------------------------------- tables
 
 
-def table_rows(table: Sequence[ObservationColumn]) -> list[dict[str, Any]]:
-    """An observation table as the manifest keeps it."""
+def table_rows(table: Sequence[Any]) -> list[dict[str, Any]]:
+    """An observation table (rows of ``env.ObservationColumn``) as the manifest keeps it."""
     return [
         {"name": c.name, "first": c.slice.start, "stop": c.slice.stop, "unit": c.unit, "frame": c.frame}
         for c in table
@@ -376,7 +373,7 @@ class Checkpoint:
         training = self._part(TRAINING, self.manifest.training)
         return self.model() | training | {SIMULATOR_PART: simulator}
 
-    def check_table(self, table: Sequence[ObservationColumn], config: Config) -> None:
+    def check_table(self, table: Sequence[Any], config: Config) -> None:
         """Raise CheckpointError where an environment's observation or action is not what the policy was
         trained for."""
         for what, own, theirs in (
@@ -407,7 +404,7 @@ def save(
     step: int,
     state: Mapping[str, Any],
     config: LearningConfig,
-    table: Sequence[ObservationColumn],
+    table: Sequence[Any],
     metrics: Mapping[str, Any] | None = None,
     score: float | None = None,
 ) -> Path:
