@@ -30,7 +30,6 @@ from uuvtai.logs.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import VectorEnv
-    from uuvtai.sim.scene import SceneOptions
 
 
 Metrics = dict[str, float]
@@ -59,12 +58,6 @@ class TrainRequest:
     case"""
     device: str = "auto"
     run_dir: Path | None = None
-
-    @classmethod
-    def typed(cls, scene: SceneOptions, preset: str, seed: int | None, **rest: Any) -> TrainRequest:
-        """What a command line asks of a new run, with the scene as it was typed. Raises ConfigError."""
-        given = [] if seed is None else [("train.seed", seed)]
-        return cls(config=scene.training(preset, given), preset=preset, **rest)
 
 
 class TrainWatch(Protocol):
@@ -95,11 +88,6 @@ def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple
     if request.resume is None:
         refuse_place(request.run_dir)
         return _train(request, None, watch, evaluate)
-    if not (request.resume / CONFIG).is_file():
-        raise ConfigError(
-            f"{request.resume}: is no run folder, it has no {CONFIG}; give the folder that 'uuv train' "
-            "printed"
-        )
     # held before anything is read: what another process writes meanwhile must not count
     held = RunFolder.held(request.resume, "uuv train")
     try:
@@ -116,7 +104,10 @@ def _train(
         assert request.config is not None
         found, (start, config) = None, _started(request.start, request.config, watch.note)
     else:
-        start, (found, config) = None, _resumed(folder, request.overrides, watch.note)
+        start, config = None, load_resolved(folder.path / CONFIG, request.overrides)
+        if not isinstance(config, LearningConfig):
+            raise ConfigError(f"{folder.path}: is no training run; give the folder that 'uuv train' printed")
+        found = checkpoint.newest(folder.path, watch.note, resumable=True)
     total = request.iterations or config.train.iterations
     if folder and found and found.step >= total:
         folder.settle(found.step >= config.train.iterations)
@@ -148,16 +139,6 @@ def _train(
         if not run.go(pressed):
             raise KeyboardInterrupt
     return run.document(), folder.path
-
-
-def _resumed(
-    folder: RunFolder, overrides: Overrides | None, note: Callable[[str], None]
-) -> tuple[Checkpoint, LearningConfig]:
-    """The checkpoint to go on from, and the config of its run with changes."""
-    config = load_resolved(folder.path / CONFIG, overrides)
-    if not isinstance(config, LearningConfig):
-        raise ConfigError(f"{folder.path}: is no training run; give the folder that 'uuv train' printed")
-    return checkpoint.newest(folder.path, note, resumable=True), config
 
 
 def _started(
@@ -303,7 +284,8 @@ class MetricsRecorder:
             kept = itertools.takewhile(lambda row: row[1]["iteration"] <= iteration, _whole_rows(run))
             truncate(run / METRICS, sum(len(line) for line, _ in kept), run)
         self._file = open_to_append(run / METRICS, run)
-        _await_next_name(run / EVENTS)
+        if iteration:  # TensorBoard goes by the seconds in which files were opened, within one by their names
+            time.sleep(1.0 - time.time() % 1.0)
         self._events = SummaryWriter(str(run / EVENTS), purge_step=iteration + 1 if iteration else None)
 
     def write(self, iteration: int, metrics: Mapping[str, float]) -> None:
@@ -338,11 +320,3 @@ def _whole_rows(run: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
         if line[-1:] != b"\n" or not isinstance(row, dict) or not isinstance(row.get("iteration"), int):
             return
         yield line, row
-
-
-def _await_next_name(folder: Path) -> None:
-    """TensorBoard reads files in the order of their names, which begin with the second in which they were
-    opened, and within one second as text: what goes on must not come before what it goes on from."""
-    now = time.time()
-    if any(folder.glob(f"events.out.tfevents.{int(now):010d}.*")):
-        time.sleep(int(now) + 1 - now)
