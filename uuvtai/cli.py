@@ -179,8 +179,8 @@ def train_policy(
     from uuvtai.learning.runner import TrainRequest, train
 
     if resume is None:
-        new = {"start": start, "iterations": iterations, "device": device, "run_dir": run_dir}
-        request = TrainRequest.typed(scene, preset, seed, **new)
+        config = scene.training(preset, [] if seed is None else [("train.seed", seed)])
+        request = TrainRequest(config, preset, start, None, None, iterations, device, run_dir)
     else:
         parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides"))
         request = TrainRequest(

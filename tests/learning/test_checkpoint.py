@@ -11,6 +11,7 @@ import torch
 import zstandard
 from safetensors.torch import save as safetensors_bytes
 
+from uuvtai.common.files import FileError
 from uuvtai.config.loader import load_training
 from uuvtai.envs.vector_env import ObservationColumn
 from uuvtai.learning import checkpoint
@@ -99,7 +100,7 @@ def test_state_comes_back_to_the_last_bit(tmp_path):
 
 
 def test_what_cannot_be_kept_is_named(tmp_path):
-    with pytest.raises(checkpoint.PackingError, match=r"counters.thing: a object cannot be kept"):
+    with pytest.raises(CheckpointError, match=r"counters.thing: a object cannot be kept"):
         checkpoint.save(tmp_path, 1, state_of(1) | {"counters": {"thing": object()}}, CONFIG, TABLE)
 
 
@@ -184,19 +185,20 @@ def test_a_simulator_of_another_size_is_refused(tmp_path):
 
 @pytest.mark.parametrize(("size", "says"), [(599, "ends within"), (601, "more than its layout says")])
 def test_a_stream_unfolds_to_what_is_expected_and_no_more(tmp_path, size, says):
-    checkpoint.write_stream(tmp_path / "s.zst", {"x": torch.zeros(size, dtype=torch.uint8)})
-    with pytest.raises(checkpoint.PackingError, match=says):
-        checkpoint.read_stream(tmp_path / "s.zst", [("x", "uint8", [600])])
+    checkpoint.write_stream(tmp_path / "simulator.zst", {"x": torch.zeros(size, dtype=torch.uint8)})
+    with pytest.raises(FileError, match=says):
+        checkpoint.read_stream(tmp_path / "simulator.zst", {"x": torch.zeros(600, dtype=torch.uint8)})
 
 
 def test_a_bomb_stays_small(tmp_path):
     """A terabyte of zeros in a few kilobytes cannot be expanded: the reader stops at the size it knows."""
-    with (tmp_path / "s.zst").open("wb") as file, zstandard.ZstdCompressor().stream_writer(file) as stream:
+    path = tmp_path / "simulator.zst"
+    with path.open("wb") as file, zstandard.ZstdCompressor().stream_writer(file) as stream:
         for _ in range(64):
             stream.write(bytes(1 << 20))
-    assert (tmp_path / "s.zst").stat().st_size < 1 << 14
-    with pytest.raises(checkpoint.PackingError, match="more than"):
-        checkpoint.read_stream(tmp_path / "s.zst", [("x", "uint8", [1000])])
+    assert path.stat().st_size < 1 << 14
+    with pytest.raises(FileError, match="more than"):
+        checkpoint.read_stream(path, {"x": torch.zeros(1000, dtype=torch.uint8)})
 
 
 # ---------------------------------------------------------------------------------------------------- SIGKILL
@@ -260,7 +262,7 @@ def test_sigkill_at_any_file_operation_leaves_the_newest_verified_checkpoint_usa
         )
         assert checkpoint.best(run).step == 1
         saved(run, 6)
-        assert not list((run / "checkpoints").glob(".partial*")), "the next writer clears what was left"
+        assert not list((run / "checkpoints").glob(".*")), "the next writer clears what was left"
         assert checkpoint.newest(run).step == 6
     assert sorted(set(steps)) == [3, 4, 5]
     assert steps == sorted(steps), "the later the kill, the newer the checkpoint"

@@ -190,7 +190,7 @@ def test_a_run_that_cannot_go_on_says_why_and_loses_nothing(points, tmp_path, mo
             "has done 2 of 2 iterations; to go on give more: --iterations 4",
         ),
         (TrainRequest(resume=run, iterations=0), ConfigError, "at least 1"),
-        (TrainRequest(resume=tmp_path), ConfigError, "is no run folder"),
+        (TrainRequest(resume=tmp_path), RunFolderError, "is no run folder"),
         (TrainRequest(resume=run, overrides=["ppo.gama=1"]), ConfigError, "did you mean 'gamma'"),
         (TrainRequest(resume=run, overrides=["policy.hidden=[4]"]), RuntimeError, "size mismatch"),
         (TrainRequest(config=config_of(), run_dir=run), RunFolderError, "already there and not empty"),

@@ -37,7 +37,7 @@ from uuvtai.evaluation.evaluate import evaluate_now
 from uuvtai.evaluation.reproduce import resume as resume_reproduction
 from uuvtai.evaluation.sweep import resume as resume_sweep
 from uuvtai.learning import checkpoint
-from uuvtai.learning.checkpoint import CheckpointError, config_sha256, sha256_of
+from uuvtai.learning.checkpoint import CheckpointError, config_sha256
 from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.folder import of_onnx
 from uuvtai.learning.policy_agent import load_agent
@@ -314,7 +314,7 @@ def test_xml(here, text, says, told):
 def forged(path, name, content):
     """Other content for a file of a checkpoint, with the right size and sha256 in the manifest."""
     (path / name).write_bytes(content)
-    entry = {"bytes": len(content), "sha256": sha256_of(path / name)}
+    entry = checkpoint.entry_of(path / name).model_dump()
     rewritten(path, lambda document: document["files"].update({name: entry}))
 
 

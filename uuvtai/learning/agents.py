@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
 from uuvtai.common.files import parsed_json, read_bytes
 from uuvtai.common.presets import POLICY, PRESET_DIR
 from uuvtai.config.behavior import FAST, SLOW, TUNED
@@ -48,9 +49,6 @@ class TunedAgent(HeldAgent):
         rows = sim.s.behavior.tuned.shape[0]
         self.log_factor = log_factor.float().cpu().numpy()[None].repeat(rows, axis=0)
         """(rows, n_tuned, 2) of every row that is allocated"""
-        nothing = torch.zeros(sim.num_envs, device=sim.device)
-        self.decision = AgentDecision(sim.action, nothing, nothing.new_zeros(4), nothing, nothing)
-        """value, residual and uncertainty are 0: nobody says them"""
 
     def reset(self, rows: torch.Tensor) -> None:
         """As ``HeldAgent``: a reset has set the numbers of these rows back."""
@@ -63,12 +61,8 @@ class TunedAgent(HeldAgent):
 
 
 def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
-    """PolicyAgent of a checkpoint that holds numbers of the tree. Raises CheckpointError for others."""
-    return TunedAgent(checkpoint_factors(checkpoint), sim)
-
-
-def checkpoint_factors(checkpoint: Checkpoint) -> torch.Tensor:
-    """(n_tuned, 2) of a checkpoint. Raises CheckpointError where they are none that a training can leave."""
+    """PolicyAgent of a checkpoint that holds numbers of the tree. Raises CheckpointError where they are none
+    that a training can leave."""
     try:
         found = checkpoint.model()["tree"]["log_factor"]
         known = len(found)
@@ -83,7 +77,7 @@ def checkpoint_factors(checkpoint: Checkpoint) -> torch.Tensor:
         raise CheckpointError(
             f"{checkpoint.path / MODEL}: holds no numbers of the tree ({error}); take another one"
         ) from None
-    return found
+    return TunedAgent(found, sim)
 
 
 def tuned_sections(log_factor: torch.Tensor) -> dict[str, dict[str, float]]:
@@ -116,25 +110,20 @@ class SetAgent(HeldAgent):
 
     def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
         """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
-        from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
         from uuvtai.sim.stages import bind
         from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO
 
         super().__init__(sim.num_envs, hold_steps, sim.device)
         self.actor, self._gap_m = actor, gap_m
         self._io = bind(ObserverIO, sim.s, sim.config)
-
-        def zeros(*shape: int) -> torch.Tensor:
-            return torch.zeros(sim.num_envs, *shape, device=sim.device)
-
+        zeros = self._zeros
         self.ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_OBSTACLE, RAW_WIDTH), zeros(N_RAY)
         self.obstacles, self.own = zeros(N_OBSTACLE, OBSTACLE_WIDTH), zeros(EGO_COLUMNS)
         """columns that the last decision was made from"""
         self.wish, self._last, self._command = zeros(NUM_WISHES), zeros(NUM_WISHES), zeros(4)
         """what is wished now, and what the vehicle is told of its last decision; (rows, NUM_WISHES)"""
         std = torch.cat([actor.log_std.detach().exp(), torch.zeros(1, device=sim.device)])
-        self.decision = AgentDecision(self._command, zeros(), std, zeros(), zeros())
-        """value, residual and uncertainty are 0: what drives has no critic and no world model"""
+        self.decision = self.decision._replace(std=std)
 
     def reset(self, rows: torch.Tensor) -> None:
         """As ``HeldAgent``."""

@@ -14,15 +14,15 @@ import contextlib
 import hashlib
 import json
 import math
-import secrets
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+import safetensors.numpy
 import safetensors.torch
 import torch
 import zstandard
@@ -39,143 +39,114 @@ from uuvtai.common.files import (
     read_bytes,
     refuse_links,
     refuse_links_in,
+    unfinished,
+    whole_folder,
 )
 from uuvtai.common.version import __version__
+from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import renamed
+
+
+class CheckpointError(UserError, RuntimeError):
+    """A checkpoint that cannot be used or written: what, where, why, what to type next."""
+
 
 # ------------------------------------------------------------------------------------------------------------
 # Nested state as named tensors and plain JSON, and back to the last bit; big arrays as one compressed stream
 # of known size.
 
 
-Layout = list[tuple[str, str, list[int]]]
-"""(name, NumPy dtype, shape) of every array in a stream, in order"""
-
-MAX_STREAM_BYTES = 1 << 40
-"""[bytes] of a stream on disk, of which no more is read than its reader expects"""
-_LEVEL = 1
-"""of zstandard: higher ones save a few per cent of disk and take several times as long"""
-
-
-class PackingError(UserError, ValueError):
-    """Something that cannot be packed, or a packed state that does not fit together."""
-
-
-def pack(state: Any, name: str = "state", copy: bool = True) -> tuple[Any, dict[str, torch.Tensor]]:
-    """(plain, tensors): ``plain`` is JSON with references to ``tensors`` on the host, contiguous, by default
-    copies apart from each other.
+def pack(state: Any, name: str = "state") -> tuple[Any, dict[str, torch.Tensor]]:
+    """(plain, tensors): ``plain`` is JSON with references to ``tensors``, which are on the host, contiguous,
+    and copies only where they must be.
 
     Dictionaries, lists, tuples, tensors, NumPy arrays, numbers, texts, booleans and None are kept as they
-    are; anything else is a PackingError that names the place.
+    are; anything else is a CheckpointError that names the place.
     """
     tensors: dict[str, torch.Tensor] = {}
-    return _packed(state, name, tensors, copy), tensors
+
+    def packed(node: Any, place: str) -> Any:
+        if isinstance(node, torch.Tensor | np.ndarray):
+            if place in tensors:
+                raise CheckpointError(f"{place}: two tensors have this name")
+            is_array = isinstance(node, np.ndarray)
+            tensor = torch.from_numpy(np.asarray(node, order="C")) if is_array else node.detach()
+            tensors[place] = tensor.cpu().contiguous()
+            return {"$array" if is_array else "$tensor": place}
+        if isinstance(node, dict):
+            items = [[packed(key, place), packed(value, f"{place}.{key}")] for key, value in node.items()]
+            is_plain = all(isinstance(key, str) and not key.startswith("$") for key in node)
+            return dict(items) if is_plain else {"$items": items}
+        if isinstance(node, list | tuple):
+            values = [packed(value, f"{place}.{i}") for i, value in enumerate(node)]
+            return values if isinstance(node, list) else {"$tuple": values}
+        if isinstance(node, float) and not math.isfinite(node):
+            return {"$float": repr(float(node))}
+        if node is None or type(node) in (bool, int, float, str):
+            return node
+        raise CheckpointError(f"{place}: a {type(node).__name__} cannot be kept in a checkpoint")
+
+    return packed(state, name), tensors
 
 
 def unpack(plain: Any, tensors: dict[str, torch.Tensor]) -> Any:
-    """The state that ``pack`` was given. Raises PackingError."""
+    """The state that ``pack`` was given. Raises FileError."""
+
+    def unpacked(node: dict[str, Any]) -> Any:
+        match list(node.items()):
+            case [("$tensor", name)]:
+                return tensors[name]
+            case [("$array", name)]:
+                return tensors[name].numpy()
+            case [("$items", items)]:
+                return dict(items)
+            case [("$tuple", values)]:
+                return tuple(values)
+            case [("$float", text)]:
+                return float(text)
+        return node
+
     try:
-        return _unpacked(plain, tensors)
+        return json.loads(json.dumps(plain), object_hook=unpacked)
     except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise PackingError(f"the packed state does not fit together ({error!r})") from None
-
-
-def _packed(node: Any, place: str, tensors: dict[str, torch.Tensor], copy: bool) -> Any:
-    if isinstance(node, torch.Tensor | np.ndarray):
-        if place in tensors:
-            raise PackingError(f"{place}: two tensors have this name")
-        is_array = isinstance(node, np.ndarray)
-        tensor = torch.from_numpy(np.asarray(node, order="C")) if is_array else node.detach()
-        tensors[place] = tensor.to("cpu", copy=copy).contiguous()
-        return {"$array" if is_array else "$tensor": place}
-    if isinstance(node, dict):
-        if all(isinstance(key, str) and not key.startswith("$") for key in node):
-            return {key: _packed(value, f"{place}.{key}", tensors, copy) for key, value in node.items()}
-        return {
-            "$items": [
-                [_packed(key, place, tensors, copy), _packed(value, f"{place}.{key}", tensors, copy)]
-                for key, value in node.items()
-            ]
-        }
-    if isinstance(node, list | tuple):
-        items = [_packed(value, f"{place}.{i}", tensors, copy) for i, value in enumerate(node)]
-        return items if isinstance(node, list) else {"$tuple": items}
-    if isinstance(node, float) and not math.isfinite(node):
-        return {"$float": repr(float(node))}
-    if node is None or type(node) in (bool, int, float, str):
-        return node
-    raise PackingError(f"{place}: a {type(node).__name__} cannot be kept in a checkpoint")
-
-
-def _unpacked(node: Any, tensors: dict[str, torch.Tensor]) -> Any:
-    if isinstance(node, list):
-        return [_unpacked(value, tensors) for value in node]
-    if not isinstance(node, dict):
-        return node
-    match list(node.items()):
-        case [("$tensor", name)]:
-            return tensors[name]
-        case [("$array", name)]:
-            return tensors[name].numpy()
-        case [("$items", items)]:
-            return {_unpacked(key, tensors): _unpacked(value, tensors) for key, value in items}
-        case [("$tuple", items)]:
-            return tuple(_unpacked(value, tensors) for value in items)
-        case [("$float", text)]:
-            return float(text)
-        case items:
-            return {key: _unpacked(value, tensors) for key, value in items}
-
-
-# ---------------------------------------------------------------------------------------------------- streams
-
-
-def layout_of(tensors: dict[str, torch.Tensor]) -> Layout:
-    """Names, dtypes and shapes, in the order of ``tensors``."""
-    return [(name, str(tensor.numpy().dtype), list(tensor.shape)) for name, tensor in tensors.items()]
+        raise FileError(f"the packed state does not fit together ({error!r})") from None
 
 
 def write_stream(path: Path, tensors: dict[str, torch.Tensor]) -> None:
     """Compress host tensors one after the other into a new file."""
     size = sum(tensor.nbytes for tensor in tensors.values())
-    compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
+    compressor = zstandard.ZstdCompressor(level=1, write_checksum=True)  # higher ones: hardly smaller, slow
     with open_new(path) as file, compressor.stream_writer(file, size=size, closefd=False) as stream:
         for tensor in tensors.values():
-            stream.write(_bytes_of(tensor.numpy()))
+            stream.write(tensor.numpy().tobytes())
 
 
-def read_stream(path: Path, layout: Layout) -> dict[str, torch.Tensor]:
-    """Read exactly what ``layout`` says, so that a file cannot unfold to more than its reader expects. Raises
-    PackingError."""
-    tensors = {}
+def read_stream(path: Path, like: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Read tensors as they are in ``like`` and nothing else: a file cannot unfold to more than its reader
+    expects. Raises FileError."""
+    found = {}
     try:
         with (
-            open_file(path, MAX_STREAM_BYTES, path.parent) as file,
+            open_file(path, LARGEST[SIMULATOR], path.parent) as file,
             zstandard.ZstdDecompressor().stream_reader(file) as stream,
         ):
-            for name, dtype, shape in layout:
-                array = np.empty(shape, dtype)
-                _fill(_bytes_of(array), stream, name)
-                tensors[name] = torch.from_numpy(array)
+            for name, tensor in like.items():
+                content = stream.read(tensor.nbytes)
+                if len(content) < tensor.nbytes:
+                    raise FileError(f"ends within {name}")
+                array = np.frombuffer(content, tensor.numpy().dtype).reshape(tensor.shape)
+                found[name] = torch.from_numpy(array.copy())
             if stream.read(1):
-                raise PackingError("holds more than its layout says")
+                raise FileError("holds more than its layout says")
     except zstandard.ZstdError as error:
-        raise PackingError(f"is not a whole zstandard stream ({error})") from None
-    return tensors
+        raise FileError(f"is not a whole zstandard stream ({error})") from None
+    return found
 
 
-def _bytes_of(array: np.ndarray) -> memoryview:
-    return array.reshape(-1).view(np.uint8).data
-
-
-def _fill(view: memoryview, stream: zstandard.ZstdDecompressionReader, name: str) -> None:
-    filled = 0
-    while filled < len(view):
-        count = stream.readinto(view[filled:])
-        if not count:
-            raise PackingError(f"ends within {name}")
-        filled += count
+def layout_of(tensors: dict[str, torch.Tensor]) -> list[tuple[str, str, list[int]]]:
+    """(name, NumPy dtype, shape) of every tensor, in the order of a stream."""
+    return [(name, str(tensor.numpy().dtype), list(tensor.shape)) for name, tensor in tensors.items()]
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -188,36 +159,13 @@ SCHEMA = 1
 READABLE_VERSIONS = ("0.1",)
 """uuvtai's series whose checkpoints mean the same to this one: same networks, same columns, same units"""
 
-MANIFEST, MODEL, TRAINING, SIMULATOR = (
-    "manifest.json",
-    "model.safetensors",
-    "training.safetensors",
-    "simulator.zst",
-)
-OPTIONAL = (TRAINING, SIMULATOR)
-"""files that a policy drives without"""
-_MAX_BYTES = 8 << 20
+MANIFEST = "manifest.json"
+MODEL, TRAINING, SIMULATOR = "model.safetensors", "training.safetensors", "simulator.zst"
 LARGEST = {MODEL: 256 << 20, TRAINING: 512 << 20, SIMULATOR: 8 << 30}
 """[bytes] most that a file may have; the first two are read into memory, the last one as far as its reader
-expects"""
-_CHUNK_BYTES = 1 << 20
-
-
-class CheckpointError(UserError, RuntimeError):
-    """A checkpoint that cannot be used or written: what, where, why, what to type next."""
-
-
-class DescribedColumn(Protocol):
-    """A row of the observation table (``env.ObservationColumn``)."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def slice(self) -> slice: ...
-    @property
-    def unit(self) -> str: ...
-    @property
-    def frame(self) -> str: ...
+expects. A policy drives by the first one alone"""
+_MAX_BYTES, _CHUNK_BYTES = 8 << 20, 1 << 20
+"""of a manifest; of a file at once"""
 
 
 class FileEntry(BaseModel):
@@ -260,56 +208,58 @@ def manifest_content(path: Path) -> bytes:
     file = path / MANIFEST
     if not path.is_dir():
         raise CheckpointError(f"{path}: no such folder; give a run folder or one of its checkpoints/step_N")
-    if file.is_symlink() or not file.is_file():
+    if not file.is_file():
         raise CheckpointError(f"{file}: is missing; the folder is no checkpoint, or its writing was cut off")
     with refused(file):
         return read_bytes(file, _MAX_BYTES, path)
 
 
 def parsed(content: bytes) -> Manifest:
-    """The manifest itself. Raises PackingError for another schema or version before anything else is looked
-    at, ValueError for nonsense."""
+    """The manifest itself. Raises FileError for another schema or version before anything else is looked at,
+    ValueError for nonsense."""
     try:
         raw = parsed_json(content, MANIFEST)
     except FileError as error:
         raise ValueError(str(error)) from None
     if not isinstance(raw, dict) or "schema" not in raw:
-        raise PackingError("is not a manifest of uuvtai")
-    if raw["schema"] != SCHEMA:
-        raise PackingError(
-            f"has schema {raw['schema']!r}, this uuvtai reads {SCHEMA}; use the version that wrote it: "
-            f"{raw.get('version')}"
-        )
+        raise FileError("is not a manifest of uuvtai")
     version = str(raw.get("version"))
+    if raw["schema"] != SCHEMA:
+        raise FileError(
+            f"has schema {raw['schema']!r}, this uuvtai reads {SCHEMA}; use the version that wrote it: "
+            f"{version}"
+        )
     if version.rpartition(".")[0] not in READABLE_VERSIONS:
-        raise PackingError(
+        raise FileError(
             f"was written by uuvtai {version}, this is {__version__}; use that version, or train again"
         )
     return Manifest.model_validate_json(content)
 
 
-def verify(file: Path, entry: FileEntry | None, is_optional: bool) -> None:
+def entry_of(file: Path) -> FileEntry:
+    """Size and sha256 of a file of a checkpoint. Raises FileError, OSError."""
+    digest = hashlib.sha256()
+    with open_file(file, LARGEST[file.name], file.parent) as stream:
+        while chunk := stream.read(_CHUNK_BYTES):
+            digest.update(chunk)
+        return FileEntry(bytes=stream.tell(), sha256=digest.hexdigest())
+
+
+def _verify(file: Path, entry: FileEntry | None) -> None:
     """Raise CheckpointError where a file is not what the manifest says of it."""
-    if file.is_symlink():
-        raise CheckpointError(f"{file}: is a link; a checkpoint holds plain files only")
-    if not file.is_file():
-        if is_optional:
-            return
-        raise CheckpointError(f"{file}: is missing; take another checkpoint of the run")
+    other = "take another checkpoint of the run"
+    if not file.is_symlink() and not file.is_file():
+        if file.name == MODEL:
+            raise CheckpointError(f"{file}: is missing; {other}")
+        return
     if entry is None:
-        raise CheckpointError(f"{file}: is not listed in {MANIFEST}; take another checkpoint of the run")
-    size, most = file.stat().st_size, LARGEST[file.name]
-    if size > most:
-        raise CheckpointError(f"{file}: has {size:,} bytes, more than the {most:,} that such a file may have")
-    if size != entry.bytes:
-        raise CheckpointError(
-            f"{file}: has {size} bytes instead of {entry.bytes}, it was cut off; take another checkpoint of "
-            "the run"
-        )
-    if sha256_of(file) != entry.sha256:
-        raise CheckpointError(
-            f"{file}: is damaged, its sha256 is not that of {MANIFEST}; take another checkpoint of the run"
-        )
+        raise CheckpointError(f"{file}: is not listed in {MANIFEST}; {other}")
+    with refused(file):
+        found = entry_of(file)
+        if found.bytes != entry.bytes:
+            raise FileError(f"has {found.bytes} bytes instead of {entry.bytes}, it was cut off; {other}")
+        if found != entry:
+            raise FileError(f"is damaged, its sha256 is not that of {MANIFEST}; {other}")
 
 
 @contextlib.contextmanager
@@ -327,7 +277,7 @@ def refused(file: Path) -> Iterator[None]:
         raise CheckpointError(
             f"{file}: {where}: {first['msg']}{renamed(where)}; it was not written by this version of uuvtai"
         ) from None
-    except (PackingError, FileError) as error:
+    except FileError as error:
         raise CheckpointError(f"{file}: {str(error).removeprefix(f'{file}: ')}") from None
     except (ValueError, RecursionError, OSError) as error:
         raise CheckpointError(
@@ -338,46 +288,25 @@ def refused(file: Path) -> Iterator[None]:
 # ----------------------------------------------------------------------------------------------------- tables
 
 
-def table_rows(table: Sequence[DescribedColumn]) -> list[dict[str, Any]]:
-    """An observation table as the manifest keeps it."""
+def table_rows(table: Sequence[Any]) -> list[dict[str, Any]]:
+    """An observation table (rows of ``env.ObservationColumn``) as the manifest keeps it."""
     return [
         {"name": c.name, "first": c.slice.start, "stop": c.slice.stop, "unit": c.unit, "frame": c.frame}
         for c in table
     ]
 
 
-def action_rows(config: Any) -> list[dict[str, Any]]:
+def action_rows(config: Config) -> list[dict[str, Any]]:
     """What an action of 1 means, for every component: the vehicle's limits."""
     v = config.vehicle
-    limits = (
-        ("surge", v.max_surge_m_s),
-        ("sway", v.max_sway_m_s),
-        ("heave", v.max_heave_m_s),
-        ("yaw_rate", v.max_yaw_rate_rad_s),
-    )
-    return [
-        {"name": name, "limit": limit, "unit": "rad/s" if name == "yaw_rate" else "m/s"}
-        for name, limit in limits
-    ]
+    speeds = {"surge": v.max_surge_m_s, "sway": v.max_sway_m_s, "heave": v.max_heave_m_s}
+    rows = [{"name": name, "limit": limit, "unit": "m/s"} for name, limit in speeds.items()]
+    return [*rows, {"name": "yaw_rate", "limit": v.max_yaw_rate_rad_s, "unit": "rad/s"}]
 
 
 def config_sha256(config: dict[str, Any]) -> str:
     """Of a config's values as canonical JSON."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
-
-
-def difference(own: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> str:
-    """First place where two tables differ, in words."""
-    for mine, other in zip(own, theirs, strict=False):
-        if mine != other:
-            return (
-                f"it expects {mine}, this environment gives {other}; evaluate it with the config it was "
-                "trained with"
-            )
-    return (
-        f"it expects {len(own)} rows, this environment gives {len(theirs)}; evaluate it with the config "
-        "it was trained with"
-    )
 
 
 def finite(metrics: Mapping[str, Any]) -> dict[str, Any]:
@@ -386,15 +315,6 @@ def finite(metrics: Mapping[str, Any]) -> dict[str, Any]:
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in metrics.items()
     }
-
-
-def sha256_of(file: Path) -> str:
-    """Of a file's content, hexadecimal."""
-    digest = hashlib.sha256()
-    with open_file(file, LARGEST[SIMULATOR], file.parent) as stream:
-        while chunk := stream.read(_CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -407,7 +327,7 @@ SIMULATOR_PART = "env"
 
 _KEEP_SIMULATORS = 2
 """newest checkpoints that keep the simulator's state: the last one, and one in case the disk damages it"""
-_STEP, _PARTIAL = "step_", ".partial-"
+_STEP = "step_"
 
 
 @dataclass(frozen=True)
@@ -428,15 +348,11 @@ class Checkpoint:
     @property
     def is_resumable(self) -> bool:
         """Everything that training needs to go on is there."""
-        return all((self.path / name).is_file() for name in OPTIONAL)
+        return all((self.path / name).is_file() for name in LARGEST)
 
     def model(self) -> dict[str, Any]:
         """State of the networks, by the names of MODEL_PARTS that were saved. Raises CheckpointError."""
         return self._part(MODEL, self.manifest.model)
-
-    def training(self) -> dict[str, Any]:
-        """What training needs beside the networks that drive and the simulator. Raises CheckpointError."""
-        return self._part(TRAINING, self.manifest.training)
 
     def state(self, like: Mapping[str, Any]) -> dict[str, Any]:
         """The trainer's whole state. ``like`` is the state of the trainer it is meant for: a simulator of
@@ -445,21 +361,19 @@ class Checkpoint:
             raise CheckpointError(
                 f"{self.path}: has networks only and cannot be trained on; resume the run's newest checkpoint"
             )
-        state = self.model() | self.training()
-        plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART, copy=False)
-        layout = self.manifest.simulator_layout
-        if _structure(plain) != _structure(self.manifest.simulator) or layout != layout_of(expected):
+        plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART)
+        own = self.manifest.simulator, self.manifest.simulator_layout
+        if own != (plain, layout_of(expected)):
             raise CheckpointError(
                 f"{self.path}: the simulator's state has other arrays than this simulator; resume with the "
                 "run's own config, number of envs and version of uuvtai"
             )
         with refused(self.path / SIMULATOR):
-            state[SIMULATOR_PART] = unpack(
-                self.manifest.simulator, read_stream(self.path / SIMULATOR, layout_of(expected))
-            )
-        return state
+            simulator = unpack(plain, read_stream(self.path / SIMULATOR, expected))
+        training = self._part(TRAINING, self.manifest.training)
+        return self.model() | training | {SIMULATOR_PART: simulator}
 
-    def check_table(self, table: Sequence[DescribedColumn], config: Any) -> None:
+    def check_table(self, table: Sequence[Any], config: Config) -> None:
         """Raise CheckpointError where an environment's observation or action is not what the policy was
         trained for."""
         for what, own, theirs in (
@@ -467,15 +381,18 @@ class Checkpoint:
             ("action", self.manifest.action, action_rows(config)),
         ):
             if own != theirs:
+                different = (pair for pair in zip(own, theirs, strict=False) if pair[0] != pair[1])
+                mine, other = next(different, (f"{len(own)} rows", len(theirs)))
                 raise CheckpointError(
-                    f"{self.path}: made for another {what} table: {difference(own, theirs)}"
+                    f"{self.path}: made for another {what} table: it expects {mine}, this environment gives "
+                    f"{other}; evaluate it with the config it was trained with"
                 )
 
     def _part(self, name: str, plain: Any) -> dict[str, Any]:
         with refused(self.path / name):
             content = read_bytes(self.path / name, LARGEST[name], self.path)
             if hashlib.sha256(content).hexdigest() != self.manifest.files[name].sha256:
-                raise PackingError("has changed since it was verified")
+                raise FileError("has changed since it was verified")
             return unpack(plain, safetensors.torch.load(content))
 
 
@@ -487,7 +404,7 @@ def save(
     step: int,
     state: Mapping[str, Any],
     config: LearningConfig,
-    table: Sequence[DescribedColumn],
+    table: Sequence[Any],
     metrics: Mapping[str, Any] | None = None,
     score: float | None = None,
 ) -> Path:
@@ -498,76 +415,58 @@ def save(
     nested. ``score``: higher is better. Raises CheckpointError where the disk refuses; then nothing
     half-written is taken for a checkpoint.
     """
-    target = checkpoints / f"{_STEP}{step:06d}"
+    target, plain = checkpoints / f"{_STEP}{step:06d}", config.model_dump(mode="json")
     try:
         checkpoints.mkdir(parents=True, exist_ok=True)
         refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
         refuse_links_in(checkpoints)
-        sweep(checkpoints)
-        partial = checkpoints / f"{_PARTIAL}{target.name}.{secrets.token_hex(4)}"
-        partial.mkdir()
-        described = _write_parts(partial, state)
-        manifest = Manifest(
-            version=__version__,
-            created=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-            step=step,
-            score=score,
-            metrics=finite(metrics or {}),
-            config=config.model_dump(mode="json"),
-            config_sha256=config_sha256(config.model_dump(mode="json")),
-            observation_table=table_rows(table),
-            action=action_rows(config),
-            files={path.name: entry_of(path) for path in sorted(partial.iterdir())},
-            **described,
-        )
-        _publish(partial, target, manifest)
+        for left in checkpoints.glob(f".{_STEP}*.tmp"):  # by a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        with whole_folder(target) as partial:
+            described = _write_parts(partial, state)
+            manifest = Manifest(
+                schema=SCHEMA,
+                version=__version__,
+                created=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+                step=step,
+                score=score,
+                metrics=finite(metrics or {}),
+                config=plain,
+                config_sha256=config_sha256(plain),
+                observation_table=table_rows(table),
+                action=action_rows(config),
+                files={path.name: entry_of(path) for path in sorted(partial.iterdir())},
+                **described,
+            )
+            text = json.dumps(manifest.model_dump(mode="json", by_alias=True), indent=1, allow_nan=False)
+            (partial / MANIFEST).write_text(text, encoding="utf-8")
+            for path in (*partial.iterdir(), partial):
+                flush(path)
+            if target.exists():
+                _remove(target)
+        flush(checkpoints)
         _thin(checkpoints, config.train.keep_checkpoints)
     except FileError as error:
         raise CheckpointError(str(error)) from None
     except OSError as error:
-        sweep(checkpoints)
         raise CheckpointError(
             f"{target}: cannot be written ({error.strerror}); make room or mend the folder, then: --resume"
         ) from None
     return target
 
 
-def sweep(checkpoints: Path) -> None:
-    """Remove what a killed process left half-written or half-removed."""
-    for left in checkpoints.glob(f"{_PARTIAL}*"):
-        shutil.rmtree(left, ignore_errors=True)
-
-
 def _write_parts(folder: Path, state: Mapping[str, Any]) -> dict[str, Any]:
     """Write the files of ``state``; what the manifest says of them."""
-    model, tensors = pack({name: state[name] for name in MODEL_PARTS if state.get(name) is not None}, "")
-    _write(folder / MODEL, safetensors.torch.save(_named(tensors)))
-    rest = {name: part for name, part in state.items() if name not in (*MODEL_PARTS, SIMULATOR_PART)}
-    training, tensors = pack(rest, "")
-    _write(folder / TRAINING, safetensors.torch.save(_named(tensors)))
-    described: dict[str, Any] = {"schema": SCHEMA, "model": model, "training": training}
-    if SIMULATOR_PART in state:
-        described["simulator"], tensors = pack(state[SIMULATOR_PART], SIMULATOR_PART, copy=False)
-        described["simulator_layout"] = layout_of(tensors)
-        write_stream(folder / SIMULATOR, tensors)
-    return described
-
-
-def _named(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return tensors or {"nothing": torch.zeros(0)}  # safetensors has no empty file
-
-
-def _publish(partial: Path, target: Path, manifest: Manifest) -> None:
-    """Flush everything to disk, then give the folder its name."""
-    text = json.dumps(manifest.model_dump(mode="json", by_alias=True), indent=1, allow_nan=False)
-    _write(partial / MANIFEST, text.encode())
-    for path in partial.iterdir():
-        flush(path)
-    flush(partial)
-    if target.exists():
-        _remove(target)
-    partial.rename(target)
-    flush(target.parent)
+    model = {name: state[name] for name in MODEL_PARTS if state.get(name) is not None}
+    training = {name: part for name, part in state.items() if name not in (*MODEL_PARTS, SIMULATOR_PART)}
+    described = {}
+    for name, file, part in (("model", MODEL, model), ("training", TRAINING, training)):
+        described[name], tensors = pack(part, "")
+        arrays = {place: tensor.numpy() for place, tensor in tensors.items()}
+        (folder / file).write_bytes(safetensors.numpy.save(arrays))
+    described["simulator"], tensors = pack(state[SIMULATOR_PART], SIMULATOR_PART)
+    write_stream(folder / SIMULATOR, tensors)
+    return described | {"simulator_layout": layout_of(tensors)}
 
 
 def _thin(checkpoints: Path, keep: int) -> None:
@@ -583,19 +482,8 @@ def _thin(checkpoints: Path, keep: int) -> None:
 
 def _remove(folder: Path) -> None:
     """Under another name first: half a folder must never be taken for a checkpoint."""
-    doomed = folder.with_name(f"{_PARTIAL}{folder.name}.old.{secrets.token_hex(4)}")
-    folder.rename(doomed)
+    doomed = folder.rename(unfinished(folder))
     shutil.rmtree(doomed)
-
-
-def _write(path: Path, content: bytes) -> None:
-    with open_new(path) as file:
-        file.write(content)
-
-
-def entry_of(path: Path) -> FileEntry:
-    """Size and sha256 of a file."""
-    return FileEntry(bytes=path.stat().st_size, sha256=sha256_of(path))
 
 
 # ---------------------------------------------------------------------------------------------------- reading
@@ -610,27 +498,31 @@ def open_checkpoint(path: Path) -> Checkpoint:
         # a choice
         config = LearningConfig.model_validate_json(json.dumps(manifest.config), strict=True)
         if config_sha256(manifest.config) != manifest.config_sha256:
-            raise PackingError("its config does not have the sha256 that it states")
-    for name in manifest.files:
-        if name not in (MODEL, *OPTIONAL):
-            raise CheckpointError(
-                f"{path / MANIFEST}: lists the file {name!r}, which no checkpoint has; it was not written by "
-                "uuvtai"
-            )
-    for name in (MODEL, *OPTIONAL):
-        verify(path / name, manifest.files.get(name), name in OPTIONAL)
+            raise FileError("its config does not have the sha256 that it states")
+    if unknown := manifest.files.keys() - LARGEST:
+        raise CheckpointError(
+            f"{path / MANIFEST}: lists the file {min(unknown)!r}, which no checkpoint has; it was not "
+            "written by uuvtai"
+        )
+    for name in LARGEST:
+        _verify(path / name, manifest.files.get(name))
     return Checkpoint(path, manifest, config, hashlib.sha256(content).hexdigest())
 
 
 def newest(
-    run: Path, note: Callable[[str], None] = lambda _text: None, resumable: bool = False
+    run: Path,
+    note: Callable[[str], None] = lambda _text: None,
+    resumable: bool = False,
+    first: Path | None = None,
 ) -> Checkpoint:
-    """Newest checkpoint of a run folder that passes verification; ``note`` is told of newer ones that do not.
-    Raises CheckpointError."""
+    """Newest checkpoint of a run folder that passes verification, ``first`` looked at before all others;
+    ``note`` is told of those that do not pass. Raises CheckpointError."""
     checkpoints, reasons = run / "checkpoints", list[str]()
-    for path in _folders(checkpoints):
+    for path in sorted(_folders(checkpoints), key=lambda path: path != first):
         try:
-            found = _open_below(run, path)
+            with refused(path):
+                refuse_links(run, path)  # to another folder, which is none of the run's own
+            found = open_checkpoint(path)
             if not resumable or found.is_resumable:
                 return found
             reasons.append(f"{path} has no simulator state to go on from")
@@ -643,20 +535,7 @@ def newest(
 
 def best(run: Path, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
     """The checkpoint with the highest score, else the newest one. Raises CheckpointError."""
-    found = _best_folder(_folders(run / "checkpoints"))
-    if found is not None:
-        try:
-            return _open_below(run, found)
-        except CheckpointError as error:
-            note(f"left out: {error}")
-    return newest(run, note)
-
-
-def _open_below(run: Path, path: Path) -> Checkpoint:
-    """As ``open_checkpoint``, of a run's own folder; a link to another one is none of its own."""
-    with refused(path):
-        refuse_links(run, path)
-    return open_checkpoint(path)
+    return newest(run, note, first=_best_folder(_folders(run / "checkpoints")))
 
 
 def _folders(checkpoints: Path) -> list[Path]:
@@ -673,7 +552,3 @@ def _best_folder(folders: list[Path]) -> Path | None:
             score = parsed(manifest_content(path)).score
             scored += [] if score is None else [(score, path)]
     return max(scored, key=lambda pair: pair[0])[1] if scored else None
-
-
-def _structure(plain: Any) -> str:
-    return json.dumps(plain, sort_keys=True)

@@ -8,16 +8,13 @@ the matrix products.
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import nn
 
-from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
 from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic
 from uuvtai.learning.world_model import N_FEATURES, WorldModel
@@ -73,13 +70,16 @@ class HeldAgent(ABC):
     the next step; ``reset`` when a row begins another episode."""
 
     world_model: WorldModel | None = None
-    decision: AgentDecision
-    """the last one; where an older one is held, what the networks said then"""
 
     def __init__(self, num_envs: int, hold_steps: int, device: torch.device | str) -> None:
         self.device, self._hold = torch.device(device), hold_steps
         self._age = torch.zeros(num_envs, dtype=torch.int64, device=device)
         """control steps of every row's episode"""
+        std = torch.zeros(NUM_ACTIONS, device=device)
+        self.decision = AgentDecision(
+            self._zeros(NUM_ACTIONS), self._zeros(), std, self._zeros(), self._zeros()
+        )
+        """the last one; where an older one is held, what the networks said then; 0 is what nobody says"""
 
     def reset(self, rows: torch.Tensor) -> None:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
@@ -98,6 +98,10 @@ class HeldAgent(ABC):
         action = self.decide(obs).action
         self.advance()
         return action
+
+    def _zeros(self, *shape: int) -> torch.Tensor:
+        """(num_envs, *shape)."""
+        return torch.zeros(len(self._age), *shape, device=self.device)
 
     def _due(self) -> torch.Tensor:
         """Rows whose decision is not held any more."""
@@ -118,17 +122,15 @@ class PolicyAgent(HeldAgent):
         super().__init__(num_envs, policy.config.hold_steps, device)
         self.policy, self.world_model = policy, world_model
         self._one = OneDecision(policy, world_model)
-        n_obs, action = policy.n_in - N_FEATURES, torch.zeros(num_envs, NUM_ACTIONS, device=device)
-        self._obs, self._last_obs = (torch.zeros(num_envs, n_obs, device=device) for _ in range(2))
-        self._said = action, action[:, 0].clone(), torch.zeros(num_envs, N_FEATURES, device=device)
+        zeros, n_obs = self._zeros, policy.n_in - N_FEATURES
+        self._obs, self._last_obs, self._last_action = zeros(n_obs), zeros(n_obs), zeros(NUM_ACTIONS)
+        self._said = zeros(NUM_ACTIONS), zeros(), zeros(N_FEATURES)
         """mean action, before it was cut off to [-1, 1], value and features of the last decision"""
-        self._last_action = action.clone()
-        self.decision = AgentDecision(*(torch.zeros(0) for _ in AgentDecision._fields))
 
     @torch.no_grad()
     def decide(self, obs: torch.Tensor) -> AgentDecision:
         """As ``HeldAgent``; what is not finite counts as its mean in training."""
-        self._obs[:] = torch.where(torch.isfinite(obs), obs, self._one.fill)
+        self._obs[:] = obs
         due = self._due()
         if len(due):
             row = self._obs[due], self._last_obs[due], self._last_action[due], self._age[due] > 0
@@ -158,30 +160,6 @@ def by_chunk(function: Callable[..., tuple[torch.Tensor, ...]], *inputs: torch.T
     return [torch.cat(found)[: len(inputs[0])] for found in zip(*parts, strict=True)]
 
 
-def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> None:
-    """Raise ValueError where the networks of a config are not as wide as the tensors that came with it,
-    before anything is made so wide."""
-    n_in, latent = n_obs + N_FEATURES, config.world_model.latent
-    nets = [
-        ("policy", "actor", (n_in, *config.policy.hidden)),
-        ("policy", "critic", (n_in, *config.policy.hidden)),
-    ]
-    if config.world_model.enabled and config.world_model.as_features:
-        hidden = config.world_model.hidden
-        nets += [
-            ("world_model", "encoder", (n_obs, *hidden, latent)),
-            ("world_model", "dynamics", (latent + NUM_ACTIONS, *hidden, latent)),
-        ]
-        nets += [("world_model", "decoder", (latent, *hidden))]
-    for part, net, widths in nets:
-        for number, (first, last) in enumerate(itertools.pairwise(widths)):
-            name = f"{net}.{2 * number}.weight"
-            if parts[part][name].shape != (last, first):
-                raise ValueError(
-                    f"{part}.{name} is {tuple(parts[part][name].shape)} instead of {(last, first)}"
-                )
-
-
 _NO_NETWORK = {
     "forecast": "forecasts and does not drive; give it to an agent that does: --set forecast.learned=RUN",
     "search": "numbers for the behaviour tree, no network that could be exported; they drive as "
@@ -199,44 +177,45 @@ def load_agent(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     kind = config.encoder if config.learner == "ppo" else config.learner
     if kind in _NO_NETWORK:
         raise CheckpointError(f"{checkpoint.path}: {_NO_NETWORK[kind]}")
-    parts, generator = checkpoint.model(), torch.Generator()
-    with fitting(checkpoint):
-        n_obs = max(row["stop"] for row in checkpoint.manifest.observation_table)
-        _check_sizes(parts, config, n_obs)
-        policy = ActorCritic(n_obs + N_FEATURES, config.policy, generator)
-        policy.load_state_dict(parts["policy"])
-        world_model = None
-        if config.world_model.enabled and config.world_model.as_features:
-            world_model = WorldModel(n_obs, config.world_model, generator)
-            world_model.load_state_dict(parts["world_model"])
-    for module in (policy, world_model):
-        if module is not None:
-            finite(module, checkpoint).to(device)
+
+    def n_obs() -> int:
+        return max(row["stop"] for row in checkpoint.manifest.observation_table)
+
+    def new_policy() -> ActorCritic:
+        return ActorCritic(n_obs() + N_FEATURES, config.policy, torch.Generator())
+
+    def new_model() -> WorldModel:
+        return WorldModel(n_obs(), config.world_model, torch.Generator())
+
+    policy, world_model = network(checkpoint, "policy", new_policy).to(device), None
+    if config.world_model.enabled and config.world_model.as_features:
+        world_model = network(checkpoint, "world_model", new_model).to(device)
     return PolicyAgent(policy, world_model, num_envs, device)
 
 
 Net = TypeVar("Net", bound=nn.Module)
 
 
-@contextlib.contextmanager
-def fitting(checkpoint: Checkpoint) -> Iterator[None]:
-    """Turn what networks of another shape raise into a CheckpointError."""
+def network(checkpoint: Checkpoint, name: str, make: Callable[[], Net]) -> Net:
+    """What ``make`` gives, with the weights that a checkpoint holds under this name, to act with. Raises
+    CheckpointError where they are of another shape, before anything is made so wide, or not finite."""
+    file, model = checkpoint.path / MODEL, checkpoint.model()
     try:
-        yield
-    except CheckpointError:
-        raise
+        part = model[name]
+        with torch.device("meta"):  # shapes alone
+            expected = make().state_dict()
+        for key, like in expected.items():
+            if part[key].shape != like.shape:
+                raise ValueError(f"{name}.{key} is {tuple(part[key].shape)} instead of {tuple(like.shape)}")
+        net = make()
+        net.load_state_dict(part)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise CheckpointError(
-            f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
+            f"{file}: its networks are not those of its config ({error}); take another one"
         ) from None
-
-
-def finite(net: Net, checkpoint: Checkpoint) -> Net:
-    """The network, to act with. Raises CheckpointError where a weight is not finite."""
-    for name, tensor in net.state_dict().items():
+    for key, tensor in net.state_dict().items():
         if not bool(torch.isfinite(tensor).all()):
             raise CheckpointError(
-                f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
-                "checkpoint"
+                f"{file}: {key} is not finite: the training failed; take an older checkpoint"
             )
     return net.eval()

@@ -3,14 +3,15 @@ how it all ends."""
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Union
+from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.common import signals
 from uuvtai.common.files import FileError, open_to_append, parsed_json, read_lines, truncate
@@ -18,15 +19,17 @@ from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError, Overrides, load_resolved, to_yaml
+from uuvtai.learning import checkpoint
+from uuvtai.learning.agents import find_policy
+from uuvtai.learning.checkpoint import Checkpoint
+from uuvtai.learning.environments import InSurrogate, Simulated, SimulatedSet
+from uuvtai.learning.forecast import ForecastTrainer
+from uuvtai.learning.parameter_search import ParameterSearchTrainer
+from uuvtai.learning.trainer import Trainer
 from uuvtai.logs.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import VectorEnv
-    from uuvtai.learning.checkpoint import Checkpoint
-    from uuvtai.learning.forecast import ForecastTrainer
-    from uuvtai.learning.parameter_search import ParameterSearchTrainer
-    from uuvtai.learning.trainer import Trainer
-    from uuvtai.sim.scene import SceneOptions
 
 
 Metrics = dict[str, float]
@@ -56,12 +59,6 @@ class TrainRequest:
     device: str = "auto"
     run_dir: Path | None = None
 
-    @classmethod
-    def typed(cls, scene: SceneOptions, preset: str, seed: int | None, **rest: Any) -> TrainRequest:
-        """What a command line asks of a new run, with the scene as it was typed. Raises ConfigError."""
-        given = [] if seed is None else [("train.seed", seed)]
-        return cls(config=scene.training(preset, given), preset=preset, **rest)
-
 
 class TrainWatch(Protocol):
     """Shows how far a training is."""
@@ -72,7 +69,7 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-AnyTrainer = Union["Trainer", "ParameterSearchTrainer", "ForecastTrainer"]
+AnyTrainer = Trainer | ParameterSearchTrainer | ForecastTrainer
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``evaluation.evaluate.evaluate_now``, which knows what learning does not)"""
@@ -91,10 +88,8 @@ def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple
     if request.resume is None:
         refuse_place(request.run_dir)
         return _train(request, None, watch, evaluate)
-    _refuse_no_run(request.resume)
-    held = RunFolder.held(
-        request.resume, "uuv train"
-    )  # before anything is read: what another process writes meanwhile must not count
+    # held before anything is read: what another process writes meanwhile must not count
+    held = RunFolder.held(request.resume, "uuv train")
     try:
         return _train(request, held, watch, evaluate)
     finally:
@@ -105,54 +100,45 @@ def _train(
     request: TrainRequest, folder: RunFolder | None, watch: TrainWatch, evaluate: Evaluate
 ) -> tuple[dict[str, Any], Path]:
     """As ``train``; ``folder`` is the folder of the run to go on with."""
-    found, config = _begin(request, watch)
-    start, config = _started(request.start, config, watch.note)
+    if folder is None:
+        assert request.config is not None
+        found, (start, config) = None, _started(request.start, request.config, watch.note)
+    else:
+        start, config = None, load_resolved(folder.path / CONFIG, request.overrides)
+        if not isinstance(config, LearningConfig):
+            raise ConfigError(f"{folder.path}: is no training run; give the folder that 'uuv train' printed")
+        found = checkpoint.newest(folder.path, watch.note, resumable=True)
     total = request.iterations or config.train.iterations
-    if found and found.step >= total:
-        if folder:
-            folder.settle(found.step >= config.train.iterations)
+    if folder and found and found.step >= total:
+        folder.settle(found.step >= config.train.iterations)
         raise ConfigError(
-            f"{request.resume}: has done {found.step} of {total} iterations; to go on give more: "
+            f"{folder.path}: has done {found.step} of {total} iterations; to go on give more: "
             f"--iterations {2 * found.step}"
         )
     watch.note(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    trainer = _continued(TRAINERS[config.learner](config, request.device), config, found)
-    trainer.note = watch.note
-    if start is not None:
-        start.check_table(trainer.observation_table, config)
-        trainer.start(start)  # type: ignore[union-attr]
-    place = _folder(request, config, found, folder)
-    run = _Run(trainer, config, place, watch, evaluate, total)
-    status, code = "failed", 1
-    try:
-        with signals.StopEvent() as pressed:
-            is_complete = run.go(pressed)
-        status, code = ("finished", 0) if is_complete else ("interrupted", signals.exit_code())
-    except KeyboardInterrupt:
-        status, code = "interrupted", signals.exit_code()
-        raise
-    finally:
-        run.close()
-        place.finish(status, code)
-    if code:
-        raise KeyboardInterrupt
-    return run.document(), place.path
-
-
-def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None, LearningConfig]:
-    """The checkpoint to go on from, None for a new run, and the config."""
-    from uuvtai.learning import checkpoint
-
-    if request.resume is None:
-        assert request.config is not None
-        return None, request.config
-    config = load_resolved(request.resume / CONFIG, request.overrides)
-    if not isinstance(config, LearningConfig):
-        raise ConfigError(f"{request.resume}: is no training run; give the folder that 'uuv train' printed")
-    return checkpoint.newest(request.resume, watch.note, resumable=True), config
+    trainer = _trainer(config, request.device)
+    for checked in filter(None, (found, start)):
+        checked.check_table(trainer.observation_table, config)
+    if found:
+        trainer.load_state(found.state(like=trainer.state()))
+    if isinstance(trainer, Trainer):
+        trainer.note = watch.note
+        if start:
+            trainer.start(start)
+    if folder is None or found is None:
+        folder = RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
+    else:
+        folder.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
+        if request.overrides:
+            folder.write(CONFIG, to_yaml(config))
+    run = _Run(trainer, config, folder, watch, evaluate, total)
+    with folder.recorded(), contextlib.closing(run), signals.StopEvent() as pressed:
+        if not run.go(pressed):
+            raise KeyboardInterrupt
+    return run.document(), folder.path
 
 
 def _started(
@@ -160,8 +146,6 @@ def _started(
 ) -> tuple[Checkpoint | None, LearningConfig]:
     """The checkpoint to begin with (``find_policy``), and the config with its networks. Raises ConfigError
     for one that holds no policy."""
-    from uuvtai.learning.agents import find_policy
-
     if place is None:
         return None, config
     found = find_policy(str(place), note)
@@ -177,20 +161,17 @@ def _started(
     return found, config.model_copy(update=update)
 
 
-def _refuse_no_run(place: Path) -> None:
-    if not (place / CONFIG).is_file():
-        raise ConfigError(
-            f"{place}: is no run folder, it has no {CONFIG}; give the folder that 'uuv train' printed"
-        )
-
-
-def _ppo(config: LearningConfig, device: str) -> AnyTrainer:
-    """A policy, in the simulator or in its surrogate."""
-    from uuvtai.learning.environments import InSurrogate, Simulated, SimulatedSet
-    from uuvtai.learning.trainer import Trainer
-
+def _trainer(config: LearningConfig, device: str) -> AnyTrainer:
+    """What learns: a policy in the simulator or in its surrogate, numbers of the tree, or what moving
+    obstacles will do. Raises ConfigError for a GPU where there is no use for it."""
+    for section in ("surrogate", "parameter_search", "forecast_training"):
+        if device == "cuda" and getattr(config, section).enabled:
+            raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
+    if config.learner == "forecast":
+        return ForecastTrainer(config)
+    if config.learner == "search":
+        return ParameterSearchTrainer(config)
     if config.surrogate.enabled:
-        _refuse_gpu("surrogate", device)
         return Trainer(InSurrogate(config), config)
     kind = SimulatedSet if config.encoder == "set" else Simulated
     return Trainer(kind(_env(config, device), config), config)
@@ -206,140 +187,76 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
     return VectorEnv(sim, config.train.seed, autoreset=config.encoder != "set")
 
 
-def _search(config: LearningConfig, device: str) -> AnyTrainer:
-    """Numbers of the tree."""
-    from uuvtai.learning.parameter_search import ParameterSearchTrainer
-
-    _refuse_gpu("parameter_search", device)
-    return ParameterSearchTrainer(config)
-
-
-def _forecast(config: LearningConfig, device: str) -> AnyTrainer:
-    """What moving obstacles will do."""
-    from uuvtai.learning.forecast import ForecastTrainer
-
-    _refuse_gpu("forecast_training", device)
-    return ForecastTrainer(config)
-
-
-def _refuse_gpu(section: str, device: str) -> None:
-    if device == "cuda":
-        raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
-
-
-TRAINERS: dict[str, Callable[[LearningConfig, str], AnyTrainer]] = {
-    "ppo": _ppo,
-    "search": _search,
-    "forecast": _forecast,
-}
-"""by ``LearningConfig.learner``"""
-
-
-def _continued(trainer: AnyTrainer, config: LearningConfig, checkpoint: Checkpoint | None) -> AnyTrainer:
-    """A trainer that stands where the checkpoint does, or at the beginning where there is none."""
-    if checkpoint:
-        checkpoint.check_table(trainer.observation_table, config)
-        trainer.load_state(checkpoint.state(like=trainer.state()))
-    return trainer
-
-
-def _folder(
-    request: TrainRequest, config: LearningConfig, checkpoint: Checkpoint | None, folder: RunFolder | None
-) -> RunFolder:
-    if folder is None or checkpoint is None:
-        return RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
-    folder.go_on({"iteration": checkpoint.step, "checkpoint_sha256": checkpoint.sha256})
-    if request.overrides:
-        folder.write(CONFIG, to_yaml(config))
-    return folder
-
-
+@dataclass
 class _Run:
     """The iterations of a run, and what is written about them."""
 
-    def __init__(
-        self,
-        trainer: AnyTrainer,
-        config: LearningConfig,
-        folder: RunFolder,
-        watch: TrainWatch,
-        evaluate: Evaluate,
-        total: int,
-    ) -> None:
+    trainer: AnyTrainer
+    config: LearningConfig
+    folder: RunFolder
+    watch: TrainWatch
+    evaluate: Evaluate
+    total: int
+    """iterations in all"""
+    metrics: Metrics = field(default_factory=dict)
+    """of the last one"""
 
-        self._trainer, self._config, self._folder = trainer, config, folder
-        self._watch, self._evaluate, self._total = watch, evaluate, total
-        self._recorder = MetricsRecorder(folder.path, trainer.iteration)
-        self._metrics: Metrics = {}
-        self._saved = trainer.iteration if trainer.iteration else None
-        watch.start(folder.path, config, trainer.iteration, total)
+    def __post_init__(self) -> None:
+        self.saved = self.trainer.iteration
+        self.recorder = MetricsRecorder(self.folder.path, self.saved)
+        self.watch.start(self.folder.path, self.config, self.saved, self.total)
 
     def go(self, pressed: threading.Event) -> bool:
         """Iterate to the end, or until somebody presses Ctrl-C: then save and return False."""
-        trainer, is_stopped = self._trainer, False
-        while trainer.iteration < self._total and not is_stopped:
-            self._metrics = trainer.iterate()
+        train, is_stopped = self.config.train, False
+        while self.trainer.iteration < self.total and not is_stopped:
+            self.metrics, done = self.trainer.iterate(), self.trainer.iteration
             # an interrupt that something has swallowed within the iteration was received all the same
             is_stopped = pressed.is_set() or signals.was_received()
-            self._note_iteration(is_stopped)
-        if self._saved != trainer.iteration:
+            is_evaluated = not is_stopped and train.evaluate_every > 0 and done % train.evaluate_every == 0
+            if is_evaluated:
+                self.metrics |= self.evaluate(self.trainer, self.config)
+            self.recorder.write(done, self.metrics)
+            self.watch.update(done, self.metrics, self._success_interval())
+            if is_evaluated or done % train.checkpoint_every == 0:
+                self._save()
+        if self.saved != self.trainer.iteration:
             self._save()
         if is_stopped:
-            self._watch.note(f"saved; go on with: uuv train --resume {self._folder.path}")
+            self.watch.note(f"saved; go on with: uuv train --resume {self.folder.path}")
         return not is_stopped
 
     def document(self) -> dict[str, Any]:
         """What ``uuv train --json`` prints."""
-        from uuvtai.learning import checkpoint
-
-        best = checkpoint.best(self._folder.path, self._watch.note)
+        best = checkpoint.best(self.folder.path, self.watch.note)
         return {
             "schema": 1,
-            "run": str(self._folder.path),
-            "learner": self._config.learner,
-            "iterations": self._trainer.iteration,
-            "env_steps": self._trainer.env_steps,
+            "run": str(self.folder.path),
+            "learner": self.config.learner,
+            "iterations": self.trainer.iteration,
+            "env_steps": self.trainer.env_steps,
             "checkpoint": str(best.path),
             "score": best.manifest.score,
-            "metrics": checkpoint.finite(self._metrics),
+            "metrics": checkpoint.finite(self.metrics),
         }
 
     def close(self) -> None:
         """Give everything back."""
-        self._watch.stop()
-        self._recorder.close()
-
-    def _note_iteration(self, is_stopped: bool) -> None:
-        done, train = self._trainer.iteration, self._config.train
-        is_evaluated = not is_stopped and train.evaluate_every > 0 and done % train.evaluate_every == 0
-        if is_evaluated:
-            self._metrics |= self._evaluate(self._trainer, self._config)
-        self._recorder.write(done, self._metrics)
-        self._watch.update(done, self._metrics, self._success_interval())
-        if is_evaluated or done % train.checkpoint_every == 0:
-            self._save()
+        self.watch.stop()
+        self.recorder.close()
 
     def _save(self) -> None:
-        from uuvtai.learning import checkpoint
-
-        trainer, table = self._trainer, self._trainer.observation_table
-        score = self._metrics.get(SCORE)
-        checkpoint.save(
-            self._folder.path / "checkpoints",
-            trainer.iteration,
-            trainer.state(),
-            self._config,
-            table,
-            self._metrics,
-            score,
-        )
-        for name, content in getattr(trainer, "files", dict)().items():  # of some trainers
-            self._folder.write_bytes(name, content)
-        self._saved = trainer.iteration
+        trainer, place = self.trainer, self.folder.path / "checkpoints"
+        state, table, score = trainer.state(), trainer.observation_table, self.metrics.get(SCORE)
+        checkpoint.save(place, trainer.iteration, state, self.config, table, self.metrics, score)
+        if not isinstance(trainer, Trainer):
+            for name, content in trainer.files().items():
+                self.folder.write_bytes(name, content)
+        self.saved = trainer.iteration
 
     def _success_interval(self) -> tuple[float, float] | None:
         """95 % interval of ``rollout/success_rate`` over the episodes that it is the mean of."""
-        rate, episodes = self._metrics.get("rollout/success_rate"), self._trainer.recent.episodes
+        rate, episodes = self.metrics.get("rollout/success_rate"), self.trainer.recent.episodes
         return None if rate is None else wilson_interval(round(rate * episodes), round(episodes))
 
 
@@ -363,14 +280,17 @@ class MetricsRecorder:
         of the run."""
         from torch.utils.tensorboard import SummaryWriter  # takes a second to import
 
-        _cut(run, iteration)
+        if (run / METRICS).exists():
+            kept = itertools.takewhile(lambda row: row[1]["iteration"] <= iteration, _whole_rows(run))
+            truncate(run / METRICS, sum(len(line) for line, _ in kept), run)
         self._file = open_to_append(run / METRICS, run)
-        _await_next_name(run / EVENTS)
+        if iteration:  # TensorBoard goes by the seconds in which files were opened, within one by their names
+            time.sleep(1.0 - time.time() % 1.0)
         self._events = SummaryWriter(str(run / EVENTS), purge_step=iteration + 1 if iteration else None)
 
     def write(self, iteration: int, metrics: Mapping[str, float]) -> None:
         """Record an iteration, counted from 1. What is not finite becomes null, and no event."""
-        row = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+        row = checkpoint.finite(metrics)
         self._file.write(json.dumps({"iteration": iteration, **row}, allow_nan=False).encode() + b"\n")
         self._file.flush()
         for name, value in row.items():
@@ -387,45 +307,16 @@ class MetricsRecorder:
 def read_metrics(run: Path) -> list[dict[str, Any]]:
     """Every whole line of a run's ``metrics.jsonl``; a last line that was cut off is left out. Raises
     OSError, FileError."""
-    return list(_whole_rows(run))
+    return [row for _, row in _whole_rows(run)]
 
 
-def _whole_rows(run: Path) -> Iterator[dict[str, Any]]:
+def _whole_rows(run: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    """Lines and their objects, up to the first that was cut off."""
     for line in read_lines(run / METRICS, folder=run):
-        if (row := _row(line)) is None:
+        try:
+            row = parsed_json(line, METRICS)
+        except FileError:
             return
-        yield row
-
-
-def _cut(run: Path, iteration: int) -> None:
-    """Shorten the file to the whole lines of iterations up to this one."""
-    file, kept = run / METRICS, 0
-    if not file.exists():
-        return
-    for line in read_lines(file, folder=run):
-        row = _row(line)
-        if row is None or row["iteration"] > iteration:
-            break
-        kept += len(line)
-    truncate(file, kept, run)
-
-
-def _await_next_name(folder: Path) -> None:
-    """TensorBoard reads files in the order of their names, which begin with the second in which they were
-    opened, and within one second as text: what goes on must not come before what it goes on from."""
-    now = time.time()
-    if any(folder.glob(f"events.out.tfevents.{int(now):010d}.*")):
-        time.sleep(int(now) + 1 - now)
-
-
-def _row(line: bytes) -> dict[str, Any] | None:
-    """The object of a line; None where the line was cut off."""
-    try:
-        row = parsed_json(line, METRICS)
-    except FileError:
-        return None
-    return (
-        row
-        if line[-1:] == b"\n" and isinstance(row, dict) and isinstance(row.get("iteration"), int)
-        else None
-    )
+        if line[-1:] != b"\n" or not isinstance(row, dict) or not isinstance(row.get("iteration"), int):
+            return
+        yield line, row

@@ -12,7 +12,7 @@ from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.networks import Policy, RunningNorm, View, mlp
-from uuvtai.learning.policy_agent import finite, fitting
+from uuvtai.learning.policy_agent import network
 
 # ------------------------------------------------------------------------------------------------------------
 # Policy over a set of obstacles: every obstacle goes through one encoder, and what comes out is pooled by
@@ -170,15 +170,6 @@ def actor_of(checkpoint: Checkpoint) -> SetActor:
     """The policy over a set of obstacles. Raises CheckpointError where its networks are not those of its
     config."""
     config = checkpoint.config
-    wide, head = config.surrogate.obstacle_hidden, config.surrogate.head_hidden
-    with fitting(checkpoint):
-        part = checkpoint.model()["policy"]
-        for name, shape in (
-            ("net.obstacle.0.weight", (wide, OBSTACLE_WIDTH)),
-            ("net.head.0.weight", (head, 3 * wide)),
-        ):
-            if tuple(part[name].shape) != shape:
-                raise ValueError(f"{name} is {tuple(part[name].shape)} instead of {shape}")
-        actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator())
-        actor.load_state_dict(part)
-    return finite(actor, checkpoint)
+    return network(
+        checkpoint, "policy", lambda: SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator())
+    )

@@ -16,7 +16,7 @@ from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.distillation import Distillation
 from uuvtai.learning.environments import InSurrogate
 from uuvtai.learning.networks import PREFIX, fast_products
-from uuvtai.learning.policy_agent import finite, fitting
+from uuvtai.learning.policy_agent import network
 from uuvtai.learning.ppo import Ppo
 from uuvtai.learning.rollout import Environment, Recent, Rollout, collect
 from uuvtai.learning.world_model import N_TARGET, WorldModel, WorldModelLearner
@@ -53,11 +53,9 @@ class Trainer:
                 "vectors; turn it off"
             )
         if world.enabled:
-            n_obs = max(column.slice.stop for column in self.observation_table)
-            self.world_model = WorldModel(n_obs, world, self.generator).to(env.device)
-            names = [
-                f"{c.name}_{i}" for c in env.observation_table for i in range(c.slice.stop - c.slice.start)
-            ]
+            widths = {c.name: c.slice.stop - c.slice.start for c in env.observation_table}
+            names = [f"{name}_{i}" for name, width in widths.items() for i in range(width)]
+            self.world_model = WorldModel(len(names), world, self.generator).to(env.device)
             self.world_learner = WorldModelLearner(self.world_model, world, names[:N_TARGET])
         self.recent = Recent(env.outcomes, env.reward_terms)
         self.iteration = self.env_steps = 0
@@ -91,14 +89,10 @@ class Trainer:
         """Begin with the policy of another run, and its world model where both have one; what the behavior
         tree shows at the beginning then teaches the policy nothing. Raises CheckpointError for networks that
         do not fit."""
-        parts = {"policy": self.policy.parts()["policy"]}
-        model = found.model()
-        if self.world_model is not None and "world_model" in model:
-            parts["world_model"] = self.world_model
-        with fitting(found):
-            for name, part in parts.items():
-                part.load_state_dict(model[name])
-                finite(part, found).train()
+        parts = {"policy": self.policy.parts()["policy"], "world_model": self.world_model}
+        for name, part in parts.items():
+            if part is not None and (name == "policy" or name in found.model()):
+                network(found, name, lambda part=part: part).train()
         self._is_started = True
 
     def evaluate(self) -> dict[str, float]:
