@@ -1,5 +1,6 @@
 """A training run: its folder, going on bit for bit, interrupts, failures, evaluations without a trace."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -203,6 +204,19 @@ def test_a_run_that_cannot_go_on_says_why_and_loses_nothing(points, tmp_path, mo
     with pytest.raises(checkpoint.CheckpointError, match="another observation table"):
         train(TrainRequest(resume=run), Quiet())
     assert {p: p.read_bytes() for p in run.rglob("*") if p.is_file()} == before
+
+
+def test_a_stranger_to_start_with_is_refused_before_its_networks_are_made(points, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    train(TrainRequest(config=config_of(), run_dir=run, iterations=2), Quiet())
+    found = checkpoint.newest(run)
+    policy = found.config.policy.model_copy(update={"hidden": (10**7, 10**7)})  # 400 TB
+    wide = dataclasses.replace(found, config=found.config.model_copy(update={"policy": policy}))
+    monkeypatch.setattr(training, "find_policy", lambda _name, _note: wide)
+    request = TrainRequest(config=config_of(), run_dir=tmp_path / "other", start=run)
+    with pytest.raises(checkpoint.CheckpointError, match="not those of its config"):
+        train(request, Quiet())
+    assert not (tmp_path / "other").exists()
 
 
 def test_an_evaluation_is_no_training_run(tmp_path):

@@ -25,6 +25,8 @@ from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.environments import InSurrogate, Simulated, SimulatedSet
 from uuvtai.learning.forecast import ForecastTrainer
 from uuvtai.learning.parameter_search import ParameterSearchTrainer
+from uuvtai.learning.policy_agent import load_agent
+from uuvtai.learning.set_networks import actor_of
 from uuvtai.learning.trainer import Trainer
 from uuvtai.logs.run_folder import RunFolder, default_run_dir, refuse_place
 
@@ -151,6 +153,7 @@ def _started(
     found = find_policy(str(place), note)
     if config.learner != "ppo" or found.config.learner != "ppo":
         raise ConfigError(f"--start {place}: policies alone can be begun with, by a preset that trains one")
+    actor_of(found) if found.config.encoder == "set" else load_agent(found, 1)  # as wide as its config says
     theirs, sizes = found.config, ("obstacle_hidden", "head_hidden", "goal_gain")
     own = {name: getattr(theirs.policy, name) for name in ("hidden", "activation")}
     update = {
@@ -167,14 +170,22 @@ def _trainer(config: LearningConfig, device: str) -> AnyTrainer:
     for section in ("surrogate", "parameter_search", "forecast_training"):
         if device == "cuda" and getattr(config, section).enabled:
             raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
-    if config.learner == "forecast":
-        return ForecastTrainer(config)
-    if config.learner == "search":
-        return ParameterSearchTrainer(config)
+    return TRAINERS[config.learner](config, device)
+
+
+def _policy_trainer(config: LearningConfig, device: str) -> Trainer:
     if config.surrogate.enabled:
         return Trainer(InSurrogate(config), config)
     kind = SimulatedSet if config.encoder == "set" else Simulated
     return Trainer(kind(_env(config, device), config), config)
+
+
+TRAINERS: dict[str, Callable[[LearningConfig, str], AnyTrainer]] = {
+    "ppo": _policy_trainer,
+    "search": lambda config, _: ParameterSearchTrainer(config),
+    "forecast": lambda config, _: ForecastTrainer(config),
+}
+"""by ``LearningConfig.learner``"""
 
 
 def _env(config: LearningConfig, device: str) -> VectorEnv:
