@@ -35,28 +35,7 @@ if TYPE_CHECKING:
     from uuvtai.surrogate.world import ScenarioBank, Surrogate
 
 
-class Carried(Environment):
-    """An environment over ``env``, which is captured, and what it carries itself."""
-
-    env: Any
-    carried: View
-    """beside what ``env`` captures; always the same tensors"""
-
-    def capture(self) -> dict[str, Any]:
-        """As in ``Environment``."""
-        return self.env.capture()
-
-    def state_dict(self) -> View:
-        """As in ``Environment``; not copied."""
-        return dict(self.carried)
-
-    def load_state_dict(self, state: View) -> None:
-        """As in ``Environment``."""
-        for name, part in self.carried.items():
-            part.copy_(state[name])
-
-
-class InSimulator(Carried):
+class InSimulator(Environment):
     """What the views of the simulator share."""
 
     rests = False
@@ -74,7 +53,6 @@ class InSimulator(Carried):
 
     @property
     def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """As in ``Environment``."""
         return self.info["seed"], self.info["episode"]
 
     def _hold(
@@ -130,7 +108,6 @@ class Simulated(InSimulator):
         """the input too: its world-model columns remember the last step"""
 
     def make_policy(self, generator: torch.Generator) -> ActorCritic:
-        """As in ``Environment``."""
         return ActorCritic(self.view["x"].shape[1], self.config.policy, generator).to(self.device)
 
     def agent(self, policy: ActorCritic) -> PolicyAgent:
@@ -184,7 +161,6 @@ class Simulated(InSimulator):
         return Step(self._reward, terminated, ended, {"x": self._final}, told)
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        """As in ``Environment``."""
         self._arrive(*self.env.restore(arrays))
 
     def _arrive(self, obs: torch.Tensor, info: View) -> None:
@@ -212,8 +188,10 @@ class SimulatedSet(InSimulator):
 
     def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
         """``env`` resets nothing by itself."""
+        from uuvtai.surrogate.observation import SET_TABLE
+
         super().__init__(env, config)
-        self.observation_table = set_table()
+        self.observation_table = SET_TABLE
         self.guard = Guard((), self.num_envs, config.train.patience, self.device)
         widths = {"obstacles": (N_OBSTACLE, OBSTACLE_WIDTH), "own": (EGO_COLUMNS,), "truth": (N_OBSTACLE, 0)}
         widths |= {"teacher_action": (NUM_WISHES,), "leaf": ()}
@@ -221,7 +199,6 @@ class SimulatedSet(InSimulator):
         self.view["leaf"] = self.view["leaf"].int()
 
     def make_policy(self, generator: torch.Generator) -> SetPolicy:
-        """As in ``Environment``."""
         return SetPolicy(self.view, self.config, generator).to(self.device)
 
     def agent(self, policy: SetPolicy) -> SetAgent:
@@ -230,7 +207,6 @@ class SimulatedSet(InSimulator):
         return SetAgent(policy.actor, self.env.sim, self.steps, gap_m)
 
     def begin(self, policy: SetPolicy, world_model: WorldModel | None, generator: torch.Generator) -> None:
-        """As in ``Environment``."""
         self._hull = self.agent(policy)
         self.carried = self.view | self._hull.memory()
         _, self.info = self.env.reset(self.config.train.seed)
@@ -254,7 +230,6 @@ class SimulatedSet(InSimulator):
         return Step(self._reward, terminated, ended, final, {"uncertainty": torch.zeros_like(reward)})
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        """As in ``Environment``."""
         _, self.info = self.env.restore(arrays)
 
     def _look(self) -> None:
@@ -273,7 +248,7 @@ BANK_SEED = 4242
 """of the scenarios to learn from; those of evaluations come from ``train.evaluate_seed``"""
 
 
-class InSurrogate(Carried):
+class InSurrogate(Environment):
     """The kinematic surrogate for a policy over a set of obstacles. Its view: ``obstacles`` and ``own``, as
     the vehicle knows them, and ``truth``, for a critic."""
 
@@ -282,11 +257,12 @@ class InSurrogate(Carried):
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
         """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
         another tank."""
+        from uuvtai.surrogate.observation import SET_TABLE
         from uuvtai.surrogate.world import Surrogate, draw_bank
 
         _refuse_what_the_surrogate_lacks(config)
         torch.set_flush_denormal(True)
-        self.config, self.observation_table, self.num_envs = config, set_table(), config.train.num_envs
+        self.config, self.observation_table, self.num_envs = config, SET_TABLE, config.train.num_envs
         self.scenes = config.train.scenes or (config.world.own_scene,)
         bank = bank or draw_bank(config, self.scenes, BANK_SEED, config.surrogate.scenarios)
         self.env = Surrogate(config, bank, self.num_envs, config.train.seed)
@@ -299,7 +275,6 @@ class InSurrogate(Carried):
         self._held_out: ScenarioBank | None = None
 
     def make_policy(self, generator: torch.Generator) -> SetPolicy:
-        """As in ``Environment``."""
         return SetPolicy(self.view, self.config, generator)
 
     def begin(self, policy: Policy, world_model: WorldModel | None, generator: torch.Generator) -> None:
@@ -319,7 +294,6 @@ class InSurrogate(Carried):
 
     @property
     def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """As in ``Environment``."""
         return torch.full_like(self.env.scenario, BANK_SEED), self.env.scenario
 
     def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
@@ -341,10 +315,6 @@ class InSurrogate(Carried):
             self._begin(ended)
         surrogate.look()
         return Step(reward, ended & ~late, ended, final, {})
-
-    def restore(self, arrays: dict[str, Any]) -> None:
-        """As in ``Environment``."""
-        self.env.restore(arrays)
 
     @torch.no_grad()
     def evaluate(self, policy: Policy) -> dict[str, float]:
@@ -370,13 +340,6 @@ class InSurrogate(Carried):
         for number, name in enumerate(bank.names):
             metrics[f"eval/success_{name}"] = float(won[bank.origin == number].float().mean())
         return metrics
-
-
-def set_table() -> tuple[Any, ...]:
-    """The observation of a policy over a set of obstacles."""
-    from uuvtai.surrogate.observation import SET_TABLE
-
-    return SET_TABLE
 
 
 def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
