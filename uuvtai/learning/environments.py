@@ -64,7 +64,7 @@ class InSimulator(Environment):
         (observation of the next decision, observation that this one led to, reward, terminated, ended), all
         (N, ...); but for the first they tell of the episode in which the decision was made.
         """
-        obs = final = torch.zeros_like(self.info["final_obs"])
+        obs = final = torch.zeros(self.num_envs, self.env.num_obs, device=self.device)
         reward = torch.zeros_like(self._reward)
         terminated = ended = torch.zeros_like(self._reward, dtype=torch.bool)
         for _ in range(self.steps):
