@@ -82,7 +82,7 @@ def in_surrogate(config: LearningConfig, scene: Scene, actor: SetActor, count: i
     outcome = np.full(count, RUNNING)
     while (running := outcome == RUNNING).any():
         view = surrogate.look()
-        _, now = surrogate.step(actor(view.obstacles, view.own).clamp(-MOST_WISH, MOST_WISH))
+        _, now = surrogate.step(actor(view["obstacles"], view["own"]).clamp(-MOST_WISH, MOST_WISH))
         outcome[running] = now.numpy()[running]
     return outcome == SUCCESS
 

@@ -5,69 +5,67 @@ import torch
 
 from tests.learning.test_policy_agent import N_OBS, networks
 from tests.learning.test_train import config_of, same, trainer_of
-from uuvtai.learning.environments import Hold
+from tests.point_env import PointEnv
 from uuvtai.learning.networks import NUM_ACTIONS
 from uuvtai.learning.policy_agent import PolicyAgent
+from uuvtai.learning.rollout import RolloutSums
 
-N = 3
 
-
-class Scripted:
+class Scripted(PointEnv):
     """An env that pays 1, 2, 3, ... and ends row 1 in its second step; the teacher says the step's number."""
 
     def __init__(self):
+        super().__init__(3)
         self.steps, self.actions = 0, []
 
     def step(self, action):
         self.steps += 1
         self.actions.append(action.clone())
         ended = torch.tensor([False, self.steps == 2, False])
-        info = {
-            "final_obs": torch.full((N, 1), float(self.steps)),
-            "teacher_action": torch.full((N, NUM_ACTIONS), float(self.steps)),
+        _, info = self.restore(self.capture())
+        info |= {
+            "final_obs": torch.full((3, self.num_obs), float(self.steps)),
+            "teacher_action": torch.full((3, NUM_ACTIONS), float(self.steps)),
             "outcome": torch.where(ended, 3, 0).to(torch.int32),
+            "episode_return": torch.zeros(3),
+            "episode_steps": torch.ones(3, dtype=torch.int32),
         }
-        return (
-            torch.full((N, 1), 100.0 + self.steps),
-            torch.full((N,), float(self.steps)),
-            ended,
-            torch.zeros_like(ended),
-            info,
-        )
+        obs, reward = torch.full((3, self.num_obs), 100.0 + self.steps), torch.full((3,), float(self.steps))
+        return obs, reward, ended, torch.zeros_like(ended), info
+
+
+def held(steps):
+    """The env after a decision of so many steps, its view, what came of it, and what was counted."""
+    env = Scripted()
+    made = trainer_of(env, config_of(policy={"hidden": [4], "hold_steps": steps})).env
+    sums = RolloutSums.zeros(len(env.outcomes), len(env.reward_terms), env.device)
+    return env, made.view, made.step(torch.full((3, NUM_ACTIONS), 0.5), sums), sums
 
 
 def test_rewards_add_up_and_an_ending_on_the_way_is_kept():
-    watched = []
-    end = Hold(Scripted(), 4).drive(
-        torch.ones(N, NUM_ACTIONS), lambda ended, info: watched.append(ended.tolist())
-    )
+    _, view, end, sums = held(4)
     assert end.reward.tolist() == [10.0, 3.0, 10.0]
-    assert end.final_obs.flatten().tolist() == [4.0, 2.0, 4.0]
+    assert end.final["x"][:, 0].tolist() == [4.0, 2.0, 4.0]
     assert end.ended.tolist() == end.terminated.tolist() == [False, True, False]
-    assert end.outcome[1] == 3
-    assert end.obs.flatten().tolist() == [104.0] * 3
-    assert watched == [[False] * 3, [False, True, False], [False] * 3, [False] * 3]
+    assert view["x"][:, 0].tolist() == [104.0] * 3
+    assert sums.samples == 4 * 3 and sums.outcomes.tolist() == [0, 0, 0, 1, 0, 0]
 
 
 def test_what_is_held_is_the_action():
-    env = Scripted()
-    Hold(env, 4).drive(torch.full((N, NUM_ACTIONS), 0.5))
-    assert [action[0, 0].item() for action in env.actions] == [0.5] * 4
-    assert [action[1, 0].item() for action in env.actions[2:]] == [2.0, 3.0], (
+    actions = held(4)[0].actions
+    assert [action[0, 0].item() for action in actions] == [0.5] * 4
+    assert [action[1, 0].item() for action in actions] == [0.5, 0.5, 2.0, 3.0], (
         "a new episode is driven by the tree until the next decision"
     )
 
 
 def test_one_step_is_a_step_of_the_env():
-    env = Scripted()
-    end = Hold(env, 1).drive(torch.full((N, NUM_ACTIONS), 0.5))
+    env, _, end, _ = held(1)
     assert (env.steps, end.reward.tolist()) == (1, [1.0] * 3)
     assert env.actions[0].unique().tolist() == [0.5]
 
 
 def test_a_training_counts_control_steps_and_goes_on_bit_for_bit():
-    from tests.point_env import PointEnv
-
     config = config_of(policy={"hidden": [16, 16], "hold_steps": 3})
     whole, first = trainer_of(PointEnv(), config), trainer_of(PointEnv(), config)
     answer = [whole.iterate() for _ in range(4)]

@@ -23,7 +23,8 @@ from uuvtai.evaluation.evaluate import evaluate_now
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
 from uuvtai.kernels.core.noise import episode_key
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
-from uuvtai.learning import checkpoint, distillation, environments, runner
+from uuvtai.kernels.task.episode import verdict
+from uuvtai.learning import checkpoint, distillation, runner
 from uuvtai.learning.agents import load_set_agent
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.distillation import Student, imitate, wish_of
@@ -34,9 +35,9 @@ from uuvtai.learning.set_networks import SetActor
 from uuvtai.learning.trainer import Trainer
 from uuvtai.sim.stages import bind, members_of
 from uuvtai.surrogate import arrays, motion, observation, sensing
+from uuvtai.surrogate.arrays import At, Rules
 from uuvtai.surrogate.world import draw_bank, scenario_rows
 
-Rules = arrays.SurrogateRules
 CLEARANCE_TOL_M = 0.01
 """the simulator's hull leans by a few degrees, the surrogate's does not"""
 TTC_TOL_S = 0.1
@@ -63,15 +64,38 @@ def lay(wishes: FloatMatrix, vehicle: Const[VehicleConfig], tank: Const[TankConf
 @ti.kernel
 def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
     for row, lane in ti.ndrange(path.shape[0], path.shape[1]):
-        place = motion.path_place(row, lane, times[row], path)
+        place = motion.path_places(row, lane, ti.Vector([times[row]]), path)
         for i in ti.static(range(4)):
-            out[row, lane, i] = place[i]
+            out[row, lane, i] = place[0, i]
 
 
 @ti.kernel
 def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[Rules], ray: FloatMatrix):
     for i in range(place.shape[0]):
-        sensing.write_rays(i, i, body.shape[1], place[i, 0], place[i, 1], body, ray, io)
+        sensing.write_rays(i, i, body.shape[1], motion.part(place, i, 0, 2), body, ray, io)
+
+
+@ti.kernel
+def judge(
+    io: Bundle[Rules],
+    pose: FloatMatrix,
+    body: AnyTensor,
+    path: AnyTensor,
+    seen: FloatMatrix,
+    outcome: IntVector,
+):
+    """Clearance [m] and time to collision [s] into ``seen`` (n, 2), and the verdict, of states (n, 12): x, y,
+    z, yaw, velocity in the world, yaw rate, time, goal. State i is judged in scenario i."""
+    for i in range(pose.shape[0]):
+        pos_w, vel_w, goal_w = (
+            motion.part(pose, i, 0, 3),
+            motion.part(pose, i, 4, 3),
+            motion.part(pose, i, 9, 3),
+        )
+        axis_w = ti.Vector([ti.cos(pose[i, 3]), ti.sin(pose[i, 3]), 0.0])
+        threat = motion.nearest_of(-1, i, pos_w, axis_w, vel_w, pose[i, 7], pose[i, 8], body, path, io)
+        seen[i, 0], seen[i, 1] = threat[0], threat[1]
+        outcome[i] = verdict(pos_w, axis_w, goal_w, threat, 0, io.episode_cfg, io.vehicle_cfg, io.tank_cfg)
 
 
 @ti.kernel
@@ -86,9 +110,9 @@ def threats(
 ):
     """Clearance and time to collision after hulls moved by (x, y, z, t), of near or of all obstacles."""
     for i in range(pose.shape[0]):
-        before = ti.Vector([pose[i, k] for k in ti.static(range(3))])
-        after = before + ti.Vector([moved[i, k] for k in ti.static(range(3))])
-        near = motion.EVERY_SLOT + 0
+        before = motion.part(pose, i, 0, 3)
+        after = before + motion.part(moved, i, 0, 3)
+        near = -1
         if near_only == 1:
             near = motion.near_slots(i, before, pose[i, 3], body, path, io)
         ahead = ti.Vector([1.0, 0.0, 0.0])
@@ -122,7 +146,7 @@ def tracked(track: AnyTensor, out: AnyTensor):
 @ti.kernel
 def velocities(wish: FloatMatrix, flip: FloatMatrix, vehicle: Const[VehicleConfig], out: FloatMatrix):
     for i in range(wish.shape[0]):
-        found = motion.wished_velocity(wish[i, 0], wish[i, 1], wish[i, 2], flip[i, 0], flip[i, 1], vehicle)
+        found = motion.wished_velocity(motion.part(wish, i, 0, 3), motion.part(flip, i, 0, 2), vehicle)
         for j in ti.static(range(3)):
             out[i, j] = found[j]
 
@@ -137,9 +161,9 @@ def earn(nearer: AnyTensor, nearest: AnyTensor, ended: IntVector, io: Bundle[Rul
 def follow(io: Bundle[Rules], route: AnyTensor, ego: FloatMatrix):
     """The terms of the route of vehicles that have moved on, each on its own."""
     for i in range(ego.shape[0]):
-        at = ti.Vector([ego[i, arrays.AT_POS], ego[i, arrays.AT_POS + 1]])
-        ego[i, arrays.AT_ARC] = motion.advanced_arc(i, ego[i, arrays.AT_ARC], at, route)
-        ego[i, arrays.AT_LEFT] = motion.length_left(i, ego[i, arrays.AT_ARC], route)
+        at = ti.Vector([ego[i, At.POS], ego[i, At.POS + 1]])
+        ego[i, At.ARC] = motion.advanced_arc(i, ego[i, At.ARC], at, route)
+        ego[i, At.LEFT] = motion.length_left(i, ego[i, At.ARC], route)
         motion.aim(i, i, route, ego, io)
 
 
@@ -223,7 +247,7 @@ def test_obstacles_move_as_in_closed_form(small, bank, easing_m):
 
 
 def states_of(sim):
-    """(n, 12) rows for ``check_states``."""
+    """(n, 12) rows for ``judge``."""
     rows, s = sim.rows, sim.s
     w, x, y, z = rows(s.vehicle.quat_wb).T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -246,7 +270,7 @@ def test_the_referee_is_the_simulators(small, bank, config):
             continue
         rows, termination = small.sim.rows, small.sim.s.termination
         seen, outcome = torch.zeros(small.N, 2), torch.zeros(small.N, dtype=torch.int32)
-        motion.check_states(rules, states_of(small.sim), bank.obstacle, bank.path, seen, outcome)
+        judge(rules, states_of(small.sim), bank.obstacle, bank.path, seen, outcome)
         clearance, ttc, ended = (
             rows(termination.clearance_m),
             rows(termination.ttc_s),
@@ -267,7 +291,7 @@ def test_far_obstacles_are_left_out(config):
     far[0, 0] = torch.tensor([1.0, 15.0, 3.0, -0.8, 0.2, 0.2, 0.2, 0.0])
     pose = torch.tensor([[5.0, 3.0, -0.8, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 18.0, 3.0, -0.8]])
     seen, outcome = torch.zeros(1, 2), torch.zeros(1, dtype=torch.int32)
-    motion.check_states(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
+    judge(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
     assert seen[0, 1] == FAR_M and outcome[0] == 0
     assert seen[0, 0] == pytest.approx(3.0 - 0.17, abs=FLOAT_TOL)  # the side walls
 
@@ -305,13 +329,13 @@ def test_a_route_is_followed_as_in_the_simulator(small, config):
         ego, seen = torch.zeros(small.N, arrays.EGO_WIDTH), torch.zeros(small.N, arrays.EGO_WIDTH)
         raw, ray = torch.zeros(small.N, 9, 14), torch.zeros(small.N, N_RAY)
         observation.observe_obstacles(io, torch.ones(small.N, dtype=torch.int32), seen, raw, ray)
-        ego[:, arrays.AT_POS : arrays.AT_POS + 3] = torch.from_numpy(rows(s.ego.pos_w))
-        ego[:, arrays.AT_ARC] = torch.from_numpy(arc)
+        ego[:, At.POS : At.POS + 3] = torch.from_numpy(rows(s.ego.pos_w))
+        ego[:, At.ARC] = torch.from_numpy(arc)
         follow(rules, torch.from_numpy(scenario_rows(small.sim)[2]), ego)
         same = (planned == rows(s.route.plan_step)) & (rows(s.clock.running) == 1)
-        at_corner = abs(ego[:, arrays.AT_ARC] - ego[:, arrays.AT_ARC].round()).numpy() < 1e-3
-        ego[at_corner, arrays.AT_ASIDE] = seen[at_corner, arrays.AT_ASIDE] = 0.0  # on either side
-        for column in (arrays.AT_AHEAD, arrays.AT_AHEAD + 1, arrays.AT_LEFT, arrays.AT_ASIDE):
+        at_corner = abs(ego[:, At.ARC] - ego[:, At.ARC].round()).numpy() < 1e-3
+        ego[at_corner, At.ASIDE] = seen[at_corner, At.ASIDE] = 0.0  # on either side
+        for column in (At.AHEAD, At.AHEAD + 1, At.LEFT, At.ASIDE):
             np.testing.assert_allclose(ego[same, column], seen[same, column], atol=1e-4)
         compared += int((same & ~at_corner).sum())
     assert compared > 200 * small.N
@@ -538,7 +562,7 @@ def test_a_command_becomes_the_wish_with_its_velocity():
     flip = torch.from_numpy(rng.choice([-1.0, 1.0], (200, 2)).astype(np.float32))
     out = torch.zeros(200, 3)
     ego = torch.zeros(200, arrays.EGO_WIDTH)
-    ego[:, arrays.AT_YAW], ego[:, arrays.AT_FLIP : arrays.AT_FLIP + 2] = yaw, flip
+    ego[:, At.YAW], ego[:, At.FLIP : At.FLIP + 2] = yaw, flip
     velocities(wish_of(command, ego, vehicle), flip, vehicle, out)
     surge, sway = vehicle.max_surge_m_s * command[:, 0], vehicle.max_sway_m_s * command[:, 1]
     expected = [
@@ -642,11 +666,6 @@ def test_what_the_surrogate_lacks_is_refused(bank, key, value, says):
     with pytest.raises(UserError, match=says):
         config = load_training("policy", overrides=SMALL | {key: value})
         Trainer(InSurrogate(config, bank), config)
-
-
-def test_the_trainer_knows_how_long_the_surrogate_holds_a_decision():
-    assert environments.HOLD_STEPS == motion.STEPS
-    assert environments.DECISION_S == sensing.DT_S
 
 
 def test_it_is_no_policy_of_one_observation(saved):

@@ -95,6 +95,7 @@ class Truth:
 # ---- A policy over a set of obstacles in numbers: widths of what it is told, and of the rule that lays its
 # wish on the hull. Read by kernels, by what learns, and by what is exported without them.
 
+HOLD_STEPS, DECISION_S = 5, 0.1  # control steps that the surrogate holds a decision, and how long that is
 N_OBSTACLE = 9  # moving obstacles that the policy sees, the nearest ones
 OBSTACLE_WIDTH = 22  # columns of an obstacle
 OWN_WIDTH = 22  # columns of the vehicle, its route and its goal

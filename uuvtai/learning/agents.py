@@ -161,10 +161,10 @@ class SetAgent(HeldAgent):
 
     def look(self) -> None:
         """Columns of the rows whose decision is due, as they are now."""
-        from uuvtai.surrogate.arrays import AT_LAST
+        from uuvtai.surrogate.arrays import At
         from uuvtai.surrogate.observation import observe_obstacles, write_set_columns
 
-        self.ego[:, AT_LAST : AT_LAST + NUM_WISHES] = self._last
+        self.ego[:, At.LAST : At.LAST + NUM_WISHES] = self._last
         due = (self._age % self._hold == 0).int()
         observe_obstacles(self._io, due, self.ego, self._raw, self._ray)
         write_set_columns(self.ego, self._raw, self._ray, self.obstacles, self.own)

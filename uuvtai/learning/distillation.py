@@ -155,13 +155,13 @@ SEED = 7_000_003
 def wish_of(command: torch.Tensor, ego: torch.Tensor, vehicle_cfg: VehicleConfig) -> torch.Tensor:
     """(n, 3) wishes whose velocity is that of commands (n, 4) of vehicles (n, EGO_WIDTH); the yaw rate is
     left out. The inverse of ``motion.wished_velocity``."""
-    from uuvtai.surrogate.arrays import AT_FLIP, AT_YAW
+    from uuvtai.surrogate.arrays import At
 
     fastest = (vehicle_cfg.max_surge_m_s**2 + vehicle_cfg.max_sway_m_s**2) ** 0.5
     surge, sway = vehicle_cfg.max_surge_m_s * command[:, 0], vehicle_cfg.max_sway_m_s * command[:, 1]
-    c, s = ego[:, AT_YAW].cos(), ego[:, AT_YAW].sin()
+    c, s = ego[:, At.YAW].cos(), ego[:, At.YAW].sin()
     level = torch.stack([c * surge - s * sway, s * surge + c * sway], dim=1)
-    return torch.cat([ego[:, AT_FLIP : AT_FLIP + 2] * level / fastest, command[:, 2:3]], dim=1)
+    return torch.cat([ego[:, At.FLIP : At.FLIP + 2] * level / fastest, command[:, 2:3]], dim=1)
 
 
 class Student(SetAgent):

@@ -5,11 +5,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, OBSTACLE_WIDTH, OUTCOMES, RUNNING, SUCCESS, TIMEOUT
+from uuvtai.common.enums import (
+    DECISION_S,
+    EGO_COLUMNS,
+    HOLD_STEPS,
+    N_OBSTACLE,
+    OBSTACLE_WIDTH,
+    OUTCOMES,
+    RUNNING,
+    SUCCESS,
+    TIMEOUT,
+)
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.agents import SetAgent
@@ -25,98 +35,62 @@ if TYPE_CHECKING:
     from uuvtai.surrogate.world import ScenarioBank, Surrogate
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A decision held for several control steps (frame skip): to the learner they are one transition.
+class InSimulator(Environment):
+    """What the views of the simulator share."""
+
+    rests = False
+    """an env whose episode ends rests until the next decision; else the behavior tree drives the next episode
+    until then"""
+
+    def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
+        """Call ``begin`` before anything else."""
+        self.env, self.config, self.steps = env, config, config.policy.hold_steps
+        self.num_envs, self.device = env.num_envs, env.device
+        self.outcomes, self.reward_terms, self.node_names = env.outcomes, env.reward_terms, env.node_names
+        self._reward = torch.zeros(self.num_envs, device=self.device)
+        self.info: View = {}
+        """what ``VectorEnv.step`` told last beside the observation"""
+
+    @property
+    def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.info["seed"], self.info["episode"]
+
+    def _hold(
+        self, command: Callable[[torch.Tensor], torch.Tensor], sums: RolloutSums | None
+    ) -> tuple[torch.Tensor, ...]:
+        """Hold a decision for ``steps`` control steps (frame skip: to the learner they are one transition).
+        ``command`` gives the action (N, 4) of a step, told which episodes (N,) have ended on the way.
+
+        (observation of the next decision, observation that this one led to, reward, terminated, ended), all
+        (N, ...); but for the first they tell of the episode in which the decision was made.
+        """
+        obs = final = torch.zeros(self.num_envs, self.env.num_obs, device=self.device)
+        reward = torch.zeros_like(self._reward)
+        terminated = ended = torch.zeros_like(self._reward, dtype=torch.bool)
+        for _ in range(self.steps):
+            obs, earned, failed, late, self.info = self.env.step(command(ended))
+            newly = failed | late
+            if sums is not None:
+                sums.count(newly & ~ended if self.rests else newly, self.info)
+            final = torch.where(ended[:, None], final, self.info["final_obs"])
+            reward += torch.where(ended, 0.0, earned)
+            terminated, ended = terminated | (failed & ~ended), ended | newly
+        return obs, final, reward, terminated, ended
+
+    def _commanded(self) -> torch.Tensor:
+        """(N, 4) what the behavior tree would do now, 0 in place of what is not finite."""
+        return self.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
 
 
-Info = dict[str, torch.Tensor]
-"""what ``VectorEnv.step`` tells beside the observation"""
-Watch = Callable[[torch.Tensor, Info], None]
-"""called after every control step with the rows (N,) whose episode ended in it, and its info"""
-
-
-class HeldResult(NamedTuple):
-    """What came of a decision, all (N, ...); rows whose episode ended on the way tell of that episode,
-    ``obs`` and ``info`` of the next."""
-
-    obs: torch.Tensor
-    """observation of the next decision"""
-    final_obs: torch.Tensor
-    """observation that the decision led to"""
-    reward: torch.Tensor
-    """sum over the steps"""
-    terminated: torch.Tensor
-    ended: torch.Tensor
-    outcome: torch.Tensor
-    """int64 index of how the episode ended; without meaning where it went on"""
-    info: Info
-    """of the last control step"""
-
-
-class Hold:
-    """Drives the envs through ``steps`` control steps by one action.
-
-    An episode that begins on the way is driven by the behaviour tree until the next decision.
-    """
-
-    def __init__(self, env: VectorEnv, steps: int) -> None:
-        self._env, self.steps = env, steps
-
-    def drive(self, action: torch.Tensor, watch: Watch | None = None) -> HeldResult:
-        """Carry out ``action`` (N, 4)."""
-        end = self._step(action)
-        if watch:
-            watch(end.ended, end.info)
-        if self.steps == 1:
-            return end
-        end = end._replace(
-            final_obs=end.final_obs.clone(), reward=end.reward.clone(), terminated=end.terminated.clone()
-        )
-        for _ in range(self.steps - 1):
-            newest = end.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-            step = self._step(torch.where(end.ended[:, None], newest, action))
-            if watch:
-                watch(step.ended, step.info)
-            end = _joined(end, step)
-        return end
-
-    def _step(self, action: torch.Tensor) -> HeldResult:
-        obs, reward, terminated, truncated, info = self._env.step(action)
-        return HeldResult(
-            obs, info["final_obs"], reward, terminated, terminated | truncated, info["outcome"].long(), info
-        )
-
-
-def _joined(first: HeldResult, then: HeldResult) -> HeldResult:
-    """One stretch after the other; rows that ended in the first keep what it told."""
-    on = ~first.ended
-    return HeldResult(
-        obs=then.obs,
-        final_obs=torch.where(on[:, None], then.final_obs, first.final_obs),
-        reward=torch.where(on, first.reward + then.reward, first.reward),
-        terminated=first.terminated | (on & then.terminated),
-        ended=first.ended | (on & then.ended),
-        outcome=torch.where(on, then.outcome, first.outcome),
-        info=then.info,
-    )
-
-
-# ------------------------------------------------------------------------------------------------------------
-
-
-class Simulated(Environment):
+class Simulated(InSimulator):
     """The simulator for a policy on observation vectors. Its view: ``x``, the observation and the world
     model's residual and uncertainty of it (zero without one, and in the first step of an episode);
     ``teacher_action`` (N, 4) and ``leaf`` (N,) of the behavior tree. What is not finite is replaced."""
 
     def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
-        """Call ``begin`` before anything else."""
-        self.env, self.config = env, config
-        self.num_envs, self.device = env.num_envs, env.device
-        self.outcomes, self.reward_terms, self.node_names = env.outcomes, env.reward_terms, env.node_names
+        """As ``InSimulator``."""
+        super().__init__(env, config)
         self.observation_table = env.observation_table
-        self.hold = Hold(env, config.policy.hold_steps)
-        self.steps = self.hold.steps
         n, n_in, device = self.num_envs, env.num_obs + N_FEATURES, self.device
         self.view: View = {
             "x": torch.zeros(n, n_in, device=device),
@@ -127,12 +101,13 @@ class Simulated(Environment):
             [(c.name, c.slice) for c in self.observation_table], n, config.train.patience, device
         )
         self.world_model: WorldModel | None = None
-        self._final, self._reward = torch.zeros(n, n_in, device=device), torch.zeros(n, device=device)
-        self._bad = torch.zeros(n, dtype=torch.bool, device=device)
+        self._final = torch.zeros(n, n_in, device=device)
         self._features = torch.zeros(n, N_FEATURES, device=device)
+        self._bad = torch.zeros(n, dtype=torch.bool, device=device)
+        self.carried = {"x": self.view["x"], "bad": self._bad}
+        """the input too: its world-model columns remember the last step"""
 
     def make_policy(self, generator: torch.Generator) -> ActorCritic:
-        """As in ``Environment``."""
         return ActorCritic(self.view["x"].shape[1], self.config.policy, generator).to(self.device)
 
     def agent(self, policy: ActorCritic) -> PolicyAgent:
@@ -167,45 +142,28 @@ class Simulated(Environment):
             found = self.world_model.features(x[t - 1, :, :n], rollout["action"][t - 1], x[t, :, :n])
             x[t, :, n:] = torch.where(rollout["ended"][t - 1, :, None], 0.0, found)
 
-    @property
-    def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """As in ``Environment``."""
-        return self.info["seed"], self.info["episode"]
-
     def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
         """Hold a decision (N, 4); the reward is NaN for samples with anything bad."""
-        end = self.hold.drive(action, None if sums is None else sums.count)
-        self._bad |= self.guard.values("reward", end.reward, self._reward)
-        self._bad |= self._cleaned(end.final_obs, self._final, end.ended)
+        obs, final, reward, terminated, ended = self._hold(
+            lambda ended: torch.where(ended[:, None], self._commanded(), action), sums
+        )
+        self._bad |= self.guard.values("reward", reward, self._reward)
+        self._bad |= self._cleaned(final, self._final, ended)
         if self.world_model is not None:
             n = self.env.num_obs
             self._features = self.world_model.features(self.view["x"][:, :n], action, self._final[:, :n])
             if self.config.world_model.as_features:
                 self._final[:, n:] = self._features
         self._reward.masked_fill_(self._bad, math.nan)  # PPO leaves such samples out
-        self.view["x"].copy_(self._final).masked_fill_(end.ended[:, None], 0.0)
-        self._arrive(end.obs, end.info)
+        self.view["x"].copy_(self._final).masked_fill_(ended[:, None], 0.0)
+        self._arrive(obs, self.info)
         told = {"uncertainty": self._features[:, -1]}
-        return Step(self._reward, end.terminated, end.ended, {"x": self._final}, told)
-
-    def capture(self) -> dict[str, Any]:
-        """As in ``Environment``."""
-        return self.env.capture()
-
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """The present input: its world-model columns remember the last step."""
-        return {"x": self.view["x"].clone(), "bad": self._bad.clone()}
-
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """As in ``Environment``."""
-        self.view["x"].copy_(state["x"])
-        self._bad.copy_(state["bad"])
+        return Step(self._reward, terminated, ended, {"x": self._final}, told)
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        """As in ``Environment``."""
         self._arrive(*self.env.restore(arrays))
 
-    def _arrive(self, obs: torch.Tensor, info: Info) -> None:
+    def _arrive(self, obs: torch.Tensor, info: View) -> None:
         """The observation of the next decision, and what the tree would do now: the next step overwrites
         it."""
         self.info = info
@@ -222,27 +180,25 @@ class Simulated(Environment):
         return self.guard.values(OBSERVATION, obs, x[:, :n], self._norm.mean[:n].float(), counted)
 
 
-class SimulatedSet(Environment):
+class SimulatedSet(InSimulator):
     """The simulator for a policy over a set of obstacles. Its view: ``obstacles`` and ``own``, as the vehicle
-    knows them, no ``truth``, and what the tree would wish. An env whose episode ends rests until the next
-    decision."""
+    knows them, no ``truth``, and what the tree would wish."""
+
+    rests = True
 
     def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
         """``env`` resets nothing by itself."""
-        self.env, self.config = env, config
-        self.num_envs, self.device, self.node_names = env.num_envs, env.device, env.node_names
-        self.outcomes, self.reward_terms = env.outcomes, env.reward_terms
-        self.observation_table, self.steps = set_table(), config.policy.hold_steps
-        n = self.num_envs
-        self.guard = Guard((), n, config.train.patience, self.device)
+        from uuvtai.surrogate.observation import SET_TABLE
+
+        super().__init__(env, config)
+        self.observation_table = SET_TABLE
+        self.guard = Guard((), self.num_envs, config.train.patience, self.device)
         widths = {"obstacles": (N_OBSTACLE, OBSTACLE_WIDTH), "own": (EGO_COLUMNS,), "truth": (N_OBSTACLE, 0)}
-        self.view = {name: torch.zeros(n, *width, device=self.device) for name, width in widths.items()}
-        self.view["teacher_action"] = torch.zeros(n, NUM_WISHES, device=self.device)
-        self.view["leaf"] = torch.zeros(n, dtype=torch.int32, device=self.device)
-        self._reward = torch.zeros(n, device=self.device)
+        widths |= {"teacher_action": (NUM_WISHES,), "leaf": ()}
+        self.view = {n: torch.zeros(self.num_envs, *width, device=self.device) for n, width in widths.items()}
+        self.view["leaf"] = self.view["leaf"].int()
 
     def make_policy(self, generator: torch.Generator) -> SetPolicy:
-        """As in ``Environment``."""
         return SetPolicy(self.view, self.config, generator).to(self.device)
 
     def agent(self, policy: SetPolicy) -> SetAgent:
@@ -251,65 +207,38 @@ class SimulatedSet(Environment):
         return SetAgent(policy.actor, self.env.sim, self.steps, gap_m)
 
     def begin(self, policy: SetPolicy, world_model: WorldModel | None, generator: torch.Generator) -> None:
-        """As in ``Environment``."""
         self._hull = self.agent(policy)
+        self.carried = self.view | self._hull.memory()
         _, self.info = self.env.reset(self.config.train.seed)
         self._look()
 
     def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
         """Hold a wish (N, 3)."""
-        hull, done = self._hull, torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        hull.wish.copy_(action.clamp(-MOST_WISH, MOST_WISH))
-        reward, terminated = torch.zeros_like(self._reward), done
+        self._hull.wish.copy_(action.clamp(-MOST_WISH, MOST_WISH))
+        *_, reward, terminated, ended = self._hold(lambda _ended: self._hull.command(), sums)
         for _ in range(self.steps):
-            _, earned, failed, late, self.info = self.env.step(hull.command())
-            hull.advance()
-            ended = (failed | late) & ~done
-            if sums is not None:
-                sums.count(ended, self.info)
-            reward += torch.where(done, 0.0, earned)
-            terminated, done = terminated | (ended & failed), done | ended
+            self._hull.advance()
         bad = self.guard.values("reward", reward, self._reward)
         self._reward.masked_fill_(bad, math.nan)
         self._look()
         final = None
-        if bool(done.any()):
+        if bool(ended.any()):
             final = {name: part.clone() for name, part in self.view.items()}
-            _, self.info = self.env.reset(mask=done)
-            hull.reset(done)
+            _, self.info = self.env.reset(mask=ended)
+            self._hull.reset(ended)
             self._look()
-        return Step(self._reward, terminated, done, final, {"uncertainty": torch.zeros_like(reward)})
-
-    @property
-    def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """As in ``Environment``."""
-        return self.info["seed"], self.info["episode"]
-
-    def capture(self) -> dict[str, Any]:
-        """As in ``Environment``."""
-        return self.env.capture()
-
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """The present view, and what was carried out last."""
-        return {name: part.clone() for name, part in (self.view | self._hull.memory()).items()}
-
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """As in ``Environment``."""
-        for name, part in (self.view | self._hull.memory()).items():
-            part.copy_(state[name])
+        return Step(self._reward, terminated, ended, final, {"uncertainty": torch.zeros_like(reward)})
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        """As in ``Environment``."""
         _, self.info = self.env.restore(arrays)
 
     def _look(self) -> None:
-        self._hull.look()
-        ego, view = self._hull.ego, self.view
-        view["obstacles"].copy_(self._hull.obstacles)
-        view["own"].copy_(self._hull.own)
+        hull, view = self._hull, self.view
+        hull.look()
+        view["obstacles"].copy_(hull.obstacles)
+        view["own"].copy_(hull.own)
         view["leaf"].copy_(self.info["leaf"])
-        command = self.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-        view["teacher_action"].copy_(wish_of(command, ego, self.env.config.vehicle))
+        view["teacher_action"].copy_(wish_of(self._commanded(), hull.ego, self.env.config.vehicle))
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -317,8 +246,6 @@ class SimulatedSet(Environment):
 
 BANK_SEED = 4242
 """of the scenarios to learn from; those of evaluations come from ``train.evaluate_seed``"""
-HOLD_STEPS, DECISION_S = 5, 0.1
-"""of the surrogate (``uuvtai/surrogate/motion.py``), which is not imported before it is used"""
 
 
 class InSurrogate(Environment):
@@ -330,34 +257,35 @@ class InSurrogate(Environment):
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
         """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
         another tank."""
+        from uuvtai.surrogate.observation import SET_TABLE
         from uuvtai.surrogate.world import Surrogate, draw_bank
 
         _refuse_what_the_surrogate_lacks(config)
         torch.set_flush_denormal(True)
-        self.config, self.observation_table, self.num_envs = config, set_table(), config.train.num_envs
+        self.config, self.observation_table, self.num_envs = config, SET_TABLE, config.train.num_envs
         self.scenes = config.train.scenes or (config.world.own_scene,)
         bank = bank or draw_bank(config, self.scenes, BANK_SEED, config.surrogate.scenarios)
-        self.surrogate = Surrogate(config, bank, self.num_envs, config.train.seed)
-        self.view: View = self.surrogate.view._asdict()
+        self.env = Surrogate(config, bank, self.num_envs, config.train.seed)
+        self.view: View = dict(self.env.view)
         if not config.ppo.critic_sees_truth:
             self.view["truth"] = self.view["truth"][..., :0]
         self.guard = Guard((), self.num_envs, config.train.patience, self.device)
         self._returns = torch.zeros(self.num_envs)
+        self.carried = {"returns": self._returns}
         self._held_out: ScenarioBank | None = None
 
     def make_policy(self, generator: torch.Generator) -> SetPolicy:
-        """As in ``Environment``."""
         return SetPolicy(self.view, self.config, generator)
 
     def begin(self, policy: Policy, world_model: WorldModel | None, generator: torch.Generator) -> None:
         """First scenarios; ``generator`` draws all that follow."""
         self._generator = generator
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
-        self.surrogate.look()
+        self.env.look()
 
     def _begin(self, rows: torch.Tensor) -> None:
-        found = torch.randint(self.surrogate.num_scenarios, (self.num_envs,), generator=self._generator)
-        self.surrogate.begin(rows, found)
+        found = torch.randint(len(self.env.bank.origin), (self.num_envs,), generator=self._generator)
+        self.env.begin(rows, found)
 
     def warm_start(self, policy: SetPolicy, note: Callable[[str], None]) -> dict[str, float]:
         """Learn from the tree first, where ``surrogate.warm_start_waves`` says so; metrics."""
@@ -366,13 +294,12 @@ class InSurrogate(Environment):
 
     @property
     def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """As in ``Environment``."""
-        return torch.full_like(self.surrogate.scenario, BANK_SEED), self.surrogate.scenario
+        return torch.full_like(self.env.scenario, BANK_SEED), self.env.scenario
 
     def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
         """Carry out a decision (N, 3)."""
         assert sums is not None
-        surrogate, final = self.surrogate, None
+        surrogate, final = self.env, None
         reward, outcome = surrogate.step(action)
         ended, late = outcome != RUNNING, outcome == TIMEOUT
         self._returns += reward
@@ -388,22 +315,6 @@ class InSurrogate(Environment):
             self._begin(ended)
         surrogate.look()
         return Step(reward, ended & ~late, ended, final, {})
-
-    def capture(self) -> dict[str, Any]:
-        """As in ``Environment``."""
-        return self.surrogate.capture()
-
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Returns of the episodes so far."""
-        return {"returns": self._returns.clone()}
-
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """As in ``Environment``."""
-        self._returns.copy_(state["returns"])
-
-    def restore(self, arrays: dict[str, Any]) -> None:
-        """As in ``Environment``."""
-        self.surrogate.restore(arrays)
 
     @torch.no_grad()
     def evaluate(self, policy: Policy) -> dict[str, float]:
@@ -431,13 +342,6 @@ class InSurrogate(Environment):
         return metrics
 
 
-def set_table() -> tuple[Any, ...]:
-    """The observation of a policy over a set of obstacles."""
-    from uuvtai.surrogate.observation import SET_TABLE
-
-    return SET_TABLE
-
-
 def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
     """Raise SettingError for settings that the surrogate does not have."""
     if config.encoder != "set":
@@ -460,7 +364,7 @@ def run_once(surrogate: Surrogate, policy: Policy) -> tuple[torch.Tensor, torch.
     surrogate.begin(every, torch.arange(surrogate.num_envs))
     outcome, time_s = torch.zeros(surrogate.num_envs, dtype=torch.int32), torch.zeros(surrogate.num_envs)
     while bool((outcome == RUNNING).any()):
-        view = surrogate.look()._asdict()
+        view = surrogate.look()
         _, now = surrogate.step(by_part(policy.mean_of, policy.prepared(view)).clamp(-MOST_WISH, MOST_WISH))
         new = (outcome == RUNNING) & (now != RUNNING)
         outcome, time_s = torch.where(new, now, outcome), torch.where(new, surrogate.time_s, time_s)

@@ -31,6 +31,10 @@ class Step(NamedTuple):
 class Environment(ABC):
     """Where a policy learns: the simulator or its surrogate (``environments.py``). ``begin`` comes first."""
 
+    env: Any
+    """where the episodes run, which can be captured"""
+    carried: View
+    """beside what ``env`` captures: always the same tensors"""
     num_envs: int
     device: torch.device
     steps = 1
@@ -72,21 +76,22 @@ class Environment(ABC):
     def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
         """Carry out a decision (N, n_action), and count it."""
 
-    @abstractmethod
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """What is carried beside ``capture``."""
+    def state_dict(self) -> View:
+        """What is carried beside ``capture``; not copied."""
+        return dict(self.carried)
 
-    @abstractmethod
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+    def load_state_dict(self, state: View) -> None:
         """What ``state_dict`` gave, after ``restore``."""
+        for name, part in self.carried.items():
+            part.copy_(state[name])
 
-    @abstractmethod
     def capture(self) -> dict[str, Any]:
         """The episodes."""
+        return self.env.capture()
 
-    @abstractmethod
     def restore(self, arrays: dict[str, Any]) -> None:
         """Go on with what ``capture`` gave; ValueError, with nothing changed, for that of another env."""
+        self.env.restore(arrays)
 
 
 # ------------------------------------------------------------------------------------------------------------

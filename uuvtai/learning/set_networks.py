@@ -52,12 +52,9 @@ class SetEncoder(nn.Module):
     def forward(self, obstacles: torch.Tensor, own: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """(..., n_out)."""
         n, rows = obstacles.shape[-2], obstacles.shape[:-2]
-        each = obstacles.reshape(-1, n, obstacles.shape[-1]).transpose(
-            0, 1
-        )  # obstacles first, as pooling wants them
-        said = self.obstacle(each.flatten(0, 1)).unflatten(
-            0, each.shape[:2]
-        )  # rows: ReLU in place costs none
+        # obstacles first, as pooling wants them; as rows, for which ReLU in place costs nothing
+        each = obstacles.reshape(-1, n, obstacles.shape[-1]).transpose(0, 1)
+        said = self.obstacle(each.flatten(0, 1)).unflatten(0, each.shape[:2])
         highest, total = MaxAndSum.apply(said, mask.reshape(-1, n).t())
         pooled = torch.cat((highest, _SUM_SCALE * total), dim=-1)
         return self.head(torch.cat((pooled.reshape(*rows, -1), self.own(own)), dim=-1))
@@ -113,28 +110,16 @@ class SetPolicy(Policy):
         n_obstacle, n_own, n_truth = (view[name].shape[-1] for name in self.inputs)
         self.actor = SetActor(n_obstacle, n_own, config, generator)
         self.critic = SetCritic(n_obstacle, n_own, n_truth, config, generator)
-
-    @property
-    def log_std(self) -> nn.Parameter:  # type: ignore[override]
-        """The actor's."""
-        return self.actor.log_std
-
-    @property
-    def value_norm(self) -> RunningNorm:  # type: ignore[override]
-        """The critic's."""
-        return self.critic.value_norm
+        self.log_std, self.value_norm = self.actor.log_std, self.critic.value_norm
 
     def mean_of(self, inputs: View) -> torch.Tensor:
-        """As in ``Policy``."""
         return self.actor(inputs["obstacles"], inputs["own"])
 
     def value_of(self, inputs: View) -> torch.Tensor:
-        """As in ``Policy``."""
         return self.critic(*(inputs[name] for name in self.inputs))
 
     def parts(self) -> dict[str, nn.Module]:
-        """As in ``Policy``; no file that drives holds the critic."""
-        return {"policy": self.actor, "critic": self.critic}
+        return {"policy": self.actor, "critic": self.critic}  # no file that drives holds the critic
 
 
 class MaxAndSum(torch.autograd.Function):
@@ -149,7 +134,6 @@ class MaxAndSum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, said: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """As the class says."""
         each = torch.relu(said).mul_(mask.unsqueeze(-1))
         highest = each.amax(dim=0)
         ctx.save_for_backward(each, highest)

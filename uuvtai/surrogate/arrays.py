@@ -26,13 +26,16 @@ from uuvtai.state import (
     TrackState,
 )
 
-(
-    AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL, AT_AHEAD, AT_LEFT,
-    AT_ASIDE, AT_ARC,
-) = (0, 3, 6, 7, 8, 9, 12, 14, 17, 21, 23, 24, 25)  # fmt: skip
-"""columns of an env's row: position in the world, velocity in the body frame, heading, yaw rate, time, goal,
-signs of the way to the goal, last action, integrals of the velocity loops; of the route: look-ahead point,
-length left, place left of it, and the foot as a fractional waypoint"""
+
+class At:
+    """Columns of an env's row: position in the world, velocity in the body frame, heading, yaw rate, time,
+    goal, signs of the way to the goal, last action, integrals of the velocity loops; of the route: look-ahead
+    point, length left, place left of it, and the foot as a fractional waypoint."""
+
+    POS, VEL, YAW, RATE, TIME, GOAL, FLIP, LAST, INTEGRAL = 0, 3, 6, 7, 8, 9, 12, 14, 17
+    AHEAD, LEFT, ASIDE, ARC = 21, 23, 24, 25
+
+
 EGO_WIDTH = 26
 TRACK_WIDTH = 9
 """of what the surrogate's tracker remembers of a body (``sensing_model.sense_surrogate``)"""
@@ -44,7 +47,7 @@ TRUTH_WIDTH = 10
 
 
 @dataclass(frozen=True, eq=False)
-class SurrogateRules:
+class Rules:
     """What the surrogate's kernels are compiled for."""
 
     vehicle_cfg: Const[VehicleConfig]

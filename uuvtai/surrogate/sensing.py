@@ -6,24 +6,14 @@ import math
 
 import taichi as ti
 
-from uuvtai.common.enums import N_RAY
-from uuvtai.kernels.core.geometry import BOX, NONE, TWO_PI, wrapped_angle
+from uuvtai.common.enums import DECISION_S, N_RAY
+from uuvtai.kernels.core.geometry import BOX, NONE, TWO_PI, turned_z, wrapped_angle
 from uuvtai.kernels.core.noise import episode_key, normal_pair_lanes, uniform
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, FloatMatrix, IntVector
-from uuvtai.surrogate.arrays import (
-    AT_FLIP,
-    AT_POS,
-    AT_TIME,
-    AT_YAW,
-    RAW_WIDTH,
-    TRACK_WIDTH,
-    TRUTH_WIDTH,
-    SurrogateRules,
-)
-from uuvtai.surrogate.motion import aim, path_places
-from uuvtai.surrogate.observation import write_columns_of
+from uuvtai.surrogate.arrays import RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules
+from uuvtai.surrogate.motion import aim, part, path_places
+from uuvtai.surrogate.observation import put_row, write_columns_of
 
-DT_S = 0.1
 RANGE_M = 12.0
 FAN_SLOPE = 0.1763
 """the sonar's fan: 10 degrees up and down"""
@@ -62,22 +52,22 @@ COLUMN_M = 1.6
 
 
 @ti.func
-def is_hidden(number, slot_count, x, y, to_x, to_y, obstacle: AnyTensor):
-    """1 where a static obstacle stands between a place and another."""
-    dx, dy = to_x - x, to_y - y
+def is_hidden(number, slot_count, here, at, obstacle: AnyTensor):
+    """1 where a static obstacle stands between a place ``here`` and another (x, y)."""
+    dx, dy = at[0] - here[0], at[1] - here[1]
     far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
-    ux, uy = dx / far, dy / far
+    to = ti.Vector([dx / far, dy / far])
     out = 0
     for slot in range(slot_count):
         kind = ti.cast(obstacle[number, slot, 0], ti.i32)
         if out == 0 and kind != NONE:
-            rx, ry = obstacle[number, slot, 1] - x, obstacle[number, slot, 2] - y
+            rx, ry = obstacle[number, slot, 1] - here[0], obstacle[number, slot, 2] - here[1]
             wide, deep = obstacle[number, slot, 4], obstacle[number, slot, 5]
-            along, across = rx * ux + ry * uy, ti.abs(rx * uy - ry * ux)
+            along, across = rx * to[0] + ry * to[1], ti.abs(rx * to[1] - ry * to[0])
             if kind == BOX:
                 if across < ti.sqrt(wide * wide + deep * deep):
                     c, s = ti.cos(obstacle[number, slot, 7]), ti.sin(obstacle[number, slot, 7])
-                    if free_to_box(rx, ry, ti.Vector([ux, uy]), c, s, wide, deep) < far:
+                    if free_to_box(rx, ry, to, c, s, wide, deep) < far:
                         out = 1
             elif along > 0.0 and along < far and across < 0.9 * wide:
                 out = 1
@@ -91,17 +81,13 @@ def rays():
 
 
 @ti.func
-def free_to_wall(x, y, to, io: Bundle[SurrogateRules]):
-    """[m] from a place in a direction to the nearest side wall."""
+def free_to_wall(at, to, io: Bundle[Rules]):
+    """[m] from a place in a direction (x, y) to the nearest side wall."""
     out = UNBOUNDED_M + 0.0
-    if to[0] > 1e-6:
-        out = ti.min(out, (io.tank_cfg.x_m[1] - x) / to[0])
-    elif to[0] < -1e-6:
-        out = ti.min(out, (io.tank_cfg.x_m[0] - x) / to[0])
-    if to[1] > 1e-6:
-        out = ti.min(out, (io.tank_cfg.y_m[1] - y) / to[1])
-    elif to[1] < -1e-6:
-        out = ti.min(out, (io.tank_cfg.y_m[0] - y) / to[1])
+    walls = ti.static((io.tank_cfg.x_m, io.tank_cfg.y_m))
+    for i in ti.static(range(2)):
+        if ti.abs(to[i]) > 1e-6:
+            out = ti.min(out, (ti.select(to[i] > 0.0, walls[i][1], walls[i][0]) - at[i]) / to[i])
     return out
 
 
@@ -142,17 +128,15 @@ def rays_towards(dx, dy, reach):
 
 
 @ti.func
-def write_rays(
-    env, number, slot_count, x, y, obstacle: AnyTensor, ray: FloatMatrix, io: Bundle[SurrogateRules]
-):
-    """[m] from a place along each ray to the nearest wall or static obstacle, without the hull."""
+def write_rays(env, number, slot_count, at, obstacle: AnyTensor, ray: FloatMatrix, io: Bundle[Rules]):
+    """[m] from a place (x, y) along each ray to the nearest wall or static obstacle, without the hull."""
     towards = ti.Matrix(ti.static(rays()))
     for i in ti.static(range(N_RAY)):
-        ray[env, i] = free_to_wall(x, y, ti.Vector([towards[i, 0], towards[i, 1]]), io)
+        ray[env, i] = free_to_wall(at, ti.Vector([towards[i, 0], towards[i, 1]]), io)
     for slot in range(slot_count):
         kind = ti.cast(obstacle[number, slot, 0], ti.i32)
         if kind != NONE:
-            dx, dy = obstacle[number, slot, 1] - x, obstacle[number, slot, 2] - y
+            dx, dy = obstacle[number, slot, 1] - at[0], obstacle[number, slot, 2] - at[1]
             wide, deep, c, s = obstacle[number, slot, 4], 0.0, 1.0, 0.0
             if kind == BOX:
                 deep = obstacle[number, slot, 5]
@@ -170,19 +154,19 @@ def write_rays(
 
 
 @ti.func
-def sight_of(number, slot_count, here, at, radius, high, level, obstacle: AnyTensor):
-    """(1 = seen, 1 = its height is seen, 1 = in the sonar's fan) of a moving obstacle at ``at`` (x, y), from
-    ``here`` (x, y, z, yaw)."""
+def sight_of(number, slot_count, here, yaw, at, radius, high, level, obstacle: AnyTensor):
+    """Whether a moving obstacle at ``at`` (x, y) is seen from ``here`` (x, y, z), its height is seen, and it
+    is in the sonar's fan."""
     dx, dy = at[0] - here[0], at[1] - here[1]
     far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
-    fan = ti.abs(here[2] - level) - high < ti.max(far - radius, 0.0) * FAN_SLOPE
-    bearing = wrapped_angle(ti.atan2(dy, dx) - here[3])
+    in_fan = ti.abs(here[2] - level) - high < ti.max(far - radius, 0.0) * FAN_SLOPE
+    bearing = wrapped_angle(ti.atan2(dy, dx) - yaw)
     camera = ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
-    visible, knows = False, False
-    if far < RANGE_M and (fan or camera):
-        visible = is_hidden(number, slot_count, here[0], here[1], at[0], at[1], obstacle) == 0
-        knows = visible and camera and far < HEIGHT_RANGE_M
-    return ti.Vector([ti.cast(visible, ti.i32), ti.cast(knows, ti.i32), ti.cast(fan, ti.i32)])
+    is_visible, knows_height = False, False
+    if far < RANGE_M and (in_fan or camera):
+        is_visible = is_hidden(number, slot_count, here, at, obstacle) == 0
+        knows_height = is_visible and camera and far < HEIGHT_RANGE_M
+    return is_visible, knows_height, in_fan
 
 
 @ti.func
@@ -202,41 +186,37 @@ def updated_track(old, lane, at, bend_m, speed, ego_at, is_visible, knows_height
     badly = how_badly(drawn)
     new[8] = drawn
     if bend_m != 0.0 and old[4] > SETTLED_S:
-        turn = DT_S * speed / bend_m
-        c, s = ti.cos(turn), ti.sin(turn)
-        new[2], new[3] = c * old[2] - s * old[3], s * old[2] + c * old[3]
+        turned = turned_z(ti.Vector([old[2], old[3]]), DECISION_S * speed / bend_m)
+        new[2], new[3] = turned[0], turned[1]
     if knows_height:
         new[6] = 1.0
     if is_visible:
         if new[5] > LOST_S:
             new[4], new[2], new[3] = 0.0, 0.0, 0.0
-        new[4] += DT_S
+        new[4] += DECISION_S
         new[5] = 0.0
-        new[7] += ti.abs(speed) * DT_S
+        new[7] += ti.abs(speed) * DECISION_S
         share = 1.0 if new[4] < 0.25 else QUICKEST - SLOWER * ti.max(drawn - 0.5, 0.0)
-        dx, dy = at[0] - ego_at[0], at[1] - ego_at[1]
-        square = ti.max(dx * dx + dy * dy, 1e-6)
-        far, vx, vy = ti.sqrt(square), at[2], at[3]
+        way = ti.Vector([at[0] - ego_at[0], at[1] - ego_at[1]])
+        square = ti.max(way.norm_sqr(), 1e-6)
+        far, vel = ti.sqrt(square), ti.Vector([at[2], at[3]])
         if new[4] < SETTLED_S * badly:
-            radial = (vx * dx + vy * dy) / square
-            vx, vy = 0.5 * (vx + radial * dx), 0.5 * (vy + radial * dy)
+            vel = 0.5 * (vel + vel.dot(way) / square * way)
         if not in_fan:
             badly *= CAMERA_ALONE
         away, faster = badly * far * POSITION_SIGMA, badly * (VELOCITY_SIGMA_M_S + far * VELOCITY_SIGMA_S)
-        new[2] += share * (vx + faster * first[0] - new[2])
-        new[3] += share * (vy + faster * first[1] - new[3])
-        new[0] = at[0] + LAG_S * (new[2] - at[2]) + away * second[0]
-        new[1] = at[1] + LAG_S * (new[3] - at[3]) + away * second[1]
+        for i in ti.static(range(2)):
+            new[2 + i] += share * (vel[i] + faster * first[i] - new[2 + i])
+            new[i] = at[i] + LAG_S * (new[2 + i] - at[2 + i]) + away * second[i]
     else:
-        if new[5] < 0.5 * DT_S:
+        if new[5] < 0.5 * DECISION_S:
             away, faster = badly * HIDDEN_SIGMA_M, badly * HIDDEN_SIGMA * ti.abs(speed)
-            new[2] += faster * first[0]
-            new[3] += faster * first[1]
-            new[0] += away * second[0]
-            new[1] += away * second[1]
-        new[5] += DT_S
-        new[0] += DT_S * new[2]
-        new[1] += DT_S * new[3]
+            for i in ti.static(range(2)):
+                new[2 + i] += faster * first[i]
+                new[i] += away * second[i]
+        new[5] += DECISION_S
+        for i in ti.static(range(2)):
+            new[i] += DECISION_S * new[2 + i]
     return new
 
 
@@ -250,17 +230,17 @@ def is_tracked(track):
 
 
 @ti.func
-def write_raw(env, lane, track, places, is_known, turn_rate, over, under, radius, raw: AnyTensor):
-    """What the tracker delivers of an obstacle that is tracked. A closed way that was watched once around
-    (``is_known``) is foreseen as it is (``places``: ``now_and_later``), a circle after a while, other ways
-    straight on."""
-    turn = turn_rate if track[4] > TURN_KNOWN_S else 0.0
+def row_of_obstacle(track, places, is_known, turn_rate, over, under, radius):
+    """What the tracker delivers (RAW_WIDTH,) of an obstacle that is tracked. A closed way that was watched
+    once around (``is_known``) is foreseen as it is (``places``: now and later), a circle after a while, other
+    ways straight on."""
+    turn, out = turn_rate if track[4] > TURN_KNOWN_S else 0.0, ti.Vector.zero(ti.f32, RAW_WIDTH)
     for i in ti.static(range(4)):
-        raw[env, lane, i] = track[i]
-    raw[env, lane, 4], raw[env, lane, 5], raw[env, lane, 8] = turn, radius, track[5]
+        out[i] = track[i]
+    out[4], out[5], out[8], out[13] = turn, radius, track[5], 1.0
     if track[6] > 0.5:
-        raw[env, lane, 6] = over if over > 0.0 else (COLUMN_M if under > 0.0 else 0.0)
-        raw[env, lane, 7] = under if under > 0.0 else (COLUMN_M if over > 0.0 else 0.0)
+        out[6] = over if over > 0.0 else (COLUMN_M if under > 0.0 else 0.0)
+        out[7] = under if under > 0.0 else (COLUMN_M if over > 0.0 else 0.0)
     for k in ti.static(range(2)):
         x, y = places[k + 1, 0] - places[0, 0], places[k + 1, 1] - places[0, 1]
         if not is_known:
@@ -268,44 +248,29 @@ def write_raw(env, lane, track, places, is_known, turn_rate, over, under, radius
             arc = 1.0 if ti.abs(half) < 1e-4 else ti.sin(half) / half
             c, s = arc * (k + 1.0) * ti.cos(half), arc * (k + 1.0) * ti.sin(half)
             x, y = c * track[2] - s * track[3], s * track[2] + c * track[3]
-        raw[env, lane, 9 + 2 * k], raw[env, lane, 10 + 2 * k] = x, y
-    raw[env, lane, 13] = 1.0
+        out[9 + 2 * k], out[10 + 2 * k] = x, y
+    return out
 
 
 @ti.func
-def now_and_later(number, lane, t_s, path: AnyTensor):
-    """Rows of (x, y, vx, vy) of a moving obstacle, now and in 1, 2 and 3 s."""
-    return path_places(number, lane, ti.Vector([t_s, t_s + 1.0, t_s + 2.0, t_s + 3.0]), path)
-
-
-@ti.func
-def write_truth(env, lane, places, over, flip, x, y, truth: AnyTensor):
-    """Where an obstacle is and will be (``places``: ``now_and_later``), for the critic."""
-    fx, fy = 0.25 * flip[0], 0.25 * flip[1]
-    truth[env, lane, 0], truth[env, lane, 1] = fx * (places[0, 0] - x), fy * (places[0, 1] - y)
-    truth[env, lane, 2], truth[env, lane, 3] = 1.0, ti.math.clamp(over, -COLUMN_M, COLUMN_M)
-    for k in ti.static(range(1, 4)):
-        truth[env, lane, 2 + 2 * k] = fx * (places[k, 0] - x)
-        truth[env, lane, 3 + 2 * k] = fy * (places[k, 1] - y)
+def true_row(places, over, flip, here):
+    """Where an obstacle is and will be (``places``: now and later), for the critic (TRUTH_WIDTH,)."""
+    out = ti.Vector.zero(ti.f32, TRUTH_WIDTH)
+    for k in ti.static(range(4)):
+        first = ti.static(2 * k + 2 if k > 0 else 0)
+        for i in ti.static(range(2)):
+            out[first + i] = 0.25 * flip[i] * (places[k, i] - here[i])
+    out[2], out[3] = 1.0, ti.math.clamp(over, -COLUMN_M, COLUMN_M)
+    return out
 
 
 @ti.kernel
 def sense_surrogate(
-    io: Bundle[SurrogateRules],
-    seed: int,
-    count: int,
-    obstacle: AnyTensor,
-    path: AnyTensor,
-    route: AnyTensor,
-    scenario: IntVector,
-    ego: FloatMatrix,
-    track: AnyTensor,
-    raw: AnyTensor,
-    ray: FloatMatrix,
-    truth: AnyTensor,
-    obstacles: AnyTensor,
-    own: FloatMatrix,
-):
+    io: Bundle[Rules], seed: int, count: int,
+    obstacle: AnyTensor, path: AnyTensor, route: AnyTensor,
+    scenario: IntVector, ego: FloatMatrix, track: AnyTensor, raw: AnyTensor, ray: FloatMatrix,
+    truth: AnyTensor, obstacles: AnyTensor, own: FloatMatrix,
+):  # fmt: skip
     """Tracks, rays, what only a critic may see, and the columns of a policy, after a decision or a reset. The
     noise is a function of (``seed``, ``count``) and the env.
 
@@ -313,40 +278,34 @@ def sense_surrogate(
     way [m]; uniform number of this spell.
     """
     for env in range(ego.shape[0]):
-        number, t_s = scenario[env], ego[env, AT_TIME]
-        n_rest = obstacle.shape[1] - path.shape[1]
-        x, y, z = ego[env, AT_POS], ego[env, AT_POS + 1], ego[env, AT_POS + 2]
-        flip = ti.Vector([ego[env, AT_FLIP], ego[env, AT_FLIP + 1]])
-        yaw = ego[env, AT_YAW]
+        number, n_static = scenario[env], obstacle.shape[1] - path.shape[1]
+        here, flip = part(ego, env, At.POS, 3), part(ego, env, At.FLIP, 2)
         for lane in range(path.shape[1]):
-            slot = n_rest + lane
-            for i in ti.static(range(RAW_WIDTH)):
-                raw[env, lane, i] = 0.0
-            for i in ti.static(range(TRUTH_WIDTH)):
-                truth[env, lane, i] = 0.0
+            slot = n_static + lane
+            told, real = ti.Vector.zero(ti.f32, RAW_WIDTH), ti.Vector.zero(ti.f32, TRUTH_WIDTH)
             if obstacle[number, slot, 0] > 0.5:
                 key = episode_key(seed + (count + 3 * lane) // SPELL, env)  # spells do not begin all at once
-                places = now_and_later(number, lane, t_s, path)
+                now = ego[env, At.TIME]
+                places = path_places(number, lane, ti.Vector([now, now + 1.0, now + 2.0, now + 3.0]), path)
                 at = ti.Vector([places[0, i] for i in ti.static(range(4))])
                 is_circle, speed = path[number, lane, 0] < 0.5, path[number, lane, 4]
                 bend_m = path[number, lane, 1] if is_circle else 0.0
                 turn_rate = speed / bend_m if is_circle else 0.0
-                radius, high, level = (
-                    obstacle[number, slot, 4],
-                    obstacle[number, slot, 6],
-                    obstacle[number, slot, 3],
+                level, radius = obstacle[number, slot, 3], obstacle[number, slot, 4]
+                high = obstacle[number, slot, 6]
+                is_visible, knows_height, in_fan = sight_of(
+                    number, n_static, here, ego[env, At.YAW], at, radius, high, level, obstacle
                 )
-                here = ti.Vector([x, y, z, yaw])
-                seen = sight_of(number, n_rest, here, at, radius, high, level, obstacle)
                 old = ti.Vector([track[env, lane, i] for i in ti.static(range(TRACK_WIDTH))])
-                new = updated_track(old, lane, at, bend_m, speed, here, seen[0], seen[1], seen[2], key)
-                for i in ti.static(range(TRACK_WIDTH)):
-                    track[env, lane, i] = new[i]
-                over, under = level - high - z, z - level - high
+                new = updated_track(old, lane, at, bend_m, speed, here, is_visible, knows_height, in_fan, key)
+                put_row(new, env, lane, track)
+                over, under = level - high - here[2], here[2] - level - high
                 if is_tracked(new):
                     is_known = not is_circle and new[7] > path[number, lane, 2]
-                    write_raw(env, lane, new, places, is_known, turn_rate, over, under, radius, raw)
-                write_truth(env, lane, places, over, flip, x, y, truth)
-        write_rays(env, number, n_rest, x, y, obstacle, ray, io)
+                    told = row_of_obstacle(new, places, is_known, turn_rate, over, under, radius)
+                real = true_row(places, over, flip, here)
+            put_row(told, env, lane, raw)
+            put_row(real, env, lane, truth)
+        write_rays(env, number, n_static, here, obstacle, ray, io)
         aim(env, number, route, ego, io)
         write_columns_of(env, ego, raw, ray, obstacles, own)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from uuvtai.sim.setup import Scene
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stages import bind
 from uuvtai.surrogate import motion, sensing
-from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, SurrogateRules
+from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules
 
 # ------------------------------------------------------------------------------------------------------------
 # Scenarios drawn by the simulator itself, as plain arrays that the surrogate's kernels read.
@@ -43,7 +43,7 @@ class ScenarioBank:
     route: torch.Tensor
     """(B, n_way, 3) waypoints x, y and the length left [m], at its end the goal again and again"""
     mission: torch.Tensor
-    """(B, 8) start (3), goal (3), heading at the start"""
+    """(B, 7) start (3), goal (3), heading at the start"""
     origin: torch.Tensor
     """(B,) int32: which of ``names`` it was drawn for"""
     names: tuple[str, ...]
@@ -55,112 +55,84 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
     D, v), drawn by ``Sim.draw_routes``. Raises ConfigError for a world that is none, or has another tank
     than the run's."""
     parts, names = [], []
+    n_static, n_dynamic = (max(scene[i] for scene in scenes) for i in range(2))
     for world in config.surrogate.worlds:
-        most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
-        drawn_config = load_config(world, overrides=[*most])
-        _refuse_other_tank(world, drawn_config.world.tank, config.world.tank)
-        tree = read_tree(TRAINING_TREE, drawn_config.behavior.max_node)
-        sim = Sim(drawn_config, min(BATCH, count), tree)
+        own = load_config(world, overrides=[("world.n_static", n_static), ("world.n_dynamic", n_dynamic)])
+        _refuse_other_tank(world, own.world.tank, config.world.tank)
+        sim = Sim(own, min(BATCH, count), read_tree(TRAINING_TREE, own.behavior.max_node))
         for scene in scenes:
-            rows = drawn(sim, scene, seed, count)
-            parts.append((*rows, torch.full((count,), len(names), dtype=torch.int32)))
+            parts.append(drawn(sim, scene, seed, count))
             names.append(f"{Path(world).stem}_{scene[1]}_{scene[2]:g}")
         sim.close()
-    widest = [max(part[i].shape[1] for part in parts) for i in range(2)]
-    rest = max(part[0].shape[1] - part[1].shape[1] for part in parts)
-    obstacle = torch.cat([_padded(part[0], rest + widest[1], part[1].shape[1], rest) for part in parts])
-    path = torch.cat([torch.nn.functional.pad(p[1], (0, 0, 0, widest[1] - p[1].shape[1])) for p in parts])
-    longest = max(part[2].shape[1] for part in parts)
-    route = torch.cat(
-        [torch.cat([p[2], p[2][:, -1:].expand(-1, longest - p[2].shape[1], -1)], dim=1) for p in parts]
-    )
-    mission, origin = (torch.cat([part[i] for part in parts]) for i in (3, 4))
-    return ScenarioBank(obstacle, path, route, mission, origin, tuple(names))
+    static, moving, path, route, mission = zip(*parts, strict=True)
+    obstacle = np.concatenate([_joined(static), _joined(moving)], axis=1)
+    arrays = obstacle, _joined(path), _joined(route, "edge"), np.concatenate(mission)
+    origin = np.arange(len(names), dtype=np.int32).repeat(count)
+    return ScenarioBank(*map(torch.from_numpy, (*arrays, origin)), names=tuple(names))
 
 
 def _refuse_other_tank(world: str, own: TankConfig, wanted: TankConfig) -> None:
     if own != wanted or own.shape != "rectangle":
         raise ConfigError(
             f"surrogate.worlds: {world} has another tank than the run's world, or a round one; the surrogate "
-            f"has one "
-            "rectangular tank: give worlds that share it, for example surrogate.worlds=[pool,gauntlet]"
+            "has one rectangular tank: give worlds that share it, for example "
+            "surrogate.worlds=[pool,gauntlet]"
         )
 
 
-def _padded(obstacle: torch.Tensor, width: int, lanes: int, rest: int) -> torch.Tensor:
-    """With empty slots behind the static and behind the moving obstacles."""
-    out = torch.zeros(len(obstacle), width, 8)
-    own = obstacle.shape[1] - lanes
-    out[:, :own], out[:, rest : rest + lanes] = obstacle[:, :own], obstacle[:, own:]
-    return out
+def _joined(parts: Sequence[np.ndarray], more: Literal["constant", "edge"] = "constant") -> np.ndarray:
+    """One below the other; what has fewer slots than others gets empty ones, or its last one ("edge")."""
+    widest = max(part.shape[1] for part in parts)
+    return np.concatenate([np.pad(p, ((0, 0), (0, widest - p.shape[1]), (0, 0)), more) for p in parts])
 
 
-def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> list[torch.Tensor]:
-    """Obstacles, paths, routes and missions as in a bank, of one scene's episodes; slots that are empty
-    everywhere are left out."""
+def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[np.ndarray, ...]:
+    """Static and moving obstacles, paths, routes and missions as in a bank, of one scene's episodes; slots
+    that are empty everywhere are left out."""
     sim.set_scenes([scene])
     found = []
     for first in range(0, count, sim.num_envs):
         number = torch.arange(first, first + sim.num_envs, dtype=torch.int32)
         mask = (number < count).int()
         sim.draw_routes(mask, torch.full_like(mask, seed), number)
-        found.append([rows[: int(mask.sum())] for rows in scenario_rows(sim)])
+        found.append([rows[: count - first] for rows in scenario_rows(sim)])
     obstacle, path, route, mission = (np.concatenate(part) for part in zip(*found, strict=True))
     rest = obstacle.shape[1] - path.shape[1]
-    longest = 1 + int(np.argmax(route[..., 2] <= 0.0, axis=1).max())
     used = np.any(obstacle[:, :, 0] > 0, axis=0)
-    moving = used[rest:]
-    kept = obstacle[:, used], path[:, moving], route[:, :longest], mission
-    return [torch.from_numpy(part.copy()) for part in kept]
+    static, moving = obstacle[:, :rest][:, used[:rest]], obstacle[:, rest:][:, used[rest:]]
+    longest = 1 + int(np.argmax(route[..., 2] <= 0.0, axis=1).max())
+    return static, moving, path[:, used[rest:]], route[:, :longest], mission
 
 
 def scenario_rows(sim: Sim) -> list[np.ndarray]:
     """Obstacles, paths, routes and missions of what every row of a simulator holds, float32; a row without a
     route goes straight to its goal."""
-    s = sim.s
-    kind, pos, size, yaw = (sim.rows(f) for f in (s.world.kind, s.world.pos_w, s.world.size, s.world.yaw))
-    way = sim.rows(s.path.way_w)
-    numbers = (s.path.n_way, s.path.radius_m, s.path.length_m, s.path.phase_m, s.path.speed_m_s)
-    path = np.stack([sim.rows(field) for field in numbers], axis=-1)
-    path = np.concatenate([path, way.reshape(*way.shape[:2], -1)], axis=-1)
-    path = np.concatenate([path, sim.rows(s.path.easing_m)[..., None]], axis=-1)
+    world, p, mission = sim.s.world, sim.s.path, sim.s.mission
+    obstacle = _columns(sim, world.kind, world.pos_w, world.size, world.yaw)
+    path = _columns(sim, p.n_way, p.radius_m, p.length_m, p.phase_m, p.speed_m_s, p.way_w, p.easing_m)
     path[..., 2] = np.where(path[..., 2] > 0, path[..., 2], 1.0)
-    m = s.mission
-    mission = np.concatenate(
-        [sim.rows(m.start_w), sim.rows(m.goal_w), sim.rows(m.start_yaw)[:, None]], axis=1
-    )
-    mission = np.concatenate([mission, np.zeros((len(mission), 1))], axis=1)
-    obstacle = np.concatenate([kind[..., None], pos, size, yaw[..., None]], axis=-1)
-    parts = obstacle, path, _routes(sim, mission), mission
-    return [np.ascontiguousarray(a, np.float32) for a in parts]
+    places = _columns(sim, mission.start_w, mission.goal_w, mission.start_yaw)
+    return [obstacle, path, _routes(sim, places.astype(float)), places]
+
+
+def _columns(sim: Sim, *fields: Any) -> np.ndarray:
+    """Fields of numbers and of vectors side by side, float32 (..., columns of all of them)."""
+    found = [sim.rows(field) for field in fields]
+    shape = min((rows.shape for rows in found), key=len)  # of those of numbers
+    return np.concatenate([rows.reshape(*shape, -1) for rows in found], axis=-1, dtype=np.float32)
 
 
 def _routes(sim: Sim, mission: np.ndarray) -> np.ndarray:
     """(n, n_way, 3) as in a bank."""
-    planned, start, goal = sim.s.route, mission[:, :2], mission[:, 3:5]
-    count, straight_m = sim.rows(planned.n_way), np.hypot(*(goal - start).T)
-    route = np.concatenate([sim.rows(planned.way_w), sim.rows(planned.way_left_m)[..., None]], axis=-1)
-    straight = np.concatenate([start, straight_m[:, None]], axis=1)
-    route[:, 0] = np.where(count[:, None] > 0, route[:, 0], straight)
-    after = np.arange(route.shape[1]) >= np.maximum(count, 1)[:, None]
-    end = np.concatenate([goal, np.zeros((len(goal), 1))], axis=1)
-    return np.where(after[..., None], end[:, None], route)
+    start, goal = mission[:, :2], mission[:, 3:5]
+    count, straight_m = sim.rows(sim.s.route.n_way)[:, None], np.hypot(*(goal - start).T)
+    route = _columns(sim, sim.s.route.way_w, sim.s.route.way_left_m)
+    route[:, 0] = np.where(count > 0, route[:, 0], np.column_stack([start, straight_m]))
+    after = np.arange(route.shape[1]) >= np.maximum(count, 1)
+    return np.where(after[..., None], np.pad(goal, ((0, 0), (0, 1)))[:, None].astype(np.float32), route)
 
 
 # ------------------------------------------------------------------------------------------------------------
-
-
-class SurrogateView(NamedTuple):
-    """What is known of N envs. The tensors are the surrogate's own: clone what must outlive the next step."""
-
-    obstacles: torch.Tensor
-    """(N, lanes, OBSTACLE_WIDTH) obstacles as tracked; the first column is 1 where there is one, else all are
-    0"""
-    own: torch.Tensor
-    """(N, EGO_COLUMNS) the vehicle, its goal and the free distances around it"""
-    truth: torch.Tensor
-    """(N, lanes, TRUTH_WIDTH) true places of the obstacles, now and 1, 2, 3 s later: for a critic in
-    training"""
 
 
 class Surrogate:
@@ -169,47 +141,50 @@ class Surrogate:
     def __init__(self, config: LearningConfig, bank: ScenarioBank, num_envs: int, seed: int) -> None:
         """``seed`` opens the noise of the tracks."""
         start_taichi("cpu")
-        self.bank, self.num_envs, self.seed, self.count = bank, num_envs, seed, 0
-        self.rules = bind(SurrogateRules, config)
-        lanes = bank.path.shape[1]
-        self.ego = torch.zeros(num_envs, EGO_WIDTH)
-        self.scenario = torch.zeros(num_envs, dtype=torch.int32)
-        self.track = torch.zeros(num_envs, lanes, TRACK_WIDTH)
-        self.reward, self.outcome = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.int32)
-        self._raw = torch.zeros(num_envs, lanes, RAW_WIDTH)
-        self._ray = torch.zeros(num_envs, N_RAY)
-        self.view = SurrogateView(
-            torch.zeros(num_envs, lanes, OBSTACLE_WIDTH),
-            torch.zeros(num_envs, EGO_COLUMNS),
-            torch.zeros(num_envs, lanes, TRUTH_WIDTH),
-        )
-
-    @property
-    def num_scenarios(self) -> int:
-        """How many there are to begin."""
-        return len(self.bank.obstacle)
+        self.bank, self.num_envs, self.seed = bank, num_envs, seed
+        self.rules, lanes = bind(Rules, config), bank.path.shape[1]
+        self.ego, self.track = torch.zeros(num_envs, EGO_WIDTH), torch.zeros(num_envs, lanes, TRACK_WIDTH)
+        self.scenario, self.outcome = (torch.zeros(num_envs, dtype=torch.int32) for _ in range(2))
+        self.reward, self.count = torch.zeros(num_envs), torch.zeros(1, dtype=torch.int64)
+        self._raw, self._ray = torch.zeros(num_envs, lanes, RAW_WIDTH), torch.zeros(num_envs, N_RAY)
+        self.view = {
+            "obstacles": torch.zeros(num_envs, lanes, OBSTACLE_WIDTH),
+            "own": torch.zeros(num_envs, EGO_COLUMNS),
+            "truth": torch.zeros(num_envs, lanes, TRUTH_WIDTH),
+        }
+        """what is known of the envs: obstacles as tracked (the first column is 1 where there is one, else all
+        are 0); the vehicle, its goal and the free distances around it; true places of the obstacles, now and
+        1, 2, 3 s later, for a critic in training. Clone what must outlive the next step."""
+        self._carried = {"ego": self.ego, "scenario": self.scenario, "track": self.track, "count": self.count}
+        self._carried |= {f"view.{name}": part for name, part in self.view.items()}
 
     @property
     def time_s(self) -> torch.Tensor:
         """(N,) since the begin of each episode."""
-        return self.ego[:, 8]
+        return self.ego[:, At.TIME]
 
     def begin(self, rows: torch.Tensor, scenario: torch.Tensor) -> None:
-        """Begin the scenarios of these numbers (N,) in the envs (N,) where ``rows`` is true; ``look`` comes
-        next."""
-        self.scenario = torch.where(rows, scenario.int(), self.scenario)
-        b = self.bank
-        motion.begin_surrogate(rows.int(), b.mission, b.route, self.scenario, self.ego, self.track)
+        """Begin the scenarios of these numbers (N,) in the envs (N,) where ``rows`` is true, at rest, nothing
+        seen; ``look`` comes next."""
+        envs = rows.nonzero().flatten()
+        number = scenario[envs].long()
+        start, goal, yaw = self.bank.mission[number].split((3, 3, 1), dim=1)
+        ego = torch.zeros(len(envs), EGO_WIDTH)
+        ego[:, At.POS : At.POS + 3], ego[:, At.GOAL : At.GOAL + 3] = start, goal
+        ego[:, At.YAW], ego[:, At.LEFT] = yaw[:, 0], self.bank.route[number, 0, 2]
+        ego[:, At.FLIP : At.FLIP + 2] = torch.where(goal >= start, 1.0, -1.0)[:, :2]
+        self.scenario[envs], self.ego[envs], self.track[envs] = number.int(), ego, 0.0
+        self.track[envs, :, 5] = 9.0
 
-    def look(self) -> SurrogateView:
-        """Sense once more, after ``step`` and ``begin``."""
-        b = self.bank
+    def look(self) -> dict[str, torch.Tensor]:
+        """Sense once more, after ``step`` and ``begin``; the view."""
+        b, view = self.bank, self.view
         sensing.sense_surrogate(
-            self.rules, self.seed, self.count, b.obstacle, b.path, b.route, self.scenario, self.ego,
-            self.track, self._raw, self._ray, self.view.truth, self.view.obstacles, self.view.own,
+            self.rules, self.seed, int(self.count), b.obstacle, b.path, b.route, self.scenario, self.ego,
+            self.track, self._raw, self._ray, view["truth"], view["obstacles"], view["own"],
         )  # fmt: skip
-        self.count = (self.count + 1) % 2**30
-        return self.view
+        self.count[0] = (self.count[0] + 1) % 2**30
+        return view
 
     def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Carry out a decision (N, 3): (reward, outcome code), both (N,)."""
@@ -222,14 +197,9 @@ class Surrogate:
 
     def capture(self) -> dict[str, np.ndarray]:
         """All that the next steps depend on."""
-        found = {name: getattr(self, name).numpy().copy() for name in ("ego", "scenario", "track")}
-        found |= {f"view.{name}": part.numpy().copy() for name, part in self.view._asdict().items()}
-        return found | {"count": np.array([self.count])}
+        return {name: part.numpy().copy() for name, part in self._carried.items()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on from what ``capture`` gave."""
-        for name in ("ego", "scenario", "track"):
-            getattr(self, name).copy_(torch.from_numpy(arrays[name]))
-        for name, part in self.view._asdict().items():
-            part.copy_(torch.from_numpy(arrays[f"view.{name}"]))
-        self.count = int(arrays["count"][0])
+        for name, part in self._carried.items():
+            part.copy_(torch.from_numpy(arrays[name]))

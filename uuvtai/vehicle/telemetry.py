@@ -506,9 +506,7 @@ class Intake:
 
     def _obstacles(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         if fields["frame"] != 12:
-            return self.refuse(
-                "OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_BODY_FRD)"
-            )
+            return self.refuse("OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_BODY_FRD)")
         increment = float(fields.get("increment_f", 0.0)) or float(fields["increment"])
         distances = np.array(list(fields["distances"])[:SECTORS], dtype=int)
         return self._scan(time_s, distances, increment, float(fields.get("angle_offset", 0.0)), fields)

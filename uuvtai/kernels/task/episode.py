@@ -5,6 +5,7 @@ import taichi as ti
 
 from uuvtai.common.enums import COLLISION, OUT_OF_TANK, OUTCOMES, RUNNING, SUCCESS, TIMEOUT, TTC
 from uuvtai.compile.launch import quick_launch
+from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import (
     FAR_M,
     NONE,
@@ -15,7 +16,7 @@ from uuvtai.kernels.core.geometry import (
     rotation_wb,
 )
 from uuvtai.kernels.core.noise import episode_key
-from uuvtai.kernels.core.stage import Bundle, IntVector, n_envs
+from uuvtai.kernels.core.stage import Bundle, Const, IntVector, n_envs
 from uuvtai.kernels.task.io import EpisodeIO
 
 __all__ = ["COLLISION", "OUTCOMES", "OUT_OF_TANK", "RUNNING", "SUCCESS", "TIMEOUT", "TTC"]
@@ -63,6 +64,45 @@ def deactivate_ended(io: Bundle[EpisodeIO]):
 
 
 @ti.func
+def threat_of(
+    pos_w, axis_w, vel_w, rate_w, kind, obstacle_pos_w, size, yaw, obstacle_vel_w,
+    episode_cfg: Const[EpisodeConfig], vehicle_cfg: Const[VehicleConfig],
+):  # fmt: skip
+    """(clearance [m], time to collision [s]) of the hull to one obstacle; FAR_M where they do not close."""
+    gap, normal, along = hull_to_obstacle(pos_w, axis_w, kind, obstacle_pos_w, size, yaw, vehicle_cfg)
+    closing = (vel_w + along * rate_w.cross(axis_w) - obstacle_vel_w).dot(normal)
+    ttc = FAR_M + 0.0
+    if closing > episode_cfg.ttc_closing_m_s:
+        ttc = ti.max(gap, 0.0) / closing
+    return ti.Vector([gap, ttc])
+
+
+@ti.func
+def verdict(
+    pos_w, axis_w, goal_w, threat, is_late,
+    episode_cfg: Const[EpisodeConfig], vehicle_cfg: Const[VehicleConfig], tank_cfg: Const[TankConfig],
+):  # fmt: skip
+    """How an episode stands, ``threat`` (clearance [m], time to collision [s]) being the nearest; the first
+    rule that holds decides."""
+    to_goal = goal_w - pos_w
+    out = RUNNING
+    if is_in_tank(pos_w, tank_cfg) == 0:
+        out = OUT_OF_TANK
+    elif (
+        threat[0] < episode_cfg.collision_clearance_m
+        or hull_to_floor_or_surface(pos_w, axis_w, vehicle_cfg, tank_cfg) < 0.0
+    ):
+        out = COLLISION
+    elif threat[1] < episode_cfg.ttc_s:
+        out = TTC
+    elif to_goal.dot(to_goal) <= episode_cfg.goal_radius_m**2:
+        out = SUCCESS
+    elif is_late:
+        out = TIMEOUT
+    return out
+
+
+@ti.func
 def nearest_threat(env, io: Bundle[EpisodeIO]):
     """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s] with an
     obstacle)."""
@@ -76,45 +116,26 @@ def nearest_threat(env, io: Bundle[EpisodeIO]):
     for obstacle in range(io.world.kind.shape[1]):
         kind = io.world.kind[env, obstacle]
         if kind != NONE:
-            gap, normal, along = hull_to_obstacle(
-                pos_w,
-                axis_w,
-                kind,
-                io.world.pos_w[env, obstacle],
-                io.world.size[env, obstacle],
-                io.world.yaw[env, obstacle],
-                io.vehicle_cfg,
-            )
-            hull_vel = vel_w + along * rate_w.cross(axis_w)
-            closing = (hull_vel - io.world.vel_w[env, obstacle]).dot(normal)
-            clearance = ti.min(clearance, gap)
-            if closing > io.episode_cfg.ttc_closing_m_s:
-                ttc = ti.min(ttc, ti.max(gap, 0.0) / closing)
+            threat = threat_of(
+                pos_w, axis_w, vel_w, rate_w, kind, io.world.pos_w[env, obstacle],
+                io.world.size[env, obstacle], io.world.yaw[env, obstacle], io.world.vel_w[env, obstacle],
+                io.episode_cfg, io.vehicle_cfg,
+            )  # fmt: skip
+            clearance, ttc = ti.min(clearance, threat[0]), ti.min(ttc, threat[1])
     return ti.Vector([clearance, ttc])
 
 
 @ti.func
 def outcome_of(env, io: Bundle[EpisodeIO]):
-    """How the episode stands; the first rule that holds decides."""
-    pos_w = io.vehicle.pos_w[env]
+    """How the episode of an env stands."""
     R_wb = rotation_wb(io.vehicle.quat_wb[env])
     axis_w = ti.Vector([R_wb[0, 0], R_wb[1, 0], R_wb[2, 0]])
-    to_goal = io.mission.goal_w[env] - pos_w
-    out = RUNNING
-    if is_in_tank(pos_w, io.tank_cfg) == 0:
-        out = OUT_OF_TANK
-    elif (
-        io.termination.clearance_m[env] < io.episode_cfg.collision_clearance_m
-        or hull_to_floor_or_surface(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg) < 0.0
-    ):
-        out = COLLISION
-    elif io.termination.ttc_s[env] < io.episode_cfg.ttc_s:
-        out = TTC
-    elif to_goal.dot(to_goal) <= io.episode_cfg.goal_radius_m**2:
-        out = SUCCESS
-    elif io.clock.step[env] >= io.episode_cfg.horizon_steps:
-        out = TIMEOUT
-    return out
+    threat = ti.Vector([io.termination.clearance_m[env], io.termination.ttc_s[env]])
+    is_late = io.clock.step[env] >= io.episode_cfg.horizon_steps
+    return verdict(
+        io.vehicle.pos_w[env], axis_w, io.mission.goal_w[env], threat, is_late,
+        io.episode_cfg, io.vehicle_cfg, io.tank_cfg,
+    )  # fmt: skip
 
 
 @quick_launch
