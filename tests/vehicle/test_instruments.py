@@ -11,13 +11,18 @@ from brping import PingMessage, definitions
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.mavlink_vehicle import Flight, link_config, plan_of
 from uuvtai.config.loader import load_config
+from uuvtai.logs.reader import read_messages
+from uuvtai.vehicle.control_loop import OnboardLoop
 from uuvtai.vehicle.instruments import ping, rip2
 from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Channel, InstrumentPlace, TcpChannel, UdpChannel, place_of
 from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360
 from uuvtai.vehicle.instruments.json_udp import JsonUdp
+from uuvtai.vehicle.instruments.rig import Rig
 from uuvtai.vehicle.mavlink import LinkError
+from uuvtai.vehicle.messages import MOST_WAITING, DvlReading, Inbox, SonarPing
 
 
 class Played(Channel):
@@ -415,3 +420,81 @@ def test_json_of_each_kind_is_a_message():
 def test_json_that_is_no_message_is_counted(said):
     device = JsonUdp(Played(json.dumps(said).encode()))
     assert device.poll(1.0) == [] and sum(device.refused.values()) == 1
+
+
+# -------------------------------------------------------------------------------------------- in the pilot
+
+
+def test_beams_that_come_in_a_burst_are_taken_in_turn():
+    inbox = Inbox(
+        {"sonar.range_m": (-1,), "sonar.hit": (-1,), "sonar.doppler_m_s": (0,), "sonar.first_beam": ()}
+    )
+    for number, time_s in enumerate((0.10, 0.14, 0.12, 0.12)):
+        inbox.feed(SonarPing(time_s, np.ones(1), np.ones(1), np.zeros(0), number))
+    taken = [inbox.newest("sonar", 0.2, in_turn=True) for _ in range(4)]
+    assert [one.time_s if one else None for one in taken] == [0.10, 0.12, 0.14, None]
+    tally = inbox.tallies["sonar"]
+    assert (tally.fed, tally.used, tally.late) == (4, 3, 1)
+
+
+def test_a_flood_does_not_grow():
+    inbox = Inbox({})
+    for number in range(2 * MOST_WAITING):
+        inbox.feed(DvlReading(1.0 + 1e-3 * number, np.zeros(3)))
+    assert len(inbox._waiting["dvl"]) == MOST_WAITING and inbox.tallies["dvl"].late == MOST_WAITING
+    newest = inbox.newest("dvl", 10.0)
+    assert newest is not None and newest.time_s == pytest.approx(1.0 + 1e-3 * (2 * MOST_WAITING - 1))
+
+
+@pytest.fixture
+def rig_config():
+    return load_config("pool", "ping360", overrides=[("sensors.dvl.position_b_m", [0.0, 0.0, -0.2])])
+
+
+def test_a_rig_gives_velocities_about_the_centre_and_only_what_was_asked_for(rig_config):
+    with Rig(rig_config, {"dvl": "json:127.0.0.1:45991"}) as rig:
+        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", 45991), calls=True, longest=2048)
+        said = {"kind": "dvl", "vel_b": [0.5, 0.0, 0.0]}, {"kind": "pressure", "depth_m": 0.5}
+        for one in said:
+            other.write(json.dumps(one).encode())
+        found = []
+        for _ in range(200):
+            found += list(rig.poll(1.0, np.array([0.0, 0.5, 0.0])))
+            if found and rig.document()["json:127.0.0.1:45991"]["heard"] == 2:
+                break
+        ((_, reading),) = found
+        assert np.allclose(reading.vel_b, [0.6, 0.0, 0.0])  # less rate x lever
+        assert rig.document()["json:127.0.0.1:45991"]["refused"] == {"pressure: not asked for": 1}
+        other.close()
+    assert rig.replaced == {"dvl"}
+
+
+def test_what_an_instrument_tells_mavlink_tells_no_more(tmp_path):
+    with Rig(link_config(), {"dvl": "json::45992"}) as rig:
+        flight = Flight(tmp_path)
+        flight.loop = OnboardLoop(
+            link_config(), flight.pilot, plan_of(flight.endpoint.place, flight.log.path), flight.endpoint,
+            flight.log, rig=rig,
+        )  # fmt: skip
+        flight.run(2)
+        assert flight.loop.last.action.name == "HOLD" and flight.sub.moved_by() == []
+        refused = flight.loop.document()["refused"]
+        assert any("--dvl names an instrument" in why for why in refused)
+        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", 45992), calls=True, longest=2048)
+        good = json.dumps({"kind": "dvl", "vel_b": [0.3, 0.0, 0.0]}).encode()
+        bad = json.dumps({"kind": "dvl", "vel_b": [0.0, 0.0]}).encode()
+        flight.run(5, before=lambda step: (other.write(good), other.write(bad)))
+        assert flight.loop.last.action.name == "DRIVE" and flight.sub.moved_by()
+        told = flight.loop.document()["instruments"]["json::45992"]
+        assert told["heard"] > 100 and told["refused"]["dvl: a velocity has three numbers"] > 100
+        flight.run(5)  # the instrument is silent: it holds, whatever the autopilot says of its velocity
+        assert flight.loop.last.action.name in ("HOLD", "HAND_BACK")
+        other.close()
+        flight.close()
+    (first, *_) = read_messages(flight.log.path, ("/instruments/read",))
+    assert "dvl" in str(first)
+
+
+def test_a_place_that_somebody_holds_is_refused_in_a_line(rig_config):
+    with Rig(rig_config, {"dvl": "json::45993"}), pytest.raises(LinkError, match="45993"):
+        Rig(rig_config, {"dvl": "json::45993"})

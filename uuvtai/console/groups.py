@@ -298,6 +298,8 @@ class FlightGroup:
     mavlink: opt.Mavlink
     start: opt.PilotStart
     goal: opt.PilotGoal
+    dvl: opt.DvlPlace = None
+    sonar: opt.SonarPlace = None
     arm: opt.Arm = False
     heading: opt.Heading = None
     box: opt.FenceBox = None
@@ -336,6 +338,7 @@ class FlightGroup:
             system=self.system,
             operator=self.operator,
             senders=self.sender or (),
+            instruments={"dvl": self.dvl, "sonar": self.sonar},
         )
 
 

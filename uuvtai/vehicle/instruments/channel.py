@@ -235,6 +235,10 @@ class Instrument(ABC):
     def poll(self, now_s: float) -> list[SensorMessage]:
         """What has come, in body axes about the instrument's own place; ``now_s`` by the pilot's clock."""
 
+    def close(self) -> None:
+        """Give the place back."""
+        self.channel.close()
+
     def refuse(self, why: str) -> None:
         """Count what was not used."""
         if why in self.refused or len(self.refused) < MOST_KINDS:
