@@ -12,17 +12,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.mavlink_vehicle import Flight, link_config, plan_of
+from tests.vehicle.test_sitl import StillWater, packet
 from uuvtai.config.loader import load_config
 from uuvtai.logs.reader import read_messages
 from uuvtai.vehicle.control_loop import OnboardLoop
 from uuvtai.vehicle.instruments import ping, rip2
 from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Channel, InstrumentPlace, TcpChannel, UdpChannel, place_of
-from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360
+from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeRig, emulated
 from uuvtai.vehicle.instruments.json_udp import JsonUdp
 from uuvtai.vehicle.instruments.rig import Rig
 from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import MOST_WAITING, DvlReading, Inbox, SonarPing
+from uuvtai.vehicle.sitl import Instance, SitlPlan
 
 
 class Played(Channel):
@@ -498,3 +500,43 @@ def test_what_an_instrument_tells_mavlink_tells_no_more(tmp_path):
 def test_a_place_that_somebody_holds_is_refused_in_a_line(rig_config):
     with Rig(rig_config, {"dvl": "json::45993"}), pytest.raises(LinkError, match="45993"):
         Rig(rig_config, {"dvl": "json::45993"})
+
+
+def test_what_a_sitl_instrument_says_the_pilot_hears():
+    """Water, an A50 and a Ping360 by their own protocols, and the rig of the pilot; the levers cancel."""
+    mounted = [("sensors.dvl.position_b_m", [0.1, 0.0, -0.2]), ("sensors.dvl.yaw_deg", 90)]
+    config = load_config("pool", "ping360", overrides=mounted)
+    wide = emulated(config, ("a50", "ping360"))
+    water, rates = StillWater(), np.array([0.0, 0.1, 0.3])
+    told = water.value
+
+    def value(name, row):
+        ring = {"scan.range_m": np.full(400, 4.0), "scan.hit": np.ones(400, int), "ego.rate_b": rates}
+        return ring[name] if name in ring else told(name, row)
+
+    water.value = value
+    places = {"dvl": f"a50:127.0.0.1:{16171 + 30}", "sonar": f"ping360:127.0.0.1:{9092 + 30}"}
+    with Rig(config, places) as rig:
+        fake = FakeRig(wide, ("a50", "ping360"), "127.0.0.1", 3)
+        one, found = Instance(wide, water, 0, fake), []
+        kinds = {order.kind for count in range(3) for order in one.answer(packet(count), 0.0)[1]}
+        assert kinds == {"DISTANCE_SENSOR"}
+        for count in range(3, 2400):
+            one.answer(packet(count), 0.0)
+            found += [reading for _, reading in rig.poll(one.time_s, rates)]
+        fake.close()
+    dvl = [one for one in found if isinstance(one, DvlReading)]
+    beams = [one for one in found if isinstance(one, SonarPing)]
+    assert len(dvl) > 20 and all(np.allclose(one.vel_b, [0.3, -0.1, 0.2], atol=1e-6) for one in dvl)
+    assert len({one.first_beam for one in beams}) == config.sensors.sonar.n_ray
+    assert all(one.hit[0] == 1 and abs(one.range_m[0] - 4.0) < 0.05 for one in beams)
+
+
+def test_an_instrument_that_cannot_be_had_is_refused_in_a_line():
+    config = load_config("pool", "ping360")
+    fake = FakeRig(config, ("a50",), "127.0.0.1", 4)
+    with pytest.raises(LinkError, match="--as: cannot listen at port 16211"):
+        FakeRig(config, ("a50", "ping360"), "127.0.0.1", 4)
+    fake.close()
+    with pytest.raises(LinkError, match="a50 or ping360"):
+        SitlPlan.typed("127.0.0.1", 9002, 1, None, 0.0, None, False, 0, 0, "a50,oculus")

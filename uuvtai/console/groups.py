@@ -352,6 +352,7 @@ class ServedGroup:
     port: opt.SitlPort = 9002
     host: opt.SitlHost = "127.0.0.1"
     mavlink: opt.SensorPlaces = None
+    emulated: opt.Emulated = None
     operator: opt.PlayOperator = False
     rate: opt.SitlRate = 0.0
     seconds: opt.SitlSeconds = None
@@ -372,6 +373,7 @@ class ServedGroup:
             self.once,
             self.seed,
             self.episode,
+            self.emulated,
         )
         return replace(told, operator=self.operator)
 

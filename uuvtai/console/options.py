@@ -372,6 +372,14 @@ SensorPlaces = Annotated[
         "ArduSub, udpout:127.0.0.1:14550 for uuv pilot].",
     ),
 ]
+Emulated = Annotated[
+    str | None,
+    Option(
+        "--as",
+        metavar="a50,ping360",
+        help="Be these instruments, by their own protocols, in place of MAVLink's DVL and sonar.",
+    ),
+]
 PlayOperator = Annotated[
     bool, Option("--operator", help="Be the ground station too: heartbeat and ArduSub's origin.")
 ]

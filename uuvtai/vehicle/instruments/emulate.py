@@ -12,7 +12,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from uuvtai.vehicle.instruments import ping
+from uuvtai.config import Config, SonarConfig
+from uuvtai.vehicle.instruments import a50, ping
+from uuvtai.vehicle.mavlink import LinkError
 
 Echo = Callable[[float], float]
 """[m] to what a beam meets at a bearing [rad] from ahead, counter-clockwise; infinite = nothing"""
@@ -150,3 +152,66 @@ class FakePing360:
     def close(self) -> None:
         """Give the port back."""
         self._socket.close()
+
+
+KINDS = ("a50", "ping360")
+"""what ``uuv sitl --as`` can be"""
+RING = {
+    **{"mechanical": False, "horizontal_aperture_deg": 360.0, "n_ray": 400, "doppler": False},
+    **{"range_sigma_m": 0.0, "range_quantum_m": 0.0},
+}
+"""of a simulated sonar behind a Ping360: every step of the head at any moment, errors are the emulator's"""
+_NEXT_PORT = 10  # as from one ArduSub's port to the next one's
+
+
+def emulated(config: Config, kinds: tuple[str, ...]) -> Config:
+    """The config of the water behind these instruments."""
+    if "ping360" not in kinds:
+        return config
+    sonar = config.sensors.sonar.model_copy(update=RING)
+    return config.model_copy(update={"sensors": config.sensors.model_copy(update={"sonar": sonar})})
+
+
+class FakeRig:
+    """The instruments of one vehicle: ``step`` in every control step."""
+
+    def __init__(self, config: Config, kinds: tuple[str, ...], host: str, number: int) -> None:
+        """``number``: of the vehicle; ports count on with it. Raises LinkError."""
+        self._sonar, dvl = config.sensors.sonar, config.sensors.dvl
+        self._lever, self._yaw = np.array(dvl.position_b_m), math.radians(dvl.yaw_deg)
+        self._dvl: FakeA50 | None = None
+        self._head: FakePing360 | None = None
+        port, next_port = 0, _NEXT_PORT * number
+        try:
+            if "a50" in kinds:
+                self._dvl = FakeA50(host, port := a50.PORT + next_port, number)
+            if "ping360" in kinds:
+                zero = round(self._sonar.zero_gradian)
+                self._head = FakePing360(host, port := ping.PORT + next_port, number, zero)
+        except OSError as error:
+            self.close()
+            raise LinkError(
+                f"--as: cannot listen at port {port} ({error.strerror or error}); another uuv sitl may run"
+            ) from None
+
+    def step(self, time_s: float, altitude_m: float, value: Callable[[str], np.ndarray]) -> None:
+        """``value`` gives arrays of the vehicle by 'struct.field'."""
+        if self._dvl is not None:
+            moved = value("ego.dvl_b") + np.cross(value("ego.rate_b"), self._lever)
+            cos, sin = math.cos(self._yaw), math.sin(self._yaw)
+            there = np.array([cos * moved[0] + sin * moved[1], cos * moved[1] - sin * moved[0], moved[2]])
+            self._dvl.tell(time_s, there, altitude_m)
+        if self._head is not None:
+            range_m, hit = value("scan.range_m"), value("scan.hit")
+            self._head.step(time_s, lambda bearing: _met(self._sonar, range_m, hit, bearing))
+
+    def close(self) -> None:
+        """Give the ports back."""
+        for one in (self._dvl, self._head):
+            if one is not None:
+                one.close()
+
+
+def _met(sonar_cfg: SonarConfig, range_m: np.ndarray, hit: np.ndarray, bearing: float) -> float:
+    beam = round(bearing / sonar_cfg.beam_step_rad) % sonar_cfg.n_ray
+    return float(range_m[beam]) if hit[beam] else math.inf
