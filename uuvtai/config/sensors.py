@@ -76,6 +76,12 @@ class SonarConfig(Section):
     """probability per beam that a specular bounce replaces the direct return"""
     grazing_cosine: Fraction = 0.0
     """a return is lost below this cosine of incidence"""
+    zero_gradian: Annotated[float, Field(ge=0, lt=400)] = 200.0
+    """angle of a Ping360 that looks ahead; for ``uuv pilot --sonar``, as what follows"""
+    min_range_m: Positive = 0.3
+    """nearer echoes of a Ping360 are its own ring-down"""
+    sound_m_s: Annotated[float, Field(ge=1350, le=1650)] = SOUND_M_S
+    """speed of sound that its ranges are reckoned with"""
     doppler: bool = True
     """each return carries its Doppler; off: ranges and intensities alone, and nothing reads a speed from a
     beam: what moves is told from one scan to the next"""
@@ -177,6 +183,14 @@ class DvlConfig(Section):
     """probability per reading that the bottom is lost"""
     dropout_s: Interval = (0.0, 0.0)
     """how long it then stays lost"""
+    position_b_m: Vector3 = (0.0, 0.0, 0.0)
+    """of the device from the vehicle's centre, body axes; for ``uuv pilot --dvl``, as what follows"""
+    yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """of its x axis from the vehicle's, counter-clockwise seen from above"""
+    fom_most_m_s: Positive = 0.1
+    """figures of merit beyond are not used"""
+    latency_s: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """of a firmware that does not tell when a velocity was measured"""
 
 
 class ImuConfig(Section):

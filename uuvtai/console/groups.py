@@ -298,6 +298,8 @@ class FlightGroup:
     mavlink: opt.Mavlink
     start: opt.PilotStart
     goal: opt.PilotGoal
+    dvl: opt.DvlPlace = None
+    sonar: opt.SonarPlace = None
     arm: opt.Arm = False
     heading: opt.Heading = None
     box: opt.FenceBox = None
@@ -336,6 +338,7 @@ class FlightGroup:
             system=self.system,
             operator=self.operator,
             senders=self.sender or (),
+            instruments={"dvl": self.dvl, "sonar": self.sonar},
         )
 
 
@@ -349,6 +352,7 @@ class ServedGroup:
     port: opt.SitlPort = 9002
     host: opt.SitlHost = "127.0.0.1"
     mavlink: opt.SensorPlaces = None
+    emulated: opt.Emulated = None
     operator: opt.PlayOperator = False
     rate: opt.SitlRate = 0.0
     seconds: opt.SitlSeconds = None
@@ -369,6 +373,7 @@ class ServedGroup:
             self.once,
             self.seed,
             self.episode,
+            self.emulated,
         )
         return replace(told, operator=self.operator)
 

@@ -291,6 +291,22 @@ Mavlink = Annotated[
         help="MAVLink of the vehicle: udp:HOST:PORT listens there, udpout:HOST:PORT speaks first.",
     ),
 ]
+DvlPlace = Annotated[
+    str | None,
+    Option(
+        "--dvl",
+        metavar="KIND:HOST",
+        help="Hear the DVL itself: a50:HOST, or json:: (UDP port 14700); MAVLink's then counts no more.",
+    ),
+]
+SonarPlace = Annotated[
+    str | None,
+    Option(
+        "--sonar",
+        metavar="KIND:HOST",
+        help="Hear the sonar itself: ping360:HOST, ping360:/dev/ttyUSB0, 3d15:224.0.0.96 or json::.",
+    ),
+]
 PilotStart = Annotated[str, Option("--start", metavar="X,Y,Z", help="Where the vehicle is now \\[m], z up.")]
 PilotGoal = Annotated[str, Option("--goal", metavar="X,Y,Z", help="Where to drive to \\[m].")]
 Heading = Annotated[
@@ -354,6 +370,14 @@ SensorPlaces = Annotated[
         metavar="udp:HOST:PORT",
         help="Where DVL, sonar and altimeter messages go (repeatable) \\[default: udp:127.0.0.1:14660 for "
         "ArduSub, udpout:127.0.0.1:14550 for uuv pilot].",
+    ),
+]
+Emulated = Annotated[
+    str | None,
+    Option(
+        "--as",
+        metavar="a50,ping360",
+        help="Be these instruments, by their own protocols, in place of MAVLink's DVL and sonar.",
     ),
 ]
 PlayOperator = Annotated[

@@ -6,12 +6,14 @@ import dataclasses
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any, TypeVar
+
+import numpy as np
 
 from uuvtai.common.signals import StopEvent
 from uuvtai.config import Config
@@ -19,6 +21,7 @@ from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
 from uuvtai.vehicle import safety
 from uuvtai.vehicle.handover import Handover
+from uuvtai.vehicle.instruments.rig import Rig
 from uuvtai.vehicle.mavlink import (
     ALT_HOLD,
     HARMLESS,
@@ -35,7 +38,7 @@ from uuvtai.vehicle.mavlink import (
     heartbeat,
     place_of,
 )
-from uuvtai.vehicle.messages import NAMES, SensorMessage
+from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
 from uuvtai.vehicle.pilot_log import LinkLog
 from uuvtai.vehicle.start_fix import MISFIT, StartFix, StartFound, WallWatch
@@ -63,6 +66,8 @@ class FlightPlan:
     system: int = 1
     operator: int = 255
     senders: Senders | None = None  # from whom what counts; None = the usual ones of ``system``
+    instruments: Mapping[str, str] = field(default_factory=dict)
+    """what is heard from an instrument itself ('dvl', 'sonar') -> its place"""
 
     @classmethod
     def typed(
@@ -84,6 +89,7 @@ class FlightPlan:
         system: int,
         operator: int,
         senders: Sequence[str] = (),
+        instruments: Mapping[str, str | None] | None = None,
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
         tank, vehicle = config.world.tank, config.vehicle
@@ -124,6 +130,7 @@ class FlightPlan:
             system,
             operator,
             Senders.typed(senders, system),
+            {option: place for option, place in (instruments or {}).items() if place},
         )
 
 
@@ -190,16 +197,21 @@ class OnboardLoop:
         sleep: Callable[[float], None] = time.sleep,
         note: Callable[[str], None] = lambda text: None,
         fix: StartFix | None = None,
+        rig: Rig | None = None,
     ) -> None:
-        """``fix``: checks the start by the walls before the vehicle is taken; None = it is believed."""
+        """``fix``: checks the start by the walls before the vehicle is taken; None = it is believed. ``rig``:
+        instruments that are heard beside MAVLink."""
         self._config, self._pilot, self._plan, self._endpoint, self._log = config, pilot, plan, endpoint, log
         self._now, self._sleep, self._note_to = now, sleep, note
         self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}", plan.operator)
         self._rate = plan.rate or 1.0
         self._codec = MavCodec(plan.system, COMPANION, plan.operator)
         self._intake = Intake(
-            config, plan.mission.start, plan.heading_rad, plan.system, plan.operator, plan.senders
-        )
+            config, plan.mission.start, plan.heading_rad, plan.system, plan.operator, plan.senders,
+            rig.replaced if rig else (),
+        )  # fmt: skip
+        self._rig, self._rate_b = rig, np.zeros(3)
+        """instruments; [rad/s] of the newest gyro"""
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
         self._memory, self.tally = safety.SafetyMemory(), FlightTally()
         self._needed = [name for name in NAMES.values() if name not in ("depth", "thruster")]
@@ -328,6 +340,16 @@ class OnboardLoop:
                     self._tried(self._take, sender, message, come_s)
                 else:
                     self._take(sender, message, come_s)
+        if self._rig is not None and not self._is_leaving:
+            for instrument, reading in self._rig.poll(come_s, self._rate_b):
+                self._log.read(come_s, reading)
+                try:
+                    self._feed(reading)
+                except ValueError as error:  # arrays of another vehicle's shape
+                    instrument.refuse(str(error))
+                else:
+                    if isinstance(reading, DvlReading):
+                        self._intake.note_velocity(reading)
         self._handover.watch(self._intake.heard, now_s)
 
     def _take(self, sender: Address, message: MavMessage, come_s: float) -> None:
@@ -374,14 +396,16 @@ class OnboardLoop:
         return f"{100 * share:.0f} % of the returns miss a wall" if share > MISFIT else ""
 
     def _feed(self, reading: SensorMessage) -> None:
+        self._pilot.feed(dataclasses.replace(reading, time_s=reading.time_s - self._lag_s))
         if self._fix is not None:
             self._fix.feed(reading)
+        if isinstance(reading, ImuReading):
+            self._rate_b = reading.rate_b
         name = NAMES[type(reading)]
         if name == "sonar":
             self._scan_s = max(self._scan_s, reading.time_s)
         else:
             self._measured_s[name] = max(self._measured_s[name], reading.time_s)
-        self._pilot.feed(dataclasses.replace(reading, time_s=reading.time_s - self._lag_s))
 
     def _note_scan(self) -> None:
         """A scan that the stack has used was placed in its map."""
@@ -513,6 +537,7 @@ class OnboardLoop:
             "broken": self._codec.broken,
             "refused": dict(heard.refused),
             "said": {kind: {"said": said, "sent": tally.sent[kind]} for kind, said in tally.said.items()},
+            "instruments": self._rig.document() if self._rig else {},
             "sensors": {name: dataclasses.asdict(row) for name, row in self._pilot.tallies.items()},
         }
 
@@ -523,7 +548,7 @@ def fly(
     """The document of a flight, and the error of this program that ended it. Raises LinkError, LogError."""
     MavCodec(plan.system, COMPANION)  # refused before a minute of compiling
     followed = FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
-    with followed or Endpoint(plan.place) as endpoint:
+    with followed or Endpoint(plan.place) as endpoint, Rig(config, plan.instruments) as rig:
         pilot = warmed(config, tree, plan.mission)
         about = {"dry_run": str(not plan.arms), "limits": str(plan.limits), "mission": str(plan.mission)}
         with StopEvent(is_last=False) as stop:
@@ -533,7 +558,7 @@ def fly(
                 now, sleep = followed.now, partial(followed.sleep, stop=stop)
             endpoint.forget()  # what came while kernels were compiled
             fix = StartFix(config, plan.mission.start)
-            loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix)
+            loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix, rig)
             dry = "dry run: no order that moves the vehicle is sent"
             what = "ARMS AND DRIVES the vehicle" if plan.arms else dry
             where = "speaks to" if plan.place.calls else "listens at"

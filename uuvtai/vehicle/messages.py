@@ -3,7 +3,6 @@ pilot's clock (0 = its first step); it may arrive later, out of order, twice or 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -107,6 +106,7 @@ not finite, makes the message a bad one"""
 
 # ---- Messages on their way to the pilot: in any order, some twice, some never, some of them nonsense.
 
+MOST_WAITING = 256  # messages of a kind; of more the first ones are lost
 ANY = -1  # Length of an axis that may have any
 
 
@@ -143,24 +143,34 @@ class Inbox:
             )
         tally = self.tallies[name]
         tally.fed += 1
-        values = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}
+        values = dict(vars(message))
         time_s = float(values.pop("time_s"))
         arrays = {key: np.asarray(value, np.float64) for key, value in values.items()}
         for key, array in arrays.items():
             self._check_shape(name, key, array.shape)
         if math.isfinite(time_s) and all(_believed(key, array) for key, array in arrays.items()):
             self._waiting[name].append(message)
+            if len(self._waiting[name]) > MOST_WAITING:
+                self._waiting[name].pop(0)
+                tally.late += 1
         else:
             tally.bad += 1
 
-    def newest(self, name: str, now_s: float) -> SensorMessage | None:
+    def newest(self, name: str, now_s: float, in_turn: bool = False) -> SensorMessage | None:
         """The newest message measured until ``now_s`` that is newer than the last one taken, else None; what
-        is older is forgotten, what lies ahead waits."""
+        is older is forgotten, what lies ahead waits. ``in_turn``: the first that is newer than the last one
+        taken, for each tells of something else; the others wait."""
         ready = [message for message in self._waiting[name] if message.time_s <= now_s]
         if not ready:
             return None
-        self._waiting[name] = [message for message in self._waiting[name] if message.time_s > now_s]
-        best = max(ready, key=lambda message: message.time_s)
+        newer = [message for message in ready if message.time_s > self._newest[name]]
+        if in_turn and newer:
+            best = min(newer, key=lambda message: message.time_s)
+            self._waiting[name] = [message for message in self._waiting[name] if message.time_s > best.time_s]
+            ready = [message for message in ready if message.time_s <= best.time_s]
+        else:
+            best = max(ready, key=lambda message: message.time_s)
+            self._waiting[name] = [message for message in self._waiting[name] if message.time_s > now_s]
         tally = self.tallies[name]
         if best.time_s <= self._newest[name]:
             tally.late += len(ready)

@@ -7,10 +7,13 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.schemas import BOOLEAN, FOUR, INT, NUMBER, STRING, THREE, array_of, record
 from uuvtai.vehicle.mavlink import MavMessage, Order
+from uuvtai.vehicle.messages import NAMES, DepthShot, SensorMessage
 from uuvtai.vehicle.onboard import PilotCommand
 from uuvtai.vehicle.safety import SafeDecision
 from uuvtai.vehicle.telemetry import Heard
@@ -20,6 +23,10 @@ _SCHEMAS = {
     "/mavlink/seen": record(
         "uuv.MavlinkSeen", "A message of MAVLink that came.",
         name=STRING, system=INT, component=INT, fields=_FIELDS,
+    ),
+    "/instruments/read": record(
+        "uuv.InstrumentReading", "What an instrument itself told; time_s is when it was measured.",
+        kind=STRING, fields=_FIELDS,
     ),
     "/mavlink/said": record(
         "uuv.MavlinkSaid", "A message of MAVLink that was sent, or (sent = false) would have been.",
@@ -69,6 +76,13 @@ class LinkLog:
         self._left -= 1
         whose = {"name": heard.name, "system": heard.system, "component": heard.component}
         self._write("/mavlink/seen", time_s, {**whose, "fields": plain_fields(heard.fields)})
+
+    def read(self, time_s: float, reading: SensorMessage) -> None:
+        """An instrument told something; images are left out."""
+        if not isinstance(reading, DepthShot):
+            fields = {name: np.asarray(value).tolist() for name, value in vars(reading).items()}
+            told = {"kind": NAMES[type(reading)], "fields": plain_fields(fields)}
+            self._write("/instruments/read", time_s, told)
 
     def said(self, time_s: float, order: Order, was_sent: bool) -> None:
         """An order was given, or would have been."""

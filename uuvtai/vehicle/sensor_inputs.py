@@ -205,6 +205,7 @@ class FedSensors:
     def __init__(self, numbers: PilotNumbers, views: dict[str, np.ndarray], inbox: Inbox) -> None:
         self._inbox, self._dt = inbox, numbers.dt_s
         self._dvl_period = numbers.dvl_steps
+        self._mechanical = numbers.mechanical
         self._sonar_m, self._camera_m = numbers.sonar_m, numbers.camera_m
         self._clock, self._ego, self._scan, self._image = (
             {name.partition(".")[2]: array for name, array in views.items() if name.startswith(f"{struct}.")}
@@ -314,7 +315,7 @@ class FedSensors:
                 ping_vel_b=ego["vel_b"][0],
                 ping_vel_valid=ego["vel_valid"][0],
             )
-        ping = self._inbox.newest("sonar", self.now_s)
+        ping = self._inbox.newest("sonar", self.now_s, in_turn=self._mechanical)
         scan["fresh"][0] = 0
         if isinstance(ping, SonarPing) and (then := self._pose_at("sonar", self._pings, ping.time_s)):
             hit, n = np.asarray(ping.hit) > 0, len(ping.range_m)

@@ -25,6 +25,7 @@ from uuvtai.kernels.world import scenario
 from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
+from uuvtai.vehicle.instruments.emulate import KINDS, FakeRig, emulated
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
 from uuvtai.vehicle.telemetry import Motors
@@ -102,8 +103,9 @@ class Instance:
     """Until a thruster turns for the first time the vehicle is held at its start and the obstacles stand
     still: an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
 
-    def __init__(self, config: Config, water: Water, row: int) -> None:
-        self._config, self._water, self._row = config, water, row
+    def __init__(self, config: Config, water: Water, row: int, rig: FakeRig | None = None) -> None:
+        """``rig``: its DVL and sonar, where they speak their own protocols."""
+        self._config, self._water, self._row, self._rig = config, water, row, rig
         self._dt = config.episode.control_dt_s
         self._count: int | None = None
         self._answered_s, self._answer = 0.0, b""
@@ -119,7 +121,7 @@ class Instance:
     def _forget(self) -> None:
         self.time_s = self.driven_s = 0.0
         self.is_held, self._ticks, self.outcome = True, 0, ""
-        self._sensors = ReportedSensors(self._config)
+        self._sensors = ReportedSensors(self._config, self._rig is not None)
 
     def answer(self, packet: bytes, now_s: float) -> tuple[bytes, list[Order]]:
         """(what to send back, empty = nothing; what the sensors say) to a packet that came at ``now_s``."""
@@ -157,10 +159,13 @@ class Instance:
                     self.outcome, self._ended_s = ended, self.time_s
             self._water.sense(self._row)
             altitude = self._water.motion(self._row, self.time_s).altitude_m
-            said += self._sensors.report(
-                self.time_s, altitude, lambda name: self._water.value(name, self._row)
-            )
+            said += self._sensors.report(self.time_s, altitude, self._value)
+            if self._rig is not None:
+                self._rig.step(self.time_s, altitude, self._value)
         return said
+
+    def _value(self, name: str) -> np.ndarray:
+        return self._water.value(name, self._row)
 
     @property
     def lingered_s(self) -> float:
@@ -380,6 +385,7 @@ class SitlPlan:
     seed: int = 0
     episode: int = 0
     operator: bool = False  # be the ground station too
+    emulated: tuple[str, ...] = ()  # instruments in place of MAVLink's DVL and sonar
 
     @classmethod
     def typed(
@@ -393,8 +399,12 @@ class SitlPlan:
         once: bool,
         seed: int,
         episode: int,
+        emulated: str | None = None,
     ) -> SitlPlan:
         """Of what was typed. Raises LinkError."""
+        kinds = tuple(emulated.split(",")) if emulated else ()
+        if not set(kinds) <= set(KINDS):
+            raise LinkError(f"--as {emulated}: give {' or '.join(KINDS)}, or both: --as {','.join(KINDS)}")
         places = tuple(place_of(text) for text in mavlink or PLACES)
         last = NEXT_PORT * (instances - 1)
         if not 1 <= instances <= _MOST_INSTANCES:
@@ -406,7 +416,7 @@ class SitlPlan:
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
         until_s = math.inf if seconds is None else seconds
-        return cls(host, port, instances, places, rate, until_s, once, seed, episode)
+        return cls(host, port, instances, places, rate, until_s, once, seed, episode, emulated=kinds)
 
 
 @dataclass
@@ -498,12 +508,17 @@ def serve_water(
     config: Config, tree: FlatTree, plan: SitlPlan, note: Callable[[str], None]
 ) -> dict[str, Any]:
     """Serve until Ctrl-C, ``seconds`` or ``once``; gives the ``--json``. Raises LinkError, SettingError."""
+    config = emulated(config, plan.emulated)
     water = WaterRows(Sim(config, plan.instances, tree), folded_seed(plan.seed), plan.episode)
     ports: list[SitlPort] = []
+    rigs: list[FakeRig] = []
     begun = time.monotonic()
     try:
         for number in range(plan.instances):
-            ports.append(SitlPort(plan, Instance(config, water, number), number))
+            if plan.emulated:
+                rigs.append(FakeRig(config, plan.emulated, plan.host, number))
+            instance = Instance(config, water, number, rigs[number] if rigs else None)
+            ports.append(SitlPort(plan, instance, number))
         water.warm()
         begun = time.monotonic()
         signals.engage()  # there is a document to print
@@ -519,8 +534,8 @@ def serve_water(
     except KeyboardInterrupt:
         note("interrupted")
     finally:
-        for port in ports:
-            port.close()
+        for one in (*ports, *rigs):
+            one.close()
     spent = time.monotonic() - begun
     instances = [port.instance.document() for port in ports]
     return {"schema": 1, "seconds": round(spent, 3), "instances": instances}

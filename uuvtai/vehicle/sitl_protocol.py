@@ -74,8 +74,9 @@ Value = Callable[[str], np.ndarray]
 class ReportedSensors:
     """One vehicle's. ``report`` is called in every control step."""
 
-    def __init__(self, config: Config) -> None:
-        sensors = config.sensors
+    def __init__(self, config: Config, is_rig: bool = False) -> None:
+        """``is_rig``: DVL and sonar speak their own protocols."""
+        sensors, self._is_rig = config.sensors, is_rig
         dt = config.episode.control_dt_s
         self._sonar = sensors.sonar
         self._dvl_steps = max(LEAST_STEPS, sensors.dvl.period_steps)
@@ -86,9 +87,9 @@ class ReportedSensors:
     def report(self, time_s: float, altitude_m: float, value: Value) -> list[Order]:
         """Messages of this step; ``value`` gives arrays of the vehicle by 'struct.field'."""
         found = []
-        if self._steps % self._dvl_steps == 0 and int(value("ego.dvl_fresh")):
+        if not self._is_rig and self._steps % self._dvl_steps == 0 and int(value("ego.dvl_fresh")):
             found.append(self._velocity(time_s, value("ego.dvl_b"), value("ego.rate_b")))
-        if self._steps % self._scan_steps == 0:
+        if not self._is_rig and self._steps % self._scan_steps == 0:
             found.append(self._scan(time_s, value("scan.range_m"), value("scan.hit")))
         if self._steps % LEAST_STEPS == 0:
             found.append(_altitude(time_s, altitude_m))

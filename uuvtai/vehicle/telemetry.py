@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -307,11 +307,12 @@ class Intake:
         system: int = 1,
         operator: int = 255,
         senders: Senders | None = None,
+        replaced: Collection[str] = (),
     ) -> None:
         """``start``: where the vehicle is now; ``heading_rad``: compass heading of the world's x axis, None =
         where the vehicle looks at first. ``system``, ``operator``: their MAVLink ids; ``senders``: None = the
-        usual ones."""
-        self.heard = Heard()
+        usual ones. ``replaced``: kinds that an instrument tells itself, so that MAVLink's do not count."""
+        self.heard, self._replaced = Heard(), replaced
         self._config, self._start, self._heading = config, start, heading_rad
         self._system, self._operator = system, operator
         self._senders = senders or Senders(system)
@@ -357,6 +358,8 @@ class Intake:
         if not self._senders.counts(name, system, component):
             who, kind = f"{system}/{component}", KIND_OF.get(name)
             return self.refuse(f"{name} of {who}" + (f" (heard by --sender {kind}={who})" if kind else ""))
+        if KIND_OF.get(name) in self._replaced:
+            return self.refuse(f"{name}: --{KIND_OF[name]} names an instrument that tells it itself")
         if not all(math.isfinite(value) for value in fields.values() if isinstance(value, float)):
             return self.refuse(f"{name}: a number that is not finite")
         key = system, component, name
@@ -457,9 +460,15 @@ class Intake:
         return self._velocity(time_s, (ahead, -right, -down))
 
     def _velocity(self, time_s: float, vel_b: tuple[float, float, float]) -> list[SensorMessage]:
-        if time_s >= self.heard.vel_b_s:
-            self.heard.vel_b, self.heard.vel_b_s = vel_b, time_s
-        return [DvlReading(time_s, np.array(vel_b))]
+        reading = DvlReading(time_s, np.array(vel_b))
+        self.note_velocity(reading)
+        return [reading]
+
+    def note_velocity(self, reading: DvlReading) -> None:
+        """What a DVL says is the vehicle's state too."""
+        if reading.time_s >= self.heard.vel_b_s:
+            ahead, left, up = (float(value) for value in reading.vel_b)
+            self.heard.vel_b, self.heard.vel_b_s = (ahead, left, up), reading.time_s
 
     def _local_position(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         if self._heading is None or not math.isfinite(self.heard.rpy[2]):
@@ -476,7 +485,8 @@ class Intake:
             if abs(time_s - self._depth[0]) < _FRESH_S:  # the autopilot's own height lags behind a climb
                 where[2] = -self._depth[1]
             found.append(PositionFix(time_s, where))
-        if time_s - self._newest.get("VISION_POSITION_DELTA", -math.inf) > _FRESH_S:
+        has_dvl = time_s - self._newest.get("VISION_POSITION_DELTA", -math.inf) <= _FRESH_S
+        if not has_dvl and "dvl" not in self._replaced:
             east, north, up = _turned(fields["vx"], fields["vy"], fields["vz"], turn)
             cos, sin = math.cos(yaw), math.sin(yaw)
             found += self._velocity(time_s, (cos * east + sin * north, cos * north - sin * east, up))

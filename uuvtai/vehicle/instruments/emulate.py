@@ -1,0 +1,217 @@
+"""Devices that are not there, from their specifications: what the simulator's vehicle senses, told as an A50
+or a Ping360 tells it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import socket
+import struct
+from collections.abc import Callable
+
+import numpy as np
+
+from uuvtai.config import Config, SonarConfig
+from uuvtai.vehicle.instruments import a50, ping
+from uuvtai.vehicle.mavlink import LinkError
+
+Echo = Callable[[float], float]
+"""[m] to what a beam meets at a bearing [rad] from ahead, counter-clockwise; infinite = nothing"""
+
+
+class FakeA50:
+    """A TCP server of lines. Readings are lost in bursts, as in recordings."""
+
+    PERIOD_S = 0.116
+
+    def __init__(
+        self, host: str, port: int, seed: int = 0, lost: float = 0.086, burst_s: float = 0.15
+    ) -> None:
+        """``lost``: share of readings in bursts of a median ``burst_s``. OSError where the port is taken."""
+        self._server = socket.create_server((host, port))
+        self._server.setblocking(False)
+        self.port: int = self._server.getsockname()[1]
+        self._clients: list[socket.socket] = []
+        self._rng, self._lost, self._burst_s = np.random.default_rng(seed), lost, burst_s
+        self._due_s = self._lost_until_s = -math.inf
+
+    def tell(self, now_s: float, vel_b: np.ndarray, altitude_m: float) -> None:
+        """In every step: the velocity (3,) [m/s] in our body axes, told when it is due."""
+        with contextlib.suppress(BlockingIOError):
+            client, _ = self._server.accept()
+            client.setblocking(False)
+            self._clients.append(client)
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + self.PERIOD_S
+        mean_s = 1.44 * self._burst_s
+        if now_s >= self._lost_until_s and self._rng.random() < self._lost * self.PERIOD_S / mean_s:
+            self._lost_until_s = now_s + self._rng.exponential(mean_s)
+        is_valid = now_s >= self._lost_until_s
+        self._send(self._line(now_s, vel_b if is_valid else np.zeros(3), altitude_m, is_valid))
+
+    def _line(self, now_s: float, vel_b: np.ndarray, altitude_m: float, is_valid: bool) -> bytes:
+        vx, vy, vz = (float(value) for value in vel_b * np.array([1.0, -1.0, -1.0]))
+        beam = {"velocity": 0.0, "distance": altitude_m, "rssi": -35.0, "nsd": -95.0, "beam_valid": is_valid}
+        sent_us = round(1e6 * now_s)
+        said = {
+            "time": 1e3 * self.PERIOD_S, "vx": vx, "vy": vy, "vz": vz, "fom": 0.001 if is_valid else 0.4,
+            "covariance": (1e-6 * np.eye(3)).tolist(), "altitude": altitude_m if is_valid else -1.0,
+            "transducers": [{"id": number, **beam} for number in range(4)], "velocity_valid": is_valid,
+            "status": 0, "format": "json_v3.1", "type": "velocity",
+            "time_of_validity": sent_us - 60_000, "time_of_transmission": sent_us,
+        }  # fmt: skip
+        return json.dumps(said).encode() + b"\r\n"
+
+    def _send(self, line: bytes) -> None:
+        for client in list(self._clients):
+            try:
+                client.send(line)
+            except OSError:  # gone, or it never reads
+                client.close()
+                self._clients.remove(client)
+
+    def close(self) -> None:
+        """Give the port back."""
+        for one in (self._server, *self._clients):
+            one.close()
+
+
+class FakePing360:
+    """A head behind a UDP bridge: it answers 2601, and scans by itself after 2602."""
+
+    def __init__(
+        self, host: str, port: int, seed: int = 0, zero_gradian: int = 200, own: bool = True
+    ) -> None:
+        """``own``: the firmware knows 2602. OSError where the port is taken."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((host, port))
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+        self._rng, self._zero, self._own = np.random.default_rng(seed), zero_gradian, own
+        self._frames, self._client = ping.Frames(), ("", 0)
+        self._scan: tuple[bytes, int, int, int] | None = None
+        self._at, self._way, self._due_s = 0, 1, -math.inf
+
+    def step(self, now_s: float, echo: Echo, sound_m_s: float = 1500.0) -> None:
+        """In every step: take requests, answer what is due."""
+        with contextlib.suppress(OSError):
+            while True:
+                data, self._client = self._socket.recvfrom(2048)
+                for number, payload in self._frames.take(data):
+                    self._take(number, payload, now_s, echo, sound_m_s)
+        while self._scan is not None and now_s >= self._due_s:
+            listening, first, count, step = self._scan
+            self._answer(listening, (first + self._at) % 400, echo, sound_m_s, True)
+            self._due_s = max(self._due_s + self._step_s(listening), now_s - 1.0)
+            if count == 399:
+                self._at = (self._at + step) % 400
+            else:
+                self._way = -1 if self._at + step > count else 1 if self._at <= 0 else self._way
+                self._at += self._way * step
+
+    @staticmethod
+    def _step_s(listening: bytes) -> float:
+        """[s] of a step as recorded: 33 ms at 2 m."""
+        _, period, _, samples = struct.unpack("<HHHH", listening)
+        return 0.030 + 25e-9 * period * samples
+
+    def _take(self, number: int, payload: bytes, now_s: float, echo: Echo, sound_m_s: float) -> None:
+        if number == ping.TRANSDUCER and len(payload) == 14:
+            self._scan = None
+            (angle,) = struct.unpack_from("<H", payload, 2)
+            self._answer(payload[4:12], angle, echo, sound_m_s, False)
+        elif number == ping.AUTO_TRANSMIT and len(payload) == 16 and self._own:
+            first, last = struct.unpack_from("<HH", payload, 10)
+            self._scan = payload[2:10], first, (last - first) % 400, payload[14]
+            self._at, self._way, self._due_s = 0, 1, now_s
+        elif number == ping.MOTOR_OFF:
+            self._scan = None
+
+    def _answer(self, listening: bytes, angle: int, echo: Echo, sound_m_s: float, is_own: bool) -> None:
+        pulse, period, frequency, samples = struct.unpack("<HHHH", listening)
+        bearing = -math.radians(0.9 * ((angle - self._zero + 200) % 400 - 200))
+        profile = self.profile(echo(bearing), 0.5 * 25e-9 * period * sound_m_s, samples)
+        head = struct.pack("<BBHHHH", 1, 1, angle, pulse, period, frequency)
+        about = struct.pack("<HHBB", 0, 399, 1, 0) if is_own else b""
+        counts = struct.pack("<HH", samples, samples)
+        number = ping.AUTO_DEVICE_DATA if is_own else ping.DEVICE_DATA
+        with contextlib.suppress(OSError):
+            self._socket.sendto(ping.frame(number, head + about + counts + profile, source=2), self._client)
+
+    def profile(self, range_m: float, bin_m: float, samples: int) -> bytes:
+        """Ring-down to 0.19 m, noise, and an echo."""
+        at = (np.arange(samples) + 0.5) * bin_m
+        level = 255.0 * np.exp(-np.maximum(at - 0.03, 0.0) / self._rng.uniform(0.05, 0.08))
+        level += self._rng.rayleigh(6.0, samples)
+        if math.isfinite(range_m):
+            level += 140.0 * np.exp(-0.5 * ((at - range_m) / 0.015) ** 2)
+        return np.clip(level, 0, 255).astype(np.uint8).tobytes()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._socket.close()
+
+
+KINDS = ("a50", "ping360")
+"""what ``uuv sitl --as`` can be"""
+RING = {
+    **{"mechanical": False, "horizontal_aperture_deg": 360.0, "n_ray": 400, "doppler": False},
+    **{"range_sigma_m": 0.0, "range_quantum_m": 0.0},
+}
+"""of a simulated sonar behind a Ping360: every step of the head at any moment, errors are the emulator's"""
+_NEXT_PORT = 10  # as from one ArduSub's port to the next one's
+
+
+def emulated(config: Config, kinds: tuple[str, ...]) -> Config:
+    """The config of the water behind these instruments."""
+    if "ping360" not in kinds:
+        return config
+    sonar = config.sensors.sonar.model_copy(update=RING)
+    return config.model_copy(update={"sensors": config.sensors.model_copy(update={"sonar": sonar})})
+
+
+class FakeRig:
+    """The instruments of one vehicle: ``step`` in every control step."""
+
+    def __init__(self, config: Config, kinds: tuple[str, ...], host: str, number: int) -> None:
+        """``number``: of the vehicle; ports count on with it. Raises LinkError."""
+        self._sonar, dvl = config.sensors.sonar, config.sensors.dvl
+        self._lever, self._yaw = np.array(dvl.position_b_m), math.radians(dvl.yaw_deg)
+        self._dvl: FakeA50 | None = None
+        self._head: FakePing360 | None = None
+        port, next_port = 0, _NEXT_PORT * number
+        try:
+            if "a50" in kinds:
+                self._dvl = FakeA50(host, port := a50.PORT + next_port, number)
+            if "ping360" in kinds:
+                zero = round(self._sonar.zero_gradian)
+                self._head = FakePing360(host, port := ping.PORT + next_port, number, zero)
+        except OSError as error:
+            self.close()
+            raise LinkError(
+                f"--as: cannot listen at port {port} ({error.strerror or error}); another uuv sitl may run"
+            ) from None
+
+    def step(self, time_s: float, altitude_m: float, value: Callable[[str], np.ndarray]) -> None:
+        """``value`` gives arrays of the vehicle by 'struct.field'."""
+        if self._dvl is not None:
+            moved = value("ego.dvl_b") + np.cross(value("ego.rate_b"), self._lever)
+            cos, sin = math.cos(self._yaw), math.sin(self._yaw)
+            there = np.array([cos * moved[0] + sin * moved[1], cos * moved[1] - sin * moved[0], moved[2]])
+            self._dvl.tell(time_s, there, altitude_m)
+        if self._head is not None:
+            range_m, hit = value("scan.range_m"), value("scan.hit")
+            self._head.step(time_s, lambda bearing: _met(self._sonar, range_m, hit, bearing))
+
+    def close(self) -> None:
+        """Give the ports back."""
+        for one in (self._dvl, self._head):
+            if one is not None:
+                one.close()
+
+
+def _met(sonar_cfg: SonarConfig, range_m: np.ndarray, hit: np.ndarray, bearing: float) -> float:
+    beam = round(bearing / sonar_cfg.beam_step_rad) % sonar_cfg.n_ray
+    return float(range_m[beam]) if hit[beam] else math.inf
