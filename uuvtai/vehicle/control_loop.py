@@ -92,7 +92,6 @@ class FlightPlan:
         instruments: Mapping[str, str | None] | None = None,
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
-        tank, vehicle = config.world.tank, config.vehicle
         if config.sensors.sonar.doppler:
             raise LinkError(
                 "the pilot would wait for a sonar with Doppler, which OBSTACLE_DISTANCE does not have: "
@@ -108,14 +107,7 @@ class FlightPlan:
             raise LinkError(f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90")
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
-        limits = safety.SafetyLimits(
-            box_m=_four(box or (tank.x_m[0], tank.y_m[0], tank.x_m[1], tank.y_m[1])),
-            depth_m=(depth[0], depth[1]) if depth else (EDGE_M - tank.z_m[1], -tank.z_m[0] - EDGE_M),
-            speed_m_s=max_speed,
-            heave_m_s=min(max_speed, vehicle.max_heave_m_s),
-            yaw_rate_rad_s=vehicle.max_yaw_rate_rad_s,
-            battery_v=battery,
-        )
+        limits = _limits(config, box, depth, max_speed, battery)
         mission = Mission(_three(start or ()), _three(goal or ()))
         _refuse_places(mission, limits)
         return cls(
@@ -132,6 +124,25 @@ class FlightPlan:
             Senders.typed(senders, system),
             {option: place for option, place in (instruments or {}).items() if place},
         )
+
+
+def _limits(
+    config: Config,
+    box: Sequence[float] | None,
+    depth: Sequence[float] | None,
+    max_speed: float,
+    battery: float,
+) -> safety.SafetyLimits:
+    """As typed; where nothing is, the tank's and the vehicle's own."""
+    tank, vehicle = config.world.tank, config.vehicle
+    return safety.SafetyLimits(
+        box_m=_four(box or (tank.x_m[0], tank.y_m[0], tank.x_m[1], tank.y_m[1])),
+        depth_m=(depth[0], depth[1]) if depth else (EDGE_M - tank.z_m[1], -tank.z_m[0] - EDGE_M),
+        speed_m_s=max_speed,
+        heave_m_s=min(max_speed, vehicle.max_heave_m_s),
+        yaw_rate_rad_s=vehicle.max_yaw_rate_rad_s,
+        battery_v=battery,
+    )
 
 
 def _refuse_places(mission: Mission, limits: safety.SafetyLimits) -> None:
