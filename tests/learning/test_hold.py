@@ -38,7 +38,7 @@ def held(steps):
     """The env after a decision of so many steps, its view, what came of it, and what was counted."""
     env = Scripted()
     made = trainer_of(env, config_of(policy={"hidden": [4], "hold_steps": steps})).env
-    sums = RolloutSums.zeros(len(env.outcomes), len(env.reward_terms), env.device)
+    sums = RolloutSums(len(env.outcomes), len(env.reward_terms), env.device)
     return env, made.view, made.step(torch.full((3, NUM_ACTIONS), 0.5), sums), sums
 
 

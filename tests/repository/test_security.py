@@ -125,6 +125,7 @@ OWN_READS = {
     # JSON of this process or its siblings
     "sim/snapshot.py": "json.loads",
     "evaluation/grid.py": "json.loads",
+    "learning/checkpoint.py": "json.loads",
     # messages and attachments of a log, each no longer than its MAX_RECORD
     "logs/reader.py": "json.loads",
 }

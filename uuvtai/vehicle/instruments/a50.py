@@ -5,13 +5,13 @@ Source: docs.waterlinked.com, DVL protocol, JSON (json_v1 to v3.1). Axes: x ahea
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
 import numpy as np
 
 from uuvtai.common.clocks import SourceClock
+from uuvtai.common.files import FileError, parsed_json
 from uuvtai.vehicle.instruments.channel import Channel, Instrument
 from uuvtai.vehicle.messages import DvlReading, SensorMessage
 
@@ -45,8 +45,8 @@ class A50(Instrument):
 
     def _reading(self, line: bytes, now_s: float) -> DvlReading | None:
         try:
-            said = json.loads(line) if len(line) <= LONGEST else None
-        except (ValueError, RecursionError):
+            said = parsed_json(line, "a line") if len(line) <= LONGEST else None
+        except FileError:
             said = None
         if not isinstance(said, dict):
             return self.refuse("no line of JSON")

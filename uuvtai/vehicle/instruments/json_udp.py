@@ -8,11 +8,11 @@ measured (0 where it is left out).
 from __future__ import annotations
 
 import dataclasses
-import json
 from typing import Any
 
 import numpy as np
 
+from uuvtai.common.files import FileError, parsed_json
 from uuvtai.vehicle.instruments.channel import Instrument
 from uuvtai.vehicle.messages import KINDS, SensorMessage
 
@@ -36,7 +36,7 @@ class JsonUdp(Instrument):
 
     def _message(self, data: bytes, now_s: float) -> SensorMessage | None:
         try:
-            said: Any = json.loads(data)
+            said: Any = parsed_json(data, "a datagram")
             kind = KINDS.get(said.pop("kind"))
             age_s = float(said.pop("age_s", 0.0))
             if kind is None or not 0.0 <= age_s <= _OLDEST_S:
@@ -47,7 +47,7 @@ class JsonUdp(Instrument):
                 return self.refuse(f"{kind.__name__}: wants {', '.join(sorted(required))}")
             arrays = {name: np.array(value, np.float64) for name, value in said.items()}
             given = {name: array if array.ndim else _plain(name, array) for name, array in arrays.items()}
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
+        except (FileError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
             return self.refuse("no JSON object of numbers")
         return kind(now_s - age_s, **given)
 

@@ -66,7 +66,7 @@ class Frames:
 
 _SMOOTH_M, _GUARD_M, _AROUND_M = 0.02, 0.06, 0.30
 _FACTOR, _ABOVE = 1.5, 12.0  # an echo is so many times its surroundings, and so much of 255 above them
-_RINGS_M = 0.5  # beyond, a profile that has not fallen quiet tells nothing
+_RINGS_M = 0.5  # a transducer may ring so far; a profile that is loud beyond, without an echo, tells nothing
 
 
 def first_echo(profile: np.ndarray, bin_m: float, blind_m: float) -> float:
@@ -96,9 +96,8 @@ def first_echo(profile: np.ndarray, bin_m: float, blind_m: float) -> float:
     beyond = level[at >= blind_m / bin_m]
     if not len(beyond):
         return math.nan
-    quiet = beyond <= np.median(beyond) + _ABOVE
-    rings = int(np.argmax(quiet))
-    is_quiet = bool(quiet[rings:].all()) and blind_m + rings * bin_m <= max(_RINGS_M, 2.0 * blind_m)
+    loud = np.flatnonzero(beyond > np.median(beyond) + _ABOVE)
+    is_quiet = blind_m + bin_m * (loud.max(initial=-1) + 1) <= max(_RINGS_M, 2.0 * blind_m)
     return math.inf if is_quiet else math.nan
 
 
