@@ -21,7 +21,7 @@ from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Channel, InstrumentPlace, TcpChannel, UdpChannel, place_of
 from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeRig, emulated
 from uuvtai.vehicle.instruments.json_udp import JsonUdp
-from uuvtai.vehicle.instruments.rig import Rig
+from uuvtai.vehicle.instruments.rig import PORTS, Rig
 from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import MOST_WAITING, DvlReading, Inbox, SonarPing
 from uuvtai.vehicle.sitl import Instance, SitlPlan
@@ -285,6 +285,14 @@ def test_datagrams_of_others_are_not_heard():
     assert channel.strange == 1
     channel.close()
     other.close()
+
+
+def test_places_are_read_as_the_help_writes_them():
+    for option, ports in PORTS.items():
+        for text in ("a50:192.168.2.95", "ping360:/dev/ttyUSB0", "3d15:224.0.0.96", "json::14700"):
+            if text.partition(":")[0] in ports:
+                place = place_of(text, f"--{option}", ports)
+                assert place.host == text.split(":")[1] and place.port == ports[place.kind]
 
 
 @pytest.mark.parametrize("text", ["a50", "a50:", "b60:host", "a50:host:0", "a50:host:70000", "a50:a b", ""])

@@ -296,7 +296,7 @@ DvlPlace = Annotated[
     Option(
         "--dvl",
         metavar="KIND:HOST",
-        help="Hear the DVL itself: a50:HOST, or json:: (UDP port 14700); MAVLink's then counts no more.",
+        help="Hear the DVL itself: a50:HOST, or json::14700 (UDP); MAVLink's then counts no more.",
     ),
 ]
 SonarPlace = Annotated[
@@ -304,7 +304,7 @@ SonarPlace = Annotated[
     Option(
         "--sonar",
         metavar="KIND:HOST",
-        help="Hear the sonar itself: ping360:HOST, ping360:/dev/ttyUSB0, 3d15:224.0.0.96 or json::.",
+        help="Hear the sonar itself: ping360:HOST, ping360:/dev/ttyUSB0, 3d15:224.0.0.96 or json::14700.",
     ),
 ]
 PilotStart = Annotated[str, Option("--start", metavar="X,Y,Z", help="Where the vehicle is now \\[m], z up.")]
