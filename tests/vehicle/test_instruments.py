@@ -265,11 +265,30 @@ def test_a_head_scans_there_and_back(own):
         fake.step(now_s, lambda bearing: 2.0 + bearing)
         found.extend(sonar.poll(now_s))
 
-    until(step, found, lambda them: len(them) >= 2 * SONAR.n_ray)
+    spent_s = until(step, found, lambda them: len(them) >= 2 * SONAR.n_ray)
+    assert spent_s > 2 * SONAR.n_ray * 0.035  # a step of the head takes its time
     for one in found:
         bearing = SONAR.first_beam_rad + one.first_beam * SONAR.beam_step_rad
         assert one.hit[0] == 1.0 and one.range_m[0] == pytest.approx(2.0 + bearing, abs=0.03)
     assert {one.first_beam for one in found} == set(range(SONAR.n_ray))
+    sonar.close()
+    fake.close()
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_head_that_was_off_is_asked_the_quicker_way_again(own):
+    fake, found = FakePing360("127.0.0.1", 0, own=own), []
+    channel = UdpChannel(InstrumentPlace("ping360", "127.0.0.1", fake.port), calls=True, longest=2048)
+    sonar = ping.Ping360(channel, SONAR, 200.0, 0.3, 1500.0)
+    for off_s in (3.5, 4.5):  # in either way of asking
+        sonar._by_itself, sonar._turns, sonar._asked_s, sonar._heard_s = True, 0, -math.inf, -math.inf
+        for number in range(round(50 * (off_s + 6.0))):
+            now_s = 0.02 * number
+            if now_s >= off_s:
+                fake.step(now_s, lambda _bearing: 2.0)
+            found += sonar.poll(now_s)
+        assert sonar._by_itself == own
+    assert len(found) > 100
     sonar.close()
     fake.close()
 

@@ -92,6 +92,8 @@ class FakePing360:
         self._rng, self._zero, self._own = np.random.default_rng(seed), zero_gradian, own
         self._frames, self._client = ping.Frames(), ("", 0)
         self._scan: tuple[bytes, int, int, int] | None = None
+        self._single: tuple[bytes, int] | None = None
+        """how to listen, and the angle that was asked for"""
         self._at, self._way, self._due_s = 0, 1, -math.inf
 
     def step(self, now_s: float, echo: Echo, sound_m_s: float = 1500.0) -> None:
@@ -100,7 +102,10 @@ class FakePing360:
             while True:
                 data, self._client = self._socket.recvfrom(2048)
                 for number, payload in self._frames.take(data):
-                    self._take(number, payload, now_s, echo, sound_m_s)
+                    self._take(number, payload, now_s)
+        if self._single is not None and now_s >= self._due_s:
+            self._answer(*self._single, echo, sound_m_s, False)
+            self._single = None
         while self._scan is not None and now_s >= self._due_s:
             listening, first, count, step = self._scan
             self._answer(listening, (first + self._at) % 400, echo, sound_m_s, True)
@@ -117,15 +122,15 @@ class FakePing360:
         _, period, _, samples = struct.unpack("<HHHH", listening)
         return 0.030 + 25e-9 * period * samples
 
-    def _take(self, number: int, payload: bytes, now_s: float, echo: Echo, sound_m_s: float) -> None:
+    def _take(self, number: int, payload: bytes, now_s: float) -> None:
         if number == ping.TRANSDUCER and len(payload) == 14:
-            self._scan = None
             (angle,) = struct.unpack_from("<H", payload, 2)
-            self._answer(payload[4:12], angle, echo, sound_m_s, False)
+            self._scan, self._single = None, (payload[4:12], angle)
+            self._due_s = now_s + self._step_s(payload[4:12])
         elif number == ping.AUTO_TRANSMIT and len(payload) == 16 and self._own:
             first, last = struct.unpack_from("<HH", payload, 10)
             self._scan = payload[2:10], first, (last - first) % 400, payload[14]
-            self._at, self._way, self._due_s = 0, 1, now_s
+            self._single, self._at, self._way, self._due_s = None, 0, 1, now_s
         elif number == ping.MOTOR_OFF:
             self._scan = None
 

@@ -124,6 +124,8 @@ class Ping360(Instrument):
             )
         self._asked_s = self._heard_s = -math.inf
         self._by_itself, self._beam, self._way = True, 0, 1
+        self._turns = 0
+        """changes of the way of asking since it answered last"""
         seconds = 2.0 * sonar_cfg.max_range_m / sound_m_s
         self._period = max(80, math.ceil(seconds / (1200 * _TICK_S)))
         self._samples = min(1200, math.ceil(seconds / (self._period * _TICK_S)))
@@ -150,7 +152,7 @@ class Ping360(Instrument):
         """Begin, begin again where nothing comes, or ask for the next beam."""
         is_silent = now_s - max(self._heard_s, self._asked_s) > self._SILENT_S
         if is_silent and self._asked_s > -math.inf:
-            self._by_itself = not self._by_itself
+            self._by_itself, self._turns = not self._by_itself, self._turns + 1
         if self._by_itself and is_silent:
             first, last = (self._gradian(beam) for beam in (self._sonar.n_ray - 1, 0))
             if self._sonar.is_ring:
@@ -181,6 +183,9 @@ class Ping360(Instrument):
         profile = np.frombuffer(payload, np.uint8, offset=head)
         self.heard += 1
         self._heard_s = now_s
+        if not self._by_itself and self._turns > 1:  # it was off, and may know the quicker way
+            self._by_itself, self._asked_s, self._heard_s = True, -math.inf, -math.inf
+        self._turns = 0
         bin_m = 0.5 * _TICK_S * period * self._sound
         if len(profile) * bin_m < 0.98 * self._sonar.max_range_m:
             return self.refuse("a profile shorter than the sonar's range")
