@@ -180,7 +180,8 @@ def train_policy(
 
     if resume is None:
         config = scene.training(preset, [] if seed is None else [("train.seed", seed)])
-        request = TrainRequest(config, preset, start, None, None, iterations, device, run_dir)
+        new = {"start": start, "iterations": iterations, "device": device, "run_dir": run_dir}
+        request = TrainRequest(config, preset, **new)
     else:
         parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides"))
         request = TrainRequest(

@@ -10,6 +10,7 @@ from tests.mavlink_vehicle import Flight, link_config, plan_of
 from uuvtai.logs.reader import read_messages
 from uuvtai.vehicle import control_loop
 from uuvtai.vehicle.control_loop import OnboardLoop
+from uuvtai.vehicle.instruments.rig import Rig
 
 FOUND = (1125,)
 """seeds that once found something"""
@@ -57,6 +58,7 @@ class Clock:
 STAGES = [
     "_pilot.tick", "_pilot.feed", "_intake.take", "_codec.decode", "_codec.encode", "_endpoint.receive",
     "_endpoint.send", "_log.begin_step", "_log.saw", "_log.said", "_log.decided", "_handover.watch",
+    "_rig.poll",
     "_handover.orders", "_view", "_say", "_note", "_sleep", "_now",
 ]  # fmt: skip
 NO_MORE = ("_codec.encode", "_endpoint.send", "_say")
@@ -71,7 +73,10 @@ def test_an_error_of_ours_stops_the_vehicle_and_gives_it_back(tmp_path, monkeypa
     flight = Flight(tmp_path)
     clock, at = Clock(flight), random.Random(stage).uniform(2.0, 6.0)
     plan = plan_of(flight.endpoint.place, flight.log.path)
-    loop = OnboardLoop(link_config(), flight.pilot, plan, flight.endpoint, flight.log, clock.now, clock.sleep)
+    loop = OnboardLoop(
+        link_config(), flight.pilot, plan, flight.endpoint, flight.log, clock.now, clock.sleep,
+        rig=Rig(link_config(), {}),
+    )  # fmt: skip
     owner, _, name = stage.rpartition(".")
     broken = getattr(loop, owner) if owner else loop
     works, raised = getattr(broken, name), []

@@ -2,6 +2,7 @@
 
 import json
 import math
+import socket
 import struct
 import zlib
 
@@ -191,6 +192,14 @@ def test_an_echo_within_the_ring_down_is_none():
     assert ping.first_echo(np.frombuffer(profile(0.1, BIN_M), np.uint8), BIN_M, 0.3) == math.inf
 
 
+@pytest.mark.parametrize(("period", "count"), [(PERIOD, 900), (2000, 200), (0, 1200), (65535, 10)])
+def test_a_profile_that_another_program_asked_for_is_not_used(period, count):
+    data = bytearray(profile(3.0, 0.5 * 25e-9 * max(period, 1) * 1500.0)[:count])
+    other = made(2300, angle=201, sample_period=period, number_of_samples=count, data_length=count, data=data)
+    sonar = ping360(other)
+    assert sonar.poll(1.0) == [] and any("another program" in why for why in sonar.refused)
+
+
 @pytest.mark.parametrize("angle", [200 + 63 + 2, 202])
 def test_an_angle_that_no_beam_has_is_not_used(angle):
     sonar = ping360(device_data(angle, 3.0))
@@ -207,6 +216,8 @@ def test_frames_are_found_among_pieces_wrong_sums_and_noise():
     found += frames.take(whole[1:])
     assert [number for number, _ in found] == [2300] * 3
     assert frames.broken >= 2
+    sonar = ping360(wrong)
+    assert sonar.poll(1.0) == [] and sonar.refused == {"a wrong sum, or a length that no frame has": 1}
 
 
 def test_requests_are_those_of_the_makers_package():
@@ -253,6 +264,29 @@ def test_a_device_that_restarts_is_heard_again():
     until(step, found, lambda them: len(them) >= 3)
     fake.close()
     dvl.channel.close()
+
+
+def test_a_device_that_lost_its_power_is_called_again():
+    """It says no farewell, and its old connection stays open for ever."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        channel = TcpChannel("127.0.0.1", server.getsockname()[1])
+        assert channel.read(0.0) == []
+        first, _ = server.accept()
+        first.send(b"old")
+        found = [piece for number in range(200) for piece in channel.read(0.001 * number)]
+        assert found == [b"old"] and channel.opened == 1
+        assert channel.read(2.9) == []
+        server.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            server.accept()
+        for number in range(100):
+            channel.read(3.3 + 0.02 * number)
+        again, _ = server.accept()
+        again.send(b"new")
+        assert [piece for number in range(200) for piece in channel.read(5.4 + 0.001 * number)] == [b"new"]
+        assert channel.opened == 2
+        for one in (first, again, channel):
+            one.close()
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -306,6 +340,30 @@ def test_datagrams_of_others_are_not_heard():
     other.close()
 
 
+def test_while_one_speaks_nobody_else_is_heard():
+    """Where no host is named, and of a multicast group."""
+    channel = UdpChannel(InstrumentPlace("json", "", 45990), calls=False, longest=64)
+    senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+    for one, host in zip(senders, ("127.0.0.1", "127.0.0.2"), strict=True):
+        one.bind((host, 0))
+
+    def heard(now_s, *numbers):
+        before, found = channel.strange, []
+        for number in numbers:
+            senders[number].sendto(str(number).encode(), ("127.0.0.1", 45990))
+        for _ in range(1000):
+            found += channel.read(now_s)
+            if len(found) + channel.strange - before == len(numbers):
+                return found
+        raise AssertionError(f"not all has come: {found}")
+
+    assert heard(0.0, 0, 1) == [b"0"]
+    assert heard(2.9, 1, 0, 1) == [b"0"]
+    assert heard(6.0, 1, 0) == [b"1"]  # the first one fell silent
+    for one in (*senders, channel):
+        one.close()
+
+
 def test_places_are_read_as_the_help_writes_them():
     for option, ports in PORTS.items():
         for text in ("a50:192.168.2.95", "ping360:/dev/ttyUSB0", "3d15:224.0.0.96", "json::14700"):
@@ -321,6 +379,18 @@ def test_a_place_that_is_none_is_refused_in_a_line(text):
         return
     with pytest.raises(LinkError, match="--dvl"):
         place_of(text, "--dvl", {"a50": 16171})
+
+
+@pytest.mark.parametrize("number", [definitions.PING360_TRANSDUCER, definitions.PING360_AUTO_TRANSMIT])
+def test_a_request_for_too_much_does_not_end_the_emulator(number):
+    fake = FakePing360("127.0.0.1", 0)
+    other = UdpChannel(InstrumentPlace("ping360", "127.0.0.1", fake.port), calls=True, longest=2048)
+    for samples in (65535, 1201, 0, 4):
+        other.write(made(number, angle=65535, sample_period=0, number_of_samples=samples))
+        for step in range(20):
+            fake.step(0.02 * step, lambda _bearing: 2.0)
+    fake.close()
+    other.close()
 
 
 def test_a_head_of_other_steps_is_refused():
@@ -367,12 +437,12 @@ def test_a_packet_of_the_makers_package_is_an_image():
 
 
 def sonar3d(*packets: bytes) -> rip2.Sonar3D:
-    return rip2.Sonar3D(Played(*packets), FAN, 0.0, 0.1)
+    return rip2.Sonar3D(Played(*packets), FAN)
 
 
 def test_what_lies_level_is_a_scan_and_all_of_it_an_image():
     ping_, shot = sonar3d(GOLDEN).poll(8.0)
-    assert ping_.time_s == shot.time_s == pytest.approx(7.9)
+    assert ping_.time_s == shot.time_s == 8.0
     assert ping_.range_m[0] == pytest.approx(3.5, abs=0.05)  # beam 0 is the right edge, column 15
     assert ping_.range_m[-1] == pytest.approx(2.0, abs=0.05)
     empty = ping_.hit == 0.0
@@ -412,12 +482,22 @@ def test_no_bytes_break_an_adapter(data):
         assert device.poll(1.0) == []
 
 
+def test_another_view_than_the_first_is_not_used(monkeypatch):
+    """Somebody else's packet must not end a flight."""
+    device = sonar3d(GOLDEN)
+    assert len(device.poll(1.0)) == 2
+    image = rip2.image_of(GOLDEN)
+    monkeypatch.setattr(rip2, "image_of", lambda _packet: image._replace(fov_rad=(0.1, 0.1)))
+    device.channel.pieces = [GOLDEN]
+    assert device.poll(2.0) == [] and any("than the first" in why for why in device.refused)
+
+
 def test_a_camera_that_sees_more_than_the_device_is_refused():
     wide = load_config("pool", "multibeam", overrides=[("sensors.sonar.horizontal_aperture_deg", 90)])
     with pytest.raises(ValueError, match="rows=44"):
-        rip2.Sonar3D(Played(GOLDEN), wide, 0.0, 0.1).poll(1.0)
+        rip2.Sonar3D(Played(GOLDEN), wide).poll(1.0)
     with pytest.raises(ValueError, match="looks ahead"):
-        rip2.Sonar3D(Played(), load_config("pool", "ping360"), 0.0, 0.1)
+        rip2.Sonar3D(Played(), load_config("pool", "ping360"))
 
 
 # ----------------------------------------------------------------------------------------------------- JSON
@@ -496,6 +576,19 @@ def test_a_rig_gives_velocities_about_the_centre_and_only_what_was_asked_for(rig
         assert rig.document()["json:127.0.0.1:45991"]["refused"] == {"pressure: not asked for": 1}
         other.close()
     assert rig.replaced == {"dvl"}
+
+
+@pytest.mark.parametrize("vel_b", [[1e6, 0, 0], [1e300, 0, 0], [0, 0]])
+def test_a_velocity_that_cannot_be_is_no_reading(vel_b):
+    with Rig(link_config(), {"dvl": "json:127.0.0.1:45989"}) as rig:
+        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", 45989), calls=True, longest=2048)
+        other.write(json.dumps({"kind": "dvl", "vel_b": vel_b}).encode())
+        for _ in range(1000):
+            assert list(rig.poll(1.0, np.zeros(3))) == []
+            if rig.document()["json:127.0.0.1:45989"]["refused"]:
+                break
+        assert rig.document()["json:127.0.0.1:45989"]["refused"]
+        other.close()
 
 
 def test_what_an_instrument_tells_mavlink_tells_no_more(tmp_path):

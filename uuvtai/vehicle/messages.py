@@ -143,12 +143,10 @@ class Inbox:
             )
         tally = self.tallies[name]
         tally.fed += 1
-        values = dict(vars(message))
-        time_s = float(values.pop("time_s"))
-        arrays = {key: np.asarray(value, np.float64) for key, value in values.items()}
-        for key, array in arrays.items():
-            self._check_shape(name, key, array.shape)
-        if math.isfinite(time_s) and all(_believed(key, array) for key, array in arrays.items()):
+        for key, value in vars(message).items():
+            if key != "time_s":
+                self._check_shape(name, key, np.shape(value))
+        if is_believed(message):
             self._waiting[name].append(message)
             if len(self._waiting[name]) > MOST_WAITING:
                 self._waiting[name].pop(0)
@@ -197,8 +195,12 @@ class Inbox:
             raise ValueError(f"{name}: {key} must have the shape {wanted}, got {shape}")
 
 
-def _believed(key: str, array: np.ndarray) -> bool:
-    return bool((np.abs(array) <= LIMITS[key]).all())  # false for NaN too
+def is_believed(message: SensorMessage) -> bool:
+    """Whether its time is finite and no number is larger than any of these instruments says."""
+    numbers = dict(vars(message))
+    time_s = float(numbers.pop("time_s"))
+    sound = (np.abs(np.asarray(value, np.float64)) <= LIMITS[key] for key, value in numbers.items())
+    return math.isfinite(time_s) and all(bool(each.all()) for each in sound)  # false for NaN too
 
 
 # ---- One vehicle under way without a world: what it is told.

@@ -359,6 +359,8 @@ class Intake:
             who, kind = f"{system}/{component}", KIND_OF.get(name)
             return self.refuse(f"{name} of {who}" + (f" (heard by --sender {kind}={who})" if kind else ""))
         if KIND_OF.get(name) in self._replaced:
+            if int(fields.get("orientation", 0)) > 7:  # an altimeter, no part of a scan
+                return []
             return self.refuse(f"{name}: --{KIND_OF[name]} names an instrument that tells it itself")
         if not all(math.isfinite(value) for value in fields.values() if isinstance(value, float)):
             return self.refuse(f"{name}: a number that is not finite")

@@ -4,6 +4,7 @@ lost is opened again."""
 from __future__ import annotations
 
 import ipaddress
+import math
 import re
 import socket
 import struct
@@ -17,6 +18,7 @@ from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import SensorMessage
 
 AGAIN_S = 1.0  # between two tries to open a place
+SILENT_S = 3.0  # a server that has said nothing for so long is called again; another sender is heard then
 MOST_BYTES = 256 << 10  # taken in one step; what is more waits, or is lost where the system's queue is full
 MOST_KINDS = 32  # reasons why something was not used that are told apart
 _WRITTEN = re.compile(r"([a-z0-9]+):(/dev/[\w./\-]+|[A-Za-z0-9.\-]{0,253})(?::(\d{1,5}))?")
@@ -53,14 +55,16 @@ class Channel(ABC):
 
     opened = 0
     """how often the place was opened; what was read before is no beginning of what comes after"""
+    strange = 0
+    """datagrams of others, and longer ones than the instrument sends"""
 
     @abstractmethod
     def read(self, now_s: float) -> list[bytes]:
         """What has come since the last call: datagrams, or pieces of a stream."""
 
     def write(self, data: bytes) -> bool:
-        """Whether the system took it."""
-        raise NotImplementedError
+        """Whether the system took it; what only listens takes nothing."""
+        return False
 
     @abstractmethod
     def close(self) -> None:
@@ -68,20 +72,23 @@ class Channel(ABC):
 
 
 class TcpChannel(Channel):
-    """A client of a TCP server. The address is looked up once."""
+    """A client of a TCP server that speaks all the time: one that lost its power says no farewell. The
+    address is looked up once."""
 
     def __init__(self, host: str, port: int) -> None:
         """Raises LinkError for a host that is none."""
         self._address = _address(host), port
         self._socket: socket.socket | None = None
-        self._is_open, self._due_s = False, float("-inf")
+        self._is_open, self._called_s, self._heard_s = False, -math.inf, -math.inf
 
     def read(self, now_s: float) -> list[bytes]:
         """As in ``Channel``."""
+        if self._socket is not None and now_s - max(self._called_s, self._heard_s) > SILENT_S:
+            self.close()
         if self._socket is None:
-            if now_s < self._due_s:
+            if now_s - self._called_s < AGAIN_S:
                 return []
-            self._due_s = now_s + AGAIN_S
+            self._called_s = now_s
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
             self._socket.setblocking(False)
             self._socket.connect_ex(self._address)
@@ -89,17 +96,13 @@ class TcpChannel(Channel):
         while size < MOST_BYTES:
             try:
                 data = self._socket.recv(1 << 16)
-            except BlockingIOError:
+            except OSError:  # nothing has come, or nobody answers
                 break
-            except OSError as error:
-                if not self._is_open and now_s < self._due_s and error.errno in _CONNECTING:
-                    break  # not answered yet
-                data = b""
             if not data:
                 self.close()
                 break
             self.opened += not self._is_open
-            self._is_open = True
+            self._is_open, self._heard_s = True, now_s
             size += len(data)
             found.append(data)
         return found
@@ -111,9 +114,6 @@ class TcpChannel(Channel):
         self._socket, self._is_open = None, False
 
 
-_CONNECTING = (socket.errno.ENOTCONN, socket.errno.EINPROGRESS, socket.errno.EALREADY)  # type: ignore[attr-defined]
-
-
 class UdpChannel(Channel):
     """Datagrams: of the instrument that we speak to, or of whom comes to our port."""
 
@@ -121,14 +121,14 @@ class UdpChannel(Channel):
 
     def __init__(self, place: InstrumentPlace, calls: bool, longest: int) -> None:
         """``calls``: we speak first, to the place, and hear nobody else; else we listen at its port, to its
-        host alone, or to a multicast group. Longer datagrams than ``longest`` are none of the instrument's.
-        Raises LinkError."""
-        self._longest, self.strange = longest, 0
-        """datagrams of others"""
+        host alone; where it names none, or a multicast group, to whom spoke first while that one speaks.
+        Longer datagrams than ``longest`` are none of the instrument's. Raises LinkError."""
+        self._longest = longest
         host = _address(place.host) if place.host else ""
         is_group = bool(host) and ipaddress.ip_address(host).is_multicast
         self._to = (host, place.port) if calls else None
         self._from = "" if is_group else host
+        self._speaker, self._heard_s = "", -math.inf
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
@@ -158,9 +158,12 @@ class UdpChannel(Channel):
             except OSError:
                 break
             size += max(len(data), 64)
-            if (self._from and sender[0] != self._from) or len(data) > self._longest:
+            if now_s - self._heard_s > SILENT_S:
+                self._speaker = self._from or sender[0]
+            if sender[0] != self._speaker or len(data) > self._longest:
                 self.strange += 1
             else:
+                self._heard_s = now_s
                 found.append(data)
         return found
 
@@ -190,15 +193,15 @@ class SerialChannel(Channel):
             ) from None
         self._make: Callable[[], Any] = lambda: serial.Serial(name, baud, timeout=0, write_timeout=0)
         self._port: Any = None
-        self._due_s = float("-inf")
+        self._called_s = -math.inf
 
     def read(self, now_s: float) -> list[bytes]:
         """As in ``Channel``."""
         try:
             if self._port is None:
-                if now_s < self._due_s:
+                if now_s - self._called_s < AGAIN_S:
                     return []
-                self._due_s = now_s + AGAIN_S
+                self._called_s = now_s
                 self._port, self.opened = self._make(), self.opened + 1
             data = self._port.read(MOST_BYTES)
         except (OSError, ValueError):  # serial.SerialException is an OSError

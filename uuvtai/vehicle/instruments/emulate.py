@@ -23,7 +23,7 @@ Echo = Callable[[float], float]
 class FakeA50:
     """A TCP server of lines. Readings are lost in bursts, as in recordings."""
 
-    PERIOD_S = 0.116
+    PERIOD_S = 0.116  # a report at 1.6 m, as recorded
 
     def __init__(
         self, host: str, port: int, seed: int = 0, lost: float = 0.086, burst_s: float = 0.15
@@ -38,14 +38,14 @@ class FakeA50:
 
     def tell(self, now_s: float, vel_b: np.ndarray, altitude_m: float) -> None:
         """In every step: the velocity (3,) [m/s] in our body axes, told when it is due."""
-        with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(OSError):  # nobody calls
             client, _ = self._server.accept()
             client.setblocking(False)
             self._clients.append(client)
         if now_s < self._due_s:
             return
         self._due_s = now_s + self.PERIOD_S
-        mean_s = 1.44 * self._burst_s
+        mean_s = self._burst_s / math.log(2.0)  # of an exponential time with this median
         if now_s >= self._lost_until_s and self._rng.random() < self._lost * self.PERIOD_S / mean_s:
             self._lost_until_s = now_s + self._rng.exponential(mean_s)
         is_valid = now_s >= self._lost_until_s
@@ -120,9 +120,12 @@ class FakePing360:
     def _step_s(listening: bytes) -> float:
         """[s] of a step as recorded: 33 ms at 2 m."""
         _, period, _, samples = struct.unpack("<HHHH", listening)
-        return 0.030 + 25e-9 * period * samples
+        return 0.030 + ping.TICK_S * period * samples
 
     def _take(self, number: int, payload: bytes, now_s: float) -> None:
+        samples = {ping.TRANSDUCER: 10, ping.AUTO_TRANSMIT: 8}.get(number, 0)
+        if samples and int.from_bytes(payload[samples : samples + 2], "little") > ping.MOST_SAMPLES:
+            return
         if number == ping.TRANSDUCER and len(payload) == 14:
             (angle,) = struct.unpack_from("<H", payload, 2)
             self._scan, self._single = None, (payload[4:12], angle)
@@ -137,7 +140,7 @@ class FakePing360:
     def _answer(self, listening: bytes, angle: int, echo: Echo, sound_m_s: float, is_own: bool) -> None:
         pulse, period, frequency, samples = struct.unpack("<HHHH", listening)
         bearing = -math.radians(0.9 * ((angle - self._zero + 200) % 400 - 200))
-        profile = self.profile(echo(bearing), 0.5 * 25e-9 * period * sound_m_s, samples)
+        profile = self.profile(echo(bearing), 0.5 * ping.TICK_S * period * sound_m_s, samples)
         head = struct.pack("<BBHHHH", 1, 1, angle, pulse, period, frequency)
         about = struct.pack("<HHBB", 0, 399, 1, 0) if is_own else b""
         counts = struct.pack("<HH", samples, samples)
@@ -162,8 +165,12 @@ class FakePing360:
 KINDS = ("a50", "ping360")
 """what ``uuv sitl --as`` can be"""
 RING = {
-    **{"mechanical": False, "horizontal_aperture_deg": 360.0, "n_ray": 400, "doppler": False},
-    **{"range_sigma_m": 0.0, "range_quantum_m": 0.0},
+    "mechanical": False,
+    "horizontal_aperture_deg": 360.0,
+    "n_ray": 400,
+    "doppler": False,
+    "range_sigma_m": 0.0,
+    "range_quantum_m": 0.0,
 }
 """of a simulated sonar behind a Ping360: every step of the head at any moment, errors are the emulator's"""
 _NEXT_PORT = 10  # as from one ArduSub's port to the next one's

@@ -1,4 +1,4 @@
-"""Blue Robotics' Ping360 and Ping1D: the ping-protocol.
+"""Blue Robotics' Ping360: the ping-protocol.
 
 A frame: ``BR``, payload length u16, message number u16, source u8, destination u8, payload, sum of all before
 u16, little endian. Source: docs.bluerobotics.com/ping-protocol.
@@ -20,10 +20,10 @@ PORT = 9092
 BAUD = 115200
 TRANSDUCER, AUTO_TRANSMIT, MOTOR_OFF = 2601, 2602, 2903
 DEVICE_DATA, AUTO_DEVICE_DATA = 2300, 2301
-DISTANCE_SIMPLE, DISTANCE, GENERAL_REQUEST = 1211, 1212, 6
 _HEAD, _SUM = struct.Struct("<2sHHBB"), struct.Struct("<H")
 LONGEST = 1300  # [bytes] of a payload: 1,200 samples and what is said of them
-_TICK_S = 25e-9  # a sample period is counted in
+MOST_SAMPLES = 1200  # of a profile
+TICK_S = 25e-9  # a sample period is counted in
 
 
 def frame(number: int, payload: bytes = b"", source: int = 0, to: int = 0) -> bytes:
@@ -127,8 +127,8 @@ class Ping360(Instrument):
         self._turns = 0
         """changes of the way of asking since it answered last"""
         seconds = 2.0 * sonar_cfg.max_range_m / sound_m_s
-        self._period = max(80, math.ceil(seconds / (1200 * _TICK_S)))
-        self._samples = min(1200, math.ceil(seconds / (self._period * _TICK_S)))
+        self._period = max(80, math.ceil(seconds / (MOST_SAMPLES * TICK_S)))
+        self._samples = min(MOST_SAMPLES, math.ceil(seconds / (self._period * TICK_S)))
 
     def poll(self, now_s: float) -> list[SensorMessage]:
         """As in ``Instrument``."""
@@ -140,6 +140,8 @@ class Ping360(Instrument):
             for number, payload in self._frames.take(piece):
                 if (ping := self._ping(number, payload, now_s)) is not None:
                     found.append(ping)
+        if self._frames.broken:
+            self.refused["a wrong sum, or a length that no frame has"] = self._frames.broken
         self._ask(now_s)
         return found
 
@@ -186,9 +188,9 @@ class Ping360(Instrument):
         if not self._by_itself and self._turns > 1:  # it was off, and may know the quicker way
             self._by_itself, self._asked_s, self._heard_s = True, -math.inf, -math.inf
         self._turns = 0
-        bin_m = 0.5 * _TICK_S * period * self._sound
-        if len(profile) * bin_m < 0.98 * self._sonar.max_range_m:
-            return self.refuse("a profile shorter than the sonar's range")
+        bin_m = 0.5 * TICK_S * period * self._sound
+        if len(profile) * bin_m < 0.98 * self._sonar.max_range_m or bin_m > _SMOOTH_M:
+            return self.refuse("a profile shorter or coarser than was asked for: another program's request?")
         beam = self._beam_at(angle)
         if beam is None:
             return self.refuse("an angle between the beams")
@@ -198,7 +200,7 @@ class Ping360(Instrument):
         if math.isnan(range_m):
             return self.refuse("a profile neither with an echo nor quiet")
         hit = float(range_m <= self._sonar.max_range_m)
-        listened_s = _TICK_S * period * len(profile)
+        listened_s = TICK_S * period * len(profile)
         return SonarPing(
             now_s - listened_s,
             np.array([min(range_m, self._sonar.max_range_m)]),

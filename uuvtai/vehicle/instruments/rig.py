@@ -19,7 +19,7 @@ from uuvtai.vehicle.instruments.channel import (
     UdpChannel,
     place_of,
 )
-from uuvtai.vehicle.messages import NAMES, DvlReading, SensorMessage
+from uuvtai.vehicle.messages import NAMES, DvlReading, SensorMessage, is_believed
 
 PORTS = {
     "dvl": {"a50": a50.PORT, "json": json_udp.PORT},
@@ -52,21 +52,23 @@ class Rig(AbstractContextManager["Rig"]):
         """What has come since the last step, about the vehicle's centre; ``rate_b`` (3,) [rad/s] now."""
         for instrument, kinds in self._sources.values():
             for message in instrument.poll(now_s):
-                if (name := NAMES[type(message)]) not in kinds:
+                name = NAMES[type(message)]
+                if name not in kinds:
                     instrument.refuse(f"{name}: not asked for")
-                elif isinstance(message, DvlReading):
-                    if message.vel_b.shape != (3,):
-                        instrument.refuse("dvl: a velocity has three numbers")
-                        continue
+                elif not is_believed(message):
+                    instrument.refuse(f"{name}: numbers that cannot be")
+                elif not isinstance(message, DvlReading):
+                    yield instrument, message
+                elif message.vel_b.shape != (3,):
+                    instrument.refuse("dvl: a velocity has three numbers")
+                else:
                     moved = np.cross(rate_b, self._lever)
                     yield instrument, replace(message, vel_b=message.vel_b - moved)
-                else:
-                    yield instrument, message
 
     def document(self) -> dict[str, dict[str, object]]:
-        """By place: messages understood, and why others were not used."""
+        """By place: messages understood, why others were not used, and datagrams of others."""
         return {
-            str(place): {"heard": one.heard, "refused": dict(one.refused)}
+            str(place): {"heard": one.heard, "refused": dict(one.refused), "strange": one.channel.strange}
             for place, (one, _) in self._sources.items()
         }
 
@@ -89,5 +91,5 @@ def _opened(place: InstrumentPlace, config: Config) -> Instrument:
         channel = SerialChannel(place.host, ping.BAUD) if is_serial else UdpChannel(place, True, 2048)
         return ping.Ping360(channel, sonar, sonar.zero_gradian, sonar.min_range_m, sonar.sound_m_s)
     if place.kind == "3d15":
-        return rip2.Sonar3D(UdpChannel(place, False, rip2.LONGEST), config, 0.0, 0.0)
+        return rip2.Sonar3D(UdpChannel(place, False, rip2.LONGEST), config)
     return json_udp.JsonUdp(UdpChannel(place, False, json_udp.LONGEST))

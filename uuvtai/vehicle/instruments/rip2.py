@@ -127,17 +127,12 @@ def _unfolded(content: bytes) -> int:
 class Sonar3D(Instrument):
     """What lies level becomes a scan of the config's fan, all of it an image of the config's camera."""
 
-    def __init__(self, channel: Channel, config: Config, yaw_rad: float, latency_s: float) -> None:
-        """``yaw_rad``: of the device's middle from ahead, counter-clockwise; ``latency_s``: from the ping to
-        its stamp's coming. SettingError for a ring, or a camera that sees more than the device."""
+    def __init__(self, channel: Channel, config: Config) -> None:
+        """SettingError for a ring, and at the first image for a fan or a camera that sees more than the
+        device, which looks ahead."""
         super().__init__(channel)
         _messages()
-        self._sonar, self._depth, self._yaw, self._latency_s = (
-            config.sensors.sonar,
-            config.sensors.depth,
-            yaw_rad,
-            latency_s,
-        )
+        self._sonar, self._depth = config.sensors.sonar, config.sensors.depth
         if self._sonar.is_ring or self._sonar.mechanical:
             raise SettingError("sensors.sonar: a 3D-15 looks ahead; take a fan: --sensors multibeam")
         self._clock = SourceClock()
@@ -153,16 +148,18 @@ class Sonar3D(Instrument):
                 self.refuse(image)
                 continue
             self.heard += 1
-            found += self._told(image, self._clock.measured_s(image.sent_s, now_s) - self._latency_s)
+            found += self._told(image, self._clock.measured_s(image.sent_s, now_s))
         return found
 
     def _told(self, image: RangeImage, time_s: float) -> list[SensorMessage]:
         if image.max_range_m < 0.98 * self._sonar.max_range_m:
             self.refuse("an image shorter than the sonar's range")
             return []
-        if self._of != (image.range_m.shape, image.fov_rad):
+        if self._maps is None:
             self._of, self._maps = (image.range_m.shape, image.fov_rad), self._mapped(image)
-        assert self._maps is not None
+        if self._of != (image.range_m.shape, image.fov_rad):
+            self.refuse("an image of another size or view than the first")
+            return []
         columns, level, pixels, scale = self._maps
         far = np.where(image.range_m > 0, image.range_m, np.inf)
         nearest = far[level].min(axis=0)[columns]
@@ -179,7 +176,7 @@ class Sonar3D(Instrument):
         wide, high = image.fov_rad
 
         def column(left: np.ndarray) -> np.ndarray:
-            return np.rint((0.5 - (left - self._yaw) / wide) * (columns - 1)).astype(int)
+            return np.rint((0.5 - left / wide) * (columns - 1)).astype(int)
 
         beams = self._sonar.first_beam_rad + self._sonar.beam_step_rad * np.arange(self._sonar.n_ray)
         up = np.linspace(-0.5 * high, 0.5 * high, rows)
