@@ -3,6 +3,7 @@
 import itertools
 import json
 import random
+import shutil
 
 import numpy as np
 import pytest
@@ -236,7 +237,7 @@ def minimal(*found):
     return {
         "budget": "quick", "seed": 90010, "started": "today", "git_sha": None, "trained_at": [],
         "hardware": {"cpu": "a", "cores": 2}, "claims": [vars(claim) for claim in claims.judged(found)],
-        "commands": {"eval/main": "uuv eval", "sweep/pool": "uuv sweep", "profile": "uuv profile"},
+        "commands": dict.fromkeys(("eval/main", "eval/NAME-SEED", "sweep/pool", "profile"), "uuv"),
         "table_main": {}, "mechanism": {}, "sweep": None,
         "profile": {"paper_latency": [], "paper_density": [], "rows": []},
     }  # fmt: skip
@@ -258,13 +259,22 @@ def test_the_page_tells_p_values_of_one_family_and_a_seed_that_was_tuned_on():
 def test_losses_must_fall_in_every_training():
     losses = "world_model/reconstruction_loss", "world_model/dynamics_loss"
     falling, rising = (
-        [dict(zip(losses, (10.0 + slope * i, 5.0), strict=True)) for i in range(8)] for slope in (-8, 1)
+        claims.training_facts(
+            [
+                dict(zip(losses, (10.0 + slope * i, 5.0), strict=True)) | {"distillation/scale": 1.0}
+                for i in range(8)
+            ],
+            2.0,
+        )
+        for slope in (-8, 1)
     )
+    assert falling["losses"] == {losses[0]: [6.0, -42.0], losses[1]: [5.0, 5.0]}
     assert [claim.points_to for claim in claims.of_training([falling, falling])] == [HOLDS, FAILS]
     found = claims.of_training([falling, rising], ", so")[0]
     assert found.points_to == FAILS and found.ours.startswith("in 1 of 2 trainings")
     assert found.text == "Reconstruction loss falls and settles, so"
-    assert [claim.points_to for claim in claims.of_training([[]])] == [OPEN, OPEN]
+    for few in ([], [claims.training_facts([], 2.0)], [falling, claims.training_facts([], 2.0)]):
+        assert [claim.points_to for claim in claims.of_training(few)] == [OPEN, OPEN]
 
 
 def test_the_mechanism_is_told_by_training_and_target():
@@ -273,12 +283,14 @@ def test_the_mechanism_is_told_by_training_and_target():
         {"distillation/scale": scale, f"{SKILL}depth": depth, f"{SKILL}tilt_0": None}
         for scale, depth in zip(scales, depths, strict=True)
     ]
-    found = claims.mechanism_of([rows, rows], 2.0)
-    assert found["scale"] == [[1.8, pytest.approx(1.85), 1.5, 0.375]] * 2
-    assert found["skill"] == {"depth": [pytest.approx(0.6)] * 2, "tilt_0": []}
-    text = results_page(minimal() | {"mechanism": {"paper": found}})
+    found = claims.training_facts(rows, 2.0)
+    assert found["scale"] == [1.8, pytest.approx(1.85), 1.5, 0.375]
+    assert found["skill"] == {"depth": pytest.approx(0.6), "tilt_0": None}
+    nothing = claims.training_facts([], 2.0)
+    assert nothing == {"losses": {}, "scale": None, "skill": {}}
+    text = results_page(minimal() | {"mechanism": {"paper": [found, found], "paper_10hz": [nothing]}})
     assert "| `paper` | 1.80 (1.80 to 1.80) | 1.85 (1.85 to 1.85) | 1.50 (1.50 to 1.50) |" in text
-    assert "| depth | 0.60 (0.60 to 0.60) |\n| tilt_0 | - |" in text
+    assert "| depth | 0.60 (0.60 to 0.60) |\n| tilt_0 | - |" in text and "`paper_10hz`" not in text
 
 
 def test_the_papers_own_time_to_success_is_as_inconsistent_as_we_say():
@@ -305,8 +317,9 @@ def test_every_training_has_the_budgets_env_steps(budget, n_training, env_steps,
         assert (config.policy.hold_steps == 5) == ("_10hz" in step.folder)
         assert config.train.evaluate_every == 0, "no checkpoint is chosen by its success"
         assert step.folder.endswith(f"-{words[words.index('--seed') + 1]}")
-    (main,) = [step.command for step in steps if step.folder == "eval/main"]
-    assert {str(tmp_path / step.folder) for step in trained} <= set(main)
+    for step, judged in itertools.pairwise(steps):
+        if step in trained:
+            assert str(tmp_path / step.folder) in judged.command and step.row == judged.row
     for step in steps:
         assert step.command[0] in ("train", "profile") or {"stack=paper", "90010"} <= set(step.command)
 
@@ -370,6 +383,7 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
     document, _ = resume(place, Quiet())
     wanted = reproduce_steps.steps_of(reproduce_steps.BUDGETS["quick"], place)
     assert len(first.ran) + len(second.ran) == len(wanted), "the interrupted step again, the made one never"
+    assert len(list(place.glob("rows/*.json"))) == 14
     assert document["trained_at"] == ["abc"], "the page names the commits of all trainings"
     assert (page := (place / "results.md").read_text()) == results_page(document)
     assert "| `bt` | - | 50/100 = 50.0 % [" in page and "| `ppo` | 50.0, 50.0 | 50.0 % [" in page
@@ -379,10 +393,27 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
     assert pages == ["finished", "finished"], "a page tells how the run ended"
 
 
+def test_rows_made_elsewhere_stand_for_their_trainings(tmp_path, monkeypatch):
+    """A row is all that counts of a training: a folder with the rows of another machine goes on from them."""
+    Uuv(monkeypatch)
+    document, _ = reproduce("quick", tmp_path / "one", Quiet())
+    interrupted = Uuv(monkeypatch, fail_at=1)
+    with pytest.raises(KeyboardInterrupt):
+        reproduce("quick", place := tmp_path / "other", Quiet())
+    shutil.copytree(tmp_path / "one/rows", place / "rows")
+    (place / "rows/ppo-1.json").unlink()
+    second = Uuv(monkeypatch)
+    again, _ = resume(place, Quiet())
+    assert len(interrupted.ran) == 1 and again["table_main"] == document["table_main"]
+    assert [words[:2] for words in second.ran if words[0] == "train"] == [["train", "ppo"]]
+    (curves,) = [block for part in again["sections"] for block in part["blocks"] if block["kind"] == "curves"]
+    assert curves["paths"] == ["train/ppo-1"], "no curves are drawn of what was not trained here"
+
+
 def test_a_step_that_fails_says_which(tmp_path, monkeypatch):
     done = type("Done", (), {"returncode": 2, "stdout": b""})
     monkeypatch.setattr(reproduce_steps, "launch", lambda _arguments: done)
-    with pytest.raises(RunFolderError, match="train paper, seed 0: 'uuv train paper"):
+    with pytest.raises(RunFolderError, match="agents that are not trained: 'uuv eval"):
         reproduce("quick", tmp_path / "run", Quiet())
 
 

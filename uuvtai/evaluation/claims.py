@@ -369,46 +369,44 @@ def _seconds(value: float | None) -> str:
 # --------------------------------------------------------------------------------------------------- training
 
 
-def of_training(trainings: Sequence[Sequence[dict[str, Any]]], note: str = "") -> list[Claim]:
-    """Whether the world model's losses fall; rows of ``metrics.jsonl`` of the method's trainings."""
+def training_facts(rows: Sequence[dict[str, Any]], limit: float) -> dict[str, Any]:
+    """What the rows of a training's ``metrics.jsonl`` say of its mechanism: ``losses`` of the world model
+    (means of the first and the last quarter), ``scale`` s_t (first, median, last, share of the iterations at
+    its ``limit``), and the world model's ``skill``, target by target: the median over the last quarter. Of
+    what the method does not have, nothing."""
+    losses = {}
+    for key in LOSSES:
+        curve = [row[key] for row in rows if row.get(key) is not None]
+        if (quarter := len(curve) // 4) > 0:
+            losses[key] = [fmean(curve[:quarter]), fmean(curve[-quarter:])]
+    scales = [row["distillation/scale"] for row in rows]
+    full = fmean(value >= limit - 1e-9 for value in scales) if scales else 0.0
+    late, skill = rows[-max(1, len(rows) // 4) :], {}
+    for key in [key for key in (late[-1] if late else {}) if key.startswith(_SKILL)]:
+        found = [row[key] for row in late if row.get(key) is not None]
+        skill[key.removeprefix(_SKILL)] = median(found) if found else None
+    scale = [scales[0], median(scales), scales[-1], full] if scales else None
+    return {"losses": losses, "scale": scale, "skill": skill}
+
+
+LOSSES = {"world_model/reconstruction_loss": "Reconstruction", "world_model/dynamics_loss": "Dynamics"}
+_SKILL = "world_model/skill/"  # that of learning.world_model, which takes torch to import
+
+
+def of_training(trainings: Sequence[dict[str, Any]], note: str = "") -> list[Claim]:
+    """Whether the world model's losses fall; ``training_facts`` of the method's trainings."""
     claims = []
-    for key, name in (
-        ("world_model/reconstruction_loss", "Reconstruction"),
-        ("world_model/dynamics_loss", "Dynamics"),
-    ):
-        curves = [[row[key] for row in rows if row.get(key) is not None] for rows in trainings]
+    for key, name in LOSSES.items():
+        ends = [facts["losses"][key] for facts in trainings if key in facts["losses"]]
         text = f"{name} loss falls and settles{note}"
-        if min(map(len, curves), default=0) < 4:
+        if not ends or len(ends) < len(trainings):
             claims.append(Claim(text, "curve", "-", OPEN, reason="too few iterations"))
             continue
-        ends = [(fmean(curve[: len(curve) // 4]), fmean(curve[-len(curve) // 4 :])) for curve in curves]
         fallen = sum(last < first - 0.1 * abs(first) for first, last in ends)
         first, last = (fmean(values) for values in zip(*ends, strict=True))
         shown = f"in {fallen} of {len(ends)} trainings; first quarter {first:.3g}, last {last:.3g}"
         claims.append(Claim(text, "curve", shown, HOLDS if fallen == len(ends) else FAILS))
     return claims
-
-
-def mechanism_of(trainings: Sequence[Sequence[dict[str, Any]]], limit: float) -> dict[str, Any]:
-    """What a method's trainings say of its mechanism: s_t (first, median, last, share of the iterations at
-    its ``limit``) by training, and the world model's skill, target by target: the median over the last
-    quarter, by training."""
-    scales = [[row["distillation/scale"] for row in rows] for rows in trainings]
-    scale = [
-        [values[0], median(values), values[-1], fmean(value >= limit - 1e-9 for value in values)]
-        for values in scales
-        if values
-    ]
-    skill: dict[str, list[float]] = {}
-    for rows in trainings:
-        late = rows[-max(1, len(rows) // 4) :]
-        for key in [key for key in (late[-1] if late else {}) if key.startswith(_SKILL)]:
-            found = [row[key] for row in late if row.get(key) is not None]
-            skill.setdefault(key.removeprefix(_SKILL), []).extend([median(found)] if found else [])
-    return {"scale": scale, "skill": skill}
-
-
-_SKILL = "world_model/skill/"  # that of learning.world_model, which takes torch to import
 
 
 # ------------------------------------------------------------------------------------------------------ sweep

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +26,7 @@ from uuvtai.evaluation.reproduce_steps import (
     Step,
     is_done,
     result_file,
+    row_file,
     run_step,
     steps_of,
 )
@@ -44,9 +44,9 @@ Rows = tuple[list[str], list[list[str]]]
 """columns and rows of a table"""
 
 
-def sections_of(document: dict[str, Any], budget: Budget) -> list[Described]:
-    """``sections`` of ``reproduce.json`` (the format is told in ``uuvtai.report.reproduction``)."""
-    curves = [run for method in budget.methods for run in budget.runs(method)]
+def sections_of(document: dict[str, Any], curves: list[str]) -> list[Described]:
+    """``sections`` of ``reproduce.json`` (the format is told in ``uuvtai.report.reproduction``); ``curves``:
+    folders of the trainings that were made here."""
     verdicts = {"kind": "verdicts", "items": [_item(claim) for claim in document["claims"]]}
     heading = {"kind": "heading", "text": "Where the paper's figures do not add up"}
     notes = [heading, *({"kind": "prose", "text": text} for text in claims.INCONSISTENCIES)]
@@ -116,15 +116,21 @@ def _rates(entries: Sequence[dict[str, Any]]) -> list[str]:
 def mechanism_tables(document: dict[str, Any]) -> list[tuple[str, Rows]]:
     """(what it says, table) of the scale s_t over time, and of the world model's skill by target."""
     found = document["mechanism"]
-    scale = [[f"`{name}`", *map(_and_range, zip(*own["scale"], strict=True))] for name, own in found.items()]
-    skilled = {name: own["skill"] for name, own in found.items() if own["skill"]}
-    targets = dict.fromkeys(target for skill in skilled.values() for target in skill)
-    skill = [[target, *(_and_range(of.get(target)) for of in skilled.values())] for target in targets]
+    scales = {name: [facts["scale"] for facts in own if facts["scale"]] for name, own in found.items()}
+    scale = [[f"`{name}`", *map(_and_range, zip(*own, strict=True))] for name, own in scales.items() if own]
+    skilled = {name: own for name, own in found.items() if own[0]["skill"]}
+    targets = dict.fromkeys(target for own in skilled.values() for facts in own for target in facts["skill"])
+    skill = [[target, *(_skill(own, target) for own in skilled.values())] for target in targets]
     columns = ["training", "s_t: first", "median", "last", "share of iterations at its limit"]
     return [(_SCALE, (columns, scale)), (_SKILL, (["target", *(f"`{name}`" for name in skilled)], skill))]
 
 
-def _and_range(values: Sequence[float] | None) -> str:
+def _skill(own: Sequence[dict[str, Any]], target: str) -> str:
+    found = [facts["skill"].get(target) for facts in own]
+    return _and_range([value for value in found if value is not None])
+
+
+def _and_range(values: Sequence[float]) -> str:
     if not values:
         return "-"
     digits = 2 if max(map(abs, values)) < 100 else 0
@@ -154,7 +160,7 @@ def _head(document: dict[str, Any]) -> str:
     machine, seed = document["hardware"], document["seed"]
     tuned = "was looked at while tuning" if seed in RETIRED_SEEDS else "was never trained or tuned on"
     others = ", ".join(document["trained_at"])
-    trained = f" (trainings: {others})" if others else ""
+    trained = f" (trained or evaluated at: {others})" if others else ""
     lines = [
         f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit "
         f"{document['git_sha'] or 'unknown'}{trained}, {machine['cpu']}, {machine['cores']} cores. RUN is "
@@ -188,7 +194,8 @@ def _main(document: dict[str, Any]) -> str:
     entries = [entry for entries in document["table_main"].values() for entry in entries]
     steps = sorted({entry["trained_steps"] for entry in entries if "trained_steps" in entry})
     trained = f"Env-steps of a training: {', '.join(f'{n:,}' for n in steps)}."
-    title = f"{_titled('Table main and ablations', document)}\n`{document['commands']['eval/main']}`"
+    commands = "\n".join(f"`{document['commands'][at]}`" for at in ("eval/NAME-SEED", "eval/main"))
+    title = f"{_titled('Table main and ablations', document)}\n{commands}"
     return f"{title}\n\n{trained} {_TTS}\n\n" + text_table(*main_table(document))
 
 
@@ -302,6 +309,8 @@ def _run(folder: RunFolder, request: dict[str, Any], watch: ReproductionWatch) -
         with folder.recorded():
             for number, step in enumerate(steps, start=1):
                 _step(step, f"{number}/{len(steps)} {step.name}", folder, watch)
+                if step.row and step.command[0] == "eval" and not row_file(folder.path, step.row).exists():
+                    folder.write_json(str(Path("rows") / f"{step.row}.json"), _row(folder.path, step))
             document = document_of(folder.path, request, steps)
             folder.write_json(RESULT, document)
             folder.write(PAGE, results_page(document))
@@ -327,19 +336,20 @@ def _step(step: Step, name: str, folder: RunFolder, watch: ReproductionWatch) ->
 
 def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
     """The ``uuv reproduce --json`` document: results of every step by its folder, and the verdicts."""
-    trained = [step.folder for step in steps if step.command[0] == "train"]
-    results = {
-        step.folder: read_json(result_file(step, root), folder=root)
-        for step in steps
-        if step.folder not in trained
-    }
+    rows = {step.row: read_json(row_file(root, step.row), folder=root) for step in steps if step.row}
+    results = {step.folder: read_json(result_file(step, root), folder=root) for step in steps if not step.row}
     record = read_json(root / "run.json", folder=root)
-    commits = {read_json(root / run / "run.json", folder=root).get("git_sha") for run in trained}
+    commits = {commit for row in rows.values() for commit in row["commits"]}
     budget = BUDGETS[request["budget"]]
     own = [plugin_spec(name).label for name in request["own"]]
-    metrics = {name: [_metrics(root / run) for run in budget.runs(name)] for name in budget.methods}
-    by_method = _by_method(results["eval/main"], metrics, own)
-    limit = load_training(METHODS[0]).uncertainty.max_scale
+    of_method = {
+        name: [rows[f"{name}-{seed}"] for seed in range(budget.training_seeds)] for name in budget.methods
+    }
+    facts = {name: [row["facts"] for row in found] for name, found in of_method.items()}
+    untrained = {entry["name"]: [_entry(entry)] for entry in results["eval/main"]["agents"]}
+    by_method = {name: [row["entry"] for row in found] for name, found in of_method.items()} | {
+        name: untrained[name] for name in ("bt", "planner", "straight", *own)
+    }
     document = {
         "schema": 2,
         "title": f"The paper reproduced, budget {request['budget']}",
@@ -347,55 +357,53 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
         "seed": EVALUATION_SEED,
         "started": record["started"],
         "git_sha": record["git_sha"],
-        "trained_at": sorted(commits - {record["git_sha"], None}),
+        "trained_at": sorted(commits - {record["git_sha"]}),
         "hardware": record["hardware"],
         "versions": record["versions"],
         "python": sys.version.split()[0],
-        "commands": {step.folder: _shown(step, root) for step in steps if step.folder in results},
+        "commands": dict(_shown(step, root) for step in steps if step.command[0] != "train"),
         "table_main": by_method,
-        "claims": [vars(claim) for claim in _claims(results, by_method, metrics[METHODS[0]], budget, own)],
-        "mechanism": {
-            name: claims.mechanism_of(rows, limit)
-            for name, rows in metrics.items()
-            if name.startswith(METHODS[0]) and all(rows)
-        },
+        "claims": [vars(claim) for claim in _claims(results, by_method, facts[METHODS[0]], budget, own)],
+        "mechanism": {name: found for name, found in facts.items() if name.startswith(METHODS[0])},
         "transfer": results.get("eval/transfer"),
         "sweep": results.get("sweep/pool"),
         "profile": results.get("profile"),
     }
-    return document | {"sections": sections_of(document, budget)}
+    made = [step.folder for step in steps if step.command[0] == "train" and (root / step.folder).is_dir()]
+    return document | {"sections": sections_of(document, made)}
 
 
-def _shown(step: Step, root: Path) -> str:
-    """Arguments without the machine's paths; NAME-SEED stands for all trainings where there are several."""
+def _shown(step: Step, root: Path) -> tuple[str, str]:
+    """Folder and arguments without the machine's paths; NAME-SEED stands for every training."""
     words = " ".join(["uuv", *step.argv(root)]).replace(str(root), "RUN")
-    return re.sub(r"(--agent RUN/train/\S+ ?){2,}", "--agent RUN/train/NAME-SEED ", words)
+    if not step.row:
+        return step.folder, words
+    return "eval/NAME-SEED", words.replace(step.row, "NAME-SEED")
 
 
-def _by_method(
-    main: dict[str, Any], metrics: dict[str, list[list[dict[str, Any]]]], own: Sequence[str]
-) -> dict[str, list[dict[str, Any]]]:
-    """Entries of the agents' table by method, a training seed each, with the env-steps of the training; of
-    their single episodes how each ended, a letter each."""
-    entries = {
-        entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"}
-        | {"ends": "".join(LETTERS[e["outcome"]] for e in entry["episodes_detail"])}
-        for entry in main["agents"]
-    }
-    trained = {
-        name: [
-            entries[f"{name}-{seed}"] | {"trained_steps": round(rows[-1]["time/env_steps"]) if rows else 0}
-            for seed, rows in enumerate(of_seeds)
-        ]
-        for name, of_seeds in metrics.items()
-    }
-    return trained | {name: [entries[name]] for name in ("bt", "planner", "straight", *own)}
+def _row(root: Path, step: Step) -> dict[str, Any]:
+    """All that counts of a training, once it is evaluated."""
+    training = root / "train" / step.row
+    (agent,) = read_json(result_file(step, root), folder=root)["agents"]
+    rows = _metrics(training)
+    trained = {"trained_steps": round(rows[-1]["time/env_steps"]) if rows else 0}
+    records = [read_json(place / "run.json", folder=root) for place in (training, root / step.folder)]
+    commits = [record["git_sha"] for record in records if record.get("git_sha")]
+    limit = load_training(METHODS[0]).uncertainty.max_scale
+    facts = claims.training_facts(rows, limit)
+    return {"schema": 1, "entry": _entry(agent) | trained, "facts": facts, "commits": commits}
+
+
+def _entry(agent: dict[str, Any]) -> dict[str, Any]:
+    """Of an agent's single episodes how each ended, a letter each."""
+    ends = "".join(LETTERS[e["outcome"]] for e in agent["episodes_detail"])
+    return {k: v for k, v in agent.items() if k != "episodes_detail"} | {"ends": ends}
 
 
 def _claims(
     results: dict[str, Any],
     by_method: dict[str, Any],
-    trainings: list[list[dict[str, Any]]],
+    trainings: list[dict[str, Any]],
     budget: Budget,
     own: Sequence[str],
 ) -> list[Claim]:

@@ -58,6 +58,8 @@ class Step:
     folder: str
     resumes: bool = False  # what was begun is gone on with by ``--resume``; other commands begin anew
     to_file: bool = False  # the command has no run folder: what it prints is kept
+    row: str = ""
+    """the training that it makes or evaluates; once the row of that is written, nothing is left to do"""
 
     def argv(self, root: Path, resume: bool = False) -> list[str]:
         """Arguments of ``uuv`` with the folder, as they are run."""
@@ -74,20 +76,16 @@ def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
     Everything drives on the paper's stack, on which the policies were trained. A training is evaluated as it
     was at its end: the presets choose no checkpoint by its success.
     """
-    trainings = [
-        Step(
-            f"train {method}, seed {seed}",
-            _train(method, seed, budget.iterations),
-            budget.runs(method)[seed],
-            resumes=True,
-        )
-        for seed in range(budget.training_seeds)
-        for method in budget.methods
-    ]
     at = ("--set", "stack=paper", "--seeds", str(EVALUATION_SEED), "--episodes")
-    places = [str(root / run) for method in budget.methods for run in budget.runs(method)]
-    judged = ("eval", *_agents("straight", "planner", "bt", *own, *places), *at, str(budget.episodes))
-    steps = [*trainings, Step("Table main and ablations", judged, "eval/main")]
+    main = ("eval", *_agents("straight", "planner", "bt", *own), *at, str(budget.episodes))
+    steps = [Step("agents that are not trained", main, "eval/main")]
+    for seed in range(budget.training_seeds):
+        for method in budget.methods:
+            place, name = budget.runs(method)[seed], f"{method}-{seed}"
+            training = _train(method, seed, budget.iterations)
+            judged = ("eval", *_agents(str(root / place)), *at, str(budget.episodes))
+            steps.append(Step(f"train {method}, seed {seed}", training, place, resumes=True, row=name))
+            steps.append(Step(f"evaluate {method}, seed {seed}", judged, f"eval/{name}", row=name))
     return steps + (_beside_training(budget, root, own, at) if budget.sweep_episodes else [])
 
 
@@ -125,6 +123,8 @@ def _agents(*names: str) -> tuple[str, ...]:
 def is_done(step: Step, root: Path) -> bool:
     """Whether nothing is left to run. A training may have been made beforehand by its own command: it leaves
     in its folder all that counts."""
+    if step.row and row_file(root, step.row).exists():
+        return True
     if step.command[0] != "train" and not result_file(step, root).exists():
         return False
     try:
@@ -132,6 +132,11 @@ def is_done(step: Step, root: Path) -> bool:
         return step.to_file or record["status"] == "finished"
     except (FileError, OSError, KeyError, TypeError):
         return False
+
+
+def row_file(root: Path, name: str) -> Path:
+    """Where lies what counts of a training and its evaluation: all that a reproduction elsewhere needs."""
+    return root / "rows" / f"{name}.json"
 
 
 def result_file(step: Step, root: Path) -> Path:
