@@ -12,6 +12,11 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from uuvtai.api import evaluate as evaluate
+    from uuvtai.api import load_log as load_log
+    from uuvtai.api import show as show
+    from uuvtai.api import sweep as sweep
+    from uuvtai.api import train as train
     from uuvtai.envs.vector_env import VectorEnv
 
 # Taichi prints a banner to stdout when it is imported; stdout belongs to results
@@ -56,3 +61,19 @@ def make(
         check_actions,
         owns_sim=True,
     )
+
+
+_OF_API = ("evaluate", "load_log", "show", "sweep", "train")
+
+
+def __getattr__(name: str) -> Any:
+    """The commands as functions, imported when one is asked for: they take a second or two."""
+    if name not in _OF_API:
+        raise AttributeError(f"module 'uuvtai' has no attribute {name!r}")
+    from uuvtai import api
+
+    return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_OF_API]

@@ -75,7 +75,8 @@ def test_the_site_builds_without_a_warning_and_lacks_no_page(site):
 def test_the_page_of_the_python_api_has_what_programs_use(site):
     page = (site / "extend.html").read_text() + (site / "logs.html").read_text()
     for name in (
-        "uuvtai.make", "uuvtai.envs.vector_env.VectorEnv.step", "uuvtai.envs.gymnasium.UuvVectorEnv.step",
+        "uuvtai.make", "uuvtai.api.Log.messages",
+        "uuvtai.envs.vector_env.VectorEnv.step", "uuvtai.envs.gymnasium.UuvVectorEnv.step",
         "uuvtai.envs.gymnasium.UuvEnv.step", "uuvtai.learning.policy_agent.PolicyAgent.act",
         "uuvtai.learning.export.run_policy.Policy.act", "uuvtai.logs.reader.read_messages",
     ):  # fmt: skip
@@ -359,7 +360,7 @@ def test_the_tables_of_the_python_page_are_those_of_the_environment(small):
 # --------------------------------------------------------------------------------------------------- notebook
 
 
-def test_the_tutorial_runs():
+def test_the_tutorial_runs(tmp_path):
     """In a process of its own with the small simulator's sizes (compiled by ``tests/warm.py``)."""
     nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
     client = pytest.importorskip("nbclient", reason="nbclient is not installed")
@@ -367,8 +368,12 @@ def test_the_tutorial_runs():
     assert not any(cell.outputs for cell in notebook.cells if cell.cell_type == "code"), (
         "commit it without outputs"
     )
-    client.NotebookClient(notebook, timeout=600, startup_timeout=300, kernel_name="python3").execute()
+    place = {"metadata": {"path": str(tmp_path)}}
+    client.NotebookClient(
+        notebook, timeout=600, startup_timeout=300, kernel_name="python3", resources=place
+    ).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+    assert any("<td>planner</td>" in output.get("data", {}).get("text/html", "") for output in outputs)
     printed = "".join(output.get("text", "") for output in outputs)
-    assert "sector_range" in printed and re.search(r"success [0-8]/8, 95 % interval", printed)
+    assert "sector_range" in printed and "replans an episode: [" in printed

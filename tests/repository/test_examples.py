@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import uuvtai
 from tests.conftest import configure
 from tests.kernels.world.test_world import Drawn
 from uuvtai.compile.runtime import start_taichi
@@ -202,10 +203,13 @@ def test_custom_reward_changes_the_terms_it_names(small, example, monkeypatch):
     assert float(rows[-1].split()[1]) == pytest.approx(float(default.sum()), abs=0.01)
 
 
-def test_custom_tree_stands_beside_the_shipped_ones(short, example):
-    head, *rows = example("custom_tree").main(short, episodes=4).splitlines()
-    assert head.split()[0] == "tree" and [row.split()[0] for row in rows] == ["patient", "bt", "planner"]
-    assert all("/4 (" in row for row in rows)
+def test_custom_tree_stands_beside_the_shipped_ones(example, monkeypatch):
+    asked = []
+    monkeypatch.setattr(uuvtai, "evaluate", lambda *given, **words: asked.append((given, words)) or "a table")
+    assert example("custom_tree").main(seeds=3) == "a table"
+    (((trees, world), words),) = asked
+    assert [agent.name for agent in load_agents(list(map(str, trees)), 64)] == ["patient", "bt", "planner"]
+    assert world == "pool" and words == {"episodes": 128, "seeds": 3}
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*_*.py")), ids=lambda path: path.stem)
