@@ -22,7 +22,6 @@ from uuvtai.learning.forecast import (
     Mixture,
     MixtureNet,
     TrackMoments,
-    column_row,
     negative_log_likelihood,
     scores_of,
     watch,
@@ -223,4 +222,3 @@ def test_a_forecast_is_the_same_in_any_row_and_company(learned):
     for one, other in zip(*found, strict=True):
         assert [name for name in one if not np.array_equal(one[name], other[name])] == []
     assert found[0][0]["futures.share"].any()
-    assert column_row().slice == slice(0, COLUMNS)

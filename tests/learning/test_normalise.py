@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from uuvtai.learning.networks import MIN_STD, RunningNorm, combined, moments_of
+from uuvtai.learning.networks import MIN_STD, Moments, RunningNorm, combined, moments_of
 
 EXACT = 1e-12
 """relative; float64 sums in another order"""
@@ -45,7 +45,7 @@ def test_batches_of_any_shape_and_size_merge_to_the_whole(samples):
     norm.update(samples[:4000].view(40, 100, 3))
     for part in samples[4000:].split(7):
         norm.update(part)
-    assert_moments(norm.moments, samples)
+    assert_moments(Moments(norm.mean, norm.m2, norm.count), samples)
     assert torch.allclose(norm.std(), samples.double().std(0, correction=0), rtol=EXACT)
 
 

@@ -189,7 +189,7 @@ def test_minibatches_cover_every_sample_once(minibatches, shuffle):
     assert sorted(together.tolist()) == list(range(T * N))
     assert torch.equal(together, batch["log_prob"]) != shuffle
     if not shuffle:
-        assert ppo_module._rows(batch, index[0])["x"].data_ptr() == batch["x"].data_ptr(), "nothing is copied"
+        assert batch["x"][index[0]].data_ptr() == batch["x"].data_ptr(), "nothing is copied"
 
 
 def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):

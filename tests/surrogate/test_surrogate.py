@@ -93,32 +93,9 @@ def judge(
             motion.part(pose, i, 9, 3),
         )
         axis_w = ti.Vector([ti.cos(pose[i, 3]), ti.sin(pose[i, 3]), 0.0])
-        threat = motion.nearest_of(-1, i, pos_w, axis_w, vel_w, pose[i, 7], pose[i, 8], body, path, io)
+        threat = motion.nearest_of(i, pos_w, axis_w, vel_w, pose[i, 7], pose[i, 8], body, path, io)
         seen[i, 0], seen[i, 1] = threat[0], threat[1]
         outcome[i] = verdict(pos_w, axis_w, goal_w, threat, 0, io.episode_cfg, io.vehicle_cfg, io.tank_cfg)
-
-
-@ti.kernel
-def threats(
-    near_only: int,
-    pose: FloatMatrix,
-    moved: FloatMatrix,
-    io: Bundle[Rules],
-    body: AnyTensor,
-    path: AnyTensor,
-    out: FloatMatrix,
-):
-    """Clearance and time to collision after hulls moved by (x, y, z, t), of near or of all obstacles."""
-    for i in range(pose.shape[0]):
-        before = motion.part(pose, i, 0, 3)
-        after = before + motion.part(moved, i, 0, 3)
-        near = -1
-        if near_only == 1:
-            near = motion.near_slots(i, before, pose[i, 3], body, path, io)
-        ahead = ti.Vector([1.0, 0.0, 0.0])
-        t_s = pose[i, 3] + moved[i, 3]
-        threat = motion.nearest_of(near, i, after, ahead, ahead, 0.0, t_s, body, path, io)
-        out[i, 0], out[i, 1] = threat[0], threat[1]
 
 
 @ti.kernel
@@ -294,27 +271,6 @@ def test_far_obstacles_are_left_out(config):
     judge(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
     assert seen[0, 1] == FAR_M and outcome[0] == 0
     assert seen[0, 0] == pytest.approx(3.0 - 0.17, abs=FLOAT_TOL)  # the side walls
-
-
-@pytest.mark.parametrize("slots", [0, 30])
-def test_no_obstacle_that_can_come_near_is_left_out(bank, config, slots):
-    """Nothing changes where those alone are looked at that were near when the decision began, however the
-    hull has moved since; nor where there are more slots than an integer has bits."""
-    rng, count = np.random.default_rng(3), len(bank.obstacle)
-    rules, changed = bind(Rules, config), 0
-    body = torch.cat([torch.zeros(count, slots, 8), bank.obstacle], dim=1).contiguous()
-    for _ in range(200):
-        pose, moved = rng.uniform(0, 1, (count, 4)), rng.uniform(-1, 1, (count, 4))
-        pose = pose * [20.0, 6.0, -1.6, 30.0]
-        moved = moved / np.linalg.norm(moved[:, :3], axis=1, keepdims=True) * 0.25
-        moved[:, 3] = rng.uniform(0, 0.1, count)
-        pose, moved = (torch.from_numpy(a.astype(np.float32)) for a in (pose, moved))
-        all_of_them, near = torch.zeros(count, 2), torch.zeros(count, 2)
-        threats(0, pose, moved, rules, body, bank.path, all_of_them)
-        threats(1, pose, moved, rules, body, bank.path, near)
-        assert torch.equal(near, all_of_them)
-        changed += int((near[:, 1] < FAR_M).sum())
-    assert changed > 100, "obstacles come closer"
 
 
 def test_a_route_is_followed_as_in_the_simulator(small, config):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
 from uuvtai.common.files import parsed_json, read_bytes
@@ -20,6 +20,7 @@ from uuvtai.learning.checkpoint import (
     MODEL,
     Checkpoint,
     CheckpointError,
+    Note,
     best,
     entry_of,
     open_checkpoint,
@@ -30,39 +31,35 @@ from uuvtai.learning.policy_agent import AgentDecision, HeldAgent, by_chunk, loa
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetActor, actor_of
 
 if TYPE_CHECKING:
-    from uuvtai.envs.vector_env import ObservationColumn
     from uuvtai.sim.sim import Sim
 
 
 _FEWEST = 25
-"""numbers that a checkpoint holds; those that came later are not changed where it lacks them"""
+"""numbers that a checkpoint holds; later ones, which it may lack, are not changed"""
 
 
 class TunedAgent(HeldAgent):
     """Lets the simulator's tree drive, with other numbers from the first decision after a reset on."""
 
-    def __init__(self, log_factor: torch.Tensor, sim: Sim) -> None:
-        """``log_factor`` (n_tuned, 2) natural logarithms of the factors, in the order of ``TUNED``, for slow
-        obstacles and for fast ones."""
+    def __init__(self, log_factor: Tensor, sim: Sim) -> None:
+        """``log_factor`` (n_tuned, 2) natural logarithms of the factors, for slow obstacles and fast ones."""
         super().__init__(sim.num_envs, 1, sim.device)
         self.simulator = sim
         rows = sim.s.behavior.tuned.shape[0]
         self.log_factor = log_factor.float().cpu().numpy()[None].repeat(rows, axis=0)
         """(rows, n_tuned, 2) of every row that is allocated"""
 
-    def reset(self, rows: torch.Tensor) -> None:
-        """As ``HeldAgent``: a reset has set the numbers of these rows back."""
+    def reset(self, rows: Tensor) -> None:
+        """A reset has set the numbers of these rows back."""
         self.simulator.put(self.simulator.s.behavior.tuned, self.log_factor)
 
-    def decide(self, obs: torch.Tensor) -> AgentDecision:
-        """What the tree has chosen."""
+    def decide(self, obs: Tensor) -> AgentDecision:
         self.decision = self.decision._replace(action=self.simulator.action.clone())
         return self.decision
 
 
 def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
-    """PolicyAgent of a checkpoint that holds numbers of the tree. Raises CheckpointError where they are none
-    that a training can leave."""
+    """Agent of a checkpoint that holds numbers of the tree. Raises CheckpointError for impossible ones."""
     try:
         found = checkpoint.model()["tree"]["log_factor"]
         known = len(found)
@@ -80,33 +77,18 @@ def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
     return TunedAgent(found, sim)
 
 
-def tuned_sections(log_factor: torch.Tensor) -> dict[str, dict[str, float]]:
-    """Sections ``slow`` and ``fast`` of the config by which a stack drives as these factors (n_tuned, 2) do,
-    to four digits."""
-    factors = np.exp(log_factor.double().numpy())
+def tuned_sections(log_factor: Tensor) -> dict[str, dict[str, float]]:
+    """Sections ``slow`` and ``fast`` of a stack that drives by these factors (n_tuned, 2), to four digits."""
+    names, factors = [number.name for number in TUNED], np.exp(log_factor.double().numpy())
     return {
-        section: {
-            number.name: float(f"{factor:.4g}")
-            for number, factor in zip(TUNED, factors[:, part], strict=True)
-        }
+        section: {name: float(f"{x:.4g}") for name, x in zip(names, factors[:, part], strict=True)}
         for section, part in (("slow", SLOW), ("fast", FAST))
     }
 
 
-def tree_row() -> ObservationColumn:
-    """The observation of such an agent, for a checkpoint's manifest."""
-    from uuvtai.envs.vector_env import ObservationColumn
-
-    return ObservationColumn("tree", slice(0, 4), "1", "body", "what the behaviour tree asks for")
-
-
-# ------------------------------------------------------------------------------------------------------------
-# A policy over a set of obstacles driving the simulator: a wish for a velocity ten times a second,
-# laid on the hull by the fixed rule in every control step.
-
-
 class SetAgent(HeldAgent):
-    """Drives the rows of a simulator; it looks at tracks, map and pose itself, as the vehicle has them."""
+    """A policy over a set of obstacles driving the rows of a simulator: a wish for a velocity ten times a
+    second, laid on the hull in every control step. It looks at tracks, map and pose itself."""
 
     def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
         """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
@@ -119,20 +101,18 @@ class SetAgent(HeldAgent):
         zeros = self._zeros
         self.ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_OBSTACLE, RAW_WIDTH), zeros(N_RAY)
         self.obstacles, self.own = zeros(N_OBSTACLE, OBSTACLE_WIDTH), zeros(EGO_COLUMNS)
-        """columns that the last decision was made from"""
         self.wish, self._last, self._command = zeros(NUM_WISHES), zeros(NUM_WISHES), zeros(4)
-        """what is wished now, and what the vehicle is told of its last decision; (rows, NUM_WISHES)"""
+        """what is wished now, and what was carried out of the last decision"""
         std = torch.cat([actor.log_std.detach().exp(), torch.zeros(1, device=sim.device)])
         self.decision = self.decision._replace(std=std)
 
-    def reset(self, rows: torch.Tensor) -> None:
-        """As ``HeldAgent``."""
+    def reset(self, rows: Tensor) -> None:
         super().reset(rows)
         self._last *= (self._age > 0)[:, None]
 
     @torch.no_grad()
-    def decide(self, obs: torch.Tensor) -> AgentDecision:
-        """As ``HeldAgent``; ``obs`` is not looked at."""
+    def decide(self, obs: Tensor) -> AgentDecision:
+        """``obs`` is not looked at."""
         due = self._due()
         if len(due):
             self.look()
@@ -141,19 +121,18 @@ class SetAgent(HeldAgent):
         self.decision = self.decision._replace(action=self.command())
         return self.decision
 
-    def command(self) -> torch.Tensor:
+    def command(self) -> Tensor:
         """(rows, 4) of the wish, by the hull rule, where each vehicle is now."""
         from uuvtai.surrogate.observation import command_hull
 
         command_hull(self._io, self._gap_m, self.wish, self._command)
         return self._command.clone()
 
-    def memory(self) -> dict[str, torch.Tensor]:
+    def memory(self) -> dict[str, Tensor]:
         """What the next decisions depend on."""
         return {"last": self._last, "age": self._age}
 
     def advance(self) -> None:
-        """As ``HeldAgent``."""
         due, wish = self._due(), self.wish
         long = wish[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
         self._last[due] = torch.cat([wish[:, :2] / long, wish[:, 2:].clamp(-1.0, 1.0)], dim=1)[due]
@@ -171,8 +150,7 @@ class SetAgent(HeldAgent):
 
 
 def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:
-    """PolicyAgent of a policy that learnt in the surrogate. Raises CheckpointError where its networks are not
-    those of its config."""
+    """Agent of a policy over a set of obstacles. Raises CheckpointError for networks that do not fit."""
     from uuvtai.surrogate.observation import SET_TABLE
 
     checkpoint.check_table(SET_TABLE, sim.config)
@@ -180,15 +158,9 @@ def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:
     return SetAgent(actor.to(sim.device), sim, config.policy.hold_steps, config.surrogate.vertical_gap_m)
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
-def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
+def find_policy(name: str, note: Note = lambda _text: None) -> Checkpoint:
     """The built-in policy, or the checkpoint of a checkpoint folder or of a run folder (its best, else its
-    newest).
-
-    Raises ConfigError for what is none of them, CheckpointError for what cannot be used.
-    """
+    newest). Raises ConfigError for what is none of them, CheckpointError for what cannot be used."""
     path = Path(name)
     if name == POLICY:
         return _built_in()
@@ -203,8 +175,7 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
 
 
 def _built_in() -> Checkpoint:
-    """The policy that comes with the package: one file, the manifest of its checkpoint inside. It has today's
-    config of its preset, so that it drives whatever keys were renamed since."""
+    """The policy of the package: one file, the manifest inside, with today's config of its preset."""
     path = PRESET_DIR / POLICY
     with refused(path / MODEL):
         content = read_bytes(path / MODEL, LARGEST[MODEL], path)

@@ -28,6 +28,7 @@ import torch
 import zstandard
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
+from torch import Tensor
 
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import (
@@ -52,22 +53,13 @@ class CheckpointError(UserError, RuntimeError):
     """A checkpoint that cannot be used or written: what, where, why, what to type next."""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Nested state as named tensors and plain JSON, and back to the last bit; big arrays as one compressed stream
-# of known size.
-
-
-def pack(state: Any, name: str = "state") -> tuple[Any, dict[str, torch.Tensor]]:
-    """(plain, tensors): ``plain`` is JSON with references to ``tensors``, which are on the host, contiguous,
-    and copies only where they must be.
-
-    Dictionaries, lists, tuples, tensors, NumPy arrays, numbers, texts, booleans and None are kept as they
-    are; anything else is a CheckpointError that names the place.
-    """
-    tensors: dict[str, torch.Tensor] = {}
+def pack(state: Any, name: str = "state") -> tuple[Any, dict[str, Tensor]]:
+    """Nested state as (plain, tensors): JSON with references to host tensors, back to the last bit by
+    ``unpack``. CheckpointError, naming the place, for what can be neither."""
+    tensors: dict[str, Tensor] = {}
 
     def packed(node: Any, place: str) -> Any:
-        if isinstance(node, torch.Tensor | np.ndarray):
+        if isinstance(node, Tensor | np.ndarray):
             if place in tensors:
                 raise CheckpointError(f"{place}: two tensors have this name")
             is_array = isinstance(node, np.ndarray)
@@ -90,7 +82,7 @@ def pack(state: Any, name: str = "state") -> tuple[Any, dict[str, torch.Tensor]]
     return packed(state, name), tensors
 
 
-def unpack(plain: Any, tensors: dict[str, torch.Tensor]) -> Any:
+def unpack(plain: Any, tensors: dict[str, Tensor]) -> Any:
     """The state that ``pack`` was given. Raises FileError."""
 
     def unpacked(node: dict[str, Any]) -> Any:
@@ -113,7 +105,7 @@ def unpack(plain: Any, tensors: dict[str, torch.Tensor]) -> Any:
         raise FileError(f"the packed state does not fit together ({error!r})") from None
 
 
-def write_stream(path: Path, tensors: dict[str, torch.Tensor]) -> None:
+def write_stream(path: Path, tensors: dict[str, Tensor]) -> None:
     """Compress host tensors one after the other into a new file."""
     size = sum(tensor.nbytes for tensor in tensors.values())
     compressor = zstandard.ZstdCompressor(level=1, write_checksum=True)  # higher ones: hardly smaller, slow
@@ -122,15 +114,12 @@ def write_stream(path: Path, tensors: dict[str, torch.Tensor]) -> None:
             stream.write(tensor.numpy().tobytes())
 
 
-def read_stream(path: Path, like: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Read tensors as they are in ``like`` and nothing else: a file cannot unfold to more than its reader
-    expects. Raises FileError."""
+def read_stream(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors as they are in ``like``: a file cannot unfold to more than expected. Raises FileError."""
     found = {}
     try:
-        with (
-            open_file(path, LARGEST[SIMULATOR], path.parent) as file,
-            zstandard.ZstdDecompressor().stream_reader(file) as stream,
-        ):
+        with open_file(path, LARGEST[SIMULATOR], path.parent) as file:
+            stream = zstandard.ZstdDecompressor().stream_reader(file)
             for name, tensor in like.items():
                 content = stream.read(tensor.nbytes)
                 if len(content) < tensor.nbytes:
@@ -144,33 +133,28 @@ def read_stream(path: Path, like: dict[str, torch.Tensor]) -> dict[str, torch.Te
     return found
 
 
-def layout_of(tensors: dict[str, torch.Tensor]) -> list[tuple[str, str, list[int]]]:
+def layout_of(tensors: dict[str, Tensor]) -> list[tuple[str, str, list[int]]]:
     """(name, NumPy dtype, shape) of every tensor, in the order of a stream."""
     return [(name, str(tensor.numpy().dtype), list(tensor.shape)) for name, tensor in tensors.items()]
 
 
 # ------------------------------------------------------------------------------------------------------------
-# The manifest of a checkpoint: what it is, for which observation and action, and the sha256 of every file.
-# Read without trust.
+# The manifest, read without trust.
 
 
 SCHEMA = 1
-"""of the folder; another one is refused"""
 READABLE_VERSIONS = ("0.1",)
 """uuvtai's series whose checkpoints mean the same to this one: same networks, same columns, same units"""
 
 MANIFEST = "manifest.json"
 MODEL, TRAINING, SIMULATOR = "model.safetensors", "training.safetensors", "simulator.zst"
 LARGEST = {MODEL: 256 << 20, TRAINING: 512 << 20, SIMULATOR: 8 << 30}
-"""[bytes] most that a file may have; the first two are read into memory, the last one as far as its reader
-expects. A policy drives by the first one alone"""
+"""[bytes] of a file; a policy drives by the first one alone"""
 _MAX_BYTES, _CHUNK_BYTES = 8 << 20, 1 << 20
 """of a manifest; of a file at once"""
 
 
 class FileEntry(BaseModel):
-    """Size and content of one file."""
-
     model_config = ConfigDict(extra="forbid", strict=True)
     bytes: int = Field(ge=0)
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
@@ -180,7 +164,6 @@ class Manifest(BaseModel):
     """What ``manifest.json`` says."""
 
     model_config = ConfigDict(extra="forbid", strict=True, populate_by_name=True)
-
     schema_number: int = Field(alias="schema")
     version: str
     created: str
@@ -200,9 +183,6 @@ class Manifest(BaseModel):
     simulator_layout: list[tuple[str, str, list[int]]] | None = None
 
 
-# -------------------------------------------------------------------------------------- reading without trust
-
-
 def manifest_content(path: Path) -> bytes:
     """Bytes of a checkpoint folder's manifest. Raises CheckpointError."""
     file = path / MANIFEST
@@ -215,8 +195,7 @@ def manifest_content(path: Path) -> bytes:
 
 
 def parsed(content: bytes) -> Manifest:
-    """The manifest itself. Raises FileError for another schema or version before anything else is looked at,
-    ValueError for nonsense."""
+    """Raises FileError for another schema or version before all else, ValueError for nonsense."""
     try:
         raw = parsed_json(content, MANIFEST)
     except FileError as error:
@@ -225,14 +204,9 @@ def parsed(content: bytes) -> Manifest:
         raise FileError("is not a manifest of uuvtai")
     version = str(raw.get("version"))
     if raw["schema"] != SCHEMA:
-        raise FileError(
-            f"has schema {raw['schema']!r}, this uuvtai reads {SCHEMA}; use the version that wrote it: "
-            f"{version}"
-        )
+        raise FileError(f"has schema {raw['schema']!r}, this uuvtai reads {SCHEMA}; use version {version}")
     if version.rpartition(".")[0] not in READABLE_VERSIONS:
-        raise FileError(
-            f"was written by uuvtai {version}, this is {__version__}; use that version, or train again"
-        )
+        raise FileError(f"was written by uuvtai {version}, this is {__version__}; use that version")
     return Manifest.model_validate_json(content)
 
 
@@ -280,16 +254,11 @@ def refused(file: Path) -> Iterator[None]:
     except FileError as error:
         raise CheckpointError(f"{file}: {str(error).removeprefix(f'{file}: ')}") from None
     except (ValueError, RecursionError, OSError) as error:
-        raise CheckpointError(
-            f"{file}: cannot be read ({error}); take another checkpoint of the run"
-        ) from None
-
-
-# ----------------------------------------------------------------------------------------------------- tables
+        raise CheckpointError(f"{file}: cannot be read ({error}); take another checkpoint") from None
 
 
 def table_rows(table: Sequence[Any]) -> list[dict[str, Any]]:
-    """An observation table (rows of ``env.ObservationColumn``) as the manifest keeps it."""
+    """An observation table (rows of ``ObservationColumn``) as the manifest keeps it."""
     return [
         {"name": c.name, "first": c.slice.start, "stop": c.slice.stop, "unit": c.unit, "frame": c.frame}
         for c in table
@@ -305,29 +274,24 @@ def action_rows(config: Config) -> list[dict[str, Any]]:
 
 
 def config_sha256(config: dict[str, Any]) -> str:
-    """Of a config's values as canonical JSON."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
 def finite(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics as JSON can hold them: NaN and infinity become None."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in metrics.items()
-    }
+    bad = {name for name, value in metrics.items() if isinstance(value, float) and not math.isfinite(value)}
+    return {name: None if name in bad else value for name, value in metrics.items()}
 
 
 # ------------------------------------------------------------------------------------------------------------
 
 
-MODEL_PARTS = ("policy", "world_model", "forecast", "tree")
-"""parts of a trainer's state that go into model.safetensors"""
-SIMULATOR_PART = "env"
-"""part of a trainer's state that goes into simulator.zst"""
-
+MODEL_PARTS, SIMULATOR_PART = ("policy", "world_model", "forecast", "tree"), "env"
+"""parts of a trainer's state that go into model.safetensors and into simulator.zst"""
 _KEEP_SIMULATORS = 2
 """newest checkpoints that keep the simulator's state: the last one, and one in case the disk damages it"""
 _STEP = "step_"
+Note = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -351,16 +315,13 @@ class Checkpoint:
         return all((self.path / name).is_file() for name in LARGEST)
 
     def model(self) -> dict[str, Any]:
-        """State of the networks, by the names of MODEL_PARTS that were saved. Raises CheckpointError."""
+        """State of the networks, by name. Raises CheckpointError."""
         return self._part(MODEL, self.manifest.model)
 
     def state(self, like: Mapping[str, Any]) -> dict[str, Any]:
-        """The trainer's whole state. ``like`` is the state of the trainer it is meant for: a simulator of
-        another size is refused."""
+        """The whole state, for a trainer whose own is ``like``: a simulator of another size is refused."""
         if not self.is_resumable:
-            raise CheckpointError(
-                f"{self.path}: has networks only and cannot be trained on; resume the run's newest checkpoint"
-            )
+            raise CheckpointError(f"{self.path}: has networks only; resume the run's newest checkpoint")
         plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART)
         own = self.manifest.simulator, self.manifest.simulator_layout
         if own != (plain, layout_of(expected)):
@@ -374,12 +335,10 @@ class Checkpoint:
         return self.model() | training | {SIMULATOR_PART: simulator}
 
     def check_table(self, table: Sequence[Any], config: Config) -> None:
-        """Raise CheckpointError where an environment's observation or action is not what the policy was
-        trained for."""
-        for what, own, theirs in (
-            ("observation", self.manifest.observation_table, table_rows(table)),
-            ("action", self.manifest.action, action_rows(config)),
-        ):
+        """Raise CheckpointError where an environment's observation or action is another one."""
+        of, action = self.manifest, action_rows(config)
+        pairs = ("observation", of.observation_table, table_rows(table)), ("action", of.action, action)
+        for what, own, theirs in pairs:
             if own != theirs:
                 different = (pair for pair in zip(own, theirs, strict=False) if pair[0] != pair[1])
                 mine, other = next(different, (f"{len(own)} rows", len(theirs)))
@@ -396,9 +355,6 @@ class Checkpoint:
             return unpack(plain, safetensors.torch.load(content))
 
 
-# ---------------------------------------------------------------------------------------------------- writing
-
-
 def save(
     checkpoints: Path,
     step: int,
@@ -408,13 +364,9 @@ def save(
     metrics: Mapping[str, Any] | None = None,
     score: float | None = None,
 ) -> Path:
-    """Write ``checkpoints/step_N`` and thin out older ones (newest ``train.keep_checkpoints`` and the best
-    stay).
-
-    ``state`` is what ``Trainer.state`` gives: MODEL_PARTS, SIMULATOR_PART and whatever else training needs,
-    nested. ``score``: higher is better. Raises CheckpointError where the disk refuses; then nothing
-    half-written is taken for a checkpoint.
-    """
+    """Write ``checkpoints/step_N`` of what ``Trainer.state`` gives, and thin out older ones (the newest
+    ``train.keep_checkpoints`` and that of the highest ``score`` stay). Raises CheckpointError where the disk
+    refuses; then nothing half-written is taken for a checkpoint."""
     target, plain = checkpoints / f"{_STEP}{step:06d}", config.model_dump(mode="json")
     try:
         checkpoints.mkdir(parents=True, exist_ok=True)
@@ -456,7 +408,7 @@ def save(
 
 
 def _write_parts(folder: Path, state: Mapping[str, Any]) -> dict[str, Any]:
-    """Write the files of ``state``; what the manifest says of them."""
+    """What the manifest says of the files."""
     model = {name: state[name] for name in MODEL_PARTS if state.get(name) is not None}
     training = {name: part for name, part in state.items() if name not in (*MODEL_PARTS, SIMULATOR_PART)}
     described = {}
@@ -486,34 +438,24 @@ def _remove(folder: Path) -> None:
     shutil.rmtree(doomed)
 
 
-# ---------------------------------------------------------------------------------------------------- reading
-
-
 def open_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint's manifest and verify every file. Raises CheckpointError."""
     content = manifest_content(path)
     with refused(path / MANIFEST):
         manifest = parsed(content)
-        # keys that are younger than this config get their defaults, which mean what was done before there was
-        # a choice
+        # younger keys get their defaults, which mean what was done before there was a choice
         config = LearningConfig.model_validate_json(json.dumps(manifest.config), strict=True)
         if config_sha256(manifest.config) != manifest.config_sha256:
             raise FileError("its config does not have the sha256 that it states")
     if unknown := manifest.files.keys() - LARGEST:
-        raise CheckpointError(
-            f"{path / MANIFEST}: lists the file {min(unknown)!r}, which no checkpoint has; it was not "
-            "written by uuvtai"
-        )
+        raise CheckpointError(f"{path / MANIFEST}: lists {min(unknown)!r}, which no checkpoint has")
     for name in LARGEST:
         _verify(path / name, manifest.files.get(name))
     return Checkpoint(path, manifest, config, hashlib.sha256(content).hexdigest())
 
 
 def newest(
-    run: Path,
-    note: Callable[[str], None] = lambda _text: None,
-    resumable: bool = False,
-    first: Path | None = None,
+    run: Path, note: Note = lambda _text: None, resumable: bool = False, first: Path | None = None
 ) -> Checkpoint:
     """Newest checkpoint of a run folder that passes verification, ``first`` looked at before all others;
     ``note`` is told of those that do not pass. Raises CheckpointError."""
@@ -533,7 +475,7 @@ def newest(
     raise CheckpointError(f"{checkpoints}: holds no usable checkpoint{why}; give a run of 'uuv train'")
 
 
-def best(run: Path, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
+def best(run: Path, note: Note = lambda _text: None) -> Checkpoint:
     """The checkpoint with the highest score, else the newest one. Raises CheckpointError."""
     return newest(run, note, first=_best_folder(_folders(run / "checkpoints")))
 

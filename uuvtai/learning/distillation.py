@@ -1,10 +1,8 @@
-"""Distillation: the policy's mean is drawn towards the behaviour tree's action, more strongly where the world
-model is unsure.
+"""Distillation: the policy's mean is drawn towards the behavior tree's action, more strongly where the world
+model is unsure (docs/learning.md).
 
-The paper's term is lambda_t E ||mu(x) - a_BT||^2 with the squared norm over the four actions. It stands in
-the PPO loss, with lambda_t = lambda(share of the run) times the scale s_t of ``Uncertainty``, and again in
-separate teacher batches with an Adam of their own. Adam forgets a constant factor of the loss, so in these
-batches lambda_t scales the learning rate instead.
+The paper's term, lambda_t s_t E ||mu(x) - a_BT||^2, stands in the PPO loss and again in teacher batches with
+an Adam of their own, which forgets a constant factor: there it scales the learning rate.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -33,19 +31,15 @@ if TYPE_CHECKING:
     from uuvtai.sim.sim import Sim
 
 
-def imitation_error(mean: torch.Tensor, teacher_action: torch.Tensor) -> torch.Tensor:
-    """||mean - teacher_action||^2 of every sample: (..., 4) and (..., 4) to (...,), in squared parts of the
-    vehicle's limits."""
+def imitation_error(mean: Tensor, teacher_action: Tensor) -> Tensor:
+    """||mean - teacher_action||^2 (...,) of every sample, in squared parts of the vehicle's limits."""
     return (mean - teacher_action).square().sum(dim=-1)
 
 
-def leaf_errors(names: Sequence[str], error: torch.Tensor, leaf: torch.Tensor) -> dict[str, float]:
-    """``distillation/loss``, the mean of imitation errors (n,), and ``distillation/leaf/<name>``, that of the
-    samples in which a leaf of this name acted. What is not finite is left out.
-
-    ``names``: of every node of the tree, by its preorder index, as ``leaf`` (n,) counts; equal names are one
-    entry. A leaf outside the tree (-1: none acted) counts in ``distillation/loss`` only.
-    """
+def leaf_errors(names: Sequence[str], error: Tensor, leaf: Tensor) -> dict[str, float]:
+    """``distillation/loss``, the mean of finite imitation errors (n,), and ``distillation/leaf/<name>``, that
+    of the samples in which a node of this name acted. ``names``: of the nodes that ``leaf`` (n,) counts; -1
+    is none."""
     finite, node = torch.isfinite(error), torch.arange(len(names), device=leaf.device)
     metrics = {}
     for name in sorted(set(names)):
@@ -56,17 +50,13 @@ def leaf_errors(names: Sequence[str], error: torch.Tensor, leaf: torch.Tensor) -
 
 
 def piecewise_linear(points: Sequence[tuple[float, float]], fraction: float) -> float:
-    """Value at ``fraction`` of (fraction, value) ``points``: linear in between, constant outside. Two points
-    at the same fraction are a jump, and at the jump itself the later value holds."""
+    """Value at ``fraction`` of (fraction, value) ``points``: constant outside; at a jump the later holds."""
     return float(np.interp(fraction, *np.transpose(points)))
 
 
 class Uncertainty(nn.Module):
-    """Exponential moving average of the batch's uncertainty proxy and the distillation scale s_t.
-
-    sigma_bar <- (1 - rho) sigma_bar + rho sigma_t, s_t = clip(1 + alpha sigma_bar, 1, s_max). sigma_bar
-    begins at the first value that is seen, not at zero, which would take some 1 / rho iterations to wear off.
-    """
+    """Exponential moving average of the uncertainty and the distillation scale s_t: sigma_bar <- (1 - rho)
+    sigma_bar + rho sigma_t, s_t = clip(1 + alpha sigma_bar, 1, s_max). It begins at the first value seen."""
 
     mean: Tensor
     seen: Tensor
@@ -79,8 +69,7 @@ class Uncertainty(nn.Module):
 
     @torch.no_grad()
     def update(self, sigma: Tensor) -> None:
-        """Take in the uncertainty of a batch, any shape; values that are not finite are left out, a batch of
-        none changes nothing."""
+        """Take in the finite uncertainties of a batch, any shape; a batch of none changes nothing."""
         newest = torch.where(torch.isfinite(sigma), sigma, math.nan).nanmean().double()
         if bool(newest.isnan()):
             return
@@ -95,18 +84,12 @@ class Uncertainty(nn.Module):
 
 
 class Distillation(AdamLearner):
-    """The loss as a part of a training: its weight, gradient steps on batches of (input, teacher action)
-    beside those of PPO, and what is told of it."""
+    """Weight of the loss, gradient steps on teacher batches, and metrics."""
 
     def __init__(self, policy: Policy, config: LearningConfig, node_names: Sequence[str]) -> None:
-        """``node_names``: of the tree that teaches."""
         super().__init__(policy.parameters(), lr=config.distillation.learning_rate)
         self.policy, self.config, self.node_names = policy, config.distillation, node_names
         self.uncertainty = Uncertainty(config.uncertainty).to(policy.log_std.device)
-
-    def parts(self) -> dict[str, Any]:
-        """What is kept, by name in a checkpoint."""
-        return {"teacher_batches": self, "uncertainty": self.uncertainty}
 
     def weigh(self, rollout: Rollout, share: float) -> tuple[float, dict[str, float]]:
         """lambda_t s_t when ``share`` of the run is over, and both for the log."""
@@ -119,9 +102,8 @@ class Distillation(AdamLearner):
         }
 
     def update(self, rollout: Rollout, strength: float, generator: torch.Generator) -> dict[str, float]:
-        """Learn from random batches of a rollout, by ``strength`` = lambda_t s_t; at 0 nothing happens, and
-        nothing is drawn from the (CPU) generator. Samples without a finite reward count as 0. Metrics of the
-        rollout."""
+        """Learn from random batches of a rollout, by ``strength`` = lambda_t s_t; at 0 nothing is drawn.
+        Samples without a finite reward count as 0. Metrics of the rollout."""
         samples, config = rollout.flat(), self.config
         teacher, valid = samples["teacher_action"], torch.isfinite(samples["reward"]).float()
         for group in self.optimiser.param_groups:
@@ -136,10 +118,8 @@ class Distillation(AdamLearner):
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Warm start of a policy over a set of obstacles: imitation of the behavior tree in the simulator.
-#
-# DAgger (Ross, Gordon & Bagnell 2011, AISTATS): whoever drives, the tree says what it would do, and the
-# actor's mean is fitted to all that was said so far. The tree drives in the first wave, the student more and
+# Warm start of a policy over a set of obstacles by DAgger (Ross, Gordon & Bagnell 2011): whoever drives, the
+# actor's mean is fitted to what the tree would do. The tree drives in the first wave, the student more and
 # more.
 
 
@@ -152,9 +132,9 @@ SEED = 7_000_003
 """added to ``train.seed`` for episodes and draws of the warm start"""
 
 
-def wish_of(command: torch.Tensor, ego: torch.Tensor, vehicle_cfg: VehicleConfig) -> torch.Tensor:
-    """(n, 3) wishes whose velocity is that of commands (n, 4) of vehicles (n, EGO_WIDTH); the yaw rate is
-    left out. The inverse of ``motion.wished_velocity``."""
+def wish_of(command: Tensor, ego: Tensor, vehicle_cfg: VehicleConfig) -> Tensor:
+    """(n, 3) wishes whose velocity is that of commands (n, 4) of vehicles (n, EGO_WIDTH): the inverse of
+    ``motion.wished_velocity``, without the yaw rate."""
     from uuvtai.surrogate.arrays import At
 
     fastest = (vehicle_cfg.max_surge_m_s**2 + vehicle_cfg.max_sway_m_s**2) ** 0.5
@@ -172,14 +152,12 @@ class Student(SetAgent):
         self.simulator, self._generator = sim, generator
         self.tree_share = 1.0
         """chance that the tree drives, beta of DAgger"""
-        self.samples: list[tuple[torch.Tensor, ...]] = []
-        """decisions to imitate: obstacles (n, lanes, OBSTACLE_WIDTH), own (n, EGO_COLUMNS), and (n, 3) what
-        the tree asks for, as the policy would say it"""
+        self.samples: list[tuple[Tensor, ...]] = []
+        """obstacles, own columns and (n, 3) the tree's wish of n decisions"""
         self._with_tree = torch.ones(sim.num_envs, dtype=torch.bool)
 
     @torch.no_grad()
-    def decide(self, obs: torch.Tensor) -> AgentDecision:
-        """Command for all rows, the tree's or the student's."""
+    def decide(self, obs: Tensor) -> AgentDecision:
         due = self._age % self._hold == 0
         said = super().decide(obs)
         tree = self.simulator.action
@@ -199,8 +177,7 @@ def imitate(
     note: Callable[[str], None],
     sims: dict[str, Sim] | None = None,
 ) -> dict[str, float]:
-    """``surrogate.warm_start_waves`` waves of DAgger, each told to ``note``; the actor's mean is then close
-    to the tree. What was spent, as metrics. ``sims``: simulators of worlds that are there already."""
+    """Waves of DAgger, each told to ``note``; metrics. ``sims``: of worlds that are there already."""
     began, sims = time.perf_counter(), dict(sims or {})
     waves, rows = config.surrogate.warm_start_waves, min(WAVE_EPISODES, config.train.num_envs)
     few = config.model_copy(update={"train": config.train.model_copy(update={"num_envs": rows})})
@@ -208,7 +185,7 @@ def imitate(
     generator = torch.Generator().manual_seed(seed)
     learner = AdamLearner(actor.net.parameters(), lr=RATE)
     places = [(world, scene) for scene in scenes for world in config.surrogate.worlds]
-    samples: list[tuple[torch.Tensor, ...]] = []
+    samples: list[tuple[Tensor, ...]] = []
     won = loss = 0.0
     for wave in range(waves):
         world, scene = places[wave % len(places)]
@@ -232,14 +209,9 @@ def imitate(
 
 
 def regress(
-    actor: SetActor,
-    learner: AdamLearner,
-    sample: tuple[torch.Tensor, ...],
-    passes: int,
-    generator: torch.Generator,
+    actor: SetActor, learner: AdamLearner, sample: tuple[Tensor, ...], passes: int, generator: torch.Generator
 ) -> float:
-    """Fit the actor's mean to the wishes of a ``Student``'s sample; mean squared error of the last pass
-    (``passes`` at least 1)."""
+    """Fit the actor's mean to the wishes of a sample; mean squared error of the last pass."""
     obstacles, own, wish = sample
     errors: list[float] = []
     for _ in range(passes):

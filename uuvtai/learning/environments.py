@@ -1,5 +1,4 @@
-"""Where a policy learns: the simulator, and its kinematic surrogate, behind one interface
-(``rollout.Environment``)."""
+"""Where a policy learns: the simulator, and its surrogate, as ``rollout.Environment``."""
 
 from __future__ import annotations
 
@@ -8,6 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from uuvtai.common.enums import (
     DECISION_S,
@@ -39,11 +39,9 @@ class InSimulator(Environment):
     """What the views of the simulator share."""
 
     rests = False
-    """an env whose episode ends rests until the next decision; else the behavior tree drives the next episode
-    until then"""
+    """until the next decision an env whose episode ended rests; else the tree drives its next episode"""
 
     def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
-        """Call ``begin`` before anything else."""
         self.env, self.config, self.steps = env, config, config.policy.hold_steps
         self.num_envs, self.device = env.num_envs, env.device
         self.outcomes, self.reward_terms, self.node_names = env.outcomes, env.reward_terms, env.node_names
@@ -52,18 +50,13 @@ class InSimulator(Environment):
         """what ``VectorEnv.step`` told last beside the observation"""
 
     @property
-    def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def scenarios(self) -> tuple[Tensor, Tensor]:
         return self.info["seed"], self.info["episode"]
 
-    def _hold(
-        self, command: Callable[[torch.Tensor], torch.Tensor], sums: RolloutSums | None
-    ) -> tuple[torch.Tensor, ...]:
-        """Hold a decision for ``steps`` control steps (frame skip: to the learner they are one transition).
-        ``command`` gives the action (N, 4) of a step, told which episodes (N,) have ended on the way.
-
-        (observation of the next decision, observation that this one led to, reward, terminated, ended), all
-        (N, ...); but for the first they tell of the episode in which the decision was made.
-        """
+    def _hold(self, command: Callable[[Tensor], Tensor], sums: RolloutSums | None) -> tuple[Tensor, ...]:
+        """Hold a decision for ``steps`` control steps; ``command`` gives the action (N, 4) of each, told
+        which episodes (N,) have ended on the way. (observation of the next decision; of the episode in which
+        this one was made: observation that it led to, reward, terminated, ended)."""
         obs = final = torch.zeros(self.num_envs, self.env.num_obs, device=self.device)
         reward = torch.zeros_like(self._reward)
         terminated = ended = torch.zeros_like(self._reward, dtype=torch.bool)
@@ -77,7 +70,7 @@ class InSimulator(Environment):
             terminated, ended = terminated | (failed & ~ended), ended | newly
         return obs, final, reward, terminated, ended
 
-    def _commanded(self) -> torch.Tensor:
+    def _commanded(self) -> Tensor:
         """(N, 4) what the behavior tree would do now, 0 in place of what is not finite."""
         return self.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
 
@@ -88,7 +81,6 @@ class Simulated(InSimulator):
     ``teacher_action`` (N, 4) and ``leaf`` (N,) of the behavior tree. What is not finite is replaced."""
 
     def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
-        """As ``InSimulator``."""
         super().__init__(env, config)
         self.observation_table = env.observation_table
         n, n_in, device = self.num_envs, env.num_obs + N_FEATURES, self.device
@@ -97,9 +89,8 @@ class Simulated(InSimulator):
             "teacher_action": torch.zeros(n, NUM_ACTIONS, device=device),
             "leaf": torch.zeros(n, dtype=torch.int32, device=device),
         }
-        self.guard = Guard(
-            [(c.name, c.slice) for c in self.observation_table], n, config.train.patience, device
-        )
+        columns = [(c.name, c.slice) for c in self.observation_table]
+        self.guard = Guard(columns, n, config.train.patience, device)
         self.world_model: WorldModel | None = None
         self._final = torch.zeros(n, n_in, device=device)
         self._features = torch.zeros(n, N_FEATURES, device=device)
@@ -116,15 +107,13 @@ class Simulated(InSimulator):
         return PolicyAgent(policy, model, self.num_envs, self.device)
 
     def begin(self, policy: ActorCritic, world_model: WorldModel | None, generator: torch.Generator) -> None:
-        """First episodes. Values that are not finite count as the policy's mean; the world model's columns
-        stay zero where ``world_model.as_features`` says so, but its uncertainty is told all the same."""
+        """First episodes. Where ``world_model.as_features`` is false its columns stay zero."""
         self._norm, self.world_model = policy.observation_norm, world_model
         self._arrive(*self.env.reset(self.config.train.seed))
 
     @torch.no_grad()
     def look_around(self, rollout: Rollout) -> bool:
-        """Let the behavior tree drive for T steps and keep inputs, actions and endings: what the statistics
-        begin with."""
+        """Let the behavior tree drive for T steps; keep inputs, actions and endings."""
         for t in range(rollout.steps):
             action = self.view["teacher_action"].clone()
             rollout.note(t, {"x": self.view["x"], "action": action})
@@ -133,8 +122,6 @@ class Simulated(InSimulator):
 
     @torch.no_grad()
     def fill_model_features(self, rollout: Rollout) -> None:
-        """Fill in the world-model columns of what ``look_around`` saw, by what the model has learned from
-        it."""
         if self.world_model is None or not self.config.world_model.as_features:
             return
         x, n = rollout["x"], self.env.num_obs
@@ -142,7 +129,7 @@ class Simulated(InSimulator):
             found = self.world_model.features(x[t - 1, :, :n], rollout["action"][t - 1], x[t, :, :n])
             x[t, :, n:] = torch.where(rollout["ended"][t - 1, :, None], 0.0, found)
 
-    def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
+    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
         """Hold a decision (N, 4); the reward is NaN for samples with anything bad."""
         obs, final, reward, terminated, ended = self._hold(
             lambda ended: torch.where(ended[:, None], self._commanded(), action), sums
@@ -163,19 +150,15 @@ class Simulated(InSimulator):
     def restore(self, arrays: dict[str, Any]) -> None:
         self._arrive(*self.env.restore(arrays))
 
-    def _arrive(self, obs: torch.Tensor, info: View) -> None:
-        """The observation of the next decision, and what the tree would do now: the next step overwrites
-        it."""
+    def _arrive(self, obs: Tensor, info: View) -> None:
+        """The observation of the next decision, and what the tree would do now."""
         self.info = info
         self._bad.copy_(self._cleaned(obs, self.view["x"]))
         self._bad |= self.guard.values("teacher_action", info["teacher_action"], self.view["teacher_action"])
         self.view["leaf"].copy_(info["leaf"])
 
-    def _cleaned(
-        self, obs: torch.Tensor, x: torch.Tensor, counted: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        """Write the observation into an input, the column's mean in place of what is not finite; which rows
-        were bad."""
+    def _cleaned(self, obs: Tensor, x: Tensor, counted: Tensor | None = None) -> Tensor:
+        """Write the observation into an input, means for what is not finite; which rows were bad."""
         n = self.env.num_obs
         return self.guard.values(OBSERVATION, obs, x[:, :n], self._norm.mean[:n].float(), counted)
 
@@ -212,7 +195,7 @@ class SimulatedSet(InSimulator):
         _, self.info = self.env.reset(self.config.train.seed)
         self._look()
 
-    def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
+    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
         """Hold a wish (N, 3)."""
         self._hull.wish.copy_(action.clamp(-MOST_WISH, MOST_WISH))
         *_, reward, terminated, ended = self._hold(lambda _ended: self._hull.command(), sums)
@@ -255,8 +238,7 @@ class InSurrogate(Environment):
     device, steps = torch.device("cpu"), HOLD_STEPS
 
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
-        """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
-        another tank."""
+        """Draws the scenarios, unless they are given. Raises ConfigError for a world that does not fit."""
         from uuvtai.surrogate.observation import SET_TABLE
         from uuvtai.surrogate.world import Surrogate, draw_bank
 
@@ -278,26 +260,23 @@ class InSurrogate(Environment):
         return SetPolicy(self.view, self.config, generator)
 
     def begin(self, policy: Policy, world_model: WorldModel | None, generator: torch.Generator) -> None:
-        """First scenarios; ``generator`` draws all that follow."""
         self._generator = generator
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
         self.env.look()
 
-    def _begin(self, rows: torch.Tensor) -> None:
+    def _begin(self, rows: Tensor) -> None:
         found = torch.randint(len(self.env.bank.origin), (self.num_envs,), generator=self._generator)
         self.env.begin(rows, found)
 
     def warm_start(self, policy: SetPolicy, note: Callable[[str], None]) -> dict[str, float]:
-        """Learn from the tree first, where ``surrogate.warm_start_waves`` says so; metrics."""
         waves = self.config.surrogate.warm_start_waves
         return imitate(policy.actor, self.config, self.scenes, note) if waves else {}
 
     @property
-    def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def scenarios(self) -> tuple[Tensor, Tensor]:
         return torch.full_like(self.env.scenario, BANK_SEED), self.env.scenario
 
-    def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
-        """Carry out a decision (N, 3)."""
+    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
         assert sums is not None
         surrogate, final = self.env, None
         reward, outcome = surrogate.step(action)
@@ -318,8 +297,7 @@ class InSurrogate(Environment):
 
     @torch.no_grad()
     def evaluate(self, policy: Policy) -> dict[str, float]:
-        """``eval/*`` of the policy as it is, without exploration, on scenarios that it never learnt from, the
-        same number of each world and scene, in the surrogate."""
+        """``eval/*`` of the policy's mean, on as many new scenarios of each world and scene."""
         from uuvtai.surrogate.world import Surrogate, draw_bank
 
         train = self.config.train
@@ -327,9 +305,8 @@ class InSurrogate(Environment):
         if self._held_out is None:
             self._held_out = draw_bank(self.config, self.scenes, train.evaluate_seed, each)
         bank = self._held_out
-        outcome, time_s = run_once(
-            Surrogate(self.config, bank, len(bank.obstacle), train.evaluate_seed), policy
-        )
+        surrogate = Surrogate(self.config, bank, len(bank.obstacle), train.evaluate_seed)
+        outcome, time_s = run_once(surrogate, policy)
         won, late = outcome == SUCCESS, outcome == TIMEOUT
         metrics = {
             "eval/success_rate": float(won.float().mean()),
@@ -343,22 +320,17 @@ class InSurrogate(Environment):
 
 
 def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
-    """Raise SettingError for settings that the surrogate does not have."""
     if config.encoder != "set":
-        raise SettingError(
-            f"policy.encoder={config.encoder}: the surrogate knows a set of obstacles and no observation "
-            "vectors; learn in the simulator: surrogate.enabled=false"
-        )
+        told = "the surrogate has no observation vectors; learn in the simulator: surrogate.enabled=false"
+        raise SettingError(f"policy.encoder={config.encoder}: {told}")
     held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
-        raise SettingError(
-            f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: the surrogate decides every "
-            f"{DECISION_S} s, after {HOLD_STEPS} control steps"
-        )
+        told = f"the surrogate decides every {DECISION_S} s, after {HOLD_STEPS} control steps"
+        raise SettingError(f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: {told}")
 
 
 @torch.no_grad()
-def run_once(surrogate: Surrogate, policy: Policy) -> tuple[torch.Tensor, torch.Tensor]:
+def run_once(surrogate: Surrogate, policy: Policy) -> tuple[Tensor, Tensor]:
     """(outcome code, time [s]), both (N,), of scenario i in env i, driven by the mean."""
     every = torch.ones(surrogate.num_envs, dtype=torch.bool)
     surrogate.begin(every, torch.arange(surrogate.num_envs))

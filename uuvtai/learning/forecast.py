@@ -1,9 +1,5 @@
-"""Learn what moving obstacles will do: what ``learning/runner.py`` drives where
-``forecast_training.enabled``.
-
-Every iteration runs episodes of one world in the simulator, driven by the tree, and fits a mixture density
-network to what the obstacles behind the tracks then did, by likelihood.
-"""
+"""Learn what moving obstacles will do: every iteration runs episodes of one world in the simulator, driven by
+the tree, and fits a mixture density network to what the obstacles behind the tracks then did."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from uuvtai.common.enums import (
     ANCHOR_S,
@@ -41,14 +37,11 @@ from uuvtai.learning.ppo import ADAM_EPS
 from uuvtai.sim.forecast_weights import WEIGHTS, packed_weights
 
 if TYPE_CHECKING:
-    from uuvtai.envs.vector_env import ObservationColumn
     from uuvtai.sim.setup import Scene
     from uuvtai.sim.sim import Sim
 
 
 # ------------------------------------------------------------------------------------------------------------
-# The network of a learned forecast, its likelihood, and what it says in metres.
-#
 # A mixture of ``N_MODE`` Gaussians over the places at ``ANCHORS`` times, along and across the track's course
 # (Bishop 1994). Each future is a whole way: its places share one weight.
 
@@ -63,16 +56,16 @@ _HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 class Mixture(NamedTuple):
     """What may come of n tracks, in their frames."""
 
-    log_weight: torch.Tensor
+    log_weight: Tensor
     """(n, N_MODE) logarithm of the probability of each future"""
-    place: torch.Tensor
+    place: Tensor
     """(n, N_MODE, ANCHORS, 2) [m] along and across the course"""
-    sigma: torch.Tensor
+    sigma: Tensor
     """(n, N_MODE, ANCHORS, 2) [m] standard deviations"""
 
 
 class MixtureNet(nn.Module):
-    """Columns of a track to its futures: two hidden layers of rectified units."""
+    """Columns of a track to its futures."""
 
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
@@ -86,7 +79,7 @@ class MixtureNet(nn.Module):
             self.said.bias[N_MODE:] = ways[:N_MODE, None].expand(-1, ANCHORS, -1).reshape(-1)
             self.spread.bias.fill_(math.log(0.3))
 
-    def forward(self, columns: torch.Tensor) -> Mixture:
+    def forward(self, columns: Tensor) -> Mixture:
         """``columns`` (n, N_COLUMN), of which the first is the speed [m/s]."""
         hidden = torch.relu(self.middle(torch.relu(self.into(columns))))
         said = self.said(hidden)
@@ -106,14 +99,14 @@ class MixtureNet(nn.Module):
         return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
 
 
-def negative_log_likelihood(mixture: Mixture, truth: torch.Tensor) -> torch.Tensor:
-    """(n,) of the true places (n, ANCHORS, 2) [m] in the tracks' frames, in nats of all of them together."""
+def negative_log_likelihood(mixture: Mixture, truth: Tensor) -> Tensor:
+    """(n,) [nat] of the true places (n, ANCHORS, 2) [m] in the tracks' frames."""
     off = (truth[:, None] - mixture.place) / mixture.sigma
     log_density = -(0.5 * off * off + mixture.sigma.log() + _HALF_LOG_TAU).sum((-1, -2))
     return -torch.logsumexp(mixture.log_weight + log_density, -1)
 
 
-def mirrored(columns: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def mirrored(columns: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     """The same tracks seen in a mirror along their course: left is right."""
     flip = torch.ones(N_COLUMN)
     flip[list(SIDE_COLUMNS)] = -1.0
@@ -123,28 +116,20 @@ def mirrored(columns: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, 
     return (columns * flip)[:, order], truth * torch.tensor([1.0, -1.0])
 
 
-# ------------------------------------------------------------------------------------------------------------
-# How good a forecast of several futures is: likelihood and distances.
-
-
-def scores_of(mixture: Mixture, truth: torch.Tensor) -> dict[str, float]:
-    """Means over n tracks of ``truth`` (n, ANCHORS, 2) [m]: nats of the likelihood; median and 90 % quantile
-    [m] of the distance at the last time, of the likeliest future and of the nearest; how probable the
-    likeliest future is said to be, and how often it is the nearest."""
-    last = (mixture.place[:, :, -1] - truth[:, None, -1]).norm(dim=-1)
-    likeliest = mixture.log_weight.argmax(-1)
-    # by the mean of the whole way
-    nearest = (mixture.place - truth[:, None]).norm(dim=-1).mean(-1).argmin(-1)
-    one = last.gather(1, likeliest[:, None])[:, 0]
-    return {
-        "nll": float(negative_log_likelihood(mixture, truth).mean()),
-        "likeliest_median_m": float(one.median()),
-        "likeliest_p90_m": float(one.quantile(0.9)),
-        "nearest_median_m": float(last.amin(-1).median()),
-        "nearest_p90_m": float(last.amin(-1).quantile(0.9)),
-        "likeliest_said": float(mixture.log_weight.amax(-1).exp().mean()),
-        "likeliest_right": float((nearest == likeliest).float().mean()),
+def scores_of(mixture: Mixture, truth: Tensor) -> dict[str, float]:
+    """How good forecasts of n tracks are (``truth`` (n, ANCHORS, 2) [m]): likelihood [nat]; median and 90 %
+    quantile [m] of the distance at the last time, of the likeliest future and of the nearest; how probable
+    the likeliest is said to be, and how often it is the nearest on the whole way."""
+    away, likeliest = (mixture.place - truth[:, None]).norm(dim=-1), mixture.log_weight.argmax(-1)
+    last = {"likeliest": away[..., -1].gather(1, likeliest[:, None])[:, 0], "nearest": away[..., -1].amin(-1)}
+    found = {f"{name}_median_m": part.median() for name, part in last.items()}
+    found |= {f"{name}_p90_m": part.quantile(0.9) for name, part in last.items()}
+    found |= {
+        "nll": negative_log_likelihood(mixture, truth).mean(),
+        "likeliest_said": mixture.log_weight.amax(-1).exp().mean(),
+        "likeliest_right": (away.mean(-1).argmin(-1) == likeliest).float().mean(),
     }
+    return {name: float(value) for name, value in found.items()}
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -164,15 +149,15 @@ _STEP_S = 0.02
 class TrackMoments(NamedTuple):
     """n moments of tracks that an obstacle is behind."""
 
-    columns: torch.Tensor
-    """(n, N_COLUMN) what a network is told; the first is the track's speed [m/s]"""
-    truth: torch.Tensor
-    """(n, ANCHORS, 2) [m] where the body then was, in the track's frame"""
+    columns: Tensor
+    """(n, N_COLUMN) what a network is told"""
+    truth: Tensor
+    """(n, ANCHORS, 2) [m] where the obstacle then was, in the track's frame"""
 
 
 def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int) -> tuple[TrackMoments, int]:
-    """Moments of episodes ``first`` .. of ``seed``, one in every env, the scenes dealt out in turn, driven by
-    the simulator's tree for at most ``steps``; and the env steps that it took."""
+    """Moments of episodes ``first`` .. of ``seed``, one in every env, driven by the simulator's tree for at
+    most ``steps``; and the env steps that it took."""
     sim.set_scenes(scenes)
     rows = torch.arange(sim.num_envs, dtype=torch.int32)
     sim.sleep()
@@ -230,20 +215,20 @@ _LEAST_RATE = 0.02
 
 
 class ForecastTrainer(EpisodeTrainer):
-    """Everything that learning to forecast carries from one iteration to the next."""
+    """The network and the moments that it learns from."""
 
     counters = ("iteration", "env_steps", "kept", "seen")
 
     def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None = None) -> None:
         """Raises SettingError where the stack already forecasts by a network."""
+        from uuvtai.envs.vector_env import ObservationColumn
+
         if config.forecast.learned:
-            raise SettingError(
-                "forecast.learned: a forecast is learnt beside the one by arcs and turn history; leave it "
-                "empty"
-            )
+            raise SettingError("forecast.learned: it is learned beside the analytic forecast; leave it empty")
         forecast = config.forecast.model_copy(update={"keep_columns": True})
         super().__init__(config.model_copy(update={"forecast": forecast}), sims)
-        self.observation_table = (column_row(),)
+        columns = slice(0, COLUMNS)
+        self.observation_table = (ObservationColumn("motion", columns, "mixed", "track", "how tracks move"),)
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.net = MixtureNet(self.generator)
@@ -255,12 +240,10 @@ class ForecastTrainer(EpisodeTrainer):
         self._scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (config.world.own_scene,)
 
     def iterate(self) -> dict[str, float]:
-        """Run episodes of one world, learn from all that is kept; metrics by their names in metrics.jsonl."""
+        """Run episodes of one world, learn from all that is kept; metrics."""
         began, config = time.perf_counter(), self.config
-        worlds = config.forecast_training.worlds
-        found, steps = self._watched(
-            worlds[self.iteration % len(worlds)], config.train.seed, self.iteration * config.train.num_envs
-        )
+        worlds, first = config.forecast_training.worlds, self.iteration * config.train.num_envs
+        found, steps = self._watched(worlds[self.iteration % len(worlds)], config.train.seed, first)
         self._keep(found)
         between = time.perf_counter()
         losses = [self._fit() for _ in range(config.forecast_training.minibatches)]
@@ -272,7 +255,7 @@ class ForecastTrainer(EpisodeTrainer):
 
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
-        """``eval/*`` of the forecast as it is, on episodes that it never learnt from, world by world."""
+        """``eval/*`` on episodes that it never learned from, world by world."""
         train, metrics = self.config.train, {}
         for world in self.config.forecast_training.worlds:
             found, _ = self._watched(world, train.evaluate_seed, 0)
@@ -308,10 +291,8 @@ class ForecastTrainer(EpisodeTrainer):
         self.learner.step(loss, 5.0)
         return float(loss.detach())
 
-    # ------------------------------------------------------------------------------------------------- resume
-
     def state(self) -> dict[str, Any]:
-        """All that the next iterations depend on. What forecasts is the part ``forecast``."""
+        """What forecasts is the part ``forecast``."""
         return super().state() | {
             "forecast": {name: tensor.clone() for name, tensor in self.net.state_dict().items()},
             "optimiser": self.learner.optimiser.state_dict(),
@@ -320,19 +301,9 @@ class ForecastTrainer(EpisodeTrainer):
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what ``state`` gave."""
         super().load_state(state)
         self.net.load_state_dict(state["forecast"])
         self.learner.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"])
         self._columns.copy_(state["env"]["columns"])
         self._truth.copy_(state["env"]["truth"])
-
-
-def column_row() -> ObservationColumn:
-    """The observation of a forecast, for a checkpoint's manifest."""
-    from uuvtai.envs.vector_env import ObservationColumn
-
-    return ObservationColumn(
-        "motion", slice(0, COLUMNS), "mixed", "track", "how a track moves, moved and turned"
-    )

@@ -14,30 +14,23 @@ from contextvars import ContextVar
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from uuvtai.common.errors import SettingError, UserError
 from uuvtai.config.learning import PolicyConfig
 
-Activation = Literal["elu", "tanh", "relu"]
-
 _ACTIVATIONS = {"elu": lambda: nn.ELU(inplace=True), "tanh": nn.Tanh, "relu": lambda: nn.ReLU(inplace=True)}
-_HIDDEN_GAIN = math.sqrt(2.0)
 
 
 def mlp(
-    sizes: Sequence[int], activation: Activation, generator: torch.Generator, out_gain: float = 1.0
+    sizes: Sequence[int], activation: str, generator: torch.Generator, out_gain: float = 1.0
 ) -> nn.Sequential:
-    """Layers of these widths (input, hidden ..., output), an activation after every one but the last, biases
-    zero.
-
-    Weights are orthogonal with gain sqrt 2, the last layer's with ``out_gain`` (0 = its output is zero at
-    birth). ``generator`` is a CPU generator.
-    """
+    """Layers of these widths (input, hidden ..., output), an activation after every one but the last; weights
+    orthogonal with gain sqrt 2, the last layer's with ``out_gain``."""
     *hidden, last = itertools.pairwise(sizes)
     layers: list[nn.Module] = []
     for n_in, n_out in hidden:
-        layers += [linear(n_in, n_out, _HIDDEN_GAIN, generator), _ACTIVATIONS[activation]()]
+        layers += [linear(n_in, n_out, math.sqrt(2.0), generator), _ACTIVATIONS[activation]()]
     return nn.Sequential(*layers, linear(*last, out_gain, generator))
 
 
@@ -55,25 +48,23 @@ def linear(n_in: int, n_out: int, gain: float, generator: torch.Generator) -> nn
 # scaling they give.
 
 
-_ROWS_AT_ONCE = 2048
-"""a float64 copy of a whole rollout would not fit the caches"""
+CACHE_ROWS = 2048
+"""rows in one pass on a CPU: what a network makes of them, or their float64 copy, stays in the cache"""
 MIN_STD = 1e-2
-"""a column's deviation counts as at least this much (in its own unit): a constant column must not become
-noise"""
+"""least deviation of a column, in its unit: a constant column must not become noise"""
 
 
 class Moments(NamedTuple):
-    """Moments of samples of ``width`` columns, float64."""
+    """Of samples of ``width`` columns, float64."""
 
-    mean: torch.Tensor
-    """(width,)"""
-    m2: torch.Tensor
-    """(width,), sum of squared differences from the mean"""
-    n: torch.Tensor
-    """(), number of samples"""
+    mean: Tensor
+    m2: Tensor
+    """(width,) both; sum of squared differences from the mean"""
+    n: Tensor
+    """() number of samples"""
 
 
-def moments_of(x: torch.Tensor) -> Moments:
+def moments_of(x: Tensor) -> Moments:
     """Moments of the rows of x (..., width); a row that is not finite in every column is left out."""
     rows = x.detach().reshape(-1, x.shape[-1])
     kept = torch.isfinite(rows.sum(dim=1))
@@ -81,8 +72,8 @@ def moments_of(x: torch.Tensor) -> Moments:
         rows = rows[kept]
     zeros = functools.partial(torch.zeros, dtype=torch.float64, device=x.device)
     total = Moments(zeros(rows.shape[1]), zeros(rows.shape[1]), zeros(()))
-    for first in range(0, len(rows), _ROWS_AT_ONCE):
-        part = rows[first : first + _ROWS_AT_ONCE].double()
+    for chunk in rows.split(CACHE_ROWS) if len(rows) else ():
+        part = chunk.double()
         mean = part.mean(dim=0)
         m2 = (part - mean).square().sum(dim=0)
         total = combined(total, Moments(mean, m2, part.new_tensor(float(len(part)))))
@@ -90,7 +81,7 @@ def moments_of(x: torch.Tensor) -> Moments:
 
 
 def combined(a: Moments, b: Moments) -> Moments:
-    """Moments of the samples of both, as if they had been taken together (Chan et al., equation 1.5)."""
+    """Moments of the samples of both (Chan et al., equation 1.5)."""
     n = a.n + b.n
     share = b.n / n.clamp(min=1.0)
     difference = b.mean - a.mean
@@ -98,44 +89,38 @@ def combined(a: Moments, b: Moments) -> Moments:
 
 
 class RunningNorm(nn.Module):
-    """Scales columns to mean 0 and deviation 1 by the moments of all samples seen so far; before the first
-    one it changes nothing."""
+    """Scales columns to mean 0 and deviation 1 by all samples so far; before the first one not at all."""
 
-    mean: torch.Tensor
-    m2: torch.Tensor
-    count: torch.Tensor
+    mean: Tensor
+    m2: Tensor
+    count: Tensor
 
     def __init__(self, width: int, clip: float = 10.0) -> None:
         """``clip``: standard deviations beyond which normalised values are cut off."""
         super().__init__()
         self.clip = clip
-        self.register_buffer("mean", torch.zeros(width, dtype=torch.float64))
-        self.register_buffer("m2", torch.zeros(width, dtype=torch.float64))
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        for name, shape in (("mean", (width,)), ("m2", (width,)), ("count", ())):
+            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
 
-    @property
-    def moments(self) -> Moments:
-        """Of all samples so far."""
-        return Moments(self.mean, self.m2, self.count)
-
-    def update(self, x: torch.Tensor) -> None:
+    def update(self, x: Tensor) -> None:
         """Add the rows of x (..., width); rows that are not finite are left out."""
-        for own, united in zip(self.moments, combined(self.moments, moments_of(x)), strict=True):
+        moments = Moments(self.mean, self.m2, self.count)
+        for own, united in zip(moments, combined(moments, moments_of(x)), strict=True):
             own.copy_(united)
 
-    def std(self) -> torch.Tensor:
+    def std(self) -> Tensor:
         """(width,) deviation, float64, at least ``MIN_STD``; 1 before the first sample."""
         variance = torch.where(self.count > 0, self.m2 / self.count.clamp(min=1.0), 1.0)
         return variance.sqrt().clamp(min=MIN_STD)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x: Tensor) -> Tensor:
         """Normalised x (..., width), float32, within +-clip; what is not a number becomes 0, the mean."""
         y = x - self.mean.float()
         limit = torch.where(self.count > 0, self.clip, math.inf).float()
         y.mul_((1.0 / self.std()).float()).clamp_(-limit, limit)
         return y.nan_to_num_(nan=0.0, posinf=self.clip, neginf=-self.clip)
 
-    def inverse(self, y: torch.Tensor) -> torch.Tensor:
+    def inverse(self, y: Tensor) -> Tensor:
         """The x whose normalised value is y (..., width), float32."""
         return torch.addcmul(self.mean.float(), y, self.std().float())
 
@@ -146,38 +131,33 @@ class RunningNorm(nn.Module):
 
 
 NUM_ACTIONS = 4
-_MEAN_GAIN, _VALUE_GAIN = 0.01, 1.0  # of the last layers: small first actions (Andrychowicz et al. 2021)
+_MEAN_GAIN = 0.01  # of the last layer: small first actions (Andrychowicz et al. 2021)
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
-View = dict[str, torch.Tensor]
+View = dict[str, Tensor]
 """what is known of N envs, by name, each (N, ...)"""
-CACHE_ROWS = 2048
-"""rows in one pass through a network on a CPU: their activations stay in the cache"""
 
 
 class PolicyStep(NamedTuple):
     """What the policy decided for N envs."""
 
-    action: torch.Tensor
+    action: Tensor
     """(N, n_action) drawn, unclamped: the environment clamps"""
-    log_prob: torch.Tensor
-    """(N,) [nat]"""
-    value: torch.Tensor
-    """(N,) expected return"""
-    mean: torch.Tensor
-    """(N, n_action)"""
+    log_prob: Tensor
+    value: Tensor
+    """(N,) both: [nat]; expected return"""
+    mean: Tensor
 
 
-def log_prob(action: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
-    """Log density [nat] of actions (..., n) under a diagonal Gaussian of mean (..., n) and log deviation
-    (n,): (...,)."""
+def log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """(...,) log density [nat] of actions (..., n) under a diagonal Gaussian of log deviation (n,)."""
     scaled = (action - mean) * torch.exp(-log_std)
     return -0.5 * scaled.square().sum(dim=-1) - (log_std.sum() + log_std.shape[-1] * _HALF_LOG_2PI)
 
 
-def entropy(log_std: torch.Tensor) -> torch.Tensor:
-    """Differential entropy [nat] of a diagonal Gaussian of log deviation (n,), a scalar."""
+def entropy(log_std: Tensor) -> Tensor:
+    """Differential entropy [nat] of such a Gaussian, a scalar."""
     return log_std.sum() + log_std.shape[-1] * (0.5 + _HALF_LOG_2PI)
 
 
@@ -200,10 +180,8 @@ class Policy(nn.Module, ABC):
         """SettingError for a deviation that begins below its floor."""
         super().__init__()
         if config.initial_std < config.min_std:
-            raise SettingError(
-                f"policy.initial_std {config.initial_std:g} lies below the floor policy.min_std "
-                f"{config.min_std:g}"
-            )
+            least = f"the floor policy.min_std {config.min_std:g}"
+            raise SettingError(f"policy.initial_std {config.initial_std:g} lies below {least}")
         self.config = config
 
     def prepared(self, view: View) -> View:
@@ -211,11 +189,11 @@ class Policy(nn.Module, ABC):
         return {name: view[name] for name in self.inputs}
 
     @abstractmethod
-    def mean_of(self, inputs: View) -> torch.Tensor:
+    def mean_of(self, inputs: View) -> Tensor:
         """(..., n_action) mean action, float32, of prepared inputs."""
 
     @abstractmethod
-    def value_of(self, inputs: View) -> torch.Tensor:
+    def value_of(self, inputs: View) -> Tensor:
         """(...,) expected return in the critic's units, float32, of prepared inputs."""
 
     def parts(self) -> dict[str, nn.Module]:
@@ -239,24 +217,19 @@ class Policy(nn.Module, ABC):
         return PolicyStep(action, log_prob(action, mean, self.log_std), self.value_norm.inverse(value), mean)
 
     @torch.no_grad()
-    def expected(self, view: View) -> torch.Tensor:
+    def expected(self, view: View) -> Tensor:
         """(N,) expected return, in units of the reward."""
         return self.value_norm.inverse(by_part(self.value_of, self.prepared(view)))
 
     @torch.no_grad()
     def floor_std(self) -> None:
-        """Bring deviations that a step took out of their bounds back: clamping inside would stop their
-        gradient there."""
+        """Bring deviations back into their bounds: clamping inside would stop their gradient there."""
         self.log_std.clamp_(math.log(self.config.min_std), math.log(self.most_std))
 
     @torch.no_grad()
-    def learn_returns(self, returns: torch.Tensor) -> None:
-        """Add returns (n, 1) to the value's statistics and change the critic's last layer
-        so that no value changes.
-
-        Source: van Hasselt et al. 2016, "Learning values across many orders of magnitude" (Pop-Art), equation
-        9.
-        """
+    def learn_returns(self, returns: Tensor) -> None:
+        """Add returns (n, 1) to the value's statistics and change the critic's last layer so that no value
+        changes (Pop-Art: van Hasselt et al. 2016, equation 9)."""
         old_mean, old_std = self.value_norm.mean.clone(), self.value_norm.std()
         self.value_norm.update(returns)
         mean, std = self.value_norm.mean, self.value_norm.std()
@@ -266,8 +239,7 @@ class Policy(nn.Module, ABC):
 
 
 class ActorCritic(Policy):
-    """Perceptrons on the normalised input ``x`` (..., n_in), raw; all it knows, statistics included, is in
-    its ``state_dict``."""
+    """Perceptrons on the raw input ``x`` (..., n_in), which it normalises."""
 
     inputs = ("x",)
 
@@ -275,38 +247,34 @@ class ActorCritic(Policy):
         super().__init__(config)
         self.n_in = n_in
         self.actor = mlp((n_in, *config.hidden, NUM_ACTIONS), config.activation, generator, _MEAN_GAIN)
-        self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
+        self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator)
         self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
         self.observation_norm = RunningNorm(n_in)
         self.value_norm = RunningNorm(1, math.inf)
 
     def prepared(self, view: View) -> View:
-        """The normalised input."""
         return {"x": self.observation_norm(view["x"])}
 
-    def mean_of(self, inputs: View) -> torch.Tensor:
-        """As in ``Policy``."""
+    def mean_of(self, inputs: View) -> Tensor:
         return self.actor(inputs["x"])
 
-    def value_of(self, inputs: View) -> torch.Tensor:
-        """As in ``Policy``."""
+    def value_of(self, inputs: View) -> Tensor:
         return self.critic(inputs["x"]).squeeze(-1)
 
     def observe(self, view: View) -> None:
-        """As in ``Policy``."""
         self.observation_norm.update(view["x"])
 
-    def distribution(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def distribution(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(mean (..., 4), log_std (4,)) of the action."""
         return self.mean_of(self.prepared({"x": x})), self.log_std
 
-    def value(self, x: torch.Tensor) -> torch.Tensor:
+    def value(self, x: Tensor) -> Tensor:
         """(...,) expected return, in units of the reward."""
         return self.value_norm.inverse(self.value_of(self.prepared({"x": x})))
 
 
 @torch.no_grad()
-def by_part(function: Callable[[View], torch.Tensor], inputs: View) -> torch.Tensor:
+def by_part(function: Callable[[View], Tensor], inputs: View) -> Tensor:
     """A function of many rows, on a CPU ``CACHE_ROWS`` at a time; nothing of it can be learnt from."""
     first = next(iter(inputs.values()))
     if first.device.type != "cpu" or len(first) <= CACHE_ROWS:
@@ -327,8 +295,7 @@ _threads: ContextVar[int] = ContextVar("threads")
 
 @contextlib.contextmanager
 def torch_threads_rest() -> Iterator[None]:
-    """Between the pieces torch computes on one thread: its own take ten times as long for a step of Adam on
-    networks of this size as one does alone."""
+    """Between the pieces torch computes on one thread: its own are slower on networks of this size."""
     threads = torch.get_num_threads()
     token = _threads.set(threads)
     torch.set_num_threads(1)
@@ -340,8 +307,7 @@ def torch_threads_rest() -> Iterator[None]:
 
 
 def side_by_side(*pieces: Callable[[], _T], device: str = "cpu") -> list[_T]:
-    """What each piece gives, in their order. Threads have no part in any result: a piece runs on one. On a
-    GPU one comes after the other."""
+    """What each piece gives, in their order; a piece runs on one thread, so threads change no result."""
     threads = _threads.get(None) or torch.get_num_threads()
     if device != "cpu" or threads == 1:
         return [piece() for piece in pieces]
@@ -351,16 +317,11 @@ def side_by_side(*pieces: Callable[[], _T], device: str = "cpu") -> list[_T]:
 
 @functools.cache
 def _pool(threads: int, flushes: bool) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, "uuvtai-learn", _begin, (flushes,))
+    def begin() -> None:
+        torch.set_num_threads(1)
+        torch.set_flush_denormal(flushes)
 
-
-def _begin(flushes: bool) -> None:
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(flushes)
-
-
-# ------------------------------------------------------------------------------------------------------------
-# Float32 products by the faster of torch's libraries.
+    return ThreadPoolExecutor(threads, "uuvtai-learn", begin)
 
 
 LARGEST_ERROR = 1e-5
@@ -369,8 +330,7 @@ LARGEST_ERROR = 1e-5
 
 @contextlib.contextmanager
 def fast_products() -> Iterator[None]:
-    """Float32 products by torch's other library (oneDNN in place of MKL) where that is as exact: up to 1.7
-    times as fast on CPUs of AMD."""
+    """Float32 products by oneDNN in place of MKL where that is as exact: faster on CPUs of AMD."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(fastest_precision())
     try:
@@ -381,8 +341,7 @@ def fast_products() -> Iterator[None]:
 
 @functools.cache
 def fastest_precision() -> Literal["medium", "highest"]:
-    """What to ask torch for: 'medium' takes the other library, and on some CPUs bfloat16 with it, as the
-    error of one product tells."""
+    """'medium' takes the other library, and on some CPUs bfloat16 with it, as one product's error tells."""
     a, b = (torch.randn(256, 256, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))
     before, exact = torch.get_float32_matmul_precision(), a.double() @ b.double()
     torch.set_float32_matmul_precision("medium")
@@ -392,15 +351,14 @@ def fastest_precision() -> Literal["medium", "highest"]:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Adam without torch's compiler, which its class imports when one is built and when it steps: that takes
-# most of a second, and nothing here compiles by it. Same numbers, same states.
 
 
 class PlainAdam(torch.optim.Adam):
-    """``torch.optim.Adam``."""
+    """``torch.optim.Adam`` without torch's compiler, which its class imports when one is built and when it
+    steps: that takes four seconds, and nothing here compiles by it. Same numbers, same states."""
 
     step = torch.no_grad()(getattr(torch.optim.Adam.step, "__wrapped__", torch.optim.Adam.step))
-    """torch's without what switches its compiler off around it"""
+    """torch's own without what switches its compiler off around it"""
 
     def __init__(self, *arguments, **named) -> None:
         _spare_compiler()
@@ -427,7 +385,7 @@ class AdamLearner:
         self.skipped = 0
         """steps left out because the gradient was not finite, or zero for want of valid samples"""
 
-    def step(self, loss: torch.Tensor | None = None, most: float = math.inf) -> bool:
+    def step(self, loss: Tensor | None = None, most: float = math.inf) -> bool:
         """One step on ``loss`` (a scalar; None: by gradients that are there), the norm of every group's
         gradient cut to ``most``; False where nothing was changed."""
         if loss is not None:
@@ -442,11 +400,9 @@ class AdamLearner:
         return is_sound
 
     def state_dict(self) -> dict[str, Any]:
-        """Adam's moments and the count of steps left out."""
         return {"optimiser": self.optimiser.state_dict(), "skipped": self.skipped}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """What ``state_dict`` gave."""
         self.optimiser.load_state_dict(state["optimiser"])
         self.skipped = int(state["skipped"])
 
@@ -472,29 +428,25 @@ class Guard:
     def __init__(
         self, columns: Sequence[tuple[str, slice]], num_envs: int, patience: int, device: torch.device
     ) -> None:
-        """``columns``: names of the observation's columns; ``patience``: iterations in a row with something
-        bad before it is an error."""
+        """``columns``: of the observation; ``patience``: bad iterations in a row before it is an error."""
         self.columns, self.patience = tuple(columns), patience
         self._rows = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._none = torch.zeros_like(self._rows)
-        self._counts: dict[str, torch.Tensor] = {}
+        self._counts: dict[str, Tensor] = {}
         """of what was replaced, column by column"""
         self.bad_in_a_row = 0
 
     def values(
         self,
         name: str,
-        values: torch.Tensor,
-        out: torch.Tensor,
-        fill: torch.Tensor | None = None,
-        counted: torch.Tensor | None = None,
-    ) -> torch.Tensor:
+        values: Tensor,
+        out: Tensor,
+        fill: Tensor | None = None,
+        counted: Tensor | None = None,
+    ) -> Tensor:
         """Copy ``values`` (N, ...) into ``out`` with ``fill`` (default: 0) in place of what is not finite;
-        returns which rows were bad, (N,).
-
-        ``name``: ``OBSERVATION`` is counted by columns. ``counted`` (N,): rows that count (default: all).
-        """
-        if _is_sound(values):
+        which rows (N,) were bad. ``OBSERVATION`` is counted by columns; ``counted`` (N,): rows that count."""
+        if values.device.type == "cpu" and math.isfinite(values.sum()):  # elsewhere that is a wait
             out.copy_(values)
             return self._none
         bad = ~torch.isfinite(values)
@@ -506,20 +458,15 @@ class Guard:
         return rows.any(dim=1)
 
     def take(self) -> dict[str, float]:
-        """Counts since the last call by name, those above zero only: ``non_finite/<column>``,
-        ``non_finite/reward`` and so on."""
+        """Counts above zero since the last call, by name."""
         by_column = self._counts.pop(OBSERVATION, torch.zeros(0))
         found = {name: by_column[place] for name, place in self.columns} | self._counts
         self._counts = {}
         return {f"{PREFIX}{name}": float(n) for name, part in found.items() if (n := part.sum())}
 
-    def check(
-        self, iteration: int, complaints: Sequence[str], scenarios: tuple[torch.Tensor, torch.Tensor]
-    ) -> None:
-        """Count an iteration with or without complaints; TrainingError after ``patience`` in a row with some.
-
-        ``scenarios``: seed and episode (N,) that the envs are in, for the message.
-        """
+    def check(self, iteration: int, complaints: Sequence[str], scenarios: tuple[Tensor, Tensor]) -> None:
+        """Count an iteration; TrainingError after ``patience`` in a row with complaints. ``scenarios``: seed
+        and episode (N,) that the envs are in."""
         rows = self._rows.nonzero().flatten().tolist()
         self._rows.zero_()
         self.bad_in_a_row = self.bad_in_a_row + 1 if complaints else 0
@@ -531,13 +478,7 @@ class Guard:
         )
         raise TrainingError(
             f"iterations {iteration - self.bad_in_a_row + 1} to {iteration} were all bad: "
-            f"{'; '.join(complaints)}{envs}. What was bad did not change the networks. If updates were left "
-            "out, go on with smaller steps: uuv train --resume RUN --set ppo.learning_rate=1e-4. If an "
-            "observation or a reward is not finite, the simulator is at fault: please report seed and episode"
+            f"{'; '.join(complaints)}{envs}. The networks did not learn it. If updates were left out, take "
+            "smaller steps: uuv train --resume RUN --set ppo.learning_rate=1e-4. If an observation or a "
+            "reward is not finite, the simulator is at fault: please report seed and episode"
         )
-
-
-def _is_sound(values: torch.Tensor) -> bool:
-    """Whether everything is finite, asked where that is no wait for a device: whatever is not makes the sum
-    so, and so may large numbers, which are then looked at one by one."""
-    return values.device.type == "cpu" and math.isfinite(values.sum())

@@ -1,8 +1,5 @@
-"""Learn the behaviour tree's numbers: what ``learning/runner.py`` drives where ``parameter_search.enabled``.
-
-Every iteration runs episodes of one scene in the simulator, each with numbers of its own, and moves the best
-numbers so far: those for slow obstacles or those for fast ones (``number_search``).
-"""
+"""Learn the behavior tree's numbers: every iteration runs episodes of one scene in the simulator, each with
+numbers of its own, and moves the best so far: those for slow obstacles or those for fast ones."""
 
 from __future__ import annotations
 
@@ -13,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS
 from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.config.behavior import FAST, SLOW, TUNED, configured_factors, log_bounds
 from uuvtai.config.learning import LearningConfig, SearchScene
 from uuvtai.config.loader import ConfigError
-from uuvtai.learning.agents import TunedAgent, tree_row, tuned_sections
+from uuvtai.learning.agents import TunedAgent, tuned_sections
 from uuvtai.learning.rollout import Recent, RolloutSums
 
 if TYPE_CHECKING:
@@ -28,24 +26,13 @@ if TYPE_CHECKING:
     from uuvtai.sim.sim import Sim
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A search among many numbers at once: trials drawn around the best ones so far, and steps along the response
-# surface of all trials.
-#
-# A quadratic without mixed terms is fitted to the trials by ridge regression: a response surface (Box &
-# Wilson 1951, Journal of the Royal Statistical Society B 13). Noise of one trial hardly matters, for every
-# trial says something about every number.
-
-
 class NumberSearch:
-    """Best numbers so far, every trial, and where the next ones lie. It draws from a generator of its own:
-    what two searches find does not depend on whether they run in turns or one after the other."""
+    """A search among many numbers at once: trials drawn around the best ones so far, and steps along the
+    response surface of all trials, a quadratic without mixed terms (Box & Wilson 1951)."""
 
-    def __init__(
-        self, centre: torch.Tensor, bounds: torch.Tensor, spread: float, size: int, seed: int
-    ) -> None:
-        """``centre`` (n,) to begin at, within ``bounds`` (2, n); trials lie within ``spread`` of the way
-        between these around the best ones; ``size`` is the most trials there will be."""
+    def __init__(self, centre: Tensor, bounds: Tensor, spread: float, size: int, seed: int) -> None:
+        """``centre`` (n,) to begin at, within ``bounds`` (2, n); ``spread`` of the way between these is how
+        far trials lie from the best ones; ``size`` is the most trials there will be."""
         self.centre = centre.clone()
         self.low, self.high = bounds
         self.spread = spread * (self.high - self.low)
@@ -54,17 +41,15 @@ class NumberSearch:
         self._place, self._score = torch.zeros(size, len(centre)), torch.zeros(size)
         self._group = torch.zeros(size, dtype=torch.int64)
 
-    def drawn(self, count: int) -> torch.Tensor:
-        """(count, n) numbers to try, by pairs for one episode each: anywhere within ``spread``, the second of
-        a pair as far the other way (mirrored sampling)."""
+    def drawn(self, count: int) -> Tensor:
+        """(count, n) numbers to try: within ``spread``, the second of a pair as far the other way."""
         draw = torch.rand(count // 2, len(self.centre), generator=self._generator)
         way = (2.0 * draw - 1.0) * self.spread
         tried = self.centre + torch.stack([way, -way], 1).reshape(count, len(self.centre))
         return tried.clamp(self.low, self.high)
 
-    def take(self, place: torch.Tensor, score: torch.Tensor, group: int) -> None:
-        """Remember trials at ``place`` (count, n) with scores (count,), all of one ``group``: the levels of
-        groups say nothing about the numbers."""
+    def take(self, place: Tensor, score: Tensor, group: int) -> None:
+        """Remember trials at ``place`` (count, n) with scores (count,), all of one ``group``."""
         rows = slice(self.trials, self.trials + len(place))
         self._place[rows], self._score[rows], self._group[rows] = place, score, group
         self.trials += len(place)
@@ -78,15 +63,13 @@ class NumberSearch:
         self.centre = torch.from_numpy(best_near(centre, slope, bend, spread, low, high)).float()
 
     def state(self) -> dict[str, Any]:
-        """All that the next steps depend on, but for ``memory``."""
+        """But for ``memory``."""
         return {"centre": self.centre, "generator": self._generator.get_state(), "trials": self.trials}
 
-    def memory(self) -> dict[str, torch.Tensor]:
-        """Every trial."""
+    def memory(self) -> dict[str, Tensor]:
         return {"place": self._place, "score": self._score, "group": self._group}
 
-    def load_state(self, state: Mapping[str, Any], memory: Mapping[str, torch.Tensor]) -> None:
-        """Go on from what ``state`` and ``memory`` gave."""
+    def load_state(self, state: Mapping[str, Any], memory: Mapping[str, Tensor]) -> None:
         self.centre = state["centre"].clone()
         self._generator.set_state(state["generator"])
         self.trials = int(state["trials"])
@@ -94,19 +77,16 @@ class NumberSearch:
             own.copy_(memory[name])
 
 
+Array = np.ndarray
 PAIR_CORRELATION = 0.4
 """of the scores of two trials of one episode: as measured in the fast gauntlet"""
 SLOPE_SD, BEND_MEAN, BEND_SD = 0.02, -0.01, 0.01
-"""what is expected of the terms per ``spread`` and per its square: the narrower, the more trials it takes to
-believe in an effect; numbers that are in use have their best place somewhere near"""
+"""what is expected of the terms per ``spread`` and per its square"""
 
 
-def fitted(
-    place: np.ndarray, score: np.ndarray, group: np.ndarray, spread: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def fitted(place: Array, score: Array, group: Array, spread: Array) -> tuple[Array, Array]:
     """(slopes, bends), both (n,) per unit of ``spread`` (n,), of the scores (m,) of trials at ``place`` (m,
-    n): score = level of its group + slopes x + bends x^2. ``group`` (m,) are numbers from 0 on. Trials 0
-    and 1, 2 and 3, .. are of one episode: what makes it easy or hard counts for both alike."""
+    n): score = level of its group + slopes x + bends x^2. Trials 0 and 1, 2 and 3, .. are of one episode."""
     x = place / spread
     level = np.eye(int(group.max()) + 1)[group]
     columns = np.concatenate([level, x, x * x], axis=1)
@@ -114,29 +94,20 @@ def fitted(
     noise = max(float(np.mean(centred**2)), 1e-9)
     columns, score = _uncorrelated(columns), _uncorrelated(score)
     n, n_level = x.shape[1], level.shape[1]
-    prior = np.concatenate(
-        [np.full(n_level, 1e-6), np.full(n, noise / SLOPE_SD**2), np.full(n, noise / BEND_SD**2)]
-    )
-    mean = np.concatenate([np.zeros(n_level + n), np.full(n, BEND_MEAN)])
+    prior = np.repeat([1e-6, noise / SLOPE_SD**2, noise / BEND_SD**2], [n_level, n, n])
+    mean = np.repeat([0.0, BEND_MEAN], [n_level + n, n])
     found = np.linalg.solve(columns.T @ columns + np.diag(prior), columns.T @ score + prior * mean)
     return found[n_level : n_level + n], found[n_level + n :]
 
 
-def _uncorrelated(rows: np.ndarray) -> np.ndarray:
-    """Sums and differences of the pairs, both with errors of the same size that are not correlated."""
+def _uncorrelated(rows: Array) -> Array:
+    """Sums and differences of the pairs, with errors of the same size that are not correlated."""
     first, second = rows[0::2], rows[1::2]
     total = (first + second) / np.sqrt(2.0 * (1.0 + PAIR_CORRELATION))
     return np.concatenate([total, (first - second) / np.sqrt(2.0 * (1.0 - PAIR_CORRELATION))])
 
 
-def best_near(
-    centre: np.ndarray,
-    slope: np.ndarray,
-    bend: np.ndarray,
-    spread: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
+def best_near(centre: Array, slope: Array, bend: Array, spread: Array, low: Array, high: Array) -> Array:
     """(n,) highest place of the surface within half a ``spread`` of ``centre`` and within the bounds."""
     first, last = np.maximum(centre - 0.5 * spread, low), np.minimum(centre + 0.5 * spread, high)
     top = np.where(bend < 0, -0.5 * slope / np.where(bend < 0, bend, -1.0) * spread, first)
@@ -145,14 +116,8 @@ def best_near(
     return np.take_along_axis(tries, np.argmax(slope * x + bend * x * x, axis=0)[None], axis=0)[0]
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Simulators of the worlds that a trainer runs.
-
-
 def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
-    """A simulator of a world with room for every scene, on the run's sensors and stack. Raises
-    ConfigError."""
-    from uuvtai.common.presets import TRAINING_TREE
+    """A simulator of a world with room for every scene, on the run's sensors and stack. ConfigError."""
     from uuvtai.config.loader import load_config
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim
@@ -162,14 +127,10 @@ def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) 
     return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.behavior.max_node))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Episodes of one scene in a trainer's simulator, so many at once as there are rows.
-
-
 def run_search_episodes(
     sim: Sim, agent: HeldAgent, scene: Scene, seed: int, first: int, count: int, times: int = 1
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(outcome code, control steps), both (count,), of episodes from ``first`` on of a seed, each run
+) -> tuple[Tensor, Tensor]:
+    """(outcome code, control steps), both (count,), of a scene's episodes from ``first`` on of a seed, each
     ``times`` times in a row, driven by an agent of this simulator."""
     outcome, steps = (torch.zeros(count, dtype=torch.int64) for _ in range(2))
     sim.set_scenes([scene])
@@ -196,13 +157,12 @@ def run_search_episodes(
 
 
 class EpisodeTrainer:
-    """What a trainer has whose episodes begin and end within an iteration: its simulators carry nothing from
-    one to the next."""
+    """A trainer whose episodes begin and end within an iteration: its simulators carry nothing on."""
 
     counters: tuple[str, ...] = ("iteration", "env_steps")
 
     def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None) -> None:
-        """``sims``: simulators of worlds that are there already."""
+        """``sims``: of worlds that are there already."""
         self.config, self._sims = config, dict(sims or {})
         self.recent = Recent(OUTCOMES, ())
         self.iteration = self.env_steps = 0
@@ -214,8 +174,7 @@ class EpisodeTrainer:
         return self._sims[world]
 
     def _done(self, steps: int, began: float, between: float) -> dict[str, float]:
-        """Count an iteration of so many env steps, and what it took: simulating from ``began`` to ``between``
-        [s], then learning."""
+        """Count an iteration, which simulated from ``began`` to ``between`` [s], then learned."""
         self.iteration += 1
         self.env_steps += steps
         now = time.perf_counter()
@@ -232,34 +191,30 @@ class EpisodeTrainer:
         return {"counters": {name: getattr(self, name) for name in self.counters}}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what ``state`` gave."""
         for name, value in state["counters"].items():
             setattr(self, name, int(value))
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 class ParameterSearchTrainer(EpisodeTrainer):
-    """Everything that the search carries from one iteration to the next."""
+    """Two searches: for slow obstacles and for fast ones."""
 
     def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None = None) -> None:
-        """Raises ConfigError."""
+        """Raises ConfigError for scenes that are neither slow nor fast."""
+        from uuvtai.envs.vector_env import ObservationColumn
+
         super().__init__(config, sims)
-        self.observation_table = (tree_row(),)
+        self.observation_table = (ObservationColumn("tree", slice(0, 4), "1", "body", "what the tree asks"),)
         self._scenes = config.parameter_search.scenes
         self._part = [self._part_of(scene) for scene in self._scenes]
         self.searches = tuple(self._search(part) for part in (SLOW, FAST))
 
     def _part_of(self, scene: SearchScene) -> int:
-        """``SLOW`` or ``FAST``."""
         fast = self.config.fast
         if fast.from_m_s < scene[3] < fast.full_m_s:
             raise ConfigError(
                 f"parameter_search.scenes: obstacles at {scene[3]:g} m/s, in {scene[0]}, are neither slow "
-                f"(fast.from_m_s, "
-                f"{fast.from_m_s:g} m/s or less) nor fast (fast.full_m_s, {fast.full_m_s:g} m/s or more); "
-                "choose another speed"
+                f"(fast.from_m_s, {fast.from_m_s:g} m/s or less) nor fast (fast.full_m_s, "
+                f"{fast.full_m_s:g} m/s or more); choose another speed"
             )
         return SLOW if scene[3] <= fast.from_m_s else FAST
 
@@ -275,19 +230,19 @@ class ParameterSearchTrainer(EpisodeTrainer):
         )
 
     def files(self) -> dict[str, bytes]:
-        """The stack that drives with the tree's numbers as they are now, for ``--agent``."""
+        """The stack that drives by the numbers as they are now."""
         lines = [f"tree: {TRAINING_TREE}"]
         for section, factors in tuned_sections(self.centre).items():
             lines += [f"{section}:", *(f"  {name}: {value}" for name, value in factors.items())]
         return {"stack.yaml": ("\n".join(lines) + "\n").encode()}
 
     @property
-    def centre(self) -> torch.Tensor:
+    def centre(self) -> Tensor:
         """(n_tuned, 2) natural logarithms of the best factors so far."""
         return torch.stack([search.centre for search in self.searches], 1)
 
     def iterate(self) -> dict[str, float]:
-        """Run episodes, move towards the better ones; metrics by their names in metrics.jsonl."""
+        """Run episodes, move towards the better ones; metrics."""
         began = time.perf_counter()
         nth = self.iteration % len(self._scenes)
         scene, part = self._scenes[nth], self._part[nth]
@@ -305,7 +260,7 @@ class ParameterSearchTrainer(EpisodeTrainer):
         return self._counted(outcome, env_steps) | self.factors() | times
 
     def factors(self) -> dict[str, float]:
-        """The factors that trials are drawn around, by their names in metrics.jsonl."""
+        """The best so far, as metrics."""
         return {
             f"{section}/{number.name}": factor
             for section, search in zip(("slow", "fast"), self.searches, strict=True)
@@ -313,34 +268,31 @@ class ParameterSearchTrainer(EpisodeTrainer):
         }
 
     def _played(
-        self, scene: SearchScene, place: torch.Tensor, seed: int, first: int, count: int, times: int = 1
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As ``run_search_episodes``, by the numbers at ``place`` (n_tuned, 2), or (num_envs, n_tuned, 2) by
-        those of every row."""
+        self, scene: SearchScene, place: Tensor, seed: int, first: int, count: int, times: int = 1
+    ) -> tuple[Tensor, Tensor]:
+        """As ``run_search_episodes``, by numbers (n_tuned, 2), or (num_envs, n_tuned, 2)."""
         world, s, d, v = scene
         sim = self.simulator(world, tuple(other[1:] for other in self._scenes if other[0] == world))
         agent = TunedAgent(self.centre, sim)
         agent.log_factor[: sim.num_envs] = place.numpy()
         return run_search_episodes(sim, agent, (s, d, v), seed, first, count, times)
 
-    def _scored(self, outcome: torch.Tensor, steps: torch.Tensor, part: int) -> torch.Tensor:
+    def _scored(self, outcome: Tensor, steps: Tensor, part: int) -> Tensor:
         """1 for an arrival at once, less for a late one, 0 for none."""
         parameter_search = self.config.parameter_search
         cost = parameter_search.slow_time_cost if part == SLOW else parameter_search.time_cost
         late = steps * self.config.episode.control_dt_s * cost
         return (outcome == SUCCESS).float() * (1.0 - late)
 
-    def _counted(self, outcome: torch.Tensor, steps: int) -> dict[str, float]:
+    def _counted(self, outcome: Tensor, steps: int) -> dict[str, float]:
         sums = RolloutSums(len(OUTCOMES), 0, torch.device("cpu"))
         sums.outcomes += torch.bincount(outcome, minlength=len(OUTCOMES)).double()
         sums.episode_steps += steps
         sums.samples += steps
         return self.recent.add(sums)
 
-    # --------------------------------------------------------------------------------------------- evaluation
-
     def evaluate(self) -> dict[str, float]:
-        """``eval/*`` of what was found so far, on episodes that no trial met, as many of each scene."""
+        """``eval/*`` of the best so far, on episodes that no trial met, as many of each scene."""
         train, scenes = self.config.train, list(dict.fromkeys(self._scenes))
         each, won, metrics = -(-train.evaluate_episodes // len(scenes)), [], {}
         for scene in scenes:
@@ -354,10 +306,8 @@ class ParameterSearchTrainer(EpisodeTrainer):
                 metrics[f"eval/time_to_success_{name}_s"] = mean_s
         return metrics | {"eval/success_rate": float(torch.cat(won).mean())}
 
-    # ------------------------------------------------------------------------------------------------- resume
-
     def state(self) -> dict[str, Any]:
-        """All that the next iterations depend on. What drives is the part ``tree``."""
+        """What drives is the part ``tree``."""
         return super().state() | {
             "tree": {"log_factor": self.centre},
             "recent": list(self.recent.rows),
@@ -366,7 +316,6 @@ class ParameterSearchTrainer(EpisodeTrainer):
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what ``state`` gave."""
         super().load_state(state)
         self.recent.rows = [list(row) for row in state["recent"]]
         for search, own, memory in zip(self.searches, state["searches"], state["env"], strict=True):

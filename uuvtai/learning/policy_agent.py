@@ -1,9 +1,7 @@
-"""A trained policy driving: the mean action without exploration noise, with the world model's memory of
-every row.
+"""A trained policy driving: the mean action without exploration noise.
 
 What a row does must not depend on its neighbours, the batch's size or the number of threads. The networks
-therefore always see ``CHUNK`` rows at once, the last chunk filled up: equal shapes take equal paths through
-the matrix products.
+therefore always see ``CHUNK`` rows at once: equal shapes take equal paths through the matrix products.
 """
 
 from __future__ import annotations
@@ -13,12 +11,13 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
 from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic
 from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
+Device = torch.device | str
 CHUNK = 64
 """rows that go through the networks together"""
 
@@ -26,34 +25,33 @@ CHUNK = 64
 class AgentDecision(NamedTuple):
     """What the policy chooses for N rows, and what it thinks of their state."""
 
-    action: torch.Tensor
+    action: Tensor
     """(N, 4) mean action in parts of the vehicle's limits, within [-1, 1]"""
-    value: torch.Tensor
+    value: Tensor
     """(N,) expected return"""
-    std: torch.Tensor
+    std: Tensor
     """(4,) of the exploration it was trained with"""
-    residual: torch.Tensor
+    residual: Tensor
     """(N,) of the world model's last prediction; 0 = none yet, or no world model"""
-    uncertainty: torch.Tensor
+    uncertainty: Tensor
     """(N,) of that prediction"""
 
 
 class OneDecision(nn.Module):
     """The networks for one decision, without memory."""
 
-    fill: torch.Tensor
+    fill: Tensor
     """(n_obs,) what counts where a value is not finite"""
 
     def __init__(self, policy: ActorCritic, world_model: WorldModel | None) -> None:
-        """``world_model``: None where the policy was trained without its features. The networks are used, not
-        copied."""
+        """``world_model``: None where the policy was trained without its features."""
         super().__init__()
         self.policy, self.world_model = policy, world_model
         self.register_buffer("fill", policy.observation_norm.mean[: policy.n_in - N_FEATURES].float())
 
     def forward(
-        self, obs: torch.Tensor, last_obs: torch.Tensor, last_action: torch.Tensor, has_last: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
+        self, obs: Tensor, last_obs: Tensor, last_action: Tensor, has_last: Tensor
+    ) -> tuple[Tensor, ...]:
         """(mean action (N, 4), value (N,), residual and uncertainty (N, 2)) for the newest observations
         (N, n_obs), those of the last decision, its action (N, 4), and whether (N,) bool there was one."""
         obs, last_obs = (torch.where(torch.isfinite(seen), seen, self.fill) for seen in (obs, last_obs))
@@ -66,44 +64,41 @@ class OneDecision(nn.Module):
 
 
 class HeldAgent(ABC):
-    """Drives rows by decisions that are held for some control steps. ``decide`` looks, ``advance`` goes on to
-    the next step; ``reset`` when a row begins another episode."""
+    """Drives rows by decisions that are held for some control steps."""
 
     world_model: WorldModel | None = None
 
-    def __init__(self, num_envs: int, hold_steps: int, device: torch.device | str) -> None:
+    def __init__(self, num_envs: int, hold_steps: int, device: Device) -> None:
         self.device, self._hold = torch.device(device), hold_steps
         self._age = torch.zeros(num_envs, dtype=torch.int64, device=device)
         """control steps of every row's episode"""
         std = torch.zeros(NUM_ACTIONS, device=device)
-        self.decision = AgentDecision(
-            self._zeros(NUM_ACTIONS), self._zeros(), std, self._zeros(), self._zeros()
-        )
-        """the last one; where an older one is held, what the networks said then; 0 is what nobody says"""
+        self.decision = AgentDecision(self._zeros(4), self._zeros(), std, self._zeros(), self._zeros())
+        """the last one; 0 is what nobody says"""
 
-    def reset(self, rows: torch.Tensor) -> None:
+    def reset(self, rows: Tensor) -> None:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
         self._age *= rows.to(self.device) == 0
 
     @abstractmethod
-    def decide(self, obs: torch.Tensor) -> AgentDecision:
+    def decide(self, obs: Tensor) -> AgentDecision:
         """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on."""
 
     def advance(self) -> None:
         """The last decision has been carried out."""
         self._age += 1
 
-    def act(self, obs: torch.Tensor) -> torch.Tensor:
+    def act(self, obs: Tensor) -> Tensor:
         """Decide and carry it out: actions (num_envs, 4)."""
         action = self.decide(obs).action
         self.advance()
         return action
 
-    def _zeros(self, *shape: int) -> torch.Tensor:
+    def _zeros(self, *shape: int) -> Tensor:
         """(num_envs, *shape)."""
         return torch.zeros(len(self._age), *shape, device=self.device)
 
-    def _due(self) -> torch.Tensor:
+    def _due(self) -> Tensor:
         """Rows whose decision is not held any more."""
         return (self._age % self._hold == 0).nonzero().flatten()
 
@@ -112,13 +107,8 @@ class PolicyAgent(HeldAgent):
     """Drives ``num_envs`` rows by a policy on observation vectors."""
 
     def __init__(
-        self,
-        policy: ActorCritic,
-        world_model: WorldModel | None,
-        num_envs: int,
-        device: torch.device | str = "cpu",
+        self, policy: ActorCritic, world_model: WorldModel | None, num_envs: int, device: Device = "cpu"
     ) -> None:
-        """As ``OneDecision``."""
         super().__init__(num_envs, policy.config.hold_steps, device)
         self.policy, self.world_model = policy, world_model
         self._one = OneDecision(policy, world_model)
@@ -128,8 +118,9 @@ class PolicyAgent(HeldAgent):
         """mean action, before it was cut off to [-1, 1], value and features of the last decision"""
 
     @torch.no_grad()
-    def decide(self, obs: torch.Tensor) -> AgentDecision:
-        """As ``HeldAgent``; what is not finite counts as its mean in training."""
+    def decide(self, obs: Tensor) -> AgentDecision:
+        """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on. What is
+        not finite counts as its mean in training."""
         self._obs[:] = obs
         due = self._due()
         if len(due):
@@ -143,15 +134,14 @@ class PolicyAgent(HeldAgent):
         return self.decision
 
     def advance(self) -> None:
-        """As ``HeldAgent``."""
+        """The last decision has been carried out."""
         due = self._due()
         self._last_obs[due], self._last_action[due] = self._obs[due], self._said[0][due]
         super().advance()
 
 
-def by_chunk(function: Callable[..., tuple[torch.Tensor, ...]], *inputs: torch.Tensor) -> list[torch.Tensor]:
-    """Outputs of a function of inputs (n, ...), ``CHUNK`` rows at a time, the last chunk filled up with its
-    first row."""
+def by_chunk(function: Callable[..., tuple[Tensor, ...]], *inputs: Tensor) -> list[Tensor]:
+    """Outputs of a function, ``CHUNK`` rows at a time, the last chunk filled up with its first row."""
     parts = []
     for i in range(0, len(inputs[0]), CHUNK):
         chunk = [tensor[i : i + CHUNK] for tensor in inputs]
@@ -162,17 +152,14 @@ def by_chunk(function: Callable[..., tuple[torch.Tensor, ...]], *inputs: torch.T
 
 _NO_NETWORK = {
     "forecast": "forecasts and does not drive; give it to an agent that does: --set forecast.learned=RUN",
-    "search": "numbers for the behaviour tree, no network that could be exported; they drive as "
-    "--agent best, or as stack.yaml of the run",
-    "set": "a policy over a set of obstacles, which looks at the simulator itself; it drives in 'uuv "
-    "eval' and 'uuv sweep', and is exported by 'uuv export'",
+    "search": "numbers of the behavior tree, no network; they drive by --agent with the run's stack.yaml",
+    "set": "a policy over a set of obstacles looks at the simulator itself; give it to 'uuv eval'",
 }
 """what cannot be a ``PolicyAgent``, by ``LearningConfig.learner``, or ``encoder`` of a policy"""
 
 
-def load_agent(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> PolicyAgent:
-    """PolicyAgent with the networks of a checkpoint. Raises CheckpointError where they do not fit what its
-    config says."""
+def load_agent(checkpoint: Checkpoint, num_envs: int, device: Device = "cpu") -> PolicyAgent:
+    """PolicyAgent of a checkpoint. Raises CheckpointError where its networks do not fit its config."""
     config = checkpoint.config
     kind = config.encoder if config.learner == "ppo" else config.learner
     if kind in _NO_NETWORK:
@@ -181,15 +168,11 @@ def load_agent(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     def n_obs() -> int:
         return max(row["stop"] for row in checkpoint.manifest.observation_table)
 
-    def new_policy() -> ActorCritic:
-        return ActorCritic(n_obs() + N_FEATURES, config.policy, torch.Generator())
-
-    def new_model() -> WorldModel:
-        return WorldModel(n_obs(), config.world_model, torch.Generator())
-
-    policy, world_model = network(checkpoint, "policy", new_policy).to(device), None
-    if config.world_model.enabled and config.world_model.as_features:
-        world_model = network(checkpoint, "world_model", new_model).to(device)
+    new, world, world_model = torch.Generator(), config.world_model, None
+    policy = network(checkpoint, "policy", lambda: ActorCritic(n_obs() + N_FEATURES, config.policy, new))
+    if world.enabled and world.as_features:
+        world_model = network(checkpoint, "world_model", lambda: WorldModel(n_obs(), world, new)).to(device)
+    policy = policy.to(device)
     return PolicyAgent(policy, world_model, num_envs, device)
 
 
@@ -197,8 +180,8 @@ Net = TypeVar("Net", bound=nn.Module)
 
 
 def network(checkpoint: Checkpoint, name: str, make: Callable[[], Net]) -> Net:
-    """What ``make`` gives, with the weights that a checkpoint holds under this name, to act with. Raises
-    CheckpointError where they are of another shape, before anything is made so wide, or not finite."""
+    """What ``make`` gives, with the weights that a checkpoint holds under this name. Raises CheckpointError
+    where they are of another shape, before anything is made so wide, or not finite."""
     file, model = checkpoint.path / MODEL, checkpoint.model()
     try:
         part = model[name]

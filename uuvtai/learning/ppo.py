@@ -1,9 +1,5 @@
-"""Proximal policy optimisation (Schulman et al. 2017) with generalised advantages, an optional distillation
-term and a guard against NaN, for any ``Policy``.
-
-Statistics of the normalisers stand still from the first step of a rollout to the last minibatch of its
-update, so that the ratio of the first minibatch is one; only then do they take in the rollout.
-"""
+"""Proximal policy optimisation (Schulman et al. 2017) with generalised advantages and an optional
+distillation term, for any ``Policy``."""
 
 from __future__ import annotations
 
@@ -13,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from uuvtai.config.learning import PpoConfig
 from uuvtai.learning.distillation import imitation_error
@@ -38,21 +35,17 @@ DECAY_FROM, LEAST_RATE = 0.5, 0.1
 
 
 def gae(
-    reward: torch.Tensor,
-    value: torch.Tensor,
-    next_value: torch.Tensor,
-    terminated: torch.Tensor,
-    ended: torch.Tensor,
+    reward: Tensor,
+    value: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    ended: Tensor,
     gamma: float,
     lam: float,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(advantage, return), both (T, N), by generalised advantage estimation (Schulman et al. 2016, equation
-    16).
-
-    All inputs are (T, N). ``next_value[t]`` is the value of the true next observation: after a timeout
-    (ended, not terminated) it is bootstrapped from, after a termination it is not; past an ending nothing is
-    carried back.
-    """
+) -> tuple[Tensor, Tensor]:
+    """(advantage, return), both (T, N) as all inputs, by generalised advantage estimation (Schulman et al.
+    2016, equation 16). ``next_value`` of the true next observation counts after a timeout (ended, not
+    terminated), not after a termination; past an ending nothing is carried back."""
     delta = reward + gamma * next_value * ~terminated - value
     carried = gamma * lam * ~ended
     advantage = torch.empty_like(reward)
@@ -62,30 +55,27 @@ def gae(
     return advantage, advantage + value
 
 
-def surrogate_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip: float) -> torch.Tensor:
+def surrogate_loss(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
     """(B,) the negative clipped objective of every sample (Schulman et al. 2017, equation 7)."""
     ratio = log_ratio.exp()
     return -torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
 
 
-def approximate_kl(log_ratio: torch.Tensor) -> torch.Tensor:
+def approximate_kl(log_ratio: Tensor) -> Tensor:
     """(B,) samples of KL(old || new) [nat] that are never negative (Schulman 2020, estimator k3)."""
     return torch.expm1(log_ratio) - log_ratio
 
 
-def adapted_rate(rate: torch.Tensor, kl: torch.Tensor, target_kl: float) -> torch.Tensor:
-    """Learning rate after an update of this mean KL divergence: slower above twice the target, faster below
-    half of it (rsl_rl)."""
+def adapted_rate(rate: Tensor, kl: Tensor, target_kl: float) -> Tensor:
+    """Learning rate after an update of this mean KL divergence (rsl_rl)."""
     slower, faster = rate / RATE_FACTOR, rate * RATE_FACTOR
-    return torch.where(kl > 2.0 * target_kl, slower, torch.where(kl < 0.5 * target_kl, faster, rate)).clamp(
-        *RATE_BOUNDS
-    )
+    found = torch.where(kl > 2.0 * target_kl, slower, torch.where(kl < 0.5 * target_kl, faster, rate))
+    return found.clamp(*RATE_BOUNDS)
 
 
 _SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distill_loss", "count")
-Piece = tuple[tuple[torch.Tensor, ...], torch.Tensor]
-"""what some rows of a minibatch add to it: gradients; sums over the valid rows, in the order of ``_SUMS``,
-float64"""
+Piece = tuple[tuple[Tensor, ...], Tensor]
+"""of some rows of a minibatch: gradients; sums over the valid ones, in the order of ``_SUMS``"""
 
 
 class Ppo(AdamLearner):
@@ -112,13 +102,8 @@ class Ppo(AdamLearner):
         distillation_weight: float = 0.0,
         share: float = 0.0,
     ) -> dict[str, float]:
-        """Learn from a closed rollout; metrics by their names in metrics.jsonl, means over all minibatches of
-        the update.
-
-        ``generator`` (CPU) draws the minibatches where they are random. ``distillation_weight`` is lambda_t
-        s_t of ||mean - teacher_action||^2. ``share`` of the run is over. Samples that are not finite have no
-        part in any of it and are counted.
-        """
+        """Learn from a closed rollout when ``share`` of the run is over; metrics, means over all minibatches.
+        ``distillation_weight`` is lambda_t s_t. Samples that are not finite have no part in it."""
         config = self.config
         samples, metrics = self._prepared(rollout)
         fade = min(1.0, (1.0 - share) / (1.0 - DECAY_FROM)) if config.target_kl > 0 else 1.0
@@ -143,38 +128,28 @@ class Ppo(AdamLearner):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Adam's moments, the learning rate and the counters."""
         return super().state_dict() | {"learning_rate": self.rate.clone(), "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """What ``state_dict`` gave."""
         super().load_state_dict(state)
         self.optimiser.param_groups[0]["lr"] = self._rate_now
         self.rate.copy_(state["learning_rate"])
         self.updates = int(state["updates"])
 
-    # ----------------------------------------------------------------------------------- what is learned from
-
     @torch.no_grad()
     def _prepared(self, rollout: Rollout) -> tuple[View, dict[str, float]]:
-        """Samples as the losses want them, (T N, ...): what the rollout has, zero where a sample is not
-        finite; ``valid`` 1 or 0; ``advantage`` normalised over the valid samples; ``target``, the return in
-        the critic's units; the prepared inputs."""
+        """Samples as the losses want them, (T N, ...), zero where one is not finite: ``valid`` 1 or 0;
+        ``advantage`` standardised; ``target``, the return in the critic's units; the prepared inputs."""
         valid = rollout.valid()
         if not bool(valid.all()):
             rollout = rollout.where(valid)
-        advantage, returns = gae(
-            rollout["reward"],
-            rollout["value"],
-            rollout["next_value"],
-            rollout["terminated"],
-            rollout["ended"] | ~valid,
-            self.config.gamma,
-            self.config.gae_lambda,
-        )
+        reward, value, following = rollout["reward"], rollout["value"], rollout["next_value"]
+        terminated, ended = rollout["terminated"], rollout["ended"] | ~valid
+        gamma, lam = self.config.gamma, self.config.gae_lambda
+        advantage, returns = gae(reward, value, following, terminated, ended, gamma, lam)
         good = returns[valid]
         metrics = {
-            "train/explained_variance": _explained_variance(rollout["value"][valid], good),
+            "train/explained_variance": _explained_variance(value[valid], good),
             "train/invalid_samples": float(valid.numel() - len(good)),
         }
         if self.config.normalise_values:
@@ -188,7 +163,7 @@ class Ppo(AdamLearner):
         kept = {n: flat[n] for n in ("action", "log_prob", "teacher_action") if n in flat}
         return kept | self.policy.prepared(flat) | found, metrics
 
-    def _minibatches(self, count: int, generator: torch.Generator) -> Iterator[slice | torch.Tensor]:
+    def _minibatches(self, count: int, generator: torch.Generator) -> Iterator[slice | Tensor]:
         """Blocks of neighbouring rows (all envs in a span of steps), or random ones."""
         parts, order = self.config.minibatches, None
         if self.policy.is_shuffled:
@@ -196,21 +171,19 @@ class Ppo(AdamLearner):
         for first, last in itertools.pairwise(count * part // parts for part in range(parts + 1)):
             yield slice(first, last) if order is None else order[first:last]
 
-    # ------------------------------------------------------------------------------------------ one minibatch
-
-    def _learn(self, samples: View, index: slice | torch.Tensor, distillation_weight: float) -> torch.Tensor:
-        """A step by these samples; their sums. Pieces are added up in their order: the number of threads
-        changes no bit."""
+    def _learn(self, samples: View, index: slice | Tensor, distillation_weight: float) -> Tensor:
+        """A step by these samples; their sums. The number of threads changes no bit."""
         self.optimiser.zero_grad(set_to_none=True)
         count = samples["valid"][index].sum().clamp(min=1.0)
         together = functools.partial(side_by_side, device=self.rate.device.type)
-        blocks = together(*(functools.partial(_rows, samples, part) for part in self._parts(index)))
+
+        def rows(part: slice | Tensor) -> View:
+            return {name: values[part] for name, values in samples.items()}
+
         pieces: list[Callable[[], Piece]] = []
-        for block in blocks:
-            pieces += [
-                functools.partial(self._of_actor, block, count, distillation_weight),
-                functools.partial(self._of_critic, block, count),
-            ]
+        for block in together(*(functools.partial(rows, part) for part in self._parts(index))):
+            pieces.append(functools.partial(self._of_actor, block, count, distillation_weight))
+            pieces.append(functools.partial(self._of_critic, block, count))
         found = together(*pieces)
         for parameters, mine in zip(self._nets, (found[::2], found[1::2]), strict=True):
             for parameter, *parts in zip(parameters, *(gradients for gradients, _ in mine), strict=True):
@@ -220,16 +193,16 @@ class Ppo(AdamLearner):
             self.updates += 1
         return torch.stack([sums for _, sums in found]).sum(dim=0)
 
-    def _parts(self, index: slice | torch.Tensor) -> Sequence[slice | torch.Tensor]:
+    def _parts(self, index: slice | Tensor) -> Sequence[slice | Tensor]:
         """A minibatch in parts whose activations stay in the cache of a CPU."""
         if self.rate.device.type != "cpu":
             return [index]
-        if isinstance(index, torch.Tensor):
+        if isinstance(index, Tensor):
             return index.split(CACHE_ROWS)
         starts = range(index.start, index.stop, CACHE_ROWS)
         return [slice(first, min(first + CACHE_ROWS, index.stop)) for first in starts]
 
-    def _of_actor(self, batch: View, count: torch.Tensor, distillation_weight: float) -> Piece:
+    def _of_actor(self, batch: View, count: Tensor, distillation_weight: float) -> Piece:
         config, valid, log_std = self.config, batch["valid"], self.policy.log_std
         share, mean = valid / count, self.policy.mean_of(batch)
         log_ratio = log_prob(batch["action"], mean, log_std) - batch["log_prob"]
@@ -245,33 +218,28 @@ class Ppo(AdamLearner):
             sums |= {"distill_loss": distill}
         return torch.autograd.grad(loss, self._nets[0]), _summed(sums, valid)
 
-    def _of_critic(self, batch: View, count: torch.Tensor) -> Piece:
+    def _of_critic(self, batch: View, count: Tensor) -> Piece:
         error = (self.policy.value_of(batch) - batch["target"]).square()
         loss = self.config.value_weight * (batch["valid"] / count * error).sum()
         gradients = torch.autograd.grad(loss, self._nets[1])
         return gradients, _summed({"value_loss": error}, batch["valid"])
 
 
-def _rows(samples: View, index: slice | torch.Tensor) -> View:
-    """These samples: views for a slice, copies next to each other for an index."""
-    return {name: part[index] for name, part in samples.items()}
-
-
 @torch.no_grad()
-def _summed(terms: View, valid: torch.Tensor) -> torch.Tensor:
+def _summed(terms: View, valid: Tensor) -> Tensor:
     """Sums of terms (B,) over the valid rows, in the order of ``_SUMS``; those that are not there are 0."""
     zero = torch.zeros_like(valid)
     return (torch.stack([terms.get(name, zero) for name in _SUMS]) @ valid).double()
 
 
-def _standardised(advantage: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+def _standardised(advantage: Tensor, valid: Tensor) -> Tensor:
     """Mean 0, deviation 1 by the moments of the valid samples; the others become 0."""
     moments = moments_of(advantage[valid][:, None])
     std = (moments.m2 / moments.n.clamp(min=1.0)).sqrt()
     return torch.where(valid, (advantage - moments.mean.float()) / (std.float() + 1e-8), 0.0)
 
 
-def _explained_variance(value: torch.Tensor, returns: torch.Tensor) -> float:
+def _explained_variance(value: Tensor, returns: Tensor) -> float:
     """1 - var(return - value) / var(return); 0 where the returns do not vary."""
     if len(returns) < 2 or not float(returns.var()):
         return 0.0

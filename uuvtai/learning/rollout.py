@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from uuvtai.common.enums import COLLIDED, OUTCOMES
 from uuvtai.learning.networks import Guard, Policy, View
@@ -17,10 +18,10 @@ from uuvtai.learning.networks import Guard, Policy, View
 class Step(NamedTuple):
     """What came of a decision, (N, ...)."""
 
-    reward: torch.Tensor
+    reward: Tensor
     """NaN where the sample is to be left out"""
-    terminated: torch.Tensor
-    ended: torch.Tensor
+    terminated: Tensor
+    ended: Tensor
     """bool, terminated or cut off; the env has begun its next episode"""
     final: View | None
     """the view that the decision led to; None where no episode was cut off"""
@@ -32,12 +33,11 @@ class Environment(ABC):
     """Where a policy learns: the simulator or its surrogate (``environments.py``). ``begin`` comes first."""
 
     env: Any
-    """where the episodes run, which can be captured"""
     carried: View
-    """beside what ``env`` captures: always the same tensors"""
+    """what is kept beside ``env.capture()``: always the same tensors"""
     num_envs: int
     device: torch.device
-    steps = 1
+    steps: int
     """of control that a decision counts as"""
     view: View
     """what is known now; written anew by ``step``"""
@@ -69,28 +69,23 @@ class Environment(ABC):
 
     @property
     @abstractmethod
-    def scenarios(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def scenarios(self) -> tuple[Tensor, Tensor]:
         """Seed and number, both (N,), of what every env is in."""
 
     @abstractmethod
-    def step(self, action: torch.Tensor, sums: RolloutSums | None) -> Step:
+    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
         """Carry out a decision (N, n_action), and count it."""
 
     def state_dict(self) -> View:
-        """What is carried beside ``capture``; not copied."""
         return dict(self.carried)
 
     def load_state_dict(self, state: View) -> None:
-        """What ``state_dict`` gave, after ``restore``."""
+        """After ``restore``."""
         for name, part in self.carried.items():
             part.copy_(state[name])
 
-    def capture(self) -> dict[str, Any]:
-        """The episodes."""
-        return self.env.capture()
-
     def restore(self, arrays: dict[str, Any]) -> None:
-        """Go on with what ``capture`` gave; ValueError, with nothing changed, for that of another env."""
+        """Go on with what ``env.capture`` gave; ValueError, with nothing changed, for another env's."""
         self.env.restore(arrays)
 
 
@@ -98,15 +93,11 @@ class Environment(ABC):
 # Memory of one rollout: T steps of N envs, allocated once.
 
 
-class Rollout(dict[str, torch.Tensor]):
-    """Tensors (T, N, ...) by name, in order of time.
-
-    Row t of env n: the view, what was decided (``PolicyStep``) and what came of it (``reward``,
-    ``next_value`` of the true next view, ``terminated``, ``ended``), what the environment told beside it.
-    """
+class Rollout(dict[str, Tensor]):
+    """Tensors (T, N, ...) by name: the view, what was decided (``PolicyStep``), what came of it (``reward``,
+    ``next_value`` of the true next view, ``terminated``, ``ended``) and what the environment told beside."""
 
     def __init__(self, steps: int) -> None:
-        """``steps`` = T."""
         super().__init__()
         self.steps = steps
 
@@ -117,9 +108,8 @@ class Rollout(dict[str, torch.Tensor]):
                 self[name] = part.new_zeros(self.steps, *part.shape)
             self[name][t].copy_(part)
 
-    def close(self, last_value: torch.Tensor) -> None:
-        """``next_value``, so far that of the views in which episodes were cut off, is that of the next view
-        where the episode went on; ``last_value`` (N,) is that of the view after the last step."""
+    def close(self, last_value: Tensor) -> None:
+        """``next_value`` where an episode went on: of the next view, after the last step ``last_value``."""
         following = torch.cat([self["value"][1:], last_value[None]])
         torch.where(self["ended"], self["next_value"], following, out=self["next_value"])
 
@@ -127,7 +117,7 @@ class Rollout(dict[str, torch.Tensor]):
         """Everything as (T N, ...), views: a run of rows is a block of memory."""
         return {name: part.flatten(0, 1) for name, part in self.items()}
 
-    def valid(self) -> torch.Tensor:
+    def valid(self) -> Tensor:
         """(T, N) bool: everything about the sample is finite."""
         total = torch.zeros_like(self["reward"])
         for part in self.values():
@@ -135,7 +125,7 @@ class Rollout(dict[str, torch.Tensor]):
                 total += part.flatten(2).sum(dim=2) if part.dim() > 2 else part
         return torch.isfinite(total)
 
-    def where(self, valid: torch.Tensor) -> Rollout:
+    def where(self, valid: Tensor) -> Rollout:
         """A copy that is 0 where ``valid`` (T, N) is not."""
         found = Rollout(self.steps)
         for name, part in self.items():
@@ -148,10 +138,7 @@ class Rollout(dict[str, torch.Tensor]):
 def collect(
     env: Environment, policy: Policy, rollout: Rollout, generator: torch.Generator
 ) -> tuple[RolloutSums, dict[str, float]]:
-    """Fill the rollout; what is counted, and the wall time [s] of simulating and of inferring.
-
-    ``generator`` (CPU) draws the exploration.
-    """
+    """Fill the rollout; what is counted, and the wall time [s] of simulating and of inferring."""
     began, simulate_s = time.perf_counter(), 0.0
     sums = RolloutSums(len(env.outcomes), len(env.reward_terms), env.device)
     for t in range(rollout.steps):
@@ -167,9 +154,8 @@ def collect(
     return sums, {"time/simulate_s": simulate_s, "time/infer_s": infer_s}
 
 
-def final_value(policy: Policy, step: Step) -> torch.Tensor:
-    """(N,) value of the views in which episodes were cut off, zero elsewhere: few rows, so only they are
-    computed."""
+def final_value(policy: Policy, step: Step) -> Tensor:
+    """(N,) value of the views in which episodes were cut off, zero elsewhere."""
     value = torch.zeros(len(step.ended), device=step.ended.device)
     rows = (step.ended & ~step.terminated).nonzero().flatten()
     if len(rows) and step.final is not None:
@@ -189,18 +175,13 @@ class RolloutSums:
     """Sums over one rollout, kept on the device until its end."""
 
     def __init__(self, n_outcome: int, n_term: int, device: torch.device) -> None:
-        """Nothing counted yet."""
         zeros = functools.partial(torch.zeros, dtype=torch.float64, device=device)
-        self.outcomes = zeros(n_outcome)
-        """(n_outcome,) episodes that ended, by outcome"""
-        self.episode_return, self.episode_steps = zeros(()), zeros(())
-        """() sums over the episodes that ended"""
-        self.terms = zeros(n_term)
-        """(n_term,) every weighted reward term, sum over all steps"""
-        self.samples = zeros(())
-        """() steps taken"""
+        self.outcomes, self.episode_return, self.episode_steps = zeros(n_outcome), zeros(()), zeros(())
+        """of the episodes that ended: number by outcome (n_outcome,), sums of returns and of steps"""
+        self.terms, self.samples = zeros(n_term), zeros(())
+        """sums of the weighted reward terms (n_term,), and number, of all steps"""
 
-    def count(self, ended: torch.Tensor, info: View) -> None:
+    def count(self, ended: Tensor, info: View) -> None:
         """Add one control step of all envs, of which these (N,) ended: ``info`` of ``VectorEnv.step``."""
         self.outcomes.index_add_(0, info["outcome"].long(), ended.double())
         self.episode_return += torch.where(ended, info["episode_return"], 0.0).nansum()
@@ -213,14 +194,12 @@ class Recent:
     """The newest iterations that together hold at least ``WINDOW`` ended episodes."""
 
     def __init__(self, outcomes: Sequence[str], terms: Sequence[str]) -> None:
-        """Names of the outcomes and of the reward's terms, in the order of the sums."""
         self.outcomes, self.terms = tuple(outcomes), tuple(terms)
         self.rows: list[list[float]] = []
         """[return, steps, one count per outcome] of every iteration in the window, oldest first"""
 
     def add(self, sums: RolloutSums) -> dict[str, float]:
-        """Take in a rollout; ``rollout/*`` over the window (none before the first episode has ended),
-        ``reward/*`` over the rollout."""
+        """Take in a rollout; ``rollout/*`` over the window, ``reward/*`` over the rollout."""
         self.rows.append([float(sums.episode_return), float(sums.episode_steps), *sums.outcomes.tolist()])
         while sum(sum(row[2:]) for row in self.rows[1:]) >= WINDOW:
             self.rows.pop(0)

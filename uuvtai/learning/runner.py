@@ -1,5 +1,4 @@
-"""``uuv train``: a run folder, iterations one after the other, checkpoints and evaluations in between, and
-how it all ends."""
+"""``uuv train``: a run folder, iterations, checkpoints and evaluations in between."""
 
 from __future__ import annotations
 
@@ -44,8 +43,7 @@ SCORE = "eval/success_rate"
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """What ``uuv train`` was asked for: a new run with ``config``, or to go on with the run folder
-    ``resume``."""
+    """A new run with ``config``, or to go on with the run folder ``resume``."""
 
     config: LearningConfig | None = None
     preset: str = "run"
@@ -56,8 +54,7 @@ class TrainRequest:
     overrides: Overrides | None = None
     """changes of the resumed run's config"""
     iterations: int | None = None
-    """stop when so many are done in all; None = ``train.iterations``, over which the schedules run in any
-    case"""
+    """done in all; None = ``train.iterations``, over which the schedules run in any case"""
     device: str = "auto"
     run_dir: Path | None = None
 
@@ -73,37 +70,33 @@ class TrainWatch(Protocol):
 
 AnyTrainer = Trainer | ParameterSearchTrainer | ForecastTrainer
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
-"""``eval/*`` of the policy as it is; training goes on as if nothing had been
-(``evaluation.evaluate.evaluate_now``, which knows what learning does not)"""
+"""``eval/*`` of the policy as it is (``evaluation.evaluate.evaluate_now``)"""
 
 
 def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple[dict[str, Any], Path]:
-    """Train or go on training; what ``uuv train --json`` prints, and the run folder. Every
-    ``train.evaluate_every`` iterations ``evaluate`` is asked.
+    """Train or go on training; what ``uuv train --json`` prints, and the run folder.
 
     Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets
-    the iteration end, saves and raises KeyboardInterrupt; a second one ends at once. Raises ConfigError,
-    ValueError, MemoryError, RunFolderError, CheckpointError, TrainingError.
+    the iteration end, saves and raises KeyboardInterrupt; a second one ends at once.
     """
     if request.iterations is not None and request.iterations < 1:
         raise ConfigError(f"--iterations {request.iterations}: at least 1, for example --iterations 100")
-    if request.resume is None:
-        refuse_place(request.run_dir)
-        return _train(request, None, watch, evaluate)
     # held before anything is read: what another process writes meanwhile must not count
-    held = RunFolder.held(request.resume, "uuv train")
+    held = RunFolder.held(request.resume, "uuv train") if request.resume else None
     try:
         return _train(request, held, watch, evaluate)
     finally:
-        held.release()
+        if held:
+            held.release()
 
 
 def _train(
     request: TrainRequest, folder: RunFolder | None, watch: TrainWatch, evaluate: Evaluate
 ) -> tuple[dict[str, Any], Path]:
-    """As ``train``; ``folder`` is the folder of the run to go on with."""
+    """``folder``: of the run to go on with."""
     if folder is None:
         assert request.config is not None
+        refuse_place(request.run_dir)
         found, (start, config) = None, _started(request.start, request.config, watch.note)
     else:
         start, config = None, load_resolved(folder.path / CONFIG, request.overrides)
@@ -113,14 +106,9 @@ def _train(
     total = request.iterations or config.train.iterations
     if folder and found and found.step >= total:
         folder.settle(found.step >= config.train.iterations)
-        raise ConfigError(
-            f"{folder.path}: has done {found.step} of {total} iterations; to go on give more: "
-            f"--iterations {2 * found.step}"
-        )
-    watch.note(
-        f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
-        "half a minute)"
-    )
+        done, more = f"{found.step} of {total} iterations", f"--iterations {2 * found.step}"
+        raise ConfigError(f"{folder.path}: has done {done}; to go on give more: {more}")
+    watch.note(f"starting {config.train.num_envs} envs (new sizes compile kernels first: half a minute)")
     trainer = _trainer(config, request.device)
     for checked in filter(None, (found, start)):
         checked.check_table(trainer.observation_table, config)
@@ -146,8 +134,7 @@ def _train(
 def _started(
     place: Path | None, config: LearningConfig, note: Callable[[str], None]
 ) -> tuple[Checkpoint | None, LearningConfig]:
-    """The checkpoint to begin with (``find_policy``), and the config with its networks. Raises ConfigError
-    for one that holds no policy."""
+    """The checkpoint to begin with, and the config with its networks. ConfigError for one without policy."""
     if place is None:
         return None, config
     found = find_policy(str(place), note)
@@ -165,8 +152,7 @@ def _started(
 
 
 def _trainer(config: LearningConfig, device: str) -> AnyTrainer:
-    """What learns: a policy in the simulator or in its surrogate, numbers of the tree, or what moving
-    obstacles will do. Raises ConfigError for a GPU where there is no use for it."""
+    """What learns. Raises ConfigError for a GPU where there is no use for it."""
     for section in ("surrogate", "parameter_search", "forecast_training"):
         if device == "cuda" and getattr(config, section).enabled:
             raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
@@ -218,7 +204,7 @@ class _Run:
         self.watch.start(self.folder.path, self.config, self.saved, self.total)
 
     def go(self, pressed: threading.Event) -> bool:
-        """Iterate to the end, or until somebody presses Ctrl-C: then save and return False."""
+        """Iterate to the end, or until an interrupt: then save and return False."""
         train, is_stopped = self.config.train, False
         while self.trainer.iteration < self.total and not is_stopped:
             self.metrics, done = self.trainer.iterate(), self.trainer.iteration
@@ -252,7 +238,6 @@ class _Run:
         }
 
     def close(self) -> None:
-        """Give everything back."""
         self.watch.stop()
         self.recorder.close()
 
@@ -271,24 +256,14 @@ class _Run:
         return None if rate is None else wilson_interval(round(rate * episodes), round(episodes))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The record of a run: ``metrics.jsonl``, one object an iteration, and the same as TensorBoard events under
-# the usual names.
-
-
 METRICS, EVENTS = "metrics.jsonl", "tensorboard"
 
 
 class MetricsRecorder:
-    """Writes what every iteration gave; each line is on its way to the disk before ``write`` returns.
-
-    A resumed run goes on behind the iteration of its checkpoint: what came later is cut off, and TensorBoard
-    is told to forget it.
-    """
+    """Writes what every iteration gave, as a line of ``metrics.jsonl`` and as TensorBoard events."""
 
     def __init__(self, run: Path, iteration: int = 0) -> None:
-        """``iteration``: how many are done already. Raises OSError, and FileError for what is no plain file
-        of the run."""
+        """What came behind ``iteration``, the last one done, is cut off. Raises OSError, FileError."""
         from torch.utils.tensorboard import SummaryWriter  # takes a second to import
 
         if (run / METRICS).exists():
@@ -310,14 +285,12 @@ class MetricsRecorder:
         self._events.flush()
 
     def close(self) -> None:
-        """Flush and close both."""
         self._file.close()
         self._events.close()
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Every whole line of a run's ``metrics.jsonl``; a last line that was cut off is left out. Raises
-    OSError, FileError."""
+    """Every whole line of a run's ``metrics.jsonl``. Raises OSError, FileError."""
     return [row for _, row in _whole_rows(run)]
 
 

@@ -1,4 +1,5 @@
-"""The networks of a policy over a set of obstacles: made, filled, checked."""
+"""Policy over a set of obstacles: every obstacle goes through one encoder, and what comes out is pooled by
+maximum and sum, so that neither their order nor their number matters."""
 
 from __future__ import annotations
 
@@ -6,19 +7,13 @@ import math
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.networks import Policy, RunningNorm, View, mlp
 from uuvtai.learning.policy_agent import network
-
-# ------------------------------------------------------------------------------------------------------------
-# Policy over a set of obstacles: every obstacle goes through one encoder, and what comes out is pooled by
-# maximum and sum, so that neither their order nor their number matters. The critic has an encoder of its own,
-# which also sees the obstacles' true future: it serves training alone, and no file that drives holds it.
-
 
 NUM_WISHES = 3
 """ahead, left, up: parts of the fastest velocity, in the mirrored world"""
@@ -35,22 +30,17 @@ class SetEncoder(nn.Module):
     (..., n_own), to ``n_out`` numbers."""
 
     def __init__(
-        self,
-        n_obstacle: int,
-        n_own: int,
-        n_out: int,
-        config: LearningConfig,
-        gain: float,
-        generator: torch.Generator,
+        self, sizes: tuple[int, int, int], config: LearningConfig, gain: float, generator: torch.Generator
     ) -> None:
+        """``sizes``: n_obstacle, n_own, n_out."""
         super().__init__()
+        n_obstacle, n_own, n_out = sizes
         wide, head = config.surrogate.obstacle_hidden, config.surrogate.head_hidden
         self.obstacle = mlp((n_obstacle, wide, wide), "relu", generator, math.sqrt(2.0))
         self.own = nn.Sequential(*mlp((n_own, wide), "relu", generator, math.sqrt(2.0)), nn.ReLU())
         self.head = mlp((3 * wide, head, head, n_out), "relu", generator, gain)
 
-    def forward(self, obstacles: torch.Tensor, own: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        """(..., n_out)."""
+    def forward(self, obstacles: Tensor, own: Tensor, mask: Tensor) -> Tensor:
         n, rows = obstacles.shape[-2], obstacles.shape[:-2]
         # obstacles first, as pooling wants them; as rows, for which ReLU in place costs nothing
         each = obstacles.reshape(-1, n, obstacles.shape[-1]).transpose(0, 1)
@@ -61,7 +51,7 @@ class SetEncoder(nn.Module):
 
 
 class SetActor(nn.Module):
-    """What drives: a diagonal Gaussian over the wish for a velocity. Its input is what the vehicle knows."""
+    """A diagonal Gaussian over the wish for a velocity, of what the vehicle knows."""
 
     def __init__(
         self, n_obstacle: int, n_own: int, config: LearningConfig, generator: torch.Generator
@@ -69,10 +59,10 @@ class SetActor(nn.Module):
         super().__init__()
         self.n_obstacle, self.n_own = n_obstacle, n_own
         self.goal_gain = config.surrogate.goal_gain
-        self.net = SetEncoder(n_obstacle, n_own, NUM_WISHES, config, 0.01, generator)
+        self.net = SetEncoder((n_obstacle, n_own, NUM_WISHES), config, 0.01, generator)
         self.log_std = nn.Parameter(torch.full((NUM_WISHES,), math.log(config.policy.initial_std)))
 
-    def forward(self, obstacles: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
+    def forward(self, obstacles: Tensor, own: Tensor) -> Tensor:
         """(..., 3) mean wish; along the route at birth."""
         ahead = self.goal_gain * own[..., AT_DIRECTION]
         said = self.net(obstacles, own, obstacles[..., :1])
@@ -80,17 +70,16 @@ class SetActor(nn.Module):
 
 
 class SetCritic(nn.Module):
-    """Expected return, from what the vehicle knows and from the obstacles' true places, now and later."""
+    """Expected return, also by the obstacles' true places, now and later: it serves training alone."""
 
     def __init__(
         self, n_obstacle: int, n_own: int, n_truth: int, config: LearningConfig, generator: torch.Generator
     ) -> None:
         super().__init__()
-        self.net = SetEncoder(n_obstacle + n_truth, n_own, 1, config, 1.0, generator)
+        self.net = SetEncoder((n_obstacle + n_truth, n_own, 1), config, 1.0, generator)
         self.value_norm = RunningNorm(1, math.inf)
 
-    def forward(self, obstacles: torch.Tensor, own: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-        """(...,)."""
+    def forward(self, obstacles: Tensor, own: Tensor, truth: Tensor) -> Tensor:
         there = obstacles[..., :1]
         if truth.shape[-1]:
             there = torch.maximum(there, truth[..., 2:3])
@@ -98,24 +87,22 @@ class SetCritic(nn.Module):
 
 
 class SetPolicy(Policy):
-    """Both of them, on ``obstacles`` (N, lanes, n_obstacle), ``own`` (N, n_own) and, for the critic alone,
-    ``truth`` (N, lanes, n_truth)."""
+    """Both, on ``obstacles`` (N, lanes, n_obstacle), ``own`` (N, n_own) and ``truth`` (N, lanes, n_truth)."""
 
     inputs = ("obstacles", "own", "truth")
     is_shuffled, most_std, critic_rate = True, 1.0, 1e-3
 
     def __init__(self, view: View, config: LearningConfig, generator: torch.Generator) -> None:
-        """``view``: any that it will be told."""
         super().__init__(config.policy)
         n_obstacle, n_own, n_truth = (view[name].shape[-1] for name in self.inputs)
         self.actor = SetActor(n_obstacle, n_own, config, generator)
         self.critic = SetCritic(n_obstacle, n_own, n_truth, config, generator)
         self.log_std, self.value_norm = self.actor.log_std, self.critic.value_norm
 
-    def mean_of(self, inputs: View) -> torch.Tensor:
+    def mean_of(self, inputs: View) -> Tensor:
         return self.actor(inputs["obstacles"], inputs["own"])
 
-    def value_of(self, inputs: View) -> torch.Tensor:
+    def value_of(self, inputs: View) -> Tensor:
         return self.critic(*(inputs[name] for name in self.inputs))
 
     def parts(self) -> dict[str, nn.Module]:
@@ -123,25 +110,18 @@ class SetPolicy(Policy):
 
 
 class MaxAndSum(torch.autograd.Function):
-    """(highest, sum), both (rows, wide), over the obstacles of relu(said) where ``mask`` is 1; 0 where no
-    obstacle is there. Its gradient is its own: torch's, by the pieces, takes as long as all products of the
-    policy.
-
-    ``said`` (obstacles, rows, wide) is what an encoder says of each obstacle, ``mask`` (obstacles, rows) is 1
-    or 0 and has no gradient. Obstacles come first: what is next to each other in memory is then reduced
-    together. Obstacles that are equally high share the gradient of the highest, as in ``torch.amax``.
-    """
+    """(highest, sum), both (rows, wide), of relu(said) (obstacles, rows, wide) where ``mask`` (obstacles,
+    rows) is 1. Its gradient is that of torch's operations, in a fraction of their time."""
 
     @staticmethod
-    def forward(ctx: Any, said: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(ctx: Any, said: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         each = torch.relu(said).mul_(mask.unsqueeze(-1))
         highest = each.amax(dim=0)
         ctx.save_for_backward(each, highest)
         return highest, each.sum(dim=0)
 
     @staticmethod
-    def backward(ctx: Any, *to_outputs: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """(gradient of ``said``, None)."""
+    def backward(ctx: Any, *to_outputs: Tensor) -> tuple[Tensor, None]:
         to_highest, to_sum = to_outputs
         each, highest = ctx.saved_tensors
         is_highest = each.clone().eq_(highest)
@@ -151,9 +131,6 @@ class MaxAndSum(torch.autograd.Function):
 
 
 def actor_of(checkpoint: Checkpoint) -> SetActor:
-    """The policy over a set of obstacles. Raises CheckpointError where its networks are not those of its
-    config."""
-    config = checkpoint.config
-    return network(
-        checkpoint, "policy", lambda: SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator())
-    )
+    """A checkpoint's policy over a set. Raises CheckpointError for networks that do not fit its config."""
+    sizes = OBSTACLE_WIDTH, EGO_COLUMNS
+    return network(checkpoint, "policy", lambda: SetActor(*sizes, checkpoint.config, torch.Generator()))

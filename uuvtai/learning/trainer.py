@@ -1,5 +1,4 @@
-"""The trainer: an environment, a policy and losses, one iteration after the other. ``Trainer.iterate`` is the
-page to read first."""
+"""The trainer: an environment, a policy and losses. ``Trainer.iterate`` is the page to read first."""
 
 from __future__ import annotations
 
@@ -23,11 +22,8 @@ from uuvtai.learning.world_model import N_TARGET, WorldModel, WorldModelLearner
 
 
 class Trainer:
-    """Everything that training carries from one iteration to the next.
-
-    All that is random draws from one CPU generator: equal states, configs and libraries give equal runs on a
-    CPU, bit for bit.
-    """
+    """Everything that training carries from one iteration to the next. All that is random draws from one CPU
+    generator: equal states, configs and libraries give equal runs on a CPU, bit for bit."""
 
     note: Callable[[str], None] = print
     """told how far the warm start is"""
@@ -64,14 +60,9 @@ class Trainer:
 
     @fast_products()
     def iterate(self) -> dict[str, float]:
-        """One iteration; its metrics by their names in metrics.jsonl.
-
-        Order: rollout, all statistics standing still; running uncertainty; PPO with the distillation term
-        (value statistics before its minibatches, observation statistics after them); teacher batches; world
-        model. Before the first iteration the behavior tree shows what it does: in the simulator for one
-        rollout, which only the statistics see, in the surrogate as the warm start. TrainingError after too
-        many bad iterations in a row.
-        """
+        """One iteration; its metrics. Rollout, all statistics standing still; running uncertainty; PPO (value
+        statistics, minibatches, observation statistics); teacher batches; world model. Before the first one
+        the behavior tree shows what it does. TrainingError after too many bad iterations in a row."""
         shown = self._begin() if self.iteration == 0 else {}
         sums, times = collect(self.env, self.policy, self.rollout, self.generator)
         began = time.perf_counter()
@@ -86,9 +77,8 @@ class Trainer:
         return metrics | {f"time/{name}": n for name, n in (found | decisions).items()}
 
     def start(self, found: Checkpoint) -> None:
-        """Begin with the policy of another run, and its world model where both have one; what the behavior
-        tree shows at the beginning then teaches the policy nothing. Raises CheckpointError for networks that
-        do not fit."""
+        """Begin with the policy of another run, and its world model where both have one; the behavior tree
+        then teaches nothing at the beginning. Raises CheckpointError for networks that do not fit."""
         parts = {"policy": self.policy.parts()["policy"], "world_model": self.world_model}
         for name, part in parts.items():
             if part is not None and (name == "policy" or name in found.model()):
@@ -96,28 +86,22 @@ class Trainer:
         self._is_started = True
 
     def evaluate(self) -> dict[str, float]:
-        """``eval/*`` of the policy as it is, by an environment that can tell."""
+        """``eval/*`` of the policy as it is, in the surrogate."""
         assert isinstance(self.env, InSurrogate)
         return self.env.evaluate(self.policy)
 
-    # ------------------------------------------------------------------------------------------------- resume
-
     def state(self) -> dict[str, Any]:
         """Copy of all that the next iterations depend on, nested; what ``checkpoint.save`` takes."""
+        counters = {"iteration": self.iteration, "env_steps": self.env_steps}
         return {name: copy.deepcopy(part.state_dict()) for name, part in self._parts().items()} | {
             "generator": self.generator.get_state(),
             "recent": list(self.recent.rows),
-            "counters": {
-                "iteration": self.iteration,
-                "env_steps": self.env_steps,
-                "bad_in_a_row": self.env.guard.bad_in_a_row,
-            },
-            "env": self.env.capture(),
+            "counters": counters | {"bad_in_a_row": self.env.guard.bad_in_a_row},
+            "env": self.env.env.capture(),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from what ``state`` gave, bit for bit on a CPU. ValueError, with nothing changed, for the
-        state of another env."""
+        """Go on bit for bit on a CPU. ValueError, with nothing changed, for the state of another env."""
         self.env.restore(state["env"])
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
@@ -131,14 +115,13 @@ class Trainer:
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own, by its name in a checkpoint."""
         parts = {"world_model": self.world_model, "world_learner": self.world_learner, "ppo": self.ppo}
-        parts |= {"collector": self.env} | (self.distillation.parts() if self.distillation else {})
+        parts |= {"collector": self.env}
+        if self.distillation:
+            parts |= {"teacher_batches": self.distillation, "uncertainty": self.distillation.uncertainty}
         return {n: part for n, part in (self.policy.parts() | parts).items() if part is not None}
 
-    # ------------------------------------------------------------------------------------------- an iteration
-
     def _begin(self) -> dict[str, float]:
-        """Statistics begin with what the behavior tree meets: networks that begin unscaled learn from their
-        first rollout in vain."""
+        """Statistics begin with what the behavior tree meets: unscaled networks would learn in vain."""
         if self.env.look_around(self.rollout):
             self.env_steps += self._samples
             self._learn_world()
@@ -148,7 +131,6 @@ class Trainer:
         return {} if self._is_started else self.env.warm_start(self.policy, self.note)
 
     def _learn(self, share: float) -> dict[str, float]:
-        """Everything that learns from the rollout; ``share`` of the run is over."""
         if self.distillation is None:
             return self.ppo.update(self.rollout, self.generator, share=share)
         strength, metrics = self.distillation.weigh(self.rollout, share)
@@ -157,7 +139,7 @@ class Trainer:
         return metrics | self._learn_world()
 
     def _learn_world(self) -> dict[str, float]:
-        """World model, from all transitions within the rollout that do not end an episode."""
+        """From all transitions within the rollout that do not end an episode."""
         if self.world_learner is None:
             return {}
         rollout = self.rollout

@@ -1,9 +1,5 @@
 """Latent world model: predicts the next observation's first 24 columns and how sure it is (paper, Sec.
-"Latent World Model").
-
-z = f(o), z' = g(z, a), o' = h(z') with a mean and a log-variance per target. Loss: reconstruction of the true
-next observation plus beta |f(o') - z'|^2, both summed over their dimensions.
-"""
+"Latent World Model"): z = f(o), z' = g(z, a), o' = h(z') with a mean and a log-variance per target."""
 
 from __future__ import annotations
 
@@ -34,12 +30,11 @@ _OUT_GAIN = 0.01
 
 
 class WorldModel(nn.Module):
-    """Encoder, latent dynamics and decoder with the statistics that the encoder scales by; raw observations
-    in, targets out, both in SI units. Actions are clamped to [-1, 1], as the environment does."""
+    """Encoder, latent dynamics and decoder; raw observations in, targets out, both in SI units. Actions are
+    clamped to [-1, 1], as the environment does."""
 
     def __init__(self, n_obs: int, config: WorldModelConfig, generator: torch.Generator) -> None:
-        """``n_obs`` columns of the observation, at least 24 (ValueError); initial weights come from the CPU
-        ``generator``."""
+        """SettingError for an observation of fewer columns than targets."""
         super().__init__()
         if n_obs < N_TARGET:
             raise SettingError(
@@ -67,17 +62,14 @@ class WorldModel(nn.Module):
         return mean, high - fn.softplus(high - low - fn.softplus(raw - low))
 
     def predict(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What follows observations (..., n_obs) and actions (..., 4): (z' (..., latent), mean (..., 24) of
-        the next observation's targets in SI units, natural logarithm of their variance)."""
+        """(z' (..., latent), mean, log-variance (..., 24)) after observations (..., n_obs) and actions."""
         latent = self.advance(self.encode(obs), action)
         return latent, *self.decode(latent)
 
     @torch.no_grad()
     def features(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
-        """Columns of the policy's input at ``next_obs``, (N, 2): one-step residual and uncertainty of the
-        prediction made before it: the root mean square of the errors, and sigma_t = mean(exp(log_var)). What
-        is not finite becomes 0.
-        """
+        """(N, 2) columns of the policy's input at ``next_obs``: root mean square error of the prediction made
+        before it, and its uncertainty sigma_t = mean(exp(log_var)). What is not finite becomes 0."""
         _, mean, log_var = self.predict(obs, action)
         error = (next_obs[..., :N_TARGET] - mean).clamp(-LARGEST_ERROR, LARGEST_ERROR)
         found = error.square().mean(dim=-1).sqrt(), log_var.exp().mean(dim=-1)
@@ -86,9 +78,8 @@ class WorldModel(nn.Module):
     def loss(
         self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """(total, reconstruction [nat] summed over the targets, dynamics: squared distance in the latent
-        space), means over the valid samples of a batch: obs, next_obs (B, n_obs), action (B, 4), valid (B,)
-        bool. ``next_obs`` is the true one, also at an end."""
+        """(total, reconstruction [nat] summed over the targets, dynamics: |f(o') - z'|^2), means over the
+        ``valid`` samples (B,). ``next_obs`` is the true one, also at an end."""
         config, weight = self.config, valid / valid.sum().clamp(min=1)
         ahead, mean, log_var = self.predict(obs, action)
         nll = 0.5 * ((next_obs[:, :N_TARGET] - mean).square() * torch.exp(-log_var) + log_var)
@@ -115,15 +106,9 @@ class WorldModelLearner(AdamLearner):
         generator: torch.Generator,
         valid: Tensor | None = None,
     ) -> dict[str, float]:
-        """``config.steps`` gradient steps on a rollout: obs, next_obs (T, N, n_obs), action (T, N, 4), valid
-        (T, N) (default: all).
-
-        ``next_obs`` is the observation each step led to, ``info["final_obs"]``. Rows that are not finite are
-        left out. ``generator`` (CPU) draws the batches. Returns metrics by their names in metrics.jsonl;
-        calibration and skill are those of the first batch before its step: the model has not learned from
-        this rollout yet. ``skill``, target by target: 1 - mean squared error / that of "as before"; left out
-        where nothing changed.
-        """
+        """``config.steps`` gradient steps on the ``valid`` (T, N) and finite samples of a rollout: obs,
+        next_obs (T, N, n_obs), action (T, N, 4). Metrics; calibration and skill (1 - mean squared error /
+        that of "as before") are those of the first batch, before the model learns from this rollout."""
         skipped, losses = self.skipped, []
         batches = [self._drawn(obs, action, next_obs, valid, generator) for _ in range(self.config.steps)]
         # a rollout's neighbouring steps are alike: all of it would say little more than what was drawn
@@ -143,8 +128,7 @@ class WorldModelLearner(AdamLearner):
     def _drawn(
         self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor | None, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Random samples: obs, action, next_obs and whether they are valid; rows with anything that is not
-        finite are zero and not valid."""
+        """Random samples and whether they are valid; rows that are not finite are zero and not valid."""
         steps, num_envs = action.shape[:2]
         drawn = torch.randint(steps * num_envs, (self.config.batch,), generator=generator).to(obs.device)
         t, env = drawn // num_envs, drawn % num_envs
@@ -172,15 +156,11 @@ class WorldModelLearner(AdamLearner):
         }
 
 
-# ------------------------------------------------------------------------------------------------ calibration
-
-
 INSIDE_90 = 1.6448536269514722
 """standard deviations on either side of a Gaussian's mean that hold 90 % of it"""
 
 
 def calibration(mean: Tensor, log_var: Tensor, target: Tensor) -> tuple[float, float]:
-    """Mean square of (target - mean) in predicted standard deviations, 1 where variances are right on average
-    and above it where they are too small; share of targets within the central 90 % interval."""
+    """Mean square of standardised errors; share of targets within the central 90 % interval."""
     z = (target.double() - mean.double()) * torch.exp(-0.5 * log_var.double())
     return float(z.square().mean()), float((z.abs() <= INSIDE_90).double().mean())

@@ -29,8 +29,8 @@ from uuvtai.state import (
 
 class At:
     """Columns of an env's row: position in the world, velocity in the body frame, heading, yaw rate, time,
-    goal, signs of the way to the goal, last action, integrals of the velocity loops; of the route: look-ahead
-    point, length left, place left of it, and the foot as a fractional waypoint."""
+    goal, signs of the way to it, last action, integrals of the velocity loops; of the route: look-ahead
+    point, length left, place left of it, foot as a fractional waypoint."""
 
     POS, VEL, YAW, RATE, TIME, GOAL, FLIP, LAST, INTEGRAL = 0, 3, 6, 7, 8, 9, 12, 14, 17
     AHEAD, LEFT, ASIDE, ARC = 21, 23, 24, 25
@@ -60,8 +60,7 @@ class Rules:
 
 @dataclass(frozen=True, eq=False)
 class ObserverIO:
-    """What a policy over a set of obstacles is told by the simulator: nothing that only the simulator
-    knows."""
+    """What a policy over a set of obstacles is told by the simulator: no truth."""
 
     clock: In[ClockState]
     mission: In[MissionState]

@@ -1,9 +1,5 @@
 """The surrogate's step: the vehicle's velocity loops axis by axis, obstacles in closed form, and the
-termination check's rules.
-
-Arrays are the caller's tensors. A scenario is three rows of a bank (``world.py``), which is never
-written: an env knows the number of its scenario.
-"""
+termination check's rules. An env knows the number of its scenario, three rows of a bank (``world.py``)."""
 
 import taichi as ti
 
@@ -32,18 +28,11 @@ def part(rows: FloatMatrix, env, first, count: Const[int]):
     return ti.Vector([rows[env, first + i] for i in ti.static(range(count))])
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The fixed rule that lays a velocity in the world on the hull: where it is wanted to go, not how.
-
-
 @ti.func
 def hull_command(wish, yaw, z_m, gap_m, vehicle_cfg: Const[VehicleConfig], tank_cfg: Const[TankConfig]):
     """(surge, sway, heave, yaw rate) in parts of the vehicle's limits for a wished velocity [m/s] in the
-    world.
-
-    A diagonal of the hull is turned along the motion, for there surge and sway add up; heave is held back so
-    that the centre stays ``gap_m`` from floor and surface.
-    """
+    world: a diagonal of the hull turns to the motion, for there surge and sway add up; the centre stays
+    ``gap_m`` from floor and surface."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     surge = (c * wish[0] + s * wish[1]) / vehicle_cfg.max_surge_m_s
     sway = (c * wish[1] - s * wish[0]) / vehicle_cfg.max_sway_m_s
@@ -61,8 +50,7 @@ def hull_command(wish, yaw, z_m, gap_m, vehicle_cfg: Const[VehicleConfig], tank_
 
 @ti.func
 def carried_out(action):
-    """What is carried out of a policy's action: parts of the speed along the hull's diagonal, and of
-    heave."""
+    """What is carried out of an action: parts of the speed along the hull's diagonal, and of heave."""
     long = ti.max(1.0, ti.sqrt(action[0] * action[0] + action[1] * action[1]))
     return ti.Vector([action[0] / long, action[1] / long, ti.math.clamp(action[2], -1.0, 1.0)])
 
@@ -78,25 +66,20 @@ def wished_velocity(action, flip, vehicle_cfg: Const[VehicleConfig]):
     )
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 NEAR_M = 1.5
 """obstacles whose surface is farther cannot matter to termination check or reward within a step"""
-DRIVEN_M = 0.3
-"""more than a hull moves while a decision is held"""
 
 
 @ti.func
 def corner_of(number, lane, leg, path: AnyTensor):
-    """(x, y) [m] at the begin of a leg of a closed polyline; legs are counted on, round after round."""
+    """(x, y) [m] at the begin of a leg of a closed polyline, counted on round after round."""
     at = 5 + 2 * (leg % int(path[number, lane, 0]))
     return ti.Vector([path[number, lane, at], path[number, lane, at + 1]])
 
 
 @ti.func
 def leg_of(number, lane, leg, path: AnyTensor):
-    """The whole of a leg (x, y) [m], as ``corner_of`` counts them."""
+    """The whole of a leg (x, y) [m]."""
     begin, end = corner_of(number, lane, leg, path), corner_of(number, lane, leg + 1, path)
     return ti.Vector([end[0] - begin[0], end[1] - begin[1]])
 
@@ -110,8 +93,7 @@ def way_direction(number, lane, leg, path: AnyTensor):
 
 @ti.func
 def path_places(number, lane, times, path: AnyTensor):
-    """Rows of (x, y, vx, vy) of a moving obstacle of scenario ``number`` at some times [s], as the simulator
-    moves it."""
+    """Rows of (x, y, vx, vy) of a moving obstacle at some times [s], as the simulator moves it."""
     length, speed = path[number, lane, 2], path[number, lane, 4]
     n_way = int(path[number, lane, 0])
     out = ti.Matrix.zero(ti.f32, times.n, 4)
@@ -161,8 +143,7 @@ def place_of(number, slot, t_s, obstacle: AnyTensor, path: AnyTensor):
 
 
 def axis_drag(cfg, axis):
-    """(inertia with added mass, linear, quadratic damping) of surge, sway, heave or yaw; plain Python,
-    constants of the kernel."""
+    """(inertia with added mass, linear, quadratic damping) of an axis; constants of the kernel."""
     at = axis if axis < 3 else 5
     inertia = cfg.mass_kg if axis < 3 else cfg.inertia_kg_m2[2]
     return inertia + cfg.added_mass[at], cfg.linear_damping[at], cfg.quadratic_damping[at]
@@ -171,7 +152,7 @@ def axis_drag(cfg, axis):
 @ti.func
 def axis_step(vel, integral, command, axis: Const[int], io: Bundle[Rules]):
     """(velocity, integral) of one of surge, sway, heave, yaw rate after a control step: the simulator's
-    velocity loop, whose feed-forward cancels Coriolis forces, against inertia and drag of this axis alone."""
+    velocity loop against inertia and drag of this axis alone."""
     loops = ti.static(axis_loops(io.actuation_cfg))
     inertia, linear, quadratic = ti.static(axis_drag(io.vehicle_cfg, axis))
     error = command - vel
@@ -183,43 +164,20 @@ def axis_step(vel, integral, command, axis: Const[int], io: Bundle[Rules]):
 
 
 @ti.func
-def is_near(number, slot, x, y, more_m, pos_w, obstacle: AnyTensor, io: Bundle[Rules]):
-    """1 where the surface of an obstacle at (x, y) may be within ``NEAR_M`` and ``more_m`` of the hull."""
-    hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
-    reach = obstacle[number, slot, 4] + obstacle[number, slot, 5] + hull + NEAR_M + more_m
-    dx, dy = x - pos_w[0], y - pos_w[1]
-    return dx * dx + dy * dy < reach * reach
-
-
-@ti.func
-def near_slots(number, pos_w, t_s, obstacle: AnyTensor, path: AnyTensor, io: Bundle[Rules]):
-    """A bit for each slot whose body can come near while a decision is held; slots beyond the bits count as
-    near."""
-    out = 0
-    first_moving = obstacle.shape[1] - path.shape[1]
-    for slot in range(ti.min(obstacle.shape[1], 31)):
-        if obstacle[number, slot, 0] > 0.5:
-            place, farthest = place_of(number, slot, t_s, obstacle, path), DRIVEN_M + 0.0
-            if slot >= first_moving:
-                speed = path[number, slot - first_moving, 4]
-                farthest += speed * HOLD_STEPS * io.episode_cfg.control_dt_s
-            if is_near(number, slot, place[0], place[1], farthest, pos_w, obstacle, io):
-                out |= 1 << slot
-    return out
-
-
-@ti.func
 def nearest_of(
-    near, number, pos_w, axis_w, vel_w, rate, t_s, obstacle: AnyTensor, path: AnyTensor, io: Bundle[Rules]
+    number, pos_w, axis_w, vel_w, rate, t_s, obstacle: AnyTensor, path: AnyTensor, io: Bundle[Rules]
 ):
     """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the termination
-    check sees it; obstacles beyond ``NEAR_M``, and those whose bit is not in ``near``, are left out."""
+    check sees it; obstacles beyond ``NEAR_M`` are left out."""
     clearance, ttc = hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg), FAR_M + 0.0
+    hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
     for slot in range(obstacle.shape[1]):
         kind = ti.cast(obstacle[number, slot, 0], ti.i32)
-        if kind != NONE and ((near >> ti.min(slot, 31)) & 1 == 1 or slot > 30):
+        if kind != NONE:
             place = place_of(number, slot, t_s, obstacle, path)
-            if is_near(number, slot, place[0], place[1], 0.0, pos_w, obstacle, io):
+            reach = obstacle[number, slot, 4] + obstacle[number, slot, 5] + hull + NEAR_M
+            dx, dy = place[0] - pos_w[0], place[1] - pos_w[1]
+            if dx * dx + dy * dy < reach * reach:
                 at = ti.Vector([place[0], place[1], obstacle[number, slot, 3]])
                 size = ti.Vector([obstacle[number, slot, 4 + i] for i in ti.static(range(3))])
                 threat = threat_of(
@@ -313,17 +271,13 @@ def aim(env, number, route: AnyTensor, ego: FloatMatrix, io: Bundle[Rules]):
     ego[env, At.ASIDE] = ti.select(is_left, off.norm(), -off.norm())
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 @ti.kernel
 def drive_surrogate(
     io: Bundle[Rules], action: FloatMatrix,
     obstacle: AnyTensor, path: AnyTensor, route: AnyTensor,
     scenario: IntVector, ego: FloatMatrix, reward: FloatVector, outcome: IntVector,
 ):  # fmt: skip
-    """One decision of every env: ``action`` (n, 3) held for ``HOLD_STEPS`` control steps, or until the
-    episode ends."""
+    """``action`` (n, 3) of every env, held for ``HOLD_STEPS`` control steps or until the episode ends."""
     dt_s = ti.static(io.episode_cfg.control_dt_s)
     for env in range(ego.shape[0]):
         number, goal_w, pos_w = scenario[env], part(ego, env, At.GOAL, 3), part(ego, env, At.POS, 3)
@@ -335,7 +289,6 @@ def drive_surrogate(
             io.vehicle_cfg.max_yaw_rate_rad_s,
         ])  # fmt: skip
         nearest, ended = 9.0, RUNNING
-        near = near_slots(number, pos_w, t_s, obstacle, path, io)
         for _ in range(HOLD_STEPS):
             if ended == RUNNING:
                 asked = hull_command(
@@ -350,7 +303,7 @@ def drive_surrogate(
                 vel_w = ti.Vector([level[0], level[1], vel[2]])
                 pos_w += dt_s * vel_w
                 t_s += dt_s
-                threat = nearest_of(near, number, pos_w, axis_w, vel_w, vel[3], t_s, obstacle, path, io)
+                threat = nearest_of(number, pos_w, axis_w, vel_w, vel[3], t_s, obstacle, path, io)
                 nearest = ti.min(nearest, threat[0])
                 is_late = t_s >= io.episode_cfg.horizon_steps * dt_s - 1e-3
                 ended = verdict(

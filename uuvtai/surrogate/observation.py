@@ -1,5 +1,5 @@
-"""What the policy over a set of obstacles is told: the same rows of the surrogate, and of the simulator as
-the vehicle senses and remembers it."""
+"""What the policy over a set of obstacles is told: the same columns of the surrogate, and of the simulator
+as the vehicle senses and remembers it."""
 
 import taichi as ti
 
@@ -21,7 +21,6 @@ LARGEST_TURN = 3.5
 
 @ti.func
 def put_row(row, env, lane, out: AnyTensor):
-    """Write the row of one obstacle."""
     for i in ti.static(range(row.n)):
         out[env, lane, i] = row[i]
 
@@ -66,8 +65,7 @@ def row_of_track(env, track, io: Bundle[ObserverIO]):
 
 @ti.func
 def next_track(env, after, slot, io: Bundle[ObserverIO]):
-    """Gap [m] and slot of the nearest track behind the one in ``slot``, whose gap is ``after``; slot -1 =
-    there is none."""
+    """Gap [m] and slot (-1 = none) of the nearest track behind that in ``slot``, whose gap is ``after``."""
     best, chosen = FAR_M + 0.0, -1
     own = io.ego.pos_w[env]
     for track in range(ti.static(io.tracks.alive.shape[1])):
@@ -94,8 +92,7 @@ def flip_of(env, io: Bundle[ObserverIO]):
 def observe_obstacles(
     io: Bundle[ObserverIO], due: IntVector, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix
 ):
-    """Rows of the vehicle, of its nearest tracks and of the free distances, where ``due`` is 1; the last
-    action in ``ego`` stays."""
+    """Rows of the vehicle, of its nearest tracks and of the free distances, where ``due`` is 1."""
     for env in range(due.shape[0]):
         if due[env] == 1:
             pos_w, vel_b, flip = io.ego.pos_w[env], io.ego.vel_b[env], flip_of(env, io)
@@ -132,10 +129,8 @@ def command_hull(io: Bundle[ObserverIO], gap_m: float, action: FloatMatrix, comm
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Columns of the policy over a set of obstacles, the same for the surrogate and the simulator.
-#
-# Everything is seen in the world mirrored so that the goal lies ahead and to the left at the start: four
-# situations that mirror each other are one to the policy.
+# The columns. Everything is seen in the world mirrored so that the goal lies ahead and to the left at the
+# start: four situations that mirror each other are one to the policy.
 
 
 _END = EGO_COLUMNS + N_OBSTACLE * OBSTACLE_WIDTH
@@ -147,8 +142,7 @@ SET_TABLE = tuple(
         ("set_obstacles", slice(EGO_COLUMNS, _END), "mixed", "nearest tracks"),
     )
 )
-"""The observation of a policy over a set of obstacles, for a checkpoint's manifest: the vehicle's own
-columns, then one obstacle's after the other."""
+"""for a checkpoint's manifest: the vehicle's own columns, then one obstacle's after the other"""
 
 HULL_M = 0.22
 """hull radius and half of its half length"""
@@ -156,8 +150,7 @@ HULL_M = 0.22
 
 @ti.func
 def mirrored(env, ego: FloatMatrix):
-    """Flips of x and y (1 or -1), then velocity [m/s] and the ways to the goal and to the look-ahead point
-    [m] in the mirrored frame."""
+    """Flips of x and y; velocity [m/s] and ways to goal and look-ahead point [m] in the mirrored frame."""
     flip, pos_w = part(ego, env, At.FLIP, 2), part(ego, env, At.POS, 2)
     speed = flip * turned_z(part(ego, env, At.VEL, 2), ego[env, At.YAW])
     way = flip * (part(ego, env, At.GOAL, 2) - pos_w)
@@ -172,7 +165,7 @@ def length_of(way):
 
 @ti.func
 def obstacle_columns(env, lane, flip, speed, ahead, ego: FloatMatrix, raw: AnyTensor):
-    """What the policy is told of a track; ``flip``, ``speed`` and ``ahead`` as ``mirrored`` gives them."""
+    """What the policy is told of a track."""
     fx, fy, to_point = flip[0], flip[1], length_of(ahead)
     dx = fx * (raw[env, lane, 0] - ego[env, At.POS])
     dy = fy * (raw[env, lane, 1] - ego[env, At.POS + 1])
@@ -194,7 +187,7 @@ def obstacle_columns(env, lane, flip, speed, ahead, ego: FloatMatrix, raw: AnyTe
 
 @ti.func
 def own_columns(env, flip, speed, way, ahead, ego: FloatMatrix):
-    """What the policy is told of the vehicle, its route and its goal; as ``obstacle_columns``."""
+    """What the policy is told of the vehicle, its route and its goal."""
     to_goal, to_point = length_of(way), length_of(ahead)
     x, y, z, yaw = ego[env, At.POS], ego[env, At.POS + 1], ego[env, At.POS + 2], ego[env, At.YAW]
     return ti.Vector([
@@ -223,7 +216,6 @@ def mirrored_ray(i, env, ego: FloatMatrix):
 def write_columns_of(
     env, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, obstacles: AnyTensor, own: FloatMatrix
 ):
-    """Columns of one row, as ``write_set_columns``."""
     flip, speed, way, ahead = mirrored(env, ego)
     for lane in range(raw.shape[1]):
         columns = ti.Vector.zero(ti.f32, OBSTACLE_WIDTH)

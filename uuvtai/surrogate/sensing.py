@@ -1,6 +1,5 @@
 """What the tracker delivers of the surrogate's obstacles: a model of its delays, noise, field of view and
-memory, in place of sonar and camera. Rays of free distance are those of the true walls and static
-obstacles."""
+memory. Rays of free distance are those of the true walls and static obstacles."""
 
 import math
 
@@ -20,10 +19,10 @@ FAN_SLOPE = 0.1763
 CAMERA_RANGE_M, HEIGHT_RANGE_M = 4.0, 3.0
 """the camera sees an obstacle up to the first, and knows how high it is up to the second"""
 SPELL = 10
-"""decisions for which an obstacle is seen equally well: part of it, at an edge of the fan, beside another"""
+"""decisions for which an obstacle is seen equally badly:"""
 BEST, SPREAD, MISSED, MISSED_HIDDEN = 0.35, 0.325, 0.985, 0.94
-"""how badly: the first, and the second over one minus a uniform number; beyond the third, or the fourth out
-of sight, it is not tracked"""
+"""the first, and the second over one minus a uniform number; beyond the third, or the fourth out of sight, it
+is not tracked"""
 BORN_S, SETTLED_S = 0.05, 0.07
 """seen so long, times how badly: a track; its velocity across the line of sight is known"""
 TURN_KNOWN_S = 0.8
@@ -32,21 +31,19 @@ LOST_S, LOST_HEIGHT_S = 2.5, 6.0
 """out of sight so long a track ends, later where its height is known"""
 POSITION_SIGMA, VELOCITY_SIGMA_M_S, VELOCITY_SIGMA_S = 0.0042, 0.009, 0.0062
 """errors of the tracks, times how badly: of position per metre of distance; of velocity at no distance, and
-per metre. EC, as are the constants around: by quantiles of the simulator's tracks (docs/learning.md)"""
+per metre. EC, as are the constants around: by quantiles of the simulator's tracks"""
 CAMERA_ALONE = 12.0
 """times as badly is an obstacle seen that the camera sees and the sonar does not"""
 QUICKEST, SLOWER, LAG_S = 0.6, 1.1, 0.04
 """share of a change of velocity that is seen at once; less of it beyond the middle uniform number; the place
 is behind by so much of what is not seen yet"""
 HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.04
-"""errors of position, and of velocity as a share of it, times how badly, when an obstacle goes out of sight,
-which it does part by part"""
+"""errors of position, and of velocity as a share of it, times how badly, when it goes out of sight"""
 FIRST_NORMAL = 1024
 """number of the first draw of an error; those before it say how badly each obstacle is seen"""
 UNBOUNDED_M = 99.0
-"""nothing in the way of a ray"""
 RAY_SLACK = 0.01
-"""share of the angle between two rays by which an obstacle is looked for wider than it is: rounding"""
+"""of the angle between two rays, by which an obstacle is looked for wider than it is: rounding"""
 COLUMN_M = 1.6
 """free water above and below is cut off here"""
 
@@ -93,8 +90,7 @@ def free_to_wall(at, to, io: Bundle[Rules]):
 
 @ti.func
 def free_to_box(dx, dy, to, c, s, wide, deep):
-    """[m] in a direction to a box whose middle is (dx, dy) away, turned by an angle of this cosine and
-    sine."""
+    """[m] in a direction to a box whose middle is (dx, dy) away, turned by an angle of cosine ``c``."""
     vx, vy = c * to[0] + s * to[1], c * to[1] - s * to[0]
     px, py = -(c * dx + s * dy), -(c * dy - s * dx)
     vx = vx if ti.abs(vx) > 1e-6 else 1e-6
@@ -115,8 +111,7 @@ def free_to_circle(dx, dy, to, wide):
 
 @ti.func
 def rays_towards(dx, dy, reach):
-    """(first, count) of the rays that can meet an obstacle of this radius whose middle is (dx, dy) away: its
-    half angle is at most pi/2 times the ratio of radius to distance."""
+    """(first, count) of the rays that can meet an obstacle of this radius whose middle is (dx, dy) away."""
     first, count = 0, N_RAY
     far = ti.sqrt(dx * dx + dy * dy)
     if far > 1.01 * reach:
@@ -144,8 +139,7 @@ def write_rays(env, number, slot_count, at, obstacle: AnyTensor, ray: FloatMatri
             first, count = rays_towards(dx, dy, ti.sqrt(wide * wide + deep * deep))
             for k in range(count):
                 i = (first + k + N_RAY) % N_RAY
-                to = ti.Vector([towards[i, 0], towards[i, 1]])
-                free_m = 0.0
+                to, free_m = ti.Vector([towards[i, 0], towards[i, 1]]), 0.0
                 if kind == BOX:
                     free_m = free_to_box(dx, dy, to, c, s, wide, deep)
                 else:
@@ -155,8 +149,7 @@ def write_rays(env, number, slot_count, at, obstacle: AnyTensor, ray: FloatMatri
 
 @ti.func
 def sight_of(number, slot_count, here, yaw, at, radius, high, level, obstacle: AnyTensor):
-    """Whether a moving obstacle at ``at`` (x, y) is seen from ``here`` (x, y, z), its height is seen, and it
-    is in the sonar's fan."""
+    """Whether a moving obstacle at ``at`` (x, y) is seen from ``here``, its height is, it is in the fan."""
     dx, dy = at[0] - here[0], at[1] - here[1]
     far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
     in_fan = ti.abs(here[2] - level) - high < ti.max(far - radius, 0.0) * FAN_SLOPE
@@ -177,9 +170,9 @@ def how_badly(drawn):
 
 @ti.func
 def updated_track(old, lane, at, bend_m, speed, ego_at, is_visible, knows_height, in_fan, key):
-    """The row of ``track`` after a decision, of an obstacle that is at ``at`` (x, y, vx, vy): born late, its
-    velocity across the line of sight known later, in error by what this spell (``key``) has for it; while it
-    is not seen straight on, or on its circle (``bend_m``: signed radius, else 0)."""
+    """The row of ``track`` after a decision, of an obstacle that is at ``at`` (x, y, vx, vy), in error by
+    what this spell (``key``) has for it; while it is not seen it goes straight on, or on its circle
+    (``bend_m``: signed radius, else 0)."""
     new = old
     drawn = uniform(key, lane)
     first, second = normal_pair_lanes(key, FIRST_NORMAL + 2 * lane, 2)
@@ -231,9 +224,8 @@ def is_tracked(track):
 
 @ti.func
 def row_of_obstacle(track, places, is_known, turn_rate, over, under, radius):
-    """What the tracker delivers (RAW_WIDTH,) of an obstacle that is tracked. A closed way that was watched
-    once around (``is_known``) is foreseen as it is (``places``: now and later), a circle after a while, other
-    ways straight on."""
+    """What the tracker delivers (RAW_WIDTH,) of an obstacle that is tracked. A way that was watched once
+    around (``is_known``) is foreseen as it is (``places``), a circle after a while, others straight on."""
     turn, out = turn_rate if track[4] > TURN_KNOWN_S else 0.0, ti.Vector.zero(ti.f32, RAW_WIDTH)
     for i in ti.static(range(4)):
         out[i] = track[i]
@@ -254,7 +246,7 @@ def row_of_obstacle(track, places, is_known, turn_rate, over, under, radius):
 
 @ti.func
 def true_row(places, over, flip, here):
-    """Where an obstacle is and will be (``places``: now and later), for the critic (TRUTH_WIDTH,)."""
+    """Where an obstacle is and will be, for the critic (TRUTH_WIDTH,)."""
     out = ti.Vector.zero(ti.f32, TRUTH_WIDTH)
     for k in ti.static(range(4)):
         first = ti.static(2 * k + 2 if k > 0 else 0)
@@ -271,12 +263,9 @@ def sense_surrogate(
     scenario: IntVector, ego: FloatMatrix, track: AnyTensor, raw: AnyTensor, ray: FloatMatrix,
     truth: AnyTensor, obstacles: AnyTensor, own: FloatMatrix,
 ):  # fmt: skip
-    """Tracks, rays, what only a critic may see, and the columns of a policy, after a decision or a reset. The
-    noise is a function of (``seed``, ``count``) and the env.
-
-    ``track`` (n, lanes, 9): estimated x, y, vx, vy; seen for [s]; not seen for [s]; 1 = height known; watched
-    way [m]; uniform number of this spell.
-    """
+    """Tracks, rays, truth for a critic, columns of a policy, after a decision or a reset. The noise is a
+    function of (``seed``, ``count``) and the env. ``track`` (n, lanes, 9): estimated x, y, vx, vy; seen for
+    [s]; not seen for [s]; 1 = height known; watched way [m]; uniform number of this spell."""
     for env in range(ego.shape[0]):
         number, n_static = scenario[env], obstacle.shape[1] - path.shape[1]
         here, flip = part(ego, env, At.POS, 3), part(ego, env, At.FLIP, 2)

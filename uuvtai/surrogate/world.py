@@ -23,25 +23,20 @@ from uuvtai.sim.stages import bind
 from uuvtai.surrogate import motion, sensing
 from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules
 
-# ------------------------------------------------------------------------------------------------------------
-# Scenarios drawn by the simulator itself, as plain arrays that the surrogate's kernels read.
-
-
 BATCH = 256
 """envs of the simulator that draws"""
 
 
 @dataclass(frozen=True)
 class ScenarioBank:
-    """B scenarios: static obstacles first, then the moving ones."""
+    """B scenarios, drawn by the simulator itself: static obstacles first, then the moving ones."""
 
     obstacle: torch.Tensor
     """(B, n_obstacle, 8) kind, centre (3), size (3), yaw; kind 0 = none"""
     path: torch.Tensor
-    """(B, n_lane, 16) corners (0 = circle), radius, length, phase, speed, corners' x and y; of a circle the
-    first is its centre"""
+    """(B, n_lane, 16) corners (0 = circle), radius, length, phase, speed, x and y of corners or centre"""
     route: torch.Tensor
-    """(B, n_way, 3) waypoints x, y and the length left [m], at its end the goal again and again"""
+    """(B, n_way, 3) waypoints x, y and the length left [m], filled up with the goal"""
     mission: torch.Tensor
     """(B, 7) start (3), goal (3), heading at the start"""
     origin: torch.Tensor
@@ -52,8 +47,7 @@ class ScenarioBank:
 
 def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, count: int) -> ScenarioBank:
     """Episodes 0 .. count - 1 of ``seed`` for every pair of a world of ``surrogate.worlds`` and a scene (S,
-    D, v), drawn by ``Sim.draw_routes``. Raises ConfigError for a world that is none, or has another tank
-    than the run's."""
+    D, v). Raises ConfigError for a world that is none, or has another tank than the run's."""
     parts, names = [], []
     n_static, n_dynamic = (max(scene[i] for scene in scenes) for i in range(2))
     for world in config.surrogate.worlds:
@@ -74,9 +68,8 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
 def _refuse_other_tank(world: str, own: TankConfig, wanted: TankConfig) -> None:
     if own != wanted or own.shape != "rectangle":
         raise ConfigError(
-            f"surrogate.worlds: {world} has another tank than the run's world, or a round one; the surrogate "
-            "has one rectangular tank: give worlds that share it, for example "
-            "surrogate.worlds=[pool,gauntlet]"
+            f"surrogate.worlds: {world} has another tank than the run's world, or a round one; give worlds "
+            "that share a rectangular one, for example surrogate.worlds=[pool,gauntlet]"
         )
 
 
@@ -87,8 +80,7 @@ def _joined(parts: Sequence[np.ndarray], more: Literal["constant", "edge"] = "co
 
 
 def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[np.ndarray, ...]:
-    """Static and moving obstacles, paths, routes and missions as in a bank, of one scene's episodes; slots
-    that are empty everywhere are left out."""
+    """Static and moving obstacles, paths, routes and missions of one scene, without empty slots."""
     sim.set_scenes([scene])
     found = []
     for first in range(0, count, sim.num_envs):
@@ -105,8 +97,7 @@ def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[np.ndarray, ..
 
 
 def scenario_rows(sim: Sim) -> list[np.ndarray]:
-    """Obstacles, paths, routes and missions of what every row of a simulator holds, float32; a row without a
-    route goes straight to its goal."""
+    """Obstacles, paths, routes and missions that a simulator holds; without a route it is a straight line."""
     world, p, mission = sim.s.world, sim.s.path, sim.s.mission
     obstacle = _columns(sim, world.kind, world.pos_w, world.size, world.yaw)
     path = _columns(sim, p.n_way, p.radius_m, p.length_m, p.phase_m, p.speed_m_s, p.way_w, p.easing_m)
@@ -116,23 +107,19 @@ def scenario_rows(sim: Sim) -> list[np.ndarray]:
 
 
 def _columns(sim: Sim, *fields: Any) -> np.ndarray:
-    """Fields of numbers and of vectors side by side, float32 (..., columns of all of them)."""
+    """Fields of numbers and of vectors side by side, float32."""
     found = [sim.rows(field) for field in fields]
     shape = min((rows.shape for rows in found), key=len)  # of those of numbers
     return np.concatenate([rows.reshape(*shape, -1) for rows in found], axis=-1, dtype=np.float32)
 
 
 def _routes(sim: Sim, mission: np.ndarray) -> np.ndarray:
-    """(n, n_way, 3) as in a bank."""
     start, goal = mission[:, :2], mission[:, 3:5]
     count, straight_m = sim.rows(sim.s.route.n_way)[:, None], np.hypot(*(goal - start).T)
     route = _columns(sim, sim.s.route.way_w, sim.s.route.way_left_m)
     route[:, 0] = np.where(count > 0, route[:, 0], np.column_stack([start, straight_m]))
     after = np.arange(route.shape[1]) >= np.maximum(count, 1)
     return np.where(after[..., None], np.pad(goal, ((0, 0), (0, 1)))[:, None].astype(np.float32), route)
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 class Surrogate:
@@ -152,20 +139,17 @@ class Surrogate:
             "own": torch.zeros(num_envs, EGO_COLUMNS),
             "truth": torch.zeros(num_envs, lanes, TRUTH_WIDTH),
         }
-        """what is known of the envs: obstacles as tracked (the first column is 1 where there is one, else all
-        are 0); the vehicle, its goal and the free distances around it; true places of the obstacles, now and
-        1, 2, 3 s later, for a critic in training. Clone what must outlive the next step."""
+        """obstacles as tracked; the vehicle, its goal and the free distances around it; true places of the
+        obstacles, now and 1, 2, 3 s later, for a critic. Clone what must outlive the next step."""
         self._carried = {"ego": self.ego, "scenario": self.scenario, "track": self.track, "count": self.count}
         self._carried |= {f"view.{name}": part for name, part in self.view.items()}
 
     @property
     def time_s(self) -> torch.Tensor:
-        """(N,) since the begin of each episode."""
         return self.ego[:, At.TIME]
 
     def begin(self, rows: torch.Tensor, scenario: torch.Tensor) -> None:
-        """Begin the scenarios of these numbers (N,) in the envs (N,) where ``rows`` is true, at rest, nothing
-        seen; ``look`` comes next."""
+        """Begin the scenarios of these numbers (N,) in the envs where ``rows`` (N,) is true."""
         envs = rows.nonzero().flatten()
         number = scenario[envs].long()
         start, goal, yaw = self.bank.mission[number].split((3, 3, 1), dim=1)
@@ -196,10 +180,8 @@ class Surrogate:
         return self.reward, self.outcome
 
     def capture(self) -> dict[str, np.ndarray]:
-        """All that the next steps depend on."""
         return {name: part.numpy().copy() for name, part in self._carried.items()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on from what ``capture`` gave."""
         for name, part in self._carried.items():
             part.copy_(torch.from_numpy(arrays[name]))

@@ -1,5 +1,4 @@
-"""The model card, README.md of an exported policy: what it was trained on, how it did, what it is for and
-what it is not for."""
+"""The model card, README.md of an exported policy."""
 
 from __future__ import annotations
 
@@ -19,17 +18,17 @@ from uuvtai.report.tables import rate, sensing, text_table
 RESULT = Path("eval/result.json")
 """what ``uuv eval`` leaves in its run folder"""
 _MAX_BYTES = 256 << 20
+_GIVE = "give the run folder that 'uuv eval RUN' printed"
 
 
 def _row(where: str, n: int, successes: int, collisions: int, together: bool = False) -> list[str]:
-    """A row of the card's table. Without intervals where episodes go ``together``: worlds or scenes had
-    episodes of the same numbers, and single ends were not kept."""
+    """A row of the card's table; without intervals where groups of episodes share their numbers."""
     counts = successes, collisions
     return [where, *(str(rate(k, n, None if together else wilson_interval(k, n))) for k in counts)]
 
 
 def _row_of_training(checkpoint: Checkpoint) -> list[list[str]]:
-    """The evaluation by which training chose this checkpoint; empty where there was none at this step."""
+    """The evaluation by which training chose this checkpoint, if there was one."""
     metrics, config = checkpoint.manifest.metrics, checkpoint.config
     success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
     if not isinstance(success, float | int) or not isinstance(collision, float | int):
@@ -47,7 +46,6 @@ def _row_of_training(checkpoint: Checkpoint) -> list[list[str]]:
 
 
 def _scenes(config: LearningConfig) -> str:
-    """Numbers and speeds of the obstacles that were learnt among."""
     return "; ".join(_scene(*each) for each in config.train.scenes or (config.world.own_scene,))
 
 
@@ -56,10 +54,7 @@ def _scene(n_static: int, n_moving: int, speed_m_s: float) -> str:
 
 
 def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[list[str]]:
-    """This checkpoint's rows in the results of ``uuv eval`` below the run folder and in ``folders``.
-
-    Raises ConfigError for one of ``folders`` that does not hold any.
-    """
+    """Rows of this checkpoint, of results in the run folder and in ``folders``, else ConfigError."""
     run, found = checkpoint.path.parent.parent, []
     if checkpoint.path.parent.name == "checkpoints":
         for file in sorted((run / RESULT, *run.glob(f"*/{RESULT}"))):
@@ -67,17 +62,13 @@ def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[list
     for folder in folders:
         rows = _rows_of_result(folder / RESULT, folder, checkpoint.sha256)
         if not rows:
-            raise ConfigError(
-                f"--evaluation {folder}: does not evaluate this checkpoint; give the run folder that 'uuv "
-                "eval RUN' printed"
-            )
+            raise ConfigError(f"--evaluation {folder}: does not evaluate this checkpoint; {_GIVE}")
         found += rows
     return found
 
 
 def _rows_of_result(file: Path, folder: Path, sha256: str) -> list[list[str]]:
-    """Rows of the agents that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is
-    no result."""
+    """Rows of the agents that this checkpoint drove. Raises ConfigError for a file that is no result."""
     rows = []
     try:
         result = read_json(file, _MAX_BYTES, folder)
@@ -96,9 +87,7 @@ def _rows_of_result(file: Path, folder: Path, sha256: str) -> list[list[str]]:
                 raise ValueError(f"{k} successes and {collisions} collisions of {n} episodes")
             rows.append(_row(where, n, k, collisions))
     except (UserError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(
-            f"{file}: is no result of uuv eval ({error!r}); give the run folder that 'uuv eval RUN' printed"
-        ) from None
+        raise ConfigError(f"{file}: is no result of uuv eval ({error!r}); {_GIVE}") from None
     return rows
 
 
@@ -126,59 +115,32 @@ checkpoint's config.
 `python run_policy.py` (NumPy alone) replays the golden pairs and prints the latency. In a program:
 `from run_policy import load`, then `policy = load(folder)`.
 {how}
-`policy_spec.json` says what every column is, and the sha256 of every file.{graph}
+`policy_spec.json` says what every column is, and the sha256 of every file.
+`policy.onnx`, if it is there, is one decision for any number of rows; `graph` in the specification names its
+inputs.
 
-{rule}## What it is for
+## What it is for
 Research in simulation, and trials on a vehicle in a tank with an operator who can stop it. Columns have to
 come from the same stack ({stack}) with the same meaning.
 
 ## What it is not for
-- It has been judged in this simulator alone. Nothing here says how it does on a real vehicle, in other water,
-  or with other sensors.
-- It does not guarantee clearance and does not say when it is in danger. Keep a separate safety
-  stop.
+- It was judged in this simulator alone: not on a real vehicle, in other water, or with other sensors.
+- It does not guarantee clearance and does not say when it is in danger. Keep a separate safety stop.
 - It expects the vehicle's inner velocity loop with these limits; it never commands thrusters.
 """
 _WHAT = {
     "mlp": "A policy that drives an underwater vehicle of the BlueROV2 class from sensor features.",
-    "set": "A policy that drives an underwater vehicle by a wish for a velocity, from tracked obstacles and "
-    "free distances.",
+    "set": "A policy that drives an underwater vehicle by a wish for a velocity, from tracked obstacles.",
 }
 _HOW = {
     "mlp": """`policy.reset()` when a mission begins, `policy.act(observation)` at every control step
 ({control_hz:g} Hz). A decision is made every {hold_steps} control step(s); in between the action is kept.""",
     "set": """`said = policy.act(obstacles, own)` {decision_hz:g} times a second, and at every control step
-({control_hz:g} Hz) `policy.command(said.wish, flip, yaw_rad, z_m)`. It remembers nothing; the last wish that
-was carried out is among the columns.""",
+({control_hz:g} Hz) `policy.command(said.wish, flip, yaw_rad, z_m)`, the hull rule: its code is in
+`run_policy.py`, its numbers are `hull_rule` of `policy_spec.json`.""",
 }
 _STACK = {"mlp": "sonar, map, route, tracking{tree}", "set": "tracks, map, route, pose"}
-_GRAPH = {
-    "mlp": """
-
-`policy.onnx` is one decision without memory: remember the last decision yourself, as `graph` in the
-specification says.""",
-    "set": " `policy.onnx` is the same for any number of rows.",
-}
-_RULE = """## The hull rule
-A wish (x, y, up) becomes a command at every control step, by the heading and the height of that moment;
-numbers are `hull_rule` of `policy_spec.json`, and `command` in `run_policy.py` is this rule.
-
-1. Velocity wanted in the world: (flip.x x, flip.y y) times {fastest_m_s:.3f} m/s, shortened to that
-   length where (x, y) is longer than 1; upward `up`, within +-1, times {heave:g} m/s. A flip is -1
-   where the goal lies at a smaller coordinate than the start, else 1.
-2. In the body frame (turned by the heading) the two become parts of {surge:g} m/s surge and {sway:g}
-   m/s sway. Where one is beyond 1 both are divided by the larger one.
-3. Heave: the upward velocity is at most what leads to {gap_m:g} m below the surface in one second, and
-   at least what leads to {gap_m:g} m above the floor in one second; then in parts of {heave:g} m/s,
-   within +-1. Height 0 is the surface, the floor lies at {floor:g} m.
-4. Yaw rate: the nearest diagonal of the hull (45, 135, 225 or 315 degrees) turns to the motion, for
-   there surge and sway add up: the angle times {turn_gain_1_s:g} 1/s, in parts of
-   {max_yaw_rate_rad_s:g} rad/s, within +-1. Slower than {least_speed_m_s:g} m/s the heading stays.
-
-"""
-_NONE = (
-    "No evaluation was at hand. Evaluate it with `uuv eval RUN` and export again with `--evaluation FOLDER`."
-)
+_NONE = "No evaluation was at hand. Evaluate it with `uuv eval RUN`, export again with `--evaluation FOLDER`."
 _COUNTED = """
 
 Rates are counts with 95 % Wilson intervals. Collision counts contacts, time-to-collision stops and leaving
@@ -187,7 +149,7 @@ the tank."""
 
 def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[list[str]]) -> str:
     """The card as Markdown, with the rows of ``evaluations_of``."""
-    kind, rule = spec["kind"], spec.get("hull_rule")
+    kind = spec["kind"]
     config, metrics = checkpoint.config, checkpoint.manifest.metrics
     rows = evaluations + _row_of_training(checkpoint)
     unit = "decisions" if "time/decisions" in metrics else "env-steps"
@@ -203,7 +165,5 @@ def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[l
         scenes=_scenes(config),
         results=text_table(("where", "success", "collision"), rows) + _COUNTED if rows else _NONE,
         how=_HOW[kind].format(**spec["rate"]),
-        graph=_GRAPH[kind] if spec["graph"] else "",
-        rule=_RULE.format(**rule, **rule["limits_m_s"], floor=rule["z_m"][0]) if rule else "",
         stack=_STACK[kind].format(tree=", behavior tree" if config.observation.behavior else ""),
     )

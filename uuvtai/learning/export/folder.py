@@ -1,12 +1,11 @@
-"""``uuv export``: a policy as a folder that drives without uuvtai, written whole or not at all, and the check
-of such a folder."""
+"""``uuv export``: a policy as a folder that drives without uuvtai, and the check of such a folder."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,13 @@ import safetensors.torch
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import unfinished, whole_folder
 from uuvtai.config.loader import ConfigError
-from uuvtai.learning.checkpoint import Checkpoint
+from uuvtai.learning.checkpoint import Checkpoint, Note
 from uuvtai.learning.export import graph as onnx_session
 from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.card import evaluations_of, model_card
 from uuvtai.learning.export.graph import GraphError, refuse_strange
 from uuvtai.learning.export.modules import (
     ONNX,
-    Arrays,
     ExportedModule,
     golden_of,
     missing_packages,
@@ -33,30 +31,24 @@ from uuvtai.learning.export.modules import (
     specification,
     weights_of,
 )
-from uuvtai.learning.export.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, PolicyError
+from uuvtai.learning.export.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, Arrays, PolicyError
 from uuvtai.logs.container import sync_folder
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
-
-Note = Callable[[str], None]
 
 EXTRA = "uuvtai[export]"
 """extra that brings ONNX"""
 
 
 class ExportError(UserError, PolicyError):
-    """What a folder lacks to be an exported policy (``run_policy.PolicyError``, whose module knows nothing of
-    this package)."""
+    """A ``run_policy.PolicyError``, whose module knows nothing of this package."""
 
 
 def export(
     checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note, force: bool = False
 ) -> dict[str, Any]:
-    """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks.
-    ``force`` replaces an exported policy. Returns what ``uuv export --json`` prints.
-
-    Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive,
-    RunFolderError where the disk refuses.
-    """
+    """Write the policy of a checkpoint into a new folder ``out``; ``force`` replaces an exported policy.
+    Returns what ``uuv export --json`` prints. Raises ConfigError for a place that is taken, CheckpointError
+    for networks that cannot drive, RunFolderError where the disk refuses."""
     _refuse_place(out, force)
     module, rows = module_of(checkpoint), evaluations_of(checkpoint, evaluations)
     golden, missing = golden_of(module), missing_packages()
@@ -77,10 +69,7 @@ def export(
 
 def check(folder: Path, note: Note) -> dict[str, Any]:
     """Verify the sha256 of every file of an exported policy and replay its golden pairs; nothing in it is
-    executed. Returns what ``uuv export --json`` prints.
-
-    Raises ExportError for a folder that is no exported policy.
-    """
+    executed. Returns what ``uuv export --json`` prints. Raises ExportError for what is none."""
     try:
         spec = run_policy.read_spec(folder)
         damages = run_policy.changed_files(folder, spec)
@@ -90,13 +79,11 @@ def check(folder: Path, note: Note) -> dict[str, Any]:
 
 
 def _document(folder: Path, engines: list[dict[str, Any]], damages: Sequence[str] = ()) -> dict[str, Any]:
-    """A folder, its files that are not as the specification says, and its engines as ``of_torch`` says."""
     agrees = not damages and all(engine["agrees"] for engine in engines)
     return {"schema": 1, "folder": str(folder), "agrees": agrees, "damages": [*damages], "engines": engines}
 
 
 def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[dict[str, Any]]:
-    """What NumPy and, where it is here, ONNX Runtime make of the folder's files."""
     golden = run_policy.read_safetensors(folder / GOLDEN)
     policy = run_policy.made(spec, run_policy.read_safetensors(folder / WEIGHTS))
     found = [run_policy.of_numpy(policy, golden)]
@@ -108,13 +95,11 @@ def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[dict[str, 
 
 
 def of_torch(module: ExportedModule, golden: Arrays) -> dict[str, Any]:
-    """The networks themselves against the golden pairs, as ``run_policy.compared``."""
     return run_policy.compared("torch", module.said, run_policy.golden_rows(golden, module.inputs), golden)
 
 
 def of_onnx(graph: bytes, golden: Arrays, inputs: Iterable[str]) -> dict[str, Any]:
-    """ONNX Runtime on one thread against the golden pairs, all rows at once, as ``run_policy.compared``.
-    Raises GraphError for a graph that is not ours or that it cannot use."""
+    """ONNX Runtime against the golden pairs. Raises GraphError for a graph that is not ours."""
     rows = run_policy.golden_rows(golden, inputs)
     refuse_strange(graph, {name: array.shape for name, array in rows.items()}, run_policy.CALLS)
     try:
@@ -130,21 +115,14 @@ def of_onnx(graph: bytes, golden: Arrays, inputs: Iterable[str]) -> dict[str, An
 
 
 def _refuse_place(out: Path, force: bool) -> None:
-    """Raise ConfigError for a place that is taken; with ``force`` a folder that holds an exported policy and
-    nothing else may be."""
+    """Raise ConfigError for a place that is taken; with ``force`` an exported policy may be there."""
     if not out.exists() and not out.is_symlink():
         return
     if not force:
-        raise ConfigError(
-            f"{out}: is already there; give another folder with --out DIR, or --force to replace an exported "
-            "policy"
-        )
+        raise ConfigError(f"{out}: is already there; give another folder with --out DIR, or --force")
     ours = out.is_dir() and not out.is_symlink() and {path.name for path in out.iterdir()} <= {SPEC, *FILES}
     if not ours or not (out / SPEC).is_file():
-        raise ConfigError(
-            f"{out}: is not just an exported policy, so it is not replaced; give another folder with --out "
-            "DIR"
-        )
+        raise ConfigError(f"{out}: is not just an exported policy; give another folder with --out DIR")
 
 
 def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:

@@ -12,10 +12,6 @@ import numpy as np
 
 from uuvtai.common.errors import UserError
 
-# ------------------------------------------------------------------------------------------------------------
-# What an ONNX graph of a stranger may hold before ONNX Runtime sees it: our operators, and memory and work
-# that are reckoned first.
-
 _NAMES = """
 Abs Add And Cast Celu Clip Concat Constant ConstantOfShape Div Elu Equal Erf Exp Expand Flatten Floor Gather
 GatherND Gelu Gemm Greater GreaterOrEqual HardSigmoid HardSwish Identity IsInf IsNaN LayerNormalization
@@ -24,18 +20,9 @@ ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape
 Slice Softmax Softplus Softsign Split Sqrt Squeeze Sub Swish Tanh Transpose Unsqueeze Where
 """
 OPERATORS = frozenset(_NAMES.split())
-"""What torch's exporter makes of a policy, and what other versions of it make of the same. No loops,
-branches, random numbers or functions. What ConstantOfShape (ours too: features before the first decision) and
-Expand make is bounded like all else, by its shape."""
-_INNER = {
-    "functions",
-    "training_info",
-    "g",
-    "graphs",
-    "sparse_initializer",
-    "sparse_tensor",
-    "sparse_tensors",
-}
+"""what torch's exporters make of a policy: no loops, branches, random numbers or functions"""
+_INNER = {"functions", "training_info", "g", "graphs"}
+_INNER |= {"sparse_initializer", "sparse_tensor", "sparse_tensors"}
 """fields of a model, a graph or an attribute that no policy needs"""
 OPSETS = range(9, 27)
 _DTYPES = {1: np.float32, 10: np.float16, 11: np.float64}
@@ -84,8 +71,8 @@ def head_of(graph: bytes) -> GraphHead:
 
 
 def with_weights(graph: bytes, read: Callable[[str], bytes]) -> bytes:
-    """A graph whose weights lie in files beside it, whole: ``read`` gives the content of such a file by its
-    plain name. GraphError where a name leads elsewhere, or a weight is not in its file."""
+    """A graph whose weights lie in files beside it, whole: ``read`` gives the content of a file by its plain
+    name. GraphError where a name leads elsewhere, or a weight is not in its file."""
     import onnx
 
     model, files = _parsed(graph), {}
@@ -115,8 +102,7 @@ def with_weights(graph: bytes, read: Callable[[str], bytes]) -> bytes:
 
 
 def only(graph: bytes, output: str) -> bytes:
-    """The part of a graph that gives this output: value and log-probability of an exported actor are nobody's
-    business here."""
+    """The part of a graph that gives this output."""
     model, needed = _parsed(graph), {output}
     for part in ("node", "output", "initializer", "input"):
         values = getattr(model.graph, part)
@@ -133,11 +119,8 @@ def refuse_strange(
     graph: bytes, inputs: dict[str, tuple[int, ...]], single_calls: int, rows_of_one: int = 1
 ) -> None:
     """Raise GraphError for a graph that reaches beyond itself or may take more memory or time than a policy
-    does.
-
-    ``inputs``: shapes (rows, ...) with which it will run once; it will run ``single_calls`` times with one
-    row, or ``rows_of_one``, where a graph takes no fewer.
-    """
+    does. It will run once with ``inputs`` of these shapes (rows, ...), and ``single_calls`` times with
+    ``rows_of_one``."""
     model = _parsed(graph)
     _refuse_parts(model)
     found = {value.name for value in model.graph.input} - {tensor.name for tensor in model.graph.initializer}
@@ -195,8 +178,8 @@ def _tensors(graph: Any) -> Iterator[Any]:
 
 def _work(model: Any, inputs: dict[str, tuple[int, ...]]) -> int:
     """Multiplications of the matrix products, and values of everything, of a call with inputs of these
-    shapes. They are reckoned without what the file itself says about them, which is taken out of ``model``.
-    GraphError where a shape is unknown, or where all values together take too much memory."""
+    shapes; what the file itself says of shapes is taken out of ``model`` first. GraphError where one is
+    unknown, or where all values together take too much memory."""
     from onnx import shape_inference
 
     graph = model.graph
@@ -210,9 +193,7 @@ def _work(model: Any, inputs: dict[str, tuple[int, ...]]) -> int:
             for size in inputs[value.name]:
                 shape.dim.add().dim_value = size
     try:
-        inferred = shape_inference.infer_shapes(
-            model, check_type=True, strict_mode=True, data_prop=True
-        ).graph
+        inferred = shape_inference.infer_shapes(model, True, True, True).graph  # checked, strict, with data
     except Exception as error:  # onnx's own, or protobuf's
         raise GraphError(f"does not fit together ({str(error).strip().splitlines()[-1][:200]})") from None
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer} | inputs
@@ -236,8 +217,7 @@ def _work(model: Any, inputs: dict[str, tuple[int, ...]]) -> int:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# The one place that imports ONNX Runtime: its telemetry is off before it is loaded, and its sessions run on
-# one thread.
+# The one place that imports ONNX Runtime: its telemetry is off before it is loaded.
 
 
 NAME = "onnxruntime"
@@ -246,18 +226,16 @@ VARIABLE = "ORT_DISABLE_TELEMETRY"
 
 
 def is_installed() -> bool:
-    """Whether graphs can be read and run here."""
     return all(importlib.util.find_spec(name) is not None for name in (NAME, "onnx"))
 
 
 def without_telemetry() -> None:
-    """Set the variable; whoever may cause ONNX Runtime to be loaded, torch's exporter included, calls this
-    first."""
+    """Called by whatever may load ONNX Runtime, torch's exporter included."""
     os.environ[VARIABLE] = "1"
 
 
 def session(graph: bytes) -> Any:
-    """An InferenceSession on one thread of the CPU. Raises what ONNX Runtime raises."""
+    """An InferenceSession on one thread of the CPU."""
     without_telemetry()
     import onnxruntime
 

@@ -1,5 +1,5 @@
-"""What is exported of a checkpoint: networks without memory as torch modules, their weights as plain arrays,
-golden pairs, and policy_spec.json, which says what every column is."""
+"""What is exported of a checkpoint: networks without memory, their weights as plain arrays, golden pairs, and
+policy_spec.json, which says what every column is."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ import warnings
 from abc import ABC, abstractmethod
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from uuvtai.common.enums import EGO_COLUMNS, LEAST_SPEED_M_S, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH, TURN_GAIN
 from uuvtai.common.version import __version__
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.checkpoint import Checkpoint
+from uuvtai.learning.checkpoint import Checkpoint, action_rows
 from uuvtai.learning.export.graph import without_telemetry
-from uuvtai.learning.export.run_policy import GOLDEN, SCHEMA, TOLERANCE, WEIGHTS
+from uuvtai.learning.export.run_policy import GOLDEN, SCHEMA, TOLERANCE, WEIGHTS, Arrays
 from uuvtai.learning.networks import NUM_ACTIONS
 from uuvtai.learning.policy_agent import OneDecision, load_agent
 from uuvtai.learning.set_networks import SetActor, actor_of
@@ -35,35 +34,29 @@ NO_LIMIT = float(torch.finfo(torch.float32).max)
 """of a normaliser that has seen nothing and therefore cuts nothing off"""
 _ROWS, _SEED = 64, 6
 
-Arrays = dict[str, np.ndarray]
-
 _OBSERVATION = (
-    "float32, raw SI units, in this order; the scaling is inside the policy. A value that is not finite "
-    "counts as the mean of training. Frames: body is the vehicle's (x ahead, y left, z up); level is the "
-    "same without roll and pitch; route follows the planned path; world has z up and 0 at the surface."
+    "float32, raw SI units, in this order; not finite = the mean of training. Frames: body (x ahead, y left, "
+    "z up); level, the same without roll and pitch; route, along the planned path; world, z 0 at the surface."
 )
-_ACTION = (
-    "parts of the limits within [-1, 1]; velocities in the body frame, wanted of the inner velocity loop"
-)
+_ACTION = "parts of the limits within [-1, 1]; body velocities, wanted of the inner velocity loop"
 _HOLD = (
-    "The networks decide at the first control step of a mission and then at every hold_steps-th one. In "
-    "between the action is held. It is carried out cut off to [-1, 1]. last_obs and last_action are those of "
-    "the last decision."
+    "The networks decide at the first control step of a mission and then at every hold_steps-th one; in "
+    "between the action is held, cut off to [-1, 1]."
 )
 _WISH = (
-    "ahead, left, up in the mirrored world: the first two in parts of fastest_m_s, shortened to length 1 "
-    "where they are longer, the third in parts of the heave limit; held until the next decision"
+    "ahead, left, up in the mirrored world: the first two in parts of fastest_m_s, shortened to length 1, "
+    "the third in parts of the heave limit; held until the next decision"
 )
 
 
 class ExportedModule(nn.Module, ABC):
-    """What is exported: rows of inputs to rows of outputs, by name."""
+    """Rows of inputs to rows of outputs, by name."""
 
     kind: str
     """one of ``run_policy.KINDS``"""
     inputs: dict[str, str]
-    """what each one is, in the order of ``forward``"""
     outputs: dict[str, str]
+    """what each one is, in the order of ``forward``"""
 
     @abstractmethod
     def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
@@ -79,7 +72,6 @@ class ExportedModule(nn.Module, ABC):
 
     @torch.inference_mode()
     def said(self, rows: Arrays) -> Arrays:
-        """Outputs by name for rows of the inputs, in their order."""
         found = self(*(torch.from_numpy(part) for part in rows.values()))
         return {name: part.numpy() for name, part in zip(self.outputs, found, strict=True)}
 
@@ -89,11 +81,9 @@ class OneAction(OneDecision, ExportedModule):
 
     kind = "mlp"
     inputs = {
-        "obs": "(N, n_obs) float32: the newest observation, raw SI units; what is not finite counts as the "
-        "training's mean",
-        "last_obs": "(N, n_obs) float32: the observation of the last decision; anything where has_last is "
-        "false",
-        "last_action": "(N, 4) float32: the action of the step in which the last decision was made",
+        "obs": "(N, n_obs) float32: the newest observation, raw SI units",
+        "last_obs": "(N, n_obs) float32: that of the last decision; anything where has_last is false",
+        "last_action": "(N, 4) float32: mean action of the last decision",
         "has_last": "(N,) bool: there was a decision before in this mission",
     }
     outputs = {
@@ -103,7 +93,6 @@ class OneAction(OneDecision, ExportedModule):
     }
 
     def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
-        """Some values are not finite, as a sensor that fails may give them; the first row has no last one."""
         norm, n_obs = self.policy.observation_norm, self.policy.n_in - N_FEATURES
         mean, std = norm.mean[:n_obs].float(), norm.std()[:n_obs].float()
         last, obs = (mean + std * torch.randn(count, n_obs, generator=rng) for _ in range(2))
@@ -116,7 +105,6 @@ class OneAction(OneDecision, ExportedModule):
         return obs, last, action, torch.arange(count) > 0
 
     def weights(self) -> dict[str, Tensor]:
-        """Networks, and what they scale by."""
         policy, world = self.policy, self.world_model
         norms = {"norm": policy.observation_norm}
         nets = {"actor": policy.actor, "critic": policy.critic}
@@ -132,7 +120,6 @@ class OneAction(OneDecision, ExportedModule):
         return found
 
     def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
-        """Every single column with its place, name, unit, frame and what it is scaled by."""
         policy, norm = self.policy, self.policy.observation_norm
         pairs = zip(norm.mean.tolist(), norm.std().tolist(), strict=True)
         scales = [{"mean": mean, "std": std} for mean, std in pairs]
@@ -156,29 +143,23 @@ class OneAction(OneDecision, ExportedModule):
 
 
 class OneWish(ExportedModule):
-    """One decision of a policy over a set of obstacles; it remembers nothing, and no critic is part of it."""
+    """One decision of a policy over a set of obstacles."""
 
     kind = "set"
     inputs = {
-        "obstacles": f"(N, n, {OBSTACLE_WIDTH}) float32: the nearest moving obstacles in any order, any n "
-        "from 1 on; a row of zeros is no obstacle",
+        "obstacles": f"(N, n, {OBSTACLE_WIDTH}) float32: moving obstacles in any order; zeros = none",
         "own": f"(N, {EGO_COLUMNS}) float32: the vehicle, its goal and the free distances around it",
     }
-    outputs = {
-        "mean_wish": "(N, 3) float32: ahead, left, up, in parts of the fastest velocity, mirrored world; cut "
-        "it off to [-2, 2]"
-    }
+    outputs = {"mean_wish": "(N, 3) float32: ahead, left, up in the mirrored world; cut it off to [-2, 2]"}
 
     def __init__(self, actor: SetActor) -> None:
         super().__init__()
         self.actor = actor
 
     def forward(self, obstacles: Tensor, own: Tensor) -> tuple[Tensor, ...]:
-        """Shapes as ``inputs`` and ``outputs`` say."""
         return (self.actor(obstacles, own),)
 
     def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
-        """Of any number of obstacles, the first of none."""
         obstacles = torch.randn(count, N_OBSTACLE, OBSTACLE_WIDTH, generator=rng)
         own = torch.randn(count, EGO_COLUMNS, generator=rng)
         number = torch.randint(1, N_OBSTACLE + 1, (count,), generator=rng)
@@ -189,11 +170,9 @@ class OneWish(ExportedModule):
         return obstacles, own
 
     def weights(self) -> dict[str, Tensor]:
-        """The actor's layers."""
         return {f"actor.{name}": tensor for name, tensor in self.actor.net.state_dict().items()}
 
     def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
-        """Columns in words, and the rule that lays a wish on the hull."""
         config = checkpoint.config
         obstacles = {"most": N_OBSTACLE, "columns": OBSTACLE_COLUMNS}
         return {
@@ -220,7 +199,7 @@ def weights_of(module: ExportedModule) -> dict[str, Tensor]:
 
 
 def golden_of(module: ExportedModule) -> Arrays:
-    """``pair_<input>`` and ``pair_<output>``, 64 rows of made-up inputs and what the module says to them."""
+    """``pair_<input>`` and ``pair_<output>``: made-up inputs and what the module says to them."""
     made_up = module.rows(_ROWS, torch.Generator().manual_seed(_SEED))
     inputs = {name: tensor.numpy() for name, tensor in zip(module.inputs, made_up, strict=True)}
     return {f"pair_{name}": array for name, array in (inputs | module.said(inputs)).items()}
@@ -241,16 +220,10 @@ def onnx_bytes(module: ExportedModule) -> bytes:
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            program = torch.onnx.export(
-                module,
-                module.rows(2, torch.Generator().manual_seed(_SEED)),
-                input_names=list(module.inputs),
-                output_names=list(module.outputs),
-                dynamic_shapes=sizes,
-                opset_version=OPSET,
-                dynamo=True,
-                verbose=False,
-            )
+            names = {"input_names": list(module.inputs), "output_names": list(module.outputs)}
+            options = {"dynamic_shapes": sizes, "opset_version": OPSET, "dynamo": True, "verbose": False}
+            made_up = module.rows(2, torch.Generator().manual_seed(_SEED))
+            program = torch.onnx.export(module, made_up, **names, **options)
     finally:
         logging.disable(before)
     assert program is not None
@@ -283,9 +256,8 @@ def _rate(config: LearningConfig) -> dict[str, Any]:
 
 
 def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
-    """Numbers of the rule that lays a wish on the hull, as the card's README tells it."""
-    vehicle = config.vehicle
-    limits = {"surge": vehicle.max_surge_m_s, "sway": vehicle.max_sway_m_s, "heave": vehicle.max_heave_m_s}
+    """Numbers of the rule that lays a wish on the hull (``run_policy.SetPolicy.command``)."""
+    vehicle, limits = config.vehicle, {row["name"]: row["limit"] for row in action_rows(config)[:3]}
     return {
         "fastest_m_s": math.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s),
         "limits_m_s": limits,
@@ -298,28 +270,21 @@ def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# What every column of a policy over a set of obstacles is, in words (``surrogate/observation.py`` writes
-# them).
+# Columns of a policy over a set of obstacles, in words (``surrogate/observation.py`` writes them).
 
 
 MEANING = (
-    "float32. Mirrored world: x is turned round where the goal lies at smaller x than the start, y "
-    "where it lies at smaller y (flip is -1 there, else 1), so that the goal lies ahead and to the left "
-    "at the start; flips do not change during a mission. Each column is the quantity in its unit, "
-    "computed as its meaning says. clip(v, a, b) cuts off to [a, b]. An obstacle is a tracked moving "
-    "obstacle; one row each, at most the nearest ones; a row of zeros is no obstacle. Numbers that are not "
-    "finite are refused."
+    "float32. Mirrored world: x is turned round where the goal lies at smaller x than the start, y where it "
+    "lies at smaller y (flip is -1 there, else 1), by the start of a mission. Each column is the quantity in "
+    "its unit; clip(v, a, b) cuts off to [a, b]. An obstacle is a tracked moving one; a row of zeros is "
+    "none. Numbers that are not finite are refused."
 )
 
 
 def _columns(table: str) -> list[dict[str, str]]:
     """Rows of "names | unit | meaning"."""
     rows = [line.split(" | ") for line in table.strip().splitlines()]
-    return [
-        {"name": name, "unit": unit, "meaning": meaning}
-        for names, unit, meaning in rows
-        for name in names.split()
-    ]
+    return [{"name": name, "unit": u, "meaning": told} for names, u, told in rows for name in names.split()]
 
 
 OBSTACLE_COLUMNS = _columns("""
@@ -340,7 +305,6 @@ closest_in | s | time of the closest approach on straight lines, clip(v, 0, 3)
 closest_gap | m | distance then, less radius and 0.22, clip(v, -1, 3)
 route_direction.x route_direction.y | 1 | unit vector to the look-ahead point of the route
 """)
-"""Columns of an obstacle."""
 OWN_COLUMNS = _columns("""
 goal.x | 10 m | from the vehicle to the goal, / 10
 goal.y | 4 m | the same, / 4
@@ -369,4 +333,3 @@ route_aside | m | place left of the route, times flip.x flip.y, clip(v, -2, 2)
     }
     for i in range(N_RAY)
 ]
-"""Columns of the vehicle's own."""

@@ -11,8 +11,7 @@ What it is stands as ``kind`` in policy_spec.json, with every column of its inpu
           policy.command(said.wish, flip, yaw_rad, z_m), the hull rule
 
 ``python run_policy.py [FOLDER]`` replays the golden pairs, prints the differences and the latency, and exits
-3 where they differ. Nothing in the folder can make this file execute code: safetensors are read as bytes of
-checked length, never as pickles.
+3 where they differ. Nothing in the folder can make this file execute code.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ import numpy as np
 
 SPEC, WEIGHTS, GOLDEN = "policy_spec.json", "policy.safetensors", "golden.safetensors"
 SCHEMA = 5
-"""of the folder; another one is refused"""
 FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py")
 """names that the spec may list; nothing else is ever opened"""
 N_TARGET, N_ACTION = 24, 4
@@ -46,8 +44,7 @@ MAX_BYTES = 64 << 20
 CALLS = 330
 """decisions that a latency is measured with"""
 TOLERANCE = 1e-5
-"""largest difference between torch, NumPy and ONNX Runtime, in parts of the output's largest value where that
-is beyond 1"""
+"""between torch, NumPy and ONNX Runtime, in parts of the output's largest value where that is beyond 1"""
 MAX_ROWS, MAX_WORK = 1 << 16, 1 << 34
 """of the golden pairs, and multiplications to replay them: seconds"""
 
@@ -78,8 +75,7 @@ class Exported(ABC):
 
     @abstractmethod
     def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
-        """``spec`` is policy_spec.json, ``arrays`` policy.safetensors; ``made`` says where they do not fit
-        together."""
+        """``spec`` is policy_spec.json, ``arrays`` policy.safetensors."""
         self.work = sum(array.size for array in arrays.values())
         """multiplications of a row, of one obstacle"""
 
@@ -88,7 +84,6 @@ class Exported(ABC):
         """Outputs by name, one row each for rows of inputs. Raises ValueError for inputs of other shapes."""
 
     def _rows(self, given: Arrays) -> list[np.ndarray]:
-        """The inputs as float32, in their order. Raises ValueError."""
         found = [np.asarray(given[name], np.float32) for name in self.inputs]
         for name, rows, shape in zip(self.inputs, found, self.shapes, strict=True):
             fits = rows.ndim == 1 + len(shape) and len(rows) == len(found[0])
@@ -115,8 +110,7 @@ class Decision(NamedTuple):
 
 
 class Policy(Exported):
-    """One vehicle's policy with its memory. ``act`` once per control step; ``reset`` when a mission
-    begins."""
+    """One vehicle's policy with its memory; ``act`` once per control step."""
 
     inputs = ("obs", "last_obs", "last_action", "has_last")
 
@@ -143,8 +137,7 @@ class Policy(Exported):
         self._age, self._last = 0, (np.zeros(self.n_obs), np.zeros(N_ACTION))
 
     def act(self, observation: Any) -> Decision:
-        """Decision for the newest observation (n_obs,), carried out: call it every control step, also while a
-        decision is held."""
+        """Decision for the newest observation (n_obs,); call it in every control step, held or not."""
         obs = np.asarray(observation, np.float32)
         if obs.shape != (self.n_obs,):
             raise ValueError(f"the observation must have shape ({self.n_obs},), got {obs.shape}; see {SPEC}")
@@ -159,12 +152,11 @@ class Policy(Exported):
         return Decision(action, action * self._limits, *thought)
 
     def said(self, given: Arrays) -> Arrays:
-        """``mean_action`` (N, 4), not cut off, ``value`` (N,), and ``features`` (N, 2): residual and
-        uncertainty, 0 where ``has_last`` is. What is not finite counts as its mean in training."""
+        """``mean_action`` (N, 4), not cut off, ``value`` (N,), and ``features`` (N, 2), 0 where ``has_last``
+        is. What is not finite counts as its mean in training."""
         obs, last, action, has_last = self._rows(given)
-        obs, last = (
-            np.where(np.isfinite(seen), seen, self._a["norm.mean"][: self.n_obs]) for seen in (obs, last)
-        )
+        fill = self._a["norm.mean"][: self.n_obs]
+        obs, last = (np.where(np.isfinite(seen), seen, fill) for seen in (obs, last))
         features = np.zeros((len(obs), 2), np.float32)
         if self._has_model:
             features = np.where(has_last[:, None] > 0, self._features(obs, last, action), features)
@@ -189,7 +181,6 @@ class Policy(Exported):
         return np.nan_to_num(np.stack([residual, uncertainty], 1), nan=0.0, posinf=0.0, neginf=0.0)
 
     def _scaled(self, x: np.ndarray, name: str) -> np.ndarray:
-        """Normalised columns, cut off beyond the clip."""
         limit = self._a[f"{name}.limit"][0]
         return np.clip((x - self._a[f"{name}.mean"]) * self._a[f"{name}.scale"], -limit, limit)
 
@@ -219,18 +210,15 @@ class SetPolicy(Exported):
         self._head = _layers(arrays, "actor.head", 2 * len(self._each[-1][1]) + len(self._own[-1][1]), 3)
 
     def act(self, obstacles: Any, own: Any) -> SetDecision:
-        """Decision for the newest columns: obstacles (n, width), any n; own (width,).
-
-        Raises ValueError for other shapes, numbers that are not finite, or a first column of an obstacle that
-        is neither 0 nor 1.
-        """
+        """Decision for the newest columns: obstacles (n, width), any n; own (width,). Raises ValueError for
+        other shapes, numbers that are not finite, or an obstacle that begins with neither 0 nor 1."""
         rows = {"obstacles": np.asarray(obstacles)[None], "own": np.asarray(own)[None]}
         mean = self.said(rows)["mean_wish"][0]
         return SetDecision(np.clip(mean, -MOST_WISH, MOST_WISH), mean)
 
     def said(self, given: Arrays) -> Arrays:
         """``mean_wish`` (N, 3): every obstacle through the same layers, then maximum and sum over those that
-        are there, so that neither their order nor their number matters. Raises ValueError as ``act``."""
+        are there. Raises ValueError as ``act``."""
         obstacles, own = self._rows(given)
         if not (np.isfinite(obstacles).all() and np.isfinite(own).all()):
             raise ValueError("columns are not finite; leave out obstacles that are not known")
@@ -245,10 +233,10 @@ class SetPolicy(Exported):
         return {"mean_wish": mean}
 
     def command(self, wish: Any, flip: Any, yaw_rad: float, z_m: float) -> np.ndarray:
-        """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame: the hull rule.
-
-        ``wish`` (3,) is held between decisions, ``flip`` (2,) are the signs of the way from start to goal
-        along x and y (1 where it is 0), ``yaw_rad`` and ``z_m`` the heading and the height now (0 = surface).
+        """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame: the hull rule. A
+        diagonal of the hull turns to the motion, for there surge and sway add up; floor and surface are kept
+        clear of. ``wish`` (3,) is held between decisions, ``flip`` (2,) are the signs of the way from start
+        to goal along x and y (1 where it is 0), ``yaw_rad`` and ``z_m`` heading and height now (0 = surface).
         """
         rule, (x, y, up) = self.rule, (float(part) for part in wish)
         limit, long = rule["limits_m_s"], max(1.0, math.hypot(x, y))
@@ -273,9 +261,6 @@ KINDS: dict[str, type[Exported]] = {"mlp": Policy, "set": SetPolicy}
 """by ``kind`` of policy_spec.json"""
 
 
-# ----------------------------------------------------------------------------------------------------- layers
-
-
 def _elu(x: np.ndarray) -> np.ndarray:
     return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
 
@@ -292,8 +277,7 @@ _ACTIVATIONS: dict[str, Activation] = {"elu": _elu, "tanh": np.tanh, "relu": _re
 
 
 def _layers(arrays: Arrays, name: str, first: int, last: int | None = None) -> Layers:
-    """(weight, bias) of a network's layers in order. Raises ValueError where they do not follow each other
-    from this input to this output."""
+    """(weight, bias) of a network's layers in order. Raises ValueError where they do not fit."""
     layers: Layers = []
     while (key := f"{name}.{2 * len(layers)}") + ".weight" in arrays:  # activations have the odd numbers
         weight, bias = arrays[f"{key}.weight"], arrays[f"{key}.bias"]
@@ -314,12 +298,8 @@ def _through(layers: Layers, x: np.ndarray, act: Activation) -> np.ndarray:
     return x @ weight.T + bias
 
 
-# -------------------------------------------------------------------------------------- reading without trust
-
-
 def load(folder: str | Path = ".") -> Any:
-    """``Policy`` or ``SetPolicy`` of an exported folder, every file checked against its sha256. Raises
-    PolicyError."""
+    """Policy of an exported folder, every file checked against its sha256. Raises PolicyError."""
     folder = Path(folder)
     spec = read_spec(folder)
     if wrong := changed_files(folder, spec):
@@ -356,8 +336,7 @@ def read_spec(folder: Path) -> dict[str, Any]:
 
 
 def changed_files(folder: Path, spec: dict[str, Any]) -> list[str]:
-    """What is not as the spec says, in words; empty = every file is there and has its sha256. Raises
-    PolicyError."""
+    """What is not as the spec says, in words. Raises PolicyError."""
     listed = spec.get("files")
     if not isinstance(listed, dict) or not {WEIGHTS, GOLDEN} <= listed.keys() <= set(FILES):
         raise PolicyError(
@@ -376,8 +355,7 @@ def changed_files(folder: Path, spec: dict[str, Any]) -> list[str]:
 
 
 def content_of(file: Path) -> bytes:
-    """Bytes of a plain file of bearable size; no link is followed and neither a pipe nor a device is waited
-    for. Raises PolicyError."""
+    """Bytes of a plain file of bearable size, no link, pipe or device. Raises PolicyError."""
     try:
         if file.is_symlink():
             raise FileNotFoundError
@@ -408,8 +386,7 @@ def read_safetensors(file: Path) -> Arrays:
 
 
 def _tensors(content: bytes) -> Arrays:
-    """Source of the format: https://huggingface.co/docs/safetensors (8 bytes of length, JSON header, raw
-    bytes without gaps)."""
+    """The format: https://huggingface.co/docs/safetensors (8 bytes of length, JSON header, raw bytes)."""
     length = int.from_bytes(content[:8], "little")
     if len(content) < 8 or length > min(len(content) - 8, _MAX_HEADER):
         raise ValueError("its header is longer than the file or than any of ours")
@@ -430,9 +407,6 @@ def _tensors(content: bytes) -> Arrays:
     return arrays
 
 
-# ----------------------------------------------------------------------------------------------- golden pairs
-
-
 def golden_rows(golden: Arrays, inputs: Iterable[str]) -> Arrays:
     """The golden inputs by name. Raises PolicyError where they are not as many rows each."""
     rows = {name: golden.get(f"pair_{name}", _NOTHING) for name in inputs}
@@ -445,12 +419,9 @@ def golden_rows(golden: Arrays, inputs: Iterable[str]) -> Arrays:
 def compared(
     engine: str, said: Callable[[Arrays], Arrays], rows: Arrays, golden: Arrays, at_once: int = 1
 ) -> dict[str, Any]:
-    """An engine against the golden pairs, as JSON: its name, the largest ``difference`` of every output (None
-    = without end), whether it ``agrees``, and ``p50_ms`` and ``p99_ms`` of a call with one row, after 30 that
-    do not count.
-
-    ``said`` gives outputs by name for inputs by name; ``at_once`` of the ``rows`` are compared together.
-    """
+    """An engine against the golden pairs, as JSON: the largest ``difference`` of every output (None = without
+    end), whether it ``agrees``, and the latency of a call with one row, after 30 that do not count. ``said``
+    gives outputs by name for inputs by name; ``at_once`` of the ``rows`` are compared together."""
     count, times = len(next(iter(rows.values()))), []
 
     def part(first: int, n: int) -> Arrays:
@@ -476,16 +447,14 @@ def compared(
 
 
 def difference(found: np.ndarray, expected: np.ndarray) -> float:
-    """Largest difference, in parts of the largest expected number where that is beyond 1; infinite for other
-    shapes or NaN."""
+    """Largest difference, as ``TOLERANCE`` counts; infinite for other shapes or NaN."""
     if found.shape != expected.shape or not (np.isfinite(found).all() and np.isfinite(expected).all()):
         return math.inf
     return float(np.max(np.abs(found - expected), initial=0.0) / np.max(np.abs(expected), initial=1.0))
 
 
 def of_numpy(policy: Exported, golden: Arrays) -> dict[str, Any]:
-    """This file against the golden pairs, as ``compared``. Raises PolicyError for golden pairs of another
-    shape, or that would take minutes."""
+    """As ``compared``. Raises PolicyError for golden pairs of another shape, or that would take minutes."""
     rows = golden_rows(golden, policy.inputs)
     first = rows[policy.inputs[0]]
     obstacles = first.shape[1] if first.ndim == 3 else 1
@@ -498,7 +467,7 @@ def of_numpy(policy: Exported, golden: Arrays) -> dict[str, Any]:
 
 
 def main(arguments: list[str]) -> int:
-    """Replay the golden pairs of a folder; 0 = they agree, 3 = they differ, 1 = the folder cannot be used."""
+    """0 = the golden pairs agree, 3 = they differ, 1 = the folder cannot be used."""
     folder = Path(arguments[0]) if arguments else Path(__file__).resolve().parent
     try:
         found = of_numpy(load(folder), read_safetensors(folder / GOLDEN))
