@@ -301,6 +301,7 @@ class FlightGroup:
     dvl: opt.DvlPlace = None
     sonar: opt.SonarPlace = None
     arm: opt.Arm = False
+    check: opt.PilotCheck = False
     heading: opt.Heading = None
     box: opt.FenceBox = None
     depth: opt.FenceDepth = None
@@ -339,6 +340,7 @@ class FlightGroup:
             operator=self.operator,
             senders=self.sender or (),
             instruments={"dvl": self.dvl, "sonar": self.sonar},
+            checks=self.check,
         )
 
 
