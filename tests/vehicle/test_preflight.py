@@ -20,7 +20,7 @@ from uuvtai.vehicle import control_loop
 from uuvtai.vehicle.control_loop import FlightPlan, OnboardLoop
 from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360
 from uuvtai.vehicle.instruments.rig import PORTS, Rig
-from uuvtai.vehicle.mavlink import Endpoint, LinkError, LinkPlace
+from uuvtai.vehicle.mavlink import Endpoint, LinkPlace
 from uuvtai.vehicle.onboard import Mission
 from uuvtai.vehicle.start_fix import StartFix, expected
 from uuvtai.vehicle.telemetry import sectors_of
@@ -285,16 +285,21 @@ def test_an_instrument_with_a_planted_mistake_is_found(check, given, row, words)
     assert "it may NOT drive" in text and ("NOTHING was heard" in text) == ("mute" in given)
 
 
-def test_several_tellers_of_one_thing_are_found(check):
-    one = check()
+def test_several_tellers_of_one_thing_are_found_and_other_vehicles_parameters_are_not_ours(check):
+    one, stranger = check(), mav.MAVLink(None, srcSystem=7, srcComponent=1)
+    one.sub.parameters.clear()
     extension = mav.MAVLink(None, srcSystem=255, srcComponent=0)
 
-    def speak(step):
-        one.sub.send(
-            mav.MAVLink_vision_position_delta_message(0, 20000, [0.0] * 3, [0.0] * 3, 90.0), extension
-        )
+    still = [0.0] * 3
 
-    state, words = one.rows(speak)["dvl"]
+    def speak(step):
+        one.sub.send(mav.MAVLink_vision_position_delta_message(0, 20000, still, still, 90.0), extension)
+        one.sub.send(mav.MAVLink_param_value_message(b"FS_GCS_ENABLE", 3, 9, 900, 65535), stranger)
+        one.sub.send(mav.MAVLink_scaled_pressure3_message(1 + step, 0.0, 0.0, 2000))
+
+    rows = one.rows(speak)
+    assert rows["pressure"][0] == "ok" and not {*GOOD} & {*rows}
+    state, words = rows["dvl"]
     assert state == "bad" and "VISION_POSITION_DELTA 1/1" in words and "--sender dvl=" in words
 
 
@@ -324,8 +329,6 @@ def test_a_rig_file_says_where_instruments_are_heard_and_options_win(rig_file):
     assert typed.instruments == {"dvl": "json::14700", "sonar": "ping360:192.168.2.2"}
     assert typed.heading_rad == 0.0 and typed.seconds == 30.0
     assert planned(load_config("pool", "multibeam")).instruments == {}, "MAVLink's"
-    with pytest.raises(LinkError, match="leave out --arm"):
-        planned(config, arms=True, checks=True)
 
 
 @pytest.mark.parametrize("text", ["a50", "ping360:192.168.2.2", "a50:host:0", "a50:host:70000", "a50:a b"])
@@ -360,6 +363,12 @@ def test_the_command_refuses_to_pass_what_nobody_speaks_to(capfd, monkeypatch, t
         assert json.loads(out)["check"]["ready"] is False
     else:
         assert "it may NOT drive: autopilot" in out and "a50:127.0.0.1:9: NOTHING was heard" in out
+
+
+def test_a_check_never_arms(capfd, monkeypatch):
+    monkeypatch.setattr(control_loop, "fly", lambda *_: pytest.fail("it flies"))
+    code, _, err = uuv(capfd, *BASE, "--check", "--arm")
+    assert code == 2 and "leave out --arm" in err
 
 
 def test_a_port_that_is_taken_names_the_option_to_change(capfd, tmp_path):

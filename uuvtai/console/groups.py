@@ -320,6 +320,8 @@ class FlightGroup:
         from uuvtai.vehicle.control_loop import FlightPlan
 
         parsing.refuse_odd_rate(self.rate)
+        if self.check and self.arm:
+            raise UsageError("--check: never arms; leave out --arm, and give it once the check is passed")
         if self.log is not None and self.log.exists() and not self.force:
             raise UsageError(f"--log {self.log}: is there already; give another name, or --force")
         return FlightPlan.typed(

@@ -96,8 +96,6 @@ class FlightPlan:
         checks: bool = False,
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
-        if checks and arms:
-            raise LinkError("--check: never arms; leave out --arm, and give it once the check is passed")
         if config.sensors.sonar.doppler:
             raise LinkError(
                 "the pilot would wait for a sonar with Doppler, which OBSTACLE_DISTANCE does not have: "
@@ -113,8 +111,7 @@ class FlightPlan:
             raise LinkError(f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90")
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
-        if heading_deg is None:
-            heading_deg = config.world.tank.heading_deg
+        heading_deg = config.world.tank.heading_deg if heading_deg is None else heading_deg
         mounted = {"dvl": config.sensors.dvl.at, "sonar": config.sensors.sonar.at}
         heard_at = mounted | {option: place for option, place in (instruments or {}).items() if place}
         limits = _limits(config, box, depth, max_speed, battery)
@@ -260,7 +257,7 @@ class OnboardLoop:
         self._sought, self._check = fix, None
         """who seeks the start, also when it is found; what a check gathers"""
         if plan.checks:
-            self._check = Preflight(config, plan.limits, plan.mission.start[2], plan.operator)
+            self._check = Preflight(config, plan.limits, plan.mission.start[2], plan.system, plan.operator)
         self.failure: BaseException | None = None
         """an error of this program that ended the flight, or came while it ended"""
 
@@ -516,7 +513,7 @@ class OnboardLoop:
             return
         self._beat_s = now_s
         self._say(now_s, heartbeat())
-        for order in () if self._check is None else self._check.asks(self._plan.system):
+        for order in () if self._check is None else self._check.asks():
             self._say(now_s, order)
         if now_s - self._asked_s >= 5.0 and self._intake.heard.vehicle_s > -math.inf:
             self._asked_s = now_s

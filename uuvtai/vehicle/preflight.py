@@ -20,7 +20,7 @@ from uuvtai.vehicle.mavlink import MavMessage, Order, ask_parameter
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage, SonarPing
 from uuvtai.vehicle.safety import SafetyLimits
 from uuvtai.vehicle.start_fix import StartFix, StartFound
-from uuvtai.vehicle.telemetry import AUTOPILOT, KINDS, Heard
+from uuvtai.vehicle.telemetry import AUTOPILOT, KIND_OF, KINDS, Heard
 
 OK, NOTE, BAD = "ok", "note", "bad"
 CHECK_S = 30.0  # of a check whose time is not typed
@@ -111,10 +111,13 @@ def judged(name: str, value: float, config: Config, operator: int, has_sticks: b
 class Preflight:
     """Is told what the loop hears, feeds and decides; ``rows`` judges it at the end."""
 
-    def __init__(self, config: Config, limits: SafetyLimits, start_z_m: float, operator: int) -> None:
-        """``start_z_m``: height of the typed start. ``operator``: the ground station's id."""
+    def __init__(
+        self, config: Config, limits: SafetyLimits, start_z_m: float, system: int, operator: int
+    ) -> None:
+        """``start_z_m``: height of the typed start. ``system``, ``operator``: MAVLink ids of the vehicle and
+        of the ground station."""
         self._config, self._limits = config, limits
-        self._start_z_m, self._operator = start_z_m, operator
+        self._start_z_m, self._system, self._operator = start_z_m, system, operator
         self._come: dict[str, deque[float]] = {name: deque(maxlen=_KEPT) for name in _LEAST_HZ}
         """by row: when something came [s]"""
         self._sources: dict[str, Counter[str]] = {name: Counter() for name in _LEAST_HZ}
@@ -122,8 +125,8 @@ class Preflight:
         self._asked: Counter[str] = Counter()
         self._offsets: dict[tuple[str, int, int], float] = {}
         self._jumps: Counter[str] = Counter()
-        self._force_s = self._pressure_m = math.nan
-        """when an acceleration came last; newest depth by the absolute pressure"""
+        self._force_s, self._depths_m = math.nan, dict[str, float]()
+        """when an acceleration came last; newest depth by absolute pressure, by its message"""
         self._imu: ImuReading | None = None
         self._spent_s, self._turned, self._told = 0.0, np.zeros(3), np.zeros(3)
         """[s], [rad] by the rates, [rad] by the attitude"""
@@ -134,22 +137,23 @@ class Preflight:
         self._now: Collection[str] = ()
         """rules that are broken in the last step"""
 
-    def asks(self, system: int) -> Iterator[Order]:
+    def asks(self) -> Iterator[Order]:
         """Once a second: requests for the parameters that were not told yet."""
         for name in PARAMETERS:
             if name not in self.parameters and self._asked[name] < _MOST_ASKED:
                 self._asked[name] += 1
-                yield ask_parameter(name, system)
+                yield ask_parameter(name, self._system)
 
     def saw(self, message: MavMessage, come_s: float, heard: Heard, was_used: bool) -> None:
         """A message that came; ``heard``: with it. ``was_used``: it was not left out."""
         name, fields = message.name, message.fields
         who = f"{message.system}/{message.component}"
-        is_autopilot = message.component == AUTOPILOT
+        is_autopilot = (message.system, message.component) == (self._system, AUTOPILOT)
         if not was_used:
             return
         if name == "PARAM_VALUE" and is_autopilot and fields["param_id"] in PARAMETERS:
-            self.parameters[fields["param_id"]] = float(fields["param_value"])
+            if math.isfinite(value := float(fields["param_value"])):
+                self.parameters[fields["param_id"]] = value
         if name == "HEARTBEAT":
             for row, last_s in (("autopilot", heard.vehicle_s), ("operator", heard.operator_s)):
                 if last_s == come_s and (row == "autopilot") == is_autopilot:
@@ -158,15 +162,15 @@ class Preflight:
             self._note("battery", f"{name} {who}", come_s)
         elif name in KINDS["imu"]:
             self._force_s = come_s
-        elif name in KINDS["pressure"]:
+        elif name in KINDS["pressure"] and fields["press_abs"] > 0:
             vehicle = self._config.vehicle
             weight = vehicle.water_density_kg_m3 * vehicle.gravity_m_s2
-            self._pressure_m = 100.0 * (float(fields["press_abs"]) - 1013.25) / weight
+            self._depths_m[name] = 100.0 * (float(fields["press_abs"]) - 1013.25) / weight
         self._look_at_clock((name, message.system, message.component), fields, come_s)
 
     def _look_at_clock(self, key: tuple[str, int, int], fields: Mapping[str, Any], come_s: float) -> None:
         sent_s, wrap_s = stamp_of(fields)
-        if not sent_s or key[0] not in {name for names in KINDS.values() for name in names} | {"ATTITUDE"}:
+        if not sent_s or key[0] not in KIND_OF:
             return
         offset = come_s - sent_s
         moved = offset - self._offsets.get(key, offset)
@@ -275,9 +279,10 @@ class Preflight:
         elif gaps.max() > oldest_s and state == OK:
             state, told = NOTE, f"once it stopped for {gaps.max():.1f} s; {told}"
         several = [one for one in self._sources[name] if not one.startswith("LOCAL_POSITION_NED")]
-        if name != "battery" and len(several) > 1:
-            state = BAD
-            told = f"several tell it: {', '.join(several)}; --sender {name}=SYSTEM/COMPONENT takes one"
+        if len({one.rpartition(" ")[2] for one in several}) > 1:
+            kind = "attitude" if name == "imu" else name
+            told = f"several tell it: {', '.join(several)}; --sender {kind}=SYSTEM/COMPONENT takes one"
+            state = NOTE if name == "battery" else BAD
         sender = self._sources[name].most_common(1)[0][0]
         return CheckRow(name, state, told.rstrip("; "), rate_hz, gap_s, now_s - come[-1], sender)
 
@@ -306,9 +311,10 @@ class Preflight:
         return (OK if echoes >= _ECHOES else NOTE), told
 
     def _depth(self) -> tuple[str, str]:
-        off_m, floor_m = abs(self._pressure_m + self._start_z_m), -self._config.world.tank.z_m[0]
-        told = f"{self._pressure_m:.2f} m deep if the air has 1013 hPa, --start says {-self._start_z_m:.2f}"
-        if off_m > _DEPTH_M[1] or self._pressure_m > floor_m + _DEPTH_M[1]:
+        depth_m = self._depths_m.get("SCALED_PRESSURE2", next(iter(self._depths_m.values()), math.nan))
+        off_m, floor_m = abs(depth_m + self._start_z_m), -self._config.world.tank.z_m[0]
+        told = f"{depth_m:.2f} m deep if the air has 1013 hPa, --start says {-self._start_z_m:.2f}"
+        if not off_m <= _DEPTH_M[1]:
             return BAD, f"{told} in a tank of {floor_m:g} m: measure again, or another sensor speaks"
         return (NOTE if off_m > _DEPTH_M[0] else OK), told
 
@@ -378,7 +384,7 @@ class Preflight:
         jumped = {name: count for name, count in self._jumps.items() if count}
         if jumped or clock_jumps:
             names = ", ".join(f"{name} {count} times" for name, count in jumped.items())
-            told = f"{names or f'{clock_jumps} times'}: does it restart, is its time set meanwhile?"
+            told = f"{names or f'{clock_jumps} times'}: does it restart, is its time set, is the link stuck?"
             yield CheckRow("clock jumps", BAD, told)
 
     def _run_rows(self, heard: Heard) -> Iterator[CheckRow]:
