@@ -87,13 +87,13 @@ class RestingPilot(WishfulPilot):
 class Check(Flight):
     """A check of a vehicle, step by step, without a clock."""
 
-    def __init__(self, folder, config=None, rig=None, places=None):
+    def __init__(self, folder, config=None, rig=None, places=None, heading_rad=None):
         config = config or link_config()
         super().__init__(folder, arms=False, config=config, sub=RestingSub)
         mission = Mission(PLACE, (3.0, 3.0, -0.8))
         plan = FlightPlan(
             self.endpoint.place, mission, LIMITS, self.log.path, seconds=SECONDS, checks=True,
-            instruments=places or {},
+            instruments=places or {}, heading_rad=heading_rad,
         )  # fmt: skip
         self.pilot = RestingPilot()
         self.loop = OnboardLoop(
@@ -143,6 +143,12 @@ def test_a_vehicle_that_is_as_it_should_be_may_drive(check):
     show_check(Screen(console=console), found)
     text = console.export_text()
     assert "it may drive" in text and max(map(len, text.splitlines())) <= 80
+
+
+def test_a_heading_that_the_walls_correct_is_no_error_of_the_gyro(check):
+    rows = check(heading_rad=math.radians(12)).rows()
+    assert rows["gyro"][0] == "ok" and "off" not in rows["gyro"][1]
+    assert rows["start"][0] == "note" and "-12.0 degrees" in rows["start"][1]
 
 
 def other(**given):

@@ -418,6 +418,8 @@ class OnboardLoop:
             return
         mission = self._plan.mission
         place = self._intake.correct(self._start.place, self._start.turn_rad)
+        if self._check is not None:
+            self._check.turned()
         self._pilot.begin_again(dataclasses.replace(mission, start=place, spread=self._start.spread))
         self._lag_s, self._scans, self._measured_s["sonar"] = now_s, 0, -math.inf
         off_m, off = math.hypot(*self._start.shift), math.degrees(self._start.turn_rad)

@@ -93,9 +93,9 @@ def judged(name: str, value: float, config: Config, operator: int, has_sticks: b
     if name in ("FS_EKF_ACTION", "FS_PRESS_ENABLE"):
         return _failsafe(value, "set 1 (warn)", NOTE)
     if name == "FS_PILOT_INPUT" and value >= 2 and not has_sticks:
-        return BAD, "2 disarms a vehicle in GUIDED that no stick is sent to: set 1 (warn)"
+        return BAD, "disarms a vehicle in GUIDED that no stick is sent to: set 1 (warn)"
     frame = _FRAMES.get(len(config.vehicle.thrusters))
-    if name == "FRAME_CONFIG" and value != frame:
+    if name == "FRAME_CONFIG" and value != (frame or value):
         return BAD, f"--vehicle has {len(config.vehicle.thrusters)} thrusters, frame {frame}: another one?"
     if name == "SYSID_MYGCS" and value != operator:
         return BAD, f"the ground station that it obeys is not {operator}: --operator {value:g}"
@@ -195,6 +195,10 @@ class Preflight:
             self._beams, self._echoes = self._beams + len(hit), self._echoes + int(hit.sum())
             self._near += int((hit & (ranges < _RINGS_M)).sum())
             self._looked.update(range(reading.first_beam, reading.first_beam + len(hit)))
+
+    def turned(self) -> None:
+        """The walls have corrected the heading: the next attitude is no motion."""
+        self._imu = None
 
     def _feel(self, imu: ImuReading) -> None:
         """A gyro's error is what its rates turn and the attitude does not, so the vehicle may be turned."""
@@ -373,7 +377,7 @@ class Preflight:
         silent = [name for name in PARAMETERS if name not in self.parameters]
         for name, value in self.parameters.items():
             state, told = judged(name, value, self._config, self._operator, heard.sticks_s > -math.inf)
-            yield CheckRow(name, state, f"{value:g}{f' {told}' if told else ''}")
+            yield CheckRow(name, state, f"{value:g}{f', {told}' if told else ''}")
         if silent:
             yield CheckRow("parameters", NOTE, f"not answered, look in QGroundControl: {', '.join(silent)}")
 
