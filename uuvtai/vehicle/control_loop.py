@@ -359,9 +359,8 @@ class OnboardLoop:
 
     def _hear(self, now_s: float) -> None:
         datagrams = self._endpoint.receive()
-        self._heard_s = come_s = max(
-            now_s, self._time_s()
-        )  # what was received was there by now, not by ``now_s``
+        # what was received was there by now, not by ``now_s``
+        self._heard_s = come_s = max(now_s, self._time_s())
         if self._endpoint.clock_jumps != self._clock_jumps:
             self._clock_jumps = self._endpoint.clock_jumps
             self._intake.forget_clocks()
@@ -433,9 +432,9 @@ class OnboardLoop:
         return f"{100 * share:.0f} % of the returns miss a wall" if share > MISFIT else ""
 
     def _feed(self, reading: SensorMessage, source: str, come_s: float) -> None:
+        self._pilot.feed(dataclasses.replace(reading, time_s=reading.time_s - self._lag_s))
         if self._check is not None:
             self._check.read(reading, source, come_s)
-        self._pilot.feed(dataclasses.replace(reading, time_s=reading.time_s - self._lag_s))
         if self._fix is not None:
             self._fix.feed(reading)
         if isinstance(reading, ImuReading):

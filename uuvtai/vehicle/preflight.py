@@ -302,7 +302,8 @@ class Preflight:
         return (NOTE if share < _VALID[0] or speed > _REST_M_S else OK), told
 
     def _sonar(self, instruments: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
-        echoes, near, sonar = self._echoes / self._beams, self._near / self._beams, self._config.sensors.sonar
+        sonar, beams = self._config.sensors.sonar, max(self._beams, 1)
+        echoes, near = self._echoes / beams, self._near / beams
         told = f"{100 * echoes:.0f} % of {self._beams} beams return"
         if near > _RINGS:
             return BAD, (
