@@ -469,7 +469,7 @@ def pilot_vehicle(
 ) -> None:
     """Drive a vehicle over MAVLink; a dry run without --arm.
 
-    Read docs/safety.md first. Exit code 3: it ended by a safe action."""
+    Read docs/safety.md first. Exit code 3: it ended by a safe action, or failed --check."""
     from uuvtai.console.views import show_flight
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.vehicle.control_loop import fly
@@ -481,7 +481,7 @@ def pilot_vehicle(
         raise failure
     if found["interrupted"]:
         raise typer.Exit(signals.exit_code())
-    if not found["safe"]:
+    if not found["safe"] or not (found["check"] or {"ready": True})["ready"]:
         raise typer.Exit(GATE)
 
 

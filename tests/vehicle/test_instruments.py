@@ -21,8 +21,7 @@ from uuvtai.vehicle.instruments import ping, rip2
 from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Channel, InstrumentPlace, TcpChannel, UdpChannel, place_of
 from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeRig, emulated
-from uuvtai.vehicle.instruments.json_udp import JsonUdp
-from uuvtai.vehicle.instruments.rig import PORTS, Rig
+from uuvtai.vehicle.instruments.rig import PORTS, JsonUdp, Rig
 from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import MOST_WAITING, DvlReading, Inbox, SonarPing
 from uuvtai.vehicle.sitl import Instance, SitlPlan

@@ -198,6 +198,9 @@ def test_depth_is_zeroed_at_the_start_and_the_sensor_in_the_water_counts(intake)
     assert isinstance(first, PressureReading)
     assert (first.depth_m, deeper.depth_m) == (pytest.approx(0.8), pytest.approx(1.8))
     assert taken(intake, "SCALED_PRESSURE", press_abs=1000.0, **rest) == []
+    assert taken(intake, "SCALED_PRESSURE3", press_abs=1000.0, **rest) == []
+    thermometer = Intake(CONFIG, START, 0.0)
+    assert taken(thermometer, "SCALED_PRESSURE3", press_abs=0.0, **rest) == []
 
 
 def obstacles(intake, distances, **fields):

@@ -7,6 +7,7 @@ Units stand in the names: ``_m``, ``_s``, ``_m_s``, ``_rad`` and so on; angles t
 from __future__ import annotations
 
 import hashlib
+import re
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -53,6 +54,23 @@ OrderedInterval = Annotated[Interval, AfterValidator(_ordered_interval)]
 PositiveInterval = Annotated[tuple[Positive, Positive], AfterValidator(_ordered_interval)]
 Vector3 = tuple[Real, Real, Real]
 NonNegative6 = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
+
+
+WRITTEN_PLACE = re.compile(r"([a-z0-9]+):(/dev/[\w./\-]+|[A-Za-z0-9.\-]{0,253})(?::(\d{1,5}))?")
+"""``KIND:HOST``, ``KIND:HOST:PORT`` or ``KIND:/dev/PORT``: where an instrument is heard"""
+
+
+def place_among(*kinds: str) -> AfterValidator:
+    """Check of a text: nothing, or the place of an instrument of one of these kinds."""
+
+    def checked(text: str) -> str:
+        found = WRITTEN_PLACE.fullmatch(text)
+        if text and (not found or found[1] not in kinds or not 0 < int(found[3] or 1) < 65536):
+            example = f"{kinds[0]}:192.168.2.95"
+            raise ValueError(f"write KIND:HOST or KIND:HOST:PORT, as {example}; KIND is {', '.join(kinds)}")
+        return text
+
+    return AfterValidator(checked)
 
 
 class Section(BaseModel):

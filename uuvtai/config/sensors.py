@@ -17,6 +17,7 @@ from uuvtai.config.base import (
     PositiveCount,
     Section,
     Vector3,
+    place_among,
 )
 
 SOUND_M_S = 1500.0
@@ -76,8 +77,11 @@ class SonarConfig(Section):
     """probability per beam that a specular bounce replaces the direct return"""
     grazing_cosine: Fraction = 0.0
     """a return is lost below this cosine of incidence"""
+    at: Annotated[str, place_among("ping360", "3d15", "json")] = ""
+    """where ``uuv pilot`` hears it by its own protocol, for example ping360:192.168.2.2, unless --sonar says;
+    empty: by MAVLink"""
     zero_gradian: Annotated[float, Field(ge=0, lt=400)] = 200.0
-    """angle of a Ping360 that looks ahead; for ``uuv pilot --sonar``, as what follows"""
+    """angle of a Ping360 that looks ahead; for ``uuv pilot``, as what follows"""
     min_range_m: Positive = 0.3
     """nearer echoes of a Ping360 are its own ring-down"""
     sound_m_s: Annotated[float, Field(ge=1350, le=1650)] = SOUND_M_S
@@ -175,6 +179,9 @@ class DepthConfig(Section):
 
 
 class DvlConfig(Section):
+    at: Annotated[str, place_among("a50", "json")] = ""
+    """where ``uuv pilot`` hears it by its own protocol, for example a50:192.168.2.95, unless --dvl says;
+    empty: by MAVLink"""
     sigma_m_s: NonNegative = 0.0
     scale_error: NonNegative = 0.0
     """standard deviation of the scale factor, drawn per episode"""
@@ -184,7 +191,7 @@ class DvlConfig(Section):
     dropout_s: Interval = (0.0, 0.0)
     """how long it then stays lost"""
     position_b_m: Vector3 = (0.0, 0.0, 0.0)
-    """of the device from the vehicle's centre, body axes; for ``uuv pilot --dvl``, as what follows"""
+    """of the device from the vehicle's centre, body axes; for ``uuv pilot``, as what follows"""
     yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     """of its x axis from the vehicle's, counter-clockwise seen from above"""
     fom_most_m_s: Positive = 0.1

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from uuvtai.common.enums import Truth
 from uuvtai.config.base import (
@@ -31,6 +31,9 @@ class TankConfig(Section):
     y_m: Interval = (0.0, 6.0)
     z_m: Interval = (-1.6, 0.0)
     """floor and surface"""
+    heading_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    """compass heading of the x axis, for ``uuv pilot`` unless --heading says; null: where the vehicle looks
+    first"""
 
     @model_validator(mode="after")
     def _ordered(self) -> TankConfig:

@@ -301,6 +301,7 @@ class FlightGroup:
     dvl: opt.DvlPlace = None
     sonar: opt.SonarPlace = None
     arm: opt.Arm = False
+    check: opt.PilotCheck = False
     heading: opt.Heading = None
     box: opt.FenceBox = None
     depth: opt.FenceDepth = None
@@ -319,6 +320,8 @@ class FlightGroup:
         from uuvtai.vehicle.control_loop import FlightPlan
 
         parsing.refuse_odd_rate(self.rate)
+        if self.check and self.arm:
+            raise UsageError("--check: never arms; leave out --arm, and give it once the check is passed")
         if self.log is not None and self.log.exists() and not self.force:
             raise UsageError(f"--log {self.log}: is there already; give another name, or --force")
         return FlightPlan.typed(
@@ -339,6 +342,7 @@ class FlightGroup:
             operator=self.operator,
             senders=self.sender or (),
             instruments={"dvl": self.dvl, "sonar": self.sonar},
+            checks=self.check,
         )
 
 

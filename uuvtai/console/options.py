@@ -296,7 +296,8 @@ DvlPlace = Annotated[
     Option(
         "--dvl",
         metavar="KIND:HOST",
-        help="Hear the DVL itself: a50:HOST, or json::14700 (UDP); MAVLink's then counts no more.",
+        help="Hear the DVL itself: a50:HOST, or json::14700 (UDP); MAVLink's then counts no more "
+        "\\[default: sensors.dvl.at].",
     ),
 ]
 SonarPlace = Annotated[
@@ -304,7 +305,8 @@ SonarPlace = Annotated[
     Option(
         "--sonar",
         metavar="KIND:HOST",
-        help="Hear the sonar itself: ping360:HOST, ping360:/dev/ttyUSB0, 3d15:224.0.0.96 or json::14700.",
+        help="Hear the sonar itself: ping360:HOST, ping360:/dev/ttyUSB0, 3d15:224.0.0.96 or json::14700 "
+        "\\[default: sensors.sonar.at].",
     ),
 ]
 PilotStart = Annotated[str, Option("--start", metavar="X,Y,Z", help="Where the vehicle is now \\[m], z up.")]
@@ -312,10 +314,15 @@ PilotGoal = Annotated[str, Option("--goal", metavar="X,Y,Z", help="Where to driv
 Heading = Annotated[
     float | None,
     Option(
-        "--heading", help="Compass heading of the x axis \\[deg] \\[default: where the vehicle looks first]."
+        "--heading",
+        help="Compass heading of the x axis \\[deg] \\[default: world.tank.heading_deg, or where it looks "
+        "first].",
     ),
 ]
 Arm = Annotated[bool, Option("--arm", help="Arm and drive; without it, a dry run.")]
+PilotCheck = Annotated[
+    bool, Option("--check", help="Judge what is heard of a vehicle at rest, and leave; it never arms.")
+]
 FenceBox = Annotated[
     str | None,
     Option(
@@ -343,7 +350,10 @@ HeardSenders = Annotated[
     ),
 ]
 PilotSeconds = Annotated[
-    float | None, Option("--seconds", help="Give the vehicle back after this time \\[s] \\[default: never].")
+    float | None,
+    Option(
+        "--seconds", help="Give the vehicle back after this time \\[s] \\[default: never; of a check: 30]."
+    ),
 ]
 PilotLog = Annotated[Path | None, _more("--log", help="Log to write \\[default: runs/pilot_TIME.mcap].")]
 PilotForce = Annotated[bool, _more("--force", help="Replace the log that --log names.")]

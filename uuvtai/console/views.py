@@ -390,10 +390,22 @@ _ACTIONS = (Column("action", left=True), Column("steps"), Column("share"))
 _ORDERS = (Column("order", left=True), Column("said"), Column("sent"))
 _FATES = ("fed", "used", "late", "bad", "unplaced")
 _SENSORS = (Column("sensor", left=True), *(Column(name) for name in _FATES))
+_PLACES = (Column("instrument", left=True), Column("heard"), Column("of others"))
+_CHECKED = (
+    Column("what", left=True),
+    Column("", left=True),
+    Column("Hz", 1),
+    Column("gap s", 2),
+    Column("age s", 3),
+    Column("sender", 4, left=True),
+    Column("found", prose=True),
+)
 
 
 def show_flight(screen: Screen, found: dict[str, Any]) -> None:
     """A ``uuv pilot --json`` document."""
+    if found["check"]:
+        return show_check(screen, found)
     steps = max(found["steps"], 1)
     title = "dry run: nothing was sent that moves the vehicle" if found["dry_run"] else "armed"
     rows = [[name, str(count), f"{100 * count / steps:.0f} %"] for name, count in found["actions"].items()]
@@ -402,11 +414,39 @@ def show_flight(screen: Screen, found: dict[str, Any]) -> None:
     screen.table(Table(_ORDERS, counts, f"driven in {found['driven_in'] or 'no mode'}"))
     sensors = [[name, *(str(row[key]) for key in _FATES)] for name, row in found["sensors"].items()]
     screen.table(Table(_SENSORS, sensors, "messages"))
+    show_instruments(screen, found["instruments"])
     for name, count in found["refused"].items():
         screen.line(f"not used, {count} times: {name}")
     if found["log_trouble"]:
         screen.line(found["log_trouble"])
     screen.line(f"ended: {found['ended']}; log: {found['log']}")
+
+
+def show_instruments(screen: Screen, places: dict[str, dict[str, Any]]) -> None:
+    """What each instrument told, why something was left out, and which of them nobody heard."""
+    if places:
+        rows = [[place, str(one["heard"]), str(one["strange"])] for place, one in places.items()]
+        screen.table(Table(_PLACES, rows))
+    for place, one in places.items():
+        for why, count in one["refused"].items():
+            screen.line(f"{place}: not used, {count} times: {why}")
+        if not one["heard"]:
+            screen.line(f"{place}: NOTHING was heard: is it on, is this its address, does 'ping' reach it?")
+
+
+def show_check(screen: Screen, found: dict[str, Any]) -> None:
+    """The rows of a ``uuv pilot --check --json`` document, and what they come to."""
+    check = found["check"]
+    rows = []
+    for row in check["rows"]:
+        numbers = (number(row[name], digits) for name, digits in (("rate_hz", 1), ("gap_s", 2), ("age_s", 2)))
+        rows.append([row["what"], row["state"], *numbers, row["sender"], row["told"]])
+    screen.table(Table(_CHECKED, rows, f"check of {found['steps']} steps: nothing was sent that moves it"))
+    show_instruments(screen, found["instruments"])
+    bad = [row["what"] for row in check["rows"] if row["state"] == "bad"]
+    wrong = f"it may NOT drive: {', '.join(bad) or 'no step was judged'}"
+    screen.line("it may drive" if check["ready"] else wrong, "bold")
+    screen.line(f"log: {found['log']}")
 
 
 _INSTANCES = tuple(Column(name) for name in ("instance", "seconds", "driven s", "outcome"))

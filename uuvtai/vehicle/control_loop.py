@@ -41,6 +41,7 @@ from uuvtai.vehicle.mavlink import (
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
 from uuvtai.vehicle.pilot_log import LinkLog
+from uuvtai.vehicle.preflight import CHECK_S, Preflight
 from uuvtai.vehicle.start_fix import MISFIT, StartFix, StartFound, WallWatch
 from uuvtai.vehicle.telemetry import AUTOPILOT, COMPANION, Heard, Intake, Senders, waiting_for
 
@@ -68,6 +69,8 @@ class FlightPlan:
     senders: Senders | None = None  # from whom what counts; None = the usual ones of ``system``
     instruments: Mapping[str, str] = field(default_factory=dict)
     """what is heard from an instrument itself ('dvl', 'sonar') -> its place"""
+    checks: bool = False
+    """a dry run that takes nothing, not even in pretence, and judges what it heard"""
 
     @classmethod
     def typed(
@@ -90,6 +93,7 @@ class FlightPlan:
         operator: int,
         senders: Sequence[str] = (),
         instruments: Mapping[str, str | None] | None = None,
+        checks: bool = False,
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
         if config.sensors.sonar.doppler:
@@ -107,6 +111,9 @@ class FlightPlan:
             raise LinkError(f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90")
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
+        heading_deg = config.world.tank.heading_deg if heading_deg is None else heading_deg
+        mounted = {"dvl": config.sensors.dvl.at, "sonar": config.sensors.sonar.at}
+        heard_at = mounted | {option: place for option, place in (instruments or {}).items() if place}
         limits = _limits(config, box, depth, max_speed, battery)
         mission = Mission(_three(start or ()), _three(goal or ()))
         _refuse_places(mission, limits)
@@ -117,12 +124,13 @@ class FlightPlan:
             log or Path("runs") / f"pilot_{time.strftime('%Y%m%d-%H%M%S')}.mcap",
             arms,
             None if heading_deg is None else math.radians(heading_deg),
-            math.inf if seconds is None else seconds,
+            (CHECK_S if checks else math.inf) if seconds is None else seconds,
             rate,
             system,
             operator,
             Senders.typed(senders, system),
-            {option: place for option, place in (instruments or {}).items() if place},
+            {option: place for option, place in heard_at.items() if place},
+            checks,
         )
 
 
@@ -236,7 +244,9 @@ class OnboardLoop:
         self._speaker: Address | None = None
         """where the autopilot's heartbeats come from"""
         self._asked_s = self._beat_s = -math.inf
-        self._clock_jumps = endpoint.clock_jumps
+        self._clock_jumps = self._jumps_before = endpoint.clock_jumps
+        self._heard_s = 0.0
+        """time of the newest step"""
         self._begun_s: float | None = None
         self._lag_s = self._unanswered_s = 0.0
         """pilot's clock behind ours: what was lost in stalls; how long the vehicle did not move as asked"""
@@ -244,6 +254,10 @@ class OnboardLoop:
         self.last = safety.SafeDecision(safety.SafeAction.HOLD, safety.STOP, ("nothing was decided yet",))
         self._is_leaving, self._told = False, ""
         self._fix, self._start, self._walls = fix, StartFound(), WallWatch(config) if fix else None
+        self._sought, self._check = fix, None
+        """who seeks the start, also when it is found; what a check gathers"""
+        if plan.checks:
+            self._check = Preflight(config, plan.limits, plan.mission.start[2], plan.system, plan.operator)
         self.failure: BaseException | None = None
         """an error of this program that ended the flight, or came while it ended"""
 
@@ -302,7 +316,8 @@ class OnboardLoop:
                 self._tried(self._sleep, dt if orders is not None else 10 * dt)
         self.tally.actions[self.last.action.name] += 1
         self.tally.reasons.update(reason.partition(":")[0] for reason in reasons)
-        self._tried(self.tell, "hand back: " + "; ".join(reasons))
+        if self._check is None:
+            self._tried(self.tell, "hand back: " + "; ".join(reasons))
 
     def _tried(self, do: Callable[..., _T], *given: Any) -> _T | None:
         """What ``do`` gives, None where it fails; the first failure is kept."""
@@ -330,6 +345,9 @@ class OnboardLoop:
         if farewell:
             decision = safety.SafeDecision(safety.SafeAction.HAND_BACK, safety.STOP, (farewell,))
             said = self._handover.leave(now_s, heard)
+        elif self._check is not None:
+            said = []
+            self._check.stepped(now_s, self._plan.seconds, command.held, memory.since_s)
         else:
             said = self._handover.orders(decision, now_s, heard, measured)
         for order in said:
@@ -341,7 +359,8 @@ class OnboardLoop:
 
     def _hear(self, now_s: float) -> None:
         datagrams = self._endpoint.receive()
-        come_s = max(now_s, self._time_s())  # what was received was there by now, not by ``now_s``
+        # what was received was there by now, not by ``now_s``
+        self._heard_s = come_s = max(now_s, self._time_s())
         if self._endpoint.clock_jumps != self._clock_jumps:
             self._clock_jumps = self._endpoint.clock_jumps
             self._intake.forget_clocks()
@@ -355,7 +374,7 @@ class OnboardLoop:
             for instrument, reading in self._rig.poll(come_s, self._rate_b):
                 self._log.read(come_s, reading)
                 try:
-                    self._feed(reading)
+                    self._feed(reading, self._plan.instruments.get(NAMES[type(reading)], ""), come_s)
                 except ValueError as error:  # arrays of another vehicle's shape
                     instrument.refuse(str(error))
                 else:
@@ -365,10 +384,14 @@ class OnboardLoop:
 
     def _take(self, sender: Address, message: MavMessage, come_s: float) -> None:
         self.tally.heard[message.name] += 1
+        refused = self._intake.heard.refused.total()
         if not self._is_another(sender, message, come_s):
             told = self._intake.take(message.name, message.system, message.component, message.fields, come_s)
             for reading in () if self._is_leaving else told:
-                self._feed(reading)
+                self._feed(reading, f"{message.name} {message.system}/{message.component}", come_s)
+        if self._check is not None:
+            was_used = self._intake.heard.refused.total() == refused
+            self._check.saw(message, come_s, self._intake.heard, was_used)
         self._log.saw(come_s, message)
 
     def _is_another(self, sender: Address, message: MavMessage, come_s: float) -> bool:
@@ -394,6 +417,8 @@ class OnboardLoop:
             return
         mission = self._plan.mission
         place = self._intake.correct(self._start.place, self._start.turn_rad)
+        if self._check is not None:
+            self._check.turned()
         self._pilot.begin_again(dataclasses.replace(mission, start=place, spread=self._start.spread))
         self._lag_s, self._scans, self._measured_s["sonar"] = now_s, 0, -math.inf
         off_m, off = math.hypot(*self._start.shift), math.degrees(self._start.turn_rad)
@@ -406,8 +431,10 @@ class OnboardLoop:
         share = self._walls.look(self._pilot.stack.views)
         return f"{100 * share:.0f} % of the returns miss a wall" if share > MISFIT else ""
 
-    def _feed(self, reading: SensorMessage) -> None:
+    def _feed(self, reading: SensorMessage, source: str, come_s: float) -> None:
         self._pilot.feed(dataclasses.replace(reading, time_s=reading.time_s - self._lag_s))
+        if self._check is not None:
+            self._check.read(reading, source, come_s)
         if self._fix is not None:
             self._fix.feed(reading)
         if isinstance(reading, ImuReading):
@@ -487,6 +514,8 @@ class OnboardLoop:
             return
         self._beat_s = now_s
         self._say(now_s, heartbeat())
+        for order in () if self._check is None else self._check.asks():
+            self._say(now_s, order)
         if now_s - self._asked_s >= 5.0 and self._intake.heard.vehicle_s > -math.inf:
             self._asked_s = now_s
             if (
@@ -506,7 +535,8 @@ class OnboardLoop:
             self.tally.reasons[reason.partition(":")[0]] += 1
         self._log.decided(now_s, command, decision, heard, speed)
         engaged, messages = self._handover.engaged, self.tally.heard.total()
-        if text := self._notes.look(now_s, decision, engaged, messages, heard):
+        text = self._notes.look(now_s, decision, engaged, messages, heard)
+        if text and not (self._check is not None and decision.action == safety.SafeAction.DRIVE):
             self.tell(text)
 
     def tell(self, text: str) -> None:
@@ -523,6 +553,17 @@ class OnboardLoop:
         if self._handover.engaged and math.dist(command.pos_w.tolist(), goal) <= radius:
             return _REACHED
         return "time is up" if now_s >= self._plan.seconds else ""
+
+    def _instruments(self) -> dict[str, dict[str, Any]]:
+        return self._rig.document() if self._rig else {}
+
+    def _checked(self) -> dict[str, Any] | None:
+        """What a check found (``Preflight.document``); None: it was a flight."""
+        if self._check is None:
+            return None
+        start, jumps = (self._sought, self._start), self._clock_jumps - self._jumps_before
+        heard, spent_s = self._intake.heard, self._heard_s
+        return self._check.document(spent_s, heard, self._needed, self._instruments(), start, jumps)
 
     def document(self) -> dict[str, Any]:
         tally, heard = self.tally, self._intake.heard
@@ -548,7 +589,8 @@ class OnboardLoop:
             "broken": self._codec.broken,
             "refused": dict(heard.refused),
             "said": {kind: {"said": said, "sent": tally.sent[kind]} for kind, said in tally.said.items()},
-            "instruments": self._rig.document() if self._rig else {},
+            "instruments": self._instruments(),
+            "check": self._checked(),
             "sensors": {name: dataclasses.asdict(row) for name, row in self._pilot.tallies.items()},
         }
 
@@ -570,10 +612,11 @@ def fly(
             endpoint.forget()  # what came while kernels were compiled
             fix = StartFix(config, plan.mission.start)
             loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix, rig)
-            dry = "dry run: no order that moves the vehicle is sent"
+            dry = f"{'check' if plan.checks else 'dry run'}: no order that moves the vehicle is sent"
             what = "ARMS AND DRIVES the vehicle" if plan.arms else dry
             where = "speaks to" if plan.place.calls else "listens at"
-            loop.tell(f"{what}; {where} {plan.place.host}:{plan.place.port}; Ctrl-C gives the vehicle back")
+            ends = "ends it" if plan.checks else "gives the vehicle back"
+            loop.tell(f"{what}; {where} {plan.place.host}:{plan.place.port}; Ctrl-C {ends}")
             try:
                 loop.run(stop)
             finally:

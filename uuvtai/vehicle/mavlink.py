@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import math
 import re
@@ -71,10 +72,14 @@ class Endpoint(AbstractContextManager["Endpoint"]):
         except OSError as error:
             self._socket.close()
             doing = "speak to" if place.calls else "listen at"
+            why = (
+                f"another program, QGroundControl perhaps, holds the port: give --mavlink udp:{place.host}:"
+                f"{place.port + 1 if place.port < 65535 else 14551}, and have the router send there too"
+                if error.errno == errno.EADDRINUSE
+                else f"the host may be none of this computer's: try --mavlink udp:0.0.0.0:{place.port}"
+            )
             raise LinkError(
-                f"{place.host}:{place.port}: cannot {doing} this address ({error.strerror or error}); "
-                "another program may hold the port, or the host may be none of this computer's: try "
-                f"udp:127.0.0.1:{place.port}"
+                f"{place.host}:{place.port}: cannot {doing} this address ({error.strerror or error}); {why}"
             ) from None
         self.calls: Address | None = address if place.calls else None
         self._socket.setblocking(False)
@@ -223,7 +228,8 @@ MODE_NAMES = {
     0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 7: "CIRCLE", 9: "SURFACE",
     16: "POSHOLD", 19: "MANUAL", 20: "MOTOR_DETECT", 21: "SURFTRAK",
 }  # fmt: skip
-HARMLESS = ("HEARTBEAT", "MAV_CMD_SET_MESSAGE_INTERVAL")  # orders that move nothing: sent in a dry run too
+HARMLESS = ("HEARTBEAT", "MAV_CMD_SET_MESSAGE_INTERVAL", "PARAM_REQUEST_READ")
+"""orders that move nothing: sent in a dry run too"""
 STICK = 600  # of 1000: the farthest that a stick is ever pushed
 FULL_STICK = (1.0, 1.0, 0.6, 2.0)
 """[m/s, m/s, m/s, rad/s] what a full stick is taken to give; the feedback corrects it"""
@@ -286,6 +292,13 @@ def ask_for(message_id: int, rate_hz: float, system: int) -> Order:
     return _command(
         "MAV_CMD_SET_MESSAGE_INTERVAL", _SET_MESSAGE_INTERVAL, system, float(message_id), 1e6 / rate_hz
     )
+
+
+def ask_parameter(name: str, system: int) -> Order:
+    """Have the autopilot tell one of its parameters; nothing is written."""
+    whom = {"target_system": system, "target_component": 1}
+    fields = {**whom, "param_id": name.encode(), "param_index": -1}
+    return Order("PARAM_REQUEST_READ", "PARAM_REQUEST_READ", fields)
 
 
 def heartbeat() -> Order:

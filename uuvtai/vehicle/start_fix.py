@@ -285,6 +285,25 @@ class StartFix:
         elif isinstance(message, SonarPing):
             self._see(message)
 
+    def walls(self) -> list[tuple[str, float, int]]:
+        """Of each wall that returned: its name, by how much [m] it is farther away than the config says
+        (NaN: what returned is no wall), and how many beams returned. From the start as found, else as
+        typed."""
+        if not self._rays:
+            return []
+        at, result = self._track.at, self.result
+        rays = Rays.joined([rays for _, _, rays in self._rays])
+        pose = np.array([*self._typed + at, 0.0])
+        if result is not None and not result.refusal:
+            pose = np.array([*result.place, result.turn_rad])
+        fit, found = fit_at(self._config, replace(rays, from_m=rays.from_m - at), pose, MOST_M), []
+        for wall in np.unique(fit.wall[rays.hit]):
+            off = fit.off_m[rays.hit & (fit.wall == wall)]
+            middle = float(np.median(off))
+            is_wall = len(off) >= _WALL_RAYS and (np.abs(off - middle) < _SAME_M).mean() > 0.5
+            found.append((_side(self._config.world.tank, wall), middle if is_wall else math.nan, len(off)))
+        return found
+
     def _see(self, ping: SonarPing) -> None:
         if (then := self._track.then(ping.time_s)) is None:
             return

@@ -506,9 +506,10 @@ class Intake:
         return has_jumped
 
     def _pressure(self, fields: Fields, time_s: float) -> list[SensorMessage]:
-        """ArduSub's second barometer is the one in the water; with one alone it sends the first."""
+        """ArduSub's second barometer is the one in the water; with one alone it sends the first. The third
+        is a thermometer's, without a pressure (ArduSub, ``send_scaled_pressure3``)."""
         name = str(fields["name"])
-        if name == "SCALED_PRESSURE" and "SCALED_PRESSURE2" in self._newest:
+        if not fields["press_abs"] > 0 or (name != "SCALED_PRESSURE2" and "SCALED_PRESSURE2" in self._newest):
             return []
         vehicle = self._config.vehicle
         depth = _PASCAL * float(fields["press_abs"]) / (vehicle.water_density_kg_m3 * vehicle.gravity_m_s2)

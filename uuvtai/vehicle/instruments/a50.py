@@ -59,6 +59,7 @@ class A50(Instrument):
         if not said["velocity_valid"]:
             return self.refuse("velocity not valid: the bottom is lost")
         ahead, right, down, fom = numbers
+        self.fom_m_s = fom
         if not 0.0 <= fom <= self._fom_most:
             return self.refuse(f"figure of merit beyond {self._fom_most:g} m/s")
         cos, sin = math.cos(self._turn), math.sin(self._turn)

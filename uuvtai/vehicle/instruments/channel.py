@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import ipaddress
 import math
-import re
 import socket
 import struct
 from abc import ABC, abstractmethod
@@ -14,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from uuvtai.config.base import WRITTEN_PLACE
 from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import SensorMessage
 
@@ -21,7 +21,6 @@ AGAIN_S = 1.0  # between two tries to open a place
 SILENT_S = 3.0  # a server that has said nothing for so long is called again; another sender is heard then
 MOST_BYTES = 256 << 10  # taken in one step; what is more waits, or is lost where the system's queue is full
 MOST_KINDS = 32  # reasons why something was not used that are told apart
-_WRITTEN = re.compile(r"([a-z0-9]+):(/dev/[\w./\-]+|[A-Za-z0-9.\-]{0,253})(?::(\d{1,5}))?")
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class InstrumentPlace:
 def place_of(text: str, option: str, ports: dict[str, int]) -> InstrumentPlace:
     """``KIND:HOST``, ``KIND:HOST:PORT`` or ``KIND:/dev/PORT``; ``ports``: usual port by kind. Raises
     LinkError."""
-    found = _WRITTEN.fullmatch(text)
+    found = WRITTEN_PLACE.fullmatch(text)
     kind, host, port = found.groups() if found else ("", "", None)
     number = int(port) if port else ports.get(kind, 0)
     if kind not in ports or not 0 < number < 65536:
@@ -233,6 +232,8 @@ class Instrument(ABC):
         """messages that were understood"""
         self.refused: Counter[str] = Counter()
         """why something was not used -> how often; at most ``MOST_KINDS`` reasons"""
+        self.fom_m_s: float | None = None
+        """of a DVL that tells it: figure of merit of its last valid velocity"""
 
     @abstractmethod
     def poll(self, now_s: float) -> list[SensorMessage]:

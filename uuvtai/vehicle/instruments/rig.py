@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from math import radians
+from typing import Any
 
 import numpy as np
 
+from uuvtai.common.files import FileError, parsed_json
 from uuvtai.config import Config
-from uuvtai.vehicle.instruments import a50, json_udp, ping, rip2
+from uuvtai.vehicle.instruments import a50, ping, rip2
 from uuvtai.vehicle.instruments.channel import (
     Instrument,
     InstrumentPlace,
@@ -19,11 +21,12 @@ from uuvtai.vehicle.instruments.channel import (
     UdpChannel,
     place_of,
 )
-from uuvtai.vehicle.messages import NAMES, DvlReading, SensorMessage, is_believed
+from uuvtai.vehicle.messages import KINDS, NAMES, DvlReading, SensorMessage, is_believed
 
+JSON_PORT, _LONGEST, _OLDEST_S = 14700, 65507, 5.0
 PORTS = {
-    "dvl": {"a50": a50.PORT, "json": json_udp.PORT},
-    "sonar": {"ping360": ping.PORT, "3d15": rip2.PORT, "json": json_udp.PORT},
+    "dvl": {"a50": a50.PORT, "json": JSON_PORT},
+    "sonar": {"ping360": ping.PORT, "3d15": rip2.PORT, "json": JSON_PORT},
 }
 """what is given by which option: kind -> usual port"""
 _TELLS = {"dvl": ("dvl",), "sonar": ("sonar", "depth")}
@@ -63,14 +66,18 @@ class Rig(AbstractContextManager["Rig"]):
                     instrument.refuse("dvl: a velocity has three numbers")
                 else:
                     moved = np.cross(rate_b, self._lever)
-                    yield instrument, replace(message, vel_b=message.vel_b - moved)
+                    yield instrument, dataclasses.replace(message, vel_b=message.vel_b - moved)
 
     def document(self) -> dict[str, dict[str, object]]:
-        """By place: messages understood, why others were not used, and datagrams of others."""
+        """By place: messages understood, why others were not used, datagrams of others, and (null: not told)
+        the figure of merit [m/s] of the last valid velocity."""
         return {
-            str(place): {"heard": one.heard, "refused": dict(one.refused), "strange": one.channel.strange}
+            str(place): {
+                "heard": one.heard, "refused": dict(one.refused), "strange": one.channel.strange,
+                "fom_m_s": one.fom_m_s,
+            }
             for place, (one, _) in self._sources.items()
-        }
+        }  # fmt: skip
 
     def close(self) -> None:
         """Give every place back."""
@@ -92,4 +99,46 @@ def _opened(place: InstrumentPlace, config: Config) -> Instrument:
         return ping.Ping360(channel, sonar, sonar.zero_gradian, sonar.min_range_m, sonar.sound_m_s)
     if place.kind == "3d15":
         return rip2.Sonar3D(UdpChannel(place, False, rip2.LONGEST), config)
-    return json_udp.JsonUdp(UdpChannel(place, False, json_udp.LONGEST))
+    return JsonUdp(UdpChannel(place, False, _LONGEST))
+
+
+class JsonUdp(Instrument):
+    """Anything else, by somebody else's driver: one JSON object a datagram.
+
+    ``{"kind": "dvl", "age_s": 0.05, "vel_b": [0.3, 0.0, 0.0]}``: ``kind`` and the fields are those of
+    ``vehicle/messages.py``, SI units, body axes x ahead, y left, z up; ``age_s`` [s] is how long ago it was
+    measured (0 where it is left out).
+    """
+
+    def poll(self, now_s: float) -> list[SensorMessage]:
+        """As in ``Instrument``."""
+        found = []
+        for data in self.channel.read(now_s):
+            message = self._message(data, now_s)
+            if message is not None:
+                self.heard += 1
+                found.append(message)
+        return found
+
+    def _message(self, data: bytes, now_s: float) -> SensorMessage | None:
+        try:
+            said: Any = parsed_json(data, "a datagram")
+            kind = KINDS.get(said.pop("kind"))
+            age_s = float(said.pop("age_s", 0.0))
+            if kind is None or not 0.0 <= age_s <= _OLDEST_S:
+                return self.refuse("no 'kind' of ours, or an 'age_s' that cannot be")
+            wanted = {field.name for field in dataclasses.fields(kind)} - {"time_s"}
+            required = wanted - {"first_beam"}
+            if not required <= said.keys() <= wanted:
+                return self.refuse(f"{kind.__name__}: wants {', '.join(sorted(required))}")
+            arrays = {name: np.array(value, np.float64) for name, value in said.items()}
+            given = {name: array if array.ndim else _plain(name, array) for name, array in arrays.items()}
+        except (FileError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
+            return self.refuse("no JSON object of numbers")
+        return kind(now_s - age_s, **given)
+
+
+def _plain(name: str, value: np.ndarray) -> float | int:
+    """A number, of ``first_beam`` a whole one. ValueError, OverflowError."""
+    number = float(value)
+    return int(number) if name == "first_beam" else number
