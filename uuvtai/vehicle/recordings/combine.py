@@ -21,7 +21,7 @@ from uuvtai.common.files import open_file, refuse_output
 from uuvtai.config import Config
 from uuvtai.config.loader import to_yaml
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.encode import IDENTITY, LogError, dumped, time_text
+from uuvtai.logs.encode import IDENTITY, LogError, dumped
 from uuvtai.logs.reader import IMPORTED
 from uuvtai.logs.scenario import scenario_document
 from uuvtai.logs.schemas import NUMBER, array_of, described, record
@@ -350,7 +350,7 @@ class _Messages:
             return [("/sensors/dvl", dumped({"velocity": _list(self._vel_b)}))]
         if isinstance(reading, PressureReading):
             return [("/sensors/pressure", dumped({"depth_m": float(reading.depth_m)}))]
-        stamp = json.loads(time_text(time_ns))
+        stamp = dict(zip(("sec", "nsec"), divmod(time_ns, 1_000_000_000), strict=True))
         if isinstance(reading, PositionFix):
             x, y, z = np.asarray(reading.pos_w) - self._start
             cos, sin = math.cos(self._yaw), math.sin(self._yaw)
