@@ -350,7 +350,7 @@ class _Messages:
             return [("/sensors/dvl", dumped({"velocity": _list(self._vel_b)}))]
         if isinstance(reading, PressureReading):
             return [("/sensors/pressure", dumped({"depth_m": float(reading.depth_m)}))]
-        stamp = dict(zip(("sec", "nsec"), divmod(time_ns, 1_000_000_000), strict=True))
+        stamp: dict[str, int] = dict(zip(("sec", "nsec"), divmod(time_ns, 1_000_000_000), strict=True))
         if isinstance(reading, PositionFix):
             x, y, z = np.asarray(reading.pos_w) - self._start
             cos, sin = math.cos(self._yaw), math.sin(self._yaw)
