@@ -32,7 +32,7 @@ app = typer.Typer(
     epilog="Example: uuv eval --world gauntlet --episodes 16 --record 1",
 )
 log_app = typer.Typer(
-    help="Read, convert, repair and draw recorded episodes (MCAP).",
+    help="Read, import, convert, repair and draw recorded episodes (MCAP).",
     no_args_is_help=True,
     epilog="Example: uuv log info runs/first/logs/bt_seed0_episode0.mcap",
 )
@@ -347,19 +347,35 @@ def log_export(
 
 
 @log_app.command("convert", epilog="Example: uuv log convert runs/first/logs/bt_seed0_episode0.mcap")
-def log_convert(
-    file: opt.LogFile,
-    out: opt.ConvertOut = None,
-    source: opt.ConvertFrom = "mcap",
-    force: opt.LogForce = False,
-) -> None:
-    """Write a log as a ROS 2 bag, or a bag as a log."""
-    from uuvtai.logs.rosbag import converted
+def log_convert(file: opt.LogFile, out: opt.ConvertOut = None) -> None:
+    """Write a log as a ROS 2 bag."""
+    from uuvtai.logs.rosbag import to_rosbag2
 
-    target, messages, left_out = converted(file, out, source, force)
-    for note in left_out:
-        say(f"{file}: {note}")
-    typer.echo(f"{target}: {messages} messages")
+    target = out or file.with_name(f"{file.stem}_rosbag2")
+    typer.echo(f"{target}: {to_rosbag2(file, target)} messages")
+
+
+@log_app.command("import", epilog="Example: uuv log import dive.tlog dvl.jsonl sonar.bin --sensors ping360")
+@groups.grouped
+def log_import(
+    file: opt.Recordings,
+    output: groups.PlainOutputGroup,
+    sensors: opt.ImportSensors = None,
+    world: opt.ImportWorld = "open",
+    start: opt.ImportStart = None,
+    goal: opt.ImportGoal = None,
+    offset: opt.ImportOffsets = None,
+    out: opt.ImportOut = None,
+) -> None:
+    """Make one log of recordings of a vehicle and its instruments."""
+    from uuvtai.console.views import show_import
+    from uuvtai.vehicle.recordings.combine import ImportPlan, import_recordings
+
+    place = parsing.numbers("--start", start, 4 if (start or "").count(",") == 3 else 3)
+    target = out or file[0].with_name(f"{file[0].stem}.log.mcap")
+    plan = ImportPlan(file, target, world, sensors, place, parsing.numbers("--goal", goal, 3), offset or ())
+    found = import_recordings(plan)
+    output.show(found, lambda screen: show_import(screen, found))
 
 
 @log_app.command(
@@ -537,13 +553,18 @@ def replay_log(
     log: opt.ReplayLog,
     output: groups.PlainOutputGroup,
     agent: opt.ReplayTree = None,
+    is_open: opt.ReplayOpen = False,
 ) -> None:
     """Run the stack on a log's sensor data; compare commands.
 
     Exit code 3: the commands differ although no fault was added."""
-    from uuvtai.console.views import show_replay
-    from uuvtai.vehicle.replay import replay
+    from uuvtai.console.views import show_opened, show_replay
+    from uuvtai.vehicle.replay import open_replay, replay
 
+    if is_open:
+        opened, folder = open_replay(log, faults.made(), agent)
+        _report_if(True, folder)
+        return output.show(opened, lambda screen: show_opened(screen, opened), folder)
     found = replay(log, faults.made(), agent)
     output.show(found, lambda screen: show_replay(screen, found))
     if not (found["equal"] or found["faults"]["any"]):

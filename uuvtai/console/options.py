@@ -234,10 +234,23 @@ LogFormat = Annotated[
     str, parsing.choice("--format", ("json", "csv", "npz"), "JSON (a line a message), CSV or NumPy arrays.")
 ]
 RepairOut = Annotated[Path | None, _out("Repaired file \\[default: NAME.repaired.mcap].")]
-ConvertOut = Annotated[Path | None, _out("New file or folder \\[default: NAME_rosbag2, or NAME.log.mcap].")]
-ConvertFrom = Annotated[
-    str, parsing.choice("--from", ("mcap", "rosbag2"), "A log becomes a ROS 2 bag, or a bag becomes a log.")
+ConvertOut = Annotated[Path | None, _out("New folder \\[default: NAME_rosbag2].")]
+Recordings = Annotated[
+    list[Path],
+    Argument(
+        metavar="FILE", help="ArduSub's .tlog, .BIN; lines of a DVL A50; Ping Viewer's file; a ROS bag."
+    ),
 ]
+ImportWorld = Annotated[str, _preset("--world", "world", f"World whose walls are known: {_WORLDS}, or YAML.")]
+_MOUNTED = "How sonar and DVL are mounted: a preset or a YAML file \\[default: a Ping360, else multibeam]."
+ImportSensors = Annotated[str | None, _preset("--sensors", "sensors", _MOUNTED)]
+_AT_FIRST = "Where the vehicle is at first \\[m, deg] \\[default: the tank's middle, along x]."
+ImportStart = Annotated[str | None, Option("--start", metavar="X,Y,Z[,YAW]", help=_AT_FIRST)]
+_GO = "Where the stack is to go \\[default: 5 m ahead]."
+ImportGoal = Annotated[str | None, Option("--goal", metavar="X,Y,Z", help=_GO)]
+_ADD = "Add to a file's times where its clock differs (repeatable)."
+ImportOffsets = Annotated[list[str] | None, Option("--offset", metavar="FILE=SECONDS", help=_ADD)]
+ImportOut = Annotated[Path | None, _out("New log \\[default: the first file's name, .log.mcap].")]
 RenderLogs = Annotated[
     list[Path], Argument(metavar="FILE", help="Logs of one episode; a picture shows all trajectories.")
 ]
@@ -436,7 +449,9 @@ IdentifyTruth = Annotated[
 IdentifyOut = Annotated[
     Path | None, _out("Vehicle file, with a .png of the prediction \\[default: NAME.vehicle.yaml].")
 ]
-ReplayLog = Annotated[Path, Argument(help="A log of 'uuv eval --record N --depth-images'.")]
+ReplayLog = Annotated[Path, Argument(help="A log of 'uuv eval --record N --depth-images', 'uuv log import'.")]
+_OPENED = "Compare nothing: what the stack perceives and would command, as log, picture and report."
+ReplayOpen = Annotated[bool, Option("--open", help=_OPENED)]
 ReplayTree = Annotated[str | None, _tree("Tree in place of the log's own")]
 Drop = Annotated[float, Option("--drop", help="Share of the sensor messages to lose, 0 to 1.")]
 Jitter = Annotated[float, Option("--jitter", help="Delay messages by up to this time \\[s].")]

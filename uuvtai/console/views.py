@@ -361,6 +361,54 @@ def _counts(name: str, row: dict[str, int]) -> list[str]:
     return [name, *(str(row[key]) for key in ("fed", "used", "lost", "late", "bad", "unplaced"))]
 
 
+_TICK = "{median:.2f} ms a step (99 %: {99th percentile:.2f} ms)"
+
+
+def show_opened(screen: Screen, found: dict[str, Any]) -> None:
+    """A ``uuv replay --open --json`` document."""
+    steps = found["steps"]
+    rows = [[name, str(count), percent(count / steps)] for name, count in found["nodes"].items()]
+    held = [
+        [f"stopped: {name}", str(count), percent(count / steps)] for name, count in found["held_for"].items()
+    ]
+    columns = (Column("node of the tree", left=True), Column("steps"), Column("%"))
+    screen.table(Table(columns, [*rows, *held], f"{found['log']}: {found['agent']}, {steps} steps"))
+    counts = [_counts(name, row) for name, row in found["messages"].items() if row["fed"] or row["lost"]]
+    screen.table(Table(_MESSAGES, counts, "messages"))
+    screen.line(f"routes planned: {found['replans']}; {_TICK.format_map(found['tick_ms'])}")
+    screen.line(f"log: {found['recorded']}")
+    screen.line(f"picture: {found['picture']}")
+
+
+_FILES = (
+    Column("file", left=True, prose=True),
+    Column("kind", left=True),
+    *(Column(name) for name in ("from s", "to s", "messages", "readings")),
+)
+_DROPPED = (Column("dropped", left=True, prose=True), Column("count"), Column("why", left=True, prose=True))
+_MOST_DROPPED = 40
+
+
+def show_import(screen: Screen, found: dict[str, Any]) -> None:
+    """A ``uuv log import --json`` document."""
+    files = [
+        [Path(row["path"]).name, row["kind"], f"{row['from_s']:.1f}", f"{row['to_s']:.1f}"]
+        + [str(row[key]) for key in ("messages", "readings")]
+        for row in found["files"]
+    ]
+    screen.table(Table(_FILES, files, f"{found['log']}: {found['duration_s']:.1f} s"))
+    rows = sorted((row for file in found["files"] for row in file["dropped"]), key=lambda row: -row["count"])
+    if rows:
+        shown = [[row["what"], str(row["count"]), row["why"]] for row in rows[:_MOST_DROPPED]]
+        screen.table(Table(_DROPPED, shown))
+    if len(rows) > _MOST_DROPPED:
+        screen.line(f"and {len(rows) - _MOST_DROPPED} more kinds that were dropped: --json")
+    for note in found["notes"]:
+        screen.line(f"note: {note}")
+    told = ", ".join(f"{name} {count}" for name, count in found["readings"].items())
+    screen.line(f"readings: {told}; next: uuv replay {shlex.quote(found['log'])} --open")
+
+
 def _show_change(screen: Screen, change: dict[str, Any], steps: int) -> None:
     screen.line(
         f"commands off by {change['mean']:.3f} in the mean, {change['largest']:.2f} at most (of 1); by more "
@@ -374,8 +422,7 @@ def _show_change(screen: Screen, change: dict[str, Any], steps: int) -> None:
 
 
 def _verdict(found: dict[str, Any]) -> str:
-    tick = found["tick_ms"]
-    time = f"{tick['median']:.2f} ms a step (99 %: {tick['99th percentile']:.2f} ms)"
+    time = _TICK.format_map(found["tick_ms"])
     if found["equal"]:
         return f"all commands equal the logged ones; {time}"
     why = "under these faults" if found["faults"]["any"] else "though nothing was disturbed"

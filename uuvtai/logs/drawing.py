@@ -408,10 +408,12 @@ class Recording:
 
     @property
     def min_clearance_m(self) -> float | None:
-        return min((value[0] for value in self["/safety"].values), default=None)
+        values = [] if self.outcome_text == REPLAYED else self["/safety"].values  # nobody knows the truth
+        return min((value[0] for value in values), default=None)
 
 
 _OUTCOME_NAMES = {"ttc": "TTC stop"}
+REPLAYED = "replayed"  # outcome of a recording: there is none
 _MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_OBSTACLES = 3600.0, 1000.0, 1e4, 1000
 """what is drawn must fit a picture and a video that somebody waits for"""
 _MAX_NUMBERS = 100_000  # of a scenario: corners of paths are drawn in every frame

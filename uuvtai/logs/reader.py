@@ -26,6 +26,7 @@ from uuvtai.common.files import open_file
 from uuvtai.logs.encode import LogError
 
 MAX_RECORD = 64 << 20  # [bytes] of a record, and of an unpacked chunk: six times the map of 200 x 100 m
+IMPORTED = "uuv.import"  # metadata of a log that ``uuv log import`` wrote
 ZSTD = b"\x28\xb5\x2f\xfd"  # what a frame of zstd begins with
 DAMAGE = (McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError)
 """what the package, zstandard and lz4 raise for bytes that are none of theirs"""

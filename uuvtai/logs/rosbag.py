@@ -1,85 +1,36 @@
-"""Logs as ROS 2 bags (``rosbag2`` with MCAP storage) and bags as logs, without ROS."""
+"""Logs as ROS 2 bags (``rosbag2`` with MCAP storage), without ROS."""
 
 from __future__ import annotations
 
 import contextlib
-import json
-from array import array
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import yaml
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from uuvtai.common.errors import ODD
 from uuvtai.common.files import refuse_output, whole_folder
 from uuvtai.config.loader import ConfigError, parsed_yaml
-from uuvtai.logs.container import MAX_MESSAGE, McapFile
+from uuvtai.logs.container import McapFile
 from uuvtai.logs.encode import LogError
-from uuvtai.logs.reader import LogHead, read_head, read_messages, records
-from uuvtai.logs.ros2 import NAMES, READ, SOURCES, WRITTEN, Reader, RosMessages, Setup, ros_messages
+from uuvtai.logs.reader import LogHead, read_head, read_messages
+from uuvtai.logs.ros2 import SOURCES, WRITTEN, RosMessages, Setup, ros_messages
 
 
-def converted(file: Path, out: Path | None, source: str, force: bool) -> tuple[Path, int, list[str]]:
-    """A log as a bag or a bag as a log: (what was written, how many messages, what was left out). Raises
-    LogError, FileError."""
-    if source == "rosbag2":
-        target = out or file.with_name(f"{file.stem}.log.mcap")
-        return target, *from_rosbag2(file, target, force)
-    target = out or file.with_name(f"{file.stem}_rosbag2")
-    return target, to_rosbag2(file, target, force), []
-
-
-def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
-    """Write the log ``path`` as a bag, the new folder ``out``; how many messages. Raises LogError, and then
-    nothing is left.
-
-    Raises LogError or FileError where ``out`` exists: ``force`` replaces no folder.
-    """
+def to_rosbag2(path: Path, out: Path) -> int:
+    """Write the log ``path`` as a bag, the new folder ``out``; how many messages. Raises LogError, also where
+    ``out`` exists, and then nothing is left."""
     path, out, ros = Path(path), Path(out), RosMessages()
-    if out.is_dir():
-        raise LogError(f"{out}: a bag is a new folder, which --force does not replace; give a new --out DIR")
-    refuse_output(out, [path], False)
+    if not out.is_dir():
+        refuse_output(out, [path], True)
+    if out.exists():
+        raise LogError(f"{out}: is already there, and a bag is a new folder; give a new --out DIR")
     head = read_head(path)
     setup = _setup(path, head)
     with _as_log_error(path, out), whole_folder(out) as staging:
         return _write_bag(path, head, setup, ros, staging, out.name)
-
-
-def from_rosbag2(path: Path, out: Path, force: bool = False) -> tuple[int, list[str]]:
-    """Write the bag ``path``, a folder or its .mcap file, as the log ``out``; how many messages, and notes:
-    which were left out, for they are odd, and which are dated by the log, for their stamps are of another
-    clock. Those that are not in ``READ`` are left out in silence. Raises LogError, and then nothing is left;
-    FileError as ``refuse_output``."""
-    ros, file = RosMessages(), _bag_file(Path(path))
-    out = Path(out)
-    refuse_output(out, [file], force)
-    head = read_head(file)
-    setup = _setup(file, head)
-    with _as_log_error(file, out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        log = McapFile(out)
-        try:
-            reading = _Reading(ros, setup, log)
-            count = reading.run(file, head)
-            if not count and reading.odd:
-                raise ValueError(next(iter(reading.why.values())))
-            if not count:
-                raise LogError(f"{file}: none of the messages that can be read; it needs {', '.join(READ)}")
-            log.finish()
-        except BaseException:
-            log.discard()
-            raise
-    return count, [
-        *(f"{topic}: left out {n} odd, the first: {reading.why[topic]}" for topic, n in reading.odd.items()),
-        *(
-            f"{topic}: {n} with stamps of another clock than the bag's, dated by when they were logged"
-            for topic, n in (+reading.foreign).items()
-        ),
-    ]
 
 
 @contextlib.contextmanager
@@ -103,29 +54,6 @@ def _setup(path: Path, head: LogHead) -> Setup:
         raise LogError(
             f"{path}: its config.yaml cannot be read ({error}); convert a log that uuv eval --record wrote"
         ) from None
-
-
-def _bag_file(path: Path) -> Path:
-    """The one .mcap of a bag."""
-    if not path.is_dir():
-        return path
-    found = sorted(entry for entry in path.iterdir() if {".mcap", ".db3"} & set(entry.suffixes))
-    if len(found) == 1 and found[0].suffix == ".mcap":
-        return found[0]
-    if not found:
-        raise LogError(f"{path}: holds 0 .mcap files; name the folder of a bag, or its file")
-    if any(".db3" in entry.suffixes for entry in found):
-        what = "is a bag in SQLite, and only MCAP is read"
-    elif any(entry.suffix != ".mcap" for entry in found):
-        what = f"holds {found[0].name}, which is compressed as a whole and not read"
-    else:
-        what = f"is a bag of {len(found)} parts, and one file is read at a time"
-    raise LogError(
-        f"{path}: {what}; first: rosbags-convert --src {quote(str(path))} --dst NEW --dst-storage mcap"
-    )
-
-
-# -------------------------------------------------------------------------------------------------- writing
 
 
 def _write_bag(path: Path, head: LogHead, setup: Setup, ros: RosMessages, folder: Path, name: str) -> int:
@@ -202,88 +130,3 @@ def _description(file: str, counts: Counter[str], duration_ns: int, start_ns: in
         "compression_mode": "",
         "files": [{"path": file, **span}],
     }
-
-
-# -------------------------------------------------------------------------------------------------- reading
-
-
-class _Reading:
-    """A bag's messages on their way into a log; times count from the earliest of those that are read."""
-
-    def __init__(self, ros: RosMessages, setup: Setup, file: McapFile) -> None:
-        self._ros, self._setup, self._log = ros, setup, file
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._made: dict[int, int] = {}
-        self._known: dict[str, int] = {}
-        self._span_ns = 0, 0
-        self._topics: set[str] = set()
-        self.odd: Counter[str] = Counter()
-        """messages of a topic that were left out"""
-        self.why: dict[str, str] = {}
-        """and what was wrong with the first"""
-        self.foreign: Counter[str] = Counter()
-        """messages of a topic that were dated by the log"""
-
-    def run(self, file: Path, head: LogHead) -> int:
-        """All of it; how many messages."""
-        count = 0
-        for name, entries in head.metadata.items():
-            if name != "rosbag2":
-                self._log.add_metadata(name, entries)
-        for name, data in head.attachments.items():
-            self._log.add_attachment(name, "application/octet-stream", data)
-        times_ns = array("Q", self._look(file))
-        self._span_ns = (min(times_ns), max(times_ns)) if times_ns else (0, 0)
-        self._topics = {channel.topic for channel in self._channels.values()}
-        for record in records(file):
-            if isinstance(record, Message):
-                count += self._put(record)
-        return count
-
-    def _look(self, file: Path) -> Iterator[int]:
-        """Log times of the messages that are read; notes schemas and channels."""
-        for record in records(file):
-            if isinstance(record, Schema):
-                self._schemas[record.id] = record
-            elif isinstance(record, Channel):
-                self._channels[record.id] = record
-            elif isinstance(record, Message):
-                if self._kind(record) in READ:
-                    yield record.log_time
-            else:
-                assert isinstance(record, Attachment | Metadata)
-
-    def _kind(self, record: Message) -> str:
-        """Name of a message's schema, '' = it is none of ROS 2's."""
-        channel = self._channels.get(record.channel_id)
-        schema = None if channel is None else self._schemas.get(channel.schema_id)
-        return schema.name if channel and schema and channel.message_encoding == "cdr" else ""
-
-    def _put(self, record: Message) -> bool:
-        if (kind := self._kind(record)) not in READ:
-            return False
-        channel = self._channels[record.channel_id]
-        topic, reading = NAMES.get(channel.topic, channel.topic), READ[kind]
-        if topic in self._topics:  # the bag has it beside: names stay apart
-            topic = channel.topic
-        if channel.id not in self._made:
-            title = reading.schema["title"]
-            if title not in self._known:
-                self._known[title] = self._log.add_schema(
-                    title, "jsonschema", json.dumps(reading.schema).encode()
-                )
-            self._made[channel.id] = self._log.add_channel(topic, self._known[title])
-        try:
-            reader = Reader(topic, self._setup, self._span_ns, record.log_time)
-            data = reading.read(reader, self._ros.unpacked(record.data, kind))
-            if len(data) > MAX_MESSAGE:
-                raise ValueError(f"{len(data):,} bytes, more than a log's message may have")
-        except ODD as error:
-            self.odd[channel.topic] += 1
-            reason = str(error) if isinstance(error, ValueError) else repr(error)
-            self.why.setdefault(channel.topic, reason.partition(": {")[0][:200])
-            return False
-        self.foreign[channel.topic] += reader.is_foreign
-        self._log.add_message(self._made[channel.id], record.log_time - self._span_ns[0], data)
-        return True

@@ -15,9 +15,14 @@ import numpy as np
 from uuvtai.common.errors import SettingError
 from uuvtai.config import Config
 from uuvtai.config.loader import LEARNING_SECTIONS, ConfigError, parsed_yaml, validated
+from uuvtai.logs.drawing import REPLAYED
 from uuvtai.logs.encode import LogError
-from uuvtai.logs.reader import LogHead, LogMessage, read_head, read_messages
+from uuvtai.logs.picture import picture
+from uuvtai.logs.reader import IMPORTED, LogHead, LogMessage, read_head, read_messages
+from uuvtai.logs.run_folder import RunFolder, default_run_dir
+from uuvtai.logs.topics.motion import quaternion_of
 from uuvtai.logs.topics.sensors import exact_image
+from uuvtai.logs.writer import EpisodeRecorder
 from uuvtai.sim.behavior_tree import FlatTree, parse_tree, read_tree
 from uuvtai.vehicle import onboard
 from uuvtai.vehicle.messages import KINDS, NAMES
@@ -25,6 +30,7 @@ from uuvtai.vehicle.messages import KINDS, NAMES
 # ---- A log as the pilot's sensors would have told it: messages with the step of their arrival.
 
 _MAX_STEPS = 180_000  # an hour
+_AGAIN = "record it again: uuv eval --record 1 --depth-images"
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,7 @@ class LogFeed:
     run: dict[str, str]  # metadata uuv.run
     arrivals: list[Delivery] = field(default_factory=list)  # in the order of the log
     steps: list[LoggedStep] = field(default_factory=list)  # from step 0 on, without a gap
+    is_imported: bool = False  # of recordings of others: without commands, and perhaps sensors
 
 
 def read_feed(path: Path, tree: str | None = None) -> LogFeed:
@@ -75,7 +82,8 @@ def read_feed(path: Path, tree: str | None = None) -> LogFeed:
 
 
 def _begun(path: Path, head: LogHead, tree: str | None) -> LogFeed:
-    config, run = _config(path, head), head.metadata.get("uuv.run", {})
+    config = _config(path, head)
+    run = head.metadata.get("uuv.run") or head.metadata.get(IMPORTED) or {}
     scenario = head.scenario
     mission = onboard.Mission(
         start=_place(scenario["start"]),
@@ -87,7 +95,8 @@ def _begun(path: Path, head: LogHead, tree: str | None) -> LogFeed:
         raise LogError(
             f"{path}: was driven with the truth, which no sensor tells; replay a log without +truth"
         )
-    return LogFeed(path, config, _tree(path, head, tree, config), mission, run)
+    is_imported = "uuv.run" not in head.metadata and IMPORTED in head.metadata
+    return LogFeed(path, config, _tree(path, head, tree, config), mission, run, is_imported=is_imported)
 
 
 def _config(path: Path, head: LogHead) -> Config:
@@ -152,10 +161,16 @@ class _FeedReader:
         wanted = {"/sensors/imu", "/sensors/dvl", "/sensors/pressure", "/sonar/doppler", "/action"}
         if uses_camera(self._config):
             wanted.add("/camera/exact")
+        if self._feed.is_imported:
+            wanted = {"/sensors/imu"}  # without it nothing can be placed
         if missing := sorted(wanted - self._seen):
             raise LogError(
                 f"{path}: the log has no {', '.join(missing)}, without which nothing decides the same; "
-                "record it again: uuv eval --record 1 --depth-images"
+                + (
+                    "import a recording that tells it too: uuv log import"
+                    if self._feed.is_imported
+                    else _AGAIN
+                )
             )
 
     def _arrives(self, m: LogMessage, message: onboard.SensorMessage) -> None:
@@ -312,6 +327,8 @@ def replay(
     LogError, TreeError, ConfigError.
     """
     feed, faults = read_feed(path, tree), faults or Faults()
+    if not feed.steps:
+        raise LogError(f"{path}: holds no commands to compare with; see what the stack does: --open")
     told = disturbed(feed.arrivals, faults)
     pilot = (build or built)(feed)
     commands, tick_s = _played(pilot, feed, told)
@@ -325,6 +342,12 @@ def replay(
         "equal": all(row["first_difference"] is None for row in agreement),
         "agreement": agreement,
         "change": _change(commands, feed),
+        **_fates(pilot, told, tick_s),
+    }
+
+
+def _fates(pilot: onboard.OnboardPilot, told: Disturbed, tick_s: list[float]) -> dict[str, Any]:
+    return {
         "messages": {
             name: {**asdict(tally), "lost": told.lost[name]} for name, tally in pilot.tallies.items()
         },
@@ -340,12 +363,19 @@ def built(feed: LogFeed) -> onboard.OnboardPilot:
 
 
 def _played(
-    pilot: onboard.OnboardPilot, feed: LogFeed, told: Disturbed
+    pilot: onboard.OnboardPilot,
+    feed: LogFeed,
+    told: Disturbed,
+    after: Callable[[int], None] = lambda step: None,
 ) -> tuple[list[onboard.PilotCommand], list[float]]:
-    """(commands of all steps, seconds that each took)."""
+    """(commands of all steps, seconds that each took); ``after`` is called at the end of each step."""
     commands, tick_s, sent = [], [], 0
     dt, arrivals = feed.config.episode.control_dt_s, told.arrivals
-    for step in range(len(feed.steps)):
+    last_s = max((arrival.message.time_s for arrival in feed.arrivals), default=0.0)
+    steps = len(feed.steps) or math.floor(last_s / dt) + 1
+    if steps > _MAX_STEPS:
+        raise LogError(f"{feed.path}: is longer than an hour ({last_s:.0f} s); cut its recordings")
+    for step in range(steps):
         until = (step + 0.5) * dt
         began = time.perf_counter()
         while sent < len(arrivals) and arrivals[sent].time_s <= until:
@@ -353,6 +383,7 @@ def _played(
             sent += 1
         commands.append(pilot.tick())
         tick_s.append(time.perf_counter() - began)
+        after(step)
     return commands, tick_s
 
 
@@ -411,3 +442,62 @@ def _change(commands: list[onboard.PilotCommand], feed: LogFeed) -> dict[str, An
         "held_steps": sum(bool(all_of) for all_of in held),
         "held_for": reasons,
     }
+
+
+# ---- Without comparing: what the stack perceives, plans and would command, as the run folder of an episode.
+
+
+@dataclass(frozen=True)
+class _End:
+    """A recording has no outcome."""
+
+    time_s: float
+    outcome: str = REPLAYED
+    episode_return: float = 0.0
+    min_clearance_m: float = 0.0
+    replans: dict[str, int] = field(default_factory=dict)
+    planned_by: dict[str, int] = field(default_factory=dict)
+
+
+def open_replay(
+    path: Path, faults: Faults | None = None, tree: str | None = None, build: Build | None = None
+) -> tuple[dict[str, Any], Path]:
+    """(what ``uuv replay --open --json`` prints, run folder with a log and a picture). Nobody knows the
+    truth: in its place stands the estimated pose. Raises as ``replay``, RunFolderError."""
+    feed, faults = read_feed(path, tree), faults or Faults()
+    told = disturbed(feed.arrivals, faults)
+    pilot = (build or built)(feed)
+    assert isinstance(pilot.stack, onboard.SimStack)
+    sim, views, mission = pilot.stack.sim, pilot.stack.views, feed.mission
+    run = RunFolder(default_run_dir("replay"), feed.config, [mission.seed])
+    with run.recorded():
+        recorder = EpisodeRecorder(run.path / "logs", feed.run["world"], feed.run["agent"], [mission])
+
+        def record(step: int) -> None:
+            views["vehicle.pos_w"][0] = views["ego.pos_w"][0]
+            views["vehicle.quat_wb"][0] = quaternion_of(views["ego.rpy"][0])
+            if step:
+                recorder.step(sim)
+            else:
+                recorder.begin(sim, 0, mission)
+
+        try:
+            commands, tick_s = _played(pilot, feed, told, record)
+            recorder.end(sim, 0, _End(len(commands) * feed.config.episode.control_dt_s))
+        finally:
+            recorder.abort()
+        log = recorder.paths[mission]
+        shown = run.path / "pictures" / f"{log.stem}.png"
+        shown.parent.mkdir()
+        picture(log, shown)
+    held = Counter(reason.partition(":")[0] for command in commands for reason in command.held)
+    return {
+        "schema": 1, "log": str(path), "steps": len(commands),
+        **{name: feed.run.get(name, "") for name in ("agent", "world", "seed", "episode")},
+        "faults": {**asdict(faults), "any": faults.any},
+        "run_folder": str(run.path), "recorded": str(log), "picture": str(shown),
+        "nodes": dict(Counter(command.leaf for command in commands if not command.held)),
+        "replans": sum(bool(command.trigger) for command in commands),
+        "held_steps": sum(bool(command.held) for command in commands), "held_for": dict(held),
+        **_fates(pilot, told, tick_s),
+    }, run.path  # fmt: skip

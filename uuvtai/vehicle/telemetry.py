@@ -47,8 +47,8 @@ def ping_of(
     distances_cm: np.ndarray,
     increment_deg: float,
     offset_deg: float,
-    min_cm: int,
-    max_cm: int,
+    min_cm: float,
+    max_cm: float,
 ) -> SonarPing | str:
     """A scan in which each beam has the range of the sector that it lies in, or why there is none.
 

@@ -56,7 +56,7 @@ def _level_rotation(quat_wb: list[float]) -> tuple[float, float, float, float]:
     return w * c + z * s, -x * c - y * s, x * s - y * c, w * s - z * c
 
 
-def _quaternion_of(rpy: Any) -> tuple[float, float, float, float]:
+def quaternion_of(rpy: Any) -> tuple[float, float, float, float]:
     """Quaternion (w, x, y, z) of roll, pitch, yaw (Z-Y-X)."""
     cr, cp, cy = (math.cos(0.5 * v) for v in rpy)
     sr, sp, sy = (math.sin(0.5 * v) for v in rpy)
@@ -125,7 +125,7 @@ POSE_ROWS = (
         "/pose_estimate",
         EVERY_STEP,
         POSE_IN_FRAME,
-        lambda moment: pose_in_frame(moment.stamp, moment["ego.pos_w"], _quaternion_of(moment["ego.rpy"])),
+        lambda moment: pose_in_frame(moment.stamp, moment["ego.pos_w"], quaternion_of(moment["ego.rpy"])),
         ("ego.pos_w", "ego.rpy"),
     ),
     Topic(

@@ -23,8 +23,10 @@ from typing import Any
 import numpy as np
 
 from uuvtai.common.clocks import SEVERAL, SourceClock, stamp_of
+from uuvtai.common.errors import ODD
 from uuvtai.common.files import open_file
 from uuvtai.config import VehicleConfig
+from uuvtai.logs.reader import read_messages
 from uuvtai.vehicle.identify.drive_log import Drive, DriveError, drives_of, refuse_long, thrust_of, up_axis
 from uuvtai.vehicle.mavlink import EXTRA
 from uuvtai.vehicle.telemetry import AUTOPILOT, NEUTRAL_US, Motors, Senders
@@ -110,6 +112,28 @@ def read_ardusub(
     for _, error in wrong:
         note(f"left out, {error}")
     return drives
+
+
+def read_imported(path: Path, vehicle_cfg: VehicleConfig) -> list[Drive]:
+    """The drives of a log of ``uuv log import``, as ``read_ardusub`` finds them."""
+    heard, flip = _Heard(), np.array([1.0, -1.0, -1.0])
+    into = {
+        "/motors/pulses": lambda data: [(heard.pulse, [*data["us"][:8], *[0.0] * 8])],
+        "/sensors/dvl": lambda data: [(heard.dvl, flip * data["velocity"])],
+        "/sensors/imu": lambda data: [
+            (heard.angle, flip * data["attitude"]),
+            (heard.rate, flip * data["rates"]),
+        ],
+    }
+    try:
+        for message in read_messages(path, into):
+            for series, values in into[message.topic](message.data):
+                series.add(message.time_s, *map(float, values))
+    except ODD:
+        raise DriveError(
+            f"{path}: a message is not as its schema says; import its recordings again"
+        ) from None
+    return _drives(path, heard, vehicle_cfg)
 
 
 def _drives(path: Path, heard: _Heard, vehicle_cfg: VehicleConfig) -> list[Drive]:
@@ -215,7 +239,7 @@ def _asked(times: np.ndarray, heard: _Heard, vehicle_cfg: VehicleConfig) -> tupl
     """(n, thrusters) and (n, thrusters) [rpm] asked for. Between two messages thrust goes on a straight line:
     so it does in the mean over all moments at which a stick may have been pushed. Or it jumps halfway."""
     motors, known = Motors(vehicle_cfg), np.array(heard.pulse.time_s)
-    speeds = np.array([motors.rpm(_by_motor(row, heard.parameters)) for row in heard.pulse.values])
+    speeds = np.array([motors.rpm(by_motor(row, heard.parameters)) for row in heard.pulse.values])
     thrust = thrust_of(speeds, vehicle_cfg)
     pushed = np.stack([np.interp(times, known, column) for column in thrust.T], axis=1)
     table = np.arange(-motors.most_rpm, motors.most_rpm + 1.0)
@@ -224,7 +248,7 @@ def _asked(times: np.ndarray, heard: _Heard, vehicle_cfg: VehicleConfig) -> tupl
     return np.where(np.abs(pushed) < _STILL_N, 0.0, found), speeds[nearest]
 
 
-def _by_motor(pulse: np.ndarray, parameters: dict[str, float]) -> list[float]:
+def by_motor(pulse: np.ndarray, parameters: dict[str, float]) -> list[float]:
     """[us] of motors 1 to 8, as if none were reversed."""
     found = pulse[:8].tolist()
     for channel in range(_CHANNELS):
@@ -256,7 +280,7 @@ def _boots(path: Path, system: int | None, note: Callable[[str], None]) -> list[
     found, kind = _Sorted(), ""
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-            for count, message in enumerate(_messages(path, is_bin, list(_OF_BIN if is_bin else _OF_TLOG))):
+            for count, message in enumerate(messages(path, is_bin, list(_OF_BIN if is_bin else _OF_TLOG))):
                 kind = message.get_type()
                 if is_bin:
                     found.take_bin(message, count)
@@ -373,8 +397,8 @@ def _of_boot(series: _Readings, boot: _Heard) -> _Readings:
     return found
 
 
-def _messages(path: Path, is_bin: bool, names: list[str]) -> Iterator[Any]:
-    """Messages of these types, in the order of the file."""
+def messages(path: Path, is_bin: bool, names: list[str] | None = None) -> Iterator[Any]:
+    """Messages of these types, or all, in the order of the file."""
     from pymavlink import DFReader, mavutil
 
     log: Any = DFReader.DFReader_binary(str(path)) if is_bin else mavutil.mavlogfile(str(path))

@@ -18,9 +18,10 @@ import numpy as np
 from uuvtai.common.files import refuse_output, whole_file
 from uuvtai.common.presets import preset_names
 from uuvtai.config import VehicleConfig
+from uuvtai.logs.reader import IMPORTED, read_head
 from uuvtai.report.figures import Line, curves, png
 from uuvtai.vehicle.identify import model
-from uuvtai.vehicle.identify.ardusub_log import SUFFIXES, read_ardusub
+from uuvtai.vehicle.identify.ardusub_log import SUFFIXES, read_ardusub, read_imported
 from uuvtai.vehicle.identify.drive_log import Drive, DriveError, read_drives
 
 _ROUNDS = 25
@@ -487,6 +488,10 @@ def _drives(
         if truth:
             raise DriveError(f"{file}: a log of ArduSub's holds no truth; leave --truth out")
         return read_ardusub(file, vehicle_cfg, system, note)
+    if file.suffix.lower() != ".csv" and IMPORTED in read_head(file).metadata:
+        if truth:
+            raise DriveError(f"{file}: recordings of others hold no truth; leave --truth out")
+        return read_imported(file, vehicle_cfg)
     return read_drives(file, truth)
 
 
