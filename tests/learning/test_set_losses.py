@@ -101,11 +101,18 @@ def test_maximum_and_sum_have_the_gradient_of_torch():
     assert bool((grad[(each == 0).detach()] == 0).all())
 
 
-def test_the_number_of_threads_changes_no_bit(ppo, batch, monkeypatch):
+def test_the_number_of_threads_changes_no_bit(ppo, batch):
+    """As in a training, where torch's own threads rest: their number changes bits on some processors."""
+
     def found(threads):
-        monkeypatch.setattr(networks.torch, "get_num_threads", lambda: threads)
-        grads, sums = gradients(ppo, batch)
-        return [*grads, sums, by_part(ppo.policy.mean_of, batch)]
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            with networks.torch_threads_rest():
+                grads, sums = gradients(ppo, batch)
+                return [*grads, sums, by_part(ppo.policy.mean_of, batch)]
+        finally:
+            torch.set_num_threads(before)
 
     one = found(1)
     assert all(tensor.abs().sum() > 0 for tensor in one)
