@@ -368,7 +368,7 @@ def log_import(
     out: opt.ImportOut = None,
 ) -> None:
     """Make one log of recordings of a vehicle and its instruments."""
-    from uuvtai.console.views import show_import
+    from uuvtai.console.vehicle_views import show_import
     from uuvtai.vehicle.recordings.combine import ImportPlan, import_recordings
 
     place = parsing.numbers("--start", start, 4 if (start or "").count(",") == 3 else 3)
@@ -486,7 +486,7 @@ def pilot_vehicle(
     """Drive a vehicle over MAVLink; a dry run without --arm.
 
     Read docs/safety.md first. Exit code 3: it ended by a safe action, or failed --check."""
-    from uuvtai.console.views import show_flight
+    from uuvtai.console.vehicle_views import show_flight
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.vehicle.control_loop import fly
 
@@ -509,7 +509,7 @@ def serve_sitl(
     """Run our physics as the ArduSub SITL backend.
 
     ArduSub connects by its JSON interface (docs/on_a_vehicle.md)."""
-    from uuvtai.console.views import show_sitl
+    from uuvtai.console.vehicle_views import show_sitl
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.vehicle.sitl import serve_water
 
@@ -540,7 +540,7 @@ def identify_vehicle(
     base = SceneOptions("open", "clean", vehicle, overrides=overrides).config().vehicle
     document = identify(file, base, vehicle, known, truth, target, force, system)
 
-    from uuvtai.console.views import show_identified
+    from uuvtai.console.vehicle_views import show_identified
 
     output.show(document, lambda screen: show_identified(screen, document, f"{known} of {vehicle}"))
     say(f"wrote {target}")
@@ -558,7 +558,7 @@ def replay_log(
     """Run the stack on a log's sensor data; compare commands.
 
     Exit code 3: the commands differ although no fault was added."""
-    from uuvtai.console.views import show_opened, show_replay
+    from uuvtai.console.vehicle_views import show_opened, show_replay
     from uuvtai.vehicle.replay import open_replay, replay
 
     if is_open:

@@ -15,7 +15,7 @@ from tests.mavlink_vehicle import LIMITS, FakeSub, Flight, WishfulPilot, free_po
 from tests.vehicle.test_link import BASE
 from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.console.screen import Screen
-from uuvtai.console.views import show_check, show_flight
+from uuvtai.console.vehicle_views import show_check, show_flight
 from uuvtai.vehicle import control_loop
 from uuvtai.vehicle.control_loop import FlightPlan, OnboardLoop
 from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360
