@@ -6,7 +6,6 @@ prints. What a command refuses raises the same error here, a ValueError.
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import os
 import shutil
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.common.errors import SettingError
+from uuvtai.common.files import read_bytes
 from uuvtai.sim.scene import SceneOptions
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ Agent = str | os.PathLike[str] | Callable[..., Any]
 """what ``--agent`` takes, a result of ``train``, or a function or class of a Python file"""
 Overrides = Mapping[str, Any]
 """dotted config keys to values"""
+MOST_PICTURE = 64 << 20
+"""[bytes]"""
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ class Log(Shown):
 
         with tempfile.TemporaryDirectory() as folder:
             picture([self.folder], target := Path(folder) / "episode.png")
-            return target.read_bytes()
+            return read_bytes(target, MOST_PICTURE)
 
     def _show(self, screen: Screen) -> None:
         from uuvtai.console.views import show_log
@@ -266,7 +268,7 @@ def show(what: str | os.PathLike[str]) -> Path:
         from uuvtai.report.build import report
 
         target = report([place]).page
-    webbrowser.open(target.resolve().as_uri())
+    webbrowser.open_new_tab(target.resolve().as_uri())
     return target
 
 
@@ -360,7 +362,7 @@ def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 def _frame(rows: list[dict[str, Any]]) -> Any:
     try:
-        pandas = importlib.import_module("pandas")
+        import pandas  # type: ignore[import-not-found]
     except ImportError:
         raise ImportError("to_pandas() needs pandas: pip install pandas") from None
     return pandas.DataFrame(rows)

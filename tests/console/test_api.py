@@ -96,7 +96,7 @@ def test_without_pandas_it_says_what_to_install(run, monkeypatch):
 
 def test_show_opens_a_report_or_a_picture(run, monkeypatch):
     opened = []
-    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(webbrowser, "open_new_tab", opened.append)
     report, picture = uuvtai.show(run[0]), uuvtai.show(run[0].logs[0])
     assert report.read_text().startswith("<!DOCTYPE html>") and picture.read_bytes().startswith(b"\x89PNG")
     assert opened == [report.resolve().as_uri(), picture.resolve().as_uri()]
@@ -140,4 +140,4 @@ def test_a_sweep_and_a_training_are_those_of_the_commands(tmp_path, pandas):
     )
     again = uuvtai.train(resume=first, iterations=2, device="cpu")
     assert [row["iteration"] for row in again.to_pandas()] == [1, 2]
-    assert f"next: uuv eval --agent {first.folder}" in str(again)
+    assert f"next:uuveval--agent{first.folder}" in "".join(str(again).split())

@@ -242,7 +242,7 @@ Recordings = Annotated[
     ),
 ]
 ImportWorld = Annotated[str, _preset("--world", "world", f"World whose walls are known: {_WORLDS}, or YAML.")]
-_MOUNTED = "How sonar and DVL are mounted: a preset or a YAML file \\[default: a Ping360, else multibeam]."
+_MOUNTED = f"How sonar and DVL are mounted: {_SENSORS}, or YAML \\[default: a Ping360, else multibeam]."
 ImportSensors = Annotated[str | None, _preset("--sensors", "sensors", _MOUNTED)]
 _AT_FIRST = "Where the vehicle is at first \\[m, deg] \\[default: the tank's middle, along x]."
 ImportStart = Annotated[str | None, Option("--start", metavar="X,Y,Z[,YAW]", help=_AT_FIRST)]
