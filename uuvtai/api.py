@@ -11,6 +11,7 @@ import os
 import shutil
 import tempfile
 import webbrowser
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -31,11 +32,11 @@ Agent = str | os.PathLike[str] | Callable[..., Any]
 Overrides = Mapping[str, Any]
 """dotted config keys to values"""
 MOST_PICTURE = 64 << 20
-"""[bytes]"""
+"""[bytes] of a picture that is read back"""
 
 
 @dataclass(frozen=True)
-class Shown:
+class Shown(ABC):
     """Something that prints as tables."""
 
     document: dict[str, Any]
@@ -45,10 +46,10 @@ class Shown:
 
     def tables(self) -> list[Table]:
         """As the command prints them."""
-        return _Kept.of(self).found
+        return _printed(self)[1]
 
     def __str__(self) -> str:
-        return _Kept.of(self).text
+        return _printed(self)[0]
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.folder}>\n{self}"
@@ -59,8 +60,9 @@ class Shown:
     def _repr_html_(self) -> str:
         return "".join(map(_html, self.tables()))
 
+    @abstractmethod
     def _show(self, screen: Screen) -> None:
-        raise NotImplementedError
+        """Print it."""
 
 
 class Evaluation(Shown):
@@ -314,31 +316,23 @@ def _name(agent: Agent, kind: str) -> str:
     return f"{kind}{file}:{name}"
 
 
-@dataclass(frozen=True)
-class _Kept:
+def _printed(shown: Shown) -> tuple[str, list[Table]]:
     """What a view prints, as text and as tables."""
+    from io import StringIO
 
-    text: str
-    found: list[Table]
+    from rich.console import Console
 
-    @classmethod
-    def of(cls, shown: Shown) -> _Kept:
-        from io import StringIO
+    from uuvtai.console.screen import Screen
 
-        from rich.console import Console
+    class Keeping(Screen):
+        def table(self, table: Table) -> None:
+            found.append(table)
+            super().table(table)
 
-        from uuvtai.console.screen import Screen
-
-        class Keeping(Screen):
-            def table(self, table: Table) -> None:
-                found.append(table)
-                super().table(table)
-
-        found: list[Table] = []
-        width = shutil.get_terminal_size((100, 24)).columns
-        screen = Keeping(console=Console(file=(text := StringIO()), width=width), more="to_pandas()")
-        shown._show(screen)
-        return cls(text.getvalue().rstrip(), found)
+    found: list[Table] = []
+    width = shutil.get_terminal_size((100, 24)).columns
+    shown._show(Keeping(console=Console(file=(text := StringIO()), width=width), more="to_pandas()"))
+    return text.getvalue().rstrip(), found
 
 
 def _html(table: Table) -> str:
