@@ -27,18 +27,23 @@ from uuvtai.sim.sim import Sim
 HOLD_STEPS = 10
 """control steps per decision: noise drawn anew every 0.02 s would average out before the vehicle has moved"""
 
+TOLD_EVERY_S, NEWEST = 5.0, 100
+"""between two lines of progress, which speak of so many episodes"""
+
 Act = Callable[[np.ndarray], np.ndarray]
 """observations (n, n_obs) -> actions (n, 4), without exploration"""
 
 
 class Watched(UuvVectorEnv):
-    """The batch as it is, which also keeps the return of every episode that ends in it."""
+    """The batch as it is, which also keeps the return of every episode that ends in it, and tells how far it
+    is: a line every few seconds."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._decisions, self._return = 0, np.zeros(self.num_envs)
         self.curve: list[tuple[int, float]] = []
         """(decisions of all envs so far, return)"""
+        self._begun = self._told = time.perf_counter()
         watched.append(self)
 
     def step(self, actions: Any) -> Any:
@@ -49,6 +54,12 @@ class Watched(UuvVectorEnv):
         for env in np.flatnonzero(np.asarray(told[2]) | np.asarray(told[3])):
             self.curve.append((self._decisions, float(self._return[env])))
             self._return[env] = 0.0
+        now = time.perf_counter()
+        if now - self._told > TOLD_EVERY_S and self.curve:
+            self._told = now
+            newest = [earned for _, earned in self.curve[-NEWEST:]]
+            done = f"{self._decisions:,} decisions, {now - self._begun:.0f} s"
+            print(f"{done}: mean return of {len(newest)} episodes {np.mean(newest):.1f}", file=sys.stderr)
         return told
 
 
