@@ -485,9 +485,10 @@ def pilot_vehicle(
 ) -> None:
     """Drive a vehicle over MAVLink; a dry run without --arm.
 
-    Read docs/safety.md first. Exit code 3: it ended by a safe action, or failed --check."""
+    Read docs/safety.md first. Exit code 3: it ended by a safe action, or failed --check or --calibrate."""
     from uuvtai.console.vehicle_views import show_flight
     from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.vehicle.calibrate import write_rig
     from uuvtai.vehicle.control_loop import fly
 
     config = scene.config()
@@ -495,9 +496,12 @@ def pilot_vehicle(
     output.show(found, lambda screen: show_flight(screen, found))
     if failure is not None:
         raise failure
+    if flight.calibrate and found["calibration"]["rig"]:
+        write_rig(flight.calibrate, scene.sensors, found["calibration"])
+        say(f"wrote {flight.calibrate}")
     if found["interrupted"]:
         raise typer.Exit(signals.exit_code())
-    if not found["safe"] or not (found["check"] or {"ready": True})["ready"]:
+    if not found["safe"] or not found["ready"]:
         raise typer.Exit(GATE)
 
 

@@ -302,6 +302,7 @@ class FlightGroup:
     sonar: opt.SonarPlace = None
     arm: opt.Arm = False
     check: opt.PilotCheck = False
+    calibrate: opt.PilotCalibrate = None
     heading: opt.Heading = None
     box: opt.FenceBox = None
     depth: opt.FenceDepth = None
@@ -322,6 +323,11 @@ class FlightGroup:
         parsing.refuse_odd_rate(self.rate)
         if self.check and self.arm:
             raise UsageError("--check: never arms; leave out --arm, and give it once the check is passed")
+        if self.calibrate and (self.arm or self.check):
+            raise UsageError("--calibrate: you drive; leave out --arm and --check")
+        if self.calibrate and (self.calibrate.exists() or not self.calibrate.parent.is_dir()):
+            what = "is there already" if self.calibrate.exists() else "its folder is not there"
+            raise UsageError(f"--calibrate {self.calibrate}: {what}; give another name")
         if self.log is not None and self.log.exists() and not self.force:
             raise UsageError(f"--log {self.log}: is there already; give another name, or --force")
         return FlightPlan.typed(
@@ -343,6 +349,7 @@ class FlightGroup:
             senders=self.sender or (),
             instruments={"dvl": self.dvl, "sonar": self.sonar},
             checks=self.check,
+            calibrates=self.calibrate is not None,
         )
 
 

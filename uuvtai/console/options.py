@@ -336,6 +336,15 @@ Arm = Annotated[bool, Option("--arm", help="Arm and drive; without it, a dry run
 PilotCheck = Annotated[
     bool, Option("--check", help="Judge what is heard of a vehicle at rest, and leave; it never arms.")
 ]
+PilotCalibrate = Annotated[
+    Path | None,
+    Option(
+        "--calibrate",
+        metavar="FILE",
+        help="Find out how the DVL is mounted and how the tank lies, while you drive by hand; write it as a "
+        "file for --sensors. It never arms.",
+    ),
+]
 FenceBox = Annotated[
     str | None,
     Option(
@@ -365,7 +374,9 @@ HeardSenders = Annotated[
 PilotSeconds = Annotated[
     float | None,
     Option(
-        "--seconds", help="Give the vehicle back after this time \\[s] \\[default: never; of a check: 30]."
+        "--seconds",
+        help="Give the vehicle back after this time \\[s] \\[default: never; a check ends after 30, a "
+        "calibration after 1200].",
     ),
 ]
 PilotLog = Annotated[Path | None, _more("--log", help="Log to write \\[default: runs/pilot_TIME.mcap].")]

@@ -3,6 +3,7 @@ identified."""
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -157,6 +158,8 @@ def show_flight(screen: Screen, found: dict[str, Any]) -> None:
     """A ``uuv pilot --json`` document."""
     if found["check"]:
         return show_check(screen, found)
+    if found["calibration"]:
+        return show_calibration(screen, found)
     steps = max(found["steps"], 1)
     title = "dry run: nothing was sent that moves the vehicle" if found["dry_run"] else "armed"
     rows = [[name, str(count), f"{100 * count / steps:.0f} %"] for name, count in found["actions"].items()]
@@ -197,6 +200,30 @@ def show_check(screen: Screen, found: dict[str, Any]) -> None:
     bad = [row["what"] for row in check["rows"] if row["state"] == "bad"]
     wrong = f"it may NOT drive: {', '.join(bad) or 'no step was judged'}"
     screen.line("it may drive" if check["ready"] else wrong, "bold")
+    screen.line(f"log: {found['log']}")
+
+
+_CALIBRATED = (Column("what", left=True), Column("found"), Column("+-", 1), Column("key", 2, left=True))
+
+
+def show_calibration(screen: Screen, found: dict[str, Any]) -> None:
+    """What a ``uuv pilot --calibrate --json`` document has found, and how sure it is."""
+    told, rig = found["calibration"]["found"], found["calibration"]["rig"]
+    if rig:
+        keys = {"DVL's yaw, deg": "sensors.dvl.yaw_deg", "heading of x, deg": "world.tank.heading_deg"}
+        values = (rig["sensors"]["dvl"]["yaw_deg"], rig["world"]["tank"]["heading_deg"])
+        spreads = (told["dvl_yaw_sd_rad"], told["turn_sd_rad"])
+        rows = [
+            [what, f"{value:.1f}", f"{math.degrees(spread):.1f}", key]
+            for (what, key), value, spread in zip(keys.items(), values, spreads, strict=True)
+        ]
+        screen.table(Table(_CALIBRATED, rows, f"calibrated at {told['places']} places"))
+        x, y = told["start"]
+        screen.line(f"walls over DVL: {told['dvl_scale']:.3f}; they agree to {told['residual_m']:.2f} m")
+        screen.line(f"the vehicle rests at x {x:.2f}, y {y:.2f}: --start from here")
+    else:
+        screen.line(f"NOT calibrated: {found['calibration']['refusal']}", "bold")
+    show_instruments(screen, found["instruments"])
     screen.line(f"log: {found['log']}")
 
 

@@ -19,7 +19,7 @@ from uuvtai.common.signals import StopEvent
 from uuvtai.config import Config
 from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
-from uuvtai.vehicle import safety
+from uuvtai.vehicle import calibrate, safety
 from uuvtai.vehicle.handover import Handover
 from uuvtai.vehicle.instruments.rig import Rig
 from uuvtai.vehicle.mavlink import (
@@ -41,7 +41,7 @@ from uuvtai.vehicle.mavlink import (
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
 from uuvtai.vehicle.pilot_log import LinkLog
-from uuvtai.vehicle.preflight import CHECK_S, Preflight
+from uuvtai.vehicle.preflight import CHECK_S, MISSING, Preflight
 from uuvtai.vehicle.start_fix import MISFIT, StartFix, StartFound, WallWatch
 from uuvtai.vehicle.telemetry import AUTOPILOT, COMPANION, Heard, Intake, Senders, waiting_for
 
@@ -71,6 +71,8 @@ class FlightPlan:
     """what is heard from an instrument itself ('dvl', 'sonar') -> its place"""
     checks: bool = False
     """a dry run that takes nothing, not even in pretence, and judges what it heard"""
+    calibrates: bool = False
+    """another one, which finds out how the instruments are mounted"""
 
     @classmethod
     def typed(
@@ -94,6 +96,7 @@ class FlightPlan:
         senders: Sequence[str] = (),
         instruments: Mapping[str, str | None] | None = None,
         checks: bool = False,
+        calibrates: bool = False,
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
         if config.sensors.sonar.doppler:
@@ -115,6 +118,7 @@ class FlightPlan:
         mounted = {"dvl": config.sensors.dvl.at, "sonar": config.sensors.sonar.at}
         heard_at = mounted | {option: place for option, place in (instruments or {}).items() if place}
         limits = _limits(config, box, depth, max_speed, battery)
+        usual_s = CHECK_S if checks else calibrate.LONGEST_S if calibrates else math.inf
         mission = Mission(_three(start or ()), _three(goal or ()))
         _refuse_places(mission, limits)
         return cls(
@@ -124,13 +128,14 @@ class FlightPlan:
             log or Path("runs") / f"pilot_{time.strftime('%Y%m%d-%H%M%S')}.mcap",
             arms,
             None if heading_deg is None else math.radians(heading_deg),
-            (CHECK_S if checks else math.inf) if seconds is None else seconds,
+            usual_s if seconds is None else seconds,
             rate,
             system,
             operator,
             Senders.typed(senders, system),
             {option: place for option, place in heard_at.items() if place},
             checks,
+            calibrates,
         )
 
 
@@ -187,7 +192,7 @@ _LEAST_ASKED_M_S, _ANSWER = 0.15, 0.2
 _REST_S, _LOOK_RAD_S = 5.0, 0.3
 """where the walls that are seen at rest do not tell the start for so long, the vehicle turns on the spot"""
 _UNKNOWN = (math.nan, math.nan, math.nan)
-_REACHED, _INTERRUPTED = "goal reached", "interrupted"
+_REACHED, _INTERRUPTED, _CALIBRATED = "goal reached", "interrupted", "calibrated"
 _T = TypeVar("_T")
 _FAREWELLS = (_REACHED, "time is up", _INTERRUPTED)
 
@@ -258,6 +263,7 @@ class OnboardLoop:
         """who seeks the start, also when it is found; what a check gathers"""
         if plan.checks:
             self._check = Preflight(config, plan.limits, plan.mission.start[2], plan.system, plan.operator)
+        self._calibration = calibrate.Calibration(config, plan.mission.start) if plan.calibrates else None
         self.failure: BaseException | None = None
         """an error of this program that ended the flight, or came while it ended"""
 
@@ -273,6 +279,11 @@ class OnboardLoop:
             self.failure, reasons = error, (f"{type(error).__name__}: {error}",)
         if not self._handover.ended:
             self._leave(reasons)
+
+    @property
+    def _only_listens(self) -> bool:
+        """Whether it takes nothing, not even in pretence."""
+        return self._check is not None or self._calibration is not None
 
     def _time_s(self) -> float:
         return 0.0 if self._begun_s is None else (self._now() - self._begun_s) * self._rate
@@ -316,7 +327,7 @@ class OnboardLoop:
                 self._tried(self._sleep, dt if orders is not None else 10 * dt)
         self.tally.actions[self.last.action.name] += 1
         self.tally.reasons.update(reason.partition(":")[0] for reason in reasons)
-        if self._check is None:
+        if not self._only_listens:
             self._tried(self.tell, "hand back: " + "; ".join(reasons))
 
     def _tried(self, do: Callable[..., _T], *given: Any) -> _T | None:
@@ -345,9 +356,10 @@ class OnboardLoop:
         if farewell:
             decision = safety.SafeDecision(safety.SafeAction.HAND_BACK, safety.STOP, (farewell,))
             said = self._handover.leave(now_s, heard)
-        elif self._check is not None:
+        elif self._only_listens:
             said = []
-            self._check.stepped(now_s, self._plan.seconds, command.held, memory.since_s)
+            if self._check is not None:
+                self._check.stepped(now_s, self._plan.seconds, command.held, memory.since_s)
         else:
             said = self._handover.orders(decision, now_s, heard, measured)
         for order in said:
@@ -435,8 +447,9 @@ class OnboardLoop:
         self._pilot.feed(dataclasses.replace(reading, time_s=reading.time_s - self._lag_s))
         if self._check is not None:
             self._check.read(reading, source, come_s)
-        if self._fix is not None:
-            self._fix.feed(reading)
+        for one in (self._fix, self._calibration):
+            if one is not None:
+                one.feed(reading)
         if isinstance(reading, ImuReading):
             self._rate_b = reading.rate_b
         name = NAMES[type(reading)]
@@ -536,8 +549,16 @@ class OnboardLoop:
         self._log.decided(now_s, command, decision, heard, speed)
         engaged, messages = self._handover.engaged, self.tally.heard.total()
         text = self._notes.look(now_s, decision, engaged, messages, heard)
+        if self._calibration is not None and heard.vehicle_s > -math.inf:
+            text = self._guidance(now_s, self._calibration)
         if text and not (self._check is not None and decision.action == safety.SafeAction.DRIVE):
             self.tell(text)
+
+    def _guidance(self, now_s: float, calibration: calibrate.Calibration) -> str:
+        """What the operator of a calibration is to do next."""
+        newest_s = self._measured_s | {"sonar": self._scan_s}
+        missing = (name for name in ("imu", "dvl", "sonar") if now_s - newest_s[name] > DEAF_S)
+        return next((MISSING[name] for name in missing), calibration.says)
 
     def tell(self, text: str) -> None:
         """A sentence for the operator; a terminal that is gone ends nothing."""
@@ -552,6 +573,8 @@ class OnboardLoop:
         goal, radius = self._plan.mission.goal, self._config.episode.goal_radius_m
         if self._handover.engaged and math.dist(command.pos_w.tolist(), goal) <= radius:
             return _REACHED
+        if self._calibration is not None and (self._calibration.found or self._calibration.refusal):
+            return _CALIBRATED if self._calibration.found else self._calibration.refusal
         return "time is up" if now_s >= self._plan.seconds else ""
 
     def _instruments(self) -> dict[str, dict[str, Any]]:
@@ -567,6 +590,8 @@ class OnboardLoop:
 
     def document(self) -> dict[str, Any]:
         tally, heard = self.tally, self._intake.heard
+        check, calibration = self._checked(), self._calibration
+        calibrated = calibration.document(self._intake.heading) if calibration else None
         reasons = list(self.last.reasons)
         return {
             "schema": 1,
@@ -590,7 +615,9 @@ class OnboardLoop:
             "refused": dict(heard.refused),
             "said": {kind: {"said": said, "sent": tally.sent[kind]} for kind, said in tally.said.items()},
             "instruments": self._instruments(),
-            "check": self._checked(),
+            "check": check,
+            "calibration": calibrated,
+            "ready": (check or calibrated or {"ready": True})["ready"],
             "sensors": {name: dataclasses.asdict(row) for name, row in self._pilot.tallies.items()},
         }
 
@@ -610,12 +637,13 @@ def fly(
             if followed:
                 now, sleep = followed.now, partial(followed.sleep, stop=stop)
             endpoint.forget()  # what came while kernels were compiled
-            fix = StartFix(config, plan.mission.start)
+            fix = None if plan.calibrates else StartFix(config, plan.mission.start)
             loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix, rig)
-            dry = f"{'check' if plan.checks else 'dry run'}: no order that moves the vehicle is sent"
+            kind = "check" if plan.checks else "calibration" if plan.calibrates else "dry run"
+            dry = f"{kind}: no order that moves the vehicle is sent"
             what = "ARMS AND DRIVES the vehicle" if plan.arms else dry
             where = "speaks to" if plan.place.calls else "listens at"
-            ends = "ends it" if plan.checks else "gives the vehicle back"
+            ends = "ends it" if plan.checks or plan.calibrates else "gives the vehicle back"
             loop.tell(f"{what}; {where} {plan.place.host}:{plan.place.port}; Ctrl-C {ends}")
             try:
                 loop.run(stop)

@@ -29,7 +29,7 @@ _LEAST_HZ = {
     "position": 5.0, "battery": 0.1,
 }  # fmt: skip
 """slower is too slow to drive by, though it may be younger than the age that stops the pilot (EC)"""
-_FROM = {
+MISSING = {
     "autopilot": "no HEARTBEAT of a submarine comes: --mavlink, --system; is the vehicle on",
     "operator": "no ground station's HEARTBEAT comes: start QGroundControl, or name its id by --operator",
     "imu": "no ATTITUDE comes: the router must pass the autopilot's messages on",
@@ -40,6 +40,7 @@ _FROM = {
     "sensors.localization=estimated",
     "battery": "no voltage comes: nobody watches the battery",
 }
+"""what is said of a reading that never came, or no more"""
 _GYRO_RAD_S, _FORCE_M_S2, _LEAN_RAD = 0.01, 0.5, math.radians(10.0)
 """errors of gyro and accelerometer that are bad (EC), and a lean that is noted"""
 _DEPTH_M = (0.4, 1.0)  # between the pressure's depth and that of --start: noted, bad; weather is 0.3 m
@@ -263,7 +264,7 @@ class Preflight:
     ) -> CheckRow:
         come = self._come[name]
         if not come:
-            why = _FROM[name]
+            why = MISSING[name]
             if name == "dvl" and lost:
                 why = f"{_OUT_OF_RANGE}: {lost.most_common(1)[0][0]}, {lost.total()} times"
             return CheckRow(name, NOTE if name == "battery" else BAD, why)

@@ -223,7 +223,7 @@ def around(tank: TankConfig, ends: np.ndarray, typed: np.ndarray) -> list[np.nda
 
 
 @dataclass
-class _Track:
+class Track:
     """Where the vehicle has gone since, by attitude and velocity, in the frame as typed."""
 
     time_s: float = -math.inf
@@ -247,6 +247,9 @@ class _Track:
         self.past.append((self.time_s, float(self.rpy[2]), self.at))
         return kept
 
+    def hear(self, reading: DvlReading) -> None:
+        self.vel_b, self.vel_s = np.asarray(reading.vel_b, float), reading.time_s
+
     def then(self, time_s: float) -> tuple[float, np.ndarray] | None:
         """(yaw, place) at a time; None where it is not known, or the vehicle was not at rest."""
         moves = not math.hypot(*self.vel_b) <= _REST_M_S or self.time_s - self.vel_s > 2 * _GAP_S
@@ -269,7 +272,7 @@ class StartFix:
         self.waits_for = "nothing has been seen yet"
         """why there is no result yet, and what the operator may do"""
         self._config, self._typed = config, np.array(typed[:2])
-        self._track, self._rays = _Track(), deque[tuple[float, float, Rays]]()
+        self._track, self._rays = Track(), deque[tuple[float, float, Rays]]()
         """scans that are kept: (time, yaw, rays)"""
         self._next_s, self._scans = -math.inf, 0
 
@@ -281,7 +284,7 @@ class StartFix:
             if not self._track.go(message):
                 self._rays.clear()
         elif isinstance(message, DvlReading):
-            self._track.vel_b, self._track.vel_s = np.asarray(message.vel_b, float), message.time_s
+            self._track.hear(message)
         elif isinstance(message, SonarPing):
             self._see(message)
 

@@ -382,6 +382,11 @@ class Intake:
         """Date messages anew: our clock has run on without those of the senders."""
         self._clocks.clear()
 
+    @property
+    def heading(self) -> float | None:
+        """[rad] compass heading of the world's x axis; None: not typed, and no attitude was heard."""
+        return self._heading
+
     def correct(self, place: tuple[float, float], turn_rad: float) -> tuple[float, float, float]:
         """Count from ``place`` [m] on, ``turn_rad`` added to the yaw; gives where it is, with its depth."""
         if self._heading is not None:

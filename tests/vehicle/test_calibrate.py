@@ -1,0 +1,187 @@
+"""``uuv pilot --calibrate``: a vehicle that somebody drives by hand from rest to rest, in a known tank."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tests.command import uuv
+from tests.mavlink_vehicle import free_port
+from tests.vehicle.test_link import BASE
+from tests.vehicle.test_preflight import RestingPilot
+from uuvtai.config.loader import load_config
+from uuvtai.console.screen import Screen
+from uuvtai.console.vehicle_views import show_calibration
+from uuvtai.vehicle import control_loop
+from uuvtai.vehicle.calibrate import Calibration, Place, solved
+from uuvtai.vehicle.messages import DvlReading, ImuReading, SonarPing
+from uuvtai.vehicle.start_fix import expected
+
+DT, Z = 0.1, -0.8
+WAYS = {"ahead": (0.35, 0.0), "to port": (0.0, 0.35), "back": (-0.35, 0.0), "to starboard": (0.0, -0.35)}
+
+
+class Diver:
+    """A vehicle with a Ping360 and a DVL, and who drives it as ``Calibration.says``."""
+
+    def __init__(self, seed, yaw_deg=0.0, off=(0.0, 0.0), turn_deg=0.0, scale=1.0, tank=None):
+        self.config = load_config("pool", "ping360")
+        self.rng, self.place, self.yaw = np.random.default_rng(seed), np.array([3.0, 2.0]), 0.2
+        self.dvl_yaw, self.turn, self.scale = math.radians(yaw_deg), math.radians(turn_deg), scale
+        known = self.config
+        if tank:
+            tank = self.config.world.tank.model_copy(update=tank)
+            known = self.config.model_copy(
+                update={"world": self.config.world.model_copy(update={"tank": tank})}
+            )
+        self.calibration = Calibration(known, (*(self.place + off), Z))
+        self.time_s, self.beam, self.left_m, self.way, self.said = 0.0, 0, 0.0, np.zeros(2), ""
+        self.speed, self.is_silent = np.zeros(2), False
+
+    def turned(self, vector, angle):
+        c, s = math.cos(angle), math.sin(angle)
+        return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+    def step(self):
+        made = self.calibration
+        if made.says != self.said:
+            self.said = made.says
+            for way, velocity in WAYS.items():
+                if f"drive 2 m {way} by hand" in made.says:
+                    self.way, self.left_m = np.array(velocity), 2.0 + 0.2 * self.rng.standard_normal()
+        self.time_s += DT
+        self.speed += ((self.way if self.left_m > 0 else 0.0) - self.speed) * DT / 0.5
+        self.left_m -= DT * math.hypot(*self.speed)
+        drifting = self.speed + 0.01 * self.rng.standard_normal(2)
+        self.place = self.place + DT * self.turned(drifting, self.yaw)
+        rate = 0.25 if "turn the vehicle" in made.says else 0.0
+        self.yaw += DT * rate
+        told = np.array([0.0, 0.0, math.remainder(self.yaw - self.turn, math.tau)])
+        made.feed(ImuReading(self.time_s, told, np.array([0.0, 0.0, rate]), np.array([0.0, 0.0, 9.81])))
+        if not self.is_silent:
+            velocity = self.turned(drifting, -self.dvl_yaw) / self.scale
+            noise = 0.005 * self.rng.standard_normal(3)
+            made.feed(DvlReading(self.time_s, np.array([*velocity, 0.0]) + noise))
+        self.look()
+
+    def look(self):
+        sonar = self.config.sensors.sonar
+        beams = self.beam + np.arange(3)
+        self.beam = (self.beam + 3) % (sonar.n_ray - 3)
+        bearing = self.yaw + sonar.first_beam_rad + sonar.beam_step_rad * beams
+        range_m = expected(self.config.world.tank, np.tile(self.place, (3, 1)), bearing)[0]
+        hit = (range_m < sonar.max_range_m) & (self.rng.random(3) > 0.05)
+        range_m = range_m + sonar.range_sigma_m * self.rng.standard_normal(3)
+        ping = SonarPing(self.time_s, range_m, hit.astype(int), np.zeros(0), int(beams[0]))
+        self.calibration.feed(ping)
+
+    def drive(self, seconds=400.0):
+        until_s = self.time_s + seconds
+        while self.time_s < until_s and not (self.calibration.found or self.calibration.refusal):
+            self.step()
+        return self.calibration
+
+
+@pytest.mark.parametrize(
+    ("seed", "yaw_deg", "off", "turn_deg"), [(0, 12.0, (0.3, -0.2), -10.0), (1, -7.0, (-0.4, 0.3), 11.0)]
+)
+def test_it_finds_how_the_dvl_looks_and_where_the_vehicle_is(seed, yaw_deg, off, turn_deg):
+    diver = Diver(seed, yaw_deg, off, turn_deg)
+    found = diver.drive().found
+    assert found is not None, diver.calibration.says
+    assert math.degrees(found.dvl_yaw_rad) == pytest.approx(yaw_deg, abs=1.0)
+    assert math.degrees(found.turn_rad) == pytest.approx(turn_deg, abs=1.0)
+    assert math.dist(found.start, diver.place) < 0.1 and found.dvl_scale == pytest.approx(1.0, abs=0.02)
+    document = diver.calibration.document(math.radians(355.0))
+    assert document["rig"]["sensors"]["dvl"]["yaw_deg"] == pytest.approx(yaw_deg, abs=1.0)
+    heading_deg = document["rig"]["world"]["tank"]["heading_deg"]
+    assert abs(math.remainder(heading_deg - 355.0 - turn_deg, 360.0)) < 1.0 and 0 <= heading_deg < 360
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"scale": 1.2}, "less than the walls"),
+        ({"tank": {"x_m": (-2.0, 20.0)}}, "see through the wall at x -2"),
+    ],
+)
+def test_what_does_not_agree_is_refused_or_said(given, words):
+    calibration = Diver(2, **given).drive()
+    assert calibration.found is None and words in (calibration.refusal or calibration.says)
+    assert calibration.document(0.0)["rig"] is None and not calibration.document(0.0)["ready"]
+
+
+def test_a_way_that_nobody_measured_begins_again():
+    diver = Diver(3)
+    while len({place.number for place in diver.calibration.places}) < 3:
+        diver.step()
+    diver.is_silent = True
+    for _ in range(40):
+        diver.step()
+    assert not diver.calibration.places and "begins again" in diver.calibration.says
+    diver.is_silent = False
+    assert diver.drive().found is not None
+
+
+def test_the_turn_is_that_of_least_squares():
+    rng = np.random.default_rng(0)
+    way, angle = rng.uniform(-2, 2, (6, 2)), 0.3
+    c, s = math.cos(angle), math.sin(angle)
+    walls = 1.02 * way @ np.array([[c, s], [-s, c]]) + [4.0, 3.0]
+    found = solved([Place(k, walls[k], way[k], 0.0) for k in range(6)])
+    assert found.dvl_yaw_rad == pytest.approx(angle) and found.dvl_scale == pytest.approx(1.02)
+    assert found.residual_m == pytest.approx(0.0, abs=1e-9)
+
+
+# ---- The command.
+
+
+@pytest.fixture
+def flown(monkeypatch):
+    """Who flies finds this document."""
+    calibration = Diver(0, 12.0).drive().document(math.radians(90.0))
+    found = {
+        "check": None, "calibration": calibration, "ready": True, "safe": True, "interrupted": False,
+        "instruments": {}, "log": "a.mcap", "steps": 3,
+    }  # fmt: skip
+    monkeypatch.setattr(control_loop, "fly", lambda *_: (found, None))
+    return found
+
+
+def test_what_was_found_is_a_file_for_sensors(capfd, flown, tmp_path):
+    out = tmp_path / "mine.yaml"
+    code, _, err = uuv(capfd, *BASE, "--sensors", "ping360", "--calibrate", str(out))
+    assert code == 0 and f"wrote {out}" in "".join(err.split("\n"))
+    config, before = load_config("pool", str(out)), load_config("pool", "ping360")
+    assert config.sensors.dvl.yaw_deg == pytest.approx(12.0, abs=1.0)
+    assert config.world.tank.heading_deg == pytest.approx(90.0, abs=1.0)
+    assert config.sensors.sonar == before.sensors.sonar
+    text = out.read_text()
+    code, _, err = uuv(capfd, *BASE, "--calibrate", str(out))
+    assert code == 2 and "is there already" in err and out.read_text() == text
+    console = Console(width=80, record=True)
+    show_calibration(Screen(console=console), flown)
+    shown = console.export_text()
+    assert "sensors.dvl.yaw_deg" in shown and max(map(len, shown.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(("--arm",), "leave out --arm"), (("--check",), "leave out"), ((), "its folder is not there")],
+)
+def test_it_never_arms_and_writes_where_it_can(capfd, monkeypatch, tmp_path, words, told):
+    monkeypatch.setattr(control_loop, "fly", lambda *_: pytest.fail("it flies"))
+    out = tmp_path / "mine.yaml" if words else tmp_path / "none" / "mine.yaml"
+    code, _, err = uuv(capfd, *BASE, "--calibrate", str(out), *words)
+    assert code == 2 and told in " ".join(err.split())
+
+
+def test_without_a_vehicle_nothing_is_written(capfd, monkeypatch, tmp_path):
+    monkeypatch.setattr(control_loop, "warmed", lambda config, tree, mission: RestingPilot())
+    out, log = tmp_path / "mine.yaml", tmp_path / "a.mcap"
+    more = ["--calibrate", str(out), "--seconds", "0.2", "--log", str(log), "--json"]
+    code, said, err = uuv(capfd, *BASE[:1], *BASE[3:], "--mavlink", f"udp:127.0.0.1:{free_port()}", *more)
+    assert code == 3 and "calibration: no order that moves the vehicle is sent" in err
+    assert json.loads(said)["calibration"]["rig"] is None and not out.exists()
