@@ -20,10 +20,10 @@ from uuvtai.vehicle.control_loop import OnboardLoop
 from uuvtai.vehicle.instruments import ping, rip2
 from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Channel, InstrumentPlace, TcpChannel, UdpChannel, place_of
-from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeRig, emulated
+from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeRig, FakeSonar3D, emulated
 from uuvtai.vehicle.instruments.rig import PORTS, JsonUdp, Rig
 from uuvtai.vehicle.mavlink import LinkError
-from uuvtai.vehicle.messages import MOST_WAITING, DvlReading, Inbox, SonarPing
+from uuvtai.vehicle.messages import MOST_WAITING, DepthShot, DvlReading, Inbox, SonarPing
 from uuvtai.vehicle.sitl import Instance, SitlPlan
 
 
@@ -649,6 +649,31 @@ def test_what_a_sitl_instrument_says_the_pilot_hears():
     assert len(dvl) > 20 and all(np.allclose(one.vel_b, [0.3, -0.1, 0.2], atol=1e-6) for one in dvl)
     assert len({one.first_beam for one in beams}) == config.sensors.sonar.n_ray
     assert all(one.hit[0] == 1 and abs(one.range_m[0] - 4.0) < 0.05 for one in beams)
+
+
+def test_a_sitl_3d15_shows_what_its_camera_sees():
+    """A wall across at 4 m, and a bar above to port that only some rows see."""
+    config = emulated(FAN, ("3d15",))
+    camera, told_s = config.sensors.depth, (0.0, 0.1, 0.2, 0.4)
+    depth_m = np.full((camera.rows, camera.cols), 4.0)
+    depth_m[: camera.rows // 5, : camera.cols // 4] = 2.0
+    depth_m[:, -camera.cols // 5 :] = camera.max_range_m
+    with Rig(FAN, {"sonar": "3d15:127.0.0.1:45994"}) as rig:
+        fake, found = FakeSonar3D("127.0.0.1", 45994, camera), []
+        for now_s in told_s:
+            fake.tell(now_s, depth_m)
+            found += [reading for _, reading in rig.poll(now_s, np.zeros(3))]
+        fake.close()
+    scans, images = ([one for one in found if isinstance(one, kind)] for kind in (SonarPing, DepthShot))
+    assert len(scans) == len(images) == 3, "five a second"
+    sonar = FAN.sensors.sonar
+    bearing = sonar.first_beam_rad + sonar.beam_step_rad * np.arange(sonar.n_ray)
+    ahead = np.abs(bearing) < np.radians(25)
+    assert np.allclose(scans[0].range_m[ahead], 4.0 / np.cos(bearing[ahead]), atol=0.05)
+    assert scans[0].hit[ahead].all() and not scans[0].hit[: sonar.n_ray // 8].any(), "nothing to starboard"
+    seen = images[0].depth_m
+    assert seen[0, 0] == pytest.approx(2.0, abs=0.05) and seen[-1, 0] == pytest.approx(4.0, abs=0.05)
+    assert seen[0, -1] == FAN.sensors.depth.max_range_m
 
 
 def test_an_instrument_that_cannot_be_had_is_refused_in_a_line():

@@ -87,7 +87,9 @@ class Calibration:
         if self._fix is not None:
             self._fix.feed(message)
             if ": turn" in self._fix.waits_for:
-                self.says = self._fix.waits_for
+                self.says = (
+                    f"place {self._number}: the walls in view do not fix it yet: turn the vehicle slowly"
+                )
             if (result := self._fix.result) is not None:
                 self._fix = None
                 self._take(result)

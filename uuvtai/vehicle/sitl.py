@@ -188,10 +188,11 @@ class Instance:
 class WaterRows:
     """The vehicles of several instances. Row i runs episode ``first + i`` of ``seed``."""
 
-    def __init__(self, sim: Sim, seed: int, first: int) -> None:
-        """SettingError for a vehicle that is none of ArduSub's frames."""
+    def __init__(self, sim: Sim, seed: int, first: int, has_camera: bool = False) -> None:
+        """``has_camera``: depth images are sensed too. SettingError for a vehicle that is none of ArduSub's
+        frames."""
         self.config, self.motors = sim.config, Motors(sim.config.vehicle)
-        self._sim, self._seed, self._first = sim, seed, first
+        self._sim, self._seed, self._first, self._has_camera = sim, seed, first, has_camera
         self._dt_s = 0.0
         """one object for as long as it stays: kernels are launched again by the identity of what they take"""
         memory = self._sim.memory()
@@ -245,6 +246,8 @@ class WaterRows:
         self._wake(row)
         self._sim.sensors.sense_motion(self._sim.io)
         self._sim.sensors.sense_sonar(self._sim.io)
+        if self._has_camera:
+            self._sim.sensors.sense_depth(self._sim.io)
 
     def motion(self, row: int, time_s: float) -> Motion:
         quat = self._vehicle["quat_wb"][row].astype(float)
@@ -404,7 +407,7 @@ class SitlPlan:
         """Of what was typed. Raises LinkError."""
         kinds = tuple(emulated.split(",")) if emulated else ()
         if not set(kinds) <= set(KINDS):
-            raise LinkError(f"--as {emulated}: give {' or '.join(KINDS)}, or both: --as {','.join(KINDS)}")
+            raise LinkError(f"--as {emulated}: give {' or '.join(KINDS)}, or several: --as a50,ping360")
         places = tuple(place_of(text) for text in mavlink or PLACES)
         last = NEXT_PORT * (instances - 1)
         if not 1 <= instances <= _MOST_INSTANCES:
@@ -509,7 +512,8 @@ def serve_water(
 ) -> dict[str, Any]:
     """Serve until Ctrl-C, ``seconds`` or ``once``; gives the ``--json``. Raises LinkError, SettingError."""
     config = emulated(config, plan.emulated)
-    water = WaterRows(Sim(config, plan.instances, tree), folded_seed(plan.seed), plan.episode)
+    sim, has_camera = Sim(config, plan.instances, tree), "3d15" in plan.emulated
+    water = WaterRows(sim, folded_seed(plan.seed), plan.episode, has_camera)
     ports: list[SitlPort] = []
     rigs: list[FakeRig] = []
     begun = time.monotonic()

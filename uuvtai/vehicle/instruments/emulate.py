@@ -1,5 +1,5 @@
-"""Devices that are not there, from their specifications: what the simulator's vehicle senses, told as an A50
-or a Ping360 tells it."""
+"""Devices that are not there, from their specifications: what the simulator's vehicle senses, told as an A50,
+a Ping360 or a 3D-15 tells it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from uuvtai.config import Config, SonarConfig
-from uuvtai.vehicle.instruments import a50, ping
+from uuvtai.config import Config, DepthConfig, SonarConfig
+from uuvtai.vehicle.instruments import a50, ping, rip2
 from uuvtai.vehicle.mavlink import LinkError
 
 Echo = Callable[[float], float]
@@ -162,7 +162,42 @@ class FakePing360:
         self._socket.close()
 
 
-KINDS = ("a50", "ping360")
+class FakeSonar3D:
+    """Sends what the simulated camera sees to a port of this computer; a real one sends to a multicast
+    group."""
+
+    SHAPE, VIEW_DEG, RANGE_M, PERIOD_S = (64, 256), (90.0, 40.0), 15.0, 0.2
+
+    def __init__(self, host: str, port: int, depth_cfg: DepthConfig) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._to, self._due_s = (host, port), -math.inf
+        rows, columns = self.SHAPE
+        wide, high = (math.radians(view) for view in self.VIEW_DEG)
+        left = np.linspace(0.5 * wide, -0.5 * wide, columns)
+        up = np.linspace(-0.5 * high, 0.5 * high, rows)[:, None]
+        reach = math.tan(0.5 * math.radians(depth_cfg.fov_deg))
+        y, z = np.tan(left), np.tan(up) / np.cos(left)
+        self._column = np.rint((0.5 - 0.5 * y / reach) * depth_cfg.cols - 0.5).astype(int)
+        self._row = np.rint(0.5 * depth_cfg.rows - 0.5 * depth_cfg.cols * z / reach - 0.5).astype(int)
+        self._per_depth = np.sqrt(1.0 + y * y + z * z)
+
+    def tell(self, now_s: float, depth_m: np.ndarray) -> None:
+        """A depth image (rows, columns) that was taken just now, told when it is due."""
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + self.PERIOD_S - 1e-6
+        range_m = depth_m[self._row, self._column] * self._per_depth
+        view = math.radians(self.VIEW_DEG[0]), math.radians(self.VIEW_DEG[1])
+        met = np.where(range_m < self.RANGE_M - 1e-3, range_m, 0.0)
+        with contextlib.suppress(OSError):  # nobody listens
+            self._socket.sendto(rip2.packet_of(rip2.RangeImage(now_s, met, view, self.RANGE_M)), self._to)
+
+    def close(self) -> None:
+        """Give the socket back."""
+        self._socket.close()
+
+
+KINDS = ("a50", "ping360", "3d15")
 """what ``uuv sitl --as`` can be"""
 RING = {
     "mechanical": False,
@@ -173,15 +208,27 @@ RING = {
     "range_quantum_m": 0.0,
 }
 """of a simulated sonar behind a Ping360: every step of the head at any moment, errors are the emulator's"""
+CAMERA = {
+    "rows": 136,
+    "cols": 256,
+    "fov_deg": 92.0,
+    "max_range_m": 2 * FakeSonar3D.RANGE_M,
+    "period_steps": 10,
+    "sigma_m": 0.0,
+    "sigma_slope": 0.0,
+}
+"""of a simulated camera behind a 3D-15: wider and higher than it sees"""
 _NEXT_PORT = 10  # as from one ArduSub's port to the next one's
 
 
 def emulated(config: Config, kinds: tuple[str, ...]) -> Config:
     """The config of the water behind these instruments."""
-    if "ping360" not in kinds:
-        return config
-    sonar = config.sensors.sonar.model_copy(update=RING)
-    return config.model_copy(update={"sensors": config.sensors.model_copy(update={"sonar": sonar})})
+    changed = {}
+    if "ping360" in kinds:
+        changed["sonar"] = config.sensors.sonar.model_copy(update=RING)
+    if "3d15" in kinds:
+        changed["depth"] = config.sensors.depth.model_copy(update=CAMERA)
+    return config.model_copy(update={"sensors": config.sensors.model_copy(update=changed)})
 
 
 class FakeRig:
@@ -193,6 +240,7 @@ class FakeRig:
         self._lever, self._yaw = np.array(dvl.position_b_m), math.radians(dvl.yaw_deg)
         self._dvl: FakeA50 | None = None
         self._head: FakePing360 | None = None
+        self._image: FakeSonar3D | None = None
         port, next_port = 0, _NEXT_PORT * number
         try:
             if "a50" in kinds:
@@ -200,6 +248,8 @@ class FakeRig:
             if "ping360" in kinds:
                 zero = round(self._sonar.zero_gradian)
                 self._head = FakePing360(host, port := ping.PORT + next_port, number, zero)
+            if "3d15" in kinds:
+                self._image = FakeSonar3D(host, rip2.PORT + next_port, config.sensors.depth)
         except OSError as error:
             self.close()
             raise LinkError(
@@ -216,10 +266,12 @@ class FakeRig:
         if self._head is not None:
             range_m, hit = value("scan.range_m"), value("scan.hit")
             self._head.step(time_s, lambda bearing: _met(self._sonar, range_m, hit, bearing))
+        if self._image is not None and value("image.fresh"):
+            self._image.tell(time_s, value("image.depth_m"))
 
     def close(self) -> None:
         """Give the ports back."""
-        for one in (self._dvl, self._head):
+        for one in (self._dvl, self._head, self._image):
             if one is not None:
                 one.close()
 

@@ -114,6 +114,26 @@ def image_of(packet: bytes) -> RangeImage | str:
     )
 
 
+def packet_of(image: RangeImage) -> bytes:
+    """The packet of an image, as the device sends it; distances in steps of 5 mm."""
+    import cramjam
+
+    kinds, scale = _messages(), 0.005
+    nanos = round(1e9 * image.sent_s)
+    stamp = kinds["Stamp"](seconds=nanos // 10**9, nanos=nanos % 10**9)
+    rows, columns = image.range_m.shape
+    value = kinds[_RANGE_IMAGE](
+        header=kinds["Header"](timestamp=stamp), range=image.max_range_m, width=columns, height=rows,
+        fov_horizontal=math.degrees(image.fov_rad[0]), fov_vertical=math.degrees(image.fov_rad[1]),
+        image_pixel_scale=scale, image_pixel_data=np.rint(image.range_m.ravel() / scale).astype(int).tolist(),
+    )  # fmt: skip
+    told = kinds["Any"](type_url=f"type.googleapis.com/waterlinked.sonar.protocol.{_RANGE_IMAGE}")
+    told.value = value.SerializeToString()
+    content = bytes(cramjam.snappy.compress_raw(kinds["Packet"](msg=told).SerializeToString()))
+    head = b"RIP2" + (len(content) + 12).to_bytes(4, "little") + content
+    return head + zlib.crc32(head).to_bytes(4, "little")
+
+
 def _unfolded(content: bytes) -> int:
     """Length that a raw snappy block says it unfolds to (its first varint)."""
     size = 0
