@@ -93,6 +93,13 @@ class VehicleConfig(Section):
     thrust_scale: Positive = 1.0
     """the paper's K_F / 4.4e-7"""
     attitude_hold: Literal["ideal", "thrusters", "none"] = "ideal"
+    tether_m: NonNegative = 0.0
+    """[m] of a tether of neutral weight in the water, from the vehicle up to a point at rest; 0 = none, as in
+    the paper"""
+    tether_diameter_m: Positive = 0.0076
+    """Fathom ROV Tether (Blue Robotics)"""
+    tether_at_b_m: Vector3 = (-0.2, 0.0, 0.1)
+    """where it leaves the vehicle, from the centre of mass, body axes (EC)"""
     hull_radius_m: Positive = 0.17
     hull_half_length_m: NonNegative = 0.10
     max_surge_m_s: Positive = 0.6

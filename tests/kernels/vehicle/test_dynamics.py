@@ -290,6 +290,33 @@ def test_added_mass_that_follows_the_water_knows_no_uniform_current():
     assert np.abs(plant.vehicle.rate_b.to_numpy()[0] - plant.vehicle.rate_b.to_numpy()[1]).max() < F32_DRIFT_M
 
 
+def test_a_tether_drags_across_as_a_third_of_its_length():
+    """Beside the oracle, whose wrench it is: towed level, and turned on the spot."""
+    length_m, wide_m, at = 30.0, 0.0076, np.array([-0.2, 0.0, 0.1])
+    vehicle = VehicleConfig(attitude_hold="none", tether_m=length_m, tether_at_b_m=tuple(at))
+    plant = Plant(Config(vehicle=vehicle), start_taichi("cpu"), n_env=2)
+    pushes = np.array([[20.0, 10.0, 3.0, 0, 0, 0], [0, 0, 0, 0, 0, 2.0]])
+
+    def tethered(push):
+        def wrench(rotation, nu):
+            there = rotation @ (nu[:3] + np.cross(nu[3:], at))
+            there[2] = 0.0
+            pull = -0.5 * 997.0 * 1.2 * wide_m * (length_m / 3) * np.linalg.norm(there) * there
+            return push + np.r_[rotation.T @ pull, np.cross(at, rotation.T @ pull)]
+
+        return wrench
+
+    plant.reset()
+    plant.write(plant.actuation.external_wrench_b, pushes)
+    for _ in range(100):
+        plant.step()
+    nu = np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()]
+    for env, push in enumerate(pushes):
+        found = oracle.simulate(oracle.Body(), 2.0, wrench=tethered(push))["nu"][-1]
+        free = oracle.simulate(oracle.Body(), 2.0, wrench=push)["nu"][-1]
+        assert np.abs(nu[env] - found).max() < SPEED_M_S < np.abs(found - free).max()
+
+
 def test_coriolis_matrix_is_skew_and_mass_matrix_positive():
     nu = np.random.default_rng(0).normal(size=6)
     for matrix in (oracle.Body().mass_matrix, np.diag(oracle.Body().added)):

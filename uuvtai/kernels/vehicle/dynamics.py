@@ -312,7 +312,7 @@ def body_of(lane, fleet: In[Any], io: Bundle[DynamicsIO]):
 @ti.func
 def acceleration(q, v, w, force, moment, current_w, body: In[Any], io: Bundle[DynamicsIO]):
     """(dv/dt, dw/dt) in body axes [m/s^2, rad/s^2]: Fossen's equation solved for the derivative of nu."""
-    # Kirchhoff's equations of an obstacle in a uniform current (Fossen 2011, chapter 6), v_r = v - current:
+    # Kirchhoff's equations of a body in a uniform current (Fossen 2011, chapter 6), v_r = v - current:
     #   force   m (dv + w x v) + A dv_r + w x (A v_r) = tau - D(v_r) v_r + (B - W) up
     #   moment  (I + A_w) dw + w x ((I + A_w) w) + v_r x (A v_r) = tau - D(w) w + (0, 0, height) x B up
     # dv_r = dv + w x current, as the current stands still in the world (or dv, by ``added_mass_follows``);
@@ -329,9 +329,28 @@ def acceleration(q, v, w, force, moment, current_w, body: In[Any], io: Bundle[Dy
     tau_w = moment + body.height * body.buoyancy * ti.Vector([-up[1], up[0], 0.0])
     tau_w -= w.cross((body.inertia + body.added_w) * w) + v_r.cross(momentum)
     tau_w -= (body.linear_w + body.quadratic_w * abs(w)) * w
+    if ti.static(io.vehicle_cfg.tether_m > 0):
+        pull = tether_pull(v_r, w, up, io.vehicle_cfg)
+        tau_v += pull
+        tau_w += ti.Vector(ti.static(list(io.vehicle_cfg.tether_at_b_m))).cross(pull)
     if ti.static(io.vehicle_cfg.attitude_hold == "ideal"):
         tau_w += hold_moment(up, w, io)
     return body.per_mass_v * tau_v, body.per_mass_w * tau_w
+
+
+TETHER_DRAG = 1.2
+"""coefficient of a cylinder across the flow"""
+
+
+@ti.func
+def tether_pull(v_r, w, up, vehicle_cfg: Const[VehicleConfig]):
+    """[N] body axes, of a tether that is towed across. It hangs upright, and its speed grows evenly from rest
+    at the far end, so its drag is a third of that of a cylinder which moves as a whole."""
+    at = ti.Vector(ti.static(list(vehicle_cfg.tether_at_b_m)))
+    there = v_r + w.cross(at)
+    across = there - there.dot(up) * up
+    area = vehicle_cfg.tether_m * vehicle_cfg.tether_diameter_m
+    return -(0.5 * TETHER_DRAG / 3.0) * vehicle_cfg.water_density_kg_m3 * area * across.norm() * across
 
 
 @ti.func
