@@ -27,12 +27,6 @@ def test_every_vehicle_loads(vehicle):
     assert isinstance(load_config("pool", vehicle=vehicle), Config)
 
 
-@pytest.mark.parametrize("world", loader.preset_names("world"))
-def test_no_preset_switches_the_debugging_stamp_on(world):
-    for sensors in loader.preset_names("sensors"):
-        assert load_config(world, sensors).mapping.stamp == 0.0
-
-
 def test_paper_sensing_is_the_default_and_a_world_may_name_another():
     assert load_config("pool").sensors == load_config("pool", "paper").sensors
     assert load_config("transfer").sensors == load_config("pool", "nominal").sensors

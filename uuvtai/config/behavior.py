@@ -156,7 +156,6 @@ class BehaviorConfig(Section):
     and waits for the first sweep"""
     yaw_gain: Positive = 2.5
     """[1/s]"""
-    max_node: PositiveCount = 64
 
     @property
     def n_held(self) -> int:

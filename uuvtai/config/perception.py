@@ -219,8 +219,6 @@ class MappingConfig(Section):
     """eta_dyn,free"""
     dynamic_decay: Fraction = 0.1
     """lambda_d"""
-    stamp: Fraction = 0.0
-    """eta_stamp: gain of the simulator-side debugging stamp; must stay 0 in every preset"""
     doppler_evidence_m_s: NonNegative = 0.15
     free_confident_s: NonNegative = 0.5
     """a hit in a cell seen free for this long is dynamic evidence"""

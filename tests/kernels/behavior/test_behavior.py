@@ -13,6 +13,7 @@ from tests.bundles import Stage
 from tests.map_bits import away, room
 from tests.oracles import behavior as oracle
 from uuvtai.common.enums import NO_SITE, clearance_m
+from uuvtai.common.tree_codes import MAX_NODES
 from uuvtai.config import BehaviorConfig, Config
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.behavior import avoidance, threats, tree
@@ -57,7 +58,7 @@ N_SAMPLE = round(CFG.tracking.horizon_s / CFG.tracking.forecast_dt_s) + 1
 TIMES = np.arange(N_SAMPLE) * CFG.tracking.forecast_dt_s
 CELL = CFG.mapping.cell_m
 SIZES = {
-    "n_env": N_ENV, "n_node": CFG.behavior.max_node, "n_candidate": CFG.behavior.n_candidate,
+    "n_env": N_ENV, "n_node": MAX_NODES, "n_candidate": CFG.behavior.n_candidate,
     "n_track": N_TRACK, "n_forecast": N_SAMPLE, "n_future": 2, "n_height": 16, "n_ray": N_RAY, "n_ahead": 16,
     "n_tuned": len(TUNED), "n_row": grid_shape(TANK, CELL)[0], "n_col": grid_shape(TANK, CELL)[1],
 }  # fmt: skip
