@@ -63,6 +63,7 @@ def test_extends_a_preset_and_a_neighbour(tmp_path):
         ("episode.control_dt_s='0.02'", "valid number"),
         ("world.tank.x_m=[3,1]", "low < high"),
         ("world.tank.x_m=[1,2", "not valid YAML"),
+        ("mapping.stamp=0", "; delete a key of an older version that is not among them"),
         ("world", "write key.sub=value"),
         ("=3", "write key.sub=value"),
     ],

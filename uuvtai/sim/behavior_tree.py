@@ -112,7 +112,7 @@ def _described(stack: list[Element]) -> bool:
 
 
 UNSET = -1.0
-"""Value of a port that is not given: the leaf takes the number of the config's ``behavior`` section."""
+"""Value of a port that is not given: the leaf takes its usual number."""
 
 
 @dataclass(frozen=True)
