@@ -31,7 +31,7 @@ def measure(job: Job) -> list[Row]:
 def _row(job: Job, what: str, n_env: int, name: str, floor: float) -> Row:
     job.say(f"{n_env} envs, {name}")
     config = load_config("pool", "paper")
-    (own,) = load_agents([f"controller:{EXAMPLES / name}"], config.behavior.max_node)
+    (own,) = load_agents([f"controller:{EXAMPLES / name}"])
     sim = Sim(config, n_env, own.tree, job.device)
     cpu = time.process_time()
     speed, steps = _speed(sim, own, 4 * job.seconds)

@@ -32,7 +32,7 @@ def _row(job: Job, sensors: str, n_env: int) -> Row:
     job.say(f"{n_env} envs, {sensors} sensing")
     config = load_config("pool", sensors)
     begun = time.perf_counter()
-    sim = Sim(config, n_env, read_tree("bt", config.behavior.max_node), job.device)
+    sim = Sim(config, n_env, read_tree("bt"), job.device)
     batch = SimBatch(sim)
     for _ in range(WARM_STEPS):
         batch.step()

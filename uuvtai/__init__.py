@@ -55,12 +55,7 @@ def make(
         raise TypeError(f"num_envs must be an int, got {num_envs!r}")
     checked_seed(seed)
     config = load_config(world, sensors, vehicle, overrides)
-    return VectorEnv(
-        Sim(config, num_envs, read_tree(teacher, config.behavior.max_node), device),
-        seed,
-        check_actions,
-        owns_sim=True,
-    )
+    return VectorEnv(Sim(config, num_envs, read_tree(teacher), device), seed, check_actions, owns_sim=True)
 
 
 _OF_API = ("evaluate", "load_log", "show", "sweep", "train")

@@ -492,7 +492,7 @@ def pilot_vehicle(
     from uuvtai.vehicle.control_loop import fly
 
     config = scene.config()
-    found, failure = fly(config, read_tree(agent, config.behavior.max_node), flight.plan(config), say)
+    found, failure = fly(config, read_tree(agent), flight.plan(config), say)
     output.show(found, lambda screen: show_flight(screen, found))
     if failure is not None:
         raise failure
@@ -518,7 +518,7 @@ def serve_sitl(
     from uuvtai.vehicle.sitl import serve_water
 
     plan, config = served.plan(), scene.config()
-    found = serve_water(config, read_tree("straight", config.behavior.max_node), plan, say)
+    found = serve_water(config, read_tree("straight"), plan, say)
     output.show(found, lambda screen: show_sitl(screen, found))
 
 

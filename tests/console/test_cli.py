@@ -296,9 +296,7 @@ def test_presets_are_listed_and_shown(capfd):
     code, out, _ = uuv(capfd, "presets", "--json")
     listed = json.loads(out)
     assert code == 0
-    assert {"pool", "gauntlet", "column", "mixed", "maze", "netpen", "transfer", "open"} <= set(
-        listed["world"]
-    )
+    assert {"pool", "gauntlet", "column", "maze", "netpen", "transfer", "open"} <= set(listed["world"])
     assert {"clean", "paper", "nominal", "harsh", "multibeam", "multibeam_image", "ping360"} == set(
         listed["sensors"]
     )

@@ -144,7 +144,7 @@ def runs(tmp_path):
 @pytest.mark.parametrize(("words", "offers"), [
     (["ev"], ["eval"]),
     (["eval", "--world", "ga"], ["gauntlet", "gauntlet_inertial"]),
-    (["eval", "--world", "mi"], ["mixed", "mine.yaml"]),
+    (["eval", "--world", "mi"], ["mine.yaml"]),
     (["eval", "--sensors", "n"], ["nominal"]),
     (["train", "cons"], ["constant_20"]),
     (["profile", "--agent", "pl"], ["planner"]),

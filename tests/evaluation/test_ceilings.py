@@ -117,7 +117,7 @@ def test_scenarios_are_those_that_are_played_in_any_batch(small):
 def test_a_tree_of_the_users_own_may_have_a_plus_in_its_name(tmp_path):
     file = tmp_path / "mine+yours.xml"
     file.write_text('<root BTCPP_format="4"><BehaviorTree ID="t"><DriveStraight/></BehaviorTree></root>')
-    plain, answer = load_agents([str(file), f"{file}+truth"], 64)
+    plain, answer = load_agents([str(file), f"{file}+truth"])
     assert (plain.name, plain.privileged, answer.name, answer.privileged) == (
         "mine+yours", False, "mine+yours+truth", True,
     )  # fmt: skip

@@ -140,7 +140,7 @@ def trained(small, tmp_path_factory):
 
 
 def agent_of(folder, small):
-    (agent,) = load_agents([str(folder)], 64, print)
+    (agent,) = load_agents([str(folder)], print)
     note = agent.agent_for(small.sim)
     small.sim.use_tree(agent.tree)
     return agent, note
@@ -227,7 +227,7 @@ def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
     by_run, by_step = (find_policy(str(folder)), find_policy(str(folder / "checkpoints" / "step_000005")))
     manifest = (folder / "checkpoints" / "step_000005" / "manifest.json").read_bytes()
     assert by_run.sha256 == by_step.sha256 == hashlib.sha256(manifest).hexdigest()
-    assert load_agents([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
+    assert load_agents([str(folder / "checkpoints" / "step_000005")], print)[0].name == "mine-step_000005"
     assert observation_of([str(folder)]) == [("observation", config.observation.model_dump(mode="json"))]
 
 
@@ -254,7 +254,7 @@ def test_names_that_are_no_policy(trained, tmp_path):
     with pytest.raises(ValueError, match="is no trained policy"):
         find_policy(str(tmp_path))
     with pytest.raises(ValueError, match="two rows would be called mine"):
-        load_agents([str(trained[0]), f"{trained[0]}/"], 64, print)
+        load_agents([str(trained[0]), f"{trained[0]}/"], print)
 
 
 def test_policies_with_other_columns_are_not_evaluated_together(trained, tmp_path):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+BAND_M_S, BAND_RAD_S = 0.3, 0.5
+
 
 def thrust_of_rpm(rpm, cfg):
     """Thrust [N]: one quadratic per direction, nothing inside the dead band."""
@@ -45,7 +47,7 @@ def control(
     thrust = thrust_of_wrench @ np.array([given[0], given[1], given[2], hold[0], hold[1], given[3]])
     top, bottom = thrust_of_rpm(cfg.rotor_max_rpm, cfg), thrust_of_rpm(-cfg.rotor_max_rpm, cfg)
     share = min(1.0, *(top / t if t > 0 else bottom / t for t in thrust if t != 0))
-    band = np.array([gains.integral_band_m_s] * 3 + [gains.integral_band_rad_s])
+    band = np.array([BAND_M_S] * 3 + [BAND_RAD_S])
     bound = np.array([gains.max_integral_n] * 3 + [gains.max_integral_n_m])
     saturated = (share < 1) | (given != asked)
     part = np.where(

@@ -17,6 +17,8 @@ NO_RETURN_SHARE = 0.999
 ROW_STRIDE = 2
 PRESENT = 0.95
 NEWLY_SEEN_S = 0.15
+BAND_M, WALL_MARGIN_M, SPLIT_M = 0.9, 0.25, 0.25
+GATE_M, MAX_GATE_M, APART_M, TURN_GATE = 0.3, 1.2, 0.35, 12.0
 LEAST_SPEED = 0.5
 """[m/s] a surprising body is taken to change its velocity by at least so much"""
 
@@ -98,8 +100,8 @@ def columns(image, view, cfg, depth, tank):
     margins = np.stack(
         [
             NO_RETURN_SHARE * depth.max_range_m - away,
-            cfg.band_m - height,
-            wall - cfg.wall_margin_m - level,
+            BAND_M - height,
+            wall - WALL_MARGIN_M - level,
             cfg.range_m - level,
         ]
     )
@@ -141,14 +143,14 @@ def corrected(track, offset, along, cut, cut_high, cfg):
     innovation = H[:, :2] @ offset
     surprise = (innovation**2 / (np.diag(H @ track.P @ H.T) + noise)).sum()
     P = track.P.copy()
-    if surprise > cfg.turn_gate:
+    if surprise > TURN_GATE:
         P[[2, 3], [2, 3]] += max(track.speed, LEAST_SPEED) ** 2
         P[[0, 1], [0, 1]] += offset @ offset
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(noise))
     A = np.eye(5) - K @ H
     track.x, track.P = track.x + K @ innovation, A @ P @ A.T + K @ np.diag(noise) @ K.T
     track.present, track.moving = PRESENT, 1
-    return abs(surprise / cfg.turn_gate - 1)
+    return abs(surprise / TURN_GATE - 1)
 
 
 def begun(seen, along, radius, height, step, cfg, tracking):
@@ -163,7 +165,7 @@ def begun(seen, along, radius, height, step, cfg, tracking):
 def follow(tracks, n_track, near, edge, view, scan, step, scan_step, cfg, depth, sonar, tracking, dt_s):
     """Bring ``tracks`` {slot: Track} up to one image's columns; (what was done with each spot, doubt)."""
     late, eye, n_col = (step - scan_step) * dt_s, view.eye(depth), len(near)
-    spots, doubt = spots_of(near, cfg.split_m)
+    spots, doubt = spots_of(near, SPLIT_M)
     done, doubts = [], [doubt]
     for cols in spots:
         distance, highest = near[cols].min(), edge[cols].min()
@@ -171,7 +173,7 @@ def follow(tracks, n_track, near, edge, view, scan, step, scan_step, cfg, depth,
         opening = wrapped(left - right)
         along = unit(right + opening / 2)
         seen = eye[:2] + distance * along
-        shown, unsure = explained(seen, scan, cfg.split_m, sonar.n_ray)
+        shown, unsure = explained(seen, scan, SPLIT_M, sonar.n_ray)
         doubts += [abs(opening * distance - tracking.max_width_m), unsure]
         if opening * distance >= tracking.max_width_m or shown:
             done.append("wide" if not shown else "sonar's")
@@ -182,7 +184,7 @@ def follow(tracks, n_track, near, edge, view, scan, step, scan_step, cfg, depth,
             if (track.moving or track.spot >= 0) and since > NEWLY_SEEN_S + 1e-6 and track.spot != step:
                 offsets[slot] = seen + track.radius * along - track.place(late)
                 way = track.speed * (step - max(track.seen, track.spot)) * dt_s
-                gaps[slot] = np.hypot(*offsets[slot]) - min(cfg.gate_m + 2 * way, cfg.max_gate_m)
+                gaps[slot] = np.hypot(*offsets[slot]) - min(GATE_M + 2 * way, MAX_GATE_M)
         ranked = sorted(gaps.values())
         doubts += [abs(gap) for gap in ranked[:1]] + [
             ranked[1] - ranked[0] for _ in ranked[1:2] if ranked[0] < 0
@@ -190,10 +192,8 @@ def follow(tracks, n_track, near, edge, view, scan, step, scan_step, cfg, depth,
         cut = cols[0] == 0 or cols[-1] == n_col - 1
         if ranked and ranked[0] < 0:
             slot = min(gaps, key=lambda s: gaps[s])
-            doubts += [abs(highest - distance - cfg.split_m)]
-            doubts += [
-                corrected(tracks[slot], offsets[slot], along, cut, highest < distance + cfg.split_m, cfg)
-            ]
+            doubts += [abs(highest - distance - SPLIT_M)]
+            doubts += [corrected(tracks[slot], offsets[slot], along, cut, highest < distance + SPLIT_M, cfg)]
             tracks[slot].spot = step
             done.append("corrected")
         elif cut or scan.step < 0:
@@ -201,7 +201,7 @@ def follow(tracks, n_track, near, edge, view, scan, step, scan_step, cfg, depth,
         else:
             radius = max(opening * distance / 2, tracking.min_radius_m)
             room = [
-                np.hypot(*(t.place(late) - seen - radius * along)) - t.radius - cfg.apart_m
+                np.hypot(*(t.place(late) - seen - radius * along)) - t.radius - APART_M
                 for t in tracks.values()
             ]
             doubts += [abs(r) for r in room]

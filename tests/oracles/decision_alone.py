@@ -32,7 +32,7 @@ def band(log, z_variance, lost):
     """(lowest, highest) z that is steered for; ``lost``: with a dead vertical thruster."""
     t, (floor, surface) = log.config["behavior"], log.scenario["tank"]["z_m"]
     edge = max(t["edge_gap_m"], t["lost_edge_gap_m"] if lost else 0)
-    gap = min(edge + t["edge_sigmas"] * math.sqrt(z_variance), (surface - floor) / 2)
+    gap = min(edge + t["place_sigmas"] * math.sqrt(z_variance), (surface - floor) / 2)
     return floor + gap, surface - gap
 
 

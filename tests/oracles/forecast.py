@@ -2,6 +2,8 @@
 
 import numpy as np
 
+MAX_GROWTH_M = 0.5
+
 
 def turned(v, angle):
     c, s = np.cos(angle), np.sin(angle)
@@ -19,4 +21,4 @@ def arc(pos, vel, rate, t):
 def growth(cov, t, tracking):
     """What the filter's uncertainty adds to the radius t [s] ahead; cov is 4 x 4."""
     F = np.hstack([np.eye(2), t * np.eye(2)])
-    return min(tracking.growth_sigmas * np.sqrt(np.linalg.eigvalsh(F @ cov @ F.T)[-1]), tracking.max_growth_m)
+    return min(tracking.growth_sigmas * np.sqrt(np.linalg.eigvalsh(F @ cov @ F.T)[-1]), MAX_GROWTH_M)

@@ -10,6 +10,7 @@ import numpy as np
 
 N = 9
 GRAVITY = 9.81
+NEWEST_SHARE, JUMP_SHARE, ACCEL_DENSITY = 0.8, 0.12, 1e-6
 SIDE = 2
 """beams on either side that are looked at together, in packets of sixteen"""
 UP = np.triu_indices(N)
@@ -115,14 +116,14 @@ class Filter:
 
     def won(self, jump):
         """Variance that a velocity wins in a step whose acceleration changed by ``jump``."""
-        imu, cfg = self.sensors.imu, self.cfg
+        imu = self.sensors.imu
         noise = imu.accel_sigma_m_s2**2 + (GRAVITY * imu.attitude_sigma_rad) ** 2
-        return (noise + (cfg.jump_share * jump) ** 2) * self.dt**2 + cfg.accel_density * self.dt
+        return (noise + (JUMP_SHARE * jump) ** 2) * self.dt**2 + ACCEL_DENSITY * self.dt
 
     def move(self, roll, pitch, imu_yaw, before, now):
         """One step between two readings (acceleration ahead, left, up, yaw rate); the body leans by roll and
         pitch."""
-        dt, share, jump = self.dt, self.cfg.newest_share, now - before
+        dt, share, jump = self.dt, NEWEST_SHARE, now - before
         accel, angle = share * now[:3] + (1 - share) * before[:3], 0.5 * dt * (now[3] + before[3])
         bias = np.array([self.mean[7], self.mean[8], self.depth[3]])
         accel = accel - (level(roll, pitch, bias) - bias)
@@ -223,7 +224,7 @@ class Filter:
 class Voyage:
     """Truth and readings of ``n`` vehicles that steer for another velocity now and then."""
 
-    def __init__(self, n, steps, sensors, cfg, tank, dt, rng, obstacles=None):
+    def __init__(self, n, steps, sensors, tank, dt, rng, obstacles=None):
         self.sensors, self.tank, self.rng, self.obstacles = sensors, tank, rng, obstacles
         t = np.arange(steps)[:, None] * dt
         mid = np.array([sum(tank.x_m), sum(tank.y_m)]) / 2
@@ -239,8 +240,8 @@ class Voyage:
         for k in range(1, steps):
             accel[k] = (aim[k] - self.vel[k - 1]) / 0.3
             jump = accel[k] - accel[k - 1]
-            between = accel[k] + (cfg.newest_share - 1 + cfg.jump_share * rng.normal(size=(n, 3))) * jump
-            between += np.sqrt(cfg.accel_density / dt) * rng.normal(size=(n, 3))
+            between = accel[k] + (NEWEST_SHARE - 1 + JUMP_SHARE * rng.normal(size=(n, 3))) * jump
+            between += np.sqrt(ACCEL_DENSITY / dt) * rng.normal(size=(n, 3))
             before = rotated(self.yaw[k - 1], self.vel[k - 1])
             push = rotated((self.yaw[k] + self.yaw[k - 1]) / 2, dt * between)
             self.pos[k] = self.pos[k - 1] + dt * (before + push / 2)

@@ -9,7 +9,7 @@ SLACK_M = 0.25
 """what is this much farther than the middle, or nearer than the near side, is not the body"""
 TRUNCATED_M = 0.4
 EDGE_M = 0.1
-LEAST = 0.05
+LEAST, HIT_SHARE = 0.05, 0.5
 
 
 def column_through(pos, rpy, at, depth):
@@ -29,7 +29,7 @@ def column_through(pos, rpy, at, depth):
     return rays, eye, ahead, col, abs(place - np.round(place))
 
 
-def look(share, present, image, pos, rpy, at, radius, cfg, depth, tank):
+def look(share, present, image, pos, rpy, at, radius, depth, tank):
     """(shares, presence, doubt) after an image [rows, cols]; ``doubt``: how near float32 is to differing."""
     rays, eye, ahead, col, doubt = column_through(pos, rpy, at, depth)
     doubt = min(doubt, abs(ahead - radius - SLACK_M), abs(depth.max_range_m - SLACK_M - ahead))
@@ -52,7 +52,7 @@ def look(share, present, image, pos, rpy, at, radius, cfg, depth, tank):
     offs = np.array([abs(front[row, 2] - height) for row, height in zip(rows, z, strict=True)])
     doubt = min(doubt, np.abs(offs - pitch / 2).min())
     free = (offs < pitch / 2) & past[rows]
-    likely = np.append(np.where(free, 1 - cfg.camera_hit_share, 1.0), 1 - cfg.camera_hit_share)
+    likely = np.append(np.where(free, 1 - HIT_SHARE, 1.0), 1 - HIT_SHARE)
     return (*height.seen_not(share, present, likely), doubt) if free.any() else (share, present, doubt)
 
 

@@ -10,6 +10,9 @@ import numpy as np
 
 ARC = np.pi / 4
 CONFIRMED = 3
+SPLIT_M, SPLIT_SLOPE, SPLIT_DOPPLER_M_S = 0.18, 0.03, 0.3
+MOVING_M_S, MOVING_DOPPLER_M_S, SIGHT_DOPPLER_M_S = 0.08, 0.03, 0.2
+MOVING_SHIFT_M, SHIFT_S, SHIFT_MEMORY_S, DOPPLER_MEMORY_S = 0.12, 0.5, 2.0, 0.5
 
 
 @dataclass
@@ -70,8 +73,8 @@ def range_variance(r, sonar):
     )
 
 
-def split_distance(r, cfg, sonar):
-    return max(cfg.split_m + cfg.split_slope * r, 4 * np.sqrt(range_variance(r, sonar)))
+def split_distance(r, sonar):
+    return max(SPLIT_M + SPLIT_SLOPE * r, 4 * np.sqrt(range_variance(r, sonar)))
 
 
 # --------------------------------------------------------------------------------------------------- clusters
@@ -113,12 +116,12 @@ def clusters_of(scan, cfg, sonar, tank):
     n, r = sonar.n_ray, scan.range_m
 
     def joined(a, b):
-        close = abs(r[b] - r[a]) <= split_distance(r[a], cfg, sonar)
+        close = abs(r[b] - r[a]) <= split_distance(r[a], sonar)
         return (
             candidate[a]
             and candidate[b]
             and close
-            and abs(still[b] - still[a]) <= cfg.split_doppler_m_s + 6 * sonar.doppler_sigma_m_s
+            and abs(still[b] - still[a]) <= SPLIT_DOPPLER_M_S + 6 * sonar.doppler_sigma_m_s
         )
 
     def follower(a):
@@ -300,36 +303,36 @@ def update(track, c, dt, scan, cfg, sonar):
     ):
         x, P = corrected(x, P, h, z - h @ x[:4], v)
     track.x, track.P = x, P
-    evidence(track, c, dt, before, cfg, sonar)
+    evidence(track, c, dt, before)
     track.z, track.seen, track.misses = scan.pos[2], scan.step, 0
     track.moving = is_moving(track, c, dt, cfg, sonar)
     turn(track, before, cfg)
 
 
-def evidence(track, c, dt, before, cfg, sonar):
-    known, new = 1 / (track.doppler_var * (1 + dt / cfg.doppler_memory_s)), 1 / c.doppler_var
+def evidence(track, c, dt, before):
+    known, new = 1 / (track.doppler_var * (1 + dt / DOPPLER_MEMORY_S)), 1 / c.doppler_var
     track.doppler = (known * track.doppler + new * c.doppler) / (known + new)
     track.doppler_var = 1 / (known + new)
-    track.shift = track.shift / (1 + dt / cfg.shift_memory_s)
+    track.shift = track.shift / (1 + dt / SHIFT_MEMORY_S)
     if not c.hidden:
         track.shift = track.shift + track.x[:2] - before[:2] + dt * before[2:4]
     swing = (c.bearing - track.sight + np.pi) % (2 * np.pi) - np.pi
-    track.sweep = track.sweep / (1 + dt / cfg.shift_memory_s) + swing
+    track.sweep = track.sweep / (1 + dt / SHIFT_MEMORY_S) + swing
     track.sight = c.bearing
 
 
 def is_moving(track, c, dt, cfg, sonar):
     v = track.x[2:4]
-    fast = np.hypot(*v) > cfg.moving_speed_m_s
-    shown = abs(track.doppler) > max(cfg.moving_doppler_m_s, 4 * np.sqrt(track.doppler_var))
+    fast = np.hypot(*v) > MOVING_M_S
+    shown = abs(track.doppler) > max(MOVING_DOPPLER_M_S, 4 * np.sqrt(track.doppler_var))
     noise = np.sqrt(
         np.linalg.eigvalsh(track.P[:2, :2])[-1]
         + centre_variances(c, track.radius, track.radius_var, cfg, sonar)[1]
     )
-    reach = cfg.moving_shift_m + 0.5 * cfg.max_width_m * abs(track.sweep) + 2 * noise
+    reach = MOVING_SHIFT_M + 0.5 * cfg.max_width_m * abs(track.sweep) + 2 * noise
     length = np.hypot(*track.shift)
     shown = shown or (
-        length > reach and track.shift @ v > 0.8 * length * np.hypot(*v) and track.age * dt > cfg.shift_s
+        length > reach and track.shift @ v > 0.8 * length * np.hypot(*v) and track.age * dt > SHIFT_S
     )
     return int((fast and shown and track.age >= CONFIRMED - 1) or (track.moving and (fast or shown)))
 
@@ -345,13 +348,13 @@ def turn(track, before, cfg):
     track.x[4] = np.clip(track.x[4], -4, 4)
 
 
-def sight_of(track, scan, cfg, sonar):
+def sight_of(track, scan, sonar):
     spacing = 2 * np.pi / sonar.n_ray
     d = track.x[:2] - scan.pos[:2]
     distance = np.hypot(*d)
     middle = int(np.floor((np.arctan2(d[1], d[0]) - scan.yaw) / spacing + 0.5))
     half = int(0.5 * track.radius / (max(distance, track.radius) * spacing))
-    slack = track.radius + split_distance(distance, cfg, sonar)
+    slack = track.radius + split_distance(distance, sonar)
     beams = np.arange(middle - half, middle + half + 1) % sonar.n_ray
     past = (scan.hit[beams] == 0) | (scan.range_m[beams] > distance + slack)
     before = (scan.hit[beams] == 1) & (scan.range_m[beams] < distance - slack)
@@ -364,7 +367,7 @@ def prune(tracks, scan, cfg, sonar, dt_s):
         if track.misses == 0:
             continue
         unseen = (scan.step - track.seen) * dt_s
-        sight = sight_of(track, scan, cfg, sonar)
+        sight = sight_of(track, scan, sonar)
         gone = sight == "through" and (track.age < CONFIRMED or unseen >= cfg.see_through_s)
         lost = unseen > (cfg.hidden_s if sight == "blocked" else cfg.max_misses * 0.1)
         double = any(
@@ -385,7 +388,7 @@ def spawn(tracks, clusters, matched, scan, cfg, sonar):
             if (
                 track.misses == 0
                 and near
-                and abs(c.doppler - track.doppler) < cfg.split_doppler_m_s + 3 * sonar.doppler_sigma_m_s
+                and abs(c.doppler - track.doppler) < SPLIT_DOPPLER_M_S + 3 * sonar.doppler_sigma_m_s
             ):
                 c.match = t
         if c.match < 0:
@@ -398,7 +401,7 @@ def spawn(tracks, clusters, matched, scan, cfg, sonar):
 
 
 def slot_for(tracks, c, scan, cfg):
-    moves = abs(c.doppler) > max(cfg.moving_doppler_m_s, 4 * np.sqrt(c.doppler_var))
+    moves = abs(c.doppler) > max(MOVING_DOPPLER_M_S, 4 * np.sqrt(c.doppler_var))
     worst, out = -1.0 if moves else c.range_m + c.radius, -1
     for t in range(cfg.n_track):
         if t not in tracks:
@@ -421,7 +424,7 @@ def begun(c, scan, cfg, sonar):
     P[2:4, 2:4] = turn_in @ np.diag([c.doppler_var, cfg.birth_speed_sigma_m_s**2]) @ turn_in.T
     x = np.concatenate([scan.pos[:2] + distance * along, c.doppler * along, [0.0]])
     track = Track(x, P, radius, radius_var, scan.pos[2], c.doppler, c.doppler_var, c.bearing, scan.step)
-    clear = max(cfg.sight_doppler_m_s, 6 * np.sqrt(c.doppler_var))
+    clear = max(SIGHT_DOPPLER_M_S, 6 * np.sqrt(c.doppler_var))
     track.moving = int(len(c.beams) >= 3 and abs(c.doppler) > clear)
     return track
 

@@ -7,6 +7,7 @@ import numpy as np
 STRAIGHT_SIGMA, SETTLED = 0.4, 0.05
 TURNED_COS, ALIKE_COS = 0.9, 0.94
 LONGEST_S, MISFIT_M, SAME_M, MOST_WEIGHT = 4.0, 0.3, 0.4, 4.0
+STRAIGHT_ODDS, ACROSS_M, ACROSS_SLOPE, OVERDUE_M, PASSED_M = 4.0, 0.25, 0.1, 0.15, 0.5
 
 
 @dataclass
@@ -27,7 +28,7 @@ def expected_turn_rate(rate, rate_var, cfg, tracking):
         return 0.0
     prior = np.exp(0.0) / tracking.turn_rate_sigma_rad_s
     posterior = np.exp(-0.5 * rate**2 / rate_var) / np.sqrt(rate_var)
-    return rate if prior > cfg.straight_odds * posterior and rate != 0 else 0.0
+    return rate if prior > STRAIGHT_ODDS * posterior and rate != 0 else 0.0
 
 
 def is_straight(x, P, rate, rate_var):
@@ -45,7 +46,7 @@ def corner(p0, d0, p1, d1, way):
     return 0.5 * (here + there), np.hypot(*(here - there)), a, b
 
 
-def learn(turns, next_slot, leg, leg_time, x, now, cfg):
+def learn(turns, next_slot, leg, leg_time, x, now):
     """``leg``: (last straight state, time [s]) of a track now straight at x, or None. The next slot."""
     if leg is None or now - leg_time >= LONGEST_S:
         return next_slot
@@ -54,11 +55,7 @@ def learn(turns, next_slot, leg, leg_time, x, now, cfg):
         moved = np.hypot(*x[2:]) * (now - leg_time)
         for turn in turns:
             along, across = offset(turn, x[:2], d1)
-            if (
-                turn.weight > 0
-                and -cfg.passed_m - moved <= along < -cfg.passed_m
-                and across < 0.5 * cfg.across_m
-            ):
+            if turn.weight > 0 and -PASSED_M - moved <= along < -PASSED_M and across < 0.5 * ACROSS_M:
                 turn.weight -= 1
         return next_slot
     pos, misfit, a, b = corner(
@@ -109,7 +106,7 @@ def next_event(turns, pos, course, radius, cfg, tank):
     best, out = 1e6, course
     for turn in turns if cfg.use_turn_history else []:
         along, across = offset(turn, pos, course)
-        if -cfg.overdue_m < along < best and across < cfg.across_m + cfg.across_slope * along:
+        if -OVERDUE_M < along < best and across < ACROSS_M + ACROSS_SLOPE * along:
             best, out = along, turn.went
     best = max(best, 0.0)
     if cfg.use_reflection and max(wall_ahead(pos, course, radius, tank), 0.0) < best:

@@ -135,7 +135,7 @@ def test_two_rows_never_share_a_name(write):
     Path("other").mkdir()
     write(AWAY, "other/mine.py")
     with pytest.raises(ConfigError, match="two rows would be called mine-act"):
-        load_agents(["controller:mine.py:act", "controller:other/mine.py:act"], 64)
+        load_agents(["controller:mine.py:act", "controller:other/mine.py:act"])
 
 
 # ---------------------------------------------------------------------------------------------------- loading

@@ -208,7 +208,7 @@ def test_custom_tree_stands_beside_the_shipped_ones(example, monkeypatch):
     monkeypatch.setattr(uuvtai, "evaluate", lambda *given, **words: asked.append((given, words)) or "a table")
     assert example("custom_tree").main(seeds=3) == "a table"
     (((trees, world), words),) = asked
-    assert [agent.name for agent in load_agents(list(map(str, trees)), 64)] == ["patient", "bt", "planner"]
+    assert [agent.name for agent in load_agents(list(map(str, trees)))] == ["patient", "bt", "planner"]
     assert world == "pool" and words == {"episodes": 128, "seeds": 3}
 
 
@@ -225,7 +225,7 @@ OWN = {"own_astar.py": "planner", "own_field.py:act": "controller", "own_torch.p
 @pytest.mark.parametrize("name", OWN)
 def test_an_own_piece_drives(short, name):
     """It runs its episodes without an error, and gets nearer to the goal."""
-    agent = load_agents([f"{OWN[name]}:{EXAMPLES / name}"], 64)[0]
+    agent = load_agents([f"{OWN[name]}:{EXAMPLES / name}"])[0]
     observed, short.planner = short.observation, agent.planner_for(short)
     try:
         note = agent.agent_for(short)
@@ -263,7 +263,7 @@ def test_what_a_trainer_saved_drives_as_an_own_policy(short, example, tmp_path, 
     with torch.no_grad():
         expected = example(name).play(short, tmp_path)(obs)
     obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
-    agent = load_agents([spec], 64)[0].agent_for(short).agent
+    agent = load_agents([spec])[0].agent_for(short).agent
     found = agent.decide(torch.from_numpy(obs)).action.numpy()
     np.testing.assert_allclose(found, np.clip(expected, -1, 1), rtol=1e-4, atol=1e-5)
     assert agent.code.marks.hold_steps == example("judge").HOLD_STEPS

@@ -89,7 +89,5 @@ def test_the_papers_own_numbers_are_the_presets():
     assert (e.goal_radius_m, e.collision_clearance_m, e.ttc_s) == (1.0, 0.1, 0.18)
     assert (sonar.n_ray, sonar.max_range_m) == (256, 12.0)
     assert (camera.cols, camera.rows, camera.fov_deg, camera.max_range_m) == (128, 72, 90.0, 10.0)
-    assert (c.clearance.inflate_m, c.route.rrt_clearance_m, c.mapping.stamp, c.tracking.horizon_s) == (
-        0.08, 0.1, 0.0, 2.5,
-    )  # fmt: skip
+    assert (c.clearance.inflate_m, c.route.rrt_clearance_m, c.tracking.horizon_s) == (0.08, 0.1, 2.5)
     assert (c.disturbance, c.sensors.localization) == (LearningConfig().disturbance, "truth")

@@ -95,6 +95,7 @@ def test_names_that_have_a_better_one_are_nowhere():
         ("behavior.body_doubt", "behavior.obstacle_growth"),
         ("features.teacher", "observation.behavior"),
         ("pose.use_walls", "localization.use_walls"),
+        ("behavior.edge_sigmas", "behavior.place_sigmas"),
     ],
 )
 def test_an_old_key_is_refused_with_its_new_name(old, new):

@@ -17,7 +17,7 @@ from uuvtai.sim.sim import Sim
 def test_a_stacks_name_is_an_agent_with_its_own_config_and_tree(tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text("extends: paper\ntree: planner\n")
-    bt, paper, with_truth, own = load_agents(["bt", "paper", "paper+truth", str(mine)], 64)
+    bt, paper, with_truth, own = load_agents(["bt", "paper", "paper+truth", str(mine)])
     config = load_config("pool")
     assert (bt.name, bt.stack, bt.document()) == ("bt", None, {}) and bt.config_of(config) is config
     assert (paper.name, paper.privileged, paper.tree.types) == ("paper", False, bt.tree.types)
@@ -31,9 +31,9 @@ def test_an_agent_that_is_neither_preset_nor_file_is_refused():
     with pytest.raises(
         ConfigError, match="--agent papr: is no preset, file or run folder; did you mean 'paper'"
     ):
-        load_agents(["papr"], 64)
+        load_agents(["papr"])
     with pytest.raises(ConfigError, match=r"nowhere.yaml.*no such file"):
-        load_agents(["nowhere.yaml"], 64)
+        load_agents(["nowhere.yaml"])
 
 
 def test_a_stack_touches_nothing_that_makes_an_episode():
@@ -99,7 +99,7 @@ def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
 def test_every_stack_plans_and_drives(small, stack):
     """Their kernels differ from those of all other tests by more than numbers."""
     config = with_stack(small.config, stack)
-    sim = Sim(config, small.N, read_tree(tree_of_stack(stack), config.behavior.max_node))
+    sim = Sim(config, small.N, read_tree(tree_of_stack(stack)))
     every = torch.ones(small.N, dtype=torch.int32)
     sim.reset(every, 5 * every, torch.arange(small.N, dtype=torch.int32))
     for _ in range(100):

@@ -13,7 +13,6 @@ from docs.writers.palettes import with_palette
 from tests.bundles import Stage, put
 from uuvtai.common import tree_codes as codes
 from uuvtai.common.presets import preset_names
-from uuvtai.config import BehaviorConfig
 from uuvtai.config.behavior import TUNED
 from uuvtai.config.loader import ConfigError, preset_path
 from uuvtai.console.screen import Screen
@@ -151,7 +150,7 @@ def test_presets_open_in_groot(name):
     assert with_palette(text) == text
     used = {node.tag for tree in root.findall("BehaviorTree") for node in tree.iter()} - {"BehaviorTree"}
     assert used <= {*behavior_tree.LEAVES, *behavior_tree.CONTROLS, *behavior_tree.DECORATORS}
-    assert len(behavior_tree.read_tree(name, BehaviorConfig().max_node).kind) <= BehaviorConfig().max_node
+    assert len(behavior_tree.read_tree(name).kind) <= codes.MAX_NODES
 
 
 @pytest.mark.parametrize("width", [80, 100, 120])
@@ -297,14 +296,6 @@ def test_priority_halts_what_ran_below(engine):
     assert rows[0] == ([R, F, F, IDLE, R, S, R], "Unstick")
     assert rows[1] == ([R, R, S, R, IDLE, IDLE, IDLE], "BackOff")
     assert rows[2] == ([F, F, F, IDLE, F, F, IDLE], None)  # the interrupted sequence began anew
-
-
-def test_tree_that_does_not_fit_is_refused(engine):
-    with pytest.raises(behavior_tree.TreeError, match="do not fit"):
-        behavior_tree.load_tree(
-            engine.table,
-            behavior_tree.parse_tree(xml("<Sequence>" + "<Hold/>" * (MAX_NODE + 1) + "</Sequence>")),
-        )
 
 
 def test_leaf_codes_are_distinct():

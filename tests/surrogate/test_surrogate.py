@@ -501,13 +501,6 @@ def test_what_cannot_be_begun_with_is_refused(bank, saved, tmp_path):
         runner._started(tmp_path / "none", load_training("ppo"), print)
 
 
-def test_the_critic_may_be_kept_from_the_truth(bank):
-    config = load_training("policy", overrides=SMALL | {"ppo.critic_sees_truth": False})
-    trainer = Trainer(InSurrogate(config, bank), config)
-    trainer.iterate()
-    assert trainer.policy.critic.net.obstacle[0].in_features == OBSTACLE_WIDTH
-
-
 # ------------------------------------------------------------------------------------- warm start
 
 

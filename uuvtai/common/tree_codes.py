@@ -43,6 +43,7 @@ VELOCITY_OBSTACLE = 34
 PATH_INTEGRAL = 35
 
 MAX_PORTS = 4  # Numbers that a leaf can be given.
+MAX_NODES = 64  # Nodes of a tree, those of its subtrees included.
 
 
 @dataclass(frozen=True)

@@ -63,14 +63,13 @@ class BehaviorConfig(Section):
     patience_s: NonNegative = 3.0
     """a vehicle that has waited longer, before crossing traffic say, is less cautious: by this over the time
     that it has waited; 0 = it waits for ever"""
-    waiting_m_s: Positive = 0.2
-    """as long as it comes on along its way more slowly than this it waits; faster, it forgets that it did"""
     obstacle_growth: Positive = 1.0
     """factor of what an obstacle's radius grows by in its forecast, as that is less and less sure"""
     static_margin_m: NonNegative = 0.1
     """wanted clearance beyond contact from mapped obstacles and walls"""
     place_sigmas: NonNegative = 3.0
-    """walls and mapped obstacles are taken to be nearer by so many standard deviations of the own place"""
+    """walls and mapped obstacles are taken to be nearer by so many standard deviations of the own place,
+    surface and floor by as many of the own depth"""
     static_horizon_s: Positive = 1.5
     static_dt_s: Positive = 0.25
 
@@ -96,26 +95,16 @@ class BehaviorConfig(Section):
     conflict_within_s: NonNegative = 2.5
     emergency_ttc_s: NonNegative = 0.15
     emergency_range_m: NonNegative = 0.07
-    emergency_closing_m_s: NonNegative = 0.15
-    """slower approach is no emergency"""
     back_off_m_s: Positive = 0.85
-    blocked_clearance_m: NonNegative = 0.25
-    """the way to the look-ahead point is blocked below this static clearance"""
-    goal_near_m: Positive = 1.5
-    stuck_s: Positive = 4.0
-    unstick_s: Positive = 1.5
-    unstick_m_s: Positive = 0.3
     slow_clearance_m: Positive = 0.6
     """speed falls below cruise where the static clearance is smaller than this"""
     slow_fraction: Fraction = 0.75
     """share of cruise speed left at contact"""
     edge_gap_m: NonNegative = 0.2
-    """hull centre to surface or floor, at least: the hull's radius of 0.17 m and 0.03 m,"""
+    """hull centre to surface or floor, at least: the hull's radius of 0.17 m and 0.03 m"""
     lost_edge_gap_m: NonNegative = 0.35
     """the same, if it is more, once a vertical thruster is suspected to be dead; the vehicle then cruises at
     the goal's depth"""
-    edge_sigmas: NonNegative = 3.0
-    """and so many standard deviations of the own depth"""
     free_depth: bool = True
     """cruise at the depth where the fewest obstacles are to be met, as far as the goal's depth can still be
     reached in time; false = at the goal's depth"""
@@ -156,7 +145,6 @@ class BehaviorConfig(Section):
     and waits for the first sweep"""
     yaw_gain: Positive = 2.5
     """[1/s]"""
-    max_node: PositiveCount = 64
 
     @property
     def n_held(self) -> int:
@@ -222,8 +210,6 @@ class FastConfig(TunedConfig):
     """speed of the fastest tracked obstacle, less its standard deviation, up to which ``slow`` holds alone"""
     full_m_s: NonNegative = 1.2
     """speed from which on these factors hold alone"""
-    settle_s: Positive = 1.0
-    """time constant of the mean of that speed"""
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -52,8 +52,6 @@ class PpoConfig(Section):
     max_grad_norm: Positive = 1.0
     target_kl: NonNegative = 0.0
     """0 = fixed learning rate; else the rate follows the KL divergence of every update (as rsl_rl does)"""
-    critic_sees_truth: bool = True
-    """the critic is told where obstacles truly are and will be, where the environment can (the surrogate)"""
     normalise_observations: bool = True
     normalise_values: bool = True
 

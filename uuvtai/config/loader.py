@@ -439,7 +439,8 @@ def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
 RENAMED = {
     "askew_clearance_m": "sideslip_clearance_m", "body_doubt": "obstacle_growth",
     "body_hidden": "obstacle_hidden", "body_returns_per_m": "obstacle_returns_per_m",
-    "calm_s": "hysteresis_s", "distill": "distillation", "elevation": "height", "features": "observation",
+    "calm_s": "hysteresis_s", "distill": "distillation", "edge_sigmas": "place_sigmas",
+    "elevation": "height", "features": "observation",
     "forecaster": "forecast_training", "gaze_clearance_m": "heading_clearance_m",
     "gaze_level_m": "heading_level_m", "gaze_m": "heading_range_m", "gaze_off_deg": "heading_off_deg",
     "heed_share": "evade_probability", "pose": "localization", "softness": "temperature",
@@ -477,7 +478,10 @@ def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseM
             got = repr(problem.get("input"))
             shown = got if len(got) <= _MOST_GOT else f"{got[:_MOST_GOT]} ..."
             lines.append(f"{where}{dotted}: {problem['msg']} (got {shown})")
-    return "\n".join(lines) + "\n'uuv presets show NAME --all' prints every key with its value"
+    lines.append("'uuv presets show NAME --all' prints every key with its value")
+    if any(problem["type"] == "extra_forbidden" for problem in error.errors()):
+        lines[-1] += "; delete a key of an older version that is not among them"
+    return "\n".join(lines)
 
 
 def _origin_of(dotted: str, origin: dict[str, str]) -> str:

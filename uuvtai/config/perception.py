@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from uuvtai.config.base import Fraction, NonNegative, Packets, Positive, PositiveCount, Section
 
@@ -13,14 +13,6 @@ class LocalizationConfig(Section):
     """Filter of the own pose, where ``sensors.localization`` is ``estimated`` (values EC, tuned). What the
     sensors do wrong it takes from their own sections."""
 
-    newest_share: Fraction = 0.8
-    """share of a step's mean acceleration that its newest reading tells, the one before tells the rest:
-    rotors follow their command within a step"""
-    jump_share: NonNegative = 0.12
-    """standard deviation of that share: what a change of the acceleration leaves unknown"""
-    accel_density: Positive = 1e-6
-    """[m^2/s^3] spectral density of what else the acceleration leaves unknown; the accelerometer's own errors
-    come on top"""
     sure_speed_m_s: Positive = 0.1
     """the own velocity counts as known (``vel_valid``) while its standard deviation is smaller: the velocity
     loop is closed by it"""
@@ -48,10 +40,6 @@ class TrackingConfig(Section):
     n_cluster: PositiveCount = 48
     period_steps: PositiveCount = 3
     """control steps between tracked scans, at least; scans in between are left out"""
-    split_m: NonNegative = 0.18
-    split_slope: NonNegative = 0.03
-    split_doppler_m_s: Positive = 0.3
-    """neighbouring beams whose Doppler differs by more (plus 6 sigma) belong to different obstacles"""
     wall_margin_m: NonNegative = 0.15
     """returns this close (plus 2 sigma of range) to a known wall are dropped"""
     max_width_m: Positive = 0.75
@@ -75,16 +63,6 @@ class TrackingConfig(Section):
     """a cluster with free edges that is narrower than its track by more standard deviations than this is a
     part of the body, which leaves the sonar's fan by its nearest side first; 0 = it is all of it
     (``research/LOG.md``)"""
-    moving_speed_m_s: NonNegative = 0.08
-    moving_doppler_m_s: NonNegative = 0.03
-    sight_doppler_m_s: Positive = 0.2
-    """an obstacle moves from its first scan on where its Doppler is larger"""
-    moving_shift_m: NonNegative = 0.12
-    """displacement (forgotten over shift_memory_s) that shows motion across the beams"""
-    shift_memory_s: Positive = 2.0
-    shift_s: NonNegative = 0.5
-    """displacement counts from this age on"""
-    doppler_memory_s: Positive = 0.5
     max_misses: PositiveCount = 8
     """in units of nominal 10 Hz scans"""
     see_through_s: NonNegative = 0.15
@@ -95,7 +73,6 @@ class TrackingConfig(Section):
     forecast_dt_s: Positive = 0.1
     growth_sigmas: NonNegative = 1.0
     """a forecast's radius grows by this many standard deviations of the predicted position"""
-    max_growth_m: NonNegative = 0.5
 
 
 class ForecastConfig(Section):
@@ -104,21 +81,10 @@ class ForecastConfig(Section):
 
     use_turn_rate: bool = True
     """obstacles keep their turn rate; off: straight ahead"""
-    straight_odds: Positive = 4.0
-    """prior odds that an obstacle goes straight: a turn rate is used where its evidence against 0 outweighs
-    them"""
     use_turn_history: bool = True
     """obstacles turn where one was seen to turn"""
     n_turn: Packets = 48
     """turns remembered"""
-    across_m: Positive = 0.25
-    """a course that passes a remembered turn within this leads to it,"""
-    across_slope: NonNegative = 0.1
-    """and within this more per metre ahead"""
-    overdue_m: NonNegative = 0.15
-    """a turn this far behind may still come: the filter lags"""
-    passed_m: Positive = 0.5
-    """a turn this far behind did not come"""
     use_reflection: bool = True
     """obstacles turn back at the tank's walls"""
     use_coasting: bool = True
@@ -146,31 +112,8 @@ class HeightConfig(Section):
     """half height assumed where an obstacle is not seen: the flattest one that would hide so"""
     column_share: Fraction = 0.05
     """share of moving obstacles expected to go through the full water column"""
-    edge_m: Positive = 0.06
-    """half width of the soft edge of the fan"""
-    evidence_s: Positive = 0.15
-    """scans closer together than this are not independent evidence"""
-    hit_share: Fraction = 0.9
-    """probability that an obstacle in the fan is hit, where its place is known exactly"""
     use_camera: bool = True
     """let the camera's image tell heights too"""
-    camera_hit_share: Annotated[float, Field(ge=0, lt=1)] = 0.5
-    """probability that an obstacle in the image and at a free distance shows in the column through its
-    middle"""
-    gone_share: Fraction = 0.25
-    """below this probability of being where it is expected, an obstacle is forgotten"""
-    tail_share: Fraction = 0.02
-    """heights that are less likely than this are taken to be free"""
-    column_tail_share: Fraction = 0.15
-
-    @model_validator(mode="after")
-    def _is_somewhere(self) -> HeightConfig:
-        if 15 * self.tail_share + self.column_tail_share >= 1:
-            raise ValueError(
-                f"tail_share {self.tail_share} of 15 heights and column_tail_share {self.column_tail_share} "
-                "must sum to less than 1: else an obstacle could be taken to be nowhere"
-            )
-        return self
 
 
 class CameraTrackingConfig(Section):
@@ -180,21 +123,8 @@ class CameraTrackingConfig(Section):
     """off: the image tells heights only"""
     range_m: Positive = 4.0
     """nothing farther is looked at: the sonar's fan is high enough there"""
-    band_m: Positive = 0.9
-    """nor what is farther above or below the camera"""
-    wall_margin_m: NonNegative = 0.25
-    split_m: Positive = 0.25
-    """a larger jump of distance between columns separates spots; a sonar return within it explains one"""
     sigma_m: Positive = 0.035
     """error of a spot's place"""
-    gate_m: Positive = 0.3
-    """a spot this close to where a track is expected may match it,"""
-    max_gate_m: Positive = 1.2
-    """and farther for obstacles that were not seen for long, up to this"""
-    apart_m: Positive = 0.35
-    """a spot farther than this from every track is an obstacle of its own"""
-    turn_gate: Positive = 12.0
-    """squared normalised innovation (2 values) beyond which an obstacle is taken to have turned"""
 
 
 class MappingConfig(Section):
@@ -219,8 +149,6 @@ class MappingConfig(Section):
     """eta_dyn,free"""
     dynamic_decay: Fraction = 0.1
     """lambda_d"""
-    stamp: Fraction = 0.0
-    """eta_stamp: gain of the simulator-side debugging stamp; must stay 0 in every preset"""
     doppler_evidence_m_s: NonNegative = 0.15
     free_confident_s: NonNegative = 0.5
     """a hit in a cell seen free for this long is dynamic evidence"""

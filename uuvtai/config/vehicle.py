@@ -138,14 +138,10 @@ class ActuationConfig(Section):
     """[N s/m]"""
     velocity_integral: tuple[NonNegative, NonNegative, NonNegative] = (40.0, 40.0, 40.0)
     """[N/m]"""
-    integral_band_m_s: Positive = 0.3
-    """errors beyond this do not build up the integral: they are a step under way or a blocked vehicle, and
-    both would overshoot later"""
     yaw_rate_gain: NonNegative = 4.0
     """[N m s]"""
     yaw_rate_integral: NonNegative = 4.0
     """[N m]"""
-    integral_band_rad_s: Positive = 0.5
     max_integral_n: NonNegative = 40.0
     """what a current, lost gain or wrong parameters may take"""
     max_integral_n_m: NonNegative = 4.0
@@ -155,11 +151,6 @@ class ActuationConfig(Section):
     watch_s: NonNegative = 2.0
     """memory of the watch over the vertical thrusters, which notices a dead one and of two gives it up;
     0 = no watch"""
-    watch_ratio: Fraction = 0.3
-    """a thruster is given up when its death leaves less than this share of what any other explanation leaves
-    of the felt thrust; thrusters that lost less than 65 % of their gain never do (EC)"""
-    watch_doubt_n2_s: NonNegative = 1.0
-    """so much more must be left by the others: the accelerometer's noise is no evidence (EC)"""
     hold_gain_n_m: NonNegative = 60.0
     """[N m/rad] roll and pitch, ideal hold"""
     hold_damping: NonNegative = 8.0

@@ -90,8 +90,7 @@ class DynamicObstacles(Section):
     full_column_fraction: Fraction = 0.0
     """share of the moving obstacles that are cylinders through the full water column (counted within
     cylinder_fraction)"""
-    motion: Literal["line_circle", "waypoints", "mixed"] = "line_circle"
-    """mixed: each obstacle by a throw of a coin"""
+    motion: Literal["line_circle", "waypoints"] = "line_circle"
     circle_fraction: Fraction = 0.5
     """the others go back and forth on a line"""
     line_length_m: PositiveInterval = (2.0, 6.0)

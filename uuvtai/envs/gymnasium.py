@@ -137,7 +137,7 @@ def simulator(
     if type(num_envs) is not int:
         raise TypeError(f"num_envs must be an int, got {num_envs!r}")
     config = load_config(world, sensors, vehicle, overrides)
-    return Sim(config, num_envs, read_tree(teacher, config.behavior.max_node), device)
+    return Sim(config, num_envs, read_tree(teacher), device)
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -110,7 +110,7 @@ def understood(recipe: bytes) -> tuple[Config, int]:
 def compile_backwards(config: Config, num_envs: int) -> int:
     """Compile the kernels of a reset and a step from the last to the first, each run once on empty arrays;
     how many there are."""
-    sim = Sim(config, num_envs, read_tree("bt", config.behavior.max_node))  # kernels know no tree
+    sim = Sim(config, num_envs, read_tree("bt"))  # kernels know no tree
     calls = calls_of(sim)
     wake(sim)
     for kernel, arguments in reversed(calls):

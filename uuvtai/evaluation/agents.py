@@ -98,15 +98,13 @@ class AgentSpec:
         }
 
 
-def load_agents(
-    names: Sequence[str], max_node: int, note: Callable[[str], None] = lambda _text: None
-) -> list[AgentSpec]:
+def load_agents(names: Sequence[str], note: Callable[[str], None] = lambda _text: None) -> list[AgentSpec]:
     """Every kind of agent by the name that ``--agent`` takes: trees and stacks, each perhaps with ``+truth``,
     the user's own plugins, trained policies. ``note`` is told of checkpoints that were left out. Raises
     ConfigError, CheckpointError, PluginError."""
     found: dict[str, AgentSpec] = {}
     for name in dict.fromkeys(names):
-        agent = _load(name, max_node, note)
+        agent = _load(name, note)
         if agent.name in found:
             raise ConfigError(
                 f"--agent {name}: two rows would be called {agent.name}; rename a file, a function or a run "
@@ -116,20 +114,20 @@ def load_agents(
     return list(found.values())
 
 
-def _load(name: str, max_node: int, note: Callable[[str], None]) -> AgentSpec:
+def _load(name: str, note: Callable[[str], None]) -> AgentSpec:
     if is_plugin(name):
-        return _plugin_agent(name, max_node)
+        return _plugin_agent(name)
     if is_trained(name):
         checkpoint = find_policy(name, note)
-        return AgentSpec(policy_name(name, checkpoint), read_tree(TRAINING_TREE, max_node), checkpoint)
+        return AgentSpec(policy_name(name, checkpoint), read_tree(TRAINING_TREE), checkpoint)
     base, privileged = _parted(name)
     label = f"{_label(base)}+{TRUTH}" if privileged else _label(base)
     stack = base if _is_stack(base) else None
     tree = tree_of_stack(base) if stack else base
-    return AgentSpec(label, read_tree(tree, max_node), privileged=privileged, stack=stack)
+    return AgentSpec(label, read_tree(tree), privileged=privileged, stack=stack)
 
 
-def _plugin_agent(name: str, max_node: int) -> AgentSpec:
+def _plugin_agent(name: str) -> AgentSpec:
     """A plugin of the user's: what it leaves to the stack, the training tree's does."""
     from uuvtai.plugins.loading import load_plugin
 
@@ -137,7 +135,7 @@ def _plugin_agent(name: str, max_node: int) -> AgentSpec:
         found = load_plugin(plugin_spec(name))
     except SettingError as error:
         raise ConfigError(str(error)) from None
-    return AgentSpec(found.label, read_tree(TRAINING_TREE, max_node), own=found)
+    return AgentSpec(found.label, read_tree(TRAINING_TREE), own=found)
 
 
 def is_trained(name: str) -> bool:

@@ -135,7 +135,7 @@ def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
 def agents_of(request: Request, watch: EvaluationWatch) -> list[AgentSpec]:
     """The request's agents but the oracle. Raises ConfigError, CheckpointError, PluginError."""
     names = [name for name in request.agents if name != ORACLE]
-    agents = load_agents(names, request.config.behavior.max_node, watch.note)
+    agents = load_agents(names, watch.note)
     if not agents and (request.record or request.explain):
         raise ConfigError(
             "--record, --explain: the oracle drives no vehicle; add who does, for example --agent bt,oracle"

@@ -187,7 +187,7 @@ def run_task(task: Task) -> list[Row]:
     from uuvtai.evaluation.agents import load_agents
     from uuvtai.evaluation.episodes import Job, run_episodes
 
-    (agent,) = load_agents([task.agent], task.config.behavior.max_node)
+    (agent,) = load_agents([task.agent])
     sim = _sim_of(task, agent.config_of(task.config))
     sim.use_tree(agent.tree)
     sim.planner = agent.planner_for(sim)
@@ -215,9 +215,7 @@ def _sim_of(task: Task, config: Config) -> Sim:
     key = (config.model_dump_json(), task.num_envs, task.device)
     if _kept.key != key:
         _kept.key, _kept.sim = None, None
-        _kept.sim = Sim(
-            config, task.num_envs, read_tree(TRAINING_TREE, config.behavior.max_node), task.device
-        )
+        _kept.sim = Sim(config, task.num_envs, read_tree(TRAINING_TREE), task.device)
         _kept.key = key
     return _kept.sim
 

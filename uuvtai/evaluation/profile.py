@@ -244,7 +244,7 @@ def profile(
     before anything runs."""
     from uuvtai.sim.behavior_tree import read_tree
 
-    tree = read_tree(agent, config.behavior.max_node)
+    tree = read_tree(agent)
     for n in sizes:
         check_size(config, n, device)
     rows, latency, real_time, device_used = [], [], None, device

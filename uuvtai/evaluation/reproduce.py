@@ -265,7 +265,7 @@ def reproduce(
         raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
     refuse_place(run_dir)
     config, plugins = load_config("pool"), [plugin_spec(name).absolute().text for name in own]
-    load_agents(plugins, config.behavior.max_node)  # refuses what cannot be loaded before hours have passed
+    load_agents(plugins)  # refuses what cannot be loaded before hours have passed
     root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
     folder = RunFolder(root, config, [EVALUATION_SEED])
     request: dict[str, Any] = {"schema": 1, "budget": budget, "own": plugins}

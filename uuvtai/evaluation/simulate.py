@@ -232,7 +232,7 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
             raise SettingError(f"{option}: not beside --agent, which drives from rest; leave one of them out")
     substeps, control_dt = control_step(trial.dt)
     n_step = checked_steps(trial.seconds, control_dt, substeps)
-    (agent,) = load_agents([name], config.behavior.max_node)
+    (agent,) = load_agents([name])
     config = agent.config_of(experiment(config, trial))
     config = config.model_copy(
         update={"episode": config.episode.model_copy(update={"horizon_steps": n_step + 1})}

@@ -153,7 +153,7 @@ def resume(
             ) from None
         agents = [agent for _name, agent in named]
         refuse_code(place, [*request.agents, *agents], allow_code)
-        _refuse_other_policies(place, request, agents, checkpoints, watch)
+        _refuse_other_policies(place, agents, checkpoints, watch)
         keys = check_rows(request, [name for name, _agent in named])
         folder.go_on({"rows": len(read_rows(place))})
         return _run_cells(request, named, keys, engine, folder, watch), place
@@ -170,13 +170,13 @@ def _agent_key(given: Any) -> AgentKey:
 
 
 def _refuse_other_policies(
-    place: Path, request: SweepRequest, agents: Sequence[str], checkpoints: dict[str, str], watch: SweepWatch
+    place: Path, agents: Sequence[str], checkpoints: dict[str, str], watch: SweepWatch
 ) -> None:
     """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
     nothing."""
     from uuvtai.evaluation.agents import load_agents
 
-    now = _sha256_of(load_agents(agents, base_config(request).behavior.max_node, watch.note))
+    now = _sha256_of(load_agents(agents, watch.note))
     changed = [name for name, sha256 in checkpoints.items() if now.get(name) != sha256]
     if changed:
         raise RunFolderError(
@@ -194,7 +194,7 @@ def resolved(request: SweepRequest, watch: SweepWatch) -> tuple[SweepRequest, li
     from uuvtai.evaluation.agents import load_agents, observation_of
 
     agents = tuple(map(_located, request.agents))
-    loaded = load_agents(agents, base_config(request).behavior.max_node, watch.note)
+    loaded = load_agents(agents, watch.note)
     named = [(agent.name, name) for agent, name in zip(loaded, agents, strict=True)]
     overrides = (*observation_of(agents), *request.overrides)
     return replace(request, overrides=overrides, agents=agents), named, _sha256_of(loaded)

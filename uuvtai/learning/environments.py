@@ -249,8 +249,6 @@ class InSurrogate(Environment):
         bank = bank or draw_bank(config, self.scenes, BANK_SEED, config.surrogate.scenarios)
         self.env = Surrogate(config, bank, self.num_envs, config.train.seed)
         self.view: View = dict(self.env.view)
-        if not config.ppo.critic_sees_truth:
-            self.view["truth"] = self.view["truth"][..., :0]
         self.guard = Guard((), self.num_envs, config.train.patience, self.device)
         self._returns = torch.zeros(self.num_envs)
         self.carried = {"returns": self._returns}

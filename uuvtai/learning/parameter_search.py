@@ -124,7 +124,7 @@ def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) 
 
     most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
     config = config.model_copy(update={"world": load_config(world, overrides=[*most]).world})
-    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.behavior.max_node))
+    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE))
 
 
 def run_search_episodes(

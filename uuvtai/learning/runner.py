@@ -179,7 +179,7 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim
 
-    sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.behavior.max_node), device)
+    sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE), device)
     sim.set_scenes(config.train.scenes)
     return VectorEnv(sim, config.train.seed, autoreset=config.encoder != "set")
 

@@ -118,7 +118,7 @@ FORMULAS = {
         "burst_s > 0: 32 headings all round from h0 on, at top speed with the heave of followed, which "
         "last burst_s and then stop. Heaves of asked, climbing and diving ones are held within [min(low - "
         "z, 0), max(high - z, 0)]: low and high are floor and surface, inwards by edge_gap_m "
-        "(lost_edge_gap_m, if more, where `given_up` of /action is not 0) + edge_sigmas sqrt(z_variance), "
+        "(lost_edge_gap_m, if more, where `given_up` of /action is not 0) + place_sigmas sqrt(z_variance), "
         "half of the water at most."
     ),
     "evasion_cost": (

@@ -18,7 +18,7 @@ import numpy as np
 
 from uuvtai.common import tree_codes as codes
 from uuvtai.common.files import FileError, read_bytes, read_json
-from uuvtai.common.tree_codes import CONTROLS, DECORATORS, LEAVES, MAX_PORTS, Leaf
+from uuvtai.common.tree_codes import CONTROLS, DECORATORS, LEAVES, MAX_NODES, MAX_PORTS, Leaf
 from uuvtai.config.loader import ConfigError, preset_path
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _described(stack: list[Element]) -> bool:
 
 
 UNSET = -1.0
-"""Value of a port that is not given: the leaf takes the number of the config's ``behavior`` section."""
+"""Value of a port that is not given: the leaf takes its usual number."""
 
 
 @dataclass(frozen=True)
@@ -143,15 +143,10 @@ class FlatTree:
 
 
 def load_tree(table: TreeTable, tree: FlatTree, put: Put | None = None) -> None:
-    """Copy a flat tree into the simulator's table by ``put`` (default: ``put_by_kernel``). Raises TreeError
-    when it does not fit."""
+    """Copy a flat tree into the simulator's table by ``put`` (default: ``put_by_kernel``)."""
     if put is None:
         from uuvtai.compile.memory import put_by_kernel as put
     n, capacity = len(tree.kind), table.kind.shape[0]
-    if n > capacity:
-        raise TreeError(
-            f"{tree.source}: {n} nodes do not fit the {capacity} that were allocated (behavior.max_node)"
-        )
     for array, values in (
         (table.kind, tree.kind),
         (table.end, tree.end),
@@ -175,13 +170,13 @@ def load_tree(table: TreeTable, tree: FlatTree, put: Put | None = None) -> None:
 _WRAPPERS = ("Action", "Condition", "Control", "Decorator")
 
 
-def read_tree(name: str, max_node: int = 64) -> FlatTree:
+def read_tree(name: str) -> FlatTree:
     """Tree of a preset (straight, planner, bt) or of an XML file. Raises TreeError, or ConfigError for an
     unknown name."""
-    return read_tree_file(preset_path("tree", name), max_node)
+    return read_tree_file(preset_path("tree", name))
 
 
-def read_tree_file(path: Path, max_node: int = 64, folder: Path | None = None) -> FlatTree:
+def read_tree_file(path: Path, folder: Path | None = None) -> FlatTree:
     """Tree of an XML file, which must lie below ``folder`` if one is given. Raises TreeError."""
     try:
         text = read_bytes(path, MAX_BYTES, folder)
@@ -189,20 +184,20 @@ def read_tree_file(path: Path, max_node: int = 64, folder: Path | None = None) -
         raise TreeError(str(error)) from None
     except OSError as error:
         raise TreeError(f"{path}: cannot be read: {error.strerror}") from None
-    return parse_tree(text, str(path), max_node)
+    return parse_tree(text, str(path))
 
 
-def parse_tree(text: bytes | str, source: str = "tree", max_node: int = 64) -> FlatTree:
+def parse_tree(text: bytes | str, source: str = "tree") -> FlatTree:
     """Flat arrays of BehaviorTree.CPP format 4 XML. Raises TreeError."""
     xml = text.encode() if isinstance(text, str) else text
-    return replace(_Flattener(read_elements(xml, source), source, max_node).flat(), xml=xml)
+    return replace(_Flattener(read_elements(xml, source), source).flat(), xml=xml)
 
 
 class _Flattener:
     """Writes the main tree in preorder, subtrees in place."""
 
-    def __init__(self, element: Element, source: str, max_node: int) -> None:
-        self.source, self.max_node = source, max_node
+    def __init__(self, element: Element, source: str) -> None:
+        self.source = source
         self.rows: list[tuple[str, str, int, int, tuple[float, ...]]] = []
         self.end: list[int] = []
         self.parent: list[int] = []
@@ -259,8 +254,8 @@ class _Flattener:
             self._add_subtree(element, attributes, parent, inside)
             return
         here = len(self.rows)
-        if here >= self.max_node:
-            self._fail(element, f"the tree has more than {self.max_node} nodes (behavior.max_node)")
+        if here >= MAX_NODES:
+            self._fail(element, f"the tree has more than {MAX_NODES} nodes")
         self.rows.append(self._row(element, kind_name, attributes))
         self.parent.append(parent)
         self.end.append(0)
@@ -276,8 +271,8 @@ class _Flattener:
             self._fail(element, f"no BehaviorTree has the ID {name!r}{_nearest(name, self.trees)}")
         if name in inside:
             self._fail(element, f"tree {name!r} contains itself")
-        if len(inside) > self.max_node:
-            self._fail(element, f"subtrees are nested more than {self.max_node} deep")
+        if len(inside) > MAX_NODES:
+            self._fail(element, f"subtrees are nested more than {MAX_NODES} deep")
         for port in attributes:
             if port not in ("name", "_autoremap"):
                 self._fail(

@@ -32,6 +32,7 @@ from uuvtai.common.enums import (
 )
 from uuvtai.common.errors import SettingError, SizeError, UserError
 from uuvtai.common.obstacle_motion import KIND_NAMES
+from uuvtai.common.tree_codes import MAX_NODES
 from uuvtai.compile.launch import forget, is_gpu_shaped
 from uuvtai.compile.memory import Memory, Put, address_of, put_by_kernel
 from uuvtai.config import Config, FixedObstacle, ForecastConfig, SonarConfig, VehicleConfig, WorldConfig
@@ -399,7 +400,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_planner": N_PLANNER,
         "n_reason": N_REASON,
         "n_sector": config.observation.n_sector,
-        "n_node": config.behavior.max_node,
+        "n_node": MAX_NODES,
         "n_candidate": config.behavior.n_candidate,
         "n_tuned": len(TUNED),
         "n_trial": config.baselines.n_trial,

@@ -123,8 +123,6 @@ def track(stages: Stages, config: Config, privileged: bool) -> None:
 def draw_map(stages: Stages, config: Config) -> None:
     """The map's two layers."""
     mapping.update_map(stages.mapping)
-    if config.mapping.stamp > 0:
-        true_state.stamp_truth(stages.true_map)
 
 
 def draw_true_map(stages: Stages) -> None:

@@ -53,7 +53,7 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
     for world in config.surrogate.worlds:
         own = load_config(world, overrides=[("world.n_static", n_static), ("world.n_dynamic", n_dynamic)])
         _refuse_other_tank(world, own.world.tank, config.world.tank)
-        sim = Sim(own, min(BATCH, count), read_tree(TRAINING_TREE, own.behavior.max_node))
+        sim = Sim(own, min(BATCH, count), read_tree(TRAINING_TREE))
         for scene in scenes:
             parts.append(drawn(sim, scene, seed, count))
             names.append(f"{Path(world).stem}_{scene[1]}_{scene[2]:g}")

@@ -79,11 +79,10 @@ class OnboardPilot(FedPilot):
     """One vehicle's stack in a simulator's row 0. On the CPU."""
 
     def __init__(self, sim: Sim, mission: Mission, limits: StaleLimits | None = None) -> None:
-        """``sim``: its row 0 becomes the pilot's, its ``sensors`` are replaced. ValueError on a GPU, and for
-        a config whose map takes the truth in (``mapping.stamp``)."""
+        """``sim``: its row 0 becomes the pilot's, its ``sensors`` are replaced. ValueError on a GPU."""
         self.config = sim.config
-        if sim.device.type != "cpu" or self.config.mapping.stamp > 0:
-            raise ValueError("the pilot runs on the CPU, with a map that it makes itself (mapping.stamp 0)")
+        if sim.device.type != "cpu":
+            raise ValueError("the pilot runs on the CPU")
         super().__init__(numbers_of(sim.config, sim.tree), SimStack(sim), mission, limits)
 
     @classmethod

@@ -91,12 +91,12 @@ def _begun(path: Path, head: LogHead, tree: str | None) -> LogFeed:
         seed=int(run["seed"]),
         episode=int(run["episode"]),
     )
-    if run["agent"].endswith("+truth") or config.mapping.stamp > 0:
+    if run["agent"].endswith("+truth"):
         raise LogError(
             f"{path}: was driven with the truth, which no sensor tells; replay a log without +truth"
         )
     is_imported = "uuv.run" not in head.metadata and IMPORTED in head.metadata
-    return LogFeed(path, config, _tree(path, head, tree, config), mission, run, is_imported=is_imported)
+    return LogFeed(path, config, _tree(path, head, tree), mission, run, is_imported=is_imported)
 
 
 def _config(path: Path, head: LogHead) -> Config:
@@ -111,14 +111,14 @@ def _config(path: Path, head: LogHead) -> Config:
         raise LogError(f"{where} cannot be used here ({error}); record the episode again") from None
 
 
-def _tree(path: Path, head: LogHead, tree: str | None, config: Config) -> FlatTree:
+def _tree(path: Path, head: LogHead, tree: str | None) -> FlatTree:
     if tree is not None:
-        return read_tree(tree, config.behavior.max_node)
+        return read_tree(tree)
     if "tree.xml" not in head.attachments:
         raise LogError(
             f"{path}: the log does not hold the tree that drove; name it: uuv replay {path} --agent bt"
         )
-    return parse_tree(head.attachments["tree.xml"], f"{path}: tree.xml", config.behavior.max_node)
+    return parse_tree(head.attachments["tree.xml"], f"{path}: tree.xml")
 
 
 def _place(values: Any) -> tuple[float, float, float]:

@@ -13,6 +13,7 @@ from tests.bundles import Stage
 from tests.map_bits import away, room
 from tests.oracles import behavior as oracle
 from uuvtai.common.enums import NO_SITE, clearance_m
+from uuvtai.common.tree_codes import MAX_NODES
 from uuvtai.config import BehaviorConfig, Config
 from uuvtai.config.behavior import TUNED
 from uuvtai.kernels.behavior import avoidance, threats, tree
@@ -27,17 +28,15 @@ TEACHER = {
     "n_heading": 12, "n_speed": 3, "evade_m_s": 0.8, "heave_m_s": 0.35, "n_heave_heading": 7, "burst_s": 0.75,
     "hull_reach_m": 0.22, "contact_m": 0.1, "margin_m": 0.25, "margin_growth_m_s": 0.1, "closing_s": 0.25,
     "vertical_weight": 1.4,
-    "caution": 1.2, "patience_s": 2.0, "waiting_m_s": 0.25, "lost_edge_gap_m": 0.35,
+    "caution": 1.2, "patience_s": 2.0, "lost_edge_gap_m": 0.35,
     "static_margin_m": 0.1, "static_horizon_s": 1.5, "static_dt_s": 0.25, "weight_peak": 6.0,
     "weight_mean": 6.0,
     "weight_contact": 12.0, "weight_static": 12.0, "weight_static_contact": 30.0, "weight_deviation": 1.0,
     "weight_change": 0.3,
     "temperature": 0.05, "hysteresis_s": 0.5, "conflict_within_s": 2.5, "emergency_ttc_s": 0.35,
     "emergency_range_m": 0.12,
-    "emergency_closing_m_s": 0.15, "back_off_m_s": 0.85, "blocked_clearance_m": 0.25, "goal_near_m": 1.5,
-    "stuck_s": 4.0, "unstick_s": 1.5,
-    "unstick_m_s": 0.3, "slow_clearance_m": 0.6, "slow_fraction": 0.5, "edge_gap_m": 0.26, "depth_gain": 1.0,
-    "yaw_gain": 1.5,
+    "back_off_m_s": 0.85, "slow_clearance_m": 0.6, "slow_fraction": 0.5, "edge_gap_m": 0.26,
+    "depth_gain": 1.0, "yaw_gain": 1.5,
     "heading_range_m": 3.0, "heading_level_m": 1.0, "heading_clearance_m": 0.6, "sideslip_clearance_m": 0.5,
     "place_sigmas": 2.5,
     "heading_off_deg": 25.0, "free_depth": False, "least_share": 0.02, "evade_probability": 0.2,
@@ -57,7 +56,7 @@ N_SAMPLE = round(CFG.tracking.horizon_s / CFG.tracking.forecast_dt_s) + 1
 TIMES = np.arange(N_SAMPLE) * CFG.tracking.forecast_dt_s
 CELL = CFG.mapping.cell_m
 SIZES = {
-    "n_env": N_ENV, "n_node": CFG.behavior.max_node, "n_candidate": CFG.behavior.n_candidate,
+    "n_env": N_ENV, "n_node": MAX_NODES, "n_candidate": CFG.behavior.n_candidate,
     "n_track": N_TRACK, "n_forecast": N_SAMPLE, "n_future": 2, "n_height": 16, "n_ray": N_RAY, "n_ahead": 16,
     "n_tuned": len(TUNED), "n_row": grid_shape(TANK, CELL)[0], "n_col": grid_shape(TANK, CELL)[1],
 }  # fmt: skip
@@ -427,12 +426,12 @@ def test_retreat_does_not_run_into_a_wall(scene):
 def test_stuck_creeps_to_the_end_of_its_time(scene):
     """Unstick stands in a sequence with memory: it outlasts the condition that began it."""
     scene.clearance.site.fill(int(away(0, -6)))
-    put(scene.route.stuck_steps, round(CFG.behavior.stuck_s / CFG.episode.control_dt_s), 0)
+    put(scene.route.stuck_steps, round(tree.STUCK_S / CFG.episode.control_dt_s), 0)
     decide(scene)
     assert acting(scene)[:2] == ["Unstick", "FollowRoute"]
-    assert scene.behavior.last_vel_w.to_numpy()[0, 0] > 0.9 * CFG.behavior.unstick_m_s
+    assert scene.behavior.last_vel_w.to_numpy()[0, 0] > 0.9 * tree.UNSTICK_M_S
     scene.route.stuck_steps.fill(0)
-    step(scene, round(CFG.behavior.unstick_s / CFG.episode.control_dt_s) - 2)
+    step(scene, round(tree.UNSTICK_S / CFG.episode.control_dt_s) - 2)
     assert acting(scene)[0] == "Unstick"
     step(scene, 4)
     assert acting(scene)[0] == "FollowRoute"
@@ -511,12 +510,12 @@ def test_climbs_or_dives_past_what_fills_the_way(scene):
 
 def test_patience_falls_while_it_does_not_come_on_and_comes_back(scene):
     """At rest, slow, at the speed that is no waiting, driving, going astern; its caution falls with it."""
-    speeds = np.array([0.0, 0.125, 0.25, 0.6, -0.25, 0.0])
+    speeds = np.array([0.0, 0.1, 0.2, 0.6, -0.2, 0.0])
     put(scene.ego.vel_b, speeds, slice(None), 0)
     step_s = CFG.behavior.decide_period_steps * CFG.episode.control_dt_s
     for _ in range(50):
         assess(scene)
-    waited = 50 * step_s * np.maximum(1 - speeds / CFG.behavior.waiting_m_s, 0)
+    waited = 50 * step_s * np.maximum(1 - speeds / threats.WAITING_M_S, 0)
     np.testing.assert_allclose(scene.behavior.waited_s.to_numpy(), waited, atol=1e-4)
     patience = np.minimum(1, CFG.behavior.patience_s / np.maximum(waited, 1e-3))
     np.testing.assert_allclose(scene.behavior.patience.to_numpy(), patience, atol=1e-4)
@@ -573,7 +572,7 @@ def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene)
     body(scene, 0, 0, (6.7, 3.0), (0.0, 0.0))
     assess(scene)
     sooner = scene.behavior.conflict_s.to_numpy()[0]
-    assess(scene, CFG.behavior.model_copy(update={"evade_m_s": 0.1, "back_off_m_s": 0.1, "unstick_m_s": 0.1}))
+    assess(scene, CFG.behavior.model_copy(update={"evade_m_s": 0.1, "back_off_m_s": 0.1}))
     assert scene.behavior.conflict_s.to_numpy()[0] == sooner < FAR_M
 
 

@@ -27,10 +27,7 @@ TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), Epis
 CAMERA, SONAR, ELEVATION, TRACKING = (
     DepthConfig(period_steps=5), SonarConfig(n_ray=256), HeightConfig(), TrackingConfig(),
 )  # fmt: skip
-CFG = CameraTrackingConfig(
-    range_m=4.0, band_m=0.9, wall_margin_m=0.25, split_m=0.25, sigma_m=0.035, gate_m=0.3, max_gate_m=1.2,
-    apart_m=0.35, turn_gate=12.0,
-)  # fmt: skip
+CFG = CameraTrackingConfig(range_m=4.0, sigma_m=0.035)
 SIZES = {
     "n_env": N_ENV, "n_track": N_TRACK, "n_obstacle": N_OBSTACLE, "n_height": 16, "n_ray": SONAR.n_ray,
     "n_thruster": 6,

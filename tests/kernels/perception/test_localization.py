@@ -103,9 +103,9 @@ class Rig(Stage):
 rig = Rig.fixture()
 
 
-def voyage(preset, cfg, tank, seed, steps=STEPS, **scene):
+def voyage(preset, tank, seed, steps=STEPS, **scene):
     return oracle.Voyage(
-        N_ENV, steps, SENSORS[preset], cfg, tank, RULES.control_dt_s, np.random.default_rng(seed), **scene
+        N_ENV, steps, SENSORS[preset], tank, RULES.control_dt_s, np.random.default_rng(seed), **scene
     )
 
 
@@ -131,7 +131,7 @@ def assert_close(found, filters, rows):
 @pytest.mark.parametrize(("preset", "cfg", "tank"), [("harsh", DEFAULT, PEN), ("nominal", PLAIN, POOL)])
 def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
     """Each step from what the kernel had before it: rounding does not add up, a wrong term shows at once."""
-    rows, v = (0, 75, 150), voyage(preset, cfg, tank, 3, obstacles=OBSTACLES)
+    rows, v = (0, 75, 150), voyage(preset, tank, 3, obstacles=OBSTACLES)
     rig.begin(v, cfg)
     filters = {row: oracle.Filter(v.pos[0][row], v.sensors, cfg, tank, RULES.control_dt_s) for row in rows}
     assert_close(rig.state(), filters, rows)
@@ -170,7 +170,7 @@ def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
 @pytest.mark.parametrize("preset", ["nominal", "harsh"])
 def test_errors_are_as_large_as_the_covariance_says(rig, preset):
     """200 independent runs of 4 s; in harsh water every second one loses the DVL for 1.5 s."""
-    rig.begin(voyage(preset, PLAIN, POOL, 21), PLAIN)
+    rig.begin(voyage(preset, POOL, 21), PLAIN)
     nees, of_z, off = rig.play()
     assert_consistent(nees, 3)
     assert_consistent(of_z, 1)
@@ -179,7 +179,7 @@ def test_errors_are_as_large_as_the_covariance_says(rig, preset):
 
 def test_without_a_wall_in_reach_the_uncertainty_grows_and_stays_honest(rig):
     """Nothing returns but clutter: dead reckoning, its heading's drift and scale error included."""
-    rig.begin(voyage("harsh", PLAIN, SEA, 12), PLAIN)
+    rig.begin(voyage("harsh", SEA, 12), PLAIN)
     halfway, _, _ = rig.play(101)
     early = rig.ego.pose_cov.to_numpy()
     nees, of_z, _ = rig.play(since=101)
@@ -192,7 +192,7 @@ def test_without_a_wall_in_reach_the_uncertainty_grows_and_stays_honest(rig):
 
 def test_obstacles_at_a_round_wall_do_not_make_it_too_sure(rig):
     """The defaults: obstacles closer to the wall than the gate is wide pass for it."""
-    rig.begin(voyage("harsh", DEFAULT, PEN, 13, obstacles=OBSTACLES), DEFAULT)
+    rig.begin(voyage("harsh", PEN, 13, obstacles=OBSTACLES), DEFAULT)
     nees, _, off = rig.play()
     assert nees.mean() < chi2.ppf(0.975, 3 * N_ENV) / N_ENV
     assert np.quantile(off, 0.95) < 0.15
@@ -206,7 +206,7 @@ def speed_errors(rig, k):
 
 def test_the_velocity_goes_on_while_the_dvl_is_lost(rig):
     """By the accelerometer and the Doppler of the walls: as well as it is known, and no DVL is believed."""
-    v = voyage("harsh", PLAIN, POOL, 14)
+    v = voyage("harsh", POOL, 14)
     rig.begin(v, PLAIN)
     rig.play(121)
     lost = v.valid[120] == 0
@@ -217,7 +217,7 @@ def test_the_velocity_goes_on_while_the_dvl_is_lost(rig):
 
 def test_a_velocity_that_nothing_tells_is_not_valid(rig):
     """No bottom, no wall, and an accelerometer that was never corrected; with the DVL again it is known."""
-    v = voyage("harsh", PLAIN, SEA, 16)
+    v = voyage("harsh", SEA, 16)
     v.valid[:] = 0
     v.valid[61:] = 1
     rig.begin(v, PLAIN)
@@ -230,7 +230,7 @@ def test_a_velocity_that_nothing_tells_is_not_valid(rig):
 
 def test_what_stands_before_the_walls_makes_them_count_less(rig):
     """As many beams meet the walls both times, but once the others end at obstacles, before the walls."""
-    v = voyage("harsh", PLAIN, POOL, 17)
+    v = voyage("harsh", POOL, 17)
     rig.begin(v, PLAIN)
     rig.play(6)
     ranges, doppler, hit = v.scan(5)
@@ -247,10 +247,10 @@ def test_what_stands_before_the_walls_makes_them_count_less(rig):
 
 
 def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
-    rig.begin(voyage("harsh", PLAIN, POOL, 15), PLAIN)
+    rig.begin(voyage("harsh", POOL, 15), PLAIN)
     rig.play(21)
     first = rig.state()
-    rig.begin(voyage("harsh", PLAIN, POOL, 15), PLAIN)
+    rig.begin(voyage("harsh", POOL, 15), PLAIN)
     rig.clock.active.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
     rig.play(21)
     second = rig.state()

@@ -16,7 +16,7 @@ from uuvtai.kernels.perception.io import TrackingIO
 N_ENV, N_TRACK = 12, 3
 TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
 CAMERA = DepthConfig(rows=36, cols=64, fov_deg=90.0, offset_b_m=(0.2, 0.0, 0.0), max_range_m=8.0)
-CFG = HeightConfig(column_share=0.05, use_camera=True, camera_hit_share=0.6)
+CFG = HeightConfig(column_share=0.05, use_camera=True)
 SIZES = {
     "n_env": N_ENV, "n_track": N_TRACK, "n_height": LANES, "n_ray": 16, "n_pixel_row": CAMERA.rows,
     "n_pixel_col": CAMERA.cols,
@@ -157,7 +157,7 @@ def test_a_column_shows_from_edge_to_edge(rig):
 
 
 def test_what_is_seen_past_is_not_there(rig):
-    """Nothing shows: heights within the image and the column lose camera_hit_share, so does presence."""
+    """Nothing shows: heights within the image and the column lose HIT_SHARE, so does presence."""
     rig.track(0, EYE_X + 1.0, 3.0)
     rig.track(1, EYE_X + 3.0, 3.0)
     rig.load()
@@ -165,7 +165,7 @@ def test_what_is_seen_past_is_not_there(rig):
     for env, away in enumerate((1.0, 3.0)):
         inside = np.append(np.abs(HEIGHTS + 0.8) < TOP * (away - 0.1), True)
         assert inside.all() == (env == 1) and inside.sum() > 5
-        wanted = weighing.seen_not(PRIOR, 0.9, np.where(inside, 1 - CFG.camera_hit_share, 1.0))
+        wanted = weighing.seen_not(PRIOR, 0.9, np.where(inside, 1 - oracle.HIT_SHARE, 1.0))
         np.testing.assert_allclose(share[env, 0], wanted[0], atol=SHARE_TOLERANCE)
         assert present[env, 0] == pytest.approx(wanted[1], abs=SHARE_TOLERANCE)
     assert present[1, 0] < present[0, 0] < 0.9
@@ -184,7 +184,7 @@ def test_what_is_hidden_is_not_judged(rig):
     assert present[0, 0] == np.float32(0.9)
     shadow = np.abs(HEIGHTS + 0.8) < 0.15 * 2.9
     ratio = share[1, 0, :15] / share[1, 0, 7]
-    np.testing.assert_allclose(ratio[~shadow], 1 - CFG.camera_hit_share, rtol=1e-4)
+    np.testing.assert_allclose(ratio[~shadow], 1 - oracle.HIT_SHARE, rtol=1e-4)
     sure = np.abs(HEIGHTS + 0.8) < 0.12 * 2.9
     np.testing.assert_allclose(ratio[sure], 1.0, rtol=1e-5)
 
@@ -283,7 +283,7 @@ def test_any_scene_equals_the_oracle(rig):
         for env, track in np.ndindex(N_ENV, N_TRACK):
             before = rig.share[env, track], rig.present[env, track]
             view = rig.depth_m[env], rig.pos[env], rig.rpy[env], rig.place[env, track], rig.radius[env, track]
-            *wanted, doubt = oracle.look(*before, *view, CFG, CAMERA, TANK)
+            *wanted, doubt = oracle.look(*before, *view, CAMERA, TANK)
             if doubt < CLOSE:
                 continue
             np.testing.assert_allclose(share[env, track], wanted[0], atol=SHARE_TOLERANCE)

@@ -9,10 +9,7 @@ from tests.bundles import Stage, put
 from tests.map_bits import check_bits, get_map, put_map
 from tests.oracles.mapping import MapOracle, rotation
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
-from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
-from uuvtai.kernels.oracle import true_state
-from uuvtai.kernels.oracle.io import TrueMapIO
 from uuvtai.kernels.perception import mapping
 from uuvtai.kernels.perception.io import MappingIO
 from uuvtai.sim.setup import load_bounds
@@ -617,31 +614,6 @@ def test_reset_empties_awake_rows_only(stage):
             )
     # and a reset row starts to map at once, whatever its last scan was
     assert stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 1)["static"][cell(*FACE)] > 0
-
-
-# ------------------------------------------------------------------------------------------------------ stamp
-
-
-def test_debugging_stamp_is_off_by_default_and_marks_moving_obstacles_only(stage):
-    assert MappingConfig().stamp == 0.0
-    stage.reset()
-    world = stage.world
-    kind, pos, vel = np.zeros((N_ENV, 4), np.int32), np.zeros((N_ENV, 4, 3)), np.zeros((N_ENV, 4, 3))
-    size = np.zeros((N_ENV, 4, 3))
-    kind[:] = (CYLINDER, CYLINDER, BOX, NONE)
-    pos[:, :, :2] = ((1.0, 1.0), (3.0, 1.0), (5.0, 3.0), (3.0, 3.0))
-    size[:] = ((0.3, 0.3, 1), (0.3, 0.3, 1), (0.5, 0.1, 1), (0.3, 0.3, 1))
-    vel[:, 1:, 0] = 0.5
-    put(world, kind=kind, pos_w=pos, vel_w=vel, size=size, yaw=np.pi / 2)
-    cfg = MappingConfig(stamp=0.7)
-    for _ in range(2):
-        true_state.stamp_truth(stage.io(TrueMapIO, cfg, TANK))
-    dynamic = stage.read()["dynamic"][0]
-    assert dynamic[cell(3.05, 1.05)] == 1.0 and dynamic[cell(5.05, 3.35)] == 1.0
-    for x, y in ((1.05, 1.05), (5.35, 3.05), (3.05, 3.05), (3.05, 1.45)):
-        assert dynamic[cell(x, y)] == 0
-    assert stage.read()["static"].max() == 0
-    check_bits(stage.grid_map, MAP.occupied, CONFIDENT)
 
 
 # ---------------------------------------------------------------------------------------------------- threads

@@ -139,7 +139,6 @@ def test_learning_equals_the_oracle(stage):
                 leg = before["leg"][env, track].astype(float) if leg_step >= 0 else None
                 slot = oracle.learn(
                     turns, slot, leg, leg_step * RULES.control_dt_s, x, stage.step * RULES.control_dt_s,
-                    CONFIG,
                 )  # fmt: skip
                 np.testing.assert_array_equal(after["leg"][env, track], state[env, track])
                 assert after["leg_step"][env, track] == stage.step

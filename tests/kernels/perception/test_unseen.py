@@ -12,6 +12,7 @@ from uuvtai.config import Config
 from uuvtai.kernels.core.simd import LANES
 from uuvtai.kernels.core.stage import AnyTensor, Bundle
 from uuvtai.kernels.perception.io import TrackingIO
+from uuvtai.kernels.perception.prediction import STRAIGHT_ODDS
 from uuvtai.kernels.perception.track_filter import turn_back_rate, turned_back
 from uuvtai.kernels.perception.tracking import predict_tracks
 
@@ -186,7 +187,7 @@ def test_obstacles_that_may_circle_turn_back_less_and_known_turns_leave_no_doubt
     usual = rates_of(2, way, 0.06)
     for turn_rate, var in ((0.0, 0.01), (0.2, 0.01), (0.5, 0.02)):
         bayes = np.sqrt(var) / CFG.tracking.turn_rate_sigma_rad_s * np.exp(0.5 * turn_rate**2 / var)
-        straight = CFG.forecast.straight_odds / (CFG.forecast.straight_odds + bayes)
+        straight = STRAIGHT_ODDS / (STRAIGHT_ODDS + bayes)
         np.testing.assert_allclose(rates_of(2, way, 0.06, turn_rate, var), straight * usual, rtol=1e-4)
     rows = habit_oracle.turn_rows(np.zeros((N, 7, 3, LANES), np.float32))
     for name, value in (("turn_x", 6.0), ("in_x", 1.0), ("out_x", -1.0), ("weight", 1.0)):

@@ -18,6 +18,8 @@ from uuvtai.kernels.core.stage import Bundle, Const, Out
 
 _SLACK_S = 1.0e-3
 """the last sample is within the horizon, however times are rounded"""
+UNSTICK_M_S = 0.3
+"""of creeping away from the nearest mapped obstacle, unless the leaf's port says (EC)"""
 
 
 @ti.func
@@ -269,7 +271,7 @@ def edge_gap(env, io: Bundle[BehaviorIO]):
     """[m] to keep from floor and surface: the less sure of the own z, and with a dead vertical thruster, the
     more."""
     least = ti.select(io.ego.given_up[env] != 0, io.behavior_cfg.lost_edge_gap_m, 0.0)
-    return ti.max(io.behavior_cfg.edge_gap_m, least) + io.behavior_cfg.edge_sigmas * ti.sqrt(
+    return ti.max(io.behavior_cfg.edge_gap_m, least) + io.behavior_cfg.place_sigmas * ti.sqrt(
         io.ego.z_var[env]
     )
 
@@ -295,9 +297,7 @@ def place_doubt(env, io: Bundle[BehaviorIO]):
 
 def _fastest(behavior_cfg):
     """[m/s] no level velocity that is ever rolled out is faster."""
-    return max(
-        behavior_cfg.evade_m_s, behavior_cfg.cruise_m_s, behavior_cfg.back_off_m_s, behavior_cfg.unstick_m_s
-    )
+    return max(behavior_cfg.evade_m_s, behavior_cfg.cruise_m_s, behavior_cfg.back_off_m_s, UNSTICK_M_S)
 
 
 def _samples(n_forecast, behavior_cfg, tracking_cfg):

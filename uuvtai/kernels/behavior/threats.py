@@ -24,6 +24,16 @@ from uuvtai.kernels.core.grid import away_of, cell_of, centre_of, clearance_of
 from uuvtai.kernels.core.simd import filled, n_lane
 from uuvtai.kernels.core.stage import Bundle, n_envs
 
+WAITING_M_S = 0.2
+"""As long as a vehicle comes on along its way more slowly than this it waits; faster, it forgets that it did
+(EC)."""
+
+EMERGENCY_CLOSING_M_S = 0.15
+"""Slower approach is no emergency (EC)."""
+
+SETTLE_S = 1.0
+"""Time constant of the mean of the fastest obstacle's speed, by which ``slow`` or ``fast`` holds (EC)."""
+
 # ------------------------------------------------------------------------------------------------------------
 # Where a vehicle may drive whose sonar is a fan ahead: not where it has not looked. A ring looks everywhere,
 # and none of this is compiled for it.
@@ -181,7 +191,7 @@ def _beam_ttc(env, beam, io: Bundle[BehaviorIO]):
     """Time until what the beam hit reaches the hull's contact distance; FAR_M where it does not approach."""
     closing = -range_rate(env, beam, io.scan, io.tracks, io.sonar_cfg)
     out = FAR_M
-    if io.scan.hit[env, beam] == 1 and closing > ti.static(io.behavior_cfg.emergency_closing_m_s):
+    if io.scan.hit[env, beam] == 1 and closing > EMERGENCY_CLOSING_M_S:
         out = (
             ti.max(
                 io.scan.range_m[env, beam]
@@ -308,7 +318,7 @@ def _note_speeds(env, io: Bundle[BehaviorIO]):
         now = ti.math.clamp((fastest - slow) / ti.static(max(fast - slow, 1e-6)), 0.0, 1.0)
         before = io.behavior.alert[env]
         rate = ti.static(
-            min(1.0, io.behavior_cfg.decide_period_steps * io.episode_cfg.control_dt_s / io.fast_cfg.settle_s)
+            min(1.0, io.behavior_cfg.decide_period_steps * io.episode_cfg.control_dt_s / SETTLE_S)
         )
         io.behavior.alert[env] = ti.select(before < 0.0, now, before + rate * (now - before))
 
@@ -317,7 +327,7 @@ def _note_speeds(env, io: Bundle[BehaviorIO]):
 def _note_waiting(env, io: Bundle[BehaviorIO]):
     """Count the time in which the vehicle does not come on along its way, and what patience it leaves."""
     vel, way = turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2]), _unit(io.behavior.steer_w[env])
-    slow = 1.0 - ti.Vector([vel[0], vel[1]]).dot(way) / io.behavior_cfg.waiting_m_s
+    slow = 1.0 - ti.Vector([vel[0], vel[1]]).dot(way) / WAITING_M_S
     period_s = ti.static(io.behavior_cfg.decide_period_steps * io.episode_cfg.control_dt_s)
     waited = ti.max(io.behavior.waited_s[env] + period_s * slow, 0.0)
     io.behavior.waited_s[env] = waited

@@ -23,10 +23,14 @@ from uuvtai.common.tree_codes import (
 from uuvtai.compile.launch import quick_launch
 from uuvtai.config.behavior import HYSTERESIS, RANGE, TTC, WITHIN
 from uuvtai.kernels.behavior.io import BehaviorIO
-from uuvtai.kernels.behavior.rollout import held_heave, tuned
+from uuvtai.kernels.behavior.rollout import UNSTICK_M_S, held_heave, tuned
 from uuvtai.kernels.behavior.threats import cruising_speed, kept_in_sight
 from uuvtai.kernels.core.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, IntVector, n_envs
+
+BLOCKED_M, STUCK_S, GOAL_NEAR_M, UNSTICK_S = 0.25, 4.0, 1.5, 1.5
+"""What leaves take whose port is not given: static clearance below which the way to the look-ahead point is
+blocked; time without motion; distance to the goal; time of creeping away (EC)."""
 
 # ------------------------------------------------------------------------------------------------------------
 # Tick of a behaviour tree stored as preorder arrays, for one env, without recursion.
@@ -258,21 +262,17 @@ def _answer(env, node, io: Bundle[BehaviorIO]):
         )
         holds = ti.cast(seen or lately, ti.i32)
     elif leaf == codes.ROUTE_BLOCKED:
-        blocked = io.behavior.path_clearance_m[env] < _port(
-            node, 0, ti.static(io.behavior_cfg.blocked_clearance_m), io
-        )
+        blocked = io.behavior.path_clearance_m[env] < _port(node, 0, BLOCKED_M, io)
         holds = ti.cast(io.route.n_way[env] > 0 and blocked, ti.i32)
     elif leaf == codes.STUCK:
-        holds = ti.cast(
-            io.route.stuck_steps[env] * dt >= _port(node, 0, ti.static(io.behavior_cfg.stuck_s), io), ti.i32
-        )
+        holds = ti.cast(io.route.stuck_steps[env] * dt >= _port(node, 0, STUCK_S, io), ti.i32)
     elif leaf == codes.HAS_ROUTE:
         holds = ti.cast(io.route.n_way[env] > 0, ti.i32)
     elif leaf == codes.SAFE_HERE:
         holds = ti.cast(io.behavior.hold_conflict_s[env] >= _port(node, 0, FAR_M, io), ti.i32)
     elif leaf == codes.GOAL_NEAR:
         away = (io.mission.goal_w[env] - io.ego.pos_w[env]).norm()
-        holds = ti.cast(away <= _port(node, 0, ti.static(io.behavior_cfg.goal_near_m), io), ti.i32)
+        holds = ti.cast(away <= _port(node, 0, GOAL_NEAR_M, io), ti.i32)
     out = ti.select(holds == 1, codes.SUCCESS, codes.FAILURE)
     if io.table.kind[node] == codes.ACTION:
         out = codes.RUNNING
@@ -282,7 +282,7 @@ def _answer(env, node, io: Bundle[BehaviorIO]):
             io.behavior.since_step[env, node] = io.clock.step[env]
         if leaf == codes.UNSTICK:
             lasted = (io.clock.step[env] - io.behavior.since_step[env, node]) * dt
-            if lasted >= _port(node, 0, ti.static(io.behavior_cfg.unstick_s), io):
+            if lasted >= _port(node, 0, UNSTICK_S, io):
                 out = codes.SUCCESS
     return out
 
@@ -320,7 +320,7 @@ def _wanted_velocity(env, leaf, node, io: Bundle[BehaviorIO]):
         )
         out = ti.Vector([away[0], away[1], 0.0]) * crowd
     elif leaf == codes.UNSTICK:
-        out = ti.Vector([away[0], away[1], 0.0]) * _port(node, 1, ti.static(io.behavior_cfg.unstick_m_s), io)
+        out = ti.Vector([away[0], away[1], 0.0]) * _port(node, 1, UNSTICK_M_S, io)
     elif leaf >= codes.FIRST_BASELINE:
         out = io.baselines.vel_w[env]
     elif leaf == codes.DRIVE_STRAIGHT:

@@ -1,7 +1,6 @@
 """The map as it truly is. Never part of a preset that drives: it breaks observation-only sensing.
 
-Moving obstacles are stamped only where ``mapping.stamp`` > 0 (default 0), for debugging; static ones only
-where routes are planned beforehand, for a surrogate (``Sim.draw_routes``).
+Static obstacles are drawn where routes are planned beforehand, for a surrogate (``Sim.draw_routes``).
 """
 
 import taichi as ti
@@ -9,7 +8,7 @@ import taichi as ti
 from uuvtai.common.enums import FULL
 from uuvtai.compile.launch import quick_launch
 from uuvtai.kernels.core.geometry import BOX, NONE, turned_z
-from uuvtai.kernels.core.grid import centre_of, occupancy_of
+from uuvtai.kernels.core.grid import centre_of
 from uuvtai.kernels.core.simd import LANES, f16x, put_bit
 from uuvtai.kernels.core.stage import Bundle, Const, loop_end
 from uuvtai.kernels.oracle.io import TrueMapIO, TrueTracksIO
@@ -32,35 +31,13 @@ def covers(env, obstacle, point, io: Bundle[TrueMapIO]):
 
 
 @ti.func
-def is_covered(env, point, moving, io: Bundle[TrueMapIO]):
-    """1 where any obstacle does that moves, or that does not."""
+def is_covered(env, point, io: Bundle[TrueMapIO]):
+    """1 where any obstacle does that does not move."""
     covered = 0
     for obstacle in range(ti.static(io.world.kind.shape[1])):
-        if moving == (io.world.vel_w[env, obstacle].norm() > 0.0) and covers(env, obstacle, point, io):
+        if io.world.vel_w[env, obstacle].norm() == 0.0 and covers(env, obstacle, point, io):
             covered = 1
     return covered
-
-
-@ti.func
-def stamp_moving(env, row, col, io: Bundle[TrueMapIO]):
-    """Add to one cell's occupancy, and keep the bits that follow from it."""
-    stamped_occ = ti.min(1.0, occupancy_of(io.grid_map.dynamic_occ[env, row, col]) + io.mapping_cfg.stamp)
-    io.grid_map.dynamic_occ[env, row, col] = ti.cast(stamped_occ * FULL, ti.u16)
-    put_bit(io.grid_map.alive, env, row, col)
-    if stamped_occ >= io.mapping_cfg.occupied:
-        put_bit(io.grid_map.dynamic_occupied, env, row, col)
-
-
-@ti.kernel
-def stamp_truth(io: Bundle[TrueMapIO]):
-    """Add ``stamp`` to the dynamic occupancy of every cell whose centre a moving obstacle covers, clipped at
-    1."""
-    n_env, n_row, n_col = ti.static(io.grid_map.dynamic_occ.shape)
-    for env, row in ti.ndrange(loop_end(n_env, io.clock), n_row):
-        if io.clock.active[env] == 1:
-            for col in range(n_col):
-                if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), True, io) == 1:
-                    stamp_moving(env, row, col, io)
 
 
 @ti.kernel
@@ -70,7 +47,7 @@ def stamp_static(io: Bundle[TrueMapIO]):
     for env, row in ti.ndrange(loop_end(n_env, io.clock), n_row):
         if io.clock.active[env] == 1:
             for col in range(n_col):
-                if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), False, io) == 1:
+                if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), io) == 1:
                     io.grid_map.static_occ[env, row, col] = ti.cast(FULL, ti.u16)
                     put_bit(io.grid_map.alive, env, row, col)
                     put_bit(io.grid_map.static_occupied, env, row, col)

@@ -34,6 +34,26 @@ _PRESENT = 0.95
 _NEWLY_SEEN_S = 0.15
 """[s] a track that the sonar saw this lately needs no image."""
 
+BAND_M, WALL_MARGIN_M = 0.9, 0.25
+"""Nothing farther above or below the camera is looked at, nor what is nearer to a known wall (EC)."""
+
+SPLIT_M = 0.25
+"""A larger jump of distance between columns separates spots; a sonar return within it explains one (EC)."""
+
+GATE_M, MAX_GATE_M = 0.3, 1.2
+"""A spot this close to where a track is expected may match it, and farther for obstacles that were not seen
+for long, up to the second (EC)."""
+
+APART_M = 0.35
+"""A spot farther than this from every track is an obstacle of its own (EC)."""
+
+TURN_GATE = 12.0
+"""Squared normalised innovation (2 values) beyond which an obstacle is taken to have turned (EC)."""
+
+HIT_SHARE = 0.5
+"""Probability that an obstacle in the image and at a free distance shows in the column through its middle
+(EC)."""
+
 
 @quick_launch
 @ti.kernel
@@ -76,7 +96,7 @@ def column_distances(env, first_col, io: Bundle[TrackingIO]):
     wall = wall_lanes(ti.Vector([eye[0], eye[1]]), level_x * scale, level_y * scale, io.tank_cfg)
     near, edge, limit = f16x(FAR_M), f16x(FAR_M), f16x(0.0)
     for i in ti.static(range(LANES)):
-        limit[i] = ti.min(wall[i] - io.camera_tracking_cfg.wall_margin_m, io.camera_tracking_cfg.range_m)
+        limit[i] = ti.min(wall[i] - WALL_MARGIN_M, io.camera_tracking_cfg.range_m)
     sway = ti.sqrt(R_wb[0, 2] * R_wb[0, 2] + R_wb[1, 2] * R_wb[1, 2])
     for k in range(ti.static(io.depth_cfg.rows // _ROW_STRIDE)):
         row = k * _ROW_STRIDE
@@ -94,7 +114,7 @@ def column_distances(env, first_col, io: Bundle[TrackingIO]):
                 z = R_wb[2, 0] + R_wb[2, 1] * left[i] + R_wb[2, 2] * up
                 level = away[i] * ti.sqrt(x * x + y * y)
                 shown = (away[i] < ti.static(NO_RETURN_SHARE * io.depth_cfg.max_range_m)) & (
-                    ti.abs(away[i] * z) < io.camera_tracking_cfg.band_m
+                    ti.abs(away[i] * z) < BAND_M
                 )
                 near_m = ti.select(shown & (level < limit[i]), level, FAR_M)
                 near[i] = ti.min(near[i], near_m)
@@ -121,7 +141,7 @@ def take_spots(env, io: Bundle[TrackingIO]):
         at = FAR_M
         if col < ti.static(io.depth_cfg.cols):
             at = io.spots.column_m[env, col]
-        if ti.abs(at - before) > io.camera_tracking_cfg.split_m:
+        if ti.abs(at - before) > SPLIT_M:
             if before < FAR_M:
                 use_spot(env, first, col - 1, near, edge, eye, R_wb, io)
             first, near, edge = col, FAR_M, FAR_M
@@ -156,9 +176,7 @@ def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[TrackingIO]):
         best, best_offset = match_of(env, seen, along, late, io)
         cut = first == 0 or last == ti.static(io.depth_cfg.cols - 1)
         if best >= 0:
-            correct_track(
-                env, best, best_offset, along, cut, edge < near + io.camera_tracking_cfg.split_m, io
-            )
+            correct_track(env, best, best_offset, along, cut, edge < near + SPLIT_M, io)
             io.tracks.spot_step[env, best] = io.clock.step[env]
         elif not cut and io.scan.ping_step[env] >= 0:
             radius = ti.max(0.5 * width * near, io.tracking_cfg.min_radius_m)
@@ -201,7 +219,7 @@ def is_off_fan(seen, env, io: Bundle[TrackingIO]):
         if (
             beam_there(middle + k, io.sonar_cfg) >= 0
             and io.scan.hit[env, ray] == 1
-            and ti.abs(io.scan.range_m[env, ray] - distance) < io.camera_tracking_cfg.split_m
+            and ti.abs(io.scan.range_m[env, ray] - distance) < SPLIT_M
         ):
             off = 0
     return off
@@ -231,7 +249,7 @@ def reach_of(env, track, io: Bundle[TrackingIO]):
         * (io.clock.step[env] - seen)
         * io.episode_cfg.control_dt_s
     )
-    return ti.min(io.camera_tracking_cfg.gate_m + 2.0 * way, io.camera_tracking_cfg.max_gate_m)
+    return ti.min(GATE_M + 2.0 * way, MAX_GATE_M)
 
 
 @ti.func
@@ -252,7 +270,7 @@ def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[TrackingI
     surprise = radial * radial / (position_variance(cov, along) + radial_var) + cross * cross / (
         position_variance(cov, across) + cross_var
     )
-    if surprise > io.camera_tracking_cfg.turn_gate:
+    if surprise > TURN_GATE:
         speed = ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
         cov[7] += ti.max(speed, 0.5) ** 2
         cov[9] += ti.max(speed, 0.5) ** 2
@@ -285,7 +303,7 @@ def begin_spotted(env, at, along, radius, late, height, io: Bundle[TrackingIO]):
         else:
             mean = io.tracks.state[env, track]
             x, y = mean[0] + late * mean[2] - at[0], mean[1] + late * mean[3] - at[1]
-            reach = io.tracks.radius_m[env, track] + ti.static(io.camera_tracking_cfg.apart_m)
+            reach = io.tracks.radius_m[env, track] + APART_M
             known = known or x * x + y * y < reach * reach
     if slot >= 0 and not known:
         var = ti.static(io.camera_tracking_cfg.sigma_m**2)
@@ -451,6 +469,6 @@ def missing_heights(env, col, ahead, radius, eye_z, R_wb, io: Bundle[TrackingIO]
         row = ti.cast(ti.floor(middle_row - focal * up + 0.5), ti.i32)
         held = ti.math.clamp(row, 0, io.depth_cfg.rows - 1)
         if row == held and io.image.depth_m[env, held, col] > ahead - radius - _DEPTH_SLACK_M:
-            out[i] = 1.0 - io.height_cfg.camera_hit_share
-            out[COLUMN] = 1.0 - io.height_cfg.camera_hit_share
+            out[i] = 1.0 - HIT_SHARE
+            out[COLUMN] = 1.0 - HIT_SHARE
     return out

@@ -27,6 +27,12 @@ _CANDIDATE = 1 << 20
 _BRIDGE = 3
 """A run may step this many beams at once: over one beam of any kind, or over two without return."""
 
+SPLIT_M, SPLIT_SLOPE = 0.18, 0.03
+"""Jump of range [m], and more per metre of it, that ends an obstacle (EC, tuned)."""
+
+SPLIT_DOPPLER_M_S = 0.3
+"""Neighbouring beams whose Doppler differs by more (plus 6 sigma) belong to different obstacles (EC)."""
+
 _MODEL_SIGMA_M = 0.01
 """What remains of a range's error however many beams are averaged: obstacles are not circles (EC)."""
 
@@ -52,10 +58,7 @@ def range_variance(range_m, io: Bundle[TrackingIO]):
 def split_distance(range_m, io: Bundle[TrackingIO]):
     """Jump of range [m] between two beams that ends an obstacle: the design's rule, or what noise alone can
     do."""
-    return ti.max(
-        io.tracking_cfg.split_m + io.tracking_cfg.split_slope * range_m,
-        4.0 * ti.sqrt(range_variance(range_m, io)),
-    )
+    return ti.max(SPLIT_M + SPLIT_SLOPE * range_m, 4.0 * ti.sqrt(range_variance(range_m, io)))
 
 
 @ti.func
@@ -214,9 +217,7 @@ def joined(env, a, b, io: Bundle[TrackingIO]):
             out = jump <= split_distance(io.scan.range_m[env, a], io)
             if ti.static(io.sonar_cfg.doppler):
                 swing = ti.abs(io.clusters.beam_doppler[env, b] - io.clusters.beam_doppler[env, a])
-                out = out and swing <= ti.static(
-                    io.tracking_cfg.split_doppler_m_s + 6 * io.sonar_cfg.doppler_sigma_m_s
-                )
+                out = out and swing <= ti.static(SPLIT_DOPPLER_M_S + 6 * io.sonar_cfg.doppler_sigma_m_s)
     return out
 
 

@@ -36,6 +36,17 @@ and nothing comes back from 0."""
 _WELL_THERE = 0.95
 """Probability of an obstacle that has just been matched to be where it is expected."""
 
+EDGE_M = 0.06
+"""Half width of the soft edge of the fan (EC)."""
+
+HIT_SHARE, EVIDENCE_S = 0.9, 0.15
+"""Probability that an obstacle in the fan is hit, where its place is known exactly; scans closer together are
+not independent evidence (EC)."""
+
+TAIL_SHARE, COLUMN_TAIL_SHARE = 0.02, 0.15
+"""Heights, and the full column, that are less likely are taken to be free. Fifteen of the first and the
+second sum to less than 1: an obstacle is somewhere (EC)."""
+
 
 @ti.func
 def heights(tank_cfg: Const[TankConfig]):
@@ -88,9 +99,7 @@ def in_fan(env, track, own, half, io: Bundle[TrackingIO]):
     at = heights(io.tank_cfg)
     out = f16x(0.0)
     for i in ti.static(range(LANES)):
-        out[i] = ti.math.clamp(
-            (reach - ti.abs(at[i] - own[2])) * ti.static(0.5 / io.height_cfg.edge_m) + 0.5, 0.0, 1.0
-        )
+        out[i] = ti.math.clamp((reach - ti.abs(at[i] - own[2])) * ti.static(0.5 / EDGE_M) + 0.5, 0.0, 1.0)
     out[COLUMN] = 1.0
     return out
 
@@ -99,7 +108,7 @@ def in_fan(env, track, own, half, io: Bundle[TrackingIO]):
 def weigh_seen(env, track, own, io: Bundle[TrackingIO]):
     """The sonar at ``own`` hit it: it is there, and within the fan."""
     half = half_height(env, track, io.tracks, io.height_cfg)
-    likely = in_fan(env, track, own, half + io.height_cfg.edge_m, io)
+    likely = in_fan(env, track, own, half + EDGE_M, io)
     weighed = io.tracks.height[env, track, 0] * ti.max(likely, _LEAST)
     io.tracks.height[env, track, 0] = shared(weighed)
     io.tracks.present[env, track] = _WELL_THERE
@@ -110,13 +119,13 @@ def weigh_unseen(env, track, own, dt, io: Bundle[TrackingIO]):
     """Beams from ``own`` went through where it is expected: it is above or below the fan, or elsewhere.
 
     The less surely the filter knows where it is, the less it says that beams through the middle of that place
-    met nothing; and neighbouring scans say the same again, so only one in ``evidence_s`` counts in full.
+    met nothing; and neighbouring scans say the same again, so only one in ``EVIDENCE_S`` counts in full.
     """
     radius = io.tracks.radius_m[env, track]
     spread_var = largest_position_variance(io.tracks.cov[env, track], 0.0)
-    sure = ti.static(io.height_cfg.hit_share) * radius * radius / (radius * radius + spread_var)
-    hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / io.height_cfg.evidence_s), 1.0)
-    likely = in_fan(env, track, own, io.height_cfg.least_half_height_m - io.height_cfg.edge_m, io)
+    sure = HIT_SHARE * radius * radius / (radius * radius + spread_var)
+    hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / EVIDENCE_S), 1.0)
+    likely = in_fan(env, track, own, io.height_cfg.least_half_height_m - EDGE_M, io)
     weighed = io.tracks.height[env, track, 0] * ti.max(1.0 - likely * hit, _LEAST)
     total = weighed.sum()
     io.tracks.height[env, track, 0] = shared(weighed)
@@ -161,16 +170,16 @@ def bound_heights(io: Bundle[TrackingIO]):
 
 @ti.func
 def free_water(env, track, own_z, io: Bundle[TrackingIO]):
-    """(lowest edge above, highest edge below) [m] of the hypotheses that hold more than ``tail_share``."""
+    """(lowest edge above, highest edge below) [m] of the hypotheses that hold more than ``TAIL_SHARE``."""
     at, share = heights(io.tank_cfg), io.tracks.height[env, track, 0]
     half = half_height(env, track, io.tracks, io.height_cfg)
     above, below = FAR_M, -FAR_M
     for i in ti.static(range(COLUMN)):
-        if share[i] > ti.static(io.height_cfg.tail_share):
+        if share[i] > TAIL_SHARE:
             if at[i] >= own_z:
                 above = ti.min(above, ti.max(at[i] - half, own_z))
             if at[i] <= own_z:
                 below = ti.max(below, ti.min(at[i] + half, own_z))
-    if share[COLUMN] > ti.static(io.height_cfg.column_tail_share):
+    if share[COLUMN] > COLUMN_TAIL_SHARE:
         above, below = own_z, own_z
     return above, below

@@ -45,6 +45,14 @@ _BESIDE = 2
 _MOST_WRONG = 0.5
 """No sonar is taken to be worse."""
 
+NEWEST_SHARE, JUMP_SHARE = 0.8, 0.12
+"""Share of a step's mean acceleration that its newest reading tells, for rotors follow their command within a
+step, and its standard deviation: what a change of the acceleration leaves unknown (EC, tuned)."""
+
+ACCEL_DENSITY = 1e-6
+"""[m^2/s^3] spectral density of what else the acceleration leaves unknown; the accelerometer's own errors
+come on top (EC, tuned)."""
+
 Beams = ti.types.struct(ahead=f16x, left=f16x, range_m=f16x, hit=f16x)
 """Sixteen neighbouring beams: direction in the level body frame, and what was measured."""
 
@@ -311,7 +319,7 @@ def predict_pose(io: Bundle[LocalizationIO]):
             motion = level_motion(env, io)
             if step > 0:
                 jump = motion - io.localization.motion[env]
-                between = motion - ti.static(1.0 - io.localization_cfg.newest_share) * jump
+                between = motion - ti.static(1.0 - NEWEST_SHARE) * jump
                 between[3] = motion[3] - 0.5 * jump[3]
                 between -= leaning(env, io)
                 move_on(env, between, jump, io)
@@ -425,17 +433,17 @@ def carried(u, way, ahead, spin, dt):
 def won_variance(jump, io: Bundle[LocalizationIO]):
     """[m^2/s^2] by which a velocity becomes less sure in one step in which its acceleration changed by
     ``jump`` [m/s^2]."""
-    missed = jump * ti.static(io.localization_cfg.jump_share * io.episode_cfg.control_dt_s)
+    missed = jump * ti.static(JUMP_SHARE * io.episode_cfg.control_dt_s)
     return missed * missed + ti.static(
-        accel_variance(io.localization_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg)
+        accel_variance(io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg)
     )
 
 
-def accel_variance(localization_cfg, dt, sensors_cfg, vehicle_cfg):
+def accel_variance(dt, sensors_cfg, vehicle_cfg):
     """[m^2/s^2] The same of a steady acceleration: noise of the accelerometer and of the attitude, by which
     gravity leaks into the level axes; plain Python."""
     leak = vehicle_cfg.gravity_m_s2 * sensors_cfg.imu.attitude_sigma_rad
-    return (sensors_cfg.imu.accel_sigma_m_s2**2 + leak**2) * dt**2 + localization_cfg.accel_density * dt
+    return (sensors_cfg.imu.accel_sigma_m_s2**2 + leak**2) * dt**2 + ACCEL_DENSITY * dt
 
 
 @ti.func
@@ -523,9 +531,7 @@ def take_walls(env, io: Bundle[LocalizationIO]):
         rows[k, 0], rows[k, 1], rows[k, 2], found[k] = a, b, root[2, k], seen[k]
         rows[k, 3], rows[k, 4] = -a * back_x - b * back_y, a * back_y - b * back_x
         rows[k, 7], rows[k, 8] = 0.5 * drifted * rows[k, 3], 0.5 * drifted * rows[k, 4]
-    won = ti.static(
-        accel_variance(io.localization_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg)
-    )
+    won = ti.static(accel_variance(io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg))
     info, part = blurred(fix.velocity, fix.velocity_part, won * (io.clock.step[env] - io.scan.ping_step[env]))
     half, slip = halved(info, part)
     for k in ti.static(range(2)):

@@ -60,6 +60,20 @@ _SAME_M = 0.4
 _MOST_WEIGHT = 4.0
 """A remembered turn moves by at least a quarter of what is seen anew."""
 
+ACROSS_M, ACROSS_SLOPE = 0.25, 0.1
+"""A course leads to a remembered turn that it passes within this, and within so much more per metre ahead
+(EC)."""
+
+OVERDUE_M, PASSED_M = 0.15, 0.5
+"""A turn so far behind may still come, for the filter lags; one so far behind did not come (EC)."""
+
+STRAIGHT_ODDS = 4.0
+"""Prior odds that an obstacle goes straight: a turn rate is used where its evidence against 0 outweighs them
+(EC)."""
+
+MAX_GROWTH_M = 0.5
+"""A forecast's radius grows no further: beyond, nothing would be free (EC)."""
+
 
 @ti.func
 def forget_turns(env, io: Bundle[TrackingIO]):
@@ -179,14 +193,14 @@ def store_turn(env, pos, d0, d1, io: Bundle[TrackingIO]):
 def drop_passed(env, pos, course, moved, io: Bundle[TrackingIO]):
     """An obstacle that was expected to turn and has gone straight on past the place, in the last ``moved``
     [m], takes one off its weight."""
-    edge = ti.static(-io.forecast_cfg.passed_m)
+    edge = ti.static(-PASSED_M)
     for packet in range(io.turn_history.turn.shape[2]):
         along, across = offsets(env, packet, pos, course, io.turn_history)
         for lane in ti.static(range(LANES)):
             behind = along[lane] < edge and along[lane] + moved >= edge
             if (
                 behind
-                and across[lane] < ti.static(0.5 * io.forecast_cfg.across_m)
+                and across[lane] < ti.static(0.5 * ACROSS_M)
                 and io.turn_history.turn[env, WEIGHT, packet][lane] > 0.0
             ):
                 io.turn_history.turn[env, WEIGHT, packet][lane] -= 1.0
@@ -218,10 +232,7 @@ def next_turn(env, pos, course, io: Bundle[TrackingIO]):
     for packet in range(io.turn_history.turn.shape[2]):
         along, across = offsets(env, packet, pos, course, io.turn_history)
         for lane in ti.static(range(LANES)):
-            meets = (
-                across[lane] < io.forecast_cfg.across_m + io.forecast_cfg.across_slope * along[lane]
-                and along[lane] > -io.forecast_cfg.overdue_m
-            )
+            meets = across[lane] < ACROSS_M + ACROSS_SLOPE * along[lane] and along[lane] > -OVERDUE_M
             if meets and along[lane] < gap:
                 gap, slot = along[lane], packet * LANES + lane
     out = course
@@ -294,7 +305,7 @@ def expected_turn_rate(
         # rate^2 / s > ln(S / s) + 2 ln k
         known, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
         bar = ti.log(ti.static(tracking_cfg.turn_rate_sigma_rad_s**2) / ti.max(var, 1e-9)) + ti.static(
-            2.0 * math.log(forecast_cfg.straight_odds)
+            2.0 * math.log(STRAIGHT_ODDS)
         )
         if var > 0.0 and known * known > var * ti.max(bar, 0.0):
             rate = known
@@ -356,7 +367,7 @@ def forecast_tracks(io: Bundle[TrackingIO]):
 
     The radius grows by ``growth_sigmas`` standard deviations of the predicted position along its worst axis,
     as the filter knows it today: turns to come are not in it (the planner's own growing margin is for them).
-    At most ``max_growth_m``.
+    At most ``MAX_GROWTH_M``.
     """
     n_track = ti.static(io.tracks.alive.shape[1])
     n_share = ti.static(shares(n_track))
@@ -394,9 +405,7 @@ def follow_arc(env, track, io: Bundle[TrackingIO]):
         ahead = late + k * io.tracking_cfg.forecast_dt_s
         growth = io.tracking_cfg.growth_sigmas * ti.sqrt(largest_position_variance(cov, ahead))
         io.forecast.pos_w[env, track, k] = pos
-        io.forecast.radius_m[env, track, k] = io.tracks.radius_m[env, track] + ti.min(
-            growth, io.tracking_cfg.max_growth_m
-        )
+        io.forecast.radius_m[env, track, k] = io.tracks.radius_m[env, track] + ti.min(growth, MAX_GROWTH_M)
         pos += step * turned_z(vel, 0.5 * rate * io.tracking_cfg.forecast_dt_s)
         vel = turned_z(vel, rate * io.tracking_cfg.forecast_dt_s)
 
@@ -427,7 +436,7 @@ def follow_legs(env, track, changed, io: Bundle[TrackingIO]):
         gap -= way
         growth = io.tracking_cfg.growth_sigmas * ti.sqrt(largest_position_variance(cov, ahead))
         io.forecast.pos_w[env, track, k] = pos
-        io.forecast.radius_m[env, track, k] = radius + ti.min(growth, io.tracking_cfg.max_growth_m)
+        io.forecast.radius_m[env, track, k] = radius + ti.min(growth, MAX_GROWTH_M)
         way = speed * io.tracking_cfg.forecast_dt_s
         ahead += io.tracking_cfg.forecast_dt_s
 

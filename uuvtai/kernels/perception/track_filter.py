@@ -15,7 +15,7 @@ from uuvtai.kernels.core.kalman import (
 from uuvtai.kernels.core.stage import Bundle, Const
 from uuvtai.kernels.perception.clustering import ARC
 from uuvtai.kernels.perception.io import TrackingIO
-from uuvtai.kernels.perception.prediction import BEGIN_SEEN, next_turn
+from uuvtai.kernels.perception.prediction import BEGIN_SEEN, STRAIGHT_ODDS, next_turn
 
 # ------------------------------------------------------------------------------------------------------------
 # What a cluster says about an obstacle of known radius: where its centre is, how surely, how well it fits a
@@ -28,6 +28,16 @@ _CROSS_SIGMA_M = 0.02
 _EDGE_SIGMA = 0.25
 """Error of the middle of two edges, in beam spacings: each is uniform within one spacing, sqrt(1 / 24) = 0.2,
 plus grazing loss."""
+
+
+MOVING_M_S, MOVING_DOPPLER_M_S = 0.08, 0.03
+"""An obstacle moves if it is faster, and its Doppler is larger (EC)."""
+
+MOVING_SHIFT_M, SHIFT_S = 0.12, 0.5
+"""Or by a displacement from this length and age on: motion across the beams (EC)."""
+
+SHIFT_MEMORY_S, DOPPLER_MEMORY_S = 2.0, 0.5
+"""Time constants with which displacement and mean Doppler are forgotten (EC)."""
 
 
 @ti.func
@@ -228,21 +238,19 @@ def put_filter(env, track, mean, cov, rate, link, io: Bundle[TrackingIO]):
 def update_evidence(env, track, c, dt, before, io: Bundle[TrackingIO]):
     """Fading mean of the Doppler and fading displacement. ``before`` = mean predicted for this scan."""
     if ti.static(io.sonar_cfg.doppler):
-        known = 1.0 / (io.tracks.doppler_var[env, track] * (1.0 + dt / io.tracking_cfg.doppler_memory_s))
+        known = 1.0 / (io.tracks.doppler_var[env, track] * (1.0 + dt / DOPPLER_MEMORY_S))
         new = 1.0 / io.clusters.doppler_var[env, c]
         io.tracks.doppler_m_s[env, track] = (
             known * io.tracks.doppler_m_s[env, track] + new * io.clusters.doppler_m_s[env, c]
         ) / (known + new)
         io.tracks.doppler_var[env, track] = 1.0 / (known + new)
-    shift = io.tracks.shift_w[env, track] / (1.0 + dt / io.tracking_cfg.shift_memory_s)
+    shift = io.tracks.shift_w[env, track] / (1.0 + dt / SHIFT_MEMORY_S)
     if io.clusters.hidden[env, c] == 0:
         after = io.tracks.state[env, track]
         shift += ti.Vector([after[0] - before[0] + dt * before[2], after[1] - before[1] + dt * before[3]])
     io.tracks.shift_w[env, track] = shift
     turned = wrapped_angle(io.clusters.bearing_w[env, c] - io.tracks.sight_w[env, track])
-    io.tracks.sweep[env, track] = (
-        io.tracks.sweep[env, track] / (1.0 + dt / io.tracking_cfg.shift_memory_s) + turned
-    )
+    io.tracks.sweep[env, track] = io.tracks.sweep[env, track] / (1.0 + dt / SHIFT_MEMORY_S) + turned
     io.tracks.sight_w[env, track] = io.clusters.bearing_w[env, c]
 
 
@@ -251,12 +259,10 @@ def is_moving(env, track, c, dt, io: Bundle[TrackingIO]):
     """1 where the track moves: fast enough and with evidence to begin with, until it is slow and there is
     none."""
     mean = io.tracks.state[env, track]
-    fast = mean[2] * mean[2] + mean[3] * mean[3] > io.tracking_cfg.moving_speed_m_s**2
+    fast = mean[2] * mean[2] + mean[3] * mean[3] > MOVING_M_S**2
     shown = has_shifted(env, track, c, dt, io)
     if ti.static(io.sonar_cfg.doppler):
-        doppler = ti.max(
-            io.tracking_cfg.moving_doppler_m_s, DOPPLER_SIGMAS * ti.sqrt(io.tracks.doppler_var[env, track])
-        )
+        doppler = ti.max(MOVING_DOPPLER_M_S, DOPPLER_SIGMAS * ti.sqrt(io.tracks.doppler_var[env, track]))
         shown = shown or ti.abs(io.tracks.doppler_m_s[env, track]) > doppler
     begins = fast and shown and io.tracks.age[env, track] >= CONFIRMED - 1
     goes_on = io.tracks.moving[env, track] == 1 and (fast or shown)
@@ -277,12 +283,12 @@ def has_shifted(env, track, c, dt, io: Bundle[TrackingIO]):
     )
     noise = ti.sqrt(largest_position_variance(io.tracks.cov[env, track], 0.0) + cross_var)
     feigned = 0.5 * io.tracking_cfg.max_width_m * ti.abs(io.tracks.sweep[env, track])
-    reach = io.tracking_cfg.moving_shift_m + feigned + 2.0 * noise
+    reach = MOVING_SHIFT_M + feigned + 2.0 * noise
     length = ti.sqrt(shift.dot(shift))
     forward = shift[0] * mean[2] + shift[1] * mean[3] > 0.8 * length * ti.sqrt(
         mean[2] * mean[2] + mean[3] * mean[3]
     )
-    return length > reach and forward and io.tracks.age[env, track] * dt > io.tracking_cfg.shift_s
+    return length > reach and forward and io.tracks.age[env, track] * dt > SHIFT_S
 
 
 @ti.func
@@ -391,7 +397,7 @@ def straight_share(env, track, io: Bundle[TrackingIO]):
         if var > 0.0:
             turns = ti.sqrt(var) * ti.static(1.0 / io.tracking_cfg.turn_rate_sigma_rad_s)
             turns *= ti.exp(ti.min(0.5 * rate * rate / var, 20.0))
-            share = io.forecast_cfg.straight_odds / (io.forecast_cfg.straight_odds + turns)
+            share = STRAIGHT_ODDS / (STRAIGHT_ODDS + turns)
     return share
 
 

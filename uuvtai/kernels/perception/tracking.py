@@ -16,13 +16,20 @@ from uuvtai.kernels.core.geometry import FAR_M, wrapped_angle
 from uuvtai.kernels.core.kalman import born, predicted
 from uuvtai.kernels.core.simd import f16x
 from uuvtai.kernels.core.stage import Bundle, Out, n_envs
-from uuvtai.kernels.perception.clustering import HELD_SIGMA_M_S, find_clusters, label_beams, split_distance
+from uuvtai.kernels.perception.clustering import (
+    HELD_SIGMA_M_S,
+    SPLIT_DOPPLER_M_S,
+    find_clusters,
+    label_beams,
+    split_distance,
+)
 from uuvtai.kernels.perception.height import begin_height, weigh_seen, weigh_unseen
 from uuvtai.kernels.perception.io import TrackingIO
 from uuvtai.kernels.perception.prediction import coasted, expected_turn_rate
 from uuvtai.kernels.perception.track_filter import (
     CONFIRMED,
     DOPPLER_SIGMAS,
+    MOVING_DOPPLER_M_S,
     bearing_vector,
     centre_sight,
     centre_variances,
@@ -42,9 +49,14 @@ from uuvtai.state import TrackState
 SEEN_THROUGH = 1
 BLOCKED = 2
 
+SIGHT_DOPPLER_M_S = 0.2
 _SIGHT_SIGMAS = 6.0
 _SIGHT_BEAMS = 3
-"""What is moving at first sight: a mean Doppler of so many standard deviations over so many beams."""
+"""What is moving at first sight: a mean Doppler of so much, and so many standard deviations, over so many
+beams (EC)."""
+
+GONE_SHARE = 0.25
+"""Below this probability of being where it is expected, an obstacle is forgotten (EC)."""
 
 _MISS_S = 0.1
 """One "miss" of the config: a nominal 10 Hz scan."""
@@ -116,7 +128,7 @@ def is_forgotten(env, track, sight, dt, io: Bundle[TrackingIO]):
     if sight == SEEN_THROUGH:
         weigh_unseen(env, track, io.scan.ping_pos_w[env], dt, io)
     io.tracks.present[env, track] *= ti.exp(-dt * ti.static(1.0 / max(io.height_cfg.memory_s, 1e-3)))
-    return ti.cast(io.tracks.present[env, track] < io.height_cfg.gone_share, ti.i32)
+    return ti.cast(io.tracks.present[env, track] < GONE_SHARE, ti.i32)
 
 
 @ti.func
@@ -230,9 +242,7 @@ def owner_of(env, c, io: Bundle[TrackingIO]):
             )
             close = (here[0] - there[0]) ** 2 + (here[1] - there[1]) ** 2 < reach * reach
             swing = ti.abs(io.clusters.doppler_m_s[env, c] - io.tracks.doppler_m_s[env, track])
-            if close and swing < ti.static(
-                io.tracking_cfg.split_doppler_m_s + 3 * io.sonar_cfg.doppler_sigma_m_s
-            ):
+            if close and swing < ti.static(SPLIT_DOPPLER_M_S + 3 * io.sonar_cfg.doppler_sigma_m_s):
                 out = track
     return out
 
@@ -246,7 +256,7 @@ def free_slot(env, c, io: Bundle[TrackingIO]):
     """
     own = io.scan.ping_pos_w[env]
     moves = ti.abs(io.clusters.doppler_m_s[env, c]) > ti.max(
-        io.tracking_cfg.moving_doppler_m_s, DOPPLER_SIGMAS * ti.sqrt(io.clusters.doppler_var[env, c])
+        MOVING_DOPPLER_M_S, DOPPLER_SIGMAS * ti.sqrt(io.clusters.doppler_var[env, c])
     )
     out = -1
     worst = ti.select(moves, -1.0, io.clusters.range_m[env, c] + io.clusters.radius_m[env, c])
@@ -303,9 +313,7 @@ def begin_track(env, track, c, io: Bundle[TrackingIO]):
 def moves_at_sight(env, c, io: Bundle[TrackingIO]):
     """1 where the first scan's Doppler alone shows motion: for this, several beams must agree, and it must be
     far beyond what noise and the own velocity's error can feign."""
-    bar = ti.max(
-        ti.static(io.tracking_cfg.sight_doppler_m_s), _SIGHT_SIGMAS * ti.sqrt(io.clusters.doppler_var[env, c])
-    )
+    bar = ti.max(SIGHT_DOPPLER_M_S, _SIGHT_SIGMAS * ti.sqrt(io.clusters.doppler_var[env, c]))
     several = io.clusters.n_beam[env, c] >= _SIGHT_BEAMS
     return ti.cast(several and ti.abs(io.clusters.doppler_m_s[env, c]) > bar, ti.i32)
 

@@ -18,6 +18,9 @@ from uuvtai.kernels.vehicle.thruster_fault import vertical_pair
 
 _LARGEST = 3.4028234663852886e38
 """of float32"""
+BAND_M_S, BAND_RAD_S = 0.3, 0.5
+"""errors beyond do not build up the integral: they are a step under way or a blocked vehicle, and both would
+overshoot later (EC)"""
 
 
 @quick_launch
@@ -88,16 +91,9 @@ def axis_loops(cfg):
     """Loops of surge, sway, heave and yaw rate; plain Python, constants of the kernel."""
     linear = zip(cfg.velocity_gain, cfg.velocity_integral, cfg.max_force_n, strict=True)
     yaw = AxisLoop(
-        cfg.yaw_rate_gain,
-        cfg.yaw_rate_integral,
-        cfg.integral_band_rad_s,
-        cfg.max_integral_n_m,
-        cfg.max_moment_n_m,
+        cfg.yaw_rate_gain, cfg.yaw_rate_integral, BAND_RAD_S, cfg.max_integral_n_m, cfg.max_moment_n_m
     )
-    return (
-        *(AxisLoop(p, i, cfg.integral_band_m_s, cfg.max_integral_n, limit) for p, i, limit in linear),
-        yaw,
-    )
+    return (*(AxisLoop(p, i, BAND_M_S, cfg.max_integral_n, limit) for p, i, limit in linear), yaw)
 
 
 @ti.func

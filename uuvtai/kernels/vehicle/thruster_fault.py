@@ -17,7 +17,7 @@ leaves a sum of squares, forgotten after ``watch_s``:
   parameters than believed
 
 each about its own mean, as far as the accelerometer's data sheet allows a constant error. Of two a thruster
-is given up, until the episode ends, when its death leaves less than ``watch_ratio`` of what the best of the
+is given up, until the episode ends, when its death leaves less than ``RATIO`` of what the best of the
 others leaves. Where any death leaves far less than whole or weak thrusters do, one is suspected: the pilot
 keeps away, which of them it is nobody needs to know.
 """
@@ -35,8 +35,13 @@ _OFFSET_NOISE_N2_S = 2.5
 _SMOOTH_S = 0.1
 """Time constant of felt and asked thrusts."""
 
+RATIO, DOUBT_N2_S = 0.3, 1.0
+"""A death must leave less than this share of what any other explanation leaves of the felt thrust, which
+thrusters that lost less than 65 % of their gain never do; and so much less: the accelerometer's noise is no
+evidence (EC)."""
+
 _SUSPECT, _SUSPECT_RATIO = 0.3, 0.4
-"""Share of ``watch_doubt_n2_s``, and what stands for ``watch_ratio``, where one is only suspected."""
+"""Share of ``DOUBT_N2_S``, and what stands for ``RATIO``, where one is only suspected."""
 
 _UPRIGHT = 0.99
 """Vertical share of a thruster's direction, at least."""
@@ -117,14 +122,14 @@ def _weigh(env, io: Bundle[ThrusterWatchIO]):
     cross = rt - weight * mean_r * mean_t
     weak = whole - cross * cross / ti.max(tt - weight * mean_t * mean_t, 1e-6)
     for i in ti.static(range(n)):
-        rival, doubt = ti.min(whole, weak), io.actuation_cfg.watch_doubt_n2_s
+        rival, doubt = ti.min(whole, weak), DOUBT_N2_S
         if (
             dead[i] + ti.static(_SUSPECT) * doubt < ti.static(_SUSPECT_RATIO) * rival
             and io.ego.given_up[env] == 0
         ):
             io.ego.given_up[env] = -1
         if ti.static(n == 2):
-            if dead[i] + doubt < io.actuation_cfg.watch_ratio * ti.min(rival, dead[1 - i]):
+            if dead[i] + doubt < RATIO * ti.min(rival, dead[1 - i]):
                 io.ego.given_up[env] = 1 + group[i]
 
 

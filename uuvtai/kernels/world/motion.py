@@ -222,10 +222,6 @@ def draw_path(env, lane, i, draw, radius, key, io: Bundle[WorldIO]):
     first = 16 + _DRAW_STRIDE * draw
     if ti.static(io.world_cfg.dynamic.motion == "waypoints"):
         fits = draw_loop(env, lane, radius, key, first, io)
-    elif ti.static(io.world_cfg.dynamic.motion == "line_circle"):
-        fits = draw_line_or_circle(env, lane, i, radius, key, first, io)
-    elif bits(key, 6) & 1 == 1:
-        fits = draw_loop(env, lane, radius, key, first, io)
     else:
         fits = draw_line_or_circle(env, lane, i, radius, key, first, io)
     io.path.phase_m[env, lane] = io.path.length_m[env, lane] * uniform(key, first)

@@ -380,8 +380,6 @@ def export_stack(
         raise StackExportError(f"--for {','.join(unknown)}: must be of {', '.join(KINDS)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StackExportError(f"{out}: is there already; give a new or an empty folder")
-    if config.mapping.stamp > 0:
-        raise StackExportError("mapping.stamp: a map that takes the truth in cannot drive a vehicle")
     linker()
     try:
         tape, sim = record(config, tree, mission)

@@ -271,7 +271,7 @@ class _Import:
         return {id(each) for s in self.sources if s.kind == "A50" for each in s.readings}
 
     def _write_head(self, file: McapFile) -> None:
-        tree = read_tree("bt", self.config.behavior.max_node)
+        tree = read_tree("bt")
         about = {"agent": "bt", "world": self.plan.world, "seed": "0", "episode": "0"}
         about["files"] = json.dumps([str(path) for path in self.plan.files])
         file.add_metadata(IMPORTED, about)
