@@ -78,8 +78,9 @@ def io_for(bundle, *parts):
     """The bundle with these structs and sections, those of a config, or those that a test's stage has as
     attributes; what is not given is None, and a kernel that touches it does not compile."""
     parts = [each for part in parts for each in _structs_of(part)]
-    key = (bundle, *map(id, parts))
-    if key not in _made:  # the parts stay alive: their identities are the key
+    # structs stay alive, so that their identities are keys; sections that say the same compile the same
+    key = (bundle, *(part if isinstance(part, Section) else id(part) for part in parts))
+    if key not in _made:
         _made[key] = bind(bundle, *parts, partial=True), parts
     return _made[key][0]
 

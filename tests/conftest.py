@@ -9,9 +9,9 @@ import pytest
 gc.disable()  # until all is imported and collected, which makes millions of objects, few of them garbage
 
 BEGUN_FIRST = """
-docs cuda native tuned world replay cli aboard deploy training tracking report set_export security sonar
-examples log_alone pose signals identify telemetry resume_eval dynamics logs sweep
-media_formats link wheel explain hostile_logs echoes voronoi
+docs native world aboard cuda cli wheel training replay tracking deploy log_alone security report set_export
+sonar examples identify telemetry signals sweep dynamics tuned logs resume_eval behavior localization
+media_formats link explain hostile_logs echoes voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""

@@ -1,6 +1,7 @@
 """An evaluation that is interrupted or killed goes on, and ends as if nobody had disturbed it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -122,6 +123,14 @@ def interrupted(ask, run, **others):
         compare(ask(run, **others), Watch("straight" if "agents" not in others else "mine", 1))
 
 
+@pytest.fixture(scope="module")
+def cut(ask, tmp_path_factory):
+    """The folder of an interrupted evaluation."""
+    run = tmp_path_factory.mktemp("cut") / "run"
+    interrupted(ask, run, record=0)
+    return run
+
+
 def test_another_tree_under_the_same_name_is_refused(ask, tmp_path):
     tree = tmp_path / "mine.xml"
     tree.write_text(preset_path("tree", "straight").read_text())
@@ -145,9 +154,8 @@ def test_another_tree_under_the_same_name_is_refused(ask, tmp_path):
         (results.JOURNAL_FILE, b"\xff\xfe\n", "line 1: is no finished episode"),
     ],
 )
-def test_a_damaged_folder_is_refused(ask, tmp_path, file, content, says):
-    run = tmp_path / "run"
-    interrupted(ask, run, record=0)
+def test_a_damaged_folder_is_refused(cut, tmp_path, file, content, says):
+    run = shutil.copytree(cut, tmp_path / "run")
     (run / file).unlink()
     if content is not None:
         (run / file).write_bytes(content)
@@ -155,9 +163,8 @@ def test_a_damaged_folder_is_refused(ask, tmp_path, file, content, says):
         resume(run, Watch())
 
 
-def test_a_ledger_that_is_a_link_is_not_written_through(ask, tmp_path):
-    run, victim = tmp_path / "run", tmp_path / "victim"
-    interrupted(ask, run, record=0)
+def test_a_ledger_that_is_a_link_is_not_written_through(cut, tmp_path):
+    run, victim = shutil.copytree(cut, tmp_path / "run"), tmp_path / "victim"
     victim.write_text("mine, without an end of line")
     (run / results.JOURNAL_FILE).unlink()
     (run / results.JOURNAL_FILE).symlink_to(victim)

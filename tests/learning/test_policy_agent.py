@@ -10,6 +10,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from tests.command import run_cli
+from tests.small_sim import SmallSim
 from uuvtai.common.presets import PRESET_DIR
 from uuvtai.config.loader import load_training
 from uuvtai.envs.vector_env import VectorEnv
@@ -232,9 +233,16 @@ def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
 
 
 def test_the_built_in_policy_arrives(tmp_path, capfd):
-    assert (
-        run_cli("eval", "--agent=policy", "--episodes=8", "--seeds=3", "--json", "--run-dir", tmp_path) == 0
+    words = (
+        "--agent=policy",
+        "--episodes=8",
+        "--seeds=3",
+        *SmallSim.OPTIONS,
+        "--json",
+        "--run-dir",
+        tmp_path,
     )
+    assert run_cli("eval", *words) == 0
     (agent,) = json.loads(capfd.readouterr().out)["agents"]
     assert agent["outcomes"]["success"] >= 7 and agent["checkpoint"]["path"] == "built-in"
 

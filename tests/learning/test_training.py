@@ -11,6 +11,7 @@ import time
 import pytest
 import torch
 
+from tests.command import uuv
 from tests.point_env import PointEnv
 from tests.small_sim import SmallSim
 from uuvtai.config.loader import ConfigError, load_config, load_training
@@ -292,21 +293,10 @@ LONGEST_S = 900.0
 """kernels that are not compiled yet take minutes on a busy machine"""
 
 
-def uuv(*arguments):
-    """(stdout, stderr) of a command that must succeed; it is stopped when it takes too long."""
-    done = subprocess.run(
-        [*UUV, *arguments], capture_output=True, text=True, env=QUIET, timeout=LONGEST_S, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout, done.stderr
-
-
 def killed_between_checkpoints(folder, *arguments):
     """Run a training and kill it as soon as it has written two checkpoints."""
     with subprocess.Popen(
-        [*UUV, *arguments, "--run-dir", str(folder)],
-        stderr=subprocess.DEVNULL,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "NO_COLOR": "1"},
+        [*UUV, *arguments, "--run-dir", str(folder)], stderr=subprocess.DEVNULL, env=QUIET
     ) as process:
         deadline = time.monotonic() + LONGEST_S
         while (
@@ -318,14 +308,24 @@ def killed_between_checkpoints(folder, *arguments):
         process.kill()
 
 
-def test_a_killed_run_goes_on_bit_for_bit_in_another_process(tmp_path):
+@pytest.fixture
+def one_thread():
+    """As in the processes below: what threads sum up depends on how many they are."""
+    usual = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(usual)
+
+
+def test_a_killed_run_goes_on_bit_for_bit_in_another_process(one_thread, tmp_path, capfd):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    out, err = uuv(*RUN, "--run-dir", str(whole), "--json")
-    assert json.loads(out)["iterations"] == 6
+    code, out, err = uuv(capfd, *RUN, "--run-dir", whole, "--json")
+    assert code == 0 and json.loads(out)["iterations"] == 6
     assert "6/6: success" in err
     killed_between_checkpoints(killed, *RUN)
     assert run_json(killed)["status"] == "running", "nobody was there to say otherwise"
     assert checkpoint.newest(killed, resumable=True).step in (2, 3, 4)
-    uuv("train", "--resume", str(killed), "--device", "cpu")
+    command = [*UUV, "train", "--resume", str(killed), "--device", "cpu"]
+    subprocess.run(command, env=QUIET, timeout=LONGEST_S, check=True)
     assert content_of(whole / "checkpoints/step_000006") == content_of(killed / "checkpoints/step_000006")
     assert notes(whole) == notes(killed)

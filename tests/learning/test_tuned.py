@@ -56,10 +56,12 @@ def config():
 
 @pytest.fixture(scope="module")
 def trainer(config, small):
-    """After three iterations: slow obstacles, fast ones, slow ones."""
+    """After three iterations: slow obstacles, fast ones, slow ones; ``centres``: before and after each."""
     made = ParameterSearchTrainer(config, {"pool": small.sim})
+    made.centres = [made.centre]
     for _ in range(3):
         made.iterate()
+        made.centres.append(made.centre)
     return made
 
 
@@ -187,15 +189,11 @@ def test_trials_come_in_mirrored_pairs():
     assert bool((drawn.abs() <= search.spread + 1e-6).all())
 
 
-def test_trials_of_one_kind_of_obstacles_leave_the_other_s_numbers_alone(config, small):
-    made = ParameterSearchTrainer(config, {"pool": small.sim})
-    began = made.centre
-    made.iterate()
-    first = made.centre
+def test_trials_of_one_kind_of_obstacles_leave_the_other_s_numbers_alone(trainer):
+    began, first, second, _ = trainer.centres
     assert torch.equal(first[:, FAST], began[:, FAST])
-    made.iterate()
-    assert torch.equal(made.centre[:, SLOW], first[:, SLOW])
-    assert not torch.equal(made.centre[:, FAST], began[:, FAST])
+    assert torch.equal(second[:, SLOW], first[:, SLOW])
+    assert not torch.equal(second[:, FAST], began[:, FAST])
 
 
 def test_a_search_goes_on_from_the_config_s_numbers(small):

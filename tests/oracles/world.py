@@ -102,18 +102,13 @@ def driven(corners, phase_m, speed, acceleration, times_s):
     turn = along - np.roll(along, 1, axis=0)  # at each corner, from the leg before it
     turn_s = np.linalg.norm(turn, axis=1) / acceleration
     begun_s = (np.cumsum(length) - length) / speed  # when each corner would be reached
-    lap_s, now_s, last_s = length.sum() / speed, phase_m / speed, phase_m / speed + times_s[-1]
+    lap_s, now_s = length.sum() / speed, phase_m / speed
     share = turn_s[0] / (turn_s[0] + turn_s[1])  # a moment of leg 0 that is in no turn
-    t = share * length[0] / speed - lap_s
-    state, out, wanted = np.array([*(corners[0] + share * legs[0]), *along[0]]), [], list(now_s + times_s)
-    while t <= last_s + 1e-3:
-        while wanted and wanted[0] <= t:
-            out.append(state.copy())
-            wanted.pop(0)
-        apart = (t + 5e-4 - begun_s + 0.5 * lap_s) % lap_s - 0.5 * lap_s
-        within = np.clip((0.5 * turn_s - np.abs(apart)) / 1e-3 + 0.5, 0.0, 1.0)  # parts of this step
-        push = within @ (turn / turn_s[:, None])
-        state[:2] += 1e-3 * (state[2:] + 5e-4 * push)
-        state[2:] += 1e-3 * push
-        t += 1e-3
-    return np.array(out)
+    t = np.arange(share * length[0] / speed - lap_s, now_s + times_s[-1] + 2e-3, 1e-3)
+    apart = (t[:, None] + 5e-4 - begun_s + 0.5 * lap_s) % lap_s - 0.5 * lap_s
+    within = np.clip((0.5 * turn_s - np.abs(apart)) / 1e-3 + 0.5, 0.0, 1.0)  # parts of each step
+    push = within @ (turn / turn_s[:, None])
+    velocity = along[0] + 1e-3 * (np.cumsum(push, axis=0) - push)
+    steps = 1e-3 * (velocity + 5e-4 * push)
+    place = corners[0] + share * legs[0] + np.cumsum(steps, axis=0) - steps
+    return np.hstack([place, velocity])[np.searchsorted(t, now_s + times_s)]

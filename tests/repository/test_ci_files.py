@@ -13,6 +13,7 @@ from packaging.utils import canonicalize_name
 
 import bootstrap
 import uuvtai
+from tests.conftest import BEGUN_FIRST
 
 ROOT = Path(__file__).parents[2]
 WORKFLOW = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
@@ -86,6 +87,11 @@ def test_the_processes_of_the_gate_keep_the_bytecode_they_compile(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["bootstrap.py", "test"])
     monkeypatch.setattr(bootstrap, "test", lambda _: int("PYTHONDONTWRITEBYTECODE" in os.environ))
     assert bootstrap.main() == 0
+
+
+def test_files_that_are_begun_first_are_here():
+    there = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
+    assert {f"test_{name}" for name in BEGUN_FIRST.split()} <= there
 
 
 def test_settings_of_pip_are_told_to_uv_and_the_nearer_ones_count():

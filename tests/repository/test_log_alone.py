@@ -10,7 +10,6 @@ import copy
 import hashlib
 import json
 import math
-import subprocess
 import sys
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
 
-from tests.command import read_by_viewer
+from tests.command import read_by_viewer, run_cli
 from tests.oracles import decision_alone, log_alone
 from tests.small_sim import SmallSim
 from uuvtai.config.loader import load_config, load_resolved
@@ -49,20 +48,14 @@ CLOSED_FORM = 1e-5
 
 
 def recorded(folder, *options):
-    command = [
-        sys.executable, "-m", "uuvtai", "eval", *SmallSim.OPTIONS,
-        "--set", f"episode.horizon_steps={HORIZON}", "--run-dir", str(folder), "--json", *options,
-    ]  # fmt: skip
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2], timeout=600,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return sorted((folder / "logs").glob("*.mcap")), json.loads(done.stdout)
+    horizon = ("--set", f"episode.horizon_steps={HORIZON}")
+    assert run_cli("eval", *SmallSim.OPTIONS, *horizon, "--run-dir", folder, *options) == 0
+    return sorted((folder / "logs").glob("*.mcap")), json.loads((folder / "eval/result.json").read_text())
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
-    """Logs of real evaluations by their preset of sensors, and what the evaluation printed for 'paper'."""
+    """Logs of real evaluations by their preset of sensors, and the results for 'paper'."""
     folder = tmp_path_factory.mktemp("recorded")
     paper, printed = recorded(
         folder / "paper", "--agent", "straight,bt", "--seeds", "7,3", "--episodes", "2", "--record", "3"

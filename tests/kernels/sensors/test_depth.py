@@ -11,7 +11,7 @@ from uuvtai.config import DepthConfig, TankConfig
 from uuvtai.kernels.sensors import depth_camera
 from uuvtai.kernels.sensors.io import DepthIO
 
-N_ENV, N_OBSTACLE, N_BATCH = 125, 14, 8
+N_ENV, N_OBSTACLE, N_BATCH = 125, 14, 2
 CLEAN = DepthConfig()
 SIZES = {
     "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_thruster": 6, "n_pixel_row": CLEAN.rows,
@@ -89,7 +89,7 @@ def assert_images(images, scene, tank, truth_of, envs=range(N_ENV)):
     assert counts[:, 0].sum() < GRAZING_SHARE * counts[:, 1].sum()
 
 
-def test_1000_scenes_against_mujoco(rig, batches):
+def test_random_scenes_against_mujoco(rig, batches):
     showing_obstacles = 0.0
     for scene in batches:
         rig.start(scene)
@@ -100,7 +100,7 @@ def test_1000_scenes_against_mujoco(rig, batches):
     assert 0.1 < showing_obstacles < 0.9, "the scenes must show obstacles and walls"
 
 
-def test_1000_scenes_against_oracle(rig, batches):
+def test_random_scenes_against_oracle(rig, batches):
     for scene in batches:
         rig.start(scene)
         assert_images(rig.shoot(), scene, TANK, by_oracle)

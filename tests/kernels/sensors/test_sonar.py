@@ -16,7 +16,7 @@ from uuvtai.kernels.core.stage import Const
 from uuvtai.kernels.sensors import sonar
 from uuvtai.kernels.sensors.io import SonarIO
 
-N_ENV, N_OBSTACLE, N_RAY, N_BATCH = 125, 14, 256, 8
+N_ENV, N_OBSTACLE, N_RAY, N_BATCH = 125, 14, 256, 2
 SIZES = {
     "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_ray": N_RAY, "n_latency": 3, "n_cloud": 8, "n_thruster": 6,
 }  # fmt: skip
@@ -68,7 +68,7 @@ rig = Rig.fixture()
 
 @pytest.fixture(scope="module")
 def batches():
-    """1,000 scenes in batches of N_ENV."""
+    """250 scenes in batches of N_ENV: 64,000 beams."""
     rng = np.random.default_rng(20)
     return [scenes.random_scenes(rng, N_ENV, N_OBSTACLE, TANK) for _ in range(N_BATCH)]
 
@@ -83,7 +83,7 @@ def assert_ranges(got, hit, lowest, truth, highest, max_range_m):
     assert wrong.mean() < GRAZING_SHARE
 
 
-def test_1000_scenes_against_mujoco(rig, batches):
+def test_random_scenes_against_mujoco(rig, batches):
     """Aperture 0: a beam is a line in space, which MuJoCo casts at the solids themselves."""
     hits = 0
     for scene in batches:
@@ -109,7 +109,7 @@ def test_1000_scenes_against_mujoco(rig, batches):
     assert 0.9 < hits / (N_BATCH * N_ENV * N_RAY) < 1.0
 
 
-def test_1000_scenes_against_oracle_with_aperture(rig, batches):
+def test_random_scenes_against_oracle_with_aperture(rig, batches):
     """Ranges, hits, intensity and Doppler; most obstacles are above or below the beams' plane."""
     different, obstacles, compared = 0, 0, 0
     for scene in batches:
@@ -142,7 +142,7 @@ def test_1000_scenes_against_oracle_with_aperture(rig, batches):
             obstacles += np.sum(who != WALL)
             different += np.sum(np.abs(truth - sonar_scan(scene, env, TANK, N_RAY, 0.0)[0]) > 0.1)
     assert compared > 0.9 * N_BATCH * N_ENV * N_RAY
-    assert obstacles > 20000 and different > 5000, (
+    assert obstacles > 5000 and different > 1250, (
         "the scenes must show obstacles, many of them only thanks to the aperture"
     )
 

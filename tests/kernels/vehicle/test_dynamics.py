@@ -104,7 +104,7 @@ def reference(case, seconds, dt=5e-3):
 @pytest.fixture(scope="module")
 def exact_runs():
     """Table first, then random cases, at one, two and four substeps of a control step of 0.02 s."""
-    return run_f64([*TABLE.values(), *random_cases(6)], [1, 2, 4], 101)
+    return run_f64([*TABLE.values(), *random_cases(6)], [1, 2, 4], 101, UUV_NUM_THREADS="2")
 
 
 @pytest.mark.parametrize(("case", "time_s", "quantity", "component", "value", "digits"), EXPECTED)
@@ -146,10 +146,9 @@ def test_level_drag_of_the_oracle_matches_the_table():
         assert abs(force[axis] - drag) < 0.005
 
 
-def test_thread_count_changes_nothing():
-    cases = random_cases(40)
-    one, two = (run_f64(cases, [2], 3, UUV_NUM_THREADS=n)[2] for n in ("1", "2"))
-    assert all(np.array_equal(one[name], two[name]) for name in one)
+def test_thread_count_changes_nothing(exact_runs):
+    one = run_f64([*TABLE.values(), *random_cases(6)], [2], 3, UUV_NUM_THREADS="1")[2]
+    assert all(np.array_equal(one[name], exact_runs[2][name][:3]) for name in one)
 
 
 # ------------------------------------------------------------------------------------------- single precision
