@@ -92,7 +92,7 @@ class Check(Flight):
         super().__init__(folder, arms=False, config=config, sub=RestingSub)
         mission = Mission(PLACE, (3.0, 3.0, -0.8))
         plan = FlightPlan(
-            self.endpoint.place, mission, LIMITS, self.log.path, seconds=SECONDS, checks=True,
+            self.endpoint.place, mission, LIMITS, self.log.path, seconds=SECONDS, purpose="check",
             instruments=places or {}, heading_rad=heading_rad,
         )  # fmt: skip
         self.pilot = RestingPilot()
@@ -331,7 +331,9 @@ def test_a_rig_file_says_where_instruments_are_heard_and_options_win(rig_file):
     plan = planned(config)
     assert plan.instruments == {"dvl": "a50:192.168.2.95", "sonar": "ping360:192.168.2.2"}
     assert plan.heading_rad == pytest.approx(math.pi / 2) and plan.seconds == math.inf
-    typed = planned(config, heading_deg=0.0, instruments={"dvl": "json::14700", "sonar": None}, checks=True)
+    typed = planned(
+        config, heading_deg=0.0, instruments={"dvl": "json::14700", "sonar": None}, purpose="check"
+    )
     assert typed.instruments == {"dvl": "json::14700", "sonar": "ping360:192.168.2.2"}
     assert typed.heading_rad == 0.0 and typed.seconds == 30.0
     assert planned(load_config("pool", "multibeam")).instruments == {}, "MAVLink's"

@@ -348,8 +348,7 @@ class FlightGroup:
             operator=self.operator,
             senders=self.sender or (),
             instruments={"dvl": self.dvl, "sonar": self.sonar},
-            checks=self.check,
-            calibrates=self.calibrate is not None,
+            purpose="check" if self.check else "calibrate" if self.calibrate else "fly",
         )
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -49,6 +49,8 @@ from uuvtai.vehicle.telemetry import AUTOPILOT, COMPANION, Heard, Intake, Sender
 
 EDGE_M = 0.2  # the fence's depths keep so far from surface and floor of the tank where none are typed
 MOST_SPEED_M_S = 2.0
+_USUAL_S = {"fly": math.inf, "check": CHECK_S, "calibrate": calibrate.LONGEST_S}
+_DRY = {"fly": "dry run", "check": "check", "calibrate": "calibration"}
 
 
 @dataclass(frozen=True)
@@ -69,10 +71,9 @@ class FlightPlan:
     senders: Senders | None = None  # from whom what counts; None = the usual ones of ``system``
     instruments: Mapping[str, str] = field(default_factory=dict)
     """what is heard from an instrument itself ('dvl', 'sonar') -> its place"""
-    checks: bool = False
-    """a dry run that takes nothing, not even in pretence, and judges what it heard"""
-    calibrates: bool = False
-    """another one, which finds out how the instruments are mounted"""
+    purpose: Literal["fly", "check", "calibrate"] = "fly"
+    """the last two take nothing, not even in pretence: they judge what they hear, or find out how the
+    instruments are mounted"""
 
     @classmethod
     def typed(
@@ -95,8 +96,7 @@ class FlightPlan:
         operator: int,
         senders: Sequence[str] = (),
         instruments: Mapping[str, str | None] | None = None,
-        checks: bool = False,
-        calibrates: bool = False,
+        purpose: Literal["fly", "check", "calibrate"] = "fly",
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
         if config.sensors.sonar.doppler:
@@ -118,7 +118,6 @@ class FlightPlan:
         mounted = {"dvl": config.sensors.dvl.at, "sonar": config.sensors.sonar.at}
         heard_at = mounted | {option: place for option, place in (instruments or {}).items() if place}
         limits = _limits(config, box, depth, max_speed, battery)
-        usual_s = CHECK_S if checks else calibrate.LONGEST_S if calibrates else math.inf
         mission = Mission(_three(start or ()), _three(goal or ()))
         _refuse_places(mission, limits)
         return cls(
@@ -128,14 +127,13 @@ class FlightPlan:
             log or Path("runs") / f"pilot_{time.strftime('%Y%m%d-%H%M%S')}.mcap",
             arms,
             None if heading_deg is None else math.radians(heading_deg),
-            usual_s if seconds is None else seconds,
+            _USUAL_S[purpose] if seconds is None else seconds,
             rate,
             system,
             operator,
             Senders.typed(senders, system),
             {option: place for option, place in heard_at.items() if place},
-            checks,
-            calibrates,
+            purpose,
         )
 
 
@@ -261,9 +259,11 @@ class OnboardLoop:
         self._fix, self._start, self._walls = fix, StartFound(), WallWatch(config) if fix else None
         self._sought, self._check = fix, None
         """who seeks the start, also when it is found; what a check gathers"""
-        if plan.checks:
+        if plan.purpose == "check":
             self._check = Preflight(config, plan.limits, plan.mission.start[2], plan.system, plan.operator)
-        self._calibration = calibrate.Calibration(config, plan.mission.start) if plan.calibrates else None
+        self._calibration = None
+        if plan.purpose == "calibrate":
+            self._calibration = calibrate.Calibration(config, plan.mission.start)
         self.failure: BaseException | None = None
         """an error of this program that ended the flight, or came while it ended"""
 
@@ -283,7 +283,7 @@ class OnboardLoop:
     @property
     def _only_listens(self) -> bool:
         """Whether it takes nothing, not even in pretence."""
-        return self._check is not None or self._calibration is not None
+        return self._plan.purpose != "fly"
 
     def _time_s(self) -> float:
         return 0.0 if self._begun_s is None else (self._now() - self._begun_s) * self._rate
@@ -637,13 +637,12 @@ def fly(
             if followed:
                 now, sleep = followed.now, partial(followed.sleep, stop=stop)
             endpoint.forget()  # what came while kernels were compiled
-            fix = None if plan.calibrates else StartFix(config, plan.mission.start)
+            fix = None if plan.purpose == "calibrate" else StartFix(config, plan.mission.start)
             loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix, rig)
-            kind = "check" if plan.checks else "calibration" if plan.calibrates else "dry run"
-            dry = f"{kind}: no order that moves the vehicle is sent"
+            dry = f"{_DRY[plan.purpose]}: no order that moves the vehicle is sent"
             what = "ARMS AND DRIVES the vehicle" if plan.arms else dry
             where = "speaks to" if plan.place.calls else "listens at"
-            ends = "ends it" if plan.checks or plan.calibrates else "gives the vehicle back"
+            ends = "gives the vehicle back" if plan.purpose == "fly" else "ends it"
             loop.tell(f"{what}; {where} {plan.place.host}:{plan.place.port}; Ctrl-C {ends}")
             try:
                 loop.run(stop)
