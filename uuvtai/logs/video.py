@@ -18,6 +18,7 @@ from PIL import Image
 from uuvtai.common.files import whole_file
 from uuvtai.logs.drawing import (
     DYNAMIC,
+    ECHO,
     FAILED,
     FAINT,
     GOAL,
@@ -27,6 +28,7 @@ from uuvtai.logs.drawing import (
     PAPER,
     ROUTE,
     STATIC,
+    TRIGGER_COLORS,
     Color,
     Recording,
     agent_inks,
@@ -46,17 +48,10 @@ from uuvtai.logs.topics.perception import Layer
 
 _MARGINS = (52, 28, 84, 212)  # [px] left, right, top, bottom
 _PANEL = 160  # [px] height of the panel below the map
-_ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
-_ECHO_BEAMS = 64  # A scan of fewer beams is painted together with those before it.
-_TRIGGER_COLORS = {
-    "initial": GREY,
-    "stuck": bgr("#ae3ec9"),
-    "safety": bgr("#e8590c"),
-    "intersection": bgr("#1971c2"),
-}
+_GOOD = bgr("#2b8a3e")
 _LEGEND = (
     (ROUTE, "route"),
-    (_ECHO, "sonar"),
+    (ECHO, "sonar"),
     (STATIC, "mapped"),
     (DYNAMIC, "tracked"),
     (MOVER, "true, dynamic"),
@@ -185,7 +180,7 @@ class FrameArtist:
     @property
     def inks(self) -> list[Color]:
         """Colours that mean something."""
-        return [self._ink, GOAL, _GOOD, FAILED, *(color for color, _ in _LEGEND), *_TRIGGER_COLORS.values()]
+        return [self._ink, GOAL, _GOOD, FAILED, *(color for color, _ in _LEGEND), *TRIGGER_COLORS.values()]
 
     def frame(self, time_s: float) -> np.ndarray:
         """Image (height, width, 3), blue green red."""
@@ -198,7 +193,7 @@ class FrameArtist:
         canvas.line(self._track[: i + 1, :2], self._ink, 2)
         self._paint_echoes(time_s)
         tracks = recording["/tracks"].at(time_s)
-        for x, y, radius in () if tracks is None else tracks:
+        for x, y, radius in () if tracks is None else tracks[:, :3]:
             canvas.disc((x, y), (radius + 0.06) * canvas.scale, DYNAMIC, 2)
         self._paint_goal()
         canvas.vehicle(pose, self._ink)
@@ -230,18 +225,8 @@ class FrameArtist:
             canvas.disc(ahead, 5, ROUTE)
 
     def _paint_echoes(self, time_s: float) -> None:
-        """Returns of the newest scan, from where it was taken; of a mechanical one ``_ECHO_BEAMS``."""
-        beams = 0
-        for ranges, away, hit, ping_s in self.recording["/sonar/scan"].until(time_s):
-            x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]
-            bearing = yaw + away
-            for echo in (
-                np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
-            )[hit]:
-                self._canvas.disc(echo, 2.4, _ECHO)
-            beams += len(ranges)
-            if beams >= _ECHO_BEAMS:
-                return
+        for echo in self.recording.echoes(time_s):
+            self._canvas.disc(echo, 2.4, ECHO)
 
     def _paint_goal(self) -> None:
         canvas, scenario = self._canvas, self.recording.scenario
@@ -326,7 +311,7 @@ class FrameArtist:
     ) -> None:
         canvas, x, plans = self._canvas, 700.0, self.recording["/plan/info"]
         replans = [(at, trigger) for at, (_, trigger) in zip(plans.times, plans.values, strict=True)]
-        for name, color in _TRIGGER_COLORS.items():
+        for name, color in TRIGGER_COLORS.items():
             count = sum(trigger == name and at <= time_s for at, trigger in replans)
             label = f"{name} {count}"
             x += 14 + canvas.text((x, low + 22), label, 14, color, bold=True) + 10
@@ -334,7 +319,7 @@ class FrameArtist:
         for at, trigger in replans:
             if at <= time_s:
                 px = round(float(place(np.array([at]), np.zeros(1))[0, 0]))
-                ink = _TRIGGER_COLORS.get(trigger, GREY)
+                ink = TRIGGER_COLORS.get(trigger, GREY)
                 cv2.line(canvas.image, (px, low), (px, low - 12), ink, 2, cv2.LINE_AA)
 
 
