@@ -102,7 +102,7 @@ class Gallery:
 
 @dataclass(frozen=True)
 class Player:
-    """Recorded episodes, each with its title and its blobs (``recorded.py``); ``note`` says what was left out."""
+    """Recorded episodes, each a title and blobs (``recorded.py``); ``note`` says what was left out."""
 
     episodes: Sequence[tuple[str, Sequence[bytes]]]
     note: str = ""

@@ -39,10 +39,10 @@ from uuvtai.report.tables import Table, heads, megabytes, number
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, training
 
-# ---- Episodes: recorded ones in the player, pictures of others, the worst first, as many as the page may hold.
+# ---- Episodes, the worst first: recorded ones in the player, pictures of others, as many as fit the page.
 
 PLAYER_BYTES, PICTURE_BYTES = 4_500_000, 2_200_000
-"""What all recorded episodes of a page, in base64, and its pictures may weigh: with the rest less than 10 MB"""
+"""what all recorded episodes of a page, in base64, and its pictures may weigh: the whole less than 10 MB"""
 _MOST_LOGS = 24  # that are read for a page: each takes a second or two
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")

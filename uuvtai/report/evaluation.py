@@ -153,7 +153,7 @@ AgentSpec = dict[str, Any]
 
 
 def evaluation(result: dict[str, Any], command: str = "", episodes: Sequence[Block] = ()) -> list[Block]:
-    """Everything that an evaluation has to show: what it says, ``episodes`` (player, pictures), then tables."""
+    """All that an evaluation has to show: what it says, ``episodes`` (player, pictures), then tables."""
     agents = result["agents"]
     table = agents_table(agents, _SHOWN, data=evaluation_data(agents), swatches=_swatches(agents))
     blocks: list[Block] = [*_opening(agents, result.get("paired", [])), Paragraph(conditions(result))]

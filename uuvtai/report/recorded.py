@@ -1,8 +1,9 @@
 """Recorded episodes for the player of a page: logs as quantised arrays, packed, that base64 carries.
 
 A blob is zlib's stream of: length of the header [bytes, uint32, little endian], the header in JSON, arrays.
-The header names each array with its place, type, columns and ``step``: value = integer * step. The integers
-are differences from row to row of one array. What comes from a log is in the blob and nowhere else.
+The header names each array with its place, bytes of an integer, rows, columns and ``step``: value = integer *
+step. Stored are differences from row to row, column after column, their lowest bytes first, then the next:
+so they pack best. What comes from a log is in the blob and nowhere else.
 """
 
 from __future__ import annotations
@@ -19,21 +20,20 @@ from typing import Any
 import numpy as np
 
 from uuvtai.common.colours import PALETTE, agent_colours
-from uuvtai.common.obstacle_motion import obstacle_positions
+from uuvtai.common.obstacle_motion import KIND_NAMES, obstacle_positions
 from uuvtai.logs import drawing
 from uuvtai.logs.drawing import TRIGGER_COLORS, Recording, Series
 
 RECORDING_BYTES, SCENE_BYTES = 300_000, 100_000
 """the most that an agent's episode, and what all agents of one share, may take of a page"""
-PLACE_M, TIME_S, SPEED_M_S, SHARE, VARIANCE_M2 = 1e-3, 1e-3, 1e-2, 1 / 31, 1e-4
+PLACE_M, TIME_S, SPEED_M_S, SHARE, TRACK_M, VARIANCE_M2 = 1e-3, 1e-3, 1e-2, 1 / 31, 1e-2, 1e-3
 """steps of the quantised values: an error is at most half of one; ``SHARE`` of an occupancy"""
-_POINT_M, _CLEAR_M, _MOST_TTC_S = 0.02, 0.1, 100.0
-_GAP_S, _ECHO_GAP_S = (
-    0.0999,
-    0.1999,
-)  # [s] between tracks or forecasts, and returns: a log may have fifty a second
-_MOST_STEPS, _MOST_CELLS = 20_000, 4_000_000
-_SHED = ("echoes", "clear", "futures", "tracks", "dynamic", "static", "route")
+_POINT_M, _FAR_M, _CLEAR_M, _MOST_TTC_S = 0.02, 0.05, 0.1, 100.0
+_GAP_S, _MOST_MOMENTS = 0.0999, 150
+"""[s] between tracks that are shown, and how many scans and forecasts are; a log may have 50 a second"""
+_LEAST_WEIGHT, _EVERY_POINT = 0.1, 5  # of forecasts: less likely ones, and points between, are not shown
+_MOST_STEPS, _MOST_CELLS, _MOST_NUMBERS = 20_000, 4_000_000, 3_000_000  # zeros pack well, and fill a memory
+_SHED = ("echoes", "map_clearance", "futures", "tracks", "map_dynamic", "map_static", "route")
 """what is left out first where an episode is too long to be held whole"""
 
 _DARK = {
@@ -75,9 +75,13 @@ class _Packer:
         rows = np.asarray(values, float)
         if not np.isfinite(rows).all():
             raise ValueError(f"{name}: a number that is not finite")
-        whole = np.rint(rows.reshape(len(rows), -1) / step).astype(np.int64)
+        whole = np.rint((rows if rows.ndim == 2 else rows[:, None]) / step).astype(np.int64)
         differences = np.diff(whole, axis=0, prepend=np.zeros((min(len(whole), 1), whole.shape[1]), np.int64))
         self._arrays[name] = differences, step
+
+    @property
+    def numbers(self) -> int:
+        return sum(integers.size for integers, _ in self._arrays.values())
 
     def drop(self, prefix: str) -> None:
         for name in [name for name in self._arrays if name.split(".")[0] == prefix]:
@@ -90,7 +94,8 @@ class _Packer:
             kind = next(k for k in ("i1", "i2", "i4", "i8") if max(-low - 1, high) < 1 << 8 * int(k[1]) - 1)
             if kind == "i8":
                 raise ValueError(f"{name}: numbers beyond all bounds")
-            data = integers.astype(f"<{kind}").tobytes(order="F")
+            flat = integers.astype(f"<{kind}").ravel(order="F")
+            data = flat.view(np.uint8).reshape(-1, flat.itemsize).T.tobytes()
             table[name] = {
                 "at": place,
                 "bytes": int(kind[1]),
@@ -101,7 +106,7 @@ class _Packer:
             parts.append(data)
             place += len(data)
         head = json.dumps({**header, "arrays": table}, allow_nan=False, separators=(",", ":")).encode()
-        return base64.b64encode(zlib.compress(struct.pack("<I", len(head)) + head + b"".join(parts), 9))
+        return base64.b64encode(zlib.compress(struct.pack("<I", len(head)) + head + b"".join(parts)))
 
 
 # ---- One agent's recording.
@@ -118,10 +123,9 @@ def packed_agent(recording: Recording, colour: str, fact: Fact) -> bytes:
     pack.add("pose", np.column_stack([pose[:, :3], np.unwrap(pose[:, 3])]), PLACE_M)
     _add_along(pack, recording, times)
     _add_events(pack, recording)
-    for name, topic, step in (
-        ("static", "/map/static", SHARE), ("dynamic", "/map/dynamic", SHARE), ("clear", "/map/clearance", _CLEAR_M),
-    ):  # fmt: skip
-        _add_map(pack, name, recording[topic], step)
+    grid = _grid(recording)
+    for name, step in (("static", SHARE), ("dynamic", SHARE), ("clearance", _CLEAR_M)) if grid else ():
+        _add_map(pack, f"map_{name}", recording[f"/map/{name}"], step, (grid["rows"], grid["columns"]))
     leaves = recording["/action"].values
     header = {
         "agent": recording.agent[:80],
@@ -133,15 +137,16 @@ def packed_agent(recording: Recording, colour: str, fact: Fact) -> bytes:
         "slot": fact.slot,
         "leaves": list(dict.fromkeys(str(leaf)[:40] for leaf in leaves))[:100],
         "triggers": list(TRIGGER_COLORS),
-        "grid": _grid(recording),
+        "grid": grid,
+        "rare_s": _rare_s(recording),
         "left_out": [],
     }
     content = pack.packed(header)
     for name in _SHED:
-        if len(content) <= RECORDING_BYTES:
+        if len(content) <= RECORDING_BYTES and pack.numbers <= _MOST_NUMBERS:
             break
         pack.drop(name)
-        header["left_out"].append(name)
+        header["left_out"].append(name.replace("_", " "))
         content = pack.packed(header)
     if len(content) > RECORDING_BYTES:
         raise ValueError(f"an episode of {len(times)} steps that takes {len(content)} bytes")
@@ -175,21 +180,27 @@ def _add_events(pack: _Packer, recording: Recording) -> None:
     codes = [triggers.index(why) if why in triggers else 0 for _, why in plans.values]
     pack.add("route.why", codes)
     tracks = _spaced(recording["/tracks"])
-    _add_rows(pack, "tracks", tracks.times, [rows[:, :6] for rows in tracks.values], PLACE_M)
+    _add_rows(pack, "tracks", tracks.times, [rows[:, :6] for rows in tracks.values], TRACK_M)
     pack.add(
         "tracks.cov", np.concatenate([np.empty((0, 3)), *(r[:, 6:9] for r in tracks.values)]), VARIANCE_M2
     )
-    futures = _spaced(recording["/futures"])
-    steps = {points.shape[1] for _, points in futures.values if len(points)} or {0}
-    if len(steps) == 1:
-        flat = [points[:, ::2].reshape(-1, 2) for _, points in futures.values]
-        weights = [weight for weight, _ in futures.values]
-        _add_rows(pack, "futures", futures.times, flat, _POINT_M)
-        pack.add("futures.weight", np.concatenate([np.empty(0), *weights]), SHARE)
-        pack.add("futures.steps", [-(-steps.pop() // 2)])
+    gap_s = _rare_s(recording)
+    futures = _spaced(recording["/futures"], gap_s)
+    likely = [(weight >= _LEAST_WEIGHT, weight, points) for weight, points in futures.values]
+    paths = [points[keep, ::_EVERY_POINT] for keep, _, points in likely]
+    if len({part.shape[1] for part in paths if len(part)}) == 1:
+        flat = [part.reshape(len(part), -1) for part in paths if len(part)]
+        moments = [time_s for time_s, part in zip(futures.times, paths, strict=True) if len(part)]
+        _add_rows(pack, "futures", moments, flat, _FAR_M)
+        pack.add("futures.weight", np.concatenate([w[keep] for keep, w, _ in likely]), SHARE)
     scans = recording["/sonar/scan"]
-    moments = _spaced(Series(scans.times, scans.times), _ECHO_GAP_S).times
+    moments = _spaced(Series(scans.times, scans.times), gap_s).times
     _add_rows(pack, "echoes", moments, [recording.echoes(time_s) for time_s in moments], _POINT_M)
+
+
+def _rare_s(recording: Recording) -> float:
+    """[s] between the moments that show returns and forecasts."""
+    return max(2 * _GAP_S, recording.duration_s / _MOST_MOMENTS)
 
 
 def _spaced(series: Series, gap_s: float = _GAP_S) -> Series:
@@ -211,15 +222,14 @@ def _add_rows(
     pack.add(f"{name}.of", np.concatenate([np.empty((0, width)), *rows]), step)
 
 
-def _add_map(pack: _Packer, name: str, series: Series, step: float) -> None:
+def _add_map(pack: _Packer, name: str, series: Series, step: float, shape: tuple[int, int]) -> None:
     """A layer of the map as changes: cells (row * columns + column) that differ from the time before."""
     cells, values, counts = [np.empty(0, int)], [np.empty(0, int)], []
-    before: np.ndarray | None = None
+    before = np.zeros(shape[0] * shape[1], np.uint8)
     for layer in series.values:
+        if layer.shape != shape:
+            raise ValueError(f"{name}: maps of {layer.shape} and {shape} cells")
         now = np.rint(np.clip(layer.values, 0, 255 * step).ravel() / step).astype(np.uint8)
-        before = np.zeros_like(now) if before is None else before
-        if len(now) > _MOST_CELLS or now.shape != before.shape:
-            raise ValueError(f"{name}: a map of {len(now)} cells")
         changed = np.flatnonzero(now != before)
         cells.append(changed)
         values.append(now[changed])
@@ -237,6 +247,8 @@ def _grid(recording: Recording) -> dict[str, Any] | None:
     if not layers:
         return None
     rows, columns = layers[0].shape
+    if rows * columns > _MOST_CELLS:
+        raise ValueError(f"a map of {rows} x {columns} cells")
     x, y = map(float, layers[0].origin_m)
     return {"rows": rows, "columns": columns, "x": x, "y": y, "cell_m": float(layers[0].cell_m)}
 
@@ -251,17 +263,21 @@ def packed_scene(recordings: Sequence[Recording]) -> bytes:
     times = times[:: -(-len(times) // _MOST_STEPS)]
     obstacles = scenario["obstacles"]
     moving = [obstacle for obstacle in obstacles if obstacle["path"] is not None]
+    tank = scenario["tank"]
+    low, high = _floats(tank["z_m"], 2)
+    if not low < high:
+        raise ValueError(f"a tank from {low:g} to {high:g} m")
     header = {
-        "tank": {name: scenario["tank"][name] for name in ("shape", "x_m", "y_m", "z_m", "radius_m")},
-        "goal": [float(x) for x in scenario["goal"]],
+        "tank": {
+            "shape": "circle" if tank["shape"] == "circle" else "rectangle",
+            "radius_m": float(tank["radius_m"]),
+            **{axis: _floats(tank[axis], 2) for axis in ("x_m", "y_m", "z_m")},
+        },
+        "goal": _floats(scenario["goal"], 3),
         "goal_radius_m": float(scenario["goal_radius_m"]),
-        "obstacles": [
-            {"kind": str(one["kind"])[:10], "at": one["position"], "size": one["size"], "yaw": one["yaw"],
-             "slot": one["slot"], "moves": one["path"] is not None}
-            for one in obstacles
-        ],
+        "obstacles": [_obstacle(one) for one in obstacles],
         "palette": palette(),
-    }  # fmt: skip
+    }
     for share in (1, 2, 5, 10, 50):  # the last step of this episode is always there
         some = np.array([*times[:-1:share], times[-1]])
         pack = _Packer()
@@ -269,9 +285,25 @@ def packed_scene(recordings: Sequence[Recording]) -> bytes:
         places = [obstacle_positions(obstacle, some)[:, :2] for obstacle in moving]
         pack.add("places", np.concatenate([np.empty((len(some), 0)), *places], axis=1), PLACE_M)
         content = pack.packed(header)
-        if len(content) <= SCENE_BYTES:
+        if len(content) <= SCENE_BYTES and pack.numbers <= _MOST_NUMBERS:
             return content
     raise ValueError(f"{len(moving)} moving obstacles in {len(times)} steps")
+
+
+def _obstacle(obstacle: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "kind": obstacle["kind"] if obstacle["kind"] in KIND_NAMES.values() else "cylinder",
+        "at": _floats(obstacle["position"], 3),
+        "size": [abs(length) for length in _floats(obstacle["size"], 3)],
+        "yaw": float(obstacle["yaw"]),
+        "slot": int(obstacle["slot"]),
+        "moves": obstacle["path"] is not None,
+    }
+
+
+def _floats(values: Sequence[Any], n: int) -> list[float]:
+    """The first so many, as numbers."""
+    return [float(values[i]) for i in range(n)]
 
 
 def packed_episode(paths: Sequence[Path], agents: Sequence[str], fact: Callable[[str], Fact]) -> list[bytes]:
@@ -299,6 +331,7 @@ def unpacked(blob: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def _unpacked_arrays(table: dict[str, Any], data: bytes) -> Iterator[tuple[str, np.ndarray]]:
     for name, entry in table.items():
         n = entry["rows"] * entry["columns"]
-        integers = np.frombuffer(data, f"<i{entry['bytes']}", n, entry["at"])
+        planes = np.frombuffer(data, np.uint8, n * entry["bytes"], entry["at"]).reshape(entry["bytes"], n)
+        integers = np.ascontiguousarray(planes.T).view(f"<i{entry['bytes']}")
         shaped = integers.reshape(entry["columns"], entry["rows"]).T.astype(np.int64)
         yield name, np.cumsum(shaped, axis=0) * entry["step"]

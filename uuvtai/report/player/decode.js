@@ -12,14 +12,17 @@ export async function unpacked(text) {
   return { header, arrays };
 }
 
-/** Sums of the differences, times the step. */
+/** Sums of the differences, times the step: lowest bytes come first, the highest has the sign. */
 function undone(raw, start, { at, bytes, rows, columns, step }) {
-  const read = { 1: (i) => raw.getInt8(i), 2: (i) => raw.getInt16(i, true), 4: (i) => raw.getInt32(i, true) }[bytes];
-  const values = new Float64Array(rows * columns);
+  const n = rows * columns;
+  const values = new Float64Array(n);
   for (let column = 0; column < columns; column++) {
     let sum = 0;
     for (let row = 0; row < rows; row++) {
-      sum += read(start + at + bytes * (column * rows + row));
+      const place = start + at + column * rows + row;
+      let difference = raw.getInt8(place + (bytes - 1) * n);
+      for (let k = bytes - 2; k >= 0; k--) difference = difference * 256 + raw.getUint8(place + k * n);
+      sum += difference;
       values[row * columns + column] = sum * step;
     }
   }

@@ -3,7 +3,7 @@ import { HULL_RADIUS_M, circle, ellipse, gap, halfWidth, hullOutline, obstacleOu
 
 /** What can be switched off, in the legend's order: name, colour of the palette, words, and whether it is shown at first. */
 export const LAYERS = [
-  ["truth", "mover", "true obstacles", true],
+  ["truth", "mover", "true obstacles (static: grey)", true],
   ["static", "static", "mapped", true],
   ["dynamic", "dynamic", "mapped, dynamic", true],
   ["tracks", "dynamic", "tracked, 2 sigma", true],
@@ -11,7 +11,7 @@ export const LAYERS = [
   ["route", "route", "route", true],
   ["echoes", "echo", "sonar", true],
   ["ghosts", "grey", "other agents", true],
-  ["clear", "intersection", "clearance field", false],
+  ["clearance", "intersection", "clearance field", false],
 ];
 
 /** Draws a scene into a 2D context of CSS pixels. `look`: colours by name, colours of the agents, layers that are on. */
@@ -52,8 +52,8 @@ export class Painter {
 
   map(map) {
     if (!map) return;
-    for (const [name, most, power, share] of [["clear", 40, 1, 0.55], ["static", 31, 0.8, 0.92], ["dynamic", 31, 0.8, 0.95]]) {
-      if (this.look.on[name]) this.cells(map, map.layers[name], this.look[name === "clear" ? "intersection" : name], most, power, share);
+    for (const [name, most, power, share] of [["clearance", 40, 1, 0.55], ["static", 31, 0.8, 0.92], ["dynamic", 31, 0.8, 0.95]]) {
+      if (this.look.on[name]) this.cells(map, map.layers[name], this.look[name === "clearance" ? "intersection" : name], most, power, share);
     }
   }
 
@@ -95,7 +95,7 @@ export class Painter {
     for (const { weight, points } of futures) {
       context.globalAlpha = 0.25 + 0.6 * weight;
       this.line(points, look.mover, 1.5);
-      for (let i = 4; i < points.length; i += 4) this.dot(points[i][0], points[i][1], 1.8, look.mover);
+      for (let i = 1; i < points.length; i++) this.dot(points[i][0], points[i][1], 1.8, look.mover);
     }
     context.globalAlpha = 1;
   }

@@ -46,7 +46,7 @@ export class Player {
     this.index = Math.min(Math.max(index, 0), this.episodes.length - 1);
     this.stop();
     this.source = await this.episodes[this.index].open();
-    this.time = 0;
+    this.time = this.source.end;
     this.agent = Math.min(this.agent, this.source.agents.length - 1);
     this.select.value = this.index;
     this.buttons();
@@ -183,7 +183,8 @@ export class Player {
     this.strip.setAttribute("aria-valuenow", time.toFixed(1));
     this.strip.setAttribute("aria-valuemax", source.end.toFixed(1));
     this.strip.setAttribute("aria-valuetext", `${time.toFixed(1)} of ${source.end.toFixed(1)} s`);
-    for (const [name, colour] of LAYERS) this.swatches[name].style.background = look[colour];
+    const colours = Object.fromEntries(LAYERS);
+    for (const [name, swatch] of Object.entries(this.swatches)) swatch.style.background = look[colours[name] ?? name];
   }
 
   // -------------------------------------------------------------------------------------------------------- the page
@@ -244,6 +245,11 @@ export class Player {
       tick.onchange = () => ((this.on[name] = tick.checked), this.draw());
       this.swatches[name] = add(label, "span", { className: "swatch" });
       label.append(words);
+    }
+    for (const why of ["initial", "stuck", "safety", "intersection"]) {
+      const label = add(box, "span", { className: "replans" });
+      this.swatches[why] = add(label, "span", { className: "swatch" });
+      label.append(`replan: ${why}`);
     }
     add(box, "span", { className: "quiet", textContent: "star: goal; dashed: wholly above or below the vehicle; bar beside a track: 1 s of its motion" });
   }

@@ -88,10 +88,10 @@ class Agent {
     this.ahead = of("ahead");
     this.cov = of("tracks.cov");
     this.weight = of("futures.weight");
-    this.points = of("futures.steps")?.[0] ?? 0;
     this.grid = header.grid;
+    this.rare = header.rare_s;
     const cells = this.grid ? this.grid.rows * this.grid.columns : 0;
-    this.layers = Object.fromEntries(["static", "dynamic", "clear"].map((name) => [name, new Layer(arrays, name, cells)]));
+    this.layers = Object.fromEntries(["static", "dynamic", "clearance"].map((name) => [name, new Layer(arrays, `map_${name}`, cells)]));
   }
 
   frame(time) {
@@ -123,14 +123,13 @@ class Agent {
     });
   }
 
-  /** Forecasts of this moment alone: what was foreseen a second ago is no forecast. */
+  /** Forecasts until the next ones may come: what was foreseen a second ago is no forecast. */
   futures(time) {
     const found = this.rows.futures.at(time);
-    if (!found || !this.points || time - this.rows.futures.times[found.index] > 0.15) return [];
-    const points = this.points_of("futures", time);
-    return Array.from({ length: points.length / this.points }, (_, i) => ({
-      weight: this.weight[found.from / this.points + i],
-      points: points.slice(i * this.points, (i + 1) * this.points),
+    if (!found || time - this.rows.futures.times[found.index] > 1.3 * this.rare) return [];
+    return this.points_of("futures", time).map((path, i) => ({
+      weight: this.weight[found.from + i],
+      points: Array.from({ length: path.length / 2 }, (_, k) => [path[2 * k], path[2 * k + 1]]),
     }));
   }
 

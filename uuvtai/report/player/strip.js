@@ -28,8 +28,8 @@ export function paintStrip(context, width, source, agent, time, look) {
   ROWS.forEach(([name, words, least], i) => {
     const low = (i + 1) * ROW;
     const top = most(history[name], least);
-    text(context, look, words, LEFT - 8, low - 16, "right");
-    text(context, look, `${top}`, LEFT - 8, low - 29, "right", 10);
+    text(context, look, words, LEFT - 8, low - 10, "right");
+    text(context, look, `${top}`, LEFT - 8, low - 26, "right", 10);
     rule(context, look.faint, LEFT, width - RIGHT, low);
     if (name === "clearance" && look.on.ghosts) {
       source.agents.forEach((_, other) => {
@@ -76,17 +76,20 @@ function band(context, history, x, top, look) {
   for (let from = 0, i = 1; i <= time.length; i++) {
     if (i < time.length && leaf[i] === leaf[from]) continue;
     const [left, right] = [x(time[from]), x(time[Math.min(i, time.length - 1)])];
-    context.fillStyle = leafColour(leaf[from], look);
-    context.fillRect(left, top, Math.max(right - left, 1), BAND);
     const name = leaves[leaf[from]] ?? "";
+    context.fillStyle = leafColour(name, look);
+    context.fillRect(left, top, Math.max(right - left, 1), BAND);
     context.font = `11px ${look.font}`;
     if (context.measureText(name).width < right - left - 8) text(context, { ...look, grey: look.paper }, name, left + 4, top + 12, "left", 11);
     from = i;
   }
 }
 
-export function leafColour(code, look) {
-  return [look.route, look.failed, look.stuck, look.echo, look.mover][code % 5];
+/** By the node's name, so that it is the same for all agents. */
+export function leafColour(name, look) {
+  const known = { FollowRoute: look.route, Evade: look.dynamic }[name];
+  const sum = [...name].reduce((total, character) => total + character.codePointAt(0), 0);
+  return known ?? [look.stuck, look.echo, look.mover, look.grey][sum % 4];
 }
 
 function axis(context, source, x, y, look) {
