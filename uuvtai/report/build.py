@@ -130,7 +130,7 @@ def _fact_of(episode: tuple[int, int] | None, agents: list[dict[str, Any]]) -> C
                 slot = row["killer"].get("slot")
                 label = str(row["label"])
                 return Fact(
-                    label.replace("_", " "), str(meanings.get(label, "")), -1 if slot is None else slot
+                    label.replace("_", " "), str(meanings.get(label, "")), -1 if slot is None else int(slot)
                 )
         return Fact()
 
@@ -416,14 +416,25 @@ def _of_run(run: Path) -> Page:
         raise ConfigError(
             f"{run}: {NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
         )
-    title = str(document["title"]) if document else run.resolve().name
+    name = run.resolve().name
+    title = str(document["title"]) if document else _title_of(read_json(run, "eval/result.json")) or name
     closing = PageSection(
         "Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)]
     )
-    about = (record.get("started"), record.get("hardware", {}).get("cpu"))
+    about = (name, record.get("started"), record.get("hardware", {}).get("cpu"))
     return Page(
         title, ", ".join(str(part) for part in about if part), status_notice(record), [*sections, closing]
     )
+
+
+def _title_of(result: dict[str, Any] | None) -> str:
+    """'best, bt in gauntlet', '' of what is no evaluation."""
+    names = [str(m["name"]) for m in (result or {}).get("agents", [])]
+    who = ", ".join(names) if len(names) <= _MOST_IN_TITLE else f"{len(names)} agents"
+    return f"{who} in {Path(str(result['world'])).stem}" if result and names else ""
+
+
+_MOST_IN_TITLE = 4
 
 
 def _of_several(runs: list[Path]) -> Page:

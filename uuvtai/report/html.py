@@ -90,7 +90,7 @@ def _script() -> Markup:
     from markupsafe import Markup
 
     folder = resources.files("uuvtai") / "report" / "player"
-    modules = [(folder / f"{name}.js").read_text(encoding="utf-8") for name in _MODULES]
+    modules = [(folder / f"{name}.mjs").read_text(encoding="utf-8") for name in _MODULES]
     # safe: the package's own text, in which a test looks for what would end the element
     return Markup("\n".join([*(_IMPORT.sub("", module) for module in modules), "start();"]))
 

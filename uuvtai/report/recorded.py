@@ -12,7 +12,7 @@ import base64
 import json
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,9 @@ class Fact:
 # ---- Blobs: a header and arrays of integers, packed.
 
 
+_MOST = 1 << 30  # of a quantised value: differences fit four bytes
+
+
 class _Packer:
     """Collects named arrays and packs them with a header."""
 
@@ -71,10 +74,10 @@ class _Packer:
         self._arrays: dict[str, tuple[np.ndarray, float]] = {}
 
     def add(self, name: str, values: Any, step: float = 1.0) -> None:
-        """Numbers (n, columns) or (n,), quantised by ``step``. Raises ValueError for what is not finite."""
+        """Numbers (n, columns) or (n,), quantised by ``step``. Raises ValueError for what is too large."""
         rows = np.asarray(values, float)
-        if not np.isfinite(rows).all():
-            raise ValueError(f"{name}: a number that is not finite")
+        if not (np.abs(rows) < _MOST * step).all():
+            raise ValueError(f"{name}: a number beyond all bounds, or none")
         whole = np.rint((rows if rows.ndim == 2 else rows[:, None]) / step).astype(np.int64)
         differences = np.diff(whole, axis=0, prepend=np.zeros((min(len(whole), 1), whole.shape[1]), np.int64))
         self._arrays[name] = differences, step
@@ -91,9 +94,7 @@ class _Packer:
         table, parts, place = {}, [], 0
         for name, (integers, step) in self._arrays.items():
             low, high = int(integers.min(initial=0)), int(integers.max(initial=0))
-            kind = next(k for k in ("i1", "i2", "i4", "i8") if max(-low - 1, high) < 1 << 8 * int(k[1]) - 1)
-            if kind == "i8":
-                raise ValueError(f"{name}: numbers beyond all bounds")
+            kind = next(kind for kind in ("i1", "i2", "i4") if max(-low - 1, high) <= np.iinfo(kind).max)
             flat = integers.astype(f"<{kind}").ravel(order="F")
             data = flat.view(np.uint8).reshape(-1, flat.itemsize).T.tobytes()
             table[name] = {
@@ -318,20 +319,3 @@ def packed_episode(paths: Sequence[Path], agents: Sequence[str], fact: Callable[
         with drawing.drawing(path):
             blobs.append(packed_agent(recording, colours[recording.agent], fact(recording.agent)))
     return blobs
-
-
-def unpacked(blob: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """(header, arrays (rows, columns) of values) of a blob: the inverse, as the page does it."""
-    raw = zlib.decompress(base64.b64decode(blob))
-    (length,) = struct.unpack_from("<I", raw)
-    header = json.loads(raw[4 : 4 + length])
-    return header, dict(_unpacked_arrays(header["arrays"], raw[4 + length :]))
-
-
-def _unpacked_arrays(table: dict[str, Any], data: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    for name, entry in table.items():
-        n = entry["rows"] * entry["columns"]
-        planes = np.frombuffer(data, np.uint8, n * entry["bytes"], entry["at"]).reshape(entry["bytes"], n)
-        integers = np.ascontiguousarray(planes.T).view(f"<i{entry['bytes']}")
-        shaped = integers.reshape(entry["columns"], entry["rows"]).T.astype(np.int64)
-        yield name, np.cumsum(shaped, axis=0) * entry["step"]

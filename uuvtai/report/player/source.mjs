@@ -1,5 +1,5 @@
 // Where frames come from. The player knows a Source and nothing else; this one reads a page's recorded episodes.
-import { Layer, Rows, newest, unpacked } from "./decode.js";
+import { Layer, Rows, newest, unpacked } from "./decode.mjs";
 
 /**
  * @typedef {object} Source

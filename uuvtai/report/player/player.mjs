@@ -1,8 +1,8 @@
 // The player: a source's scene, strip and figures, and whatever moves through its time.
-import { LAYERS, Painter, ended } from "./paint.js";
-import { recorded } from "./source.js";
-import { STRIP_HEIGHT, moment, paintStrip } from "./strip.js";
-import { View } from "./view.js";
+import { LAYERS, Painter, ended } from "./paint.mjs";
+import { recorded } from "./source.mjs";
+import { STRIP_HEIGHT, moment, paintStrip } from "./strip.mjs";
+import { View } from "./view.mjs";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 const STEP_S = 0.1;

@@ -1,5 +1,5 @@
 // The scene of a moment: from above what an agent senses, maps, plans and does, with the truth; below that from the side.
-import { HULL_RADIUS_M, circle, ellipse, gap, halfWidth, hullOutline, obstacleOutline, tankOutline } from "./view.js";
+import { HULL_RADIUS_M, circle, ellipse, gap, halfWidth, hullOutline, obstacleOutline, tankOutline } from "./view.mjs";
 
 /** What can be switched off, in the legend's order: name, colour of the palette, words, and whether it is shown at first. */
 export const LAYERS = [
