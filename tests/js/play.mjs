@@ -20,20 +20,19 @@ await inBrowser(async (browser) => {
       const copy = new OffscreenCanvas(wide, high).getContext("2d", { willReadFrequently: true });
       copy.drawImage(scene, 0, 0);
       const { data } = copy.getImageData(0, 0, wide, high);
-      const found = [];
+      const [ahead, beside] = [[], []];
+      const [c, s] = [Math.cos(pose[3]), Math.sin(pose[3])];
       for (let y = 0; y < high; y++)
         for (let x = 0; x < wide; x++) {
           const k = 4 * (y * wide + x);
-          const own = data[k] < 30 && Math.abs(data[k + 1] - 0x72) < 9 && Math.abs(data[k + 2] - 0xb2) < 9;
-          if (own && filled(data, wide, x, y)) found.push([x + 0.5, y + 0.5]);
+          if (data[k] < 30 && Math.abs(data[k + 1] - 0x72) < 9 && Math.abs(data[k + 2] - 0xb2) < 9) {
+            ahead.push(c * (x + 0.5) - s * (y + 0.5));
+            beside.push(s * (x + 0.5) + c * (y + 0.5));
+          }
         }
-      const middle = [0, 1].map((axis) => found.reduce((sum, place) => sum + place[axis], 0) / found.length);
+      const [u, v] = [ahead, beside].map((places) => (Math.min(...places) + Math.max(...places)) / 2);
+      const middle = [c * u + s * v, c * v - s * u];
       return { time, pose: [...pose], clearance, middle, scale: view.scale, left: view.left, top: view.top };
-    }
-
-    // the hull is filled, the path is a line of two pixels
-    function filled(data, wide, x, y) {
-      return [[-3, 0], [3, 0], [0, -3], [0, 3]].every(([u, v]) => data[4 * ((y + v) * wide + x + u)] < 30);
     }
   });
   await tab.focus(".player");

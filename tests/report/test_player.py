@@ -239,7 +239,6 @@ def test_the_player_in_a_browser_shows_the_log(page, log):
             log["/safety"].at(moment["time"])[0], abs=recorded.PLACE_M
         )
         place = moment["left"] + moment["scale"] * x, moment["top"] + moment["scale"] * (6.0 - y)
-        # the hull's middle is a little behind its centre of mass
         assert moment["middle"] == pytest.approx(place, abs=1.5)
     pressed = seen["pressed"]
     times = [round(pressed[key]["time"], 3) for key in ("Home", "ArrowRight", "Shift+ArrowRight", "End", "x")]

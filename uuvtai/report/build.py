@@ -96,26 +96,27 @@ def _player(
     for one in logs:  # a failure that was recorded again to explain it is the same episode
         together.setdefault(one.episode or one.path.name, {}).setdefault(one.agent or one.path.name, one)
     episodes, held, left_out, budget, n_read = [], set(), [], PLAYER_BYTES, 0
-    for some in together.values():
-        files = [one.path for one in some.values()]
+    names = [m["name"] for m in agents]
+    for found in together.values():
+        some = sorted(found.values(), key=lambda one: names.index(one.agent) if one.agent in names else -1)
+        files = [one.path for one in some]
         n_read += len(files)
-        names = ", ".join(str(path.relative_to(folder)) for path in files)
+        these = ", ".join(str(path.relative_to(folder)) for path in files)
         if n_read > _MOST_LOGS or budget <= 0:
-            left_out.append(names)
+            left_out.append(these)
             continue
-        first = next(iter(some.values()))
         try:
-            blobs = packed_episode(files, [m["name"] for m in agents], _fact_of(first.episode, agents))
+            blobs = packed_episode(files, names, _fact_of(some[0].episode, agents))
         except LogError as error:
-            left_out.append(f"{names} (cannot be shown: {shown(str(error))})")
+            left_out.append(f"{these} (cannot be shown: {shown(str(error)[:300])})")
             continue
         size = sum(map(len, blobs))
         if size > budget:
-            left_out.append(names)
+            left_out.append(these)
             continue
         budget -= size
-        held.add(first.episode)
-        episodes.append((_title(list(some.values())), blobs))
+        held.add(some[0].episode)
+        episodes.append((_title(some), blobs))
     return Player(episodes, _note(left_out)), held
 
 

@@ -9,6 +9,7 @@ export const LAYERS = [
   ["tracks", "dynamic", "tracked, 2 sigma", true],
   ["futures", "mover", "forecasts", true],
   ["route", "route", "route", true],
+  ["path", "", "path driven", true],
   ["echoes", "echo", "sonar", true],
   ["ghosts", "grey", "other agents", true],
   ["clearance", "intersection", "clearance field", false],
@@ -142,7 +143,8 @@ export class Painter {
   }
 
   path({ pose }, step, colour, width) {
-    const { context, view } = this;
+    const { context, view, look } = this;
+    if (!look.on.path) return;
     context.beginPath();
     for (let i = 0; i <= step; i++) context.lineTo(view.x(pose[4 * i]), view.y(pose[4 * i + 1]));
     this.stroked(colour, width);

@@ -184,7 +184,7 @@ export class Player {
     this.strip.setAttribute("aria-valuemax", source.end.toFixed(1));
     this.strip.setAttribute("aria-valuetext", `${time.toFixed(1)} of ${source.end.toFixed(1)} s`);
     const colours = Object.fromEntries(LAYERS);
-    for (const [name, swatch] of Object.entries(this.swatches)) swatch.style.background = look[colours[name] ?? name];
+    for (const [name, swatch] of Object.entries(this.swatches)) swatch.style.background = look[colours[name] ?? name] ?? look.agents[agent];
   }
 
   // -------------------------------------------------------------------------------------------------------- the page
