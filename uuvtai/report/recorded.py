@@ -125,8 +125,10 @@ def packed_agent(recording: Recording, colour: str, fact: Fact) -> bytes:
     _add_along(pack, recording, times)
     _add_events(pack, recording)
     grid = _grid(recording)
-    for name, step in (("static", SHARE), ("dynamic", SHARE), ("clearance", _CLEAR_M)) if grid else ():
-        _add_map(pack, f"map_{name}", recording[f"/map/{name}"], step, (grid["rows"], grid["columns"]))
+    if grid is not None:
+        shape = grid["rows"], grid["columns"]
+        for name, step in (("static", SHARE), ("dynamic", SHARE), ("clearance", _CLEAR_M)):
+            _add_map(pack, f"map_{name}", recording[f"/map/{name}"], step, shape)
     leaves = recording["/action"].values
     header = {
         "agent": recording.agent[:80],
