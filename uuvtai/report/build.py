@@ -237,7 +237,7 @@ def _outcome(detail: Detail) -> str:
 
 
 def _outcome_name(detail: Detail) -> str:
-    return _OUTCOMES.get(detail["outcome"], detail["outcome"])
+    return _OUTCOMES.get(detail["outcome"], str(detail["outcome"]))
 
 
 # ---- Where figures come from: the command, the machine, the versions, the config.

@@ -163,11 +163,8 @@ export class Player {
   figures(frame, look) {
     const { source, agent, time } = this;
     const said = (value, unit) => (value === null ? "–" : `${value.toFixed(unit === "s" ? 1 : 2)} ${unit}`);
-    const replans = source.history(agent).replans.filter((one) => one.time <= time + 1e-6);
-    const values = [
-      `${time.toFixed(1)} s`, said(frame.clearance, "m"), said(frame.ttc, "s"), said(frame.speed, "m/s"),
-      frame.leaf || "–", replans.length ? `${replans.length}, ${replans[replans.length - 1].why}` : "0",
-    ];
+    const replans = source.history(agent).replans.filter((one) => one.time <= time + 1e-6).length;
+    const values = [`${time.toFixed(1)} s`, said(frame.clearance, "m"), said(frame.ttc, "s"), said(frame.speed, "m/s"), frame.leaf || "–", replans];
     values.forEach((value, i) => (this.values[i].textContent = value));
     this.values[1].classList.toggle("near", frame.clearance !== null && frame.clearance < 0.3);
     this.button.textContent = this.playing ? "Pause" : "Play";
