@@ -196,6 +196,7 @@ export class Player {
     this.episodes.forEach(({ title }, i) => add(this.select, "option", { value: i, textContent: title }));
     this.select.onchange = () => this.open(Number(this.select.value));
     this.chips = add(root, "div", { className: "chips" });
+    this.transport(add(root, "div", { className: "transport" }));
     this.scene = add(root, "canvas", { className: "scene", role: "img", ariaLabel: "the episode from above and from the side" });
     const figures = add(root, "dl", { className: "figures" });
     this.values = ["time", "clearance", "time to collision", "speed", "tree", "replans"].map((name) => {
@@ -204,7 +205,6 @@ export class Player {
       return add(pair, "dd");
     });
     this.strip = add(root, "canvas", { className: "strip", tabIndex: 0, role: "slider", ariaLabel: "time", ariaValueMin: "0" });
-    this.transport(add(root, "div", { className: "transport" }));
     this.ending = add(root, "p", { className: "ending" });
     this.legend();
     this.help = add(root, "details", { className: "keys" });
