@@ -51,7 +51,7 @@ NOT_OF_PACKAGES = {
 }
 """pip's settings that do not change what is installed in an environment of our own"""
 
-DEMO = ["eval", "--world", "pool", "--record", "2", "--video"]
+DEMO = ["eval", "--world", "pool", "--record", "2", "--report"]
 
 
 def main() -> int:
@@ -74,7 +74,7 @@ def main() -> int:
 
 
 def demo(arguments: list[str]) -> int:
-    """Evaluate the three controllers in the pool, record two episodes, draw pictures and videos."""
+    """Evaluate the three controllers in the pool, record two episodes, make a report that plays them."""
     install(".")
     return run([str(BIN / "uuv"), *DEMO, *arguments])
 

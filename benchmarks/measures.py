@@ -74,9 +74,8 @@ def of_files(tree: Path) -> dict[str, int]:
     sources = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(package.rglob("*.py"))}
     lengths = {path: _lines(path) for path in sources}
     pages = [p for p in (tree / "docs").rglob("*.md") if not {"reference", "research"} & {*p.parts}]
-    data = [
-        p for folder in ("docs/data", "benchmarks/results", "research") for p in (tree / folder).rglob("*")
-    ]
+    kept = ("docs/data", "benchmarks/results", "research")
+    data = [p for folder in kept for p in (tree / folder).rglob("*")]
     readme = (tree / "README.md").read_text(encoding="utf-8")
     functions = [
         (node.end_lineno or 0) - node.lineno + 1
@@ -91,6 +90,7 @@ def of_files(tree: Path) -> dict[str, int]:
         "package: files with code under 60 lines": sum(3 < n < 60 for n in lengths.values()),
         "package: folders and loose files at its top": len({_box(path, package) for path in sources}),
         "package: floors": _floors(sources, package),
+        "package: lines of JavaScript": _lines_below(package, "*.mjs"),
         "package: preset files": sum(path.is_file() for path in (package / "presets").rglob("*")),
         "docs: pages": len(pages),
         "docs: words": sum(len(page.read_text(encoding="utf-8").split()) for page in pages),

@@ -45,7 +45,7 @@ _SWEEP = [
     *("sweep", "--grid", "S=4,8", "--grid", "D=3,6", "--grid", "v=0.6", "--agent", "straight"),
     *("--agent", "bt", "--num-envs", "8"),
 ]
-_HALF = (".tmp", ".part", ".tmp.webm")
+_HALF = (".tmp", ".part", ".tmp.mp4")
 _TIMES = ("wall_s", "env_steps_per_s")
 _LONGEST_S, _MOST_BYTES = 60.0, 1 << 30
 
@@ -262,7 +262,7 @@ class Bench:
             ["export", "train_whole", "--out", "out/policy"],
             ["profile", "--num-envs", "8", "--seconds", "1"], ["reproduce", *run], ["replay", log],
             ["presets"], ["doctor"], ["log", "info", log], ["log", "repair", log, "--out", "out/log.mcap"],
-            ["log", "render", log, "--out", "out/log.png"], ["log", "render", log, "--out", "out/log.webm"],
+            ["log", "render", log, "--out", "out/log.png"], ["log", "render", log, "--out", "out/log.mp4"],
         ]  # fmt: skip
         wrong, interrupted, count = [], 0, len(commands) if self.job.quick else _SIGNALS
         for i in range(count):

@@ -1,4 +1,4 @@
-"""Pages from disk in headless Chromium, at two widths, light and dark (``js/look.mjs``)."""
+"""Pages from disk in headless Chromium, at two widths, light and dark (``js/look.mjs``), and Node."""
 
 import json
 import os
@@ -16,21 +16,32 @@ VIEWS = [(width, scheme) for width in (1400, 390) for scheme in ("light", "dark"
 
 def look(*pages):
     """What the browser met, by (page, width, scheme). Skips where there is no browser."""
-    node = shutil.which("node")
-    if node is None or not (JS / "node_modules/@sparticuz").is_dir():
+    return {(one["page"], one["width"], one["scheme"]): one for one in told("look.mjs", *pages)["seen"]}
+
+
+def told(script, *arguments):
+    """What a script says of pages in a browser. Skips where there is none."""
+    if not (JS / "node_modules/@sparticuz").is_dir():
         pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
     if (platform.system(), platform.machine()) != ("Linux", "x86_64") and "CHROME_PATH" not in os.environ:
         pytest.skip("the packed Chromium is for Linux on x86_64: set CHROME_PATH to another one")
     with tempfile.TemporaryDirectory() as unpacked:
-        command = [node, "look.mjs", *map(str, pages)]
-        environment = {**os.environ, "TMPDIR": unpacked}
-        done = subprocess.run(
-            command, cwd=JS, env=environment, capture_output=True, text=True, check=False, timeout=120
-        )
+        done = node(script, *map(str, arguments), TMPDIR=unpacked)
     if done.returncode == 3:
         pytest.skip(f"Chromium does not start here: {done.stderr.strip().splitlines()[0]}")
     assert done.returncode == 0, done.stderr
-    return {(one["page"], one["width"], one["scheme"]): one for one in json.loads(done.stdout)["seen"]}
+    return json.loads(done.stdout)
+
+
+def node(*arguments, **environment):
+    """What Node did in ``js``. Skips where there is none."""
+    found = shutil.which("node")
+    if found is None:
+        pytest.skip("needs node (bootstrap.py brings one)")
+    return subprocess.run(
+        [found, *arguments], cwd=JS, env={**os.environ, **environment}, capture_output=True, text=True,
+        check=False, timeout=120,
+    )  # fmt: skip
 
 
 def brightness(colour):

@@ -161,7 +161,6 @@ def evaluate(
     vehicle: str | None = None,
     overrides: Overrides | None = None,
     record: int = 0,
-    video: bool = False,
     explain: bool = False,
     num_envs: int | None = None,
     device: str = "auto",
@@ -181,7 +180,7 @@ def evaluate(
         raise SettingError(f"episodes={episodes}: at least 1")
     request = Request.typed(
         _scene(world, sensors, vehicle, overrides), [*_named(agents), *_named(planners, "planner")],
-        seeds=_seeds(seeds), episodes=episodes, record=record, video=video, explain=explain,
+        seeds=_seeds(seeds), episodes=episodes, record=record, explain=explain,
         num_envs=num_envs, device=device, run_dir=_path(run_dir),
     )  # fmt: skip
     return Evaluation(*compare(request, Progress()))

@@ -237,7 +237,7 @@ def report_run(
 ) -> None:
     """Write the HTML page of a run, or figures for a paper.
 
-    The page is one file with tables, figures, pictures and videos."""
+    The page is one file with a player of recorded episodes, figures and tables."""
     if paper is not None:
         if out is not None or force:
             raise UsageError("--paper: writes a folder of its own; leave out --out and --force")
@@ -379,7 +379,7 @@ def log_import(
 
 
 @log_app.command(
-    "render", epilog="Example: uuv log render runs/first/logs/bt_seed0_episode0.mcap --out a.webm"
+    "render", epilog="Example: uuv log render runs/first/logs/bt_seed0_episode0.mcap --out a.mp4"
 )
 def log_render(
     file: opt.RenderLogs,
@@ -390,13 +390,13 @@ def log_render(
     width: opt.RenderWidth = None,
     force: opt.LogForce = False,
 ) -> None:
-    """Draw a picture (PNG) or a video (WebM, MP4, GIF) of an episode."""
+    """Draw a picture (PNG) or a video (MP4, GIF) of an episode."""
     from uuvtai.common.files import output_beside
 
     target = output_beside(file, out, ".png", force)
     if target.suffix.lower() == ".png":
         if speed is not None or fps is not None:
-            raise UsageError("--speed, --fps: are of a video; add --out NAME.webm")
+            raise UsageError("--speed, --fps: are of a video; add --out NAME.mp4")
         from uuvtai.logs.picture import picture
 
         more: dict[str, Any] = {} if width is None else {"width_px": width}

@@ -69,7 +69,7 @@ from uuvtai.console.views import show_evaluation
         (["train", "--num-envs", "4"], "No such option: --num-envs; now it is --set train.num_envs=N"),
         (["warm"], "No such command 'warm'; now it is uuv doctor --compile"),
         (["tree", "--dot"], "No such command 'tree'; now it is uuv presets show bt"),
-        (["log", "video", "a.mcap"], "now it is uuv log render FILE --out NAME.webm"),
+        (["log", "video", "a.mcap"], "now it is uuv log render FILE --out NAME.mp4"),
         (["presets", "show", "pool", "--dot"], "--run, --dot: are of a tree"),
         (["log", "render", "a.mcap", "--fps", "5"], "--speed, --fps: are of a video"),
         (["log", "render", "a.mcap", "--out", "a.gif", "--clearance"], "are of a picture"),
@@ -383,7 +383,7 @@ def evaluation(tmp_path_factory):
     command = [
         sys.executable, "-m", "uuvtai", "eval", "--agent", "straight,bt", "--episodes", "4", "--seeds",
         "3", *SmallSim.OPTIONS,
-        "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder),
+        "--record", "1", "--set", "episode.horizon_steps=400", "--run-dir", str(folder),
         "--report", "--json",
     ]  # fmt: skip
     done = subprocess.run(
@@ -445,7 +445,7 @@ def test_eval_leaves_a_complete_run_folder(evaluation):
     assert {
         "config.yaml", "run.json", "eval/result.json", "eval/tree.json", "eval/trees/bt.xml",
         "logs/bt_seed3_episode0.mcap",
-        "logs/straight_seed3_episode0.mcap", "pictures/seed3_episode0.png", "videos/bt_seed3_episode0.webm",
+        "logs/straight_seed3_episode0.mcap", "pictures/seed3_episode0.png",
         "report.html", "figures/agents.png",
     } <= names  # fmt: skip
     assert not [n for n in names if n.endswith((".tmp", ".part"))]

@@ -291,7 +291,7 @@ def test_a_pipe_is_not_waited_for(tmp_path, command):
     works = {
         "info": info,
         "picture": lambda path: picture(path, tmp_path / "x.png"),
-        "video": lambda path: video(path, tmp_path / "x.webm"),
+        "video": lambda path: video(path, tmp_path / "x.mp4"),
         "convert": lambda path: to_rosbag2(path, tmp_path / "x"),
         "repair": repair,
         "export": lambda path: export(path, tmp_path / "x"),

@@ -23,8 +23,6 @@ from uuvtai.logs.writer import McapEpisodeLog
 
 INKS = ink.agent_inks(["bt", "straight", "planner"])
 N_STEP = 110
-CODEC_ERROR = 40
-"""VP9 keeps colours of small details only so well (0 to 255)"""
 
 
 @pytest.fixture(scope="module")
@@ -131,13 +129,11 @@ def test_true_obstacles_are_as_old_as_the_map(folder, bt):
 
 def test_remarks_stand_in_red_beside_the_title(bt):
     recording = load_recording(bt)
-    for plain, marked in (
-        (paint_picture([recording]).image, paint_picture([recording], remark="unseen above").image),
-        (FrameArtist(recording).frame(1.0), FrameArtist(recording, remark="unseen above").frame(1.0)),
-    ):
-        rows, cols = np.nonzero((plain != marked).any(axis=2))
-        assert rows.max() < 60 and cols.min() > 250
-        assert has(marked[: rows.max() + 1, cols.min() :].reshape(-1, 3).astype(int), ink.FAILED, 60)
+    plain = paint_picture([recording]).image
+    marked = paint_picture([recording], remark="unseen above").image
+    rows, cols = np.nonzero((plain != marked).any(axis=2))
+    assert rows.max() < 60 and cols.min() > 250
+    assert has(marked[: rows.max() + 1, cols.min() :].reshape(-1, 3).astype(int), ink.FAILED, 60)
 
 
 def test_obstacles_above_and_below_the_vehicle_are_dashed():
@@ -191,32 +187,6 @@ def test_text_is_drawn_with_any_opencv(monkeypatch, font):
     assert image.min() < 100
 
 
-def test_video_is_a_readable_webm(folder, bt, capfd):
-    answer = []
-    out = video(bt, folder / "v.webm", fps=10.0, progress=lambda done, total: answer.append((done, total)))
-    assert out.read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
-    assert capfd.readouterr().err == ""
-    reader = cv2.VideoCapture(str(out))
-    frames = []
-    while (got := reader.read())[0]:
-        frames.append(got[1])
-    expected = round(N_STEP * episode.DT * 10) + 11
-    assert len(frames) == expected and answer[-1] == (expected, expected)
-    assert reader.get(cv2.CAP_PROP_FPS) == 10.0
-    artist = FrameArtist(load_recording(bt))
-    for index, time_s in ((5, 0.5), (expected - 1, N_STEP * episode.DT)):
-        drawn = artist.frame(time_s)
-        assert frames[index].shape == drawn.shape and drawn.shape[1] == 1280
-        assert np.abs(frames[index].astype(int) - drawn.astype(int)).mean() < 6
-    goal = (
-        map_canvas(episode.scenario()["tank"], 1280, (52, 28, 84, 212))
-        .pixels([episode.GOAL])[0]
-        .round()
-        .astype(int)
-    )
-    assert has(around(frames[-1], goal, 3), ink.GOAL, CODEC_ERROR)
-
-
 def test_a_frame_shows_the_moment(bt):
     recording = load_recording(bt)
     artist = FrameArtist(recording)
@@ -225,7 +195,7 @@ def test_a_frame_shows_the_moment(bt):
         frame = artist.frame(time_s)
         hull = canvas.pixels([recording["/pose"].at(time_s)])[0].round().astype(int)
         assert has(around(frame, hull, 1), INKS["bt"])
-        x, y, radius = recording["/tracks"].at(time_s)[0]
+        x, y, radius = recording["/tracks"].at(time_s)[0, :3]
         rim = canvas.pixels([(x, y + radius + 0.06)])[0].round().astype(int)
         assert has(around(frame, rim, 2), ink.DYNAMIC, 30)
     early, late = artist.frame(0.0).astype(int), artist.frame(2.2).astype(int)
@@ -235,7 +205,7 @@ def test_a_frame_shows_the_moment(bt):
     ).all()  # independent of what was drawn before
 
 
-@pytest.mark.parametrize(("draw", "name"), [(picture, "out.png"), (video, "out.webm"), (video, "out.gif")])
+@pytest.mark.parametrize(("draw", "name"), [(picture, "out.png"), (video, "out.mp4"), (video, "out.gif")])
 def test_missing_files_and_bad_places(folder, bt, tmp_path, draw, name):
     with pytest.raises(LogError, match="cannot open"):
         draw(tmp_path / "nowhere.mcap", tmp_path / name)

@@ -26,8 +26,9 @@ from uuvtai.config.loader import ConfigError
 from uuvtai.console.screen import print_heat_maps
 from uuvtai.evaluation.results import paired
 from uuvtai.logs.run_folder import RunFolderError
+from uuvtai.report import build, recorded
 from uuvtai.report import figures as ink
-from uuvtai.report.blocks import Figure, Gallery
+from uuvtai.report.blocks import Figure
 from uuvtai.report.build import media, report
 from uuvtai.report.evaluation import evaluation, paired_table
 from uuvtai.report.figures import Line, curves, heat_map, intervals
@@ -378,14 +379,12 @@ def test_a_training_without_iterations_says_so():
 
 
 @pytest.fixture
-def recorded(tmp_path):
-    """A run folder with pictures and videos, by their sizes only."""
+def pictured(tmp_path):
+    """A run folder with pictures, by their sizes only."""
     sizes = {
-        "pictures/seed0_episode0.png": 100, "pictures/seed0_episode7.png": 100,
-        "videos/bt_seed0_episode0.webm": 300,
-        "videos/bt_seed0_episode7.webm": 300, "videos/bt_seed0_episode5.webm": 900,
-        "explain/late_bt_seed0_episode7.webm": 301,
-        "videos/unknown.webm": 50,
+        "pictures/seed0_episode0.png": 300, "pictures/seed0_episode7.png": 301,
+        "pictures/seed0_episode5.png": 900, "explain/late_bt_seed0_episode7.png": 301,
+        "pictures/unknown.png": 50,
     }  # fmt: skip
     for name, size in sizes.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -393,26 +392,23 @@ def recorded(tmp_path):
     return tmp_path, samples.evaluation_document(samples.agent("bt"))
 
 
-def test_the_worst_episodes_come_first_and_once(recorded):
-    pictures, videos = (block for block in media(*recorded) if isinstance(block, Gallery))
-    assert [item.caption.split(".")[0] for item in pictures.items] == [
-        "Seed 0, episode 7",
-        "Seed 0, episode 0",
-    ]
-    assert [item.caption for item in videos.items] == [
+def test_the_worst_episodes_come_first(pictured):
+    _, pictures = media(*pictured)
+    assert [item.caption for item in pictures.items] == [
         "Late, seed 0, episode 7. bt: collision after 17.0 s, closest 0.23 m",
+        "Seed 0, episode 7. bt: collision after 17.0 s, closest 0.23 m",
         "Seed 0, episode 5. bt: success after 15.0 s, closest 0.25 m",
         "Seed 0, episode 0. bt: success after 10.0 s, closest 0.30 m",
         "unknown",
     ]
-    assert videos.note == ""
+    assert pictures.note == ""
 
 
-def test_what_does_not_fit_is_named(recorded):
-    pictures, videos = (block for block in media(*recorded, budget=900) if isinstance(block, Gallery))
-    assert len(pictures.items) == 2 and pictures.note == ""
-    assert [len(item.content) for item in videos.items] == [301, 300, 50]
-    assert "videos/bt_seed0_episode5.webm (0.0 MB)" in videos.note and "run folder" in videos.note
+def test_what_does_not_fit_is_named(pictured, monkeypatch):
+    monkeypatch.setattr(build, "PICTURE_BYTES", 960)
+    _, pictures = media(*pictured)
+    assert [len(item.content) for item in pictures.items] == [301, 301, 300, 50]
+    assert "pictures/seed0_episode5.png (0.0 MB)" in pictures.note and "run folder" in pictures.note
 
 
 # ------------------------------------------------------------------------------------------------------- page
@@ -627,26 +623,28 @@ def test_every_colour_of_a_line_has_a_lighter_one_for_the_dark():
         )
 
 
-def test_a_page_of_many_videos_stays_below_ten_megabytes(tmp_path):
+def test_a_page_of_many_episodes_stays_below_ten_megabytes(tmp_path, monkeypatch):
     """Also where it is of several runs, each of which would fit alone."""
+    blob = b"A" * (recorded.RECORDING_BYTES - 1000)
+    monkeypatch.setattr(build, "packed_episode", lambda files, *_: [blob] * (1 + len(files)))
     runs = []
     for i in range(2):
         run = samples.write_run(
             tmp_path / f"run_{i}", eval__result=samples.evaluation_document(samples.agent("bt"))
         )
-        for place, name, n_files, size in (
-            ("pictures", "seed0_episode{}.png", 8, 300_000),
-            ("videos", "bt_seed0_episode{}.webm", 9, 900_000),
+        for name, n_files, size in (
+            ("pictures/seed1_episode{}.png", 8, 300_000),
+            ("logs/bt_seed0_episode{}.mcap", 9, 1),
         ):
-            (run / place).mkdir()
+            (run / name).parent.mkdir()
             for k in range(n_files):
-                (run / place / name.format(k)).write_bytes(bytes(size))
+                (run / name.format(k)).write_bytes(bytes(size))
         runs.append(run)
     for some in (runs[:1], runs):
         page = report(some, tmp_path / f"page_of_{len(some)}.html").page
         assert 7e6 < page.stat().st_size < 10e6
         assert "Left out to keep this page small" in page.read_text()
-        assert "videos/bt_seed0_episode" in page.read_text()
+        assert "logs/bt_seed0_episode" in page.read_text()
 
 
 # ----------------------------------------------------------------------------------------------- reproduction

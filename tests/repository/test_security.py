@@ -418,7 +418,7 @@ WRITTEN = """
 .lock run.json config.yaml metrics.jsonl cells.jsonl sweep.json sweep_request.json reproduce.json report.html
 profile.json checkpoints checkpoints/step_000002 checkpoints/step_000002/model.safetensors
 checkpoints/.partial-step_000003.1 eval eval/result.json eval/tree.json eval/trees eval/trees/bt.xml figures
-figures/agents.png pictures pictures/x.png videos videos/x.webm explain explain/x.png logs logs/x.mcap
+figures/agents.png pictures pictures/x.png explain explain/x.png logs logs/x.mcap
 tensorboard tensorboard/events.out.tfevents.1 anything/else
 """
 """what a run folder may hold, and what a resumed run, a report or an evaluation writes or deletes there"""
@@ -516,7 +516,7 @@ READ = """
 run.json config.yaml metrics.jsonl sweep.json profile.json reproduce.json eval/result.json
 checkpoints/step_000001/manifest.json
 """
-SHOWN = "pictures/x.png explain/x.png videos/x.webm"
+SHOWN = "pictures/x.png explain/x.png"
 """a large one is left out of a page"""
 
 
@@ -757,7 +757,7 @@ COMMANDS = (
     ("log", "export", "--out", "out"),
     ("log", "repair"),
     ("log", "render", "--out", "a.png"),
-    ("log", "render", "--out", "a.webm"),
+    ("log", "render", "--out", "a.mp4"),
     ("log", "convert"),
 )
 

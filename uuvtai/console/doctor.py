@@ -96,10 +96,10 @@ def _video() -> str:
 
     frames = [np.full((64, 64, 3), 80 * i, np.uint8) for i in range(3)]
     with tempfile.TemporaryDirectory() as folder:
-        for suffix in (".webm", ".mp4", ".gif"):
+        for suffix in (".mp4", ".gif"):
             target = Path(folder) / f"test{suffix}"
             check_whole(target, write_video(target, frames, 10.0, frames, []), target)
-    return f"PyAV {av.__version__}, WebM, MP4 and GIF can be written"
+    return f"PyAV {av.__version__}, MP4 and GIF can be written"
 
 
 def _mcap() -> str:

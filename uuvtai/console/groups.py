@@ -165,7 +165,6 @@ class RecordingGroup:
     """What an evaluation keeps of its episodes."""
 
     record: opt.Record = 0
-    video: opt.Video = False
     depth_images: opt.DepthImages = False
     explain: opt.Explain = False
     explain_record: opt.ExplainRecord = None

@@ -101,7 +101,6 @@ Planners = Annotated[
 ]
 EvalEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed.")]
 Record = Annotated[int, Option("--record", help="Record the first K episodes of every agent as MCAP.")]
-Video = Annotated[bool, _more("--video", help="Also draw a video of every recorded episode.")]
 Explain = Annotated[bool, Option("--explain", help="Find the cause of every failure, from the ground truth.")]
 ExplainRecord = Annotated[
     int | None,
@@ -255,7 +254,7 @@ RenderLogs = Annotated[
     list[Path], Argument(metavar="FILE", help="Logs of one episode; a picture shows all trajectories.")
 ]
 RenderOut = Annotated[
-    Path | None, _out("Picture .png, or video .webm, .mp4 or .gif \\[default: the first log's name, .png].")
+    Path | None, _out("Picture .png, or video .mp4 or .gif \\[default: the first log's name, .png].")
 ]
 WithClearance = Annotated[bool, Option("--clearance", help="Of a picture: colour the clearance field.")]
 VideoSpeed = Annotated[float | None, Option("--speed", help="Of a video: times real time \\[default: 1].")]

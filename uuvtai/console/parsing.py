@@ -141,7 +141,8 @@ _TODAY = {
     "warm": "uuv doctor --compile",
     "tree": "uuv presets show bt",
     "picture": "uuv log render FILE",
-    "video": "uuv log render FILE --out NAME.webm",
+    "video": "uuv log render FILE --out NAME.mp4",
+    "--video": "the player of 'uuv report', or 'uuv log render FILE --out NAME.mp4'",
 }
 """what older versions took, and what says it now"""
 

@@ -1,4 +1,4 @@
-"""Compare agents on paired scenarios in one run folder: results, logs, pictures, videos."""
+"""Compare agents on paired scenarios in one run folder: results, logs, pictures."""
 
 from __future__ import annotations
 
@@ -224,11 +224,10 @@ def _write_results(folder: RunFolder, result: dict[str, Any], runs: list[AgentRu
 
 
 def _draw(comparison: Comparison, folder: Path, logs: list[dict[Job, Path]]) -> None:
-    """One picture per recorded episode with every agent's trajectory, and the videos."""
+    """One picture per recorded episode with every agent's trajectory."""
     if not logs:
         return
     from uuvtai.logs.picture import picture
-    from uuvtai.logs.video import SMALL, video
 
     for job in logs[0]:
         end = f"seed{job.seed}_episode{job.episode}"
@@ -236,11 +235,6 @@ def _draw(comparison: Comparison, folder: Path, logs: list[dict[Job, Path]]) -> 
         names = [file.stem.removesuffix(f"_{end}") for file in reversed(files)]
         picture(files, folder / "pictures" / f"{end}.png", agents=names)
         picture(files, folder / "pictures" / f"{end}_clearance.png", clearance=True, agents=names)
-        for file in files if comparison.request.video else []:
-            target = folder / "videos" / f"{file.stem}.webm"
-            if not target.exists():  # an evaluation that goes on may have drawn it before
-                comparison.watch.note(f"drawing {target.name}")
-                video(file, target, agents=names, **SMALL)
 
 
 _DIGITS = 3

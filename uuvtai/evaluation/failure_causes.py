@@ -529,12 +529,11 @@ def record_worst(
     agents: Sequence[str] = (),
 ) -> list[Path]:
     """Run these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture
-    and a video beside it.
+    beside it.
 
     ``agents``: all that are compared, in order, so that each keeps its colour.
     """
     from uuvtai.logs.picture import picture
-    from uuvtai.logs.video import SMALL, video
     from uuvtai.logs.writer import EpisodeRecorder
 
     if not rows:
@@ -552,7 +551,10 @@ def record_worst(
     for path, row in zip(paths, rows, strict=True):
         note(f"drawing {path.stem}")
         label = row.explanation.label
-        cause = label.replace("_", " ")
-        picture(path, path.with_suffix(".png"), remark=f"{cause}: {CAUSES[label]}", agents=agents)
-        video(path, path.with_suffix(".webm"), remark=cause, agents=agents, **SMALL)
+        picture(
+            path,
+            path.with_suffix(".png"),
+            remark=f"{label.replace('_', ' ')}: {CAUSES[label]}",
+            agents=agents,
+        )
     return paths

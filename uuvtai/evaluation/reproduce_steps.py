@@ -100,7 +100,7 @@ def _beside_training(budget: Budget, root: Path, own: Sequence[str], at: tuple[s
     """The distilled policy in another scene and in other conditions, trajectories, times."""
     policies = [str(root / budget.runs(method)[0]) for method in METHODS[:3]]
     distilled, few = policies[0], str(budget.sweep_episodes)
-    recorded = ("eval", *_agents("bt", *own, *policies), "--record", "1", "--video", *at, "1")
+    recorded = ("eval", *_agents("bt", *own, *policies), "--record", "1", *at, "1")
     moved = ("eval", *_agents("bt", *own, distilled), "--world", "transfer", *at, str(budget.episodes))
     swept = ("sweep", *_agents("bt", *own, distilled), "--grid", "paper", *at, few)
     timed = ("profile", "--num-envs", "1,64,1024", "--seconds", str(budget.profile_seconds), "--density")

@@ -345,7 +345,6 @@ class Request:
     """name of its preset; of old requests ''"""
     num_envs: int | None = None
     record: int = 0
-    video: bool = False
     depth_images: bool = False
     explain: bool = False
     explain_record: int = 3
@@ -378,7 +377,6 @@ class _Document(BaseModel):
     episodes: int = Field(ge=1)
     num_envs: int = Field(ge=1)
     record: int = Field(ge=0)
-    video: bool
     depth_images: bool
     explain: bool
     explain_record: int = Field(ge=0)

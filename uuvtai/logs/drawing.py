@@ -34,7 +34,13 @@ def bgr(code: str) -> Color:
 
 PAPER, WATER, INK, GREY, FAINT = map(bgr, ("#ffffff", "#eef5f9", "#1d2733", "#66727f", "#c9d2da"))
 STATIC, DYNAMIC, GOAL, ROUTE, MOVER = map(bgr, ("#262c38", "#e53946", "#f7b801", "#1f8fff", "#d9480f"))
-FAILED = bgr("#c92a2a")
+FAILED, ECHO = bgr("#c92a2a"), bgr("#0b7a75")
+TRIGGER_COLORS = {
+    "initial": GREY,
+    "stuck": bgr("#ae3ec9"),
+    "safety": bgr("#e8590c"),
+    "intersection": bgr("#1971c2"),
+}
 
 
 def agent_inks(names: Sequence[str]) -> dict[str, Color]:
@@ -406,12 +412,26 @@ class Recording:
         """(n, 4) x, y, z, yaw at every control step."""
         return np.array(self["/pose"].values)
 
+    def echoes(self, time_s: float) -> np.ndarray:
+        """(n, 2) [m] returns of the newest scan, from where it was taken; of a mechanical sonar those of
+        ``_ECHO_BEAMS`` beams."""
+        found, beams = [np.empty((0, 2))], 0
+        for ranges, away, hit, ping_s in self["/sonar/scan"].until(time_s):
+            x, y, _, yaw = self["/pose"].at(ping_s) or self["/pose"].values[0]
+            bearing = yaw + away[hit]
+            found.append((x, y) + ranges[hit, None] * np.column_stack([np.cos(bearing), np.sin(bearing)]))
+            beams += len(ranges)
+            if beams >= _ECHO_BEAMS:
+                break
+        return np.concatenate(found)
+
     @property
     def min_clearance_m(self) -> float | None:
         values = [] if self.outcome_text == REPLAYED else self["/safety"].values  # nobody knows the truth
         return min((value[0] for value in values), default=None)
 
 
+_ECHO_BEAMS = 64  # A scan of fewer beams is shown together with those before it.
 _OUTCOME_NAMES = {"ttc": "TTC stop"}
 REPLAYED = "replayed"  # outcome of a recording: there is none
 _MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_OBSTACLES = 3600.0, 1000.0, 1e4, 1000

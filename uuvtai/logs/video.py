@@ -18,6 +18,7 @@ from PIL import Image
 from uuvtai.common.files import whole_file
 from uuvtai.logs.drawing import (
     DYNAMIC,
+    ECHO,
     FAILED,
     FAINT,
     GOAL,
@@ -27,6 +28,7 @@ from uuvtai.logs.drawing import (
     PAPER,
     ROUTE,
     STATIC,
+    TRIGGER_COLORS,
     Color,
     Recording,
     agent_inks,
@@ -46,17 +48,10 @@ from uuvtai.logs.topics.perception import Layer
 
 _MARGINS = (52, 28, 84, 212)  # [px] left, right, top, bottom
 _PANEL = 160  # [px] height of the panel below the map
-_ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
-_ECHO_BEAMS = 64  # A scan of fewer beams is painted together with those before it.
-_TRIGGER_COLORS = {
-    "initial": GREY,
-    "stuck": bgr("#ae3ec9"),
-    "safety": bgr("#e8590c"),
-    "intersection": bgr("#1971c2"),
-}
+_GOOD = bgr("#2b8a3e")
 _LEGEND = (
     (ROUTE, "route"),
-    (_ECHO, "sonar"),
+    (ECHO, "sonar"),
     (STATIC, "mapped"),
     (DYNAMIC, "tracked"),
     (MOVER, "true, dynamic"),
@@ -64,11 +59,9 @@ _LEGEND = (
 )
 _HOLD_S = 1.0  # The last frame stays this long.
 _DRAWN_PX = 1280  # Narrower frames are drawn this wide and made smaller: the panel below needs the room.
-FORMATS = {".webm": (1280, 15.0), ".mp4": (1280, 15.0), ".gif": (800, 10.0)}
+FORMATS = {".mp4": (1280, 15.0), ".gif": (800, 10.0)}
 """what a video's name may end in: (width [px], frames per second) unless told"""
 WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)  # least and most
-SMALL: dict[str, Any] = {"width_px": 960, "speed": 2.0}
-"""what a run folder holds, so that several fit a page: some 40 kB per second of the episode"""
 _MOST_FRAMES = 100_000
 _FEW_FRAMES, _FRAMES_PER_POSE = 1000, 10
 """a small file must not cost minutes: beyond so many frames a log has to hold something new for them (ours
@@ -84,15 +77,11 @@ def video(
     fps: float | None = None,
     speed: float = 1.0,
     progress: Progress | None = None,
-    remark: str = "",
-    agents: Sequence[str] = (),
 ) -> Path:
-    """Render a log as WebM, MP4 or GIF, as the name of ``out`` ends; ``width_px`` and ``fps`` default to what
+    """Render a log as MP4 or GIF, as the name of ``out`` ends; ``width_px`` and ``fps`` default to what
     ``FORMATS`` says of it.
 
-    ``speed`` 2 shows it twice as fast as it was, ``remark`` stands beside the title; ``agents``: all that
-    are compared with each other, in order, so that each has the colour of the picture of them all. Raises
-    LogError; the file appears whole or not at all.
+    ``speed`` 2 shows it twice as fast as it was. Raises LogError; the file appears whole or not at all.
     """
     out = Path(out)
     suffix = checked_suffix(out, tuple(FORMATS), "video")
@@ -101,7 +90,7 @@ def video(
     recording = load_recording(path)
     times = frame_times(recording, fps, speed)
     with drawing(Path(path)):
-        artist = FrameArtist(recording, max(width_px, _DRAWN_PX), remark, agents)
+        artist = FrameArtist(recording, max(width_px, _DRAWN_PX))
         samples = [_sized(artist.frame(recording.duration_s * share), width_px) for share in (0.0, 0.5, 1.0)]
     return _encoded(out, _frames(artist, times, width_px, progress), fps, samples, artist.inks)
 
@@ -170,11 +159,9 @@ def _sized(frame: np.ndarray, width_px: int) -> np.ndarray:
 class FrameArtist:
     """Draws the frame of any moment of a recording; what stays between two maps is drawn once."""
 
-    def __init__(
-        self, recording: Recording, width_px: int = 1280, remark: str = "", agents: Sequence[str] = ()
-    ) -> None:
-        self.recording, self.remark = recording, remark
-        self._ink = agent_inks([*agents, recording.agent])[recording.agent]
+    def __init__(self, recording: Recording, width_px: int = 1280) -> None:
+        self.recording = recording
+        self._ink = agent_inks([recording.agent])[recording.agent]
         self._canvas = map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
         self._base: np.ndarray | None = None
         self._base_map: Layer | None = None
@@ -185,7 +172,7 @@ class FrameArtist:
     @property
     def inks(self) -> list[Color]:
         """Colours that mean something."""
-        return [self._ink, GOAL, _GOOD, FAILED, *(color for color, _ in _LEGEND), *_TRIGGER_COLORS.values()]
+        return [self._ink, GOAL, _GOOD, FAILED, *(color for color, _ in _LEGEND), *TRIGGER_COLORS.values()]
 
     def frame(self, time_s: float) -> np.ndarray:
         """Image (height, width, 3), blue green red."""
@@ -198,7 +185,7 @@ class FrameArtist:
         canvas.line(self._track[: i + 1, :2], self._ink, 2)
         self._paint_echoes(time_s)
         tracks = recording["/tracks"].at(time_s)
-        for x, y, radius in () if tracks is None else tracks:
+        for x, y, radius in () if tracks is None else tracks[:, :3]:
             canvas.disc((x, y), (radius + 0.06) * canvas.scale, DYNAMIC, 2)
         self._paint_goal()
         canvas.vehicle(pose, self._ink)
@@ -230,18 +217,8 @@ class FrameArtist:
             canvas.disc(ahead, 5, ROUTE)
 
     def _paint_echoes(self, time_s: float) -> None:
-        """Returns of the newest scan, from where it was taken; of a mechanical one ``_ECHO_BEAMS``."""
-        beams = 0
-        for ranges, away, hit, ping_s in self.recording["/sonar/scan"].until(time_s):
-            x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]
-            bearing = yaw + away
-            for echo in (
-                np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
-            )[hit]:
-                self._canvas.disc(echo, 2.4, _ECHO)
-            beams += len(ranges)
-            if beams >= _ECHO_BEAMS:
-                return
+        for echo in self.recording.echoes(time_s):
+            self._canvas.disc(echo, 2.4, ECHO)
 
     def _paint_goal(self) -> None:
         canvas, scenario = self._canvas, self.recording.scenario
@@ -254,8 +231,7 @@ class FrameArtist:
         canvas, recording, scenario = self._canvas, self.recording, self.recording.scenario
         width = canvas.image.shape[1]
         which = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
-        end = 24 + canvas.text((24, 34), f"{recording.agent} · {which}", 22, INK, bold=True)
-        canvas.text((end + 20, 34), self.remark, 17, FAILED)
+        canvas.text((24, 34), f"{recording.agent} · {which}", 22, INK, bold=True)
         moving = f", {scenario['D']} dynamic at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
         canvas.text(
             (24, 60),
@@ -326,7 +302,7 @@ class FrameArtist:
     ) -> None:
         canvas, x, plans = self._canvas, 700.0, self.recording["/plan/info"]
         replans = [(at, trigger) for at, (_, trigger) in zip(plans.times, plans.values, strict=True)]
-        for name, color in _TRIGGER_COLORS.items():
+        for name, color in TRIGGER_COLORS.items():
             count = sum(trigger == name and at <= time_s for at, trigger in replans)
             label = f"{name} {count}"
             x += 14 + canvas.text((x, low + 22), label, 14, color, bold=True) + 10
@@ -334,21 +310,19 @@ class FrameArtist:
         for at, trigger in replans:
             if at <= time_s:
                 px = round(float(place(np.array([at]), np.zeros(1))[0, 0]))
-                ink = _TRIGGER_COLORS.get(trigger, GREY)
+                ink = TRIGGER_COLORS.get(trigger, GREY)
                 cv2.line(canvas.image, (px, low), (px, low - 12), ink, 2, cv2.LINE_AA)
 
 
-# ---- Frames into a file: WebM (VP9), MP4 (H.264) and GIF, at a quality rather than a bit rate.
+# ---- Frames into a file: MP4 (H.264) and GIF, at a quality rather than a bit rate.
 
 Frames = Iterable[np.ndarray]  # images (height, width, 3), blue green red, all of one size
 
 _BT601 = 6  # the matrix by which frames become YUV; named in the file, or players guess by the height
 _LIMITED_RANGE = 1
 _CODECS: dict[str, tuple[str, dict[str, str]]] = {
-    # VP9 as for a call, at its quickest: drawing the frames takes longer
-    ".webm": ("libvpx-vp9", {"crf": "36", "b": "0", "deadline": "realtime", "cpu-used": "8", "row-mt": "1"}),
     # H.264 in 4:2:0 with its index first: what slides, phones and browsers all play
-    ".mp4": ("libx264", {"crf": "26", "preset": "veryfast"}),
+    ".mp4": ("libx264", {"crf": "26", "preset": "veryfast"})
 }
 _GIF_TICKS = 100  # per second: a GIF counts hundredths
 

@@ -17,6 +17,7 @@ Hover = dict[str, str]  # id of a drawn thing -> what is shown while the pointer
 @dataclass(frozen=True)
 class Paragraph:
     text: str
+    leads: bool = False  # says what matters most, in larger letters
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,8 @@ class Figure:
 
 @dataclass(frozen=True)
 class Media:
-    mime: str
+    """A PNG."""
+
     content: bytes
     caption: str
     name: str = ""  # where it lies in the run folder
@@ -92,13 +94,21 @@ class Media:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pictures or videos; ``note`` says what was left out."""
+    """Pictures; ``note`` says what was left out."""
 
     items: Sequence[Media]
     note: str = ""
 
 
-Block = Paragraph | Heading | Notice | Table | Facts | Code | Verdicts | Figure | Gallery
+@dataclass(frozen=True)
+class Player:
+    """Recorded episodes, each a title and blobs (``recorded.py``); ``note`` says what was left out."""
+
+    episodes: Sequence[tuple[str, Sequence[bytes]]]
+    note: str = ""
+
+
+Block = Paragraph | Heading | Notice | Table | Facts | Code | Verdicts | Figure | Gallery | Player
 
 
 @dataclass(frozen=True)

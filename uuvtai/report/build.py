@@ -6,7 +6,7 @@ import hashlib
 import os
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 from uuvtai.common.errors import ODD, UserError
 from uuvtai.common.files import FileError, read_bytes, refuse_links_in, refuse_output
 from uuvtai.config.loader import ConfigError
+from uuvtai.logs.encode import LogError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
 from uuvtai.report.blocks import (
     Block,
@@ -27,19 +28,22 @@ from uuvtai.report.blocks import (
     Notice,
     PageSection,
     Paragraph,
+    Player,
 )
 from uuvtai.report.evaluation import evaluation
-from uuvtai.report.html import Page, read_config, read_json, read_lines, render
+from uuvtai.report.html import Page, read_config, read_json, read_lines, render, shown
+from uuvtai.report.recorded import Fact, packed_episode
 from uuvtai.report.reproduction import reproduction
 from uuvtai.report.sweep import sweep
 from uuvtai.report.tables import Table, heads, megabytes, number
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, training
 
-# ---- Pictures and videos: trajectories over the map, the worst episodes first, as many as the page may hold.
+# ---- Episodes, the worst first: recorded ones in the player, pictures of others, as many as fit the page.
 
-MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
-"""What all pictures and videos of a page, and its pictures alone, may weigh: in base64 8.8 MB of 10"""
+PLAYER_BYTES, PICTURE_BYTES = 4_500_000, 2_200_000
+"""what all recorded episodes of a page, in base64, and its pictures may weigh: the whole less than 10 MB"""
+_MOST_LOGS = 24  # that are read for a page: each takes a second or two
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
 _SUCCESS = "success"
@@ -70,34 +74,89 @@ class _Shown:
         return (not self.details, not failed, min(closest, default=float("inf")))
 
 
-def media(folder: Path, result: dict[str, Any] | None, budget: int = MEDIA_BYTES) -> list[Block]:
-    """Pictures, then videos, of a run; ``result``: document of ``uuv eval --json``; ``budget`` in bytes."""
+def media(folder: Path, result: dict[str, Any] | None) -> list[Block]:
+    """The player of a run's logs, then pictures of what it does not hold; ``result``: document of ``uuv eval
+    --json``. Raises FileError for a log or a picture that is no plain file."""
     agents = (result or {}).get("agents", [])
+    logs = _worst_first(sorted([*folder.glob("logs/*.mcap"), *folder.glob("explain/*.mcap")]), agents)
+    player, held = _player(folder, logs, agents)
     pictures = _worst_first(sorted([*folder.glob("pictures/*.png"), *folder.glob("explain/*.png")]), agents)
-    videos = _worst_first(sorted([*folder.glob("explain/*.webm"), *folder.glob("videos/*.webm")]), agents)
-    blocks: list[Block] = []
-    for title, shown, mime, most in (
-        ("Trajectories over the occupancy map", pictures, "image/png", PICTURE_BYTES),
-        ("Videos, the worst episodes first", _once(videos), "video/webm", budget),
-    ):
-        if shown:
-            gallery = _gallery(folder, shown, mime, min(budget, most))
-            budget -= sum(len(item.content) for item in gallery.items)
-            blocks += [Heading(title), gallery]
+    pictures = [one for one in pictures if one.episode is None or one.episode not in held]
+    blocks: list[Block] = [player] if player.episodes or player.note else []
+    if pictures:
+        blocks += [Heading("Trajectories over the occupancy map"), _gallery(folder, pictures, PICTURE_BYTES)]
     return blocks
 
 
-def _gallery(folder: Path, shown: Iterable[_Shown], mime: str, budget: int) -> Gallery:
-    """As many files as the budget holds, in order; what is too big is named."""
+def _player(
+    folder: Path, logs: list[_Shown], agents: list[dict[str, Any]]
+) -> tuple[Player, set[tuple[int, int] | None]]:
+    """Logs of one episode together, and which episodes those are. What cannot be read is named."""
+    together: dict[Any, dict[str, _Shown]] = {}
+    for one in logs:  # a failure that was recorded again to explain it is the same episode
+        together.setdefault(one.episode or one.path.name, {}).setdefault(one.agent or one.path.name, one)
+    episodes, held, left_out, budget, n_read = [], set(), [], PLAYER_BYTES, 0
+    names = [m["name"] for m in agents]
+    for found in together.values():
+        some = sorted(found.values(), key=lambda one: names.index(one.agent) if one.agent in names else -1)
+        files = [one.path for one in some]
+        n_read += len(files)
+        these = ", ".join(str(path.relative_to(folder)) for path in files)
+        if n_read > _MOST_LOGS or budget <= 0:
+            left_out.append(these)
+            continue
+        try:
+            blobs = packed_episode(files, names, _fact_of(some[0].episode, agents))
+        except LogError as error:
+            left_out.append(f"{these} (cannot be shown: {shown(str(error)[:300])})")
+            continue
+        size = sum(map(len, blobs))
+        if size > budget:
+            left_out.append(these)
+            continue
+        budget -= size
+        held.add(some[0].episode)
+        episodes.append((_title(some), blobs))
+    return Player(episodes, _note(left_out)), held
+
+
+def _fact_of(episode: tuple[int, int] | None, agents: list[dict[str, Any]]) -> Callable[[str], Fact]:
+    """Why each agent failed in an episode, as far as the result says so."""
+
+    def fact(name: str) -> Fact:
+        agent = next((m for m in agents if m["name"] == name), {})
+        meanings = {cause["label"]: cause["meaning"] for cause in agent.get("causes", [])}
+        for row in agent.get("explain", []):
+            if isinstance(row, dict) and (row["seed"], row["episode"]) == episode:
+                slot = row["killer"].get("slot")
+                label = str(row["label"])
+                return Fact(
+                    label.replace("_", " "), str(meanings.get(label, "")), -1 if slot is None else int(slot)
+                )
+        return Fact()
+
+    return fact
+
+
+def _title(logs: list[_Shown]) -> str:
+    first = logs[0]
+    if first.episode is None:
+        return first.path.stem
+    went = [f"{name} {_outcome_name(detail)}" for one in logs for name, detail in one.details]
+    return f"Seed {first.episode[0]}, episode {first.episode[1]}" + (f": {', '.join(went)}" if went else "")
+
+
+def _gallery(folder: Path, pictures: Iterable[_Shown], budget: int) -> Gallery:
+    """As many files as the budget [bytes] holds, in order; what is too big is named."""
     items, left_out = [], []
-    for one in shown:
+    for one in pictures:
         size = one.path.lstat().st_size
         if size > budget:
             left_out.append(f"{one.path.relative_to(folder)} ({megabytes(size)})")
             continue
         budget -= size
         items.append(
-            Media(mime, read_bytes(one.path, size, folder), _caption(one), str(one.path.relative_to(folder)))
+            Media(read_bytes(one.path, size, folder), _caption(one), str(one.path.relative_to(folder)))
         )
     return Gallery(items, _note(left_out))
 
@@ -110,43 +169,37 @@ def _note(left_out: Sequence[str]) -> str:
     )
 
 
-def shared(sections: Sequence[PageSection]) -> list[PageSection]:
-    """The sections with what the budget [bytes] holds: all runs' pictures, then videos, in order."""
-    kept: dict[int, Gallery] = {}
-    budget = MEDIA_BYTES
-    galleries = [block for section in sections for block in section.blocks if isinstance(block, Gallery)]
-    for gallery in sorted(
-        galleries, key=lambda one: any(item.mime.startswith("video/") for item in one.items)
-    ):
-        kept[id(gallery)] = _trimmed(gallery, budget)
-        budget -= sum(len(item.content) for item in kept[id(gallery)].items)
+def trimmed(sections: Sequence[PageSection]) -> list[PageSection]:
+    """The sections with what the budgets hold of all runs' episodes and pictures, in order."""
+    left = {Player: PLAYER_BYTES, Gallery: PICTURE_BYTES}
     return [
-        replace(section, blocks=[kept.get(id(block), block) for block in section.blocks])
-        for section in sections
+        replace(section, blocks=[_trimmed(block, left) for block in section.blocks]) for section in sections
     ]
 
 
-def _trimmed(gallery: Gallery, budget: int) -> Gallery:
-    items, left_out = [], []
-    for item in gallery.items:
-        if len(item.content) > budget:
-            left_out.append(f"{item.name} ({megabytes(len(item.content))})")
+def _trimmed(block: Block, left: dict[type, int]) -> Block:
+    """The block with what its kind's budget [bytes] holds; what it takes is taken from the budget."""
+    if isinstance(block, Player):
+        sized = [(one, sum(map(len, one[1])), one[0]) for one in block.episodes]
+    elif isinstance(block, Gallery):
+        sized = [
+            (one, len(one.content), f"{one.name} ({megabytes(len(one.content))})") for one in block.items
+        ]
+    else:
+        return block
+    kept, left_out = [], []
+    for one, size, name in sized:
+        if size > left[type(block)]:
+            left_out.append(name)
             continue
-        budget -= len(item.content)
-        items.append(item)
-    return replace(
-        gallery, items=items, note=" ".join(part for part in (gallery.note, _note(left_out)) if part)
-    )
+        left[type(block)] -= size
+        kept.append(one)
+    note = " ".join(part for part in (block.note, _note(left_out)) if part)
+    return Player(kept, note) if isinstance(block, Player) else Gallery(kept, note)
 
 
 def _worst_first(paths: Iterable[Path], agents: list[dict[str, Any]]) -> list[_Shown]:
     return sorted((_shown(path, agents) for path in paths), key=lambda one: one.severity)
-
-
-def _once(shown: list[_Shown]) -> list[_Shown]:
-    """A failure that was recorded again to explain it is shown once, with its cause."""
-    explained = {(one.agent, one.episode) for one in shown if one.remark}
-    return [one for one in shown if one.remark or (one.agent, one.episode) not in explained]
 
 
 def _shown(path: Path, agents: list[dict[str, Any]]) -> _Shown:
@@ -179,10 +232,12 @@ def _caption(one: _Shown) -> str:
 
 
 def _outcome(detail: Detail) -> str:
-    outcome = _OUTCOMES.get(detail["outcome"], detail["outcome"])
-    return (
-        f"{outcome} after {number(detail['time_s'])} s, closest {number(detail.get('min_clearance_m'), 2)} m"
-    )
+    closest = number(detail.get("min_clearance_m"), 2)
+    return f"{_outcome_name(detail)} after {number(detail['time_s'])} s, closest {closest} m"
+
+
+def _outcome_name(detail: Detail) -> str:
+    return _OUTCOMES.get(detail["outcome"], str(detail["outcome"]))
 
 
 # ---- Where figures come from: the command, the machine, the versions, the config.
@@ -306,7 +361,7 @@ def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Re
     _refuse_place(target, runs, force)
     with damage_named(runs[0] if len(runs) == 1 else target):
         page = _of_several(runs) if len(runs) > 1 else _of_run(runs[0])
-        html, pngs = render(replace(page, sections=shared(page.sections)))
+        html, pngs = render(replace(page, sections=trimmed(page.sections)))
     figures = [target.parent / FIGURES / f"{name}.png" for name in pngs]
     for figure in figures:
         _refuse_place(figure, runs, force)
@@ -362,14 +417,25 @@ def _of_run(run: Path) -> Page:
         raise ConfigError(
             f"{run}: {NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
         )
-    title = str(document["title"]) if document else run.resolve().name
+    name = run.resolve().name
+    title = str(document["title"]) if document else _title_of(read_json(run, "eval/result.json")) or name
     closing = PageSection(
         "Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)]
     )
-    about = (record.get("started"), record.get("hardware", {}).get("cpu"))
+    about = (name, record.get("started"), record.get("hardware", {}).get("cpu"))
     return Page(
         title, ", ".join(str(part) for part in about if part), status_notice(record), [*sections, closing]
     )
+
+
+def _title_of(result: dict[str, Any] | None) -> str:
+    """'best, bt in gauntlet', '' of what is no evaluation."""
+    names = [str(m["name"]) for m in (result or {}).get("agents", [])]
+    who = ", ".join(names) if len(names) <= _MOST_IN_TITLE else f"{len(names)} agents"
+    return f"{who} in {Path(str(result['world'])).stem}" if result and names else ""
+
+
+_MOST_IN_TITLE = 4
 
 
 def _of_several(runs: list[Path]) -> Page:
@@ -413,14 +479,15 @@ def _figures_of(run: Path, blocks: Sequence[Block]) -> list[Block]:
 def content(run: Path) -> list[PageSection]:
     command = command_of(read_json(run, "run.json") or {})
     result = read_json(run, "eval/result.json")
+    episodes = media(run, result)
     found = [
-        PageSection("Evaluation", evaluation(result, command) if result else []),
+        PageSection("Evaluation", evaluation(result, command, episodes) if result else []),
         PageSection("Sweep", sweep(document, command) if (document := read_json(run, "sweep.json")) else []),
         PageSection("Training", _curves_of([run]) if (run / "metrics.jsonl").exists() else []),
         PageSection(
             "Time", timing(document, command) if (document := read_json(run, "profile.json")) else []
         ),
-        PageSection("Episodes", media(run, result)),
+        PageSection("Episodes", [] if result else episodes),
     ]
     return [replace(one, blocks=_filled(one.blocks)) for one in found if one.blocks]
 

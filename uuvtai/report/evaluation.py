@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -151,11 +152,12 @@ def causes_table(agent: dict[str, Any], title: str) -> Table:
 AgentSpec = dict[str, Any]
 
 
-def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
-    """Everything that an evaluation has to show but its pictures."""
+def evaluation(result: dict[str, Any], command: str = "", episodes: Sequence[Block] = ()) -> list[Block]:
+    """All that an evaluation has to show: what it says, ``episodes`` (player, pictures), then tables."""
     agents = result["agents"]
     table = agents_table(agents, _SHOWN, data=evaluation_data(agents), swatches=_swatches(agents))
-    blocks: list[Block] = [Paragraph(conditions(result)), table]
+    blocks: list[Block] = [*_opening(agents, result.get("paired", [])), Paragraph(conditions(result))]
+    blocks += [*episodes, table]
     if agents:
         blocks.append(_rates_figure(agents, command))
     blocks += _paired(result.get("paired", []))
@@ -163,6 +165,45 @@ def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
     for agent in agents:
         blocks += _causes(agent)
     return blocks
+
+
+_MOST_NAMED = 4  # agents in the sentence of the result
+
+
+def _opening(agents: list[AgentSpec], pairs: list[dict[str, Any]]) -> list[Block]:
+    """Who reached the goal how often, and the two best against each other; [] without episodes."""
+    ran = sorted(
+        (m for m in agents if m["episodes"] and m.get("outcomes")),
+        key=lambda m: m["outcomes"]["success"] / m["episodes"],
+        reverse=True,
+    )
+    if not ran:
+        return []
+    first, *others = ran
+    said = (
+        f"{first['name']} reached the goal in {first['outcomes']['success']} of {first['episodes']} episodes"
+    )
+    said += "".join(f", {m['name']} in {m['outcomes']['success']}" for m in others[: _MOST_NAMED - 1])
+    if rest := others[_MOST_NAMED - 1 :]:
+        said += f", {len(rest)} more agents in {rest[0]['outcomes']['success']} or fewer"
+    blocks: list[Block] = [Paragraph(f"{said}.", leads=True)]
+    best = {m["name"] for m in ran[:2]}
+    return blocks + [Paragraph(_duel(pair)) for pair in pairs if {pair["a"], pair["b"]} == best][:1]
+
+
+def _duel(pair: dict[str, Any]) -> str:
+    """A pair in words: who alone arrived, how sure that is, who was faster."""
+    a, b = pair["a"], pair["b"]
+    said = (
+        f"Of the same {pair['episodes']} episodes {a} alone arrived in {pair['only_a']}, {b} alone in "
+        f"{pair['only_b']} (McNemar's exact p = {probability(pair['mcnemar_p'])})"
+    )
+    gap = pair.get("time_difference_mean_s")
+    if gap is None:
+        return f"{said}."
+    took = f"{number(abs(gap), 2)} s {'less' if gap < 0 else 'longer'}"
+    sure = with_interval(gap, pair.get("time_difference_ci95"))
+    return f"{said}; where both arrived, {a} took {took} (difference with its 95 % interval: {sure} s)."
 
 
 _SHOWN = (

@@ -1,8 +1,10 @@
-"""From blocks to one self-contained page: no script, no address; what comes from files is escaped."""
+"""From blocks to one self-contained page: no address, no script but the player's; what comes from files is
+escaped, or packed in base64."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,7 +21,7 @@ from uuvtai.common.version import __version__
 from uuvtai.config.loader import MAX_BYTES as MAX_YAML_BYTES
 from uuvtai.config.loader import ConfigError
 from uuvtai.report import figures
-from uuvtai.report.blocks import Block, Figure, PageSection
+from uuvtai.report.blocks import Block, Figure, PageSection, Player
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -64,13 +66,33 @@ class _Drawing:
 def render(page: Page) -> tuple[str, dict[str, bytes]]:
     """(the page's HTML, name -> PNG of every figure)."""
     drawing = _Drawing()
+    has_player = any(
+        isinstance(block, Player) and block.episodes for s in page.sections for block in s.blocks
+    )
+    script = _script() if has_player else ""
     html = _template().render(
         page=page, version=__version__, svgs=drawing.svgs, kind=lambda block: type(block).__name__,
         max_rows=_MAX_SHOWN_ROWS, text=_text,
         csv_uri=lambda data: "data:text/csv;charset=utf-8," + quote(data.csv()),
-        on_page=on_page, file_name=_file_name, data_uri=_data_uri,
+        on_page=on_page, file_name=_file_name, data_uri=_data_uri, script=script,
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )  # fmt: skip
     return html, drawing.pngs
+
+
+_MODULES = ("decode", "view", "paint", "strip", "source", "player")
+_IMPORT = re.compile(r"^import [^\n]*\n|^export (?=[a-z])", re.MULTILINE)
+
+
+@cache
+def _script() -> Markup:
+    """The player's modules as one script: each stands after those that it imports."""
+    from markupsafe import Markup
+
+    folder = resources.files("uuvtai") / "report" / "player"
+    modules = [(folder / f"{name}.mjs").read_text(encoding="utf-8") for name in _MODULES]
+    # safe: the package's own text, in which a test looks for what would end the element
+    return Markup("\n".join([*(_IMPORT.sub("", module) for module in modules), "start();"]))
 
 
 @cache
@@ -85,8 +107,8 @@ def _template() -> Template:
     )
 
 
-def _data_uri(mime: str, content: bytes) -> str:
-    return f"data:{mime};base64,{base64.b64encode(content).decode()}"
+def _data_uri(content: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(content).decode()}"
 
 
 def _file_name(text: str) -> str:

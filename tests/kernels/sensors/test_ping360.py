@@ -11,10 +11,10 @@ from tests.small_sim import sim_with_one_beam
 from uuvtai.config import Config, SensorsConfig
 from uuvtai.config.loader import load_config
 from uuvtai.evaluation.episodes import Job
-from uuvtai.logs.drawing import load_recording
+from uuvtai.logs.drawing import ECHO, load_recording
 from uuvtai.logs.encode import EpisodeHeader, Moment
 from uuvtai.logs.topics.sensors import SONAR_ROWS
-from uuvtai.logs.video import _ECHO, FrameArtist
+from uuvtai.logs.video import FrameArtist
 from uuvtai.logs.writer import EpisodeRecorder
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, SonarPing
 from uuvtai.vehicle.replay import replay
@@ -84,7 +84,7 @@ def test_a_log_holds_each_beam_once_and_a_video_paints_the_last_sweep(driven):
     newest = list(recording["/sonar/scan"].until(3.0))
     assert newest[0][3] <= 3.0 < newest[0][3] + 0.05 and len(newest) > 64
     artist = FrameArtist(recording, 1000)
-    ink = [(artist.frame(time_s) == np.array(_ECHO)).all(-1).sum() for time_s in (0.1, 3.0)]
+    ink = [(artist.frame(time_s) == np.array(ECHO)).all(-1).sum() for time_s in (0.1, 3.0)]
     assert ink[1] > 2 * ink[0] > 0
 
 

@@ -247,8 +247,24 @@ def _belief(rate: float, rate_cov: np.ndarray, present: float, above: float, bel
 
 
 def _read_tracks(data: dict[str, Any]) -> np.ndarray:
-    """(n, 3) x, y, radius."""
-    return np.array([(t["x"], t["y"], t["radius"]) for t in data["tracks"]]).reshape(-1, 3)
+    """(n, 9) x, y, radius, z, vx, vy and the covariance xx, xy, yy of the place [m, m/s, m^2]."""
+    rows = [
+        (
+            *(t[name] for name in ("x", "y", "radius", "z", "vx", "vy")),
+            *(t["covariance"][i] for i in (0, 1, 4)),
+        )
+        for t in data["tracks"]
+    ]
+    return np.array(rows, float).reshape(-1, 9)
+
+
+def _read_futures(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """(weight (n,) of every hypothesis of every track, their points (n, k, 2) [m])."""
+    paths = [path for track in data["tracks"] for path in track["hypotheses"]]
+    points = [np.column_stack([path["x"], path["y"]]) for path in paths]
+    return np.array([path["weight"] for path in paths], float), np.array(points, float).reshape(
+        len(paths), -1, 2
+    )
 
 
 _PLACED = ("world.kind", "world.pos_w", "world.size", "world.yaw")
@@ -278,6 +294,7 @@ OBSTACLE_ROWS = (
             *(f"forecast.{name}" for name in ("pos_w", "radius_m", "above_w", "below_w")),
             *("futures.share", "futures.pos_w"),
         ),
+        _read_futures,
     ),
 )
 
