@@ -79,27 +79,26 @@ CAUSES: dict[str, str] = {
     f"{NEAR_M:g} m",
     "hit_static": "touched a static obstacle, no moving obstacle near",
     "hit_wall": "touched a side wall, no moving obstacle near",
-    "no_escape_at_start": f"killed in the first {START_S:g} s",
-    "undetected_beside": f"killer beside or behind the sonar's fan all through the last {UNDETECTED_S:g} s",
-    "undetected_depth_change": f"killer above or below the sonar's fan all through the last {UNDETECTED_S:g} "
+    "no_escape_at_start": f"over within the first {START_S:g} s",
+    "undetected_beside": f"it was beside or behind the sonar's fan all through the last {UNDETECTED_S:g} s",
+    "undetected_depth_change": f"it was above or below the sonar's fan all through the last {UNDETECTED_S:g} "
     f"s, and the own depth changed towards it by > {CLIMB_M:g} m in the last {CLIMB_S:g} s",
-    "undetected_above": f"killer above the sonar's fan all through the last {UNDETECTED_S:g} s",
-    "undetected_below": f"killer below the sonar's fan all through the last {UNDETECTED_S:g} s",
-    "obstacle_reversed": f"killer turned back in the last {TURN_S:g} s and the forecast before it was wrong",
-    "obstacle_turned": f"killer turned a corner in the last {TURN_S:g} s and the forecast before it was "
-    "wrong",
-    "late_detection": f"killer came into the sonar's fan less than {LEAD_S:g} s before the end",
-    "occluded": f"killer was behind something else until {LEAD_S:g} s before the end",
-    "untracked": f"killer seen, but no forecast of it {LEAD_S:g} s before the end",
-    "obstacle_on_curve": f"killer on a circle, forecast off by > {MISS_M:g} m",
-    "prediction_error": f"killer on a straight course, forecast off by > {MISS_M:g} m",
+    "undetected_above": f"it was above the sonar's fan all through the last {UNDETECTED_S:g} s",
+    "undetected_below": f"it was below the sonar's fan all through the last {UNDETECTED_S:g} s",
+    "obstacle_reversed": f"it turned back in the last {TURN_S:g} s and the forecast before it was wrong",
+    "obstacle_turned": f"it turned a corner in the last {TURN_S:g} s and the forecast before it was wrong",
+    "late_detection": f"it came into the sonar's fan less than {LEAD_S:g} s before the end",
+    "occluded": f"it was behind something else until {LEAD_S:g} s before the end",
+    "untracked": f"it was seen, but no forecast of it {LEAD_S:g} s before the end",
+    "obstacle_on_curve": f"it moved on a circle, forecast off by > {MISS_M:g} m",
+    "prediction_error": f"it moved on a straight course, forecast off by > {MISS_M:g} m",
     "late_reaction": "forecast right, but evasion began after the last chance to escape, or never",
     "failed_evasion": "forecast right and evading before the last chance to escape: it chose the wrong way",
     "depth_change_needed": "forecast right, but only a change of depth would have escaped",
     "no_depth_left": "forecast right, only below the floor or above the surface was there a way out",
     "blocked_by_static": f"forecast right, no way out: static or wall within {REACH_M:g} m",
     "second_obstacle_near": f"forecast right, no way out: a second moving obstacle within {CROWD_M:g} m",
-    "obstacle_too_fast": "forecast right, no way out: the killer is too fast to give way to",
+    "obstacle_too_fast": "forecast right, no way out: the obstacle is too fast to give way to",
     "no_route": f"timeout: no route in most of the last {LAST_S:g} s",
     "too_slow": f"timeout: still came > {PROGRESS_M:g} m nearer to the goal in the last {LAST_S:g} s",
     "waiting": f"timeout: waited on purpose in most of the last {LAST_S:g} s",
@@ -107,7 +106,8 @@ CAUSES: dict[str, str] = {
     "stuck": f"timeout: drove < {STUCK_M:g} m in the last {LAST_S:g} s",
     "no_progress": f"timeout: drove on without coming nearer in the last {LAST_S:g} s",
 }
-"""Every label with its meaning, in order of precedence (forecasts: LEAD_S before the end, escapes too)."""
+"""Every label with its meaning, in order of precedence (it: what ended the episode; forecasts and
+escapes: LEAD_S before the end)."""
 
 
 Fact = dict[str, Any]
@@ -130,7 +130,8 @@ REMARKS: dict[str, Callable[[Fact], bool]] = {
     ),
     "only heave escaped": lambda f: not f["escapes"] and bool(f["escapes_by_heave"]),
 }
-"""What may have contributed, where the killer moves. "Corner passed in reach before": was learnable."""
+"""What may have contributed, where what ended the episode moves. "Corner passed in reach before": was
+learnable."""
 
 _IMPLIED = {
     ("obstacle_turned", "turned lately"),
