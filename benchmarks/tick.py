@@ -44,7 +44,7 @@ def measure(job: Job) -> list[Row]:
     sizes = array_sizes(config, n_env)
     behavior, table = state.allocate(state.BehaviorState, sizes), state.allocate(state.TreeTable, sizes)
     load_tree(table, tree)
-    shape = (_TURNS, n_env)
+    shape = (_TURNS, n_env, codes.MAX_NODES)
     answers = np.random.default_rng(0).integers(
         tree_tick.RUNNING, tree_tick.FAILURE + 1, shape, dtype=np.int8
     )

@@ -288,6 +288,7 @@ PLAIN = {
     "evaluation/failure_causes.py": ["RuntimeError"],  # a replay that ends otherwise: a bug of ours
     "common/statistics.py": ["ValueError"],  # counts that cannot be: a bug of ours
     "sim/behavior_tree.py": ["ValueError"],  # told by its caller, with the file that it comes from
+    "report/recorded.py": ["ValueError"],  # told by ``drawing``, with the log that it comes from
     "compile/runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
 }
 

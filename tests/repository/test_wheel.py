@@ -21,7 +21,11 @@ PRESETS = {
     path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai" / "presets").rglob("*") if path.is_file()
 }
 EXAMPLES = {path.name for path in (ROOT / "examples").iterdir() if path.is_file()}
-MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai").rglob("*.py")}
+MODULES = {
+    path.relative_to(ROOT).as_posix()
+    for path in (ROOT / "uuvtai").rglob("*")
+    if path.suffix in (".py", ".mjs")
+}
 
 NO_NETWORK = """
 import pathlib, sys
