@@ -101,8 +101,8 @@ _REMARKABLE_SHARE = 0.2
 """Remarks on fewer of a cause's episodes are left to the JSON."""
 
 _LEGEND = (
-    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: "
-    "unseen = since a beam last met the killer, evading = since evasion began, chance = until when some "
+    "knew: share whose forecast of the obstacle, made 1 s before the end, was right. Medians before the end: "
+    "unseen = since a beam last met it, evading = since evasion began, chance = until when some "
     "velocity still escaped. worst: seed:episode of the hardest hit"
 )
 

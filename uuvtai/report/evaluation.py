@@ -317,7 +317,7 @@ def _causes(agent: AgentSpec) -> list[Block]:
         return []
     caption = (
         f"Why {len(agent['explain'])} of {agent['episodes']} episodes of {agent['name']} failed. "
-        "Knew: share whose forecast of the killer 1 s before the end was right; the times are medians before "
+        "Knew: share whose forecast of the obstacle 1 s before the end was right; times are medians before "
         "the end"
     )
     return [causes_table(agent, caption)]
