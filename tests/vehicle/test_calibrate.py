@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -15,12 +16,11 @@ from uuvtai.config.loader import load_config
 from uuvtai.console.screen import Screen
 from uuvtai.console.vehicle_views import show_calibration
 from uuvtai.vehicle import control_loop
-from uuvtai.vehicle.calibrate import Calibration, Place, solved
+from uuvtai.vehicle.calibrate import WAYS, Calibration, Place, solved
 from uuvtai.vehicle.messages import DvlReading, ImuReading, SonarPing
 from uuvtai.vehicle.start_fix import expected
 
 DT, Z = 0.1, -0.8
-WAYS = {"ahead": (0.35, 0.0), "to port": (0.0, 0.35), "back": (-0.35, 0.0), "to starboard": (0.0, -0.35)}
 
 
 class Diver:
@@ -28,7 +28,7 @@ class Diver:
 
     def __init__(self, seed, yaw_deg=0.0, off=(0.0, 0.0), turn_deg=0.0, scale=1.0, tank=None):
         self.config = load_config("pool", "ping360")
-        self.rng, self.place, self.yaw = np.random.default_rng(seed), np.array([3.0, 2.0]), 0.2
+        self.rng, self.place, self.yaw = np.random.default_rng(seed), np.array([2.5, 2.0]), 0.2
         self.dvl_yaw, self.turn, self.scale = math.radians(yaw_deg), math.radians(turn_deg), scale
         known = self.config
         if tank:
@@ -48,9 +48,10 @@ class Diver:
         made = self.calibration
         if made.says != self.said:
             self.said = made.says
-            for way, velocity in WAYS.items():
-                if f"drive 2 m {way} by hand" in made.says:
-                    self.way, self.left_m = np.array(velocity), 2.0 + 0.2 * self.rng.standard_normal()
+            if told := re.search(r"drive (\d) m ([a-z ]+) by hand", made.says):
+                angle = WAYS.index(told[2]) * math.tau / 8
+                self.way = 0.35 * np.array([math.cos(angle), math.sin(angle)])
+                self.left_m = int(told[1]) + 0.2 * self.rng.standard_normal()
         self.time_s += DT
         self.speed += ((self.way if self.left_m > 0 else 0.0) - self.speed) * DT / 0.5
         self.left_m -= DT * math.hypot(*self.speed)

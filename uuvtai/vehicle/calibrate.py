@@ -29,7 +29,13 @@ PLACES, MOST_PLACES, _FIXES, _LEG_M = 7, 12, 3, 1.5
 YAW_RAD, SCALE = math.radians(0.5), 0.05
 """standard deviation of the yaw at most; by how much more or less the DVL may tell than the walls"""
 _REST_M_S, _STILL_S = 0.1, 1.5  # at rest, though it may turn: slower, for so long
-_WAYS = ("ahead", "to port", "back", "to starboard")
+WAYS = (
+    "ahead", "ahead to port", "to port", "back to port", "back", "back to starboard", "to starboard",
+    "ahead to starboard",
+)  # fmt: skip
+"""where to drive next, from the hull, counter-clockwise in steps of 45 degrees"""
+_SQUARE_M = np.array([(2.0, 0.0), (2.0, 2.0), (0.0, 2.0), (0.0, 0.0)])
+"""where to, one place after the other, from the first one towards the middle of the tank"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +133,18 @@ class Calibration:
         if (count := len(self._of(self._number))) < _FIXES:
             self.says = f"place {self._number}: fix {count} of {_FIXES}, let it rest"
             return
-        way = _WAYS[(self._number - 1) % len(_WAYS)]
-        self.says = f"place {self._number} is known: drive 2 m {way} by hand, then let it rest"
+        self.says = f"place {self._number} is known: drive {self._next_way()} by hand, then let it rest"
         if self._number >= PLACES:
             self._conclude()
+
+    def _next_way(self) -> str:
+        """The next corner of the square that is a leg away, as seen from the hull."""
+        tank, first = self._config.world.tank, self.places[0].by_walls
+        inwards = np.where(np.array([sum(tank.x_m), sum(tank.y_m)]) / 2 < first, -1.0, 1.0)
+        corners = np.roll(first + inwards * _SQUARE_M, 1 - self._number, axis=0) - self._at
+        x, y = corners[int(np.argmax(np.hypot(*corners.T) > _LEG_M + 0.2))]
+        bearing = math.atan2(y, x) - self._track.rpy[2] - self._turn
+        return f"{math.hypot(x, y):.0f} m {WAYS[round(8 * bearing / math.tau) % 8]}"
 
     def _conclude(self) -> None:
         found = solved(self.places)
