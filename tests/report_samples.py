@@ -101,7 +101,7 @@ def evaluation_document(*agents):
 CAUSE = {
     "label": "undetected_above", "count": 2, "share": 1.0, "knew_share": 0.5, "undetected_median_s": 1.7,
     "evading_median_s": None,
-    "last_chance_median_s": 0.2, "meaning": "killer above the sonar's fan all through the last 0.3 "
+    "last_chance_median_s": 0.2, "meaning": "it was above the sonar's fan all through the last 0.3 "
                                             "s", "remarks": {},
 }  # fmt: skip
 

@@ -12,11 +12,11 @@ def page() -> str:
     parts = [
         "# Causes of failure",
         "`uuv eval --explain` runs every failed episode again and gives it one cause, the first of these "
-        "that holds. *Killer* is what the termination check stopped the episode for. Forecasts, and whether "
+        "that holds. *It* is what the termination check stopped the episode for. Forecasts, and whether "
         "there was "
         "a way out, are judged 1 s before the end.",
         text_table(["cause", "meaning"], causes),
-        "Remarks say what may have contributed, where the killer moves; any number of them may hold: "
+        "Remarks say what may have contributed, where it moves; any number of them may hold: "
         + ", ".join(REMARKS)
         + ".",
     ]

@@ -34,7 +34,7 @@ HERE = np.array([10.0, 3.0, -0.8])
 NOSE_M = 0.27
 """Hull centre to the tip of the nose."""
 END_S = 14.0
-KILLER, SECOND, STATIC = 0, 1, 2
+TOUCHED, SECOND, STATIC = 0, 1, 2
 
 
 def at(x, y, z):
@@ -55,9 +55,9 @@ class Story:
         self.circle = np.zeros(3)
         self.obstacle = np.tile(np.array([2.0, 1.0, -0.8]), (self.n, 3, 1))
         touching = at(NOSE_M + gap + radius, 0.0, rise)
-        self.obstacle[:, KILLER] = touching + self.ago[:, None] * [speed, 0.0, 0.0]
+        self.obstacle[:, TOUCHED] = touching + self.ago[:, None] * [speed, 0.0, 0.0]
         self.vel = np.zeros((self.n, 3, 3))
-        self.vel[:, KILLER, 0] = -speed
+        self.vel[:, TOUCHED, 0] = -speed
         self.hull_vel = np.zeros((self.n, 3))
         self.pos = np.tile(HERE, (self.n, 1))
         self.sees = np.ones(self.n, bool)
@@ -72,11 +72,11 @@ class Story:
         self.look, self.config = 0.0, CONFIG
 
     def turn(self, ago_s, before=(0.0, -1.0)):
-        """The killer moved along ``before`` until ``ago_s`` before the end; forecasts went on straight."""
+        """The touched moved along ``before`` until ``ago_s`` before the end; forecasts went on straight."""
         early = self.ago > ago_s + 1e-6
-        corner = self.obstacle[~early, KILLER][0]
-        self.vel[early, KILLER] = [before[0], before[1], 0.0]
-        self.obstacle[early, KILLER] = corner - (self.ago[early, None] - ago_s) * self.vel[early, KILLER]
+        corner = self.obstacle[~early, TOUCHED][0]
+        self.vel[early, TOUCHED] = [before[0], before[1], 0.0]
+        self.obstacle[early, TOUCHED] = corner - (self.ago[early, None] - ago_s) * self.vel[early, TOUCHED]
         self.foreseen_vel[early] = before
         return self
 
@@ -91,23 +91,23 @@ class Story:
         )
 
     def scan(self):
-        """Beam 0 looks at the killer, wherever it is: the tests turn the vehicle's yaw with the bearing."""
-        away = np.linalg.norm((self.obstacle[:, KILLER] - self.pos)[:, :2], axis=1) - self.size[KILLER, 0]
+        """Beam 0 looks at the touched, wherever it is: the tests turn the vehicle's yaw with the bearing."""
+        away = np.linalg.norm((self.obstacle[:, TOUCHED] - self.pos)[:, :2], axis=1) - self.size[TOUCHED, 0]
         scan = np.full((self.n, CONFIG.sensors.sonar.n_ray), 12.0)
         scan[self.sees, 0] = away[self.sees]
         return scan
 
     def history(self):
-        toward = self.obstacle[:, KILLER] - self.pos
+        toward = self.obstacle[:, TOUCHED] - self.pos
         yaw = np.arctan2(toward[:, 1], toward[:, 0]) + self.look
         lead = 0.1 * np.arange(26)
-        forecast = self.obstacle[:, KILLER, None, :2] + lead[:, None] * self.foreseen_vel[:, None]
+        forecast = self.obstacle[:, TOUCHED, None, :2] + lead[:, None] * self.foreseen_vel[:, None]
         return History(
             t_s=self.t, pos_w=self.pos, believed_pos_w=self.pos + self.place_error, vel_valid=self.vel_valid,
             quat_wb=np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1), vel_b=self.hull_vel,
             rate_b=np.zeros((self.n, 3)), obstacle_w=self.obstacle, obstacle_vel_w=self.vel,
             ping_age_s=np.zeros(self.n), range_m=self.scan(),
-            track_moving=np.where(self.believes, 1, 0)[:, None], track_w=self.obstacle[:, KILLER, None, :2],
+            track_moving=np.where(self.believes, 1, 0)[:, None], track_w=self.obstacle[:, TOUCHED, None, :2],
             forecast_w=forecast[:, None], forecast_m=np.where(self.believes, 0.2, -1.0)[:, None],
             forecast_above_w=self.pos[:, 2:] + self.believed_gap,
             forecast_below_w=self.pos[:, 2:] - self.believed_gap, conflict=self.conflict, leaf=self.leaf,
@@ -137,7 +137,7 @@ def with_second(story, y=0.7):
 
 def hit_static(evading=False, moving_m=None):
     story = Story(speed=1.0).put(STATIC, CYLINDER, at(NOSE_M + 0.3 + 0.05, 0.0, 0.0), [0.3, 0.3, 0.8])
-    story.obstacle[:, KILLER] = at(0.0, 2.5 if moving_m is None else NOSE_M + 0.2 + moving_m, 0.0)
+    story.obstacle[:, TOUCHED] = at(0.0, 2.5 if moving_m is None else NOSE_M + 0.2 + moving_m, 0.0)
     story.leaf = ["Evade" if evading else "FollowRoute"] * story.n
     return story
 
@@ -149,7 +149,7 @@ def change(story, **fields):
 
 
 def at_wall(story):
-    story.kind[KILLER] = NONE
+    story.kind[TOUCHED] = NONE
     story.pos = np.tile([0.2, 3.0, -0.8], (story.n, 1))
     story.leaf = ["FollowRoute"] * story.n
     return story
@@ -157,7 +157,7 @@ def at_wall(story):
 
 def at_depth(z):
     story = Story()
-    story.kind[KILLER] = NONE
+    story.kind[TOUCHED] = NONE
     story.pos = np.tile([10.0, 3.0, z], (story.n, 1))
     return story
 
@@ -171,21 +171,21 @@ def lately(story, seconds, name, before):
 
 
 def late_into_the_fan():
-    """The vehicle rises to the killer's depth only in the last 0.7 s."""
+    """The vehicle rises to the touched's depth only in the last 0.7 s."""
     story = lately(Story(), 0.6, "believes", False)
     story.pos[story.ago > 0.7, 2] -= 0.6
     return story
 
 
 def diving_into_it():
-    """The vehicle dives for its last second; the killer stays below the fan."""
+    """The vehicle dives for its last second; the touched stays below the fan."""
     story = below(-0.35)
     story.pos[:, 2] += 0.3 * np.minimum(story.ago, 1.0)
     return story
 
 
 def from_behind():
-    """A sonar that looks ahead only, and the killer comes from behind."""
+    """A sonar that looks ahead only, and the touched comes from behind."""
     sonar = CONFIG.sensors.sonar.model_copy(update={"horizontal_aperture_deg": 130.0})
     sensors = CONFIG.sensors.model_copy(update={"sonar": sonar})
     config = CONFIG.model_copy(update={"sensors": sensors})
@@ -256,8 +256,8 @@ def test_every_label_has_a_story():
 def test_a_story_gets_its_label(label):
     make, outcome = STORIES[label]
     found = make().explained(outcome)
-    assert found.label == label, (found.killer, found.facts)
-    json.dumps(vars(found.killer) | found.facts, allow_nan=False)
+    assert found.label == label, (found.touched, found.facts)
+    json.dumps(vars(found.touched) | found.facts, allow_nan=False)
 
 
 @pytest.mark.parametrize("label", TIMEOUTS)
@@ -294,17 +294,17 @@ def test_just_past_a_threshold_the_label_changes(make, label):
 
 
 def _learnt_turn(ago_s):
-    """Constant velocities that lead from every place before the turn to where the killer ends."""
+    """Constant velocities that lead from every place before the turn to where the touched ends."""
     story = Story().turn(ago_s)
     left = np.maximum(story.ago, 0.1)[:, None]
-    return (story.obstacle[-1, KILLER, :2] - story.obstacle[:, KILLER, :2]) / left
+    return (story.obstacle[-1, TOUCHED, :2] - story.obstacle[:, TOUCHED, :2]) / left
 
 
 def test_facts_of_a_plain_story():
     found = lately(Story(), 0.8, "leaf", "FollowRoute").explained()
-    assert (found.killer.name, found.killer.slot, found.killer.moving) == ("sphere", KILLER, True)
-    assert found.killer.gap_m == pytest.approx(0.05, abs=1e-3)
-    assert found.killer.closing_m_s == pytest.approx(1.0, abs=1e-3)
+    assert (found.touched.name, found.touched.slot, found.touched.moving) == ("sphere", TOUCHED, True)
+    assert found.touched.gap_m == pytest.approx(0.05, abs=1e-3)
+    assert found.touched.closing_m_s == pytest.approx(1.0, abs=1e-3)
     facts = found.facts
     assert (facts["age_s"], facts["evading_s"], facts["leaf"]) == (14.0, 0.8, "Evade")
     assert (facts["fan_ago_s"], facts["seen_ago_s"], facts["believed_ago_s"]) == (0.0, 0.0, 0.0)
@@ -373,16 +373,16 @@ def test_the_gap_that_was_believed_is_told(rise):
 
 def test_a_ttc_stop_names_the_obstacle_that_closes_in_and_not_the_nearest():
     story = Story(speed=3.0, gap=0.4).put(STATIC, CYLINDER, at(0.0, 0.17 + 0.3 + 0.15, 0.0), [0.3, 0.3, 0.8])
-    assert story.explained("ttc").killer.slot == KILLER
-    assert story.explained("collision").killer.slot == STATIC
+    assert story.explained("ttc").touched.slot == TOUCHED
+    assert story.explained("collision").touched.slot == STATIC
 
 
 def test_a_ttc_stop_never_names_a_obstacle_that_moves_away():
     story = with_second(Story(speed=3.0, gap=0.4), y=0.5)
     story.vel[:, SECOND] = [0.0, 2.0, 0.0]
     found = story.explained("ttc")
-    assert found.facts["second_body_m"] < found.killer.gap_m
-    assert found.killer.slot == KILLER
+    assert found.facts["second_body_m"] < found.touched.gap_m
+    assert found.touched.slot == TOUCHED
 
 
 def test_a_second_obstacle_that_passed_earlier_is_not_near():
@@ -392,7 +392,7 @@ def test_a_second_obstacle_that_passed_earlier_is_not_near():
 
 
 def test_a_scan_is_compared_with_the_moment_of_its_ping():
-    """Delivered 0.2 s late: the killer is 0.2 m nearer by then, twice the tolerance."""
+    """Delivered 0.2 s late: the touched is 0.2 m nearer by then, twice the tolerance."""
     story = Story()
     late = replace(
         story.history(), ping_age_s=np.full(story.n, 0.2), range_m=story.scan() + 0.2 * (np.arange(256) == 0)
@@ -517,7 +517,7 @@ def test_a_held_velocity_is_approached_with_the_lag():
 
 def test_everything_escapes_in_free_water_and_nothing_from_a_box():
     free = Story()
-    free.kind[KILLER] = NONE
+    free.kind[TOUCHED] = NONE
     level, heaving = escapes(free.history(), free.obstacles(), CONFIG, 1.0)
     assert level == int((candidates(CONFIG, 0.0)[:, 2] == 0).sum()) == 33
     assert heaving == 66  # 0.4 m/s for 1.5 s reaches neither floor nor surface from mid-water
@@ -539,8 +539,8 @@ def test_candidates_respect_the_limits_of_the_body_axes():
 def test_obstacles_go_straight_on_after_the_end():
     story = Story(speed=1.0)
     then, vel = motion(story.history(), np.array([END_S - 0.25, END_S + 0.4]))
-    np.testing.assert_allclose(then[:, KILLER, 0] - story.obstacle[-1, KILLER, 0], [0.25, -0.4], atol=1e-6)
-    np.testing.assert_allclose(vel[:, KILLER], [[-1.0, 0.0, 0.0]] * 2)
+    np.testing.assert_allclose(then[:, TOUCHED, 0] - story.obstacle[-1, TOUCHED, 0], [0.25, -0.4], atol=1e-6)
+    np.testing.assert_allclose(vel[:, TOUCHED], [[-1.0, 0.0, 0.0]] * 2)
 
 
 # ---------------------------------------------------------------------------------- tables, replay, recording
@@ -549,7 +549,8 @@ def test_obstacles_go_straight_on_after_the_end():
 def row(label, episode, closing=None, **facts):
     result = EpisodeResult(1, episode, "collision", 3.0, 0.0, 0.05, 1.0, {}, {}, {}, np.zeros(1), np.zeros(1))
     return failure_causes.Row(
-        result, failure_causes.Explanation(label, failure_causes.Killer("sphere", closing_m_s=closing), facts)
+        result,
+        failure_causes.Explanation(label, failure_causes.Touched("sphere", closing_m_s=closing), facts),
     )
 
 
@@ -626,11 +627,11 @@ def test_the_killer_is_what_the_referee_saw(played):
     stops = [
         row
         for row in rows
-        if row.result.outcome == "collision" and row.explanation.killer.name not in ("floor", "surface")
+        if row.result.outcome == "collision" and row.explanation.touched.name not in ("floor", "surface")
     ]
     assert stops
     for row in stops:
-        assert row.explanation.killer.gap_m == pytest.approx(
+        assert row.explanation.touched.gap_m == pytest.approx(
             row.result.min_clearance_m, abs=2 * HULL_TOLERANCE_M
         )
 

@@ -31,7 +31,7 @@ def run(tmp_path_factory):
     """A run folder with two agents on one recorded episode; ``straight`` failed."""
     folder = tmp_path_factory.mktemp("player") / "run"
     cause = samples.CAUSE | {"label": "late_detection", "meaning": "seen too late"}
-    row = {"seed": 0, "episode": 3, "label": "late_detection", "killer": {"slot": 4}}
+    row = {"seed": 0, "episode": 3, "label": "late_detection", "touched": {"slot": 4}}
     straight = samples.agent("straight", 3, 5, causes=[cause], explain=[row])
     samples.write_run(folder, eval__result=samples.evaluation_document(samples.agent("bt"), straight))
     (folder / "logs").mkdir()

@@ -126,6 +126,18 @@ def test_a_way_that_nobody_measured_begins_again():
     assert diver.drive().found is not None
 
 
+def test_a_way_too_short_is_said():
+    diver = Diver(4)
+    while "is known" not in diver.calibration.says:
+        diver.step()
+    diver.step()
+    diver.left_m = 1.0
+    while "drive on" not in diver.calibration.says:
+        diver.step()
+        assert diver.time_s < 60
+    assert "m of 1.5 at least" in diver.calibration.says
+
+
 def test_the_turn_is_that_of_least_squares():
     rng = np.random.default_rng(0)
     way, angle = rng.uniform(-2, 2, (6, 2)), 0.3

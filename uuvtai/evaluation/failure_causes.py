@@ -30,11 +30,11 @@ from uuvtai.evaluation.failure_facts import (
     LEAD_S,
     CoarseHistory,
     History,
-    Killer,
     Obstacles,
     Scene,
-    killer_facts,
+    Touched,
     timeout_facts,
+    touched_facts,
 )
 from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.setup import obstacle_slots
@@ -149,7 +149,7 @@ class Explanation:
     """Label, facts and remarks of one failed episode."""
 
     label: str
-    killer: Killer
+    touched: Touched
     facts: Fact = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
@@ -158,44 +158,44 @@ def explain(outcome: str, history: History, obstacles: Obstacles, config: Config
     """Label and facts of an episode that ended with ``outcome`` (collision, ttc, out_of_tank or timeout)."""
     if outcome == "timeout":
         facts = timeout_facts(history.coarse)
-        return Explanation(timeout_label(facts), Killer(""), facts)
+        return Explanation(timeout_label(facts), Touched(""), facts)
     scene = Scene(history, obstacles, config)
-    killer = scene.killer(outcome)
-    facts, remarks = scene.facts(killer), []
-    if killer.moving and killer.slot is not None:
-        facts |= killer_facts(history, obstacles, killer.slot, config)
-    label = label_of(outcome, killer, facts)
-    if killer.moving:
+    touched = scene.touched(outcome)
+    facts, remarks = scene.facts(touched), []
+    if touched.moving and touched.slot is not None:
+        facts |= touched_facts(history, obstacles, touched.slot, config)
+    label = label_of(outcome, touched, facts)
+    if touched.moving:
         remarks = [name for name, holds in REMARKS.items() if holds(facts) and (label, name) not in _IMPLIED]
     if label == "no_escape_at_start":
-        remarks.insert(0, f"else {label_of(outcome, killer, facts | {'age_s': START_S})}")
-    return Explanation(label, killer, facts, remarks)
+        remarks.insert(0, f"else {label_of(outcome, touched, facts | {'age_s': START_S})}")
+    return Explanation(label, touched, facts, remarks)
 
 
 # ----------------------------------------------------------------------------------------------------- labels
 
 
-def label_of(outcome: str, killer: Killer, facts: Fact) -> str:
+def label_of(outcome: str, touched: Touched, facts: Fact) -> str:
     """The first cause that holds; its order and meaning are ``CAUSES``."""
     if outcome == "out_of_tank":
         return "out_of_tank"
-    if killer.name in ("floor", "surface"):
-        towards = facts["depth_error_m"] * (1 if killer.name == "floor" else -1)
+    if touched.name in ("floor", "surface"):
+        towards = facts["depth_error_m"] * (1 if touched.name == "floor" else -1)
         if towards > DEPTH_M:
             return "depth_error"
-        return "velocity_lost" if facts["blind_share"] > 0.5 else f"hit_{killer.name}"
-    if not killer.moving:
+        return "velocity_lost" if facts["blind_share"] > 0.5 else f"hit_{touched.name}"
+    if not touched.moving:
         if facts["place_error_m"] > PLACE_M:
             return "localization_error"
         if facts["blind_share"] > 0.5:
             return "velocity_lost"
         pushed = facts["evading_s"] > 0 or _within(facts["moving_near_m"], NEAR_M)
-        return "evaded_into_static" if pushed else "hit_wall" if killer.name == "wall" else "hit_static"
+        return "evaded_into_static" if pushed else "hit_wall" if touched.name == "wall" else "hit_static"
     return _knowledge_label(facts) or _decision_label(facts)
 
 
 def _knowledge_label(facts: Fact) -> str | None:
-    """What kept the vehicle from knowing where the killer would be; None = it knew."""
+    """What kept the vehicle from knowing where what was touched would be; None = it knew."""
     if facts["age_s"] < START_S:
         return "no_escape_at_start"
     if _is_undetected(facts):
@@ -438,7 +438,7 @@ class Row:
             "remarks": e.remarks,
             "log": None,
         }
-        return shared | {"killer": vars(e.killer)} | e.facts
+        return shared | {"touched": vars(e.touched)} | e.facts
 
 
 def explain_failures(
@@ -507,7 +507,7 @@ def worst_of(rows: list[Row], label: str) -> list[Row]:
     """Episodes of a label, worst first: the hardest hits; timeouts that ended farthest from the goal."""
 
     def severity(row: Row) -> tuple[float, float]:
-        return (row.explanation.killer.closing_m_s or 0.0, row.explanation.facts.get("goal_m", 0.0))
+        return (row.explanation.touched.closing_m_s or 0.0, row.explanation.facts.get("goal_m", 0.0))
 
     return sorted((row for row in rows if row.explanation.label == label), key=severity, reverse=True)
 

@@ -1,7 +1,7 @@
 """What was true in the last seconds of a failed episode, as numbers with names. Pure NumPy;
 ``failure_causes.py`` makes labels of them.
 
-The killer is what the termination check stopped the episode for: the obstacle with the least time to
+What was touched is what the termination check stopped the episode for: the obstacle with the least time to
 collision of a ``ttc`` stop, otherwise what the hull touches. "Seen" means that a beam of a delivered scan met
 the obstacle, "believed" that a forecast lies within ``BELIEF_M`` of it. Facts that end in ``_ago_s`` count
 back from the end; None = not within ``WINDOW_S``.
@@ -356,7 +356,7 @@ WAITING = ("Hold",)  # leaves that stay in place on purpose; so do names that be
 
 
 @dataclass
-class Killer:
+class Touched:
     name: str  # sphere, cylinder, box, wall, floor or surface; "" = nothing (timeout)
     slot: int | None = None
     moving: bool = False
@@ -397,7 +397,7 @@ class Scene:
         self.closing = ((point_vel - history.obstacle_vel_w) * self.normal).sum(-1)
         self.vel_w = vel_w
 
-    def killer(self, outcome: str) -> Killer:
+    def touched(self, outcome: str) -> Touched:
         rules, gap, closing = self.config.episode, self.gap[-1], self.closing[-1]
         if outcome == "ttc":
             approaching = closing > rules.ttc_closing_m_s
@@ -414,10 +414,10 @@ class Scene:
         name = min(excess, key=lambda key: excess[key])
         if outcome != "out_of_tank" and gap[nearest] - rules.collision_clearance_m <= excess[name]:
             return self._body(nearest)
-        return Killer(name, gap_m=_round(solids[name]))
+        return Touched(name, gap_m=_round(solids[name]))
 
-    def _body(self, slot: int) -> Killer:
-        return Killer(
+    def _body(self, slot: int) -> Touched:
+        return Touched(
             name=KIND_NAMES[int(self.obstacles.kind[slot])],
             slot=slot,
             moving=bool(self.obstacles.moving[slot]),
@@ -425,14 +425,14 @@ class Scene:
             closing_m_s=_round(self.closing[-1, slot]),
         )
 
-    def facts(self, killer: Killer) -> dict[str, Any]:
-        """What holds for every failure that has a killer."""
+    def facts(self, touched: Touched) -> dict[str, Any]:
+        """What holds for every failure that has one."""
         h, moving = self.h, self.obstacles.moving
-        others = moving & (np.arange(len(moving)) != (-1 if killer.slot is None else killer.slot))
+        others = moving & (np.arange(len(moving)) != (-1 if touched.slot is None else touched.slot))
         still = (self.obstacles.kind != NONE) & ~moving
         ago = h.t_s[-1] - h.t_s
         off = h.believed_pos_w[-1] - h.pos_w[-1]
-        blind = h.vel_valid == 0 if killer.name in ("floor", "surface") else h.vel_valid != 1
+        blind = h.vel_valid == 0 if touched.name in ("floor", "surface") else h.vel_valid != 1
         return {
             "place_error_m": _round(np.hypot(off[0], off[1])),
             "depth_error_m": _round(off[2]),
@@ -453,7 +453,7 @@ class Scene:
 
 
 def _sight_facts(history: History, obstacles: Obstacles, slot: int, config: Config) -> dict[str, Any]:
-    """When the sonar could reach the killer, when it saw it, and what else it is."""
+    """When the sonar could reach what was touched, when it saw it, and what else it is."""
     sonar, kind, size = config.sensors.sonar, int(obstacles.kind[slot]), obstacles.size[slot]
     ago = history.t_s[-1] - history.t_s
     R_wb = rotation(history.quat_wb)
@@ -483,8 +483,8 @@ def _sight_facts(history: History, obstacles: Obstacles, slot: int, config: Conf
         "vertical_gap_m": _round(
             vertical_gap(history.pos_w[-1:], kind, history.obstacle_w[-1:, slot], size)[0]
         ),
-        "killer_speed_m_s": _round(np.linalg.norm(history.obstacle_vel_w[-1, slot])),
-        "killer_radius_m": _round(size[0]),
+        "touched_speed_m_s": _round(np.linalg.norm(history.obstacle_vel_w[-1, slot])),
+        "touched_radius_m": _round(size[0]),
         "full_height": bool(
             kind != BOX and size[2] > 0.49 * (config.world.tank.z_m[1] - config.world.tank.z_m[0])
         ),
@@ -524,7 +524,7 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
 
 
 def _believed_gap(history: History, slot: int, track: int) -> float:
-    """Vertical gap [m] that the vehicle believed in at the end, towards the killer; 0 = may be level."""
+    """Vertical gap [m], as the vehicle believed at the end, to what was touched; 0 = may be level."""
     own, above = history.pos_w[-1, 2], history.obstacle_w[-1, slot, 2] > history.pos_w[-1, 2]
     return _round(
         max(
@@ -541,7 +541,7 @@ def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
 
 
 def _course_facts(history: History, obstacles: Obstacles, slot: int, config: Config) -> dict[str, Any]:
-    """When the killer last turned a corner (circles have none), and how often there before in reach."""
+    """When what was touched last turned a corner (circles have none), and how often there before in reach."""
     vel = history.obstacle_vel_w[:, slot, :2]
     turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(vel[:, 1], vel[:, 0])))))
     corner = (turn > TURN_RAD) & (obstacles.circle_m[slot] == 0)
@@ -578,8 +578,8 @@ def _turns_in_reach(history: History, obstacles: Obstacles, slot: int, ago_s: fl
     )
 
 
-def killer_facts(history: History, obstacles: Obstacles, slot: int, config: Config) -> dict[str, Any]:
-    """What holds where a moving obstacle in this slot was the killer."""
+def touched_facts(history: History, obstacles: Obstacles, slot: int, config: Config) -> dict[str, Any]:
+    """What holds where a moving obstacle in this slot was touched."""
     course = _course_facts(history, obstacles, slot, config)
     beliefs = _belief_facts(history, slot, course["turned_ago_s"], config)
     return (

@@ -128,7 +128,7 @@ def _fact_of(episode: tuple[int, int] | None, agents: list[dict[str, Any]]) -> C
         meanings = {cause["label"]: cause["meaning"] for cause in agent.get("causes", [])}
         for row in agent.get("explain", []):
             if isinstance(row, dict) and (row["seed"], row["episode"]) == episode:
-                slot = row["killer"].get("slot")
+                slot = row["touched"].get("slot")
                 label = str(row["label"])
                 return Fact(
                     label.replace("_", " "), str(meanings.get(label, "")), -1 if slot is None else int(slot)

@@ -21,11 +21,13 @@ from uuvtai.common.files import whole_file
 from uuvtai.config import Config
 from uuvtai.config.loader import preset_names
 from uuvtai.vehicle.messages import DvlReading, ImuReading, SensorMessage
-from uuvtai.vehicle.start_fix import StartFix, StartFound, Track
+from uuvtai.vehicle.start_fix import FLOOR_M, FLOOR_RAD, StartFix, StartFound, Track
 
 LONGEST_S = 1200.0  # of a calibration
-PLACES, MOST_PLACES, _FIXES, _LEG_M = 7, 12, 3, 1.5
-"""places at least and at most, fixes at each; between two of them so far by the DVL at least"""
+PLACES, MOST_PLACES, _FIXES = 7, 12, 3
+"""places at least and at most, and fixes at each"""
+_LEG_M, _TOLD_M, _DRIFT_M = 1.5, 1.7, 0.5
+"""between two places so far by the DVL at least, and so far as the operator is told; less is drift"""
 YAW_RAD, SCALE = math.radians(0.5), 0.05
 """standard deviation of the yaw at most; by how much more or less the DVL may tell than the walls"""
 _REST_M_S, _STILL_S = 0.1, 1.5  # at rest, though it may turn: slower, for so long
@@ -115,7 +117,9 @@ class Calibration:
             return
         here = self._of(self._number)
         if len(here) >= _FIXES:
-            if math.dist(self._track.at, here[-1].by_dvl) < _LEG_M:
+            if (way_m := math.dist(self._track.at, here[-1].by_dvl)) < _LEG_M:
+                if way_m > _DRIFT_M:
+                    self.says = f"that was {way_m:.1f} m of {_LEG_M:g} at least: drive on, then let it rest"
                 return
             self._number += 1
         x, y = self._at + _turned(self._track.at - self._from, self._turn)
@@ -142,7 +146,7 @@ class Calibration:
         tank, first = self._config.world.tank, self.places[0].by_walls
         inwards = np.where(np.array([sum(tank.x_m), sum(tank.y_m)]) / 2 < first, -1.0, 1.0)
         corners = np.roll(first + inwards * _SQUARE_M, 1 - self._number, axis=0) - self._at
-        x, y = corners[int(np.argmax(np.hypot(*corners.T) > _LEG_M + 0.2))]
+        x, y = corners[int(np.argmax(np.hypot(*corners.T) > _TOLD_M))]
         bearing = math.atan2(y, x) - self._track.rpy[2] - self._turn
         return f"{math.hypot(x, y):.0f} m {WAYS[round(8 * bearing / math.tau) % 8]}"
 
@@ -185,7 +189,7 @@ class Calibration:
 
 
 def solved(places: list[Place]) -> Calibrated:
-    """The turn and the scale that lay the ways by the DVL on the places by the walls; of three rests."""
+    """The turn and the scale that lay the ways by the DVL on the places by the walls, from three rests on."""
     numbers = sorted({place.number for place in places})
     rows = [[place for place in places if place.number == number] for number in numbers]
     walls, way = (
@@ -205,10 +209,10 @@ def solved(places: list[Place]) -> Calibrated:
     deviation = math.sqrt(float((off**2).sum()) / free)
     return Calibrated(
         yaw,
-        max(deviation, 0.005) / math.sqrt(size),
+        max(deviation, FLOOR_M) / math.sqrt(size),
         scale,
         turn,
-        float(np.std(turns)),
+        max(float(np.std(turns)), FLOOR_RAD),
         (float(places[-1].by_walls[0]), float(places[-1].by_walls[1])),
         math.sqrt(float((off**2).sum()) / (2 * len(rows))),
         len(rows),

@@ -30,7 +30,7 @@ _KEPT_S, _SCAN_RAYS = 45.0, 64
 _TURN_RAD, _REST_S = math.radians(4.0), 0.5  # a scan is kept when turned or waited so much since the last
 _CELL_M, _STEP_RAD = 0.05, math.radians(1.0)  # of the histograms
 _SEARCH_RAYS, _FARTHEST_M = 800, 60.0
-_FLOOR_M, _FLOOR_RAD = 0.02, math.radians(0.3)  # what a fix is never better than: errors that rays share
+FLOOR_M, FLOOR_RAD = 0.02, math.radians(0.3)  # what a fix is never better than: errors that rays share
 _INDEPENDENT = 100  # rays count as no more measurements than this
 _WALL_RAYS, _WALL_M = 12, 1.5
 """a wall is seen by so many returns at least, that lie so far apart: larger than the face of an obstacle"""
@@ -395,7 +395,7 @@ def covariance_of(fit: Fit) -> tuple[np.ndarray, float]:
     residual = math.sqrt(float(off @ off) / n)
     values, vectors = np.linalg.eigh(slope.T @ slope)
     variances = max(residual, 0.03) ** 2 * max(n / _INDEPENDENT, 1.0) / np.maximum(values, 1e-9)
-    floor = np.diag([_FLOOR_M**2, _FLOOR_M**2, _FLOOR_RAD**2])
+    floor = np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_RAD**2])
     return vectors @ np.diag(variances) @ vectors.T + floor, residual
 
 

@@ -339,7 +339,7 @@ def acceleration(q, v, w, force, moment, current_w, body: In[Any], io: Bundle[Dy
 
 
 TETHER_DRAG = 1.2
-"""coefficient of a cylinder across the flow"""
+"""coefficient of a cylinder across the flow (S. Hoerner, Fluid-Dynamic Drag, 1965)"""
 
 
 @ti.func
