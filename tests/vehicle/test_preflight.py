@@ -85,20 +85,19 @@ class RestingPilot(WishfulPilot):
 
 
 class Check(Flight):
-    """A check of a vehicle, step by step, without a clock."""
+    """A check of a vehicle, or a calibration, step by step, without a clock."""
 
-    def __init__(self, folder, config=None, rig=None, places=None, heading_rad=None):
+    def __init__(self, folder, config=None, rig=None, places=None, heading_rad=None, purpose="check"):
         config = config or link_config()
         super().__init__(folder, arms=False, config=config, sub=RestingSub)
         mission = Mission(PLACE, (3.0, 3.0, -0.8))
         plan = FlightPlan(
-            self.endpoint.place, mission, LIMITS, self.log.path, seconds=SECONDS, purpose="check",
+            self.endpoint.place, mission, LIMITS, self.log.path, seconds=SECONDS, purpose=purpose,
             instruments=places or {}, heading_rad=heading_rad,
         )  # fmt: skip
         self.pilot = RestingPilot()
-        self.loop = OnboardLoop(
-            config, self.pilot, plan, self.endpoint, self.log, fix=StartFix(config, PLACE), rig=rig
-        )
+        fix = StartFix(config, PLACE) if purpose == "check" else None
+        self.loop = OnboardLoop(config, self.pilot, plan, self.endpoint, self.log, fix=fix, rig=rig)
 
     def found(self, before=lambda step: None, seconds=SECONDS):
         self.run(seconds, before, dt=DT)
@@ -371,6 +370,15 @@ def test_the_command_refuses_to_pass_what_nobody_speaks_to(capfd, monkeypatch, t
         assert json.loads(out)["check"]["ready"] is False
     else:
         assert "it may NOT drive: autopilot" in out and "a50:127.0.0.1:9: NOTHING was heard" in out
+
+
+def test_a_calibration_sends_nothing_that_moves_the_vehicle(check):
+    one = check(purpose="calibrate")
+    found = one.found()  # which looks at all that was sent
+    assert one.loop._calibration.places and not found["ready"] and found["calibration"]["rig"] is None
+    one.loop._leave(("interrupted",))
+    one.sub.listen()
+    assert set(one.sub.kinds()) <= {"HEARTBEAT", "COMMAND_LONG 511"} and not one.sub.armed
 
 
 def test_a_check_never_arms(capfd, monkeypatch):
