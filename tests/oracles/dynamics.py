@@ -59,7 +59,7 @@ class Body:
 
     @property
     def mass_matrix(self):
-        return self.rigid_mass_matrix + np.diag(self.added)
+        return np.diag(np.concatenate([np.full(3, self.mass), self.inertia]) + self.added)
 
     def neutral(self):
         """The same obstacle with buoyancy equal to weight."""
@@ -70,7 +70,10 @@ def coriolis_matrix(mass_matrix, nu):
     """Fossen (2011) eq. 3.46: C(nu) of a symmetric mass matrix; skew-symmetric."""
     top = cross_matrix(mass_matrix[:3, :3] @ nu[:3] + mass_matrix[:3, 3:] @ nu[3:])
     bottom = cross_matrix(mass_matrix[3:, :3] @ nu[:3] + mass_matrix[3:, 3:] @ nu[3:])
-    return np.block([[np.zeros((3, 3)), -top], [-top, -bottom]])
+    found = np.zeros((6, 6))
+    found[:3, 3:] = found[3:, :3] = -top
+    found[3:, 3:] = -bottom
+    return found
 
 
 def nu_dot(body, rotation, nu, wrench, current_w):
@@ -78,7 +81,10 @@ def nu_dot(body, rotation, nu, wrench, current_w):
     nu_r = nu - np.concatenate([rotation.T @ current_w, np.zeros(3)])
     up = rotation.T @ np.array([0.0, 0.0, 1.0])
     restoring = np.concatenate(
-        [-(body.buoyancy - body.mass * body.gravity) * up, -np.cross([0, 0, body.height], body.buoyancy * up)]
+        [
+            -(body.buoyancy - body.mass * body.gravity) * up,
+            -cross_matrix([0, 0, body.height]) @ (body.buoyancy * up),
+        ]
     )
     damping = (body.linear + body.quadratic * np.abs(nu_r)) * nu_r
     tau = wrench(rotation, nu) if callable(wrench) else wrench

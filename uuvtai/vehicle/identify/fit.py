@@ -119,8 +119,9 @@ def _step(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.n
 
 
 def _solved(square: np.ndarray, right: np.ndarray) -> np.ndarray:
-    ridge = 1e-10 * np.trace(square) / max(1, len(square)) + 1e-12
-    return np.linalg.solve(square + ridge * np.eye(len(square)), right)
+    size = right.shape[-1]
+    ridge = 1e-10 * np.trace(square, axis1=-2, axis2=-1) / max(1, size) + 1e-12
+    return np.linalg.solve(square + ridge[..., None, None] * np.eye(size), right[..., None])[..., 0]
 
 
 def _left_open(
@@ -149,11 +150,9 @@ def _bootstrap(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple
     count, size = right.shape
     if not size:
         return np.zeros(0), np.zeros(0)
-    rng = np.random.default_rng(0)
-    draws = np.empty((_DRAWS, size))
-    for i in range(_DRAWS):
-        weight = np.bincount(rng.integers(0, count, count), minlength=count).astype(float)
-        draws[i] = _solved(np.tensordot(weight, square, 1), weight @ right)
+    picked = np.random.default_rng(0).integers(0, count, (_DRAWS, count))
+    weight = np.stack([np.bincount(row, minlength=count) for row in picked]).astype(float)
+    draws = _solved(np.tensordot(weight, square, 1), weight @ right)
     wider = np.sqrt(count / max(1.0, count - size))
     low, high = np.percentile(draws, _LEVEL, axis=0)
     return wider * low, wider * high

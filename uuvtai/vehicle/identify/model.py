@@ -1,5 +1,5 @@
 """The motion that is fitted: Fossen's equation in surge, sway, heave and yaw, with measured roll, pitch and
-thrust as inputs (T. Fossen, Handbook of Marine Craft, 2011). NumPy, many parameter sets at once.
+thrust as inputs (T. Fossen, Handbook of Marine Craft, 2011); many parameter sets at once, in float64.
 
 What an instrument says at a moment is what was so a little earlier (filters, averages, transport), so each of
 the two, of velocity and of yaw rate, has a delay of its own.
@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import VehicleConfig
+from uuvtai.kernels.vehicle.stretches import move_stretches
 from uuvtai.sim.setup import allocation_matrices
 from uuvtai.vehicle.identify.drive_log import LEAST_LAG_S, Drive, DriveError, mean_wrench
 
@@ -21,7 +23,6 @@ NET, GAIN = 12, 13  # places of net buoyancy and gain, behind added mass and dam
 LAG, LATE = 14, (15, 16)  # of the rotors' lag, and of the delays of velocity and yaw rate [s]
 SIZE = 17
 _LONGEST_STEP_S = 0.025
-_FAST = 20.0  # [m/s, rad/s] a trial's motion ends here
 _LAG_STEP_S = 1e-3
 _LATEST_S = 0.15  # readings at the begin of a stretch that a delay may have from before it; they are left out
 _FORGOTTEN_S = 1.0
@@ -151,24 +152,19 @@ def _wrenches(
 def motion(theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle_cfg: VehicleConfig) -> np.ndarray:
     """Velocities (runs, s, n + 1, 4) of each parameter set ``theta`` (runs, 17), from ``start`` (runs, s, 4)
     on. Lags near that of ``given``."""
-    steps = given.wrench.shape[1]
+    start_taichi("cpu")
+    six, spin = vehicle_cfg.added_mass, vehicle_cfg.inertia_kg_m2
+    munk, rolling = theta[:, 1] - theta[:, 0], np.full(len(theta), spin[1] + six[4] - spin[0] - six[3])
+    told = np.column_stack([theta, munk, rolling])
+    told[:, :4] += [vehicle_cfg.mass_kg] * 3 + [spin[2]]
+    told[:, LAG] -= given.lag_s
+    loads = np.stack([given.wrench, given.slope], axis=2)
+    turns = np.concatenate([given.tilt_rate, given.up], axis=2)
+    out = np.empty((len(theta), *given.velocity.shape))
     parts = max(1, int(np.ceil(given.dt_s / _LONGEST_STEP_S)))
-    body = _Body.of(theta, vehicle_cfg)
-    later = (theta[:, LAG] - given.lag_s)[:, None]
-    wrench, slope = (np.ascontiguousarray(a.transpose(1, 2, 3, 0)) for a in (given.wrench, given.slope))
-    tilt, up = (np.ascontiguousarray(a.transpose(1, 2, 0)) for a in (given.tilt_rate, given.up))
-    out = np.empty((steps + 1, len(AXES), *start.shape[:2]))
-    x = out[0] = np.moveaxis(start, 2, 0)
-    for k in range(steps):
-        steady = body.steady(up[k], tilt[k])
-        loads = [w[:, None] + later * s[:, None] for w, s in zip(wrench[k], slope[k], strict=True)]
-        mean, early = (body.gain * load + steady for load in loads)
-        rise = 6.0 * (mean - early)
-        for part in range(parts):
-            middle = mean + ((part + 0.5) / parts - 0.5) * rise
-            x = _moved(body, x, (middle, middle - rise / (6 * parts)), tilt[k], given.dt_s / parts)
-        out[k + 1] = x
-    return out.transpose(2, 3, 0, 1)
+    arrays = map(np.ascontiguousarray, (told, start, loads, turns))
+    move_stretches(*arrays, given.dt_s / parts, parts, out)
+    return out
 
 
 def readings(
@@ -210,60 +206,6 @@ def _earlier(rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
     for i, weight in enumerate(weights):
         found += weight * np.take_along_axis(rows, first[..., None] + i, axis=1)
     return found
-
-
-@dataclass(frozen=True)
-class _Body:
-    """Parameter sets as the equation of motion wants them: (4, runs, 1), one number each (runs, 1)."""
-
-    inertia: np.ndarray
-    linear: np.ndarray
-    quadratic: np.ndarray
-    gain: np.ndarray
-    net: np.ndarray
-    munk: np.ndarray
-    rolling: float  # [kg m2] yaw moment of roll rate times pitch rate
-
-    @staticmethod
-    def of(theta: np.ndarray, vehicle_cfg: VehicleConfig) -> _Body:
-        added, linear, quadratic = (theta[:, i : i + 4].T[..., None] for i in (0, 4, 8))
-        six, spin = vehicle_cfg.added_mass, vehicle_cfg.inertia_kg_m2
-        own = np.array([vehicle_cfg.mass_kg] * 3 + [spin[2]])[:, None, None]
-        gain, net = theta[:, GAIN, None], theta[:, NET, None]
-        rolling = spin[1] + six[4] - spin[0] - six[3]
-        return _Body(added + own, linear, quadratic, gain, net, added[1] - added[0], rolling)
-
-    def steady(self, up: np.ndarray, tilt: np.ndarray) -> np.ndarray:
-        """(4, runs, s) [N, N m] what does not depend on the four velocities."""
-        load = np.empty((len(AXES), len(self.net), up.shape[1]))
-        load[:3] = self.net * up[:, None]
-        load[3] = -self.rolling * tilt[0] * tilt[1]
-        return load
-
-    def acceleration(self, x: np.ndarray, load: np.ndarray, tilt: np.ndarray) -> np.ndarray:
-        """(4, runs, s) at velocities ``x`` under ``load``, both of that shape."""
-        left = load - (self.linear + self.quadratic * np.abs(x)) * x
-        (p, q), r = tilt, x[3]
-        mu, mv, mw = self.inertia[:3] * x[:3]
-        left[0] -= q * mw - r * mv
-        left[1] -= r * mu - p * mw
-        left[2] -= p * mv - q * mu
-        left[3] -= self.munk * x[0] * x[1]
-        left /= self.inertia
-        return left
-
-
-def _moved(
-    body: _Body, x: np.ndarray, loads: tuple[np.ndarray, np.ndarray], tilt: np.ndarray, dt_s: float
-) -> np.ndarray:
-    """(4, runs, s) a step further, by Kutta's method of third order. ``loads``: the mean, and that weighted
-    by the time left. Kutta's first two stages count for how early a load comes, so they get the latter, and
-    the third one what the mean then lacks."""
-    mean, early = loads
-    first = body.acceleration(x, early, tilt)
-    second = body.acceleration(x + 0.5 * dt_s * first, early, tilt)
-    third = body.acceleration(x + dt_s * (2 * second - first), 6 * mean - 5 * early, tilt)
-    return np.clip(x + dt_s / 6 * (first + 4 * second + third), -_FAST, _FAST)
 
 
 # ---- Derivatives of the readings with respect to parameters and initial velocities, by differences.
