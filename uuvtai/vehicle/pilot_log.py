@@ -75,19 +75,18 @@ class LinkLog:
             return
         self._left -= 1
         whose = {"name": heard.name, "system": heard.system, "component": heard.component}
-        self._write("/mavlink/seen", time_s, {**whose, "fields": plain_fields(heard.fields)})
+        self._write("/mavlink/seen", time_s, {**whose, "fields": heard.fields})
 
     def read(self, time_s: float, reading: SensorMessage) -> None:
         """An instrument told something; images are left out."""
         if not isinstance(reading, DepthShot):
             fields = {name: np.asarray(value).tolist() for name, value in vars(reading).items()}
-            told = {"kind": NAMES[type(reading)], "fields": plain_fields(fields)}
-            self._write("/instruments/read", time_s, told)
+            self._write("/instruments/read", time_s, {"kind": NAMES[type(reading)], "fields": fields})
 
     def said(self, time_s: float, order: Order, was_sent: bool) -> None:
         """An order was given, or would have been."""
         whose = {"name": order.message, "kind": order.kind, "sent": was_sent}
-        self._write("/mavlink/said", time_s, {**whose, "fields": plain_fields(order.fields)})
+        self._write("/mavlink/said", time_s, {**whose, "fields": order.fields})
 
     def decided(
         self,
@@ -115,7 +114,7 @@ class LinkLog:
         if self.trouble:
             return
         try:
-            data = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+            data = as_json(content)
             self._file.add_message(self._channels[topic], max(0, round(1e9 * time_s)), data)
             self._file.settle()
         except OSError as error:
@@ -133,17 +132,25 @@ class LinkLog:
         self.trouble = f"{self.path}: the log ends early ({error.strerror or error})"
 
 
-def plain_fields(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields as JSON has them; a number that is not finite is null."""
-    return {name: _plain_value(value) for name, value in fields.items()}
+_JSON = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+
+
+def as_json(content: dict[str, Any]) -> bytes:
+    """A message as JSON; a number that is not finite is null."""
+    try:
+        return _JSON.encode(content).encode()
+    except (TypeError, ValueError):  # rarely, and a look at every number costs as much as all the rest
+        return _JSON.encode(_plain_value(content)).encode()
 
 
 def _plain_value(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain_value(part) for name, part in value.items()}
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, list | tuple):
         return [_plain_value(item) for item in value]
-    return value if isinstance(value, int | str) else str(value)
+    return value if value is None or isinstance(value, int | str) else str(value)
 
 
 def _finite(values: Any) -> list[float]:
