@@ -97,8 +97,10 @@ class Filter:
         self.mean, self.cov = np.zeros(N), np.zeros((N, N))
         self.mean[:2] = start[:2]
         bias = sensors.imu.accel_bias_m_s2**2
-        self.cov[range(3, N), range(3, N)] = (
-            0.01, 0.01, sensors.imu.heading_drift_rad_s**2, sensors.dvl.scale_error**2, bias, bias,
+        told, heading = sensors.start_sigma_m**2, sensors.imu.heading_sigma_rad**2
+        self.cov[range(N), range(N)] = (
+            told, told, heading, 0.01, 0.01, sensors.imu.heading_drift_rad_s**2, sensors.dvl.scale_error**2,
+            bias, bias,
         )  # fmt: skip
         self.depth = np.array([start[2], 0, 0, 0])
         self.depth_cov = np.diag([0, 0.01, sensors.pressure.sigma_m**2, bias])
@@ -250,7 +252,7 @@ class Voyage:
         gyro = imu.gyro_noise_rad_s_rthz / np.sqrt(dt) * rng.normal(size=(steps, n))
         drift = imu.heading_drift_rad_s * rng.normal(size=n) + gyro
         drift[0] = 0
-        self.imu_yaw = self.yaw + dt * np.cumsum(drift, 0)
+        self.imu_yaw, self.told = self.yaw + dt * np.cumsum(drift, 0), self.pos[0].copy()
         # the level frame turns by the yaw alone: rates of roll and pitch do not matter to the filter
         yaw_rate = (rate + gyro) * np.cos(self.pitch)
         self.rates = np.stack([0 * rate, yaw_rate * np.sin(self.roll), yaw_rate * np.cos(self.roll)], -1)
@@ -264,6 +266,8 @@ class Voyage:
         self.depth = -self.pos[:, :, 2] + noise - noise[0]
         self.valid = np.ones((steps, n), np.int32)
         begin = rng.integers(50, 100, n)
+        self.imu_yaw += imu.heading_sigma_rad * rng.normal(size=n)
+        self.told[:, :2] += sensors.start_sigma_m * rng.normal(size=(n, 2))
         if dvl.dropout_s[1] > 0:  # a burst of one to two seconds in every second row
             lost = (np.arange(steps)[:, None] >= begin) & (np.arange(steps)[:, None] < begin + 75)
             self.valid[lost & (np.arange(n) % 2 == 0)] = 0

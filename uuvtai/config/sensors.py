@@ -204,6 +204,8 @@ class ImuConfig(Section):
     gyro_noise_rad_s_rthz: NonNegative = 0.0
     heading_drift_rad_s: NonNegative = 0.0
     """standard deviation of the constant drift rate, drawn per episode"""
+    heading_sigma_rad: NonNegative = 0.0
+    """standard deviation of the heading's error at the start, drawn per episode"""
     accel_sigma_m_s2: NonNegative = 0.0
     accel_bias_m_s2: NonNegative = 0.0
     """standard deviation of each axis's constant error, drawn per episode"""
@@ -225,3 +227,6 @@ class SensorsConfig(Section):
     localization: Literal["truth", "dead_reckoning", "estimated"] = "truth"
     """truth: the position is given, as in the paper. dead_reckoning: DVL, IMU and pressure alone, from the
     known start. estimated: the pose filter (section pose) corrects these by the walls that the sonar sees"""
+    start_sigma_m: NonNegative = 0.0
+    """standard deviation along x and y of the place that is told at the start, drawn per episode; not where
+    the position is given"""

@@ -164,6 +164,23 @@ def test_heading_drifts_at_a_constant_rate(rig):
     assert np.allclose(outs[100], 2 * outs[50], atol=1e-7)
 
 
+def test_heading_and_place_at_the_start_are_off_for_a_whole_episode(rig):
+    told = {"imu": ImuConfig(heading_sigma_rad=0.05), "start_sigma_m": 0.2}
+    for where, sigma in (("dead_reckoning", 0.2), ("truth", 0.0)):
+        sensors = SensorsConfig(localization=where, **told)
+        rig.start(sensors)
+        outs = [rig.sense(sensors, step) for step in (0, 50)]
+        assert np.array_equal(outs[0]["rpy"], outs[1]["rpy"]) and np.array_equal(*(o["pos_w"] for o in outs))
+        assert_normal(outs[0]["rpy"][:, 2], 0.05)
+        off = outs[0]["pos_w"] - (5.0, 3.0, -1.0)
+        assert np.abs(off[:, 2]).max() < 1e-6
+        if sigma:
+            assert_normal(off[:, :2], sigma)
+            assert abs(np.corrcoef(off[:, 0], off[:, 1])[0, 1]) < 0.1
+        else:
+            assert np.abs(off).max() < 1e-6
+
+
 def test_yaw_stays_wrapped_under_drift(rig):
     sensors = SensorsConfig(imu=ImuConfig(heading_drift_rad_s=0.001))
     rig.start(sensors, quat_wb=(np.cos(np.pi / 2 - 1e-6), 0, 0, np.sin(np.pi / 2 - 1e-6)))

@@ -6,7 +6,7 @@ carries the position from step to step, and the accelerometer the velocity from 
 next, or while that has lost the bottom. Rotors follow their command within a step, so a change of the
 acceleration makes the velocity less sure. Every fresh scan corrects pose and velocity by the beams that end
 on a known wall (wall_fix.py). Depth: z, heave, the error that zeroing the pressure sensor at the known start
-has left, and the accelerometer's upwards. The start itself is known.
+has left, and the accelerometer's upwards. The start is known but for ``sensors.start_sigma_m``.
 
 Errors of a scan refer to its ping: the pose there is off by the pose's error of now less the latency times
 the velocity's; for one later than the sonar's own latency the accelerometer's error counts too. S. Thrun,
@@ -284,7 +284,7 @@ _LEAST_DEPTH_SIGMA_M = 0.001
 @quick_launch
 @ti.kernel
 def reset_pose(io: Bundle[LocalizationIO]):
-    """At the known start, where ``ego.pos_w`` is, with the heading that the IMU says. Active rows only."""
+    """At the place that is told, ``ego.pos_w``, with the heading that the IMU says. Active rows only."""
     for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             pos = io.ego.pos_w[env]
@@ -295,6 +295,10 @@ def reset_pose(io: Bundle[LocalizationIO]):
             io.localization.motion[env] = 0.0
             drift, scale = io.sensors_cfg.imu.heading_drift_rad_s, io.sensors_cfg.dvl.scale_error
             bias = io.sensors_cfg.imu.accel_bias_m_s2
+            told, heading = io.sensors_cfg.start_sigma_m, io.sensors_cfg.imu.heading_sigma_rad
+            io.localization.cov[env][ti.static(place(2, 2, _N))] = heading * heading
+            for axis in ti.static((0, 1)):
+                io.localization.cov[env][ti.static(place(axis, axis, _N))] = told * told
             for axis in ti.static((3, 4)):
                 io.localization.cov[env][ti.static(place(axis, axis, _N))] = (
                     _START_SPEED_M_S * _START_SPEED_M_S

@@ -38,8 +38,8 @@ _RISE_RATE = 4.0
 @quick_launch
 @ti.kernel
 def reset_proprioception(io: Bundle[ProprioceptionIO]):
-    """Draw the errors that stay constant over an episode; the estimate starts at the true position. Active
-    rows only."""
+    """Draw the errors that stay constant over an episode; the estimate starts where the vehicle is told that
+    it is. Active rows only."""
     for env in range(n_envs(io.clock)):
         if io.clock.active[env] == 1:
             draw_constants(env, io)
@@ -72,6 +72,10 @@ def draw_constants(env, io: Bundle[ProprioceptionIO]):
             imu, _EPISODE_DRAW + 1
         )
     io.ego_memory.heading_error[env] = 0.0
+    if ti.static(io.sensors_cfg.imu.heading_sigma_rad > 0):
+        io.ego_memory.heading_error[env] = io.sensors_cfg.imu.heading_sigma_rad * normal(
+            imu, _EPISODE_DRAW + 4
+        )
     io.ego_memory.dropout_until[env] = 0
     io.ego_memory.pressure_zero_m[env] = 0.0
     bias = io.sensors_cfg.pressure.bias_m
@@ -95,6 +99,10 @@ def clear_readings(env, io: Bundle[ProprioceptionIO]):
     io.ego.fix_vel_w[env], io.ego.rise_m_s[env], io.ego.rise_z_m[env] = zero, 0.0, 0.0
     io.ego.depth_m[env] = 0.0
     io.ego.pos_w[env] = io.vehicle.pos_w[env]
+    if ti.static(io.sensors_cfg.localization != "truth" and io.sensors_cfg.start_sigma_m > 0):
+        imu = stream_key(io.episode.key[env], 0, STREAM_IMU)
+        for axis in ti.static(range(2)):
+            io.ego.pos_w[env][axis] += io.sensors_cfg.start_sigma_m * normal(imu, _EPISODE_DRAW + 5 + axis)
     io.ego.pose_cov[env] = 0.0
     io.ego.z_var[env] = 0.0
     if ti.static(io.sensors_cfg.localization == "dead_reckoning"):  # a reading's noise, and that of the zero
