@@ -250,15 +250,19 @@ class WaterRows:
             self._sim.sensors.sense_depth(self._sim.io)
 
     def motion(self, row: int, time_s: float) -> Motion:
-        quat = self._vehicle["quat_wb"][row].astype(float)
-        rotation = _rotation(quat)
+        """By an x axis that looks north, whatever the tank's heading."""
+        w, x, y, z = self._vehicle["quat_wb"][row].astype(float)
+        half = math.radians(self.config.world.tank.heading_deg or 0.0) / 2
+        c, s = math.cos(half), math.sin(half)
+        quat = (c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w)
+        rotation, turned = _rotation(quat), _rotation((c, 0.0, 0.0, -s))
         gravity = self.config.vehicle.gravity_m_s2
         place = self._vehicle["pos_w"][row].astype(float)
         return Motion(
             time_s,
-            _three(place),
+            _three(turned @ place),
             _three(rotation @ self._vehicle["vel_b"][row]),
-            (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])),
+            quat,
             _three(self._vehicle["rate_b"][row]),
             _three(self._vehicle["acc_b"][row] + gravity * rotation[2]),
             float(place[2]) - self.config.world.tank.z_m[0],
@@ -277,7 +281,7 @@ class WaterRows:
         self._active[row] = self._running[row] = 1
 
 
-def _rotation(quat: np.ndarray) -> np.ndarray:
+def _rotation(quat: tuple[float, float, float, float]) -> np.ndarray:
     w, x, y, z = quat
     return np.array(
         [
@@ -533,7 +537,8 @@ def serve_water(
         for number in range(plan.instances):
             water.begin(number)
             start, goal = (_written(water.value(f"mission.{name}_w", number)) for name in ("start", "goal"))
-            note(f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading 0")
+            heading = f"{config.world.tank.heading_deg or 0.0:g}"
+            note(f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading {heading}")
         _serve(ports, plan, begun, note)
     except KeyboardInterrupt:
         note("interrupted")
