@@ -26,6 +26,7 @@ from uuvtai.logs.writer import EpisodeRecorder
 from uuvtai.sim.behavior_tree import FlatTree, parse_tree, read_tree
 from uuvtai.vehicle import onboard
 from uuvtai.vehicle.messages import KINDS, NAMES
+from uuvtai.vehicle.pilot_log import ABOUT
 
 # ---- A log as the pilot's sensors would have told it: messages with the step of their arrival.
 
@@ -101,7 +102,9 @@ def _begun(path: Path, head: LogHead, tree: str | None) -> LogFeed:
 
 def _config(path: Path, head: LogHead) -> Config:
     if "config.yaml" not in head.attachments:
-        raise LogError(f"{path}: the log has no attachment config.yaml: uuv eval --record did not write it")
+        pilot, other = f"uuv pilot wrote it: uuv log import {path}", "uuv eval --record did not write it"
+        why = pilot if ABOUT in head.metadata else other
+        raise LogError(f"{path}: the log has no attachment config.yaml: {why}")
     where = f"{path}: config.yaml"
     try:
         given = parsed_yaml(head.attachments["config.yaml"].decode(), where)

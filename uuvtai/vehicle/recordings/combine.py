@@ -29,6 +29,7 @@ from uuvtai.logs.topics import TOPICS
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.scene import SceneOptions
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, PositionFix, PressureReading, SonarPing
+from uuvtai.vehicle.pilot_log import ABOUT
 from uuvtai.vehicle.recordings import sources
 from uuvtai.vehicle.recordings.bags import read_bag
 from uuvtai.vehicle.recordings.sources import Pulses, RecordingError, Source, Told
@@ -49,6 +50,7 @@ _READERS: dict[str, Read] = {
     "DataFlash": sources.read_ardusub,
     "A50": lambda source, config, _: sources.read_a50(source, config),
     "Ping Viewer": lambda source, config, _: sources.read_ping_viewer(source, config),
+    "uuv pilot": sources.read_pilot,
     "bag": read_bag,
 }
 _INSTRUMENTS = ("A50", "Ping Viewer")
@@ -65,6 +67,8 @@ def kind_of(path: Path) -> str:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}); name a recording") from None
     if not head:
         raise RecordingError(f"{path}: is empty; give another copy of the recording")
+    if head.startswith(b"\x89MCAP0") and ABOUT.encode() in head:
+        return "uuv pilot"
     if head.startswith((b"\x89MCAP0", b"#ROSBAG", b"SQLite format 3\0")):
         return "bag"
     if head.startswith(b"\xa3\x95\x80"):
@@ -76,8 +80,8 @@ def kind_of(path: Path) -> str:
     if b"{" in head.lstrip()[:64].partition(b"\n")[0]:
         return "A50"
     raise RecordingError(
-        f"{path}: begins neither like a .tlog, a .BIN, lines of an A50, a recording of Ping Viewer's nor a "
-        "bag of ROS 1 or 2; name one of these"
+        f"{path}: begins neither like a .tlog, a .BIN, a log of uuv pilot, lines of an A50, a recording of "
+        "Ping Viewer's nor a bag of ROS 1 or 2; name one of these"
     )
 
 
