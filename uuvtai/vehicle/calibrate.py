@@ -60,7 +60,7 @@ class Calibrated:
     turn_rad: float  # to be added to the yaw as typed
     turn_sd_rad: float
     start: tuple[float, float]  # [m] where the vehicle rests now
-    residual_m: float  # root mean square by which walls and DVL disagree
+    residual_m: float  # root mean square by which walls and DVL disagree about a leg
     places: int
 
 
@@ -189,7 +189,8 @@ class Calibration:
 
 
 def solved(places: list[Place]) -> Calibrated:
-    """The turn and the scale that lay the ways by the DVL on the places by the walls, from three rests on."""
+    """The turn and the scale that lay the ways by the DVL on those by the walls, from three rests on: leg by
+    leg, for what a DVL misses on one is missing for good."""
     numbers = sorted({place.number for place in places})
     rows = [[place for place in places if place.number == number] for number in numbers]
     walls, way = (
@@ -198,15 +199,13 @@ def solved(places: list[Place]) -> Calibrated:
     )
     turns = np.array([math.remainder(place.turn_rad, math.tau) for place in places])
     turn = float(np.mean(turns))
-    turned = _turned(way - way.mean(0), turn)
-    centred = walls - walls.mean(0)
-    along = float((turned * centred).sum())
-    across = float((turned[:, 0] * centred[:, 1] - turned[:, 1] * centred[:, 0]).sum())
+    legs, turned = np.diff(walls, axis=0), _turned(np.diff(way, axis=0), turn)
+    along = float((turned * legs).sum())
+    across = float((turned[:, 0] * legs[:, 1] - turned[:, 1] * legs[:, 0]).sum())
     size = float((turned**2).sum())
     yaw, scale = math.atan2(across, along), math.hypot(along, across) / size
-    off = centred - scale * _turned(turned, yaw)
-    free = max(2 * len(rows) - 4, 1)
-    deviation = math.sqrt(float((off**2).sum()) / free)
+    off = legs - scale * _turned(turned, yaw)
+    deviation = math.sqrt(float((off**2).sum()) / max(2 * len(legs) - 2, 1))
     return Calibrated(
         yaw,
         max(deviation, FLOOR_M) / math.sqrt(size),
@@ -214,7 +213,7 @@ def solved(places: list[Place]) -> Calibrated:
         turn,
         max(float(np.std(turns)), FLOOR_RAD),
         (float(places[-1].by_walls[0]), float(places[-1].by_walls[1])),
-        math.sqrt(float((off**2).sum()) / (2 * len(rows))),
+        math.sqrt(float((off**2).sum()) / (2 * len(legs))),
         len(rows),
     )
 

@@ -248,7 +248,12 @@ class Track:
         return kept
 
     def hear(self, reading: DvlReading) -> None:
-        self.vel_b, self.vel_s = np.asarray(reading.vel_b, float), reading.time_s
+        """Since the last one the velocity changed evenly, as ``go`` could not know."""
+        vel_b, spent_s = np.asarray(reading.vel_b, float), reading.time_s - self.vel_s
+        if 0.0 < spent_s <= 2 * _GAP_S and self.past:
+            changed = np.clip(vel_b, -1.0, 1.0) - np.clip(self.vel_b, -1.0, 1.0)
+            self.at = self.at + 0.5 * spent_s * to_world(changed, self.rpy)[:2]
+        self.vel_b, self.vel_s = vel_b, reading.time_s
 
     def then(self, time_s: float) -> tuple[float, np.ndarray] | None:
         """(yaw, place) at a time; None where it is not known, or the vehicle was not at rest."""
