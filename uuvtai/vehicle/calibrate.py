@@ -36,8 +36,9 @@ WAYS = (
     "ahead to starboard",
 )  # fmt: skip
 """where to drive next, from the hull, counter-clockwise in steps of 45 degrees"""
-_SQUARE_M = np.array([(2.0, 0.0), (2.0, 2.0), (0.0, 2.0), (0.0, 0.0)])
-"""where to, one place after the other, from the first one towards the middle of the tank"""
+_SIDE_M, _LEAST_M = 2.0, 1.0  # of a square; from a wall, and from where the sonar no longer sees it
+_SQUARE_M = _SIDE_M * np.array([(1, 0), (1, 1), (0, 1), (0, 0)])
+"""where to, one place after the other, from the first one: inwards, or to a wall that would leave the view"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +145,12 @@ class Calibration:
     def _next_way(self) -> str:
         """The next corner of the square that is a leg away, as seen from the hull."""
         tank, first = self._config.world.tank, self.places[0].by_walls
-        inwards = np.where(np.array([sum(tank.x_m), sum(tank.y_m)]) / 2 < first, -1.0, 1.0)
-        corners = np.roll(first + inwards * _SQUARE_M, 1 - self._number, axis=0) - self._at
+        off = np.array([sum(tank.x_m), sum(tank.y_m)]) / 2 - first
+        wall_m = np.array([np.ptp(tank.x_m), np.ptp(tank.y_m)]) / 2 - np.abs(off)
+        sees_m = self._config.sensors.sonar.max_range_m - _LEAST_M
+        is_inwards = (wall_m + _SIDE_M <= sees_m) | (wall_m < _SIDE_M + _LEAST_M)
+        signs = np.where(is_inwards == (off >= 0), 1.0, -1.0)
+        corners = np.roll(first + signs * _SQUARE_M, 1 - self._number, axis=0) - self._at
         x, y = corners[int(np.argmax(np.hypot(*corners.T) > _TOLD_M))]
         bearing = math.atan2(y, x) - self._track.rpy[2] - self._turn
         return f"{math.hypot(x, y):.0f} m {WAYS[round(8 * bearing / math.tau) % 8]}"
