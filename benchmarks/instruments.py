@@ -348,7 +348,7 @@ class Waters:
 _LONGEST_EPISODE_S, _AFTER_S = 150.0, 10.0  # of the water's time; after the pilot has left
 
 
-def flown(waters: Waters, number: int, pilots: SimpleQueue[Process], say: Callable[[str], None]) -> str:
+def flown(waters: Waters, pilots: SimpleQueue[Process], say: Callable[[str], None], number: int) -> str:
     """How an episode ends that ``uuv pilot --arm`` drives."""
     pilot, begun_s = pilots.get(), time.monotonic()
     waters.pilot(pilot, number, "--arm", "--depth", "0.05,1.55", "--max-speed", "1")

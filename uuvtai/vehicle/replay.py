@@ -25,7 +25,7 @@ from uuvtai.logs.topics.sensors import exact_image
 from uuvtai.logs.writer import EpisodeRecorder
 from uuvtai.sim.behavior_tree import FlatTree, parse_tree, read_tree
 from uuvtai.vehicle import onboard
-from uuvtai.vehicle.messages import KINDS, NAMES
+from uuvtai.vehicle.messages import KINDS, NAMES, three
 from uuvtai.vehicle.pilot_log import ABOUT
 
 # ---- A log as the pilot's sensors would have told it: messages with the step of their arrival.
@@ -87,8 +87,8 @@ def _begun(path: Path, head: LogHead, tree: str | None) -> LogFeed:
     run = head.metadata.get("uuv.run") or head.metadata.get(IMPORTED) or {}
     scenario = head.scenario
     mission = onboard.Mission(
-        start=_place(scenario["start"]),
-        goal=_place(scenario["goal"]),
+        start=three(scenario["start"]),
+        goal=three(scenario["goal"]),
         seed=int(run["seed"]),
         episode=int(run["episode"]),
     )
@@ -122,11 +122,6 @@ def _tree(path: Path, head: LogHead, tree: str | None) -> FlatTree:
             f"{path}: the log does not hold the tree that drove; name it: uuv replay {path} --agent bt"
         )
     return parse_tree(head.attachments["tree.xml"], f"{path}: tree.xml")
-
-
-def _place(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 def _array(values: Any) -> np.ndarray:

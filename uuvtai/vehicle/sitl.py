@@ -27,6 +27,7 @@ from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
 from uuvtai.vehicle.instruments.emulate import KINDS, FakeRig, emulated
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
+from uuvtai.vehicle.messages import three
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
 from uuvtai.vehicle.telemetry import Motors
 
@@ -260,11 +261,11 @@ class WaterRows:
         place = self._vehicle["pos_w"][row].astype(float)
         return Motion(
             time_s,
-            _three(turned @ place),
-            _three(rotation @ self._vehicle["vel_b"][row]),
+            three(turned @ place),
+            three(rotation @ self._vehicle["vel_b"][row]),
             quat,
-            _three(self._vehicle["rate_b"][row]),
-            _three(self._vehicle["acc_b"][row] + gravity * rotation[2]),
+            three(self._vehicle["rate_b"][row]),
+            three(self._vehicle["acc_b"][row] + gravity * rotation[2]),
             float(place[2]) - self.config.world.tank.z_m[0],
         )
 
@@ -290,10 +291,6 @@ def _rotation(quat: tuple[float, float, float, float]) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def _three(values: Any) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
 
 
 # ---- What ``uuv sitl`` says while it serves: who speaks, who does not, what begins and ends. Pure.
@@ -407,6 +404,7 @@ class SitlPlan:
         seed: int,
         episode: int,
         emulated: str | None = None,
+        operator: bool = False,
     ) -> SitlPlan:
         """Of what was typed. Raises LinkError."""
         kinds = tuple(emulated.split(",")) if emulated else ()
@@ -423,7 +421,7 @@ class SitlPlan:
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
         until_s = math.inf if seconds is None else seconds
-        return cls(host, port, instances, places, rate, until_s, once, seed, episode, emulated=kinds)
+        return cls(host, port, instances, places, rate, until_s, once, seed, episode, operator, kinds)
 
 
 @dataclass

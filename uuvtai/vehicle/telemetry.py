@@ -397,7 +397,7 @@ class Intake:
         if self._heading is not None:
             self._heading += turn_rad
         roll, pitch, yaw = self.heard.rpy
-        self.heard.rpy = roll, pitch, _wrapped(yaw + turn_rad)
+        self.heard.rpy = roll, pitch, wrapped(yaw + turn_rad)
         told_s, depth = self._depth
         self._start = (*place, -depth if told_s > -math.inf else self._start[2])
         self._origin, self._place = None, (-math.inf, np.zeros(3))
@@ -441,7 +441,7 @@ class Intake:
         heading = self._heading
         if heading is None:
             heading = self._heading = float(fields["yaw"])
-        rpy = np.array([fields["roll"], -fields["pitch"], _wrapped(heading - fields["yaw"])])
+        rpy = np.array([fields["roll"], -fields["pitch"], wrapped(heading - fields["yaw"])])
         rate = np.array([fields["rollspeed"], -fields["pitchspeed"], -fields["yawspeed"]])
         heard = self.heard
         if time_s >= heard.rpy_s:
@@ -601,5 +601,5 @@ def _turned(north: float, east: float, down: float, heading: float) -> tuple[flo
     return cos * north + sin * east, sin * north - cos * east, -down
 
 
-def _wrapped(angle: float) -> float:
+def wrapped(angle: float) -> float:
     return math.atan2(math.sin(angle), math.cos(angle))

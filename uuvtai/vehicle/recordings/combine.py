@@ -33,6 +33,7 @@ from uuvtai.vehicle.pilot_log import ABOUT
 from uuvtai.vehicle.recordings import sources
 from uuvtai.vehicle.recordings.bags import read_bag
 from uuvtai.vehicle.recordings.sources import Pulses, RecordingError, Source, Told
+from uuvtai.vehicle.telemetry import wrapped
 
 PULSES = record(
     "uuv.Pulses",
@@ -345,7 +346,7 @@ class _Messages:
             return [("/motors/pulses", dumped({"us": _list(reading.us)}))]
         if isinstance(reading, ImuReading):
             self._rate_b = np.asarray(reading.rate_b)
-            turned = [*_list(reading.rpy)[:2], _wrapped(float(reading.rpy[2]) + self._yaw)]
+            turned = [*_list(reading.rpy)[:2], wrapped(float(reading.rpy[2]) + self._yaw)]
             rest = {"rates": _list(reading.rate_b), "specific_force": _list(reading.specific_force_b)}
             return [("/sensors/imu", dumped({"attitude": turned} | rest))]
         if isinstance(reading, DvlReading):
@@ -378,10 +379,6 @@ class _Messages:
 
 def _list(values: Any) -> list[float]:
     return [float(value) for value in values]
-
-
-def _wrapped(angle: float) -> float:
-    return math.atan2(math.sin(angle), math.cos(angle))
 
 
 def import_recordings(plan: ImportPlan) -> dict[str, Any]:
