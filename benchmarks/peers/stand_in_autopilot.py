@@ -35,6 +35,8 @@ class StandIn:
         self.mode, self.is_armed = 19, False
         self._asked = np.zeros(4)
         """ahead, right, down [m/s], clockwise [rad/s]"""
+        self.time_s, self.place, self.by_hand = 0.0, (0.0, 0.0), np.zeros(4)
+        """of the water; [m] where it is, x north, y west; what is asked for where GUIDED is not on"""
         self._sum, self._pulses = np.zeros(4), [1500] * 16
 
     def frame(self) -> bytes:
@@ -48,6 +50,8 @@ class StandIn:
         if self._count % (RATE_HZ // 50):
             return
         told = json.loads(answer)
+        self.time_s = told["timestamp"]
+        self.place = told["position"][0], -told["position"][1]
         self._listen()
         roll, pitch, yaw = _euler(told["quaternion"])
         north, east, down = told["velocity"]
@@ -66,7 +70,7 @@ class StandIn:
         if not self.is_armed:
             self._pulses = [1500] * 16
             return
-        error = (self._asked if self.mode == _GUIDED else np.zeros(4)) - motion
+        error = (self._asked if self.mode == _GUIDED else self.by_hand) - motion
         self._sum = np.clip(self._sum + 0.02 * error, -1.0, 1.0)
         push = np.clip(
             np.array([1.2, 1.2, 1.5, 0.35]) * error + np.array([0.5, 0.5, 0.8, 0.3]) * self._sum, -1, 1

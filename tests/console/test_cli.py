@@ -298,7 +298,7 @@ def test_presets_are_listed_and_shown(capfd):
     listed = json.loads(out)
     assert code == 0
     assert {"pool", "gauntlet", "column", "maze", "netpen", "transfer", "open"} <= set(listed["world"])
-    assert {"clean", "paper", "nominal", "harsh", "multibeam", "multibeam_image", "ping360"} == set(
+    assert {"clean", "paper", "nominal", "harsh", "multibeam", "multibeam_image", "ping360", "3d15"} == set(
         listed["sensors"]
     )
     assert {"paper", "ppo", "constant_20", "no_risk_scaling", "no_world_model", "smoke"} <= set(

@@ -138,6 +138,19 @@ def test_a_way_too_short_is_said():
     assert "m of 1.5 at least" in diver.calibration.says
 
 
+def test_it_leads_where_the_walls_stay_in_view():
+    """The head sees 6 m: from 4 m before the end of the pool to the end, from 2.5 m into the pool."""
+    for x, sides in ((16.0, (16.0, 18.0)), (17.5, (15.5, 17.5)), (4.0, (2.0, 4.0)), (2.5, (2.5, 4.5))):
+        diver = Diver(5)
+        diver.place = np.array([x, 2.0])
+        diver.calibration = Calibration(diver.config, (*diver.place, Z))
+        found = diver.drive(600.0).found
+        assert found is not None, (x, diver.calibration.says)
+        places = np.array([place.by_walls for place in diver.calibration.places])
+        assert sides[0] - 0.6 < places[:, 0].min() and places[:, 0].max() < sides[1] + 0.6
+        assert math.degrees(found.dvl_yaw_rad) == pytest.approx(0.0, abs=1.0)
+
+
 def test_the_turn_is_that_of_least_squares():
     rng = np.random.default_rng(0)
     way, angle = rng.uniform(-2, 2, (6, 2)), 0.3

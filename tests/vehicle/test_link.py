@@ -160,6 +160,50 @@ def test_axes_of_velocity_depth_and_position():
     assert found[1].vel_b == pytest.approx([0.5, 0.0, -0.1]), "no DVL for two seconds"
 
 
+BLUEOS = mav.MAVLink(None, srcSystem=255, srcComponent=0)
+SPEED = mav.MAVLink_vision_speed_estimate_message(7_000_000, 0.3, 0.1, -0.2)
+DELTA = mav.MAVLink_vision_position_delta_message(0, 116_000, [0.0] * 3, [0.0348, 0.0116, -0.0232], 98.0)
+PLACES = (
+    mav.MAVLink_global_vision_position_estimate_message(9_000, 1.0, 2.0, 0.1, 0.0, 0.0, 1.6),
+    mav.MAVLink_vision_position_estimate_message(9_000, 1.0, 2.0, 0.1, 0.0, 0.0, 1.6),
+)
+
+
+def from_blueos(intake, message, come_s):
+    """As the extension of a DVL in BlueOS sends it, through the codec."""
+    (found,) = MavCodec(1, 191).decode(message.pack(BLUEOS))
+    return intake.take(found.name, found.system, found.component, found.fields, come_s)
+
+
+@pytest.mark.parametrize("message", [DELTA, SPEED])
+def test_a_dvl_of_blueos_tells_its_velocity_in_body_axes(message):
+    """Whatever the heading; the autopilot's own estimate counts no more then."""
+    intake = Intake(CONFIG, START, 0.0)
+    attitude(intake, yaw=math.radians(120))
+    (dvl,) = from_blueos(intake, message, 4.0)
+    assert dvl.time_s == 4.0 and dvl.vel_b == pytest.approx([0.3, -0.1, 0.2])
+    assert intake.heard.vel_b == pytest.approx((0.3, -0.1, 0.2))
+    place = {"time_boot_ms": 4000, "x": 0.0, "y": 0.0, "z": 0.0, "vx": 9.0, "vy": 9.0, "vz": 9.0}
+    assert taken(intake, "LOCAL_POSITION_NED", 4.0, **place) == []
+
+
+@pytest.mark.parametrize("message", PLACES)
+def test_a_dvl_of_blueos_that_tells_places_leaves_velocity_to_the_autopilot(message):
+    intake = Intake(CONFIG, START, math.radians(90))
+    attitude(intake, yaw=math.radians(90))
+    assert from_blueos(intake, message, 4.0) == []
+    assert "set the DVL to POSITION_DELTA" in intake.heard.left_out()
+    place = {"time_boot_ms": 4000, "x": 0.0, "y": 0.0, "z": 0.0, "vx": 0.0, "vy": 0.5, "vz": 0.1}
+    (dvl,) = taken(intake, "LOCAL_POSITION_NED", 4.0, **place)
+    assert dvl.vel_b == pytest.approx([0.5, 0.0, -0.1])
+
+
+def test_a_speed_of_others_is_north_east_down_and_not_heard(intake):
+    fields = SPEED.to_dict()
+    assert intake.take("VISION_SPEED_ESTIMATE", 1, 197, fields, 0.0) == []
+    assert "VISION_SPEED_ESTIMATE of 1/197 (heard by --sender dvl=1/197)" in intake.heard.left_out()
+
+
 def test_a_start_that_is_corrected_moves_and_turns_what_is_told():
     intake = Intake(link_config(**{"sensors.localization": "truth"}), START, math.radians(90))
     attitude(intake, yaw=math.radians(90))
@@ -309,7 +353,8 @@ OF_OTHERS = (*KINDS["dvl"], *KINDS["sonar"])
 def test_each_kind_of_message_counts_from_its_own_senders(name, sender, is_heard, intake):
     intake.take(name, *sender, {"broken": math.nan}, 0.0)
     (why,) = intake.heard.refused
-    if is_heard is True or (is_heard and name in OF_OTHERS):
+    is_body = name != "VISION_SPEED_ESTIMATE" or sender == (255, 0)  # others mean north, east, down by it
+    if is_body and (is_heard is True or (is_heard and name in OF_OTHERS)):
         assert "not finite" in why
     else:
         assert f"{name} of {sender[0]}/{sender[1]} (heard by --sender" in why

@@ -27,6 +27,9 @@ from uuvtai.vehicle import replay as replaying
 from uuvtai.vehicle.identify.ardusub_log import read_ardusub, read_imported
 from uuvtai.vehicle.instruments.emulate import FakePing360
 from uuvtai.vehicle.instruments.ping import AUTO_DEVICE_DATA, DEVICE_DATA, frame
+from uuvtai.vehicle.mavlink import MavCodec, MavMessage
+from uuvtai.vehicle.messages import DvlReading, SonarPing
+from uuvtai.vehicle.pilot_log import LinkLog
 from uuvtai.vehicle.recordings import bags, combine, sources
 from uuvtai.vehicle.replay import read_feed
 
@@ -211,6 +214,41 @@ def test_a_dataflash_log_says_what_mavlink_says(tmp_path, capfd):
     np.testing.assert_allclose(imu["rates"], [0.01, -0.02, -0.03], atol=1e-6)
     depth = [data["depth_m"] for _, data in told(found, "/sensors/pressure")]
     np.testing.assert_allclose(np.diff(depth), 0.1, atol=2e-3)
+
+
+def pilots(path, seconds=SECONDS):
+    """What uuv pilot writes of a vehicle with a DVL and a head of its own; something of each is broken."""
+    made, codec = LinkLog(path, {}), MavCodec(1, 191)
+    link = mavlink.MAVLink(None, srcSystem=3, srcComponent=1)
+    for step in range(round(seconds / 0.1)):
+        now_s, milli = 0.1 * step, 100 * step + 1
+        made.begin_step()
+        for message in (
+            mavlink.MAVLink_attitude_message(milli, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
+            mavlink.MAVLink_scaled_pressure2_message(milli, 1013.25 + 80.0, 0.0, 20),
+            mavlink.MAVLink_local_position_ned_message(milli, 0.0, 0.0, 0.0, 9.0, 9.0, 9.0),
+        ):
+            (seen,) = codec.decode(message.pack(link))
+            made.saw(now_s, seen)
+        made.read(now_s, DvlReading(now_s, np.array([SPEED, 0.0, 0.0])))
+        made.read(now_s, SonarPing(now_s, np.array([2.0]), np.ones(1), np.zeros(0), step % 64))
+    made.saw(now_s, MavMessage("ATTITUDE", 3, 1, {"roll": None}))
+    made._write("/instruments/read", now_s, {"kind": "gps", "fields": {"time_s": 0.0}})
+    made._write("/instruments/read", now_s, {"kind": "dvl", "fields": {"time_s": 0.0}})
+    made.close()
+    return path
+
+
+def test_a_log_of_the_pilot_is_what_it_heard(tmp_path, capfd):
+    path = pilots(tmp_path / "pilot.mcap")
+    code, _, err = uuv(capfd, "replay", path)
+    assert code == 2 and f"uuv log import {path}" in " ".join(err.replace("\n", "").split())
+    found = imported(capfd, path, *MATCHED, "--out", tmp_path / "one.mcap")
+    assert [row["kind"] for row in found["files"]] == ["uuv pilot"] and found["localization"] == "truth"
+    assert found["readings"] == {"imu": 120, "pressure": 120, "position": 120, "dvl": 120, "sonar": 120}
+    assert set(dropped(found)) == {"ATTITUDE", "gps", "dvl"}
+    (time_s, velocity), (_, scan) = told(found, "/sensors/dvl")[5], told(found, "/sonar/scan")[5]
+    assert time_s == pytest.approx(0.5) and velocity["velocity"] == [SPEED, 0, 0] and scan["ranges"] == [2.0]
 
 
 def test_identify_finds_the_same_drives_in_the_log(tmp_path, capfd):

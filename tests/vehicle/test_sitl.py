@@ -378,6 +378,26 @@ def test_at_rest_the_accelerometer_feels_gravity(water):
     assert force == pytest.approx([0, 0, -water.config.vehicle.gravity_m_s2], abs=1e-4)
 
 
+def test_the_x_axis_looks_where_the_tank_says(water):
+    """ArduSub's compass and place by north; uuv pilot with the tank's heading is back in our axes."""
+    water.begin(2)
+    for _ in range(40):
+        water.push(2, pulses(forward=0.5, yaw=0.3), 0.0025)
+    ours = water.motion(2, 0.0)
+    world = water.config.world
+    tank = world.tank.model_copy(update={"heading_deg": 120.0})
+    water.config = water.config.model_copy(update={"world": world.model_copy(update={"tank": tank})})
+    theirs, intake = json.loads(reply_of(water.motion(2, 0.0))), Intake(CONFIG, (0, 0, 0), math.radians(120))
+    quat = Rotation.from_quat(np.roll(theirs["quaternion"], -1))
+    roll, pitch, yaw = quat.as_euler("xyz")
+    rates = dict.fromkeys(("rollspeed", "pitchspeed", "yawspeed"), 0.0)
+    (imu,) = intake.take("ATTITUDE", 1, 1, {"roll": roll, "pitch": pitch, "yaw": yaw, **rates}, 0.0)
+    assert imu.rpy == pytest.approx(Rotation.from_quat(np.roll(ours.quat_wb, -1)).as_euler("xyz"), abs=1e-6)
+    cos, sin = math.cos(math.radians(120)), math.sin(math.radians(120))
+    for name, (x, y, z) in (("position", ours.pos_w), ("velocity", ours.vel_w)):
+        assert theirs[name] == pytest.approx([x * cos + y * sin, x * sin - y * cos, -z], abs=1e-6)
+
+
 # ---------------------------------------------------------------------------------------------------- sockets
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from uuvtai.config.loader import load_config
 from uuvtai.vehicle.onboard import DvlReading, ImuReading, SonarPing
-from uuvtai.vehicle.start_fix import LONGEST_S, MISFIT, StartFix, WallWatch, expected
+from uuvtai.vehicle.start_fix import LONGEST_S, MISFIT, StartFix, Track, WallWatch, expected
 from uuvtai.vehicle.telemetry import ping_of, sectors_of
 
 OBSTACLES = ((9.0, 4.4, 0.35), (12.0, 1.2, 0.3), (6.0, 5.0, 0.25), (15.5, 3.2, 0.4), (3.6, 1.4, 0.3))
@@ -50,6 +50,18 @@ def played(config, true, typed, turn, seed=0, rate=0.35, obstacles=OBSTACLES, co
         if fix.result is not None:
             return fix, pose
     raise AssertionError("neither fixed nor refused")
+
+
+def test_readings_that_were_lost_while_it_slowed_down_move_nothing():
+    """0.4 m/s ahead, then slower within 0.6 s of which the DVL tells nothing: 0.4 + 0.12 m."""
+    track = Track()
+    for k in range(31):
+        time_s = 0.1 * k
+        speed = 0.4 * max(0.0, min(1.0, (1.6 - time_s) / 0.6))
+        if not 1.0 < time_s < 1.6 - 1e-9:
+            track.hear(DvlReading(time_s, np.array([speed, 0.0, 0.0])))
+        track.go(ImuReading(time_s, np.zeros(3), np.zeros(3), np.zeros(3)))
+    assert track.at == pytest.approx([0.52, 0.0], abs=0.005)
 
 
 def off(found, pose, turn):

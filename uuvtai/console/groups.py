@@ -11,7 +11,7 @@ import functools
 import inspect
 import json
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_origin, get_type_hints
 
@@ -372,19 +372,7 @@ class ServedGroup:
         from uuvtai.vehicle.sitl import SitlPlan
 
         parsing.refuse_odd_rate(self.rate)
-        told = SitlPlan.typed(
-            self.host,
-            self.port,
-            self.instances,
-            self.mavlink,
-            self.rate,
-            self.seconds,
-            self.once,
-            self.seed,
-            self.episode,
-            self.emulated,
-        )
-        return replace(told, operator=self.operator)
+        return SitlPlan.typed(**vars(self))
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,9 @@ WAYS = (
     "ahead to starboard",
 )  # fmt: skip
 """where to drive next, from the hull, counter-clockwise in steps of 45 degrees"""
-_SQUARE_M = np.array([(2.0, 0.0), (2.0, 2.0), (0.0, 2.0), (0.0, 0.0)])
-"""where to, one place after the other, from the first one towards the middle of the tank"""
+_SIDE_M, _LEAST_M = 2.0, 1.0  # of a square; from a wall, and from where the sonar no longer sees it
+_SQUARE_M = _SIDE_M * np.array([(1, 0), (1, 1), (0, 1), (0, 0)])
+"""where to, one place after the other, from the first one: inwards, or to a wall that would leave the view"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class Calibrated:
     turn_rad: float  # to be added to the yaw as typed
     turn_sd_rad: float
     start: tuple[float, float]  # [m] where the vehicle rests now
-    residual_m: float  # root mean square by which walls and DVL disagree
+    residual_m: float  # root mean square by which walls and DVL disagree about a leg
     places: int
 
 
@@ -144,8 +145,12 @@ class Calibration:
     def _next_way(self) -> str:
         """The next corner of the square that is a leg away, as seen from the hull."""
         tank, first = self._config.world.tank, self.places[0].by_walls
-        inwards = np.where(np.array([sum(tank.x_m), sum(tank.y_m)]) / 2 < first, -1.0, 1.0)
-        corners = np.roll(first + inwards * _SQUARE_M, 1 - self._number, axis=0) - self._at
+        off = np.array([sum(tank.x_m), sum(tank.y_m)]) / 2 - first
+        wall_m = np.array([np.ptp(tank.x_m), np.ptp(tank.y_m)]) / 2 - np.abs(off)
+        sees_m = self._config.sensors.sonar.max_range_m - _LEAST_M
+        is_inwards = (wall_m + _SIDE_M <= sees_m) | (wall_m < _SIDE_M + _LEAST_M)
+        signs = np.where(is_inwards == (off >= 0), 1.0, -1.0)
+        corners = np.roll(first + signs * _SQUARE_M, 1 - self._number, axis=0) - self._at
         x, y = corners[int(np.argmax(np.hypot(*corners.T) > _TOLD_M))]
         bearing = math.atan2(y, x) - self._track.rpy[2] - self._turn
         return f"{math.hypot(x, y):.0f} m {WAYS[round(8 * bearing / math.tau) % 8]}"
@@ -189,7 +194,8 @@ class Calibration:
 
 
 def solved(places: list[Place]) -> Calibrated:
-    """The turn and the scale that lay the ways by the DVL on the places by the walls, from three rests on."""
+    """The turn and the scale that lay the ways by the DVL on those by the walls, from three rests on: leg by
+    leg, for what a DVL misses on one is missing for good."""
     numbers = sorted({place.number for place in places})
     rows = [[place for place in places if place.number == number] for number in numbers]
     walls, way = (
@@ -198,15 +204,13 @@ def solved(places: list[Place]) -> Calibrated:
     )
     turns = np.array([math.remainder(place.turn_rad, math.tau) for place in places])
     turn = float(np.mean(turns))
-    turned = _turned(way - way.mean(0), turn)
-    centred = walls - walls.mean(0)
-    along = float((turned * centred).sum())
-    across = float((turned[:, 0] * centred[:, 1] - turned[:, 1] * centred[:, 0]).sum())
+    legs, turned = np.diff(walls, axis=0), _turned(np.diff(way, axis=0), turn)
+    along = float((turned * legs).sum())
+    across = float((turned[:, 0] * legs[:, 1] - turned[:, 1] * legs[:, 0]).sum())
     size = float((turned**2).sum())
     yaw, scale = math.atan2(across, along), math.hypot(along, across) / size
-    off = centred - scale * _turned(turned, yaw)
-    free = max(2 * len(rows) - 4, 1)
-    deviation = math.sqrt(float((off**2).sum()) / free)
+    off = legs - scale * _turned(turned, yaw)
+    deviation = math.sqrt(float((off**2).sum()) / max(2 * len(legs) - 2, 1))
     return Calibrated(
         yaw,
         max(deviation, FLOOR_M) / math.sqrt(size),
@@ -214,7 +218,7 @@ def solved(places: list[Place]) -> Calibrated:
         turn,
         max(float(np.std(turns)), FLOOR_RAD),
         (float(places[-1].by_walls[0]), float(places[-1].by_walls[1])),
-        math.sqrt(float((off**2).sum()) / (2 * len(rows))),
+        math.sqrt(float((off**2).sum()) / (2 * len(legs))),
         len(rows),
     )
 

@@ -38,7 +38,7 @@ from uuvtai.vehicle.mavlink import (
     heartbeat,
     place_of,
 )
-from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage
+from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage, three
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
 from uuvtai.vehicle.pilot_log import LinkLog
 from uuvtai.vehicle.preflight import CHECK_S, MISSING, Preflight
@@ -118,7 +118,7 @@ class FlightPlan:
         mounted = {"dvl": config.sensors.dvl.at, "sonar": config.sensors.sonar.at}
         heard_at = mounted | {option: place for option, place in (instruments or {}).items() if place}
         limits = _limits(config, box, depth, max_speed, battery)
-        mission = Mission(_three(start or ()), _three(goal or ()))
+        mission = Mission(three(start or ()), three(goal or ()))
         _refuse_places(mission, limits)
         return cls(
             place_of(mavlink),
@@ -169,11 +169,6 @@ def _refuse_places(mission: Mission, limits: safety.SafetyLimits) -> None:
                 f"{option} {where}: is {out:.2f} m outside the fence; z is up and 0 at the surface, so a "
                 "depth of 0.8 m is -0.8; or widen --box and --depth"
             )
-
-
-def _three(values: Sequence[float]) -> tuple[float, float, float]:
-    x, y, z = values
-    return x, y, z
 
 
 def _four(values: Sequence[float]) -> tuple[float, float, float, float]:

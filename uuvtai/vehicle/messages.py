@@ -4,6 +4,7 @@ pilot's clock (0 = its first step); it may arrive later, out of order, twice or 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -204,6 +205,12 @@ def is_believed(message: SensorMessage) -> bool:
 
 
 # ---- One vehicle under way without a world: what it is told.
+
+
+def three(values: Iterable[float]) -> tuple[float, float, float]:
+    """A place, or a vector. ValueError for another number of them."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 @dataclass(frozen=True)

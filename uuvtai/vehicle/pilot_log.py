@@ -41,6 +41,8 @@ _SCHEMAS = {
         action=STRING, asked=FOUR, reasons=array_of(STRING), mode=INT, armed=BOOLEAN, speed=NUMBER,
     ),
 }  # fmt: skip
+ABOUT = "uuv.pilot"  # metadata
+SEEN = "/mavlink/seen", "/instruments/read"  # topics of what was heard
 MOST_SEEN = 10  # messages heard in one step that are written; more are counted, lest the disk fill
 
 
@@ -54,7 +56,7 @@ class LinkLog:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = McapFile(path)
-            self._file.add_metadata("uuv.pilot", about)
+            self._file.add_metadata(ABOUT, about)
             self._channels = {
                 topic: self._file.add_channel(
                     topic, self._file.add_schema(schema["title"], "jsonschema", json.dumps(schema).encode())

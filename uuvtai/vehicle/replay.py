@@ -25,7 +25,8 @@ from uuvtai.logs.topics.sensors import exact_image
 from uuvtai.logs.writer import EpisodeRecorder
 from uuvtai.sim.behavior_tree import FlatTree, parse_tree, read_tree
 from uuvtai.vehicle import onboard
-from uuvtai.vehicle.messages import KINDS, NAMES
+from uuvtai.vehicle.messages import KINDS, NAMES, three
+from uuvtai.vehicle.pilot_log import ABOUT
 
 # ---- A log as the pilot's sensors would have told it: messages with the step of their arrival.
 
@@ -86,8 +87,8 @@ def _begun(path: Path, head: LogHead, tree: str | None) -> LogFeed:
     run = head.metadata.get("uuv.run") or head.metadata.get(IMPORTED) or {}
     scenario = head.scenario
     mission = onboard.Mission(
-        start=_place(scenario["start"]),
-        goal=_place(scenario["goal"]),
+        start=three(scenario["start"]),
+        goal=three(scenario["goal"]),
         seed=int(run["seed"]),
         episode=int(run["episode"]),
     )
@@ -101,7 +102,9 @@ def _begun(path: Path, head: LogHead, tree: str | None) -> LogFeed:
 
 def _config(path: Path, head: LogHead) -> Config:
     if "config.yaml" not in head.attachments:
-        raise LogError(f"{path}: the log has no attachment config.yaml: uuv eval --record did not write it")
+        pilot, other = f"uuv pilot wrote it: uuv log import {path}", "uuv eval --record did not write it"
+        why = pilot if ABOUT in head.metadata else other
+        raise LogError(f"{path}: the log has no attachment config.yaml: {why}")
     where = f"{path}: config.yaml"
     try:
         given = parsed_yaml(head.attachments["config.yaml"].decode(), where)
@@ -119,11 +122,6 @@ def _tree(path: Path, head: LogHead, tree: str | None) -> FlatTree:
             f"{path}: the log does not hold the tree that drove; name it: uuv replay {path} --agent bt"
         )
     return parse_tree(head.attachments["tree.xml"], f"{path}: tree.xml")
-
-
-def _place(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 def _array(values: Any) -> np.ndarray:

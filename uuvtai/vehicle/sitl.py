@@ -27,6 +27,7 @@ from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
 from uuvtai.vehicle.instruments.emulate import KINDS, FakeRig, emulated
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
+from uuvtai.vehicle.messages import three
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
 from uuvtai.vehicle.telemetry import Motors
 
@@ -250,17 +251,21 @@ class WaterRows:
             self._sim.sensors.sense_depth(self._sim.io)
 
     def motion(self, row: int, time_s: float) -> Motion:
-        quat = self._vehicle["quat_wb"][row].astype(float)
-        rotation = _rotation(quat)
+        """By an x axis that looks north, whatever the tank's heading."""
+        w, x, y, z = self._vehicle["quat_wb"][row].astype(float)
+        half = math.radians(self.config.world.tank.heading_deg or 0.0) / 2
+        c, s = math.cos(half), math.sin(half)
+        quat = (c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w)
+        rotation, turned = _rotation(quat), _rotation((c, 0.0, 0.0, -s))
         gravity = self.config.vehicle.gravity_m_s2
         place = self._vehicle["pos_w"][row].astype(float)
         return Motion(
             time_s,
-            _three(place),
-            _three(rotation @ self._vehicle["vel_b"][row]),
-            (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])),
-            _three(self._vehicle["rate_b"][row]),
-            _three(self._vehicle["acc_b"][row] + gravity * rotation[2]),
+            three(turned @ place),
+            three(rotation @ self._vehicle["vel_b"][row]),
+            quat,
+            three(self._vehicle["rate_b"][row]),
+            three(self._vehicle["acc_b"][row] + gravity * rotation[2]),
             float(place[2]) - self.config.world.tank.z_m[0],
         )
 
@@ -277,7 +282,7 @@ class WaterRows:
         self._active[row] = self._running[row] = 1
 
 
-def _rotation(quat: np.ndarray) -> np.ndarray:
+def _rotation(quat: tuple[float, float, float, float]) -> np.ndarray:
     w, x, y, z = quat
     return np.array(
         [
@@ -286,10 +291,6 @@ def _rotation(quat: np.ndarray) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def _three(values: Any) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
 
 
 # ---- What ``uuv sitl`` says while it serves: who speaks, who does not, what begins and ends. Pure.
@@ -403,6 +404,7 @@ class SitlPlan:
         seed: int,
         episode: int,
         emulated: str | None = None,
+        operator: bool = False,
     ) -> SitlPlan:
         """Of what was typed. Raises LinkError."""
         kinds = tuple(emulated.split(",")) if emulated else ()
@@ -419,7 +421,7 @@ class SitlPlan:
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
         until_s = math.inf if seconds is None else seconds
-        return cls(host, port, instances, places, rate, until_s, once, seed, episode, emulated=kinds)
+        return cls(host, port, instances, places, rate, until_s, once, seed, episode, operator, kinds)
 
 
 @dataclass
@@ -533,7 +535,8 @@ def serve_water(
         for number in range(plan.instances):
             water.begin(number)
             start, goal = (_written(water.value(f"mission.{name}_w", number)) for name in ("start", "goal"))
-            note(f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading 0")
+            heading = f"{config.world.tank.heading_deg or 0.0:g}"
+            note(f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading {heading}")
         _serve(ports, plan, begun, note)
     except KeyboardInterrupt:
         note("interrupted")

@@ -248,7 +248,12 @@ class Track:
         return kept
 
     def hear(self, reading: DvlReading) -> None:
-        self.vel_b, self.vel_s = np.asarray(reading.vel_b, float), reading.time_s
+        """Since the last one the velocity changed evenly, which ``go`` could not know."""
+        vel_b, middle_s = np.asarray(reading.vel_b, float), 0.5 * (self.vel_s + reading.time_s)
+        if self.vel_s < reading.time_s and abs(since_s := self.time_s - middle_s) <= 2 * _GAP_S:
+            changed = np.clip(vel_b, -1.0, 1.0) - np.clip(self.vel_b, -1.0, 1.0)
+            self.at = self.at + since_s * to_world(changed, self.rpy)[:2]
+        self.vel_b, self.vel_s = vel_b, reading.time_s
 
     def then(self, time_s: float) -> tuple[float, np.ndarray] | None:
         """(yaw, place) at a time; None where it is not known, or the vehicle was not at rest."""

@@ -202,13 +202,15 @@ def _same(ours: np.ndarray, factors: np.ndarray) -> tuple[int, float]:
 # and a sonar from whom they are known to come.
 
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
+_VELOCITIES = ("VISION_POSITION_DELTA", "VISION_SPEED_ESTIMATE")
+_PLACES = ("VISION_POSITION_ESTIMATE", "GLOBAL_VISION_POSITION_ESTIMATE")
 KINDS = {
     "attitude": ("ATTITUDE",),
     "imu": ("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "HIGHRES_IMU"),
     "pressure": ("SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"),
     "position": ("LOCAL_POSITION_NED",),
     "battery": ("SYS_STATUS", "BATTERY_STATUS"),
-    "dvl": ("VISION_POSITION_DELTA",),
+    "dvl": (*_VELOCITIES, *_PLACES),
     "sonar": ("OBSTACLE_DISTANCE", "DISTANCE_SENSOR"),
 }
 KIND_OF = {name: kind for kind, names in KINDS.items() for name in names}
@@ -247,6 +249,7 @@ class Senders:
         """Whether a message of this name counts from there; one of no kind as what the autopilot says."""
         kind = KIND_OF.get(name, "")
         usual = ((self.system, None), BLUEOS) if kind in _OF_OTHERS else ((self.system, AUTOPILOT),)
+        usual = (BLUEOS,) if name == "VISION_SPEED_ESTIMATE" else usual  # others mean north, east, down
         return any(system == known and one in (None, component) for known, one in self.given.get(kind, usual))
 
 
@@ -331,6 +334,8 @@ class Intake:
         self._takers: dict[str, Callable[[Fields, float], list[SensorMessage]]] = {
             "ATTITUDE": self._attitude,
             "VISION_POSITION_DELTA": self._vision_delta,
+            "VISION_SPEED_ESTIMATE": self._vision_speed,
+            **dict.fromkeys(_PLACES, self._vision_place),
             "LOCAL_POSITION_NED": self._local_position,
             "OBSTACLE_DISTANCE": self._obstacles,
             "DISTANCE_SENSOR": self._ranger,
@@ -392,7 +397,7 @@ class Intake:
         if self._heading is not None:
             self._heading += turn_rad
         roll, pitch, yaw = self.heard.rpy
-        self.heard.rpy = roll, pitch, _wrapped(yaw + turn_rad)
+        self.heard.rpy = roll, pitch, wrapped(yaw + turn_rad)
         told_s, depth = self._depth
         self._start = (*place, -depth if told_s > -math.inf else self._start[2])
         self._origin, self._place = None, (-math.inf, np.zeros(3))
@@ -436,7 +441,7 @@ class Intake:
         heading = self._heading
         if heading is None:
             heading = self._heading = float(fields["yaw"])
-        rpy = np.array([fields["roll"], -fields["pitch"], _wrapped(heading - fields["yaw"])])
+        rpy = np.array([fields["roll"], -fields["pitch"], wrapped(heading - fields["yaw"])])
         rate = np.array([fields["rollspeed"], -fields["pitchspeed"], -fields["yawspeed"]])
         heard = self.heard
         if time_s >= heard.rpy_s:
@@ -466,6 +471,14 @@ class Intake:
             return self.refuse("VISION_POSITION_DELTA: a number that is not finite")
         return self._velocity(time_s, (ahead, -right, -down))
 
+    def _vision_speed(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+        """The DVL's extension of BlueOS sends body axes, which MAVLink has as north, east, down."""
+        ahead, right, down = (float(fields[axis]) for axis in "xyz")
+        return self._velocity(time_s, (ahead, -right, -down))
+
+    def _vision_place(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+        return self.refuse(f"{fields['name']}: a place tells no velocity: set the DVL to POSITION_DELTA")
+
     def _velocity(self, time_s: float, vel_b: tuple[float, float, float]) -> list[SensorMessage]:
         reading = DvlReading(time_s, np.array(vel_b))
         self.note_velocity(reading)
@@ -492,8 +505,8 @@ class Intake:
             if abs(time_s - self._depth[0]) < _FRESH_S:  # the autopilot's own height lags behind a climb
                 where[2] = -self._depth[1]
             found.append(PositionFix(time_s, where))
-        has_dvl = time_s - self._newest.get("VISION_POSITION_DELTA", -math.inf) <= _FRESH_S
-        if not has_dvl and "dvl" not in self._replaced:
+        newest_s = max(self._newest.get(name, -math.inf) for name in _VELOCITIES)
+        if time_s - newest_s > _FRESH_S and "dvl" not in self._replaced:
             east, north, up = _turned(fields["vx"], fields["vy"], fields["vz"], turn)
             cos, sin = math.cos(yaw), math.sin(yaw)
             found += self._velocity(time_s, (cos * east + sin * north, cos * north - sin * east, up))
@@ -588,5 +601,5 @@ def _turned(north: float, east: float, down: float, heading: float) -> tuple[flo
     return cos * north + sin * east, sin * north - cos * east, -down
 
 
-def _wrapped(angle: float) -> float:
+def wrapped(angle: float) -> float:
     return math.atan2(math.sin(angle), math.cos(angle))

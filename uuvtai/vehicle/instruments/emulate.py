@@ -41,6 +41,7 @@ class FakeA50:
         with contextlib.suppress(OSError):  # nobody calls
             client, _ = self._server.accept()
             client.setblocking(False)
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # its time may run quicker than ours
             self._clients.append(client)
         if now_s < self._due_s:
             return

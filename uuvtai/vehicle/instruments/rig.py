@@ -131,11 +131,16 @@ class JsonUdp(Instrument):
             required = wanted - {"first_beam"}
             if not required <= said.keys() <= wanted:
                 return self.refuse(f"{kind.__name__}: wants {', '.join(sorted(required))}")
-            arrays = {name: np.array(value, np.float64) for name, value in said.items()}
-            given = {name: array if array.ndim else _plain(name, array) for name, array in arrays.items()}
+            given = as_fields(said)
         except (FileError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
             return self.refuse("no JSON object of numbers")
         return kind(now_s - age_s, **given)
+
+
+def as_fields(said: Mapping[str, Any]) -> dict[str, Any]:
+    """A message's fields as JSON has them. ValueError, TypeError, OverflowError."""
+    arrays = {name: np.array(value, np.float64) for name, value in said.items()}
+    return {name: array if array.ndim else _plain(name, array) for name, array in arrays.items()}
 
 
 def _plain(name: str, value: np.ndarray) -> float | int:

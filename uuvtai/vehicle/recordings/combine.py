@@ -29,9 +29,11 @@ from uuvtai.logs.topics import TOPICS
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.scene import SceneOptions
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, PositionFix, PressureReading, SonarPing
+from uuvtai.vehicle.pilot_log import ABOUT
 from uuvtai.vehicle.recordings import sources
 from uuvtai.vehicle.recordings.bags import read_bag
 from uuvtai.vehicle.recordings.sources import Pulses, RecordingError, Source, Told
+from uuvtai.vehicle.telemetry import wrapped
 
 PULSES = record(
     "uuv.Pulses",
@@ -49,6 +51,7 @@ _READERS: dict[str, Read] = {
     "DataFlash": sources.read_ardusub,
     "A50": lambda source, config, _: sources.read_a50(source, config),
     "Ping Viewer": lambda source, config, _: sources.read_ping_viewer(source, config),
+    "uuv pilot": sources.read_pilot,
     "bag": read_bag,
 }
 _INSTRUMENTS = ("A50", "Ping Viewer")
@@ -65,6 +68,8 @@ def kind_of(path: Path) -> str:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}); name a recording") from None
     if not head:
         raise RecordingError(f"{path}: is empty; give another copy of the recording")
+    if head.startswith(b"\x89MCAP0") and ABOUT.encode() in head:
+        return "uuv pilot"
     if head.startswith((b"\x89MCAP0", b"#ROSBAG", b"SQLite format 3\0")):
         return "bag"
     if head.startswith(b"\xa3\x95\x80"):
@@ -76,8 +81,8 @@ def kind_of(path: Path) -> str:
     if b"{" in head.lstrip()[:64].partition(b"\n")[0]:
         return "A50"
     raise RecordingError(
-        f"{path}: begins neither like a .tlog, a .BIN, lines of an A50, a recording of Ping Viewer's nor a "
-        "bag of ROS 1 or 2; name one of these"
+        f"{path}: begins neither like a .tlog, a .BIN, a log of uuv pilot, lines of an A50, a recording of "
+        "Ping Viewer's nor a bag of ROS 1 or 2; name one of these"
     )
 
 
@@ -341,7 +346,7 @@ class _Messages:
             return [("/motors/pulses", dumped({"us": _list(reading.us)}))]
         if isinstance(reading, ImuReading):
             self._rate_b = np.asarray(reading.rate_b)
-            turned = [*_list(reading.rpy)[:2], _wrapped(float(reading.rpy[2]) + self._yaw)]
+            turned = [*_list(reading.rpy)[:2], wrapped(float(reading.rpy[2]) + self._yaw)]
             rest = {"rates": _list(reading.rate_b), "specific_force": _list(reading.specific_force_b)}
             return [("/sensors/imu", dumped({"attitude": turned} | rest))]
         if isinstance(reading, DvlReading):
@@ -374,10 +379,6 @@ class _Messages:
 
 def _list(values: Any) -> list[float]:
     return [float(value) for value in values]
-
-
-def _wrapped(angle: float) -> float:
-    return math.atan2(math.sin(angle), math.cos(angle))
 
 
 def import_recordings(plan: ImportPlan) -> dict[str, Any]:

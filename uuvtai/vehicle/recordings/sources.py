@@ -1,4 +1,4 @@
-"""What one recorded file told: ArduSub's logs, lines of a DVL A50, Ping Viewer's Ping360.
+"""What one recorded file told: ArduSub's logs, those of uuv pilot, lines of a DVL A50, Ping Viewer's Ping360.
 
 Everything goes through what hears it on a vehicle: ``telemetry.Intake``, ``instruments.a50``,
 ``instruments.ping``. Times are the file's own.
@@ -12,7 +12,7 @@ import math
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -23,11 +23,14 @@ import numpy as np
 from uuvtai.common.errors import ODD, UserError
 from uuvtai.common.files import FileError, open_file, parsed_json, read_lines
 from uuvtai.config import Config
+from uuvtai.logs.reader import read_messages
 from uuvtai.vehicle.identify.ardusub_log import by_motor, messages
 from uuvtai.vehicle.instruments.a50 import A50, LONGEST
 from uuvtai.vehicle.instruments.channel import Channel, Instrument
 from uuvtai.vehicle.instruments.ping import AUTO_DEVICE_DATA, DEVICE_DATA, TICK_S, Frames, Ping360
-from uuvtai.vehicle.messages import DvlReading, SensorMessage, is_believed
+from uuvtai.vehicle.instruments.rig import as_fields
+from uuvtai.vehicle.messages import KINDS, DvlReading, SensorMessage, is_believed
+from uuvtai.vehicle.pilot_log import SEEN
 from uuvtai.vehicle.telemetry import AUTOPILOT, KIND_OF, Intake, Senders
 
 MOST_BYTES = 2 << 30
@@ -108,10 +111,18 @@ _OWN = 1, AUTOPILOT
 class Telemetry:
     """Of one vehicle; ``finish`` when all is told."""
 
-    def __init__(self, source: Source, config: Config, start: tuple[float, ...], system: int = 1) -> None:
+    def __init__(
+        self,
+        source: Source,
+        config: Config,
+        start: tuple[float, ...],
+        system: int = 1,
+        replaced: Collection[str] = (),
+    ) -> None:
+        """``replaced``: as in ``Intake``."""
         x, y, z = start
         self._source, self._system, self._senders = source, system, Senders(system)
-        self._intake = _NamedIntake(config, (x, y, z), None, system)
+        self._intake = _NamedIntake(config, (x, y, z), None, system, replaced=replaced)
         self._parameters: dict[str, float] = {}
         self._pulses: list[Pulses] = []
         self.is_armed = True
@@ -200,6 +211,29 @@ def _system(path: Path) -> int:
     for m in messages(path, False, ["ATTITUDE", "HEARTBEAT"]):
         told[m.get_srcSystem()] += m.get_srcComponent() == AUTOPILOT and m.get_type() == "ATTITUDE"
     return told.most_common(1)[0][0] if told else 1
+
+
+def read_pilot(source: Source, config: Config, start: tuple[float, ...]) -> None:
+    """What ``uuv pilot`` heard, by its own log. Raises RecordingError, LogError."""
+    told: Counter[int] = Counter()
+    own: set[str] = set()
+    for m in read_messages(source.path, SEEN):
+        own |= {str(m.data.get("kind"))} if m.topic == SEEN[1] else set()
+        is_it = (m.data.get("name"), m.data.get("component")) == ("ATTITUDE", AUTOPILOT)
+        told.update([m.data.get("system", 1)] if is_it else [])
+    telemetry = Telemetry(source, config, start, told.most_common(1)[0][0] if told else 1, own)
+    for m in read_messages(source.path, SEEN):
+        source.heard()
+        what = str(m.data.get("kind" if m.topic == SEEN[1] else "name"))
+        try:
+            if m.topic == SEEN[1]:
+                source.add(KINDS[what](**as_fields(m.data["fields"])), what)
+            else:
+                sender = m.data["system"], m.data["component"]
+                telemetry.take(what, m.data["fields"], m.time_s, what, sender)
+        except ODD:
+            source.drop(what, ODD_SHAPE)
+    telemetry.finish()
 
 
 def _take_bin(telemetry: Telemetry, source: Source, m: Any, gyro: list[float]) -> None:

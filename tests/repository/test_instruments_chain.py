@@ -1,0 +1,20 @@
+"""``uuv sitl --as a50,ping360``, an autopilot and ``uuv pilot --arm``, each a process, to the goal."""
+
+from pathlib import Path
+from queue import SimpleQueue
+
+import pytest
+
+from benchmarks.instruments import Process, Setup, Waters, flown
+
+PLACES = ("world.spawn_x_m=[2,6]", "world.start_goal_gap_m=3.0")
+
+
+@pytest.mark.skipif(not Path("/proc/net/udp").exists(), reason="asks Linux what a socket has read")
+def test_a_pilot_arrives_by_what_emulated_instruments_tell(tmp_path):
+    said, pilots = [], SimpleQueue()
+    with Process(tmp_path) as process, Process(tmp_path) as pilot:
+        pilots.put(pilot)
+        waters = Waters(process, Setup(static=0, changes=PLACES), tmp_path, 0, 1)
+        assert flown(waters, pilots, said.append, 0) == "success", (said, pilot.lines)
+        assert pilot.lines[-1] == "ended 0" and "goal reached" in pilot.lines[-2]
