@@ -35,7 +35,7 @@ from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.common.tree_codes import MAX_NODES
 from uuvtai.compile.launch import forget, is_gpu_shaped
 from uuvtai.compile.memory import Memory, Put, address_of, put_by_kernel
-from uuvtai.config import Config, FixedObstacle, ForecastConfig, SonarConfig, VehicleConfig, WorldConfig
+from uuvtai.config import Config, ForecastConfig, SonarConfig, VehicleConfig, WorldConfig
 from uuvtai.config.behavior import TUNED, configured_factors
 from uuvtai.config.multibeam import elevations, heard_bearings
 from uuvtai.config.task import TERMS
@@ -176,7 +176,7 @@ def load_fixed(table: FixedTable, world_cfg: WorldConfig) -> None:
     at_rest = [obstacle for obstacle in world_cfg.fixed if not obstacle.path]
     moving = [obstacle for obstacle in world_cfg.fixed if obstacle.path]
     for i, obstacle in enumerate(at_rest + moving):
-        z, size = _center_and_size(obstacle, world_cfg)
+        z, size = world_cfg.center_and_size(obstacle)
         table.kind[i] = _KINDS[obstacle.kind]
         table.pos_w[i] = (obstacle.x_m, obstacle.y_m, z)
         table.size[i] = size
@@ -185,21 +185,6 @@ def load_fixed(table: FixedTable, world_cfg: WorldConfig) -> None:
         table.speed_m_s[i] = -1.0 if obstacle.speed_m_s is None else obstacle.speed_m_s
         for j, way in enumerate(obstacle.path):
             table.way_w[i, j] = (way.x_m, way.y_m)
-
-
-def _center_and_size(
-    obstacle: FixedObstacle, world_cfg: WorldConfig
-) -> tuple[float, tuple[float, float, float]]:
-    floor, surface = world_cfg.tank.z_m
-    z = 0.5 * (floor + surface) if obstacle.z_m is None else obstacle.z_m
-    half_height = 0.5 * (surface - floor if obstacle.height_m is None else obstacle.height_m)
-    radius = obstacle.radius_m or 0.0
-    if obstacle.kind == "sphere":
-        return z, (radius, radius, radius)
-    if obstacle.kind == "cylinder":
-        return z, (radius, radius, half_height)
-    extent_x, extent_y = obstacle.half_extents_m or (0.0, 0.0)
-    return z, (extent_x, extent_y, half_height)
 
 
 Scene = tuple[int, int, float]
