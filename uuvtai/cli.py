@@ -16,6 +16,7 @@ import typer
 
 from uuvtai.common import signals
 from uuvtai.common.exits import FAILED, GATE, UsageError, guarded, say
+from uuvtai.common.files import refuse_output
 from uuvtai.common.version import __version__
 from uuvtai.console import groups, parsing
 from uuvtai.console import options as opt
@@ -271,8 +272,12 @@ def presets(
     everything: opt.Everything = False,
     run: opt.TreeUse = None,
     dot: opt.Dot = False,
+    out: opt.WorldPicture = None,
+    force: opt.Force = False,
 ) -> None:
-    """List the presets, or show one of them."""
+    """List the presets, or show one of them.
+
+    A world is checked and drawn as well."""
     from uuvtai.console import views as shown
 
     if action is None:
@@ -280,13 +285,17 @@ def presets(
     kind, name = shown.kind_and_name(action, name, run)
     if (run is not None or dot) and kind != "tree":
         raise UsageError(f"--run, --dot: are of a tree, and {name} is a preset of kind {kind}")
+    if out is not None:
+        if kind != "world" or everything or output.as_json:
+            raise UsageError("--out: is of the picture of a world, without --all and --json")
+        refuse_output(out, [Path(name)], force)
     if kind == "tree" and not everything:
         from uuvtai.sim.behavior_tree import tree_report
 
         report = tree_report(name, run)
         return output.show(report.document, lambda screen: shown.show_tree_report(screen, report, dot))
     if not everything or kind == "tree":  # a tree has no keys
-        return shown.show_stated(kind, name, output.as_json)
+        return shown.show_stated(kind, name, output.as_json, out)
     from uuvtai.sim.scene import whole_preset
 
     found, text = whole_preset(kind, name)

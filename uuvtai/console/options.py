@@ -216,6 +216,9 @@ TreeUse = Annotated[
         autocompletion=parsing.evaluations,
     ),
 ]
+WorldPicture = Annotated[
+    Path | None, _out("Of a world: its picture, .png \\[default: beside a YAML file, .world.png].")
+]
 Dot = Annotated[bool, Option("--dot", help="Of a tree: print Graphviz DOT.")]
 ExamplesFolder = Annotated[Path, Argument(metavar="FOLDER", help="Where to; what is there is kept.")]
 Clean = Annotated[bool, Option("--clean", help="First delete our compiled kernels.")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import json
 import math
@@ -258,8 +257,9 @@ def show_presets(screen: Screen) -> None:
     )
 
 
-def show_stated(kind: str, name: str, as_json: bool) -> None:
-    """A preset as it is written, its comments included. Raises ConfigError, FileError, OSError."""
+def show_stated(kind: str, name: str, as_json: bool, out: Path | None = None) -> None:
+    """A preset as it is written, its comments included; a world is checked too, and drawn to ``out`` or
+    beside a file of the user's. Raises ConfigError, WorldError, FileError, LogError, OSError."""
     from uuvtai.config import loader
 
     path = loader.preset_path(kind, name)
@@ -271,13 +271,29 @@ def show_stated(kind: str, name: str, as_json: bool) -> None:
         typer.echo(json.dumps({"schema": 1, "text": text}, allow_nan=False))
         return
     typer.echo(text)
-    if kind == "world":
-        with contextlib.suppress(loader.ConfigError):  # a file is shown although it cannot be used
-            told = obstacles(loader.load_config(name).world.obstacles)
-            vehicle, sensors = (loader.preset_of(other, name, None) for other in ("vehicle", "sensors"))
-            say(f"{told}, vehicle {vehicle}, sensors {sensors}")
     if (base := loader.base_of(path)) is not None:
         say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
+    is_own = path != built_in_file(kind, name)
+    stated = loader.stated(path) if kind == "world" else {}
+    if "world" in stated or stated.get("extends") in preset_names("world"):
+        _show_world(name, out or (path.with_suffix(".world.png") if is_own else None))
+
+
+def _show_world(name: str, out: Path | None) -> None:
+    """What is remarkable of a world, its picture, and whether episodes can begin in it."""
+    from uuvtai.config import loader
+    from uuvtai.report import world
+
+    config = loader.load_config(name)
+    vehicle, sensors = (loader.preset_of(other, name, None) for other in ("vehicle", "sensors"))
+    told, ground = world.check(config)
+    for line in (*told, f"vehicle {vehicle}, sensors {sensors}"):
+        say(line)
+    if out is not None:
+        say(f"picture: {world.picture(name, config, ground, out)}")
+    world.refuse(name, config.world, ground)
+    if out is not None:
+        say(f"next: uuv eval --world {shlex.quote(name)} --agent bt --episodes 8 --record 1 --report")
 
 
 def kind_and_name(action: str, name: str | None, run: Path | None = None) -> tuple[str, str]:
