@@ -166,6 +166,7 @@ def train_policy(
     resume: opt.TrainResume = None,
     iterations: opt.Iterations = None,
     start: opt.TrainStart = None,
+    reward: opt.Reward = None,
     seed: opt.TrainSeed = None,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
@@ -179,14 +180,19 @@ def train_policy(
     from uuvtai.evaluation.evaluate import evaluate_now
     from uuvtai.learning.runner import TrainRequest, train
 
+    own = parsing.reward(reward)
     if resume is None:
         config = scene.training(preset, [] if seed is None else [("train.seed", seed)])
         new = {"start": start, "iterations": iterations, "device": device, "run_dir": run_dir}
-        request = TrainRequest(config, preset, **new)
+        request = TrainRequest(config, preset, **new, reward=own)
     else:
-        parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides"))
+        parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides", "reward"))
         request = TrainRequest(
-            resume=resume, overrides=[*(scene.overrides or [])], iterations=iterations, device=device
+            resume=resume,
+            overrides=[*(scene.overrides or [])],
+            iterations=iterations,
+            device=device,
+            reward=own,
         )
     result, folder = train(request, TrainingProgress(), evaluate_now)
     _report_if(with_report, folder)

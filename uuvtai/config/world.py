@@ -25,6 +25,7 @@ from uuvtai.config.base import (
 )
 
 _LONGEST_M, _MOST_AREA_M2, _DEEPEST_M = 1000.0, 40_000.0, 100.0
+_MOST_CORNERS = 64
 
 
 class TankConfig(Section):
@@ -144,6 +145,7 @@ class FixedObstacle(Section):
     """default: the full water column"""
     yaw_deg: Real = 0.0
     path: tuple[Waypoint, ...] = ()
+    """2 to 64 corners; 2 = back and forth"""
     speed_m_s: NonNegative | None = None
     """default: the scenario's v"""
 
@@ -153,8 +155,8 @@ class FixedObstacle(Section):
             raise ValueError("a box needs half_extents_m: [x, y]")
         if self.kind != "box" and self.radius_m is None:
             raise ValueError(f"a {self.kind} needs radius_m")
-        if len(self.path) not in (0, 2, 3, 4, 5):
-            raise ValueError("path must have 2 to 5 waypoints (2 = back and forth)")
+        if len(self.path) == 1 or len(self.path) > _MOST_CORNERS:
+            raise ValueError(f"path must have 2 to {_MOST_CORNERS} waypoints (2 = back and forth)")
         if any((a.x_m, a.y_m) == (b.x_m, b.y_m) for a, b in zip(self.path, self.path[1:], strict=False)):
             raise ValueError("neighbouring waypoints of a path must differ")
         return self
@@ -222,6 +224,8 @@ class WorldConfig(Section, Truth):
     static: StaticObstacles = StaticObstacles()
     dynamic: DynamicObstacles = DynamicObstacles()
     fixed: tuple[FixedObstacle, ...] = ()
+    added: tuple[FixedObstacle, ...] = ()
+    """more of them: a world keeps those of the one that it extends, and --motion adds its own"""
     polygons: tuple[tuple[tuple[Real, Real], ...], ...] = ()
     """outlines of obstacles through the full water column, each a list of corners [x, y] in metres; they
     become boxes of ``fixed``"""
@@ -230,10 +234,12 @@ class WorldConfig(Section, Truth):
 
     @model_validator(mode="after")
     def _boxed(self) -> WorldConfig:
-        """Outlines and pictures as explicit boxes: nothing behind the config knows them."""
+        """All that is explicit in ``fixed``, outlines and pictures as boxes: nothing else knows them."""
         shown = self.occupancy.outlines(self.tank) if self.occupancy else ()
         fine_m = self.occupancy.resolution if self.occupancy else 0.0
         given = [(f"polygons.{i}", [np.array(corners)], 0.025) for i, corners in enumerate(self.polygons)]
+        for i, one in enumerate(self.added):
+            self._check_place(f"added.{i}", one)
         name, boxes = "", []
         for name, rings, tolerance_m in (*given, *(("occupancy", rings, fine_m) for rings in shown)):
             if away := [at for at in rings[0].tolist() if not self.tank.holds(*at)][: name != "occupancy"]:
@@ -243,12 +249,13 @@ class WorldConfig(Section, Truth):
                 raise ValueError(f"{name}: needs more than {shapes.MAX_BOXES} boxes: straighten outlines")
         if self.occupancy and name != "occupancy":
             raise ValueError("occupancy: shows nothing in the tank; look at resolution, origin and negate")
-        if boxes:  # a frozen section is still being made here
+        if boxes or self.added:  # a frozen section is still being made here
             fixed = [
                 FixedObstacle(kind="box", x_m=x, y_m=y, half_extents_m=(a, b), yaw_deg=yaw)
                 for x, y, a, b, yaw in boxes
             ]
-            self.__dict__.update(fixed=(*self.fixed, *fixed), polygons=(), occupancy=None)
+            empty = {"added": (), "polygons": (), "occupancy": None}
+            self.__dict__.update(fixed=(*self.fixed, *self.added, *fixed), **empty)
         return self
 
     @model_validator(mode="after")

@@ -68,6 +68,10 @@ Speed = Annotated[float | None, Option("--speed", help="Speed of the moving obst
 Set = Annotated[
     list[str] | None, _more("--set", metavar="KEY=VALUE", help="Override a config key (repeatable).")
 ]
+Motion = Annotated[
+    str | None,
+    _more("--motion", metavar="FILE.py:NAME", help="Moving obstacles that a function of yours gives."),
+]
 Device = Annotated[str, parsing.device(**_PANEL)]
 RunDir = Annotated[Path | None, Option("--run-dir", help="Run folder \\[default: runs/TIME_PRESET].")]
 WithReport = Annotated[bool, Option("--report", help="Also write report.html into the run folder.")]
@@ -154,6 +158,12 @@ Iterations = Annotated[
 ]
 TrainStart = Annotated[
     Path | None, _run("Run whose policy to begin with, or policy: the built-in one.", "--start")
+]
+Reward = Annotated[
+    str | None,
+    Option(
+        "--reward", metavar="FILE.py:NAME", help="Terms of yours beside the built-in ones, in the simulator."
+    ),
 ]
 TrainSeed = Annotated[int | None, Option("--seed", help="Random seed (train.seed).")]
 TrainWorld = Annotated[

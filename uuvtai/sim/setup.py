@@ -107,7 +107,7 @@ def controllable_axes(wrench_of_thrust: np.ndarray) -> list[int]:
 
 
 N_CORNER = 5
-"""Most waypoints of one path."""
+"""Most waypoints of a random path."""
 
 _KINDS = {name: kind for kind, name in KIND_NAMES.items()}
 
@@ -165,7 +165,7 @@ def scenario_sizes(world_cfg: WorldConfig) -> dict[str, int]:
         "n_obstacle": slots.n_obstacle,
         "n_dynamic": slots.n_dynamic,
         "n_fixed": max(1, len(world_cfg.fixed)),
-        "n_corner": N_CORNER,
+        "n_corner": max(N_CORNER, *(len(obstacle.path) for obstacle in world_cfg.fixed), 0),
         "n_coarse_row": math.ceil((tank.y_m[1] - tank.y_m[0]) / COARSE_M - 1e-9),
         "n_coarse_col": math.ceil((tank.x_m[1] - tank.x_m[0]) / COARSE_M - 1e-9),
     }
