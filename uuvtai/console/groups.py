@@ -430,7 +430,7 @@ class PlainOutputGroup(OutputGroup):
 
 
 _GROUPS = {
-    "Run": ("eval", "sweep", "watch"),
+    "Run": ("demo", "eval", "sweep", "watch"),
     "Learn": ("train", "export"),
     "Look": ("report", "log", "presets", "doctor", "examples"),
     "Paper": ("reproduce", "profile"),

@@ -73,6 +73,7 @@ Motion = Annotated[
     _more("--motion", metavar="FILE.py:NAME", help="Moving obstacles that a function of yours gives."),
 ]
 Device = Annotated[str, parsing.device(**_PANEL)]
+OpenPage = Annotated[bool, Option("--open", help="Open the report in the browser.")]
 RunDir = Annotated[Path | None, Option("--run-dir", help="Run folder \\[default: runs/TIME_PRESET].")]
 WithReport = Annotated[bool, Option("--report", help="Also write report.html into the run folder.")]
 Wide = Annotated[bool, _more("--wide", help="Show all columns even if they do not fit the terminal.")]

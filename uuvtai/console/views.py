@@ -18,7 +18,7 @@ from uuvtai.common.files import read_text
 from uuvtai.common.presets import KINDS, built_in_file, preset_names
 from uuvtai.common.tree_codes import ACTION, LEAVES
 from uuvtai.console.screen import Screen, print_heat_maps
-from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, paired_table
+from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, paired_table, who_arrived
 from uuvtai.report.sweep import cell_table
 from uuvtai.report.tables import (
     Column,
@@ -44,6 +44,8 @@ def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> Non
     if any("causes" in agent for agent in result["agents"]):
         show_causes(screen, result)
         say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
+    if said := who_arrived(result["agents"]):
+        screen.line(said, "bold")
 
 
 def show_training(screen: Screen, result: dict[str, Any]) -> None:
