@@ -26,6 +26,7 @@ _HOLLOW_M = 0.4
 
 Box = tuple[float, float, float, float, float]
 """x, y of the centre, half extents along and across [m], yaw [deg]"""
+Rectangle = tuple[np.ndarray, np.ndarray]
 
 
 def boxes_of(what: str, rings: Sequence[np.ndarray], tolerance_m: float) -> list[Box]:
@@ -53,10 +54,8 @@ def boxes_of(what: str, rings: Sequence[np.ndarray], tolerance_m: float) -> list
             rest[tuple(np.clip((steps / cell).astype(int), 0, np.array(shape) - 1).T[::-1])] = True
     enough = sum(map(len, rings))
     filled, is_whole = _rectangles(inside, rest, enough, round(_HOLLOW_M / float(cell.min())))
-    found = [(low * cell, high * cell, 0.0) for low, high in filled]
-    boxes = [(0.5 * (low + high), 0.5 * (high - low), angle) for low, high, angle in found]
-    if not is_whole:
-        boxes += list(_edges(own, 2 * tolerance_m))
+    boxes = [(0.5 * (low + high) * cell, 0.5 * (high - low) * cell, 0.0) for low, high in filled]
+    boxes += [] if is_whole else _edges(own, 2 * tolerance_m)
     rows = [(*((at + corner) @ turn + middle), *half, math.degrees(angle + yaw)) for at, half, angle in boxes]
     return [(*(round(float(v), 4) for v in row[:4]), round(row[4] % 180.0, 3)) for row in rows]  # type: ignore
 
@@ -74,7 +73,7 @@ def _inside(rings: Sequence[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.nda
 
 def _rectangles(
     inside: np.ndarray, rest: np.ndarray, enough: int, hollow: int
-) -> tuple[list[tuple[np.ndarray, np.ndarray]], bool]:
+) -> tuple[list[Rectangle], bool]:
     """Corners (column, row) of rectangles within a raster, the thickest first, and whether they fill ``rest``
     to a cell. If ``enough`` do not, these are only the ones without which a hollow of so many cells to all
     sides would be left."""
@@ -92,29 +91,23 @@ def _rectangles(
         if reach < 0 or (len(found) >= enough and reach < hollow):
             break
         low, high = np.array([column, row]) - reach, np.array([column, row]) + reach + 1
-        low, high = max((_grown(inside, low, high, axes) for axes in ((0, 1), (1, 0))), key=_area)
+        _, (low, high) = max((_grown(inside, low, high, axis) for axis in (0, 1)), key=lambda one: one[0])
         rest[max(0, low[1] - 1) : high[1] + 1, max(0, low[0] - 1) : high[0] + 1] = False
         found.append((low, high))
     return found[:needed], False
 
 
-def _grown(
-    inside: np.ndarray, low: np.ndarray, high: np.ndarray, axes: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """A rectangle made as long as it can be along one axis, then along the other."""
+def _grown(inside: np.ndarray, low: np.ndarray, high: np.ndarray, first: int) -> tuple[int, Rectangle]:
+    """(area, corners) of a rectangle made as long as it can be along one axis, then along the other."""
     low, high = low.copy(), high.copy()
-    for axis in axes:
+    for axis in (first, 1 - first):
         lines = inside if axis == 0 else inside.T
         free = lines[low[1 - axis] : high[1 - axis]].all(axis=0)
         while low[axis] > 0 and free[low[axis] - 1]:
             low[axis] -= 1
         while high[axis] < len(free) and free[high[axis]]:
             high[axis] += 1
-    return low, high
-
-
-def _area(rectangle: tuple[np.ndarray, np.ndarray]) -> int:
-    return int(np.prod(rectangle[1] - rectangle[0]))
+    return int(np.prod(high - low)), (low, high)
 
 
 def _edges(rings: Sequence[np.ndarray], thick_m: float) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:

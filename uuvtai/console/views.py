@@ -275,10 +275,10 @@ def show_stated(kind: str, name: str, as_json: bool, out: Path | None = None) ->
     typer.echo(text)
     if (base := loader.base_of(path)) is not None:
         say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
-    is_own = path != built_in_file(kind, name)
     stated = loader.stated(path) if kind == "world" else {}
     if "world" in stated or stated.get("extends") in preset_names("world"):
-        _show_world(name, out or (path.with_suffix(".world.png") if is_own else None))
+        beside = None if path == built_in_file(kind, name) else path.with_suffix(".world.png")
+        _show_world(name, out or beside)
 
 
 def _show_world(name: str, out: Path | None) -> None:
@@ -288,12 +288,12 @@ def _show_world(name: str, out: Path | None) -> None:
 
     config = loader.load_config(name)
     vehicle, sensors = (loader.preset_of(other, name, None) for other in ("vehicle", "sensors"))
-    told, ground = world.check(config)
-    for line in (*told, f"vehicle {vehicle}, sensors {sensors}"):
-        say(line)
+    told, problem, label = world.check(config)
+    say("\n".join([*told, f"vehicle {vehicle}, sensors {sensors}"]))
     if out is not None:
-        say(f"picture: {world.picture(name, config, ground, out)}")
-    world.refuse(name, config.world, ground)
+        say(f"picture: {world.picture(name, config.world, label, out)}")
+    if problem:
+        raise world.WorldError(f"{name}: {problem}")
     if out is not None:
         say(f"next: uuv eval --world {shlex.quote(name)} --agent bt --episodes 8 --record 1 --report")
 

@@ -66,8 +66,6 @@ class RewardSource(Protocol):
 
     sha256: str
 
-    @property
-    def label(self) -> str: ...
     def reward(self, env: VectorEnv) -> None: ...
 
 
@@ -134,7 +132,7 @@ def _train(
     if folder is None or found is None:
         folder = RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
         if own := request.reward:
-            folder.write_json(REWARD, {"schema": 1, "name": own.label, "sha256": own.sha256})
+            folder.write_json(REWARD, {"schema": 1, "sha256": own.sha256})
     else:
         folder.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
         if request.overrides:

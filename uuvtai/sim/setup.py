@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, get_type_hints
+from typing import get_type_hints
 
 import numpy as np
 import taichi as ti
@@ -49,10 +49,6 @@ from uuvtai.kernels.world.motion import FAULT_MOVING
 from uuvtai.kernels.world.scenario import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
 from uuvtai.sim.stages import SimState, Stages, bind_all
 from uuvtai.state import FixedTable, GridMask, SceneState
-
-if TYPE_CHECKING:
-    pass
-
 
 # ------------------------------------------------------------------------------------------------------------
 # Thruster geometry: which wrench each thruster gives, and the least-squares way back over the axes that the
