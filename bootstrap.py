@@ -51,8 +51,6 @@ NOT_OF_PACKAGES = {
 }
 """pip's settings that do not change what is installed in an environment of our own"""
 
-DEMO = ["eval", "--world", "pool", "--record", "2", "--report"]
-
 
 def main() -> int:
     """Run the job named on the command line; its exit code."""
@@ -74,9 +72,9 @@ def main() -> int:
 
 
 def demo(arguments: list[str]) -> int:
-    """Evaluate the three controllers in the pool, record two episodes, make a report that plays them."""
+    """Evaluate three agents in the pool, record two episodes, make a report that plays them: ``uuv demo``."""
     install(".")
-    return run([str(BIN / "uuv"), *DEMO, *arguments])
+    return run([str(BIN / "uuv"), "demo", *arguments])
 
 
 def test(arguments: list[str]) -> int:

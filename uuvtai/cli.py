@@ -8,6 +8,7 @@ machine: a full disk), 2 refused, with what to type instead, 3 a gate was not me
 from __future__ import annotations
 
 import gc
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +17,7 @@ import typer
 
 from uuvtai.common import signals
 from uuvtai.common.exits import FAILED, GATE, UsageError, guarded, say
+from uuvtai.common.files import refuse_output
 from uuvtai.common.version import __version__
 from uuvtai.console import groups, parsing
 from uuvtai.console import options as opt
@@ -80,7 +82,31 @@ def evaluate(
     from uuvtai.console.views import show_evaluation
 
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
-    _report_if(with_report, folder)
+    _report_if(with_report, folder, "uuv report")
+
+
+@app.command(epilog="Example: uuv demo --open")
+@groups.grouped
+def demo(
+    output: groups.PlainOutputGroup,
+    episodes: opt.EvalEpisodes = 64,
+    open_page: opt.OpenPage = False,
+    run_dir: opt.RunDir = None,
+) -> None:
+    """Compare three agents in a pool, with a report to play.
+
+    The same as uuv eval --record 2 --report, for a first look."""
+    parsing.refuse_less("--episodes", episodes, 1)
+    from uuvtai.console.views import show_evaluation
+    from uuvtai.evaluation.evaluate import compare
+    from uuvtai.evaluation.results import Request
+
+    agents = [*groups.AgentsGroup.default]
+    asked = {"seeds": [0], "episodes": episodes, "record": 2, "run_dir": run_dir}
+    result, folder = compare(Request.typed(groups.SceneGroup(), agents, **asked), Progress())
+    output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
+    _report_if(True, folder, opens=open_page)
+    say("next: uuv eval --agent bt --world gauntlet -D 9 --speed 1.5 --explain --report")
 
 
 @app.command(epilog="Example: uuv sweep --agent best --grid D=0,6 --grid v=0.4,1.5 --workers 2")
@@ -119,8 +145,8 @@ def sweep(
             seeds=tuple(parsing.seeds("--seeds", seeds)), num_envs=num_envs, device=device,
         )  # fmt: skip
         result, folder = sweeps.sweep(request, engine, run_dir, progress)
-    _report_if(with_report, folder)
     output.show(result, lambda screen: show_sweep(screen, result), folder)
+    _report_if(with_report, folder, "uuv report")
 
 
 @app.command("watch", epilog="Example: uuv watch --world gauntlet --agent bt,dwa --episodes 4")
@@ -165,6 +191,7 @@ def train_policy(
     resume: opt.TrainResume = None,
     iterations: opt.Iterations = None,
     start: opt.TrainStart = None,
+    reward: opt.Reward = None,
     seed: opt.TrainSeed = None,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
@@ -178,14 +205,19 @@ def train_policy(
     from uuvtai.evaluation.evaluate import evaluate_now
     from uuvtai.learning.runner import TrainRequest, train
 
+    own = parsing.reward(reward)
     if resume is None:
         config = scene.training(preset, [] if seed is None else [("train.seed", seed)])
         new = {"start": start, "iterations": iterations, "device": device, "run_dir": run_dir}
-        request = TrainRequest(config, preset, **new)
+        request = TrainRequest(config, preset, **new, reward=own)
     else:
-        parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides"))
+        parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides", "reward"))
         request = TrainRequest(
-            resume=resume, overrides=[*(scene.overrides or [])], iterations=iterations, device=device
+            resume=resume,
+            overrides=[*(scene.overrides or [])],
+            iterations=iterations,
+            device=device,
+            reward=own,
         )
     result, folder = train(request, TrainingProgress(), evaluate_now)
     _report_if(with_report, folder)
@@ -233,14 +265,15 @@ def report_run(
     output: groups.PlainOutputGroup,
     out: opt.ReportOut = None,
     paper: opt.ReportPaper = None,
+    open_page: opt.OpenPage = False,
     force: opt.Force = False,
 ) -> None:
     """Write the HTML page of a run, or figures for a paper.
 
     The page is one file with a player of recorded episodes, figures and tables."""
     if paper is not None:
-        if out is not None or force:
-            raise UsageError("--paper: writes a folder of its own; leave out --out and --force")
+        if out is not None or force or open_page:
+            raise UsageError("--paper: writes a folder of its own; leave out --out, --open and --force")
         from uuvtai.report.paper import paper as write_paper
 
         kit = write_paper(runs, paper)
@@ -250,13 +283,28 @@ def report_run(
     written = report(runs, out, force)
     document = {"schema": 1, "report": str(written.page), "figures": list(map(str, written.figures))}
     output.show(document, lambda _screen: typer.echo(str(written.page)))
+    if open_page:
+        _open(written.page)
 
 
-def _report_if(with_report: bool, folder: Path) -> None:
+def _report_if(with_report: bool, folder: Path, otherwise: str = "", opens: bool = False) -> None:
+    """Write the report and tell its place, or else what to type next."""
     if with_report:
         from uuvtai.report.build import report
 
-        say(f"report: {report([folder]).page}")
+        page = report([folder]).page
+        say(f"report: {page}")
+        if opens:
+            _open(page)
+    elif otherwise:
+        say(f"next: {otherwise} {shlex.quote(str(folder))}")
+
+
+def _open(page: Path) -> None:
+    import webbrowser
+
+    if not webbrowser.open_new_tab(page.resolve().as_uri()):
+        say(f"--open: no browser was found here; open {page} in one")
 
 
 app.add_typer(log_app, name="log")
@@ -271,8 +319,12 @@ def presets(
     everything: opt.Everything = False,
     run: opt.TreeUse = None,
     dot: opt.Dot = False,
+    out: opt.WorldPicture = None,
+    force: opt.Force = False,
 ) -> None:
-    """List the presets, or show one of them."""
+    """List the presets, or show one of them.
+
+    A world is checked and drawn as well."""
     from uuvtai.console import views as shown
 
     if action is None:
@@ -280,13 +332,17 @@ def presets(
     kind, name = shown.kind_and_name(action, name, run)
     if (run is not None or dot) and kind != "tree":
         raise UsageError(f"--run, --dot: are of a tree, and {name} is a preset of kind {kind}")
+    if out is not None:
+        if kind != "world" or everything or output.as_json:
+            raise UsageError("--out: is of the picture of a world, without --all and --json")
+        refuse_output(out, [Path(name)], force)
     if kind == "tree" and not everything:
         from uuvtai.sim.behavior_tree import tree_report
 
         report = tree_report(name, run)
         return output.show(report.document, lambda screen: shown.show_tree_report(screen, report, dot))
     if not everything or kind == "tree":  # a tree has no keys
-        return shown.show_stated(kind, name, output.as_json)
+        return shown.show_stated(kind, name, output.as_json, out)
     from uuvtai.sim.scene import whole_preset
 
     found, text = whole_preset(kind, name)

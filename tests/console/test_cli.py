@@ -12,12 +12,14 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from mcap.reader import make_reader
 from taichi.lang.impl import default_cfg
 
 import uuvtai
+from tests import report_samples as samples
 from tests.command import uuv
 from tests.small_sim import SmallSim
 from uuvtai.common import exits
@@ -489,6 +491,50 @@ def test_without_a_preset_the_policy_trains(capfd, monkeypatch):
     assert [(request.preset, request.config) for request in asked] == [
         ("policy", loader.load_training("policy"))
     ]
+
+
+@pytest.fixture
+def compared(monkeypatch, tmp_path):
+    """An evaluation and its report as they would be; what was asked for, and which page was opened."""
+    rows = [samples.agent(name, n, 8 - n, privileged=False) for name, n in (("planner", 3), ("bt", 6))]
+    document = samples.evaluation_document(*rows) | {"paired": [], "remainder": []}
+    asked, opened, folder = [], [], tmp_path / "my run"
+    monkeypatch.setattr(
+        "uuvtai.evaluation.evaluate.compare", lambda request, _: (asked.append(request) or document, folder)
+    )
+    monkeypatch.setattr(
+        "uuvtai.report.build.report", lambda *_: SimpleNamespace(page=folder / "report.html", figures=[])
+    )
+    monkeypatch.setattr("webbrowser.open_new_tab", lambda page: bool(opened.append(page)))
+    return asked, opened, folder
+
+
+def test_the_demo_tells_who_won_where_the_report_is_and_what_comes_next(capfd, compared):
+    asked, opened, folder = compared
+    code, out, err = uuv(capfd, "demo", "--open", "--episodes", "8")
+    assert code == 0 and out.splitlines()[-1] == "bt reached the goal in 6 of 8 episodes, planner in 3."
+    assert err.splitlines()[-4:] == [
+        f"run folder: {folder}",
+        f"report: {folder / 'report.html'}",
+        f"--open: no browser was found here; open {folder / 'report.html'} in one",
+        "next: uuv eval --agent bt --world gauntlet -D 9 --speed 1.5 --explain --report",
+    ]
+    assert opened == [(folder / "report.html").as_uri()]
+    assert [(r.agents, r.world, r.episodes, r.record, r.seeds) for r in asked] == [
+        (["straight", "planner", "bt"], "pool", 8, 2, [0])
+    ]
+    assert uuv(capfd, "demo", "--episodes", "0")[0] == 2
+
+
+def test_an_evaluation_leads_on_to_its_report(capfd, compared):
+    _asked, opened, folder = compared
+    _, out, err = uuv(capfd, "eval")
+    assert out.splitlines()[-1] == "bt reached the goal in 6 of 8 episodes, planner in 3."
+    assert err.splitlines()[-2:] == [f"run folder: {folder}", f"next: uuv report '{folder}'"]
+    _, _, err = uuv(capfd, "eval", "--report")
+    assert err.splitlines()[-1] == f"report: {folder / 'report.html'}" and not opened
+    assert uuv(capfd, "report", str(folder), "--open")[0] == 0 and len(opened) == 1
+    assert uuv(capfd, "report", str(folder), "--paper", "x", "--open")[0] == 2
 
 
 def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):

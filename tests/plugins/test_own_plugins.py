@@ -16,18 +16,23 @@ from uuvtai.common.errors import SettingError, UserError
 from uuvtai.config import Config, ObservationConfig
 from uuvtai.config.loader import ConfigError
 from uuvtai.console import parsing
+from uuvtai.console.groups import SceneGroup
+from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.episodes import Job, Stepper, jobs_of, run_episodes
 from uuvtai.evaluation.evaluate import Request, compare, resume
 from uuvtai.evaluation.failure_causes import FailureRecorder
+from uuvtai.evaluation.grid import SweepRequest, base_config, grid_of, request_of
 from uuvtai.evaluation.reproduce_steps import BUDGETS, steps_of
 from uuvtai.kernels.planning.observation import observation_width
+from uuvtai.learning import runner
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins import adapters, loading, plugin
 from uuvtai.plugins.adapters import CallMeter
 from uuvtai.plugins.api import COMMAND, PluginError, PluginSpec, is_plugin, plugin_spec
 from uuvtai.report.evaluation import agents_table
 from uuvtai.report.tables import TERMINAL
+from uuvtai.sim.setup import array_sizes
 
 AWAY = "import numpy as np\n\ndef act(view):\n    return np.tile([0.6, 0.0, 0.0, 0.0], (len(view.rows), 1))\n"
 N_OBS = observation_width(ObservationConfig())
@@ -781,6 +786,204 @@ def test_a_graph_with_too_few_outputs_is_told(sim, tmp_path, monkeypatch):
     Path("model.onnx").write_bytes(graph_of(n_out=3))
     with pytest.raises(PluginError, match=r"model.onnx: gave 3 columns; wanted is shape"):
         stepped(sim, "model.onnx", kind="policy")
+
+
+# ------------------------------------------------------------------------------------- rewards and motions
+
+
+REWARD = """import numpy as np
+
+def terms(view):
+    drive, end = 0.5 * np.abs(view.action).sum(axis=1), 1.0 * (view.outcome > 0)
+    return {"near": -view.clearance, "drive": drive, "end": end}
+"""
+
+
+def rewarded(sim, write, text=REWARD, name="terms"):
+    """An environment with terms of the user's."""
+    env = VectorEnv(sim, seed=5)
+    found(f"{write(text)}:{name}", "reward").reward(env)
+    return env
+
+
+def test_terms_of_a_users_own_are_added_and_summed_by_episode(sim, write):
+    plain, n = VectorEnv(sim, seed=5), sim.num_envs
+    _obs, info = plain.reset()
+    action = torch.full((n, 4), 0.25)
+    first = [plain.step(action)[1].clone() for _ in range(3)]
+    env = rewarded(sim, write)
+    assert env.reward_terms == (*VectorEnv.reward_terms, "near", "drive", "end")
+    _obs, info = env.reset()
+    assert info["episode"].tolist() == list(range(n)), "asking for the names costs no episode"
+    sums = torch.zeros(n, 3)
+    for before in first:
+        _obs, reward, *_ends, info = env.step(action)
+        own = info["reward_terms"][:, -3:]
+        near = torch.from_numpy(sim.rows(sim.s.termination.clearance_m))
+        torch.testing.assert_close(own, torch.stack([-near, torch.full((n,), 0.5), torch.zeros(n)], 1))
+        torch.testing.assert_close(reward, before + own.sum(1))
+        sums += own
+    torch.testing.assert_close(info["episode_terms"][:, -3:], sums)
+    torch.testing.assert_close(info["episode_return"], info["episode_terms"].sum(1), rtol=1e-5, atol=1e-4)
+    kept = env.capture()
+    after = [part.clone() for part in env.step(action)[:2]]
+    env.restore(kept)
+    assert all(map(torch.equal, after, env.step(action)[:2]))
+
+
+@pytest.mark.parametrize("autoreset", [True, False])
+def test_the_sums_begin_anew_with_an_episode_and_who_rests_earns_nothing(sim, write, autoreset):
+    env = VectorEnv(sim, seed=5, autoreset=autoreset)
+    found(f"{write(REWARD)}:terms", "reward").reward(env)
+    env.reset()
+    late = sim.config.episode.horizon_steps - 2
+    for row in range(sim.num_envs):
+        sim.s.clock.step[row] = late if row % 2 else 0
+    still = torch.zeros(sim.num_envs, 4)
+    rows = [env.step(still) for _ in range(2)]
+    info, ended = rows[-1][-1], rows[-1][3].clone()
+    assert ended.tolist() == [bool(row % 2) for row in range(sim.num_envs)]
+    assert info["reward_terms"][:, -1].tolist() == ended.float().tolist(), "the end itself counts"
+    whole = info["episode_terms"].clone()
+    _obs, reward, *_ends, info = env.step(still)
+    if autoreset:
+        torch.testing.assert_close(info["episode_terms"][ended, -3:], info["reward_terms"][ended, -3:])
+    else:
+        assert reward[ended].tolist() == [0.0] * int(ended.sum())
+        torch.testing.assert_close(info["episode_terms"][ended, -3:], whole[ended, -3:])
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        ("None", "gave NoneType None; wanted is a dict of arrays (8,), what each term adds"),
+        ("view.clearance", "gave ndarray"),
+        ("{}", "gave dict {}"),
+        ("{'two words': view.clearance}", "gave dict {'two words'"),
+        ("{'near': view.goal}", "near has shape (8, 3); wanted is a dict of arrays (8,)"),
+        ("{'near': 1.0}", "near has shape ()"),
+        ("{'near': view.clearance / 0.0 * 0.0}", "near is nan in env 0, and 7 more"),
+        ("{'near': ['a'] * 8}", "near: gave list of <U1; wanted are real numbers"),
+        ("view.obstacles", "'JudgedView' object has no attribute 'obstacles' (--reward mine.py:terms)"),
+    ],
+)
+def test_a_wrong_reward_is_told_by_its_line(sim, write, answer, says):
+    assert sim.num_envs == 8
+    with pytest.raises(PluginError) as error:
+        rewarded(sim, write, f"def terms(view):\n    return {answer}\n")
+    assert "mine.py:" in str(error.value) and says in str(error.value)
+
+
+def test_terms_that_change_their_names_are_told(sim, write):
+    text = "def terms(view):\n    return {'a' if view.time_s[0] < 0.01 else 'b': view.clearance}\n"
+    env = rewarded(sim, write, text)
+    env.reset()
+    with pytest.raises(PluginError, match=r"mine.py:1: terms: gave b, and a at first"):
+        env.step(torch.zeros(sim.num_envs, 4))
+
+
+@pytest.mark.parametrize(
+    ("preset", "more", "says"),
+    [
+        (
+            "policy",
+            [],
+            "is of a policy that learns in the simulator; train 'paper' or --set surrogate.enabled",
+        ),
+        ("best", [], "is of a policy that learns in the simulator; train 'paper'"),
+        ("paper", ["--reward", "none.py:terms"], "none.py cannot be read (No such file"),
+        ("paper", ["--reward", "mine.py:term"], "has no 'term'; it has terms"),
+        (
+            "paper",
+            ["--reward", "mine"],
+            "--reward 'mine': names no plugin; for example --reward mine.py:terms",
+        ),
+    ],
+)
+def test_a_reward_where_there_is_no_use_for_it_is_refused(write, capfd, tmp_path, preset, more, says):
+    write(REWARD)
+    run = ["--run-dir", str(tmp_path / "run")]
+    code, _, err = uuv(capfd, "train", preset, *(more or ["--reward", "mine.py:terms"]), *run)
+    assert code == 2 and says in err and not (tmp_path / "run").exists()
+
+
+def test_a_run_goes_on_with_the_reward_that_it_began_with(write, tmp_path):
+    own = found(f"{write(REWARD)}:terms", "reward")
+    runner._check_reward(tmp_path, None)
+    with pytest.raises(ConfigError, match="began with no --reward"):
+        runner._check_reward(tmp_path, own)
+    (tmp_path / runner.REWARD).write_text(json.dumps({"schema": 1, "name": "mine", "sha256": own.sha256}))
+    runner._check_reward(tmp_path, own)
+    for other in (None, found(f"{write(REWARD + '# changed')}:terms", "reward")):
+        with pytest.raises(ConfigError, match="began with another --reward; give the same again"):
+            runner._check_reward(tmp_path, other)
+    (tmp_path / runner.REWARD).write_text("[]")
+    with pytest.raises(ConfigError, match="began with another --reward"):
+        runner._check_reward(tmp_path, own)
+
+
+MOTION = """import numpy as np
+
+def paths():
+    angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+    ring = np.column_stack([10 + np.cos(angle), 3 + np.sin(angle)])
+    return [{"kind": "sphere", "radius_m": np.float64(0.25), "path": ring, "speed_m_s": 0.8}]
+"""
+
+
+def test_a_motion_of_a_users_own_is_part_of_the_config(write):
+    """Nothing but numbers: a run folder and the workers of a sweep need no file of hers."""
+    scene = SceneGroup("maze", motion=f"{write(MOTION)}:paths", n_dynamic=2)
+    config = scene.config()
+    assert [bool(one.path) for one in config.world.fixed] == [False] * 3 + [True]
+    moving = config.world.fixed[3]
+    assert len(moving.path) == 20 and (moving.x_m, moving.y_m) == (11.0, 3.0) and moving.speed_m_s == 0.8
+    assert config.world.obstacles["fixed_moving"] == 1 and config.world.n_dynamic == 2
+    assert array_sizes(config, 8)["n_corner"] == 20
+    request = SweepRequest.typed(scene, ["bt"], grid=grid_of(["D=0,6"]), episodes=1, seeds=(0,))
+    assert base_config(request_of(request.document()), {"D": 0}).world.fixed == config.world.fixed
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        ("None", "mine.py: TypeError: 'NoneType' object is not iterable"),
+        ("[3]", "TypeError: 'int' object is not iterable"),
+        (
+            "[{'kind': 'sphere', 'path': [(1, 1), (2, 2)]}]",
+            "mine.py:2: obstacle 0: Value error, a sphere needs",
+        ),
+        ("[{'kind': 'cube', 'x_m': 1, 'y_m': 1}]", "obstacle 0: kind: Input should be 'sphere'"),
+        (
+            "[{'kind': 'sphere', 'radius_m': 1, 'path': [(1, 1), (float('nan'), 2)]}]",
+            "obstacle 0: path.1.x_m",
+        ),
+        (
+            "[{'kind': 'sphere', 'radius_m': 1, 'path': [(1, 1, 1), (2, 2, 2)]}]",
+            "obstacle 0: too many values",
+        ),
+        (
+            "[{'kind': 'sphere', 'radius_m': 1, 'path': [(i, 1) for i in range(65)]}]",
+            "must have 2 to 64 waypoints",
+        ),
+        ("1 / 0", "mine.py:3: ZeroDivisionError: division by zero (--motion mine.py:paths)"),
+    ],
+)
+def test_a_wrong_motion_is_told_by_its_line(write, answer, says):
+    write(f"\ndef paths():\n    return {answer}\n")
+    with pytest.raises(PluginError) as error:
+        loading.obstacles_of(plugin_spec("mine.py", "motion"))
+    assert says in str(error.value) and str(error.value).startswith("mine.py:")
+
+
+def test_a_motion_out_of_the_tank_or_with_arguments_is_told(write):
+    with pytest.raises(
+        ConfigError, match=r"--set world.added: world.added.0: \(20.5, 3\) is outside the tank"
+    ):
+        SceneGroup("pool", motion=f"{write(MOTION.replace('10 +', '19.5 +'), 'a.py')}:paths").config()
+    write("def paths(tank):\n    return []\n")
+    with pytest.raises(PluginError, match=r"a motion is called paths\(\)"):
+        loading.obstacles_of(plugin_spec("mine.py", "motion"))
 
 
 def test_the_spec_of_a_command_is_what_a_request_keeps():

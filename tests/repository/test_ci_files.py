@@ -150,6 +150,15 @@ def test_what_others_wrote_is_pinned():
     assert hooks and all(re.fullmatch(r"v?\d+\.\d+\.\d+", repo["rev"]) for repo in hooks)
 
 
+def test_other_systems_install_and_run_an_episode_and_hold_up_no_release():
+    job = WORKFLOW["jobs"]["elsewhere"]
+    assert {name.partition("-")[0] for name in job["strategy"]["matrix"]["os"]} == {"macos", "windows"}
+    assert "uuv eval" in steps_of("elsewhere")[-1]["run"]
+    assert "elsewhere" not in WORKFLOW["jobs"]["release"]["needs"]
+    linux_only = {str(r.marker) for r in wanted() if r.name in ("ompl", "llvmlite")}
+    assert linux_only == {'sys_platform == "linux"'}
+
+
 def test_the_release_waits_for_tests_and_build_and_needs_a_tag():
     release = WORKFLOW["jobs"]["release"]
     assert set(release["needs"]) == {"test", "build", "docs"} and "refs/tags/v" in release["if"]

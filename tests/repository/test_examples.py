@@ -18,6 +18,8 @@ from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
 from uuvtai.logs.run_folder import RunFolderError
+from uuvtai.plugins.api import plugin_spec
+from uuvtai.plugins.loading import load_plugin, obstacles_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 N = 8
@@ -224,6 +226,24 @@ def test_an_own_piece_drives(short, name):
         agent.own.close()
     assert [r.outcome for r in results] == ["timeout"] * N and max(r.path_length_m for r in results) > 0.1
     assert (sum(r.planned_by["own"] for r in results) >= N) == (OWN[name] == "planner")
+
+
+def test_own_reward_pays_for_distance_and_calm(short, monkeypatch):
+    monkeypatch.chdir(EXAMPLES.parent)
+    env = VectorEnv(short)
+    load_plugin(plugin_spec("examples/own_reward.py:Careful", "reward")).reward(env)
+    assert env.reward_terms[-2:] == ("near", "jerk")
+    env.reset()
+    for push in (0.0, 0.5, 0.5):
+        *_rest, info = env.step(torch.full((N, 4), push))
+    assert (info["reward_terms"][:, -2:] <= 0).all() and info["reward_terms"][:, -1].tolist() == [0.0] * N
+    np.testing.assert_allclose(info["episode_terms"][:, -1], -0.02, atol=1e-6)
+
+
+def test_own_motion_keeps_within_the_pool():
+    paths = obstacles_of(plugin_spec(str(EXAMPLES / "own_motion.py"), "motion"))
+    fixed = load_config("pool", overrides=[("world.added", paths)]).world.fixed
+    assert [len(one.path) for one in fixed] == [48, 2]
 
 
 def test_own_astar_goes_around_what_is_in_the_way(example):

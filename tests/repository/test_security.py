@@ -119,6 +119,8 @@ OWN_READS = {
     "learning/export/folder.py": "Path(run_policy.__file__).read_bytes",
     "vehicle/embedded/export.py": "out.read_bytes, (_ROOT / name).read_text",
     "console/doctor.py": "source.read_bytes",
+    # bytes that the reader has read
+    "config/shapes.py": "Image.open",
     # one file of the system, by its name
     "logs/run_folder.py": "cpuinfo.read_text",
     "sim/setup.py": "meminfo.read_text",

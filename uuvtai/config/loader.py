@@ -265,6 +265,10 @@ def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:
     _refuse_other_kind(kind, path, own)
     if kind == "train":
         _spell_out(own)
+    world = own.tree.get("world")
+    if isinstance(world, dict) and isinstance(drawn := world.get("occupancy"), dict):
+        if isinstance(drawn.get("image"), str):
+            drawn["image"] = str(path.parent / drawn["image"])
     base = own.tree.pop("extends", None)
     if base is None:
         return own

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from uuvtai.common.enums import Truth
+from uuvtai.config import shapes
 from uuvtai.config.base import (
     Count,
     Fraction,
@@ -18,9 +21,11 @@ from uuvtai.config.base import (
     PositiveInterval,
     Real,
     Section,
+    Vector3,
 )
 
 _LONGEST_M, _MOST_AREA_M2, _DEEPEST_M = 1000.0, 40_000.0, 100.0
+_MOST_CORNERS = 64
 
 
 class TankConfig(Section):
@@ -51,11 +56,15 @@ class TankConfig(Section):
 
     def holds(self, x_m: float, y_m: float) -> bool:
         """Whether a place is within the walls, or on them."""
+        return bool(self.from_wall(np.array(x_m), np.array(y_m)) >= -1e-6)
+
+    def from_wall(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """[m] from places to the nearest side wall; negative outside."""
         (x_low, x_high), (y_low, y_high) = self.x_m, self.y_m
         if self.shape == "circle":
-            off = math.hypot(x_m - 0.5 * (x_low + x_high), y_m - 0.5 * (y_low + y_high))
-            return off <= self.radius_m + 1e-6
-        return x_low <= x_m <= x_high and y_low <= y_m <= y_high
+            off = np.hypot(x_m - 0.5 * (x_low + x_high), y_m - 0.5 * (y_low + y_high))
+            return self.radius_m - off
+        return np.minimum(np.minimum(x_m - x_low, x_high - x_m), np.minimum(y_m - y_low, y_high - y_m))
 
     @property
     def radius_m(self) -> float:
@@ -136,6 +145,7 @@ class FixedObstacle(Section):
     """default: the full water column"""
     yaw_deg: Real = 0.0
     path: tuple[Waypoint, ...] = ()
+    """2 to 64 corners; 2 = back and forth"""
     speed_m_s: NonNegative | None = None
     """default: the scenario's v"""
 
@@ -145,11 +155,44 @@ class FixedObstacle(Section):
             raise ValueError("a box needs half_extents_m: [x, y]")
         if self.kind != "box" and self.radius_m is None:
             raise ValueError(f"a {self.kind} needs radius_m")
-        if len(self.path) not in (0, 2, 3, 4, 5):
-            raise ValueError("path must have 2 to 5 waypoints (2 = back and forth)")
+        if len(self.path) == 1 or len(self.path) > _MOST_CORNERS:
+            raise ValueError(f"path must have 2 to {_MOST_CORNERS} waypoints (2 = back and forth)")
         if any((a.x_m, a.y_m) == (b.x_m, b.y_m) for a, b in zip(self.path, self.path[1:], strict=False)):
             raise ValueError("neighbouring waypoints of a path must differ")
         return self
+
+
+class OccupancyPicture(Section):
+    """A map as map_server of ROS has it: dark pixels are obstacles through the full water column."""
+
+    image: str
+    """PNG or PGM, beside the file that names it"""
+    resolution: Annotated[float, Field(ge=0.001, le=10)]
+    """[m] a pixel"""
+    origin: Vector3 = (0.0, 0.0, 0.0)
+    """x, y of the lower left corner [m], and how far the picture is turned about it [rad]"""
+    negate: bool | Literal[0, 1] = False
+    """light pixels are obstacles"""
+    occupied_thresh: Fraction = 0.65
+    """darkness beyond which a pixel is one"""
+    free_thresh: Fraction = 0.196
+    """what is between the two is unknown to map_server, and free water here"""
+
+    def outlines(self, tank: TankConfig) -> Iterator[list[np.ndarray]]:
+        """Rings (n, 2) [m] of what it shows inside the tank: of each obstacle the outline and its holes."""
+        bright = shapes.read_picture(self.image)
+        dark = (bright if self.negate else 255 - bright) > 255 * self.occupied_thresh
+        x0, y0, yaw = self.origin
+        turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+
+        def placed(pixels: np.ndarray) -> np.ndarray:
+            return np.asarray(pixels) * self.resolution @ turn + (x0, y0)
+
+        for row in range(len(dark)):
+            columns = np.flatnonzero(dark[row])
+            x, y = placed(np.column_stack([columns + 0.5, np.full(len(columns), len(dark) - row - 0.5)])).T
+            dark[row, columns] = tank.from_wall(x, y) > 0
+        return ([placed(ring) for ring in rings] for rings in shapes.outlines_of(dark))
 
 
 def _roomy(count: int) -> int:
@@ -181,6 +224,39 @@ class WorldConfig(Section, Truth):
     static: StaticObstacles = StaticObstacles()
     dynamic: DynamicObstacles = DynamicObstacles()
     fixed: tuple[FixedObstacle, ...] = ()
+    added: tuple[FixedObstacle, ...] = ()
+    """more of them: a world keeps those of the one that it extends, and --motion adds its own"""
+    polygons: tuple[tuple[tuple[Real, Real], ...], ...] = ()
+    """outlines of obstacles through the full water column, each a list of corners [x, y] in metres; they
+    become boxes of ``fixed``"""
+    occupancy: OccupancyPicture | None = None
+    """a picture of obstacles, which become boxes of ``fixed`` too"""
+
+    @model_validator(mode="after")
+    def _boxed(self) -> WorldConfig:
+        """All that is explicit in ``fixed``, outlines and pictures as boxes: nothing else knows them."""
+        shown = self.occupancy.outlines(self.tank) if self.occupancy else ()
+        fine_m = self.occupancy.resolution if self.occupancy else 0.0
+        given = [(f"polygons.{i}", [np.array(corners)], 0.025) for i, corners in enumerate(self.polygons)]
+        for i, one in enumerate(self.added):
+            self._check_place(f"added.{i}", one)
+        name, boxes = "", []
+        for name, rings, tolerance_m in (*given, *(("occupancy", rings, fine_m) for rings in shown)):
+            if away := [at for at in rings[0].tolist() if not self.tank.holds(*at)][: name != "occupancy"]:
+                raise ValueError(f"{name}: {away[0]} is outside the tank; corners are in metres")
+            boxes += shapes.boxes_of(name, rings, tolerance_m)
+            if len(boxes) > shapes.MAX_BOXES:
+                raise ValueError(f"{name}: needs more than {shapes.MAX_BOXES} boxes: straighten outlines")
+        if self.occupancy and name != "occupancy":
+            raise ValueError("occupancy: shows nothing in the tank; look at resolution, origin and negate")
+        if boxes or self.added:  # a frozen section is still being made here
+            fixed = [
+                FixedObstacle(kind="box", x_m=x, y_m=y, half_extents_m=(a, b), yaw_deg=yaw)
+                for x, y, a, b, yaw in boxes
+            ]
+            empty = {"added": (), "polygons": (), "occupancy": None}
+            self.__dict__.update(fixed=(*self.fixed, *self.added, *fixed), **empty)
+        return self
 
     @model_validator(mode="after")
     def _fits(self) -> WorldConfig:
@@ -217,6 +293,16 @@ class WorldConfig(Section, Truth):
         most = max(tank.x_m[1] - tank.x_m[0], tank.y_m[1] - tank.y_m[0])
         if across > most or (half or 0.0) > surface - floor:
             raise ValueError(f"{name}: is larger than the tank; sizes are in metres")
+
+    def center_and_size(self, obstacle: FixedObstacle) -> tuple[float, tuple[float, float, float]]:
+        """(z of the centre, size) [m] of an explicit obstacle: half extents; radii and half height."""
+        floor, surface = self.tank.z_m
+        z = 0.5 * (floor + surface) if obstacle.z_m is None else obstacle.z_m
+        half_height = 0.5 * (surface - floor if obstacle.height_m is None else obstacle.height_m)
+        radius = obstacle.radius_m or 0.0
+        if obstacle.kind == "box":
+            return z, (*(obstacle.half_extents_m or (0.0, 0.0)), half_height)
+        return z, (radius, radius, radius if obstacle.kind == "sphere" else half_height)
 
     @property
     def own_scene(self) -> tuple[int, int, float]:

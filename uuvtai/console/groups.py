@@ -21,7 +21,7 @@ from uuvtai.common.exits import UsageError, say
 from uuvtai.console import options as opt
 from uuvtai.console import parsing
 from uuvtai.console.screen import Screen
-from uuvtai.sim.scene import SceneOptions
+from uuvtai.sim.scene import SceneOptions, Setting
 
 if TYPE_CHECKING:
     from uuvtai.config import Config
@@ -79,8 +79,18 @@ def _spread(parameter: inspect.Parameter, hint: Any, groups: dict[str, Any]) -> 
 # ------------------------------------------------------------------------------------------------ the groups
 
 
+class _Moving(SceneOptions):
+    """With obstacles that a function of the user's gives."""
+
+    motion: str | None
+
+    @property
+    def settings(self) -> list[Setting]:
+        return [*parsing.motion(self.motion), *super().settings]
+
+
 @dataclass(frozen=True)
-class SceneGroup(SceneOptions):
+class SceneGroup(_Moving):
     """Where, and with which vehicle."""
 
     world: opt.World = "pool"
@@ -89,6 +99,7 @@ class SceneGroup(SceneOptions):
     n_static: opt.Static = None
     n_dynamic: opt.Dynamic = None
     speed_m_s: opt.Speed = None
+    motion: opt.Motion = None
     overrides: opt.Set = None
 
 
@@ -103,7 +114,7 @@ class ProfileSceneGroup(SceneOptions):
 
 
 @dataclass(frozen=True)
-class TrainSceneGroup(SceneOptions):
+class TrainSceneGroup(_Moving):
     """What is not typed is the training preset's."""
 
     world: opt.TrainWorld = None
@@ -111,6 +122,7 @@ class TrainSceneGroup(SceneOptions):
     n_static: opt.Static = None
     n_dynamic: opt.Dynamic = None
     speed_m_s: opt.Speed = None
+    motion: opt.Motion = None
     overrides: opt.Set = None
 
 
@@ -406,7 +418,7 @@ class PlainOutputGroup(OutputGroup):
 
 
 _GROUPS = {
-    "Run": ("eval", "sweep", "watch"),
+    "Run": ("demo", "eval", "sweep", "watch"),
     "Learn": ("train", "export"),
     "Look": ("report", "log", "presets", "doctor", "examples"),
     "Paper": ("reproduce", "profile"),

@@ -68,7 +68,12 @@ Speed = Annotated[float | None, Option("--speed", help="Speed of the moving obst
 Set = Annotated[
     list[str] | None, _more("--set", metavar="KEY=VALUE", help="Override a config key (repeatable).")
 ]
+Motion = Annotated[
+    str | None,
+    _more("--motion", metavar="FILE.py:NAME", help="Moving obstacles that a function of yours gives."),
+]
 Device = Annotated[str, parsing.device(**_PANEL)]
+OpenPage = Annotated[bool, Option("--open", help="Open the report in the browser.")]
 RunDir = Annotated[Path | None, Option("--run-dir", help="Run folder \\[default: runs/TIME_PRESET].")]
 WithReport = Annotated[bool, Option("--report", help="Also write report.html into the run folder.")]
 Wide = Annotated[bool, _more("--wide", help="Show all columns even if they do not fit the terminal.")]
@@ -155,6 +160,12 @@ Iterations = Annotated[
 TrainStart = Annotated[
     Path | None, _run("Run whose policy to begin with, or policy: the built-in one.", "--start")
 ]
+Reward = Annotated[
+    str | None,
+    Option(
+        "--reward", metavar="FILE.py:NAME", help="Terms of yours beside the built-in ones, in the simulator."
+    ),
+]
 TrainSeed = Annotated[int | None, Option("--seed", help="Random seed (train.seed).")]
 TrainWorld = Annotated[
     str | None, _preset("--world", "world", f"World: {_WORLDS}, or a YAML file \\[default: the preset's].")
@@ -215,6 +226,9 @@ TreeUse = Annotated[
         help="Of a tree: how often its nodes ran in this evaluation.",
         autocompletion=parsing.evaluations,
     ),
+]
+WorldPicture = Annotated[
+    Path | None, _out("Of a world: its picture, .png \\[default: beside a YAML file, .world.png].")
 ]
 Dot = Annotated[bool, Option("--dot", help="Of a tree: print Graphviz DOT.")]
 ExamplesFolder = Annotated[Path, Argument(metavar="FOLDER", help="Where to; what is there is kept.")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -109,6 +110,27 @@ def one_agent(given: str | None, planner: list[str] | None) -> str | None:
     if len(found) != 1:
         raise UsageError("--agent, --planner: give one of them, once: one vehicle is driven")
     return found[0]
+
+
+def reward(given: str | None) -> Any:
+    """Reward terms of the user's (``runner.RewardSource``); None where none were typed."""
+    if given is None:
+        return None
+    from uuvtai.plugins.api import REWARD, plugin_spec
+    from uuvtai.plugins.loading import load_plugin
+
+    return load_plugin(plugin_spec(given, REWARD))
+
+
+@functools.cache
+def motion(given: str | None) -> list[tuple[str, Any]]:
+    """Settings for the obstacles that a function of the user's gives; none where none was typed."""
+    if given is None:
+        return []
+    from uuvtai.plugins.api import MOTION, plugin_spec
+    from uuvtai.plugins.loading import obstacles_of
+
+    return [("world.added", obstacles_of(plugin_spec(given, MOTION)))]
 
 
 def refuse_odd_rate(rate: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import json
 import math
@@ -19,7 +18,7 @@ from uuvtai.common.files import read_text
 from uuvtai.common.presets import KINDS, built_in_file, preset_names
 from uuvtai.common.tree_codes import ACTION, LEAVES
 from uuvtai.console.screen import Screen, print_heat_maps
-from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, paired_table
+from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, paired_table, who_arrived
 from uuvtai.report.sweep import cell_table
 from uuvtai.report.tables import (
     Column,
@@ -45,6 +44,8 @@ def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> Non
     if any("causes" in agent for agent in result["agents"]):
         show_causes(screen, result)
         say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
+    if said := who_arrived(result["agents"]):
+        screen.line(said, "bold")
 
 
 def show_training(screen: Screen, result: dict[str, Any]) -> None:
@@ -258,8 +259,9 @@ def show_presets(screen: Screen) -> None:
     )
 
 
-def show_stated(kind: str, name: str, as_json: bool) -> None:
-    """A preset as it is written, its comments included. Raises ConfigError, FileError, OSError."""
+def show_stated(kind: str, name: str, as_json: bool, out: Path | None = None) -> None:
+    """A preset as it is written, its comments included; a world is checked too, and drawn to ``out`` or
+    beside a file of the user's. Raises ConfigError, WorldError, FileError, LogError, OSError."""
     from uuvtai.config import loader
 
     path = loader.preset_path(kind, name)
@@ -271,13 +273,29 @@ def show_stated(kind: str, name: str, as_json: bool) -> None:
         typer.echo(json.dumps({"schema": 1, "text": text}, allow_nan=False))
         return
     typer.echo(text)
-    if kind == "world":
-        with contextlib.suppress(loader.ConfigError):  # a file is shown although it cannot be used
-            told = obstacles(loader.load_config(name).world.obstacles)
-            vehicle, sensors = (loader.preset_of(other, name, None) for other in ("vehicle", "sensors"))
-            say(f"{told}, vehicle {vehicle}, sensors {sensors}")
     if (base := loader.base_of(path)) is not None:
         say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
+    stated = loader.stated(path) if kind == "world" else {}
+    if "world" in stated or stated.get("extends") in preset_names("world"):
+        beside = None if path == built_in_file(kind, name) else path.with_suffix(".world.png")
+        _show_world(name, out or beside)
+
+
+def _show_world(name: str, out: Path | None) -> None:
+    """What is remarkable of a world, its picture, and whether episodes can begin in it."""
+    from uuvtai.config import loader
+    from uuvtai.report import world
+
+    config = loader.load_config(name)
+    vehicle, sensors = (loader.preset_of(other, name, None) for other in ("vehicle", "sensors"))
+    told, problem, label = world.check(config)
+    say("\n".join([*told, f"vehicle {vehicle}, sensors {sensors}"]))
+    if out is not None:
+        say(f"picture: {world.picture(name, config.world, label, out)}")
+    if problem:
+        raise world.WorldError(f"{name}: {problem}")
+    if out is not None:
+        say(f"next: uuv eval --world {shlex.quote(name)} --agent bt --episodes 8 --record 1 --report")
 
 
 def kind_and_name(action: str, name: str | None, run: Path | None = None) -> tuple[str, str]:

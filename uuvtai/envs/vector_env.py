@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import json
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -127,6 +127,30 @@ class VectorEnv(AbstractContextManager["VectorEnv"]):
         }
         self._begun = self._closed = False
         self._owns_sim = owns_sim
+        self._ask: Callable[[], Mapping[str, torch.Tensor]] | None = None
+        self.driven = torch.zeros_like(self._asked)
+        """(num_envs, 4) the action of the last step, where terms were added"""
+
+    def add_terms(self, ask: Callable[[], Mapping[str, torch.Tensor]]) -> None:
+        """Add to the reward what ``ask`` says after each step, float32 (num_envs,) by name. It is asked once
+        before the first step, for the names."""
+        self.reset()
+        self.reward_terms = (*TERMS, *ask())
+        for name in ("reward_terms", "episode_terms"):
+            self._info[name] = torch.zeros(self.num_envs, len(self.reward_terms), device=self.device)
+        self._ask, self._begun = ask, False
+
+    def _add_own_terms(self, ask: Callable[[], Mapping[str, torch.Tensor]]) -> None:
+        """Of the step that was just taken: rows that rest earn nothing."""
+        sim, info = self.sim, self._info
+        running = torch.as_tensor(sim.rows(sim.s.clock.active) == 1, device=self.device)
+        own = torch.stack([*ask().values()], dim=1) * running[:, None]
+        sums = info["episode_terms"][:, len(TERMS) :]
+        sums.masked_fill_((running & (info["episode_steps"] <= 1))[:, None], 0.0)
+        sums += own
+        info["reward_terms"][:, len(TERMS) :] = own
+        info["episode_return"] += sums.sum(dim=1)
+        sim.reward += own.sum(dim=1)
 
     def reset(
         self, seed: int | None = None, mask: torch.Tensor | None = None
@@ -179,9 +203,13 @@ class VectorEnv(AbstractContextManager["VectorEnv"]):
         sim, info = self.sim, self._info
         sim.observation = self._obs
         self._take(action.detach())
+        if self._ask:
+            self.driven.copy_(sim.action)
         sim.step()
         info["final_obs"].copy_(self._obs)
         write_results(sim.io.reward, *(info[name] for name in _STEP_RESULTS))
+        if self._ask:
+            self._add_own_terms(self._ask)
         write_ends(sim.io.reward, *self._ends)
         told = sim.counts.any_ended
         if sim.counts.number(sim.s.reward.n_ended) if told is None else told:

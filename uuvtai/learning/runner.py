@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.common import signals
-from uuvtai.common.files import FileError, open_to_append, parsed_json, read_lines, truncate
+from uuvtai.common.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
 from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 Metrics = dict[str, float]
 
-CONFIG = "config.yaml"
+CONFIG, REWARD = "config.yaml", "reward.json"
 """of a run folder"""
 SCORE = "eval/success_rate"
 """metric by which a checkpoint is the best"""
@@ -57,6 +57,16 @@ class TrainRequest:
     """done in all; None = ``train.iterations``, over which the schedules run in any case"""
     device: str = "auto"
     run_dir: Path | None = None
+    reward: RewardSource | None = None
+    """terms of the user's beside the built-in ones"""
+
+
+class RewardSource(Protocol):
+    """Reward terms in a file of the user's (``plugins.loading.LoadedPlugin``)."""
+
+    sha256: str
+
+    def reward(self, env: VectorEnv) -> None: ...
 
 
 class TrainWatch(Protocol):
@@ -103,13 +113,14 @@ def _train(
         if not isinstance(config, LearningConfig):
             raise ConfigError(f"{folder.path}: is no training run; give the folder that 'uuv train' printed")
         found = checkpoint.newest(folder.path, watch.note, resumable=True)
+        _check_reward(folder.path, request.reward)
     total = request.iterations or config.train.iterations
     if folder and found and found.step >= total:
         folder.settle(found.step >= config.train.iterations)
         done, more = f"{found.step} of {total} iterations", f"--iterations {2 * found.step}"
         raise ConfigError(f"{folder.path}: has done {done}; to go on give more: {more}")
     watch.note(f"starting {config.train.num_envs} envs (new sizes compile kernels first: half a minute)")
-    trainer = _trainer(config, request.device)
+    trainer = _trainer(config, request.device, request.reward)
     for checked in filter(None, (found, start)):
         checked.check_table(trainer.observation_table, config)
     if found:
@@ -120,6 +131,8 @@ def _train(
             trainer.start(start)
     if folder is None or found is None:
         folder = RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
+        if own := request.reward:
+            folder.write_json(REWARD, {"schema": 1, "sha256": own.sha256})
     else:
         folder.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
         if request.overrides:
@@ -151,25 +164,39 @@ def _started(
     return found, config.model_copy(update=update)
 
 
-def _trainer(config: LearningConfig, device: str) -> AnyTrainer:
-    """What learns. Raises ConfigError for a GPU where there is no use for it."""
+def _check_reward(folder: Path, own: RewardSource | None) -> None:
+    """ConfigError where a run goes on with another reward than it began with."""
+    kept = read_json(folder / REWARD, folder=folder) if (folder / REWARD).exists() else {"sha256": None}
+    if not isinstance(kept, dict) or kept.get("sha256") != (own.sha256 if own else None):
+        began = "another --reward" if (folder / REWARD).exists() else "no --reward"
+        raise ConfigError(f"{folder}: began with {began}; give the same again, or begin a new run by --start")
+
+
+def _trainer(config: LearningConfig, device: str, own: RewardSource | None) -> AnyTrainer:
+    """What learns. Raises ConfigError for a GPU or a reward where there is no use for it."""
+    if own and (config.surrogate.enabled or config.learner != "ppo"):
+        more = " or --set surrogate.enabled=false" if config.learner == "ppo" else ""
+        raise ConfigError(f"--reward: is of a policy that learns in the simulator; train 'paper'{more}")
     for section in ("surrogate", "parameter_search", "forecast_training"):
         if device == "cuda" and getattr(config, section).enabled:
             raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
-    return TRAINERS[config.learner](config, device)
+    return TRAINERS[config.learner](config, device, own)
 
 
-def _policy_trainer(config: LearningConfig, device: str) -> Trainer:
+def _policy_trainer(config: LearningConfig, device: str, own: RewardSource | None) -> Trainer:
     if config.surrogate.enabled:
         return Trainer(InSurrogate(config), config)
     kind = SimulatedSet if config.encoder == "set" else Simulated
-    return Trainer(kind(_env(config, device), config), config)
+    env = _env(config, device)
+    if own:
+        own.reward(env)
+    return Trainer(kind(env, config), config)
 
 
-TRAINERS: dict[str, Callable[[LearningConfig, str], AnyTrainer]] = {
+TRAINERS: dict[str, Callable[[LearningConfig, str, RewardSource | None], AnyTrainer]] = {
     "ppo": _policy_trainer,
-    "search": lambda config, _: ParameterSearchTrainer(config),
-    "forecast": lambda config, _: ForecastTrainer(config),
+    "search": lambda config, *_: ParameterSearchTrainer(config),
+    "forecast": lambda config, *_: ForecastTrainer(config),
 }
 """by ``LearningConfig.learner``"""
 

@@ -148,11 +148,17 @@ FORMULAS = {
 """How an outsider recomputes the log's figures; names such as mapping.occupied are keys of config.yaml."""
 
 
+def tank_document(tank: Any) -> dict[str, Any]:
+    """A TankConfig as scenario.json has it."""
+    sides = {name: list(getattr(tank, name)) for name in ("x_m", "y_m", "z_m")}
+    return {"shape": tank.shape, **sides, "radius_m": tank.radius_m}
+
+
 def scenario_document(
     config: Any, described: dict[str, Any], world: str, seed: int, episode: int
 ) -> dict[str, Any]:
     """Content of scenario.json. ``described``: ``closed_form.describe_scenario`` at step 0."""
-    wanted, tank = config.world, config.world.tank
+    wanted = config.world
     moving = sum(body["path"] is not None for body in described["obstacles"])
     return {
         "schema": 1,
@@ -164,13 +170,7 @@ def scenario_document(
         "v_m_s": wanted.dynamic_speed_m_s,
         "control_dt_s": config.episode.control_dt_s,
         "goal_radius_m": config.episode.goal_radius_m,
-        "tank": {
-            "shape": tank.shape,
-            "x_m": list(tank.x_m),
-            "y_m": list(tank.y_m),
-            "z_m": list(tank.z_m),
-            "radius_m": tank.radius_m,
-        },
+        "tank": tank_document(wanted.tank),
         **described,
         "frames": FRAMES,
         "formulas": FORMULAS,

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -201,6 +202,24 @@ class PluginView:
         return torch.as_tensor(picked, device=self._fixed.device) if self._fixed.torch else picked
 
 
+JUDGED = {
+    "clearance": "termination.clearance_m",
+    "ttc": "termination.ttc_s",
+    "outcome": "termination.outcome",
+}
+"""the truth that a reward is shown beside ``FIELDS``"""
+
+
+class JudgedView(PluginView):
+    """A ``protocol.RewardView``."""
+
+    def __init__(self, sim: Sim, obs: torch.Tensor, fixed: Fixed, action: torch.Tensor) -> None:
+        super().__init__(Readings(sim, list(range(sim.num_envs)), obs), fixed)
+        self.action = action if fixed.torch else action.cpu().numpy()
+        for name, place in JUDGED.items():
+            setattr(self, name, self._given(sim.rows(attrgetter(place)(sim.s))))
+
+
 class Fixed:
     """What a view says of every env and every step."""
 
@@ -237,6 +256,21 @@ def commands(found: Any, n: int, place: str, meaning: str, device: torch.device)
             f", and {len(bad) - 1} more that are not finite"
         )
     return values.to(device)
+
+
+def terms(found: Any, n: int, place: str, device: torch.device) -> dict[str, torch.Tensor]:
+    """(n,) float32 by name of what a reward answered. Raises PluginError."""
+    wanted = f"a dict of arrays ({n},), what each term adds to the reward"
+    if not isinstance(found, dict) or not found or not all(str(name).isidentifier() for name in found):
+        raise PluginError(f"{place}: gave {type(found).__name__} {found!r:.60}; wanted is {wanted}, by name")
+    values = {str(name): _tensor(value, f"{place}: {name}", wanted) for name, value in found.items()}
+    for name, value in values.items():
+        if value.shape != (n,):
+            raise PluginError(f"{place}: {name} has shape {tuple(value.shape)}; wanted is {wanted}")
+        if len(bad := (~torch.isfinite(value)).nonzero()):
+            row = int(bad[0])
+            raise PluginError(f"{place}: {name} is {float(value[row])} in env {row}, and {len(bad) - 1} more")
+    return {name: value.to(device) for name, value in values.items()}
 
 
 def command(found: Any, place: str, meaning: str) -> torch.Tensor:

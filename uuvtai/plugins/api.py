@@ -196,6 +196,20 @@ class OwnController(Protocol):
         ...
 
 
+class RewardView(View, Protocol):
+    """What ``terms(view)`` of ``uuv train --reward`` is shown after each control step: a view of all envs,
+    and what a reward may know and a policy never does."""
+
+    clearance: Any
+    """(n,) [m] from the hull to the nearest obstacle or wall, the truth"""
+    ttc: Any
+    """(n,) [s] to a collision, the truth; a large number for none"""
+    outcome: Any
+    """(n,) index into ``uuvtai.envs.vector_env.VectorEnv.outcomes``; 0 = the episode runs"""
+    action: Any
+    """(n, 4) that was driven, in parts of the limits"""
+
+
 class OwnPolicy(Protocol):
     """A trained policy: what it does follows from the observation alone."""
 
@@ -282,13 +296,17 @@ def _is(frame: FrameType, path: Path) -> bool:
 
 
 PLANNER, CONTROLLER, POLICY = "planner", "controller", "policy"
-_DEFAULT = {PLANNER: "plan", CONTROLLER: "act", POLICY: "load"}
+REWARD, MOTION = "reward", "motion"
+_DRIVES = (PLANNER, CONTROLLER, POLICY)
+_DEFAULT = {PLANNER: "plan", CONTROLLER: "act", POLICY: "load", REWARD: "terms", MOTION: "paths"}
 """what is meant where no object is named"""
 _PYTHON = re.compile(r"(?P<file>.+?\.py)(?::(?P<name>[^=:/\\]*))?(?:=(?P<argument>.*))?")
 _EXAMPLE = {
     PLANNER: "--planner mine.py:plan",
     CONTROLLER: "--agent mine.py:act",
     POLICY: "--agent model.onnx or --agent mine.py:load",
+    REWARD: "--reward mine.py:terms",
+    MOTION: "--motion mine.py:paths",
 }
 
 
@@ -318,8 +336,8 @@ class PluginSpec:
     @property
     def option(self) -> str:
         """As it is typed, with its option."""
-        if self.kind == PLANNER:
-            return f"--planner {self.typed}"
+        if self.kind in (PLANNER, REWARD, MOTION):
+            return f"--{self.kind} {self.typed}"
         is_plain = plugin_spec(self.typed).kind == self.kind
         return f"--agent {self.typed if is_plain else self.text}"
 
@@ -356,21 +374,21 @@ class PluginSpec:
 def is_plugin(text: str) -> bool:
     """Whether an agent's name is that of a plugin of the user's."""
     kind, colon, _rest = text.partition(":")
-    return (kind in _DEFAULT and bool(colon)) or bool(_PYTHON.fullmatch(text)) or text.endswith(".onnx")
+    return (kind in _DRIVES and bool(colon)) or bool(_PYTHON.fullmatch(text)) or text.endswith(".onnx")
 
 
 def plugin_spec(text: str, kind: str = "") -> PluginSpec:
     """The plugin of a text. ``kind`` where the text does not begin with one; without either, a graph and an
     object named ``load`` are policies, every other one is a controller. SettingError."""
     first, colon, rest = text.partition(":")
-    if first in _DEFAULT and colon:
+    if first in _DRIVES and colon:
         kind, text = first, rest
     if kind in ("", POLICY) and text.endswith(".onnx"):
         return PluginSpec(POLICY, Path(text))
     found = _PYTHON.fullmatch(text)
     if not kind:
         kind = POLICY if found and found["name"] == _DEFAULT[POLICY] else CONTROLLER
-    option = "--planner" if kind == PLANNER else "--agent"
+    option = _EXAMPLE[kind].partition(" ")[0]
     if found is None:
         raise SettingError(f"{option} {text!r}: names no plugin; for example {_EXAMPLE[kind]}")
     name = found["name"] or _DEFAULT[kind]

@@ -16,19 +16,31 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from pydantic import ValidationError
 
 from uuvtai.common.files import read_bytes
-from uuvtai.envs.vector_env import NUM_ACTIONS
+from uuvtai.config import FixedObstacle
+from uuvtai.envs.vector_env import NUM_ACTIONS, VectorEnv
 from uuvtai.kernels.planning.observation import placed_columns
 from uuvtai.learning.export import graph as graph_check
 from uuvtai.learning.export import graph as onnx_session
 from uuvtai.learning.policy_agent import CHUNK
 from uuvtai.plugins import adapters
-from uuvtai.plugins.adapters import CallMeter, Marks, OwnCode, PluginAgent, asking_controller, asking_policy
+from uuvtai.plugins.adapters import (
+    CallMeter,
+    Fixed,
+    Marks,
+    OwnCode,
+    PluginAgent,
+    asking_controller,
+    asking_policy,
+)
 from uuvtai.plugins.api import (
     CONTROLLER,
+    MOTION,
     PLANNER,
     POLICY,
+    REWARD,
     About,
     Forecast,
     PluginError,
@@ -289,9 +301,17 @@ _USAGE = {
     PLANNER: "a planner is called plan(clearance, cell_m, start, goal, forecast)",
     CONTROLLER: "a controller is called act(view)",
     POLICY: "a policy is called act(obs)",
+    REWARD: "a reward is called terms(view)",
+    MOTION: "a motion is called paths()",
 }
-_AGENTS = {PLANNER: ("plan",), CONTROLLER: ("act",), POLICY: ("act", "predict")}
-_ARGUMENTS = {PLANNER: 5, CONTROLLER: 1, POLICY: 1}
+_AGENTS = {
+    PLANNER: ("plan",),
+    CONTROLLER: ("act",),
+    POLICY: ("act", "predict"),
+    REWARD: ("terms",),
+    MOTION: (),
+}
+_ARGUMENTS = {PLANNER: 5, CONTROLLER: 1, POLICY: 1, REWARD: 1, MOTION: 0}
 _LIMITS = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
 
 
@@ -334,6 +354,25 @@ class LoadedPlugin:
             return None
         code = self._code(sim, about_of(sim, self.spec.argument))
         return RouteSource(code, sim.config.mapping.cell_m, sim.config.tracking.forecast_dt_s)
+
+    def reward(self, env: VectorEnv) -> None:
+        """Add its terms to the reward of an environment. Raises PluginError, at once or in a step."""
+        sim, about = env.sim, about_of(env.sim, self.spec.argument)
+        code = self._code(sim, about)
+        fixed, names = Fixed(sim, about.columns, about.limits, code.marks.arrays), []
+
+        def terms() -> dict[str, torch.Tensor]:
+            assert sim.observation is not None
+            view = adapters.JudgedView(sim, sim.observation.clone(), fixed, env.driven.clone())
+            found = adapters.terms(
+                code.called(code.act, view, sim.num_envs), sim.num_envs, code.place, sim.device
+            )
+            names[:] = names or [*found]
+            if [*found] != names:
+                raise PluginError(f"{code.place}: gave {', '.join(found)}, and {', '.join(names)} at first")
+            return found
+
+        env.add_terms(terms)
 
     def told(self) -> str:
         """What has to be said of its time; empty = nothing."""
@@ -380,6 +419,28 @@ def load_plugin(spec: PluginSpec) -> LoadedPlugin:
         return LoadedPlugin(spec, hashlib.sha256(graph).hexdigest(), graph)
     content = content_of(spec, MAX_BYTES)
     return LoadedPlugin(spec, hashlib.sha256(content).hexdigest(), object_of(spec))
+
+
+def obstacles_of(spec: PluginSpec) -> list[dict[str, Any]]:
+    """Explicit obstacles that a function of the user's gives, as ``world.added`` has them. PluginError,
+    FileError."""
+    found = object_of(spec)
+    give = agent_of(found, (), spec, _USAGE[MOTION], _ARGUMENTS[MOTION])
+    try:
+        given = [dict(one) for one in give()]
+    except (Exception, SystemExit) as error:
+        raise failed(error, spec.path, spec.option) from error
+    for i, one in enumerate(given):
+        try:
+            if (path := np.asarray(one.get("path", ()), float)).size:
+                one["path"] = [{"x_m": x, "y_m": y} for x, y in path.tolist()]
+                one |= {"x_m": path[0, 0], "y_m": path[0, 1]}
+            given[i] = FixedObstacle.model_validate(one).model_dump(mode="json", exclude_defaults=True)
+        except (TypeError, ValueError) as error:
+            first = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": error}
+            reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}".lstrip(": ")
+            raise PluginError(f"{place_of(give, spec)}: obstacle {i}: {reason}") from None
+    return given
 
 
 def columns_of(sim: Sim) -> dict[str, slice]:

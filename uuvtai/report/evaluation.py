@@ -170,15 +170,16 @@ def evaluation(result: dict[str, Any], command: str = "", episodes: Sequence[Blo
 _MOST_NAMED = 4  # agents in the sentence of the result
 
 
-def _opening(agents: list[AgentSpec], pairs: list[dict[str, Any]]) -> list[Block]:
-    """Who reached the goal how often, and the two best against each other; [] without episodes."""
-    ran = sorted(
-        (m for m in agents if m["episodes"] and m.get("outcomes")),
-        key=lambda m: m["outcomes"]["success"] / m["episodes"],
-        reverse=True,
-    )
-    if not ran:
-        return []
+def by_success(agents: list[AgentSpec]) -> list[AgentSpec]:
+    """Those that ran, the most successful first."""
+    ran = [m for m in agents if m["episodes"] and m.get("outcomes")]
+    return sorted(ran, key=lambda m: m["outcomes"]["success"] / m["episodes"], reverse=True)
+
+
+def who_arrived(agents: list[AgentSpec]) -> str:
+    """Who reached the goal how often, in a sentence; '' without episodes."""
+    if not (ran := by_success(agents)):
+        return ""
     first, *others = ran
     said = (
         f"{first['name']} reached the goal in {first['outcomes']['success']} of {first['episodes']} episodes"
@@ -186,8 +187,15 @@ def _opening(agents: list[AgentSpec], pairs: list[dict[str, Any]]) -> list[Block
     said += "".join(f", {m['name']} in {m['outcomes']['success']}" for m in others[: _MOST_NAMED - 1])
     if rest := others[_MOST_NAMED - 1 :]:
         said += f", {len(rest)} more agents in {rest[0]['outcomes']['success']} or fewer"
-    blocks: list[Block] = [Paragraph(f"{said}.", leads=True)]
-    best = {m["name"] for m in ran[:2]}
+    return f"{said}."
+
+
+def _opening(agents: list[AgentSpec], pairs: list[dict[str, Any]]) -> list[Block]:
+    """Who reached the goal how often, and the two best against each other; [] without episodes."""
+    if not (said := who_arrived(agents)):
+        return []
+    blocks: list[Block] = [Paragraph(said, leads=True)]
+    best = {m["name"] for m in by_success(agents)[:2]}
     return blocks + [Paragraph(_duel(pair)) for pair in pairs if {pair["a"], pair["b"]} == best][:1]
 
 

@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, get_type_hints
+from typing import get_type_hints
 
 import numpy as np
 import taichi as ti
@@ -35,7 +35,7 @@ from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.common.tree_codes import MAX_NODES
 from uuvtai.compile.launch import forget, is_gpu_shaped
 from uuvtai.compile.memory import Memory, Put, address_of, put_by_kernel
-from uuvtai.config import Config, FixedObstacle, ForecastConfig, SonarConfig, VehicleConfig, WorldConfig
+from uuvtai.config import Config, ForecastConfig, SonarConfig, VehicleConfig, WorldConfig
 from uuvtai.config.behavior import TUNED, configured_factors
 from uuvtai.config.multibeam import elevations, heard_bearings
 from uuvtai.config.task import TERMS
@@ -49,10 +49,6 @@ from uuvtai.kernels.world.motion import FAULT_MOVING
 from uuvtai.kernels.world.scenario import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
 from uuvtai.sim.stages import SimState, Stages, bind_all
 from uuvtai.state import FixedTable, GridMask, SceneState
-
-if TYPE_CHECKING:
-    pass
-
 
 # ------------------------------------------------------------------------------------------------------------
 # Thruster geometry: which wrench each thruster gives, and the least-squares way back over the axes that the
@@ -107,7 +103,7 @@ def controllable_axes(wrench_of_thrust: np.ndarray) -> list[int]:
 
 
 N_CORNER = 5
-"""Most waypoints of one path."""
+"""Most waypoints of a random path."""
 
 _KINDS = {name: kind for kind, name in KIND_NAMES.items()}
 
@@ -165,7 +161,7 @@ def scenario_sizes(world_cfg: WorldConfig) -> dict[str, int]:
         "n_obstacle": slots.n_obstacle,
         "n_dynamic": slots.n_dynamic,
         "n_fixed": max(1, len(world_cfg.fixed)),
-        "n_corner": N_CORNER,
+        "n_corner": max(N_CORNER, *(len(obstacle.path) for obstacle in world_cfg.fixed), 0),
         "n_coarse_row": math.ceil((tank.y_m[1] - tank.y_m[0]) / COARSE_M - 1e-9),
         "n_coarse_col": math.ceil((tank.x_m[1] - tank.x_m[0]) / COARSE_M - 1e-9),
     }
@@ -176,7 +172,7 @@ def load_fixed(table: FixedTable, world_cfg: WorldConfig) -> None:
     at_rest = [obstacle for obstacle in world_cfg.fixed if not obstacle.path]
     moving = [obstacle for obstacle in world_cfg.fixed if obstacle.path]
     for i, obstacle in enumerate(at_rest + moving):
-        z, size = _center_and_size(obstacle, world_cfg)
+        z, size = world_cfg.center_and_size(obstacle)
         table.kind[i] = _KINDS[obstacle.kind]
         table.pos_w[i] = (obstacle.x_m, obstacle.y_m, z)
         table.size[i] = size
@@ -185,21 +181,6 @@ def load_fixed(table: FixedTable, world_cfg: WorldConfig) -> None:
         table.speed_m_s[i] = -1.0 if obstacle.speed_m_s is None else obstacle.speed_m_s
         for j, way in enumerate(obstacle.path):
             table.way_w[i, j] = (way.x_m, way.y_m)
-
-
-def _center_and_size(
-    obstacle: FixedObstacle, world_cfg: WorldConfig
-) -> tuple[float, tuple[float, float, float]]:
-    floor, surface = world_cfg.tank.z_m
-    z = 0.5 * (floor + surface) if obstacle.z_m is None else obstacle.z_m
-    half_height = 0.5 * (surface - floor if obstacle.height_m is None else obstacle.height_m)
-    radius = obstacle.radius_m or 0.0
-    if obstacle.kind == "sphere":
-        return z, (radius, radius, radius)
-    if obstacle.kind == "cylinder":
-        return z, (radius, radius, half_height)
-    extent_x, extent_y = obstacle.half_extents_m or (0.0, 0.0)
-    return z, (extent_x, extent_y, half_height)
 
 
 Scene = tuple[int, int, float]
