@@ -41,7 +41,7 @@ ROBUSTNESS, SAFETY, SPEEDS = "docs/robustness.md", "docs/safety.md", "benchmarks
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(?P<foot>^<!-- end -->)", re.M | re.S
 )
-LITERATURE = {"mppi", "dwa", "potential_field", "velocity_obstacle"}  # rows with a table of their own
+LITERATURE = {"mppi", "dwa"}  # rows with a table of their own
 SHORT = {  # rows of README's table
     "pool_6": "`pool`, 6 at 0.6 m/s",
     "gauntlet_9_fast": "`gauntlet`, 9 at 1.5 m/s",
@@ -113,7 +113,7 @@ def local_planners(root: Path) -> str:
         "agents": paper["agents"] | worlds[0]["agents"],
         "paired": [*worlds[0]["paired"], *paper["paired"]],
     }
-    names = ("bt", "paper", "mppi", "dwa", "potential_field", "velocity_obstacle")
+    names = ("bt", "paper", "mppi", "dwa")
     lines = [[f"`{name}`", *(_beside_bt(row, name) for row in worlds)] for name in names]
     return text_table(["", *(row["title"] for row in worlds)], lines)
 

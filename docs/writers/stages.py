@@ -21,7 +21,7 @@ FILES = {
     "clearance": ("clearance",),
     "planning": ("triggers", "voronoi", "medial_axis", "route"),
     "observation": ("observation",),
-    "behavior": ("threats", "avoidance", "dwa", "potential_field", "velocity_obstacle", "mppi", "tree"),
+    "behavior": ("threats", "avoidance", "dwa", "mppi", "tree"),
     "reward": ("reward",),
 }
 """kernel files of each stage, by the names of ``uuvtai.sim.stages.STAGES``"""

@@ -150,8 +150,7 @@ def test_the_command_takes_speed_rate_and_width_and_tells_its_progress(tmp_path,
 # ---------------------------------------------------------------------------------------------------- colours
 
 
-METHODS = ["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"]
-METHODS += ["dwa", "potential_field", "velocity_obstacle", "mppi"]
+METHODS = ["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth", "dwa", "mppi"]
 
 
 def test_a_method_has_one_colour_wherever_it_is_shown():

@@ -26,7 +26,7 @@ N_BOARD = 20
 N_TREE = 250
 N_TICK = 6
 MAX_NODE = 40
-PRESETS = ("straight", "planner", "bt", "dwa", "potential_field", "velocity_obstacle", "mppi")
+PRESETS = ("straight", "planner", "bt", "dwa", "mppi")
 
 
 def xml(body: str, extra: str = "") -> str:

@@ -10,10 +10,10 @@ _ANCHORS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito 2008 without black and yellow, which a dark or a light page would swallow."""
 
-PALETTE = (*SERIES, "#8d5524", "#6a3d9a", "#999933", "#882255", "#332288", "#117733")
+PALETTE = (*SERIES, "#8d5524", "#6a3d9a", "#999933", "#117733")
 """Every colour that a line or a swatch can have; the page has a lighter one for each on a dark screen."""
 
-_BLUE, _VERMILLION, _GREEN, _PURPLE, _ORANGE, _SKY, _BROWN, _VIOLET, _OLIVE, _WINE, _INDIGO, _FOREST = PALETTE
+_BLUE, _VERMILLION, _GREEN, _PURPLE, _ORANGE, _SKY, _BROWN, _VIOLET, _OLIVE, _FOREST = PALETTE
 _AGENTS = {
     "bt": _BLUE,
     "planner": _ORANGE,
@@ -22,8 +22,6 @@ _AGENTS = {
     "paper": _BROWN,
     "oracle": _VIOLET,
     "dwa": _OLIVE,
-    "potential_field": _WINE,
-    "velocity_obstacle": _INDIGO,
     "mppi": _FOREST,
 }
 _TRUTH = "+truth"

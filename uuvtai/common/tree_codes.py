@@ -38,9 +38,7 @@ FOLLOW_ROUTE = 20
 DRIVE_STRAIGHT = 21
 FIRST_BASELINE = 32  # Codes from here on are local planners of the literature.
 DYNAMIC_WINDOW = FIRST_BASELINE
-POTENTIAL_FIELD = 33
-VELOCITY_OBSTACLE = 34
-PATH_INTEGRAL = 35
+PATH_INTEGRAL = 33
 
 MAX_PORTS = 4  # Numbers that a leaf can be given.
 MAX_NODES = 64  # Nodes of a tree, those of its subtrees included.
@@ -92,10 +90,6 @@ LEAVES = {
     "DriveStraight": _action(DRIVE_STRAIGHT, "speed_m_s", "drive at the goal, blind"),
     "DynamicWindow": _action(
         DYNAMIC_WINDOW, "", "dynamic window approach along the route; fails without one"
-    ),
-    "PotentialField": _action(POTENTIAL_FIELD, "", "potential field along the route; fails without one"),
-    "VelocityObstacle": _action(
-        VELOCITY_OBSTACLE, "", "velocity obstacles along the route; fails without one"
     ),
     "PathIntegral": _action(PATH_INTEGRAL, "", "sampling MPC (MPPI) along the route; fails without one"),
 }

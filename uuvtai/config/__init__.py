@@ -24,10 +24,8 @@ from uuvtai.config.planning import (
     DynamicWindowConfig,
     ObservationConfig,
     PathIntegralConfig,
-    PotentialFieldConfig,
     QuietConfig,
     RouteConfig,
-    VelocityObstacleConfig,
     VoronoiConfig,
 )
 from uuvtai.config.sensors import (
@@ -109,9 +107,9 @@ __all__ = [
     "ActuationConfig", "BaselinesConfig", "BehaviorConfig", "CameraTrackingConfig", "ClearanceConfig",
     "Config", "DepthConfig", "DisturbanceConfig", "DvlConfig", "DynamicObstacles", "DynamicWindowConfig",
     "EpisodeConfig", "FastConfig", "FixedObstacle", "ForecastConfig", "HeightConfig", "ImuConfig",
-    "LocalizationConfig", "MappingConfig", "ObservationConfig", "PathIntegralConfig", "PotentialFieldConfig",
+    "LocalizationConfig", "MappingConfig", "ObservationConfig", "PathIntegralConfig",
     "PressureConfig", "QuietConfig", "RewardConfig", "RouteConfig", "RuntimeConfig", "Section",
     "SensorsConfig", "SlowConfig", "SonarConfig", "StaticObstacles", "TankConfig", "Thruster",
-    "TrackingConfig", "TrafficConfig", "VehicleConfig", "VelocityObstacleConfig", "VoronoiConfig", "Waypoint",
+    "TrackingConfig", "TrafficConfig", "VehicleConfig", "VoronoiConfig", "Waypoint",
     "WorldConfig",
 ]  # fmt: skip

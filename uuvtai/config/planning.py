@@ -106,28 +106,6 @@ class DynamicWindowConfig(Section):
     """of time and distance to what is nearest, as a share; the speed, as a share of cruise speed, weighs 1"""
 
 
-class PotentialFieldConfig(Section):
-    """Artificial potential field (Khatib 1986)."""
-
-    reach_m: Positive = 1.5
-    """moving obstacles farther away push nobody"""
-    gain: NonNegative = 0.1
-    """[m^4/s] of the push of a moving obstacle"""
-
-
-class VelocityObstacleConfig(Section):
-    """Velocity obstacles (Fiorini and Shiller 1998)."""
-
-    window_s: Positive = 0.8
-    """velocities that can be reached within this are tried"""
-    horizon_s: Positive = 3.0
-    """collisions later than this are none"""
-    margin_m: NonNegative = 0.4
-    """wanted clearance beyond contact from moving obstacles"""
-    static_horizon_s: Positive = 1.5
-    """the same for mapped obstacles and walls"""
-
-
 class PathIntegralConfig(Section):
     """Sampling model-predictive control: MPPI (Williams and others 2017)."""
 
@@ -160,8 +138,7 @@ class BaselinesConfig(Section):
     period_steps: PositiveCount = 5
     """control steps between decisions"""
     heave_m_s: NonNegative = 0.4
-    """vertical speed of those that climb or dive; 0 = depth is not used to evade (also in the potential
-    field)"""
+    """vertical speed of climbs and dives; 0 = depth is not used to evade"""
     vertical_weight: Positive = 1.5
     """free water above or below an obstacle counts this many times: the hull is slimmer upwards"""
     edge_gap_m: NonNegative = 0.26
@@ -169,8 +146,6 @@ class BaselinesConfig(Section):
     static_margin_m: NonNegative = 0.1
     """wanted clearance beyond contact from mapped obstacles and walls"""
     dwa: DynamicWindowConfig = DynamicWindowConfig()
-    potential_field: PotentialFieldConfig = PotentialFieldConfig()
-    velocity_obstacle: VelocityObstacleConfig = VelocityObstacleConfig()
     mppi: PathIntegralConfig = PathIntegralConfig()
 
     @property

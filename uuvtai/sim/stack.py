@@ -15,7 +15,7 @@ import torch
 
 from uuvtai.common import tree_codes as codes
 from uuvtai.config import Config, ObservationConfig, SensorsConfig
-from uuvtai.kernels.baselines import dwa, mppi, potential_field, velocity_obstacle
+from uuvtai.kernels.baselines import dwa, mppi
 from uuvtai.kernels.behavior import avoidance, threats, tree
 from uuvtai.kernels.oracle import true_state
 from uuvtai.kernels.perception import (
@@ -162,10 +162,6 @@ def _has_baseline(used: Collection[int]) -> bool:
 def _plan_by_baseline(stages: Stages, used: Collection[int]) -> None:
     if codes.DYNAMIC_WINDOW in used:
         dwa.plan_dynamic_window(stages.local_planner)
-    if codes.POTENTIAL_FIELD in used:
-        potential_field.plan_potential_field(stages.local_planner)
-    if codes.VELOCITY_OBSTACLE in used:
-        velocity_obstacle.plan_velocity_obstacle(stages.local_planner)
     if codes.PATH_INTEGRAL in used:
         mppi.plan_path_integral(stages.local_planner)
 

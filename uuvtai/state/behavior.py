@@ -129,7 +129,7 @@ class BaselineState:
     vel_w: ti.Field = array("n_env", vec=3)
     """[m/s] velocity of the newest decision, world"""
     score: ti.Field = array("n_env", "n_trial", scratch=True)
-    """how good (dynamic window) or how costly (the others) each trial of the newest decision is"""
+    """how good (dynamic window) or how costly (MPPI) each trial of the newest decision is"""
     plan_w: ti.Field = array("n_env", "n_control", vec=3)
     """[m/s] velocities that MPPI means to command from now on, one per decision, world"""
     change_w: ti.Field = array("n_env", "n_control", vec=3, scratch=True)

@@ -17,18 +17,11 @@ from uuvtai.config.planning import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.dwa import plan_dynamic_window
 from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.mppi import plan_path_integral
-from uuvtai.kernels.baselines.potential_field import plan_potential_field
-from uuvtai.kernels.baselines.velocity_obstacle import plan_velocity_obstacle
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.setup import array_sizes
 
-PLANNERS = {
-    "dwa": plan_dynamic_window,
-    "potential_field": plan_potential_field,
-    "velocity_obstacle": plan_velocity_obstacle,
-    "mppi": plan_path_integral,
-}
+PLANNERS = {"dwa": plan_dynamic_window, "mppi": plan_path_integral}
 HERE = np.array([8.0, 3.0, -0.8])
 OPEN_M = 1e6
 """Height of free water that nothing bounds."""
@@ -109,12 +102,11 @@ def test_free_water_is_driven_as_wanted(scene, name):
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_a_head_on_obstacle_is_given_way_to(scene, name):
-    """And passed, but by the potential field, which sees no velocities and is pushed back for longer."""
     start, vel = near(2.4, 0.05), np.array([-0.6, 0.0])
     places = drive(scene, name, lambda time: body(scene, 0, 0, start + vel * time, vel))
     obstacles = start + np.outer((np.arange(len(places)) + 1) * 0.1, vel)
     assert np.linalg.norm(places[:, :2] - obstacles, axis=1).min() > 0.2 + touch_m(scene)
-    assert name == "potential_field" or places[-1, 0] > max(obstacles[-1, 0], HERE[0]) + 0.5
+    assert places[-1, 0] > max(obstacles[-1, 0], HERE[0]) + 0.5
 
 
 @pytest.mark.parametrize("name", PLANNERS)
@@ -141,38 +133,6 @@ def test_no_velocity_leads_into_a_wall(scene, name):
     assert places[:, 0].min() > HERE[0] - 0.3, "nor fled"
 
 
-def test_a_velocity_obstacle_is_left(scene):
-    """Random obstacles: the velocity lies outside the cone of each, wherever the wanted one lies."""
-    rng = np.random.default_rng(4)
-    config = scene.config.baselines.velocity_obstacle
-    reach = 0.2 + touch_m(scene) + config.margin_m
-    inside = 0
-    for _ in range(6):
-        place, vel = np.zeros((scene.n, 2, 2)), np.zeros((scene.n, 2, 2))
-        for row in range(scene.n):
-            for track in range(2):
-                angle = rng.uniform(-1.0, 1.0) + track * np.pi
-                place[row, track] = 1.8 * np.array([np.cos(angle), np.sin(angle)])
-                vel[row, track] = -place[row, track] * rng.uniform(0, 0.3) + rng.uniform(-0.1, 0.1, 2)
-                body(scene, row, track, HERE[:2] + place[row, track], vel[row, track])
-        found = decide(scene, "velocity_obstacle")
-        for row in range(scene.n):
-            for track in range(2):
-                case = (
-                    place[row, track], vel[row, track], reach, config.horizon_s, scene.config.behavior.lag_s,
-                )  # fmt: skip
-                assert not in_cone(found[row], *case, slack=1e-3)
-                inside += in_cone(np.array([0.6, 0.0, 0.0]), *case, slack=0.0)
-    assert inside > 10, "the wanted velocity was often in a cone"
-
-
-def in_cone(velocity, place, vel, reach, horizon_s, lag, slack):
-    """Whether a velocity from rest meets an obstacle's grown outline within the horizon (sampled finely)."""
-    times = np.linspace(0, horizon_s, 600)[:, None]
-    begin = -velocity[:2] * lag
-    return np.linalg.norm(place + vel * times - begin - velocity[:2] * times, axis=1).min() < reach - slack
-
-
 def test_the_dynamic_window_is_what_can_be_reached(scene):
     """Whatever is around: within the acceleration's reach of the own velocity, and within the limits."""
     rng = np.random.default_rng(5)
@@ -186,23 +146,6 @@ def test_the_dynamic_window_is_what_can_be_reached(scene):
     assert (np.abs(found[:, :2] - own) <= reach + 1e-5).all()
     assert (np.abs(found[:, :2]) <= 0.6 + 1e-5).all()
     assert len(np.unique(found.round(3), axis=0)) > 2
-
-
-def test_the_potential_field_pushes_away_and_only_within_reach(scene):
-    config = scene.config.baselines.potential_field
-    scene.views["behavior.follow_vel_w"][:] = 0
-    reach = config.reach_m + 0.2 + touch_m(scene)
-    ways = np.array([[0.9, 0.0], [0.0, -0.9], [reach - 0.05, 0.0], [reach + 0.05, 0.0]])
-    for row, way in enumerate(ways):
-        body(scene, row, 0, HERE[:2] + way, [0.5, 0.5])
-    body(scene, 4, 0, near(0.2, 0.0), [0.0, 0.0], above=HERE[2] + 0.5, below=-OPEN_M)
-    found = decide(scene, "potential_field")
-    apart = 0.9 - 0.2 - touch_m(scene)
-    size = config.gain * (1 / apart - 1 / config.reach_m) / apart**2
-    np.testing.assert_allclose(found[0], [-min(size, 0.6), 0, 0], atol=1e-4)
-    np.testing.assert_allclose(found[1], [0, min(size, 0.6), 0], atol=1e-4)
-    assert -0.05 < found[2, 0] < 0 and (found[3] == 0).all()
-    assert found[4, 2] < -0.1 and abs(found[4, 0]) < 0.05, "away from what is above"
 
 
 def test_mppi_is_the_same_in_any_row_and_beside_any_others(scene):
@@ -277,7 +220,7 @@ def test_all_of_them_are_rows_of_an_evaluation(borrowed, capfd, tmp_path):
     agents = json.loads(out)["agents"]
     assert [m["name"] for m in agents] == names and not any(m["privileged"] for m in agents)
     times = [[d["time_s"] for d in m["episodes_detail"]] for m in agents]
-    assert len({tuple(t) for t in times}) == 4, "each drives in its own way"
+    assert len({tuple(t) for t in times}) == 2, "each drives in its own way"
     assert max(m["outcomes"]["success"] for m in agents) == 2
 
 

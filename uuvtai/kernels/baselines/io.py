@@ -12,11 +12,9 @@ from uuvtai.config import (
     EpisodeConfig,
     MappingConfig,
     PathIntegralConfig,
-    PotentialFieldConfig,
     TankConfig,
     TrackingConfig,
     VehicleConfig,
-    VelocityObstacleConfig,
 )
 from uuvtai.kernels.core.stage import Const, In, Out
 from uuvtai.state import (
@@ -48,10 +46,8 @@ class LocalPlannerIO:
     clearance_cfg: Const[ClearanceConfig]
     dwa_cfg: Const[DynamicWindowConfig]
     episode_cfg: Const[EpisodeConfig]
-    field_cfg: Const[PotentialFieldConfig]
     mapping_cfg: Const[MappingConfig]
     mppi_cfg: Const[PathIntegralConfig]
-    obstacle_cfg: Const[VelocityObstacleConfig]
     tank_cfg: Const[TankConfig]
     tracking_cfg: Const[TrackingConfig]
     vehicle_cfg: Const[VehicleConfig]

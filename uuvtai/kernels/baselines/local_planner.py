@@ -103,7 +103,7 @@ def depth_limits(tank_cfg, baselines_cfg):
 #
 # The window of Fox, Burgard and Thrun (1997) is in speed and turn rate, because their robot cannot move
 # sideways; this vehicle can, so that its window is in surge and sway (as that of Brock and Khatib 1999), and
-# its paths are straight. It is also the set of reachable velocities of Fiorini and Shiller (1998).
+# its paths are straight.
 
 
 @ti.func
