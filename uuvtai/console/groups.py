@@ -136,6 +136,14 @@ class AgentsOrTreeGroup(AgentsGroup):
 
 
 @dataclass(frozen=True)
+class OpponentsGroup(AgentsGroup):
+    """As ``AgentsOrTreeGroup``; they drive what a person has driven."""
+
+    agent: opt.Opponents = None
+    default = ("bt",)
+
+
+@dataclass(frozen=True)
 class AgentGroup:
     """Who drives one vehicle."""
 
@@ -418,7 +426,7 @@ class PlainOutputGroup(OutputGroup):
 
 
 _GROUPS = {
-    "Run": ("eval", "sweep", "watch"),
+    "Run": ("eval", "sweep", "watch", "drive"),
     "Learn": ("train", "export"),
     "Look": ("report", "log", "presets", "doctor", "examples"),
     "Paper": ("reproduce", "profile"),

@@ -208,6 +208,26 @@ def _compared(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def who_won(agents: Sequence[dict[str, Any]]) -> str:
+    """Who arrived most often, then soonest, of entries of ``uuv eval --json``, with what each did."""
+
+    def rank(m: dict[str, Any]) -> tuple[int, float]:
+        return -m["outcomes"]["success"], m["time_to_success_mean_s"] or 0.0
+
+    def told(m: dict[str, Any]) -> str:
+        if m["episodes"] == 1:
+            one = m["episodes_detail"][0]
+            return f"{m['name']}: {one['outcome'].replace('_', ' ')} after {one['time_s']:.1f} s"
+        mean_s = m["time_to_success_mean_s"]
+        after = "" if mean_s is None else f" after {mean_s:.1f} s on average"
+        return f"{m['name']}: {m['outcomes']['success']} of {m['episodes']} episodes{after}"
+
+    ranked = sorted(agents, key=rank)
+    best = [m["name"] for m in ranked if rank(m) == rank(ranked[0])]
+    won = f"{' and '.join(best)} won" if rank(ranked[0])[0] else "nobody reached the goal"
+    return f"{won} ({'; '.join(map(told, ranked))})"
+
+
 def _pairs(a: list[Episode], b: list[Episode]) -> list[tuple[Episode, Episode]]:
     """Entries of the same (seed, episode), in the order of ``a``."""
     of_b = {(e["seed"], e["episode"]): e for e in b}

@@ -133,7 +133,7 @@ MOST_CLIENTS = 8  # at once, whether they have sent a request already or not
 _REQUEST_S, _REQUEST_BYTES = 5.0, 16 << 10
 _SLOW_S = 10.0  # a client that takes nothing for as long is dropped [s]
 _BUFFER = 256 << 10  # [bytes] that the system keeps for each side of a client
-_OWN_NAMES = ("localhost", "127.0.0.1", "::1")
+OWN_NAMES = ("localhost", "127.0.0.1", "::1")
 _DESKTOP = "file://"  # origin of Foxglove's and Lichtblick's programs; no web page can name it
 
 
@@ -202,7 +202,7 @@ class Doorkeeper:
         ]
         if ("upgrade", "websocket") not in [(name, value.lower()) for name, value in named]:
             return "426 Upgrade Required"
-        own = {*_OWN_NAMES, self._host, address}
+        own = {*OWN_NAMES, self._host, address}
         known = all(self._is_known(value, own) for name, value in named if name == "origin")
         return "" if known else "403 Forbidden: that page may not connect; allow it with --origin"
 
@@ -274,6 +274,14 @@ class LiveError(UserError, RuntimeError):
     """Episodes cannot be shown live: what, where, why, what to type next."""
 
 
+def cannot_listen(scheme: str, host: str, port: int, error: Exception) -> LiveError:
+    """The error of an address that is taken, or not this machine's."""
+    return LiveError(
+        f"{scheme}://{host}:{port}: cannot listen there ({error}); another program may hold the port: "
+        f"--port {port + 1 if port < 65535 else 8765}"
+    )
+
+
 class ViewerServer(contextlib.AbstractContextManager["ViewerServer"]):
     """Sends messages to whoever has subscribed to their topic. Use as a context: it ends with it."""
 
@@ -308,10 +316,7 @@ class ViewerServer(contextlib.AbstractContextManager["ViewerServer"]):
                 self._server.stop()
                 raise
         except (RuntimeError, OSError, ValueError) as error:
-            raise LiveError(
-                f"ws://{host}:{port}: cannot listen there ({error}); another program may hold the port: "
-                f"--port {port + 1 if port < 65535 else 8765}"
-            ) from None
+            raise cannot_listen("ws", host, port, error) from None
         self.port: int = self._door.port
 
     def begin(self, schemas: Mapping[str, Schema]) -> None:
