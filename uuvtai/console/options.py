@@ -141,7 +141,7 @@ Origins = Annotated[
     _more(
         "--origin",
         metavar="URL",
-        help="Web page that may connect, https://app.foxglove.dev; or an address that leads to ours (repeatable).",
+        help="Web page that may connect, as https://app.foxglove.dev; or an address of ours (repeatable).",
     ),
 ]
 

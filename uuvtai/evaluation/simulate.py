@@ -22,14 +22,7 @@ from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError
 from uuvtai.evaluation.agents import AgentSpec, load_agents
 from uuvtai.evaluation.episodes import Job, Recorders, Stepper, run_episodes
-from uuvtai.evaluation.evaluate import (
-    Comparison,
-    EvaluationWatch,
-    Guest,
-    agents_of,
-    compare,
-    comparison_of,
-)
+from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, Guest, agents_of, compare, comparison_of
 from uuvtai.evaluation.results import ORACLE, Request, who_won
 from uuvtai.live.page import PageServer
 from uuvtai.live.server import Broadcast, RealTime, ViewerServer
@@ -316,9 +309,9 @@ class LiveOptions:
 
 
 def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) -> list[dict[str, Any]]:
-    """Run the request's episodes, ``live.tanks`` at once, by every agent in turn, and serve them; ``episodes``
-    0 = on and on, until it is interrupted. How each ended. Raises LiveError, ConfigError, CheckpointError,
-    PluginError."""
+    """Run the request's episodes, ``live.tanks`` at once, by every agent in turn, and serve them;
+    ``episodes`` 0 = on and on, until it is interrupted. How each ended. Raises LiveError, ConfigError,
+    CheckpointError, PluginError."""
     if ORACLE in request.agents:
         raise ConfigError("--agent oracle: it drives no vehicle; name who does, for example bt")
     agents = agents_of(request, watch)
@@ -376,7 +369,6 @@ def _watched(
     if isinstance(server, ViewerServer):
         shown = Broadcast(server, world, agent.name, request.depth_images, policy)
     else:
-        server.note("")
         shown = RunningEpisodes(server, world, agent.name, rate)
     acting = policy.agent if policy else None
     results, _ = run_episodes(sim, jobs, Recorders([shown, clock]), agent=acting)
@@ -405,7 +397,8 @@ class _Hand(LoadedPlugin):
 
     def agent(self, sim: Sim) -> PluginAgent:
         """Drives all rows by the newest command."""
-        code = OwnCode(self.spec, self.found, None, "", Marks(), CallMeter(PERSON, Path(), math.inf, self.note))
+        meter = CallMeter(PERSON, Path(), math.inf, self.note)
+        code = OwnCode(self.spec, self.found.command, None, "", Marks(), meter)
         return PluginAgent(sim, code, lambda rows, obs: torch.tensor([self.found.command()] * len(rows)))
 
     def saw_truth(self) -> bool:

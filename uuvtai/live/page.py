@@ -1,5 +1,5 @@
-"""The server of the page with running episodes: the page over HTTP, and over its WebSocket whatever it is told
-to show; who may look, and who steers. It has a thread of its own: no client holds up the episodes."""
+"""The server of the page with running episodes: the page over HTTP, and over its WebSocket whatever it is
+told to show; who may look, and who steers. It has a thread of its own: no client holds up the episodes."""
 
 from __future__ import annotations
 
@@ -65,9 +65,10 @@ class PageServer(contextlib.AbstractContextManager["PageServer"]):
         stale_s: float = STALE_S,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``port`` 0: a free one, see ``url``; ``origins``: addresses by which it is reached too; ``steered``: a
-        vehicle waits for who has the helm, and the truth is hidden. Raises LiveError."""
-        self._page, self._origins, self.steered, self._stale_s, self._now = page, origins, steered, stale_s, now
+        """``port`` 0: a free one, see ``url``; ``origins``: addresses by which it is reached too;
+        ``steered``: a vehicle waits for who has the helm, and the truth is hidden. Raises LiveError."""
+        self._page, self._origins, self.steered = page, origins, steered
+        self._stale_s, self._now = stale_s, now
         self._changed = threading.Condition()
         self._clients: list[_Client] = []
         self._asked: list[tuple[Any, int]] = []
@@ -85,7 +86,7 @@ class PageServer(contextlib.AbstractContextManager["PageServer"]):
             raise cannot_listen("http", host, port, error) from None
         self.url = f"http://{self._at('127.0.0.1' if host in ('0.0.0.0', '::') else host)}"
 
-    # ------------------------------------------------------------------------------- for who runs the episodes
+    # ------------------------------------------------------------------------------ for who runs the episodes
 
     def asked(self) -> list[tuple[Any, int]]:
         """As of ``report.running.Audience``."""
@@ -134,7 +135,7 @@ class PageServer(contextlib.AbstractContextManager["PageServer"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # ------------------------------------------------------------------------------------- in the server's thread
+    # --------------------------------------------------------------------------------- in the server's thread
 
     async def _opened(self, host: str, port: int) -> Any:
         from websockets.asyncio.server import serve
@@ -256,7 +257,7 @@ class PageServer(contextlib.AbstractContextManager["PageServer"]):
                 return False
         return True
 
-    # ---------------------------------------------------------------------------------- where the lock is held
+    # --------------------------------------------------------------------------------- where the lock is held
 
     def _helm(self) -> _Client | None:
         return next((client for client in self._clients if client.is_local), None)
@@ -293,7 +294,7 @@ class PageServer(contextlib.AbstractContextManager["PageServer"]):
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(client.socket.transport.abort if slow else client.wake.set)
 
-    # ------------------------------------------------------------------------------------------------- the thread
+    # --------------------------------------------------------------------------------------------- the thread
 
     def _done(self, work: Coroutine[Any, Any, Any]) -> Any:
         """What the server's thread makes of it."""

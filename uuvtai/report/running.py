@@ -49,6 +49,9 @@ class Audience(Protocol):
     def tell(self, message: str, tank: int | None = None, to: Any = None) -> None:
         """A message for all, for those who follow a tank, or for one."""
 
+    def note(self, text: str) -> None:
+        """Say it in place of what was said before."""
+
     def is_held(self, at_start: bool = False) -> bool:
         """Whether the episode has to wait, of which a moment has been waited."""
         ...
@@ -109,13 +112,14 @@ class RunningEpisodes:
         scene, moving = scene_header(scenario)
         colour = agent_colours([self._agent])[self._agent]
         head = {
-            "kind": "begin", "tank": row, "title": f"seed {job.seed}, episode {job.episode}", "scene": scene,
+            "kind": "begin", "tank": row, "key": f"{self._agent} {job.seed} {job.episode}", "title": f"seed {job.seed}, episode {job.episode}", "scene": scene,
             "agent": self._agent, "colour": [colour, PALETTE.index(colour) if colour in PALETTE else -1],
-            "leaves": numbered(sim.tree.names), "grid": _grid(sim),
+            "leaves": numbered(sim.tree.names), "grid": _grid(sim), "of": len(sim.rows(sim.s.clock.step)),
         }  # fmt: skip
         tank = self._tanks[row] = _Tank(head, [one["slot"] for one in moving])
         tank.moments += self._moments(sim, [row])
-        self._audience.tell(self._whole(tank))
+        self._audience.note("")
+        self._audience.tell(self._whole(tank, self._audience.with_truth))
         self._wait(sim, at_start=True)
 
     def step(self, sim: Recordable) -> None:
@@ -134,6 +138,8 @@ class RunningEpisodes:
         end = {"outcome": said, "failed": result.outcome != "success", "time": result.time_s}
         self._tanks[row].end = end
         self._audience.tell(_dumped({"kind": "end", "tank": row, "end": end}))
+        if not self._audience.with_truth:  # now it does no harm
+            self._audience.tell(self._whole(self._tanks[row], with_truth=True))
 
     def _is_due(self, dt_s: float) -> bool:
         """Whether a frame's time has come: by the episode's time, which the clock follows by the rate, so
@@ -172,16 +178,16 @@ class RunningEpisodes:
                     if (tank := self._tanks.get(found)) is None:
                         continue
                     if row < 0:
-                        self._audience.tell(self._whole(tank), to=who)
+                        self._audience.tell(self._whole(tank, self._audience.with_truth), to=who)
                     else:
                         self._audience.tell(_detail(sim, row, tank.moments[-1].time_s, True), to=who)
             if not self._audience.is_held(at_start):
                 return
             at_start = False
 
-    def _whole(self, tank: _Tank) -> str:
+    def _whole(self, tank: _Tank, with_truth: bool) -> str:
         """All of an episode up to now."""
-        head, with_truth = dict(tank.head), self._audience.with_truth
+        head = dict(tank.head)
         if not with_truth:
             head["scene"] = head["scene"] | {"obstacles": []}
         rows = [moment.row(with_truth) for moment in tank.moments]
@@ -261,7 +267,9 @@ def _detail(sim: Recordable, row: int, time_s: float, with_map: bool) -> str:
     if with_map:
         layers = [occupancy(read(f"grid_map.{name}_occ")) / SHARE for name in ("static", "dynamic")]
         layers.append(clearance_m(read("clearance.site"), sim.config) / _CLEAR_M)
-        packed = [base64.b64encode(np.clip(np.rint(one), 0, 255).astype(np.uint8).tobytes()) for one in layers]
+        packed = [
+            base64.b64encode(np.clip(np.rint(one), 0, 255).astype(np.uint8).tobytes()) for one in layers
+        ]
         message["map"] = [one.decode() for one in packed]
     return _dumped(message)
 
