@@ -112,7 +112,7 @@ class RunningEpisodes:
         scene, moving = scene_header(scenario)
         colour = agent_colours([self._agent])[self._agent]
         head = {
-            "kind": "begin", "tank": row, "key": f"{self._agent} {job.seed} {job.episode}", "title": f"seed {job.seed}, episode {job.episode}", "scene": scene,
+            "kind": "begin", "tank": row, "title": f"seed {job.seed}, episode {job.episode}", "scene": scene,
             "agent": self._agent, "colour": [colour, PALETTE.index(colour) if colour in PALETTE else -1],
             "leaves": numbered(sim.tree.names), "grid": _grid(sim), "of": len(sim.rows(sim.s.clock.step)),
         }  # fmt: skip

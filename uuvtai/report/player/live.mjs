@@ -31,8 +31,7 @@ export class Live extends Player {
     this.socket = this.connect();
     this.socket.onmessage = ({ data }) => this.told(JSON.parse(data));
     this.socket.onopen = () => {
-      this.tries = 0;
-      this.joined = false;
+      Object.assign(this, { tries: 0, tanks: [] }); // the server tells all of them
       if (this.tank >= 0) this.send({ follow: this.tank });
     };
     this.socket.onclose = () => {

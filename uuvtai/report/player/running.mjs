@@ -7,8 +7,9 @@ const STALE_S = 0.4; // what was sensed longer ago is not shown
 export class Running {
   /** `told`: the message that an episode begins with, or all of it up to now, then perhaps after `before`. */
   constructor(told, before) {
-    const { details, maps } = before?.key === told.key ? before : { details: [], maps: [] };
-    Object.assign(this, { key: told.key, title: told.title, scene: told.scene, grid: told.grid, spots: [], details, maps });
+    const goesOn = before?.title === told.title && before.agents[0].name === told.agent;
+    const { details, maps } = goesOn ? before : { details: [], maps: [] };
+    Object.assign(this, { title: told.title, scene: told.scene, grid: told.grid, spots: [], details, maps });
     const about = { outcome: "", failed: false, cause: "", meaning: "", slot: -1, end: Infinity, leftOut: [] };
     this.agents = [{ name: told.agent, colour: told.colour, ...about }];
     this.past = { time: [], pose: [], clearance: [], ttc: [], speed: [], leaf: [], leaves: told.leaves, replans: [] };
