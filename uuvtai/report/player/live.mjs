@@ -92,6 +92,7 @@ export class Live extends Player {
     this.send({ follow: tank });
     this.root.classList.toggle("walled", tank < 0);
     if (tank >= 0) this.buttons();
+    this.root.focus({ preventScroll: true }); // the tank that was clicked is gone
     this.tellRole();
     this.soon();
   }
