@@ -201,13 +201,13 @@ class RunningEpisodes:
         )
         found = []
         for row, *read in zip(rows, *(_read(sim, name, rows) for name in names), strict=True):
-            step, place, quat, velocity, own, rpy, own_velocity, clearance, ttc_s, leaf, bodies = read
+            step, place, quat, velocity, own, rpy, own_velocity, clearance, ttc_s, leaf, obstacles = read
             w, x, y, z = map(float, quat)
             yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
             poses = _rounded([*place, yaw], 3), _rounded([*own, rpy[2]], 3)
             speeds = [round(float(np.linalg.norm(each)), 2) for each in (velocity, own_velocity)]
             ttc_s = -1.0 if ttc_s > _FAR_S else round(float(ttc_s), 2)
-            places = _rounded(bodies[self._tanks[row].moving, :2].ravel(), 2)
+            places = _rounded(obstacles[self._tanks[row].moving, :2].ravel(), 2)
             found.append(
                 _Moment(
                     round(int(step) * dt_s, 4), poses, (speeds[0], speeds[1]), round(float(clearance), 3),
