@@ -162,12 +162,12 @@ def watch_live(
 @app.command("drive", epilog="Example: uuv drive --world maze --agent bt,best --open")
 @groups.grouped
 def drive_vehicle(
-    agents: groups.OpponentsGroup,
+    agents: groups.AgentsOrTreeGroup,
     scene: groups.SceneGroup,
     output: groups.OutputGroup,
     episodes: opt.EvalEpisodes = 1,
     seeds: opt.Seeds = "0",
-    rate: opt.DriveRate = 1.0,
+    rate: opt.Rate = 1.0,
     port: opt.Port = 8765,
     opens: opt.Opens = False,
     run_dir: opt.RunDir = None,

@@ -136,14 +136,6 @@ class AgentsOrTreeGroup(AgentsGroup):
 
 
 @dataclass(frozen=True)
-class OpponentsGroup(AgentsGroup):
-    """As ``AgentsOrTreeGroup``; they drive what a person has driven."""
-
-    agent: opt.Opponents = None
-    default = ("bt",)
-
-
-@dataclass(frozen=True)
 class AgentGroup:
     """Who drives one vehicle."""
 

@@ -128,10 +128,6 @@ SweepResume = Annotated[Path | None, _run("Continue an interrupted sweep.")]
 Tanks = Annotated[int, Option("--tanks", help="Episodes at once, side by side: 1 to 16.")]
 Opens = Annotated[bool, Option("--open", help="Open the page in the browser.")]
 Foxglove = Annotated[bool, Option("--foxglove", help="Serve Foxglove and Lichtblick in place of a page.")]
-Opponents = Annotated[
-    list[str] | None, _agents(f"Who drives the same episodes afterwards: {_KINDS} \\[default: bt].")
-]
-DriveRate = Annotated[float, Option("--rate", help="Episode seconds per second; 0.5 = half the speed.")]
 WatchEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed; 0 = until Ctrl-C.")]
 Rate = Annotated[float, Option("--rate", help="Episode seconds per second; 0 = as fast as possible.")]
 Host = Annotated[str, _more("--host", help="Address to serve at; 0.0.0.0 = to the whole network.")]

@@ -317,8 +317,7 @@ def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) 
     agents = agents_of(request, watch)
     if live.foxglove:
         server = ViewerServer(live.host, live.port, live.origins)
-        shown = "localhost" if live.host in ("127.0.0.1", "0.0.0.0", "::") else live.host
-        watch.note(f"serving ws://{shown}:{server.port}; in Foxglove or Lichtblick: open a connection,")
+        watch.note(f"serving {server.url}; in Foxglove or Lichtblick: open a connection,")
         watch.note(f"Foxglove WebSocket, to that address, and import the layout {LAYOUT}")
     else:
         server = _page_of(request, [agent.name for agent in agents], live, watch)
