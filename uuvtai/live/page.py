@@ -137,10 +137,9 @@ class PageServer(LiveServer):
         if what == "follow" and type(value) is int and -1 <= value < MOST_TANKS:
             client.tank = value
             self._asked += [(client, value)] if value >= 0 else []
-        elif what == "steer" and self.steered and _is_command(value):
+        elif what == "steer" and self.steered and (command := _command(value)) is not None:
             if may:
-                self._driver = client
-                self._steer(tuple(min(max(float(part), -1.0), 1.0) for part in value))
+                self._steer(client, command)
         elif what == "pause" and type(value) is bool:
             if may:
                 self._hold("pause" if value else "")
@@ -156,8 +155,8 @@ class PageServer(LiveServer):
     def _helm(self) -> Client | None:
         return next((client for client in self._clients if client.is_local), None)
 
-    def _steer(self, command: Command) -> None:
-        self._command, self._heard_s = command, self._now()
+    def _steer(self, client: Client, command: Command) -> None:
+        self._driver, self._command, self._heard_s = client, command, self._now()
         if self._held == "start" and command != STOP:
             self._hold("")
 
@@ -182,7 +181,9 @@ class PageServer(LiveServer):
             self.put(client, json.dumps(role))
 
 
-def _is_command(value: Any) -> bool:
-    """Whether it is four numbers (``parsed_json`` gives finite ones)."""
+def _command(value: Any) -> Command | None:
+    """Four numbers (``parsed_json`` gives finite ones), cut off at -1 and 1; None for anything else."""
     is_list = isinstance(value, list) and len(value) == len(STOP)
-    return is_list and all(type(part) in (int, float) for part in value)
+    if not is_list or not all(type(part) in (int, float) for part in value):
+        return None
+    return tuple(min(max(float(part), -1.0), 1.0) for part in value)

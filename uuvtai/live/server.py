@@ -265,7 +265,9 @@ class LiveServer(contextlib.AbstractContextManager["LiveServer"]):
                 await client.wake.wait()
                 client.wake.clear()
                 while client.waiting:
-                    await client.socket.send(client.waiting.popleft())
+                    with self._lock:
+                        message = client.waiting.popleft()
+                    await client.socket.send(message)
 
     def _done(self, work: Coroutine[Any, Any, Any]) -> Any:
         """What the server's thread makes of it."""
