@@ -19,12 +19,17 @@ def look(*pages):
     return {(one["page"], one["width"], one["scheme"]): one for one in told("look.mjs", *pages)["seen"]}
 
 
-def told(script, *arguments):
-    """What a script says of pages in a browser. Skips where there is none."""
+def require():
+    """Skips where there is no browser."""
     if not (JS / "node_modules/@sparticuz").is_dir():
         pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
     if (platform.system(), platform.machine()) != ("Linux", "x86_64") and "CHROME_PATH" not in os.environ:
         pytest.skip("the packed Chromium is for Linux on x86_64: set CHROME_PATH to another one")
+
+
+def told(script, *arguments):
+    """What a script says of pages in a browser. Skips where there is none."""
+    require()
     with tempfile.TemporaryDirectory() as unpacked:
         done = node(script, *map(str, arguments), TMPDIR=unpacked)
     if done.returncode == 3:
@@ -40,7 +45,7 @@ def node(*arguments, **environment):
         pytest.skip("needs node (bootstrap.py brings one)")
     return subprocess.run(
         [found, *arguments], cwd=JS, env={**os.environ, **environment}, capture_output=True, text=True,
-        check=False, timeout=120,
+        check=False, timeout=240,
     )  # fmt: skip
 
 

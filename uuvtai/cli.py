@@ -149,7 +149,7 @@ def sweep(
     _report_if(with_report, folder, "uuv report")
 
 
-@app.command("watch", epilog="Example: uuv watch --world gauntlet --agent bt,dwa --episodes 4")
+@app.command("watch", epilog="Example: uuv watch --world gauntlet -D 9 --tanks 16 --open")
 @groups.grouped
 def watch_live(
     agents: groups.AgentsOrTreeGroup,
@@ -161,12 +161,18 @@ def watch_live(
     host: opt.Host = "127.0.0.1",
     port: opt.Port = 8765,
     origin: opt.Origins = None,
+    tanks: opt.Tanks = 1,
+    opens: opt.Opens = False,
+    foxglove: opt.Foxglove = False,
     depth_images: opt.DepthImages = False,
     device: opt.Device = "auto",
 ) -> None:
-    """Show episodes live in Foxglove or Lichtblick."""
+    """Show episodes live in the browser, or in Foxglove."""
     seed_list = parsing.seeds("--seeds", seeds)
-    parsing.refuse_odd_live(episodes, rate, port)
+    parsing.refuse_less("--episodes", episodes, 0)
+    parsing.refuse_odd_live(rate, port, tanks, foxglove)
+    if (opens and foxglove) or (depth_images and not foxglove):
+        raise UsageError("--open: is of the page; --depth-images: is of --foxglove")
     from uuvtai.console.views import show_watched
     from uuvtai.evaluation.results import Request
     from uuvtai.evaluation.simulate import LiveOptions, watch_episodes
@@ -174,8 +180,43 @@ def watch_live(
     request = Request.typed(
         scene, agents.named(), seeds=seed_list, episodes=episodes, depth_images=depth_images, device=device
     )
-    result = watch_episodes(request, LiveOptions(host, port, rate, origin or ()), Progress())
+    live = LiveOptions(host, port, rate, origin or (), tanks, foxglove, opens)
+    result = watch_episodes(request, live, Progress())
     output.show(result, lambda screen: show_watched(screen, result))
+
+
+@app.command("drive", epilog="Example: uuv drive --world maze --agent bt,best --open")
+@groups.grouped
+def drive_vehicle(
+    agents: groups.AgentsOrTreeGroup,
+    scene: groups.SceneGroup,
+    output: groups.OutputGroup,
+    episodes: opt.EvalEpisodes = 1,
+    seeds: opt.Seeds = "0",
+    rate: opt.Rate = 1.0,
+    port: opt.Port = 8765,
+    opens: opt.Opens = False,
+    run_dir: opt.RunDir = None,
+) -> None:
+    """Steer a vehicle in the browser; bt drives the same episode.
+
+    By keys or a gamepad, and by what the vehicle senses. Log and report are those of 'uuv eval'."""
+    seed_list = parsing.seeds("--seeds", seeds)
+    parsing.refuse_less("--episodes", episodes, 1)
+    parsing.refuse_odd_live(rate, port)
+    if not rate:
+        raise UsageError("--rate 0: a person needs a pace, for example --rate 0.5")
+    from uuvtai.console.views import show_evaluation
+    from uuvtai.evaluation.results import Request
+    from uuvtai.evaluation.simulate import LiveOptions, drive_by_hand
+
+    request = Request.typed(
+        scene, agents.named(), seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
+    )
+    live = LiveOptions(port=port, rate=rate, opens=opens)
+    result, folder, page = drive_by_hand(request, live, Progress())
+    output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
+    say(f"report: {page}")
 
 
 # ----------------------------------------------------------------------------------------------------- Learn

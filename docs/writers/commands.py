@@ -18,6 +18,7 @@ SEE = {
     "train": ("quickstart", "learning"),
     "simulate": ("simulator", "extend"),
     "watch": ("logs",),
+    "drive": ("logs", "evaluate"),
     "identify": ("on_a_vehicle",),
     "sweep": ("evaluate",),
     "reproduce": ("evaluate", "results"),

@@ -512,7 +512,11 @@ def compared(monkeypatch, tmp_path):
 def test_the_demo_tells_who_won_where_the_report_is_and_what_comes_next(capfd, compared):
     asked, opened, folder = compared
     code, out, err = uuv(capfd, "demo", "--open", "--episodes", "8")
-    assert code == 0 and out.splitlines()[-1] == "bt reached the goal in 6 of 8 episodes, planner in 3."
+    assert (
+        code == 0
+        and out.splitlines()[-1]
+        == "bt reached the goal in 6 of 8 episodes (12.0 s on average), planner in 3 (10.5 s)."
+    )
     assert err.splitlines()[-4:] == [
         f"run folder: {folder}",
         f"report: {folder / 'report.html'}",
@@ -529,7 +533,10 @@ def test_the_demo_tells_who_won_where_the_report_is_and_what_comes_next(capfd, c
 def test_an_evaluation_leads_on_to_its_report(capfd, compared):
     _asked, opened, folder = compared
     _, out, err = uuv(capfd, "eval")
-    assert out.splitlines()[-1] == "bt reached the goal in 6 of 8 episodes, planner in 3."
+    assert (
+        out.splitlines()[-1]
+        == "bt reached the goal in 6 of 8 episodes (12.0 s on average), planner in 3 (10.5 s)."
+    )
     assert err.splitlines()[-2:] == [f"run folder: {folder}", f"next: uuv report '{folder}'"]
     _, _, err = uuv(capfd, "eval", "--report")
     assert err.splitlines()[-1] == f"report: {folder / 'report.html'}" and not opened

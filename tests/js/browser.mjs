@@ -22,16 +22,17 @@ async function launch() {
   return chromium.launch({ executablePath, args: ["--no-sandbox", "--disable-gpu"] });
 }
 
-/** A page from disk without a network, and what goes wrong or leaves it. */
+/** A page from disk without a network, or one of a server here; and what goes wrong or leaves it. */
 export async function opened(browser, page, width, colorScheme) {
-  const context = await browser.newContext({ viewport: { width, height: 900 }, colorScheme, offline: true });
+  const served = page.startsWith("http://127.0.0.1:");
+  const context = await browser.newContext({ viewport: { width, height: 900 }, colorScheme, offline: !served });
   const tab = await context.newPage();
   const errors = [];
   const requests = [];
   tab.on("console", (message) => ["error", "warning"].includes(message.type()) && errors.push(message.text()));
   tab.on("pageerror", (error) => errors.push(String(error)));
   tab.on("request", (request) => request.url().startsWith("data:") || requests.push(request.url()));
-  const address = pathToFileURL(page).href;
+  const address = served ? `${page}/` : pathToFileURL(page).href;
   await tab.goto(address, { waitUntil: "load" });
   requests.splice(requests.indexOf(address), 1);
   return { context, tab, errors, requests };

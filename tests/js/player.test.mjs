@@ -9,6 +9,8 @@ const { View, ellipse, gap, halfWidth, hullOutline, obstacleOutline, tankOutline
 const { moment, most, place } = await import(new URL("strip.mjs", player));
 const { command, ending } = await import(new URL("player.mjs", player));
 const { recorded } = await import(new URL("source.mjs", player));
+const { Running } = await import(new URL("running.mjs", player));
+const { Steering, said } = await import(new URL("steer.mjs", player));
 
 /** A blob of arrays: name -> [step, columns, whole numbers row by row], in four bytes each. */
 function packed(header, arrays) {
@@ -97,6 +99,41 @@ test("how an episode ended, in words", () => {
   const agent = { name: "bt", outcome: "collision", end: 7.24, cause: "late detection", meaning: "seen too late" };
   assert.equal(ending(agent), "bt: collision after 7.2 s. Late detection: seen too late");
   assert.equal(ending({ ...agent, cause: "", meaning: "" }), "bt: collision after 7.2 s");
+  assert.equal(ending({ ...agent, end: Infinity }), "bt: under way");
+});
+
+test("a running episode", () => {
+  const obstacles = [{ at: [9, 8, 0], moves: false }, { at: [0, 0, 0], moves: true }];
+  const rows = [[0, 1, 2, -1, 0, 2, -1, 0, 0, [3, 4]], [0.05, 1.5, 2, -1, 0.1, null, null, 0.5, 1, [5, 6]]];
+  const told = { agent: "bt", title: "seed 0, episode 1", colour: ["#0072b2", 0], leaves: ["Follow", "Evade"], scene: { obstacles }, grid: { rows: 1, columns: 2 }, rows, replans: [[0, "initial"]], end: null };
+  const source = new Running(told);
+  assert.deepEqual([source.end, source.agents[0].end, ...source.places(0), ...source.places(1)], [0.05, Infinity, 9, 8, 3, 4, 9, 8, 5, 6]);
+  const [first, second] = [0, 0.05].map((time) => source.frame(0, time));
+  assert.deepEqual([first.pose, first.clearance, first.ttc, first.leaf, first.map], [[1, 2, -1, 0], 2, null, "Follow", null]);
+  assert.deepEqual([second.step, second.clearance, second.ttc, second.speed, second.leaf], [1, null, null, 0.5, "Evade"]);
+  source.detail({ time: 0.05, route: [[0, 0]], ahead: [1, 1], echoes: [[2, 2]], tracks: [[1, 2, 3, 4, 0.5, 0.1, 0, 0.2]], futures: [[0.7, [[1, 1]]]], map: ["AR8=", "AAA=", "/wA="] });
+  source.add([2, 3, 2, -1, 0, 1, 4, 0.5, 0, [5, 6]]);
+  const [seen, later] = [0.1, 2].map((time) => source.frame(0, time));
+  assert.deepEqual([seen.tracks[0].cov, seen.futures[0].weight, [...seen.map.layers.static.cells]], [[0.1, 0, 0.2], 0.7, [1, 31]]);
+  assert.deepEqual([later.echoes, later.ttc, [...later.map.layers.clearance.cells]], [[], 4, [255, 0]]);
+  source.finish({ outcome: "collision", failed: true, time: 2 });
+  assert.deepEqual([source.agents[0].end, source.agents[0].failed], [2, true]);
+  assert.deepEqual([new Running(told, source).maps.length, new Running({ ...told, title: "seed 0, episode 2" }, source).maps.length], [1, 0]);
+});
+
+test("steering by keys and gamepad", () => {
+  const steering = new Steering();
+  const [none, plain] = [[], { shiftKey: false }];
+  for (const code of ["KeyW", "KeyA", "PageDown", "ArrowLeft"]) assert.ok(steering.key({ ...plain, code }, true));
+  assert.deepEqual(steering.command(none), [1, 1, -1, 1]);
+  steering.key({ code: "KeyA", shiftKey: true }, false);
+  assert.deepEqual(steering.command(none).map((value) => Math.round(10 * value)), [3, 0, -3, 3]);
+  assert.equal(said(steering.command(none)), "ahead 33 %, down 33 %, turn left 33 %");
+  assert.ok(steering.key({ ...plain, code: "Space" }, true) && !steering.key({ ...plain, code: "KeyX" }, true) && !steering.key({ ...plain, code: "KeyW", ctrlKey: true }, true));
+  assert.deepEqual([steering.command(none), said([0, 0, 0, 0])], [[0, 0, 0, 0], "stop"]);
+  const pad = { connected: true, axes: [0.1, -1, 1, 0.56], buttons: [{ pressed: false }] };
+  assert.deepEqual(steering.command([null, pad]).map((value) => Math.round(100 * value)), [100, 0, -50, -100]);
+  assert.deepEqual(steering.command([{ ...pad, buttons: [{ pressed: true }] }]), [0, 0, 0, 0]);
 });
 
 test("agents of an episode in step", async () => {

@@ -233,7 +233,7 @@ def test_only_a_new_or_empty_folder_is_written(tmp_path, capfd):
     assert [path.name for path in full.iterdir()] == ["mine.txt"]
     for more in (["--force"], ["--out", "x.html"]):
         code, _out, err = uuv(capfd, "report", run, "--paper", tmp_path / "kit", *more)
-        assert code == 2 and "leave out --out and --force" in " ".join(err.split())
+        assert code == 2 and "leave out --out, --open and --force" in " ".join(err.split())
     assert not (tmp_path / "kit").exists()
 
 

@@ -191,9 +191,10 @@ def test_the_one_script_is_the_packages_and_allowed_by_its_digest(page):
     assert f"script-src &#39;sha256-{digest}&#39;" in html or f"script-src 'sha256-{digest}'" in html
     modules = [m.read_text() for m in (files("uuvtai") / "report" / "player").iterdir()]
     assert sum(map(len, modules)) < 150_000
+    asks = r"\bfetch\b|XMLHttpRequest|innerHTML|\beval\b|https?:"
+    assert not re.search(asks + "|WebSocket", scripts[-1][1]), "a report asks nobody for anything"
     for module in modules:
-        assert "</script" not in module and "<!--" not in module
-        assert not re.search(r"\bfetch\b|XMLHttpRequest|WebSocket|innerHTML|\beval\b|https?:", module)
+        assert "</script" not in module and "<!--" not in module and not re.search(asks, module)
 
 
 def test_the_report_begins_with_what_it_says(page):
@@ -201,8 +202,8 @@ def test_the_report_begins_with_what_it_says(page):
     places = [
         html.index(words)
         for words in (
-            "bt reached the goal in 6 of 8 episodes, straight in 3.", "World pool", 'class="player"',
-            "Agents. Collision counts", "Planning",
+            "bt reached the goal in 6 of 8 episodes (12.0 s on average), straight in 3 (10.5 s).",
+            "World pool", 'class="player"', "Agents. Collision counts", "Planning",
         )
     ]  # fmt: skip
     assert places == sorted(places)

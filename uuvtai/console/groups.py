@@ -418,7 +418,7 @@ class PlainOutputGroup(OutputGroup):
 
 
 _GROUPS = {
-    "Run": ("demo", "eval", "sweep", "watch"),
+    "Run": ("demo", "eval", "sweep", "watch", "drive"),
     "Learn": ("train", "export"),
     "Look": ("report", "log", "presets", "doctor", "examples"),
     "Paper": ("reproduce", "profile"),

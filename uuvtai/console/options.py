@@ -130,6 +130,9 @@ EngineName = Annotated[
 Workers = Annotated[int, Option("--workers", help="Processes of the local engine.")]
 Address = Annotated[str, _more("--address", help="Ray cluster: host:port, auto, or local (this process).")]
 SweepResume = Annotated[Path | None, _run("Continue an interrupted sweep.")]
+Tanks = Annotated[int, Option("--tanks", help="Episodes at once, side by side: 1 to 16.")]
+Opens = Annotated[bool, Option("--open", help="Open the page in the browser.")]
+Foxglove = Annotated[bool, Option("--foxglove", help="Serve Foxglove and Lichtblick in place of a page.")]
 WatchEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed; 0 = until Ctrl-C.")]
 Rate = Annotated[float, Option("--rate", help="Episode seconds per second; 0 = as fast as possible.")]
 Host = Annotated[str, _more("--host", help="Address to serve at; 0.0.0.0 = to the whole network.")]
@@ -139,7 +142,7 @@ Origins = Annotated[
     _more(
         "--origin",
         metavar="URL",
-        help="Web page that may connect, for example https://app.foxglove.dev (repeatable).",
+        help="Web page that may connect, as https://app.foxglove.dev; or an address of ours (repeatable).",
     ),
 ]
 

@@ -95,6 +95,8 @@ def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
 def _privilege(name: str) -> str:
     if name == "oracle":
         return "it knows the future and has no inertia; timeout = not reachable. An upper bound, no agent"
+    if name == "human":
+        return "the page showed what no vehicle senses"
     return "it is told where every moving obstacle is and how it moves; what stands still it senses"
 
 

@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -24,6 +24,7 @@ from uuvtai.config.loader import ConfigError
 from uuvtai.evaluation import failure_causes
 from uuvtai.evaluation.agents import TRUTH, AgentSpec, differences, load_agents
 from uuvtai.evaluation.episodes import (
+    EpisodeObserver,
     EpisodeResult,
     Job,
     Progress,
@@ -63,8 +64,11 @@ _BATCH = 256
 little."""
 
 
-def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
-    """Run every agent's episodes; the ``uuv eval --json`` document and the run folder.
+def compare(
+    request: Request, watch: EvaluationWatch, guest: Guest | None = None
+) -> tuple[dict[str, Any], Path]:
+    """Run every agent's episodes, a ``guest``'s before them; the ``uuv eval --json`` document and the run
+    folder.
 
     Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError,
     MemoryError, RunFolderError, CheckpointError.
@@ -80,8 +84,11 @@ def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], P
         )
     refuse_place(request.run_dir)
     agents = agents_of(request, watch)
+    if guest and guest.agent.name in [agent.name for agent in agents]:
+        raise ConfigError(f"--agent {guest.agent.name}: somebody else has that name; rename the file")
+    agents = [guest.agent, *agents] if guest else agents
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
-    comparison = comparison_of(request, num_envs, agents, watch)
+    comparison = replace(comparison_of(request, num_envs, agents, watch), guest=guest)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     with _going_on(folder, watch):
         device = comparison.any_simulator().device.type
@@ -270,6 +277,14 @@ class EvaluationWatch(Protocol):
 
 
 @dataclass(frozen=True)
+class Guest:
+    """An agent that no name stands for, and who looks on while it drives."""
+
+    agent: AgentSpec
+    observer: EpisodeObserver
+
+
+@dataclass(frozen=True)
 class Comparison:
     """What is compared, and on what."""
 
@@ -282,6 +297,7 @@ class Comparison:
     planners: dict[str, RoutePlanner | None]
     """by agent: who plans routes in place of the simulator's planners; None = they do"""
     watch: EvaluationWatch
+    guest: Guest | None = None
 
     def any_simulator(self) -> Sim:
         """For what is the same in all of them."""
@@ -324,11 +340,13 @@ def run_agent(
     before = len(jobs) - len(left)
     watch.start(agent.name, len(jobs))
     writer, clock = JournalWriter(journal, agent.name), StepClock()
+    guest = comparison.guest
+    looker = guest.observer if guest and guest.agent is agent else None
     try:
         run_episodes(
             sim,
             left,
-            Recorders([recorder, writer]),
+            Recorders([recorder, writer, looker]),
             lambda done, _total, env_steps, to_come: watch.update(
                 before + done, len(jobs), env_steps, to_come
             ),
@@ -346,7 +364,8 @@ def run_agent(
     results = [over[job].result for job in jobs]
     env_steps, wall_s = sum(round(r.time_s / dt) for r in results), writer.wall_s if left else writer.before_s
     entry = summary(agent.name, results, env_steps, wall_s, clock.env_steps_per_s)
-    entry |= {"privileged": agent.privileged} | agent.document()
+    is_privileged = agent.privileged or bool(agent.own and agent.own.saw_truth())
+    entry |= {"privileged": is_privileged} | agent.document()
     return AgentRun(agent, policy, results, entry, tree_use(sim, results), logs)
 
 

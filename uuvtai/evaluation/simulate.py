@@ -1,11 +1,13 @@
-"""One vehicle: open-loop physics in endless water (``uuv simulate``), and live episodes (``uuv watch``)."""
+"""One vehicle: open-loop physics in endless water (``uuv simulate``), live episodes (``uuv watch``), and
+driving by hand (``uuv drive``)."""
 
 from __future__ import annotations
 
 import itertools
 import math
+import webbrowser
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,24 @@ import torch
 
 from uuvtai.common.enums import RUNNING
 from uuvtai.common.errors import DivergenceError, SettingError
-from uuvtai.common.presets import PRESET_DIR
+from uuvtai.common.presets import PRESET_DIR, TRAINING_TREE
 from uuvtai.compile.runtime import Runtime, start_taichi
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError
 from uuvtai.evaluation.agents import AgentSpec, load_agents
 from uuvtai.evaluation.episodes import Job, Recorders, Stepper, run_episodes
-from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, agents_of, comparison_of
+from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, Guest, agents_of, compare, comparison_of
 from uuvtai.evaluation.results import ORACLE, Request
+from uuvtai.live.page import PageServer
 from uuvtai.live.server import Broadcast, RealTime, ViewerServer
+from uuvtai.plugins.adapters import CallMeter, Marks, OwnCode, PluginAgent
+from uuvtai.plugins.api import CONTROLLER, PluginSpec
+from uuvtai.plugins.loading import LoadedPlugin
+from uuvtai.report.build import report
+from uuvtai.report.evaluation import who_arrived
+from uuvtai.report.html import live_page
+from uuvtai.report.running import RunningEpisodes
+from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.plant import Plant
 from uuvtai.sim.sim import Sim
 
@@ -270,11 +281,14 @@ def _drive_sample(sim: Sim, start: np.ndarray, time_s: float) -> dict[str, Any]:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# ``uuv watch``: episodes at the clock's pace, one after another, for viewers that come and go.
+# ``uuv watch``: episodes at the clock's pace, for pages or Foxglove; ``uuv drive``: one in which a person
+# drives.
 
 
 LAYOUT = PRESET_DIR / "layout" / "navigation.json"
 """for Foxglove and Lichtblick"""
+PERSON = "human"
+"""who drives by hand, in tables and files"""
 
 
 @dataclass(frozen=True)
@@ -286,25 +300,36 @@ class LiveOptions:
     rate: float = 1.0
     """seconds of the episode in one of the clock's; 0 = as fast as it goes"""
     origins: Sequence[str] = ()
-    """of web pages that may connect beside those of this host"""
+    """of web pages that may connect beside those of this host; of our page, addresses that lead to it"""
+    tanks: int = 1
+    """episodes at once"""
+    foxglove: bool = False
+    """in place of our page"""
+    opens: bool = False
+    """in the browser, by itself"""
 
 
 def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) -> list[dict[str, Any]]:
-    """Run the request's episodes, each by every agent in turn, and serve them; ``episodes`` 0 = on and on,
-    until it is interrupted. How each ended. Raises LiveError, ConfigError, CheckpointError, PluginError."""
+    """Run the request's episodes, ``live.tanks`` at once, by every agent in turn, and serve them;
+    ``episodes`` 0 = on and on, until it is interrupted. How each ended. Raises LiveError, ConfigError,
+    CheckpointError, PluginError."""
     if ORACLE in request.agents:
         raise ConfigError("--agent oracle: it drives no vehicle; name who does, for example bt")
     agents = agents_of(request, watch)
-    with ViewerServer(live.host, live.port, live.origins) as server:
-        shown = "localhost" if live.host in ("127.0.0.1", "0.0.0.0", "::") else live.host
-        watch.note(f"serving ws://{shown}:{server.port}; in Foxglove or Lichtblick: open a connection,")
+    if live.foxglove:
+        server = ViewerServer(live.host, live.port, live.origins)
+        watch.note(f"serving {server.url}; in Foxglove or Lichtblick: open a connection,")
         watch.note(f"Foxglove WebSocket, to that address, and import the layout {LAYOUT}")
-        comparison = comparison_of(request, 1, agents, watch)
+    else:
+        server = _page_of(request, [agent.name for agent in agents], live, watch)
+    with server:
+        comparison = comparison_of(request, live.tanks, agents, watch)
         try:
             return [
-                _watched(comparison, agent, job, server, live.rate)
-                for job in _jobs(request)
+                entry
+                for jobs in _batches(request, live.tanks)
                 for agent in agents
+                for entry in _watched(comparison, agent, jobs, server, live.rate)
             ]
         finally:
             for agent in agents:
@@ -312,32 +337,96 @@ def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) 
                     agent.own.close()
 
 
-def _jobs(request: Request) -> Iterable[Job]:
+def _page_of(
+    request: Request, names: list[str], live: LiveOptions, watch: EvaluationWatch, steered: bool = False
+) -> PageServer:
+    """The page's server, told of and opened."""
+    world = Path(request.world).stem
+    title = f"{', '.join(names)} in {world}"
+    page = live_page(title, "drive to the star" if steered else "live")
+    server = PageServer(page, live.host, live.port, live.origins, steered)
+    watch.note(f"open {server.url} in a browser" + ("" if steered else "; Ctrl-C ends it"))
+    server.note("The simulator starts.")
+    if live.opens:
+        webbrowser.open_new_tab(server.url)
+    return server
+
+
+def _batches(request: Request, size: int) -> Iterable[list[Job]]:
     numbers = range(request.episodes) if request.episodes else itertools.count()
-    return (Job(seed, number) for number in numbers for seed in request.seeds)
+    jobs = (Job(seed, number) for number in numbers for seed in request.seeds)
+    while batch := [*itertools.islice(jobs, size)]:
+        yield batch
 
 
 def _watched(
-    comparison: Comparison, agent: AgentSpec, job: Job, server: ViewerServer, rate: float
-) -> dict[str, Any]:
-    """Run one episode for all to see; how it ended."""
+    comparison: Comparison, agent: AgentSpec, jobs: list[Job], server: ViewerServer | PageServer, rate: float
+) -> list[dict[str, Any]]:
+    """Run episodes for all to see; how they ended."""
     request, policy = comparison.request, comparison.policies[agent.name]
-    sim = comparison.simulator_for(agent)
+    sim, world = comparison.simulator_for(agent), Path(request.world).stem
     clock = RealTime(request.config.episode.control_dt_s, rate)
-    shown = Broadcast(server, Path(request.world).stem, agent.name, request.depth_images, policy)
+    if isinstance(server, ViewerServer):
+        shown = Broadcast(server, world, agent.name, request.depth_images, policy)
+    else:
+        shown = RunningEpisodes(server, world, agent.name, rate)
     acting = policy.agent if policy else None
-    (result,), _ = run_episodes(sim, [job], Recorders([shown, clock]), agent=acting)
-    entry = {
-        "agent": agent.name,
-        "seed": job.seed,
-        "episode": job.episode,
-        "outcome": result.outcome,
-        "time_s": result.time_s,
-        "min_clearance_m": round(result.min_clearance_m, 4),
-        "real_time_factor": round(clock.real_time_factor, 2),
-    }
-    comparison.watch.note(
-        f"{agent.name}, seed {job.seed}, episode {job.episode}: {result.outcome} after "
-        f"{result.time_s:.1f} s ({entry['real_time_factor']:.2f} of real time)"
-    )
-    return entry
+    results, _ = run_episodes(sim, jobs, Recorders([shown, clock]), agent=acting)
+    entries = [
+        {
+            "agent": agent.name,
+            "seed": result.seed,
+            "episode": result.episode,
+            "outcome": result.outcome,
+            "time_s": result.time_s,
+            "min_clearance_m": round(result.min_clearance_m, 4),
+            "real_time_factor": round(clock.real_time_factor, 2),
+        }
+        for result in results
+    ]
+    for entry in entries:
+        comparison.watch.note(
+            f"{agent.name}, seed {entry['seed']}, episode {entry['episode']}: {entry['outcome']} after "
+            f"{entry['time_s']:.1f} s ({entry['real_time_factor']:.2f} of real time)"
+        )
+    return entries
+
+
+class _Hand(LoadedPlugin):
+    """A person who steers by the page, as a plugin that is asked for actions."""
+
+    def agent(self, sim: Sim) -> PluginAgent:
+        """Drives all rows by the newest command."""
+        meter = CallMeter(PERSON, Path(), math.inf, self.note)
+        code = OwnCode(self.spec, self.found.command, None, "", Marks(), meter)
+        return PluginAgent(sim, code, lambda rows, obs: torch.tensor([self.found.command()] * len(rows)))
+
+    def saw_truth(self) -> bool:
+        """Whether the page has shown what no vehicle senses."""
+        return self.found.truth_was_seen
+
+    def document(self) -> dict[str, Any]:
+        """There is no file of hers."""
+        return {}
+
+
+def drive_by_hand(
+    request: Request, live: LiveOptions, watch: EvaluationWatch
+) -> tuple[dict[str, Any], Path, Path]:
+    """A person drives the request's episodes, one after the other, on a page; then its agents do. The ``uuv
+    eval --json`` document, the run folder, and its report. Raises as ``watch_episodes`` and ``compare``."""
+    if request.num_envs is None:
+        request = replace(request, num_envs=1)
+    request = replace(request, record=len(request.seeds) * request.episodes)
+    with _page_of(request, [PERSON, *request.agents], live, watch, steered=True) as server:
+        own = _Hand(PluginSpec(CONTROLLER, Path(PERSON)), "", server, watch.note)
+        dt_s = request.config.episode.control_dt_s
+        shown = RunningEpisodes(server, Path(request.world).stem, PERSON, live.rate)
+        observer = Recorders([shown, RealTime(dt_s, live.rate)])
+        hand = AgentSpec(PERSON, read_tree(TRAINING_TREE), own=own)
+        result, folder = compare(request, watch, Guest(hand, observer))
+        page = report([folder]).page
+        server.note(f"{who_arrived(result['agents'])} Report: {page}")
+    if live.opens:
+        webbrowser.open_new_tab(page.resolve().as_uri())
+    return result, folder, page

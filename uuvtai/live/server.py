@@ -1,48 +1,39 @@
-"""A WebSocket server that Foxglove and Lichtblick connect to, by Foxglove's SDK (its protocol is
-``foxglove.sdk.v1``). It listens to nothing but subscriptions from those who connect."""
+"""A WebSocket server in a thread of its own, so that no client holds up the episodes; and what Foxglove and
+Lichtblick are served by it (protocol ``foxglove.sdk.v1``): they look, and say what they want to see."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import importlib.util
-import ipaddress
 import json
 import logging
-import secrets
-import socket
-import sys
+import struct
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
-from typing import Any, Protocol
+import uuid
+from collections import deque
+from collections.abc import Callable, Collection, Coroutine, Mapping
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from uuvtai.common.errors import UserError
-from uuvtai.common.exits import say
+from uuvtai.common.files import FileError, parsed_json
 from uuvtai.logs.encode import EpisodeEnd, EpisodeHeader, Topic, Values
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.writer import EpisodeReader, PolicyNote, Recordable, RecordedJob, TopicMessage, TopicStream
 
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
 # ---- Running episodes as messages for viewers: the topics of the log, no faster than the clock.
-
-
-class Viewers(Protocol):
-    """Whoever is shown episodes as messages."""
-
-    def begin(self, schemas: Mapping[str, Schema]) -> None:
-        """Another episode."""
-
-    def tell_time(self, time_ns: int) -> None:
-        """It is now this late in the episode."""
-
-    def send(self, message: TopicMessage) -> None:
-        """Show a message."""
 
 
 class LiveEpisode:
     """One episode for viewers; an ``EpisodeSink``."""
 
-    def __init__(self, viewers: Viewers, header: EpisodeHeader, depth_images: bool) -> None:
+    def __init__(self, viewers: ViewerServer, header: EpisodeHeader, depth_images: bool) -> None:
         self._viewers, self._stream = viewers, TopicStream(header, depth_images)
         self._dt_s = header.config.episode.control_dt_s
         viewers.begin(self._stream.schemas())
@@ -67,7 +58,7 @@ class Broadcast(EpisodeReader):
 
     def __init__(
         self,
-        viewers: Viewers,
+        viewers: ViewerServer,
         world: str,
         agent: str,
         depth_images: bool = False,
@@ -126,261 +117,305 @@ class RealTime:
         return self._steps * self._dt_s / spent if spent > 0 else 0.0
 
 
-# ---- Who may connect to the server of episodes: a relay in front of it, which looks at each request and
-# passes bytes on. The SDK's own server takes any web page's script, and any number of clients.
+# ---- A server: who may connect, and messages that wait for those who are slow.
 
-MOST_CLIENTS = 8  # at once, whether they have sent a request already or not
-_REQUEST_S, _REQUEST_BYTES = 5.0, 16 << 10
-_SLOW_S = 10.0  # a client that takes nothing for as long is dropped [s]
-_BUFFER = 256 << 10  # [bytes] that the system keeps for each side of a client
-_OWN_NAMES = ("localhost", "127.0.0.1", "::1")
-_DESKTOP = "file://"  # origin of Foxglove's and Lichtblick's programs; no web page can name it
-
-
-class Doorkeeper:
-    """Listens at an address and lets clients through to ``inner``; ends with ``close``."""
-
-    def __init__(self, host: str, port: int, inner: tuple[str, int], origins: Collection[str]) -> None:
-        """``origins``: of web pages that may connect beside those of this host ('https://app.foxglove.dev').
-        Raises OSError where the address cannot be listened at."""
-        self._inner, self._origins, self._host = inner, {*origins}, host
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._listener = socket.create_server((host, port), family=family)
-        self.port: int = self._listener.getsockname()[1]
-        self._open: set[socket.socket] = set()
-        self._slots = threading.BoundedSemaphore(MOST_CLIENTS)
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def close(self) -> None:
-        for place in (self._listener, *self._open):
-            _ended(place)
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                client, _ = self._listener.accept()
-            except OSError:  # closed
-                return
-            if self._slots.acquire(blocking=False):
-                threading.Thread(target=self._serve, args=(client,), daemon=True).start()
-            else:
-                _refuse(client, f"503 More than {MOST_CLIENTS} viewers")
-
-    def _serve(self, client: socket.socket) -> None:
-        """One client from its request to its end."""
-        self._open.add(client)
-        try:
-            request = _request(client)
-            if why := self._refusal(request, client.getsockname()[0]):
-                _refuse(client, why)
-                return
-            with socket.create_connection(self._inner) as server:
-                for place in (client, server):
-                    place.settimeout(_SLOW_S)
-                    place.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-                    place.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                server.sendall(request)
-                back = threading.Thread(target=_relay, args=(server, client), daemon=True)
-                back.start()
-                _relay(client, server)
-                back.join()
-        except OSError:
-            pass
-        finally:
-            self._open.discard(client)
-            _ended(client)
-            self._slots.release()
-
-    def _refusal(self, request: bytes, address: str) -> str:
-        """Why not, as an HTTP status; '' = let it through."""
-        head, end, _ = request.partition(b"\r\n\r\n")
-        lines = [line.decode("latin-1") for line in head.split(b"\r\n")[1:]]
-        if not end or any(line[:1] in (" ", "\t") for line in lines):
-            return "400 Bad Request"
-        named = [
-            (name.strip().lower(), value.strip()) for name, _, value in (x.partition(":") for x in lines)
-        ]
-        if ("upgrade", "websocket") not in [(name, value.lower()) for name, value in named]:
-            return "426 Upgrade Required"
-        own = {*_OWN_NAMES, self._host, address}
-        known = all(self._is_known(value, own) for name, value in named if name == "origin")
-        return "" if known else "403 Forbidden: that page may not connect; allow it with --origin"
-
-    def _is_known(self, origin: str, own: set[str]) -> bool:
-        try:
-            host = urlsplit(origin).hostname
-        except ValueError:
-            return False
-        return origin in {_DESKTOP, *self._origins} or host in own
-
-
-def private_host() -> str:
-    """A loopback address that no web page guesses, where the system has more than one."""
-    number = int(ipaddress.ip_address("127.1.0.0")) + secrets.randbelow(250 << 16)
-    return str(ipaddress.ip_address(number)) if sys.platform == "linux" else "127.0.0.1"
-
-
-def _request(client: socket.socket) -> bytes:
-    """Up to the end of its head; what is longer or later is cut. Raises OSError."""
-    end, request = time.monotonic() + _REQUEST_S, b""
-    while b"\r\n\r\n" not in request and len(request) < _REQUEST_BYTES:
-        client.settimeout(max(0.01, end - time.monotonic()))
-        part = client.recv(4096)
-        if not part:
-            break
-        request += part
-    return request
-
-
-def _relay(source: socket.socket, target: socket.socket) -> None:
-    """Pass bytes on until one side ends or takes nothing for ``_SLOW_S``; then both end."""
-    with contextlib.suppress(OSError):
-        while True:
-            try:
-                part = source.recv(1 << 16)
-            except TimeoutError:  # silent, as viewers are
-                continue
-            if not part:
-                break
-            target.sendall(part)
-    for place in (source, target):
-        with contextlib.suppress(OSError):
-            place.shutdown(socket.SHUT_RDWR)
-
-
-def _refuse(client: socket.socket, status: str) -> None:
-    with contextlib.suppress(OSError):  # what is left unread resets the connection before its answer is read
-        client.settimeout(0.2)
-        client.recv(_REQUEST_BYTES)
-    with contextlib.suppress(OSError):
-        client.sendall(f"HTTP/1.1 {status}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n".encode())
-    _ended(client)
-
-
-def _ended(place: socket.socket) -> None:
-    """Shut down, which wakes who waits for it, and close."""
-    with contextlib.suppress(OSError):
-        place.shutdown(socket.SHUT_RDWR)
-    place.close()
-
-
-EXTRA = "uuvtai[live]"
-BACKLOG = 64  # messages that wait for a client; when more do, the oldest are dropped
-_NEEDED = "foxglove.websocket"
-_MOST_TOLD = 300  # characters
+MOST_CLIENTS = 8  # at once
+OWN_NAMES = ("localhost", "127.0.0.1", "::1")
+BACKLOG, MOST_WAITING = 64, 300  # messages that wait for a client: of bytes the oldest go; with more she goes
+_MOST_SOCKETS = 4 * MOST_CLIENTS  # whether they have sent a request already or not
+_REQUEST_S, _CLOSE_S, _MOMENT_S = 5.0, 1.0, 0.02
+Answer = tuple[HTTPStatus, str]
 
 
 class LiveError(UserError, RuntimeError):
     """Episodes cannot be shown live: what, where, why, what to type next."""
 
 
-class ViewerServer(contextlib.AbstractContextManager["ViewerServer"]):
-    """Sends messages to whoever has subscribed to their topic. Use as a context: it ends with it."""
+class Client:
+    """Somebody who is connected."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 8765, origins: Collection[str] = ()) -> None:
-        """``port`` 0: a free one, see ``port``; ``origins``: as of ``Doorkeeper``. Raises LiveError."""
-        _require_sdk()
-        import foxglove
-        from foxglove.websocket import Capability
+    def __init__(self, socket: ServerConnection) -> None:
+        self.socket, self.waiting, self.wake = socket, deque[Any](), asyncio.Event()
+        self.is_local = str((socket.remote_address or ("",))[0]) in OWN_NAMES
+        self.tank = -1  # that is followed on the page
+        self.topics: dict[int, int] = {}  # subscriptions by channel
 
-        log = logging.getLogger("foxglove")
-        log.handlers, log.propagate = [_Told()], False
-        log.setLevel(logging.ERROR)
-        self._foxglove, self._context = foxglove, foxglove.Context()
-        self._channels: dict[str, Any] = {}
-        self._newest: dict[str, TopicMessage] = {}
-        self._lock = threading.Lock()
-        self._asked: set[str] = set()
-        inner = private_host()
+
+class LiveServer(contextlib.AbstractContextManager["LiveServer"]):
+    """Tells its clients what it is told to. Use as a context: it ends with it."""
+
+    scheme, path, protocols, most_bytes = "ws", "/", None, 1024
+
+    def __init__(self, host: str, port: int, origins: Collection[str]) -> None:
+        """``port`` 0: a free one, see ``port``; ``origins``: of web pages that may connect beside those of
+        this host. Raises LiveError."""
+        self._origins, self._lock = {*origins}, threading.Condition()
+        self._clients: list[Client] = []
+        self._sockets: set[Any] = set()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
         try:
-            self._server = foxglove.start_server(
-                name="uuvtai",
-                host=inner,
-                port=0,
-                capabilities=[Capability.Time],
-                server_listener=_listener(self._ask),
-                context=self._context,
-                message_backlog_size=BACKLOG,
-            )
-            try:
-                self._door = Doorkeeper(host, port, (inner, self._server.port), origins)
-            except BaseException:
-                self._server.stop()
-                raise
-        except (RuntimeError, OSError, ValueError) as error:
+            self._server = self._done(self._opened(host, port))
+        except (OSError, OverflowError) as error:
+            self._end()
             raise LiveError(
-                f"ws://{host}:{port}: cannot listen there ({error}); another program may hold the port: "
-                f"--port {port + 1 if port < 65535 else 8765}"
+                f"{self.scheme}://{host}:{port}: cannot listen there ({error}); another program may hold the "
+                f"port: --port {port + 1 if port < 65535 else 8765}"
             ) from None
-        self.port: int = self._door.port
+        shown = "127.0.0.1" if host in ("0.0.0.0", "::") else host
+        self.url = f"{self.scheme}://{self.at(shown)}"
 
-    def begin(self, schemas: Mapping[str, Schema]) -> None:
-        """Another episode: viewers forget the one before."""
-        if self._newest:
-            self._newest.clear()
-            self._server.clear_session()
-        for topic, schema in schemas.items():
-            if topic not in self._channels:
-                text = json.dumps(schema, separators=(",", ":")).encode()
-                declared = self._foxglove.Schema(name=schema["title"], encoding="jsonschema", data=text)
-                self._channels[topic] = self._foxglove.Channel(
-                    topic, message_encoding="json", schema=declared, context=self._context
-                )
-
-    def send(self, message: TopicMessage) -> None:
-        """To those who want its topic."""
-        self._newest[message.topic] = message
-        self._channels[message.topic].log(message.data, log_time=message.time_ns)
-
-    def tell_time(self, time_ns: int) -> None:
-        """It is now this late in the episode. Whoever has come since the last call gets the newest message of
-        every topic it wants, for some come once a minute."""
-        with self._lock:
-            asked, self._asked = self._asked, set()
-        for topic in sorted(asked):
-            if topic in self._newest:
-                self.send(self._newest[topic])
-        self._server.broadcast_time(time_ns)
-
-    def _ask(self, topic: str) -> None:
-        """Somebody has subscribed; on a thread of the SDK's."""
-        with self._lock:
-            self._asked.add(topic)
+    def at(self, host: str) -> str:
+        """host:port"""
+        return f"[{host}]:{self.port}" if ":" in host else f"{host}:{self.port}"
 
     def close(self) -> None:
-        self._server.stop()
-        self._door.close()
+        """Turn all away."""
+        if not self._loop.is_closed():
+            self._done(self._closed())
+            self._end()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    # --------------------------------------------------------- what kinds of servers differ in; in its thread
 
-class _Told(logging.Handler):
-    """What the SDK says of its clients, who may have worded it; the first lines of it."""
+    def refusal(self, connection: ServerConnection, request: Request) -> Answer | None:
+        """Why somebody may not connect; None = she may."""
+        raise NotImplementedError
 
-    left = 20
+    def document(self, connection: ServerConnection) -> Response:
+        """For who opens no WebSocket."""
+        return connection.respond(HTTPStatus.UPGRADE_REQUIRED, "a WebSocket is served here\n")
 
-    def emit(self, record: logging.LogRecord) -> None:
-        if self.left > 0:
-            self.left -= 1
-            say(f"a viewer: {' '.join(record.getMessage()[:_MOST_TOLD].split())}")
+    def arrived(self, client: Client) -> None:
+        """She has come; the lock is held."""
+
+    def heard(self, client: Client, asked: Any) -> bool:
+        """She says something, read as JSON (None: it is none); whether she may stay. The lock is held."""
+        raise NotImplementedError
+
+    def left(self, client: Client) -> None:
+        """She has gone, and is no client any more; the lock is held."""
+
+    # ------------------------------------------------------------------------------------ the server's thread
+
+    def put(self, client: Client, message: str | bytes) -> None:
+        """Have a message wait for a client."""
+        waiting = client.waiting
+        if len(waiting) >= BACKLOG and isinstance(waiting[0], bytes):
+            waiting.popleft()
+        waiting.append(message)
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            is_lost = len(waiting) > MOST_WAITING
+            self._loop.call_soon_threadsafe(client.socket.transport.abort if is_lost else client.wake.set)
+
+    async def _opened(self, host: str, port: int) -> Any:
+        from websockets.asyncio.server import serve
+
+        quiet = logging.getLogger("uuvtai.live")
+        quiet.setLevel(logging.CRITICAL + 1)  # whatever a client does is no news
+        server = await serve(
+            self._serve, host, port, process_request=self._answer, compression=None, logger=quiet,
+            max_size=self.most_bytes, open_timeout=_REQUEST_S, close_timeout=_CLOSE_S, server_header=None,
+            create_connection=_counted(self._sockets), subprotocols=self.protocols,
+        )  # fmt: skip
+        self.port: int = next(iter(server.sockets)).getsockname()[1]
+        return server
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """What is no WebSocket, or why not; None = let it open."""
+        wants_socket = request.headers.get_all("Upgrade") != []
+        if why := self.refusal(connection, request):
+            return connection.respond(*why)
+        if request.path != (self.path if wants_socket else "/"):
+            return connection.respond(HTTPStatus.NOT_FOUND, "nothing is here\n")
+        if not wants_socket:
+            return self.document(connection)
+        is_full = len(self._clients) >= MOST_CLIENTS
+        why = HTTPStatus.SERVICE_UNAVAILABLE, f"more than {MOST_CLIENTS} look on\n"
+        return connection.respond(*why) if is_full else None
+
+    async def _serve(self, socket: ServerConnection) -> None:
+        """One client from the first to the last message."""
+        client = Client(socket)
+        with self._lock:
+            if len(self._clients) >= MOST_CLIENTS:
+                return
+            self._clients.append(client)
+            self.arrived(client)
+        sender = asyncio.ensure_future(self._send(client))
+        try:
+            with _ended():
+                async for message in socket:
+                    with self._lock:
+                        stays = self.heard(client, _parsed(message))
+                    if not stays:
+                        await socket.close(1008, "no message of ours")
+        finally:
+            sender.cancel()
+            with self._lock:
+                self._clients.remove(client)
+                self.left(client)
+
+    async def _send(self, client: Client) -> None:
+        with _ended():
+            while True:
+                await client.wake.wait()
+                client.wake.clear()
+                while client.waiting:
+                    with self._lock:
+                        message = client.waiting.popleft()
+                    await client.socket.send(message)
+
+    def _done(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """What the server's thread makes of it."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+    async def _closed(self) -> None:
+        end_s = time.monotonic() + _CLOSE_S
+        while any(client.waiting for client in self._clients) and time.monotonic() < end_s:
+            await asyncio.sleep(_MOMENT_S)  # what was told last
+        self._server.close()
+        self._loop.call_later(_CLOSE_S, lambda: [one.transport.abort() for one in [*self._sockets]])
+        await self._server.wait_closed()
+
+    def _end(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
 
 
-def _require_sdk() -> None:
+def _counted(sockets: set[Any]) -> type[ServerConnection]:
+    """Connections of which there is a bounded number."""
+    from websockets.asyncio.server import ServerConnection
+
+    class Counted(ServerConnection):
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            sockets.add(self)
+            if len(sockets) > _MOST_SOCKETS:
+                transport.abort()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            sockets.discard(self)
+            super().connection_lost(exc)
+
+    return Counted
+
+
+def _ended() -> contextlib.AbstractContextManager[None]:
+    from websockets.exceptions import ConnectionClosed
+
+    return contextlib.suppress(ConnectionClosed)
+
+
+def _parsed(message: str | bytes) -> Any:
     try:
-        found = importlib.util.find_spec(_NEEDED)
-    except ImportError:
-        found = None
-    if found is None:
-        raise LiveError(f"a viewer is served by Foxglove's SDK, which is not here: pip install '{EXTRA}'")
+        return parsed_json(message, "a message")
+    except FileError:
+        return None
 
 
-def _listener(ask: Callable[[str], None]) -> Any:
-    """Tells ``ask`` of subscriptions; all other callbacks do nothing, as the SDK's own class has them."""
-    from foxglove.websocket import ServerListener
+# ---- For Foxglove and Lichtblick.
 
-    class Arrivals(ServerListener):
-        def on_subscribe(self, client: Any, channel: Any) -> None:
-            ask(channel.topic)
+_DESKTOP = "file://"  # origin of Foxglove's and Lichtblick's programs; no web page can name it
+_DATA, _TIME = struct.Struct("<BIQ"), struct.Struct("<BQ")  # heads of messages: code, subscription, time [ns]
 
-    return Arrivals()
+
+class ViewerServer(LiveServer):
+    """Sends messages to whoever has subscribed to their topic."""
+
+    protocols, most_bytes = ("foxglove.sdk.v1", "foxglove.websocket.v1"), 1 << 16
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 8765, origins: Collection[str] = ()) -> None:
+        """``origins``: such as 'https://app.foxglove.dev'. Raises LiveError."""
+        self._host, self._session = host, str(uuid.uuid4())
+        self._channels: dict[str, dict[str, Any]] = {}
+        self._newest: dict[str, TopicMessage] = {}
+        super().__init__(host, port, origins)
+
+    def begin(self, schemas: Mapping[str, Schema]) -> None:
+        """Another episode: viewers forget the one before."""
+        with self._lock:
+            if self._newest:
+                self._newest.clear()
+                self._session = str(uuid.uuid4())
+                for client in self._clients:
+                    self.put(client, self._info())
+            new = [topic for topic in schemas if topic not in self._channels]
+            for topic in new:
+                schema = schemas[topic]
+                self._channels[topic] = {
+                    "id": len(self._channels) + 1, "topic": topic, "encoding": "json",
+                    "schemaName": schema["title"], "schemaEncoding": "jsonschema",
+                    "schema": json.dumps(schema, separators=(",", ":")),
+                }  # fmt: skip
+            for client in self._clients if new else ():
+                self.put(client, self._advertised(new))
+
+    def send(self, message: TopicMessage) -> None:
+        """To those who want its topic."""
+        with self._lock:
+            self._newest[message.topic] = message
+            for client in self._clients:
+                self._give(client, message)
+
+    def tell_time(self, time_ns: int) -> None:
+        """It is now this late in the episode."""
+        with self._lock:
+            for client in self._clients:
+                self.put(client, _TIME.pack(2, time_ns))
+
+    def refusal(self, connection: ServerConnection, request: Request) -> Answer | None:
+        """Web pages of elsewhere; programs name no origin."""
+        own = {*OWN_NAMES, self._host, connection.local_address[0]}
+        for origin in request.headers.get_all("Origin"):
+            if origin not in {_DESKTOP, *self._origins} and _host_of(origin) not in own:
+                return HTTPStatus.FORBIDDEN, "that page may not connect; allow it with --origin\n"
+        return None
+
+    def arrived(self, client: Client) -> None:
+        """Say what there is."""
+        self.put(client, self._info())
+        self.put(client, self._advertised([*self._channels]))
+
+    def heard(self, client: Client, asked: Any) -> bool:
+        """Subscriptions; who comes late gets the newest message at once, for some come once a minute. All
+        else is left alone: viewers ask for much that is not served here."""
+        topics = {channel["id"]: topic for topic, channel in self._channels.items()}
+        for one in _listed(asked, "subscribe", "subscriptions"):
+            wanted = (one.get("channelId"), one.get("id")) if isinstance(one, dict) else (None, None)
+            channel, number = (part if type(part) is int and 0 <= part < 1 << 32 else -1 for part in wanted)
+            if channel in topics and number >= 0:
+                client.topics[channel] = number
+                if newest := self._newest.get(topics[channel]):
+                    self._give(client, newest)
+        for one in _listed(asked, "unsubscribe", "subscriptionIds"):
+            client.topics = {channel: number for channel, number in client.topics.items() if number != one}
+        return True
+
+    def _give(self, client: Client, message: TopicMessage) -> None:
+        subscription = client.topics.get(self._channels[message.topic]["id"])
+        if subscription is not None:
+            self.put(client, _DATA.pack(1, subscription, message.time_ns) + message.data)
+
+    def _info(self) -> str:
+        info = {"op": "serverInfo", "name": "uuvtai", "capabilities": ["time"], "sessionId": self._session}
+        return json.dumps(info | {"supportedEncodings": [], "metadata": {}})
+
+    def _advertised(self, topics: Collection[str]) -> str:
+        return json.dumps({"op": "advertise", "channels": [self._channels[topic] for topic in topics]})
+
+
+def _listed(asked: Any, what: str, of: str) -> list[Any]:
+    found = asked.get(of) if isinstance(asked, dict) and asked.get("op") == what else None
+    return found if isinstance(found, list) else []
+
+
+def _host_of(origin: str) -> str | None:
+    try:
+        return urlsplit(origin).hostname
+    except ValueError:
+        return None

@@ -383,6 +383,10 @@ class LoadedPlugin:
         if self.meter:
             self.meter.close()
 
+    def saw_truth(self) -> bool:
+        """Whether it was shown more than the vehicle senses."""
+        return False
+
     def document(self) -> dict[str, Any]:
         """What ``uuv eval --json`` says of it: where it comes from, and the time of its calls so far."""
         spec = self.spec

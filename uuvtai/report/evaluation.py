@@ -171,20 +171,27 @@ _MOST_NAMED = 4  # agents in the sentence of the result
 
 
 def by_success(agents: list[AgentSpec]) -> list[AgentSpec]:
-    """Those that ran, the most successful first."""
+    """Those that ran, the most successful first, then the fastest."""
     ran = [m for m in agents if m["episodes"] and m.get("outcomes")]
-    return sorted(ran, key=lambda m: m["outcomes"]["success"] / m["episodes"], reverse=True)
+    soonest = sorted(ran, key=lambda m: m.get("time_to_success_mean_s") or 0.0)
+    return sorted(soonest, key=lambda m: m["outcomes"]["success"] / m["episodes"], reverse=True)
 
 
 def who_arrived(agents: list[AgentSpec]) -> str:
-    """Who reached the goal how often, in a sentence; '' without episodes."""
+    """Who reached the goal how often and how soon, in a sentence; '' without episodes."""
     if not (ran := by_success(agents)):
         return ""
     first, *others = ran
-    said = (
-        f"{first['name']} reached the goal in {first['outcomes']['success']} of {first['episodes']} episodes"
-    )
-    said += "".join(f", {m['name']} in {m['outcomes']['success']}" for m in others[: _MOST_NAMED - 1])
+
+    def took(m: AgentSpec, how: str = "") -> str:
+        mean_s = m.get("time_to_success_mean_s")
+        return "" if mean_s is None else f" ({mean_s:.1f} s{how})"
+
+    arrived, n = first["outcomes"]["success"], first["episodes"]
+    many, how = ("s", " on average") if n > 1 else ("", "")
+    said = f"{first['name']} reached the goal in {arrived} of {n} episode{many}{took(first, how)}"
+    for m in others[: _MOST_NAMED - 1]:
+        said += f", {m['name']} in {m['outcomes']['success']}{took(m)}"
     if rest := others[_MOST_NAMED - 1 :]:
         said += f", {len(rest)} more agents in {rest[0]['outcomes']['success']} or fewer"
     return f"{said}."

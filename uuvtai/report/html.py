@@ -69,30 +69,39 @@ def render(page: Page) -> tuple[str, dict[str, bytes]]:
     has_player = any(
         isinstance(block, Player) and block.episodes for s in page.sections for block in s.blocks
     )
-    script = _script() if has_player else ""
-    html = _template().render(
+    return _rendered(page, _script(_RECORDED, "start") if has_player else "", drawing), drawing.pngs
+
+
+def live_page(title: str, subtitle: str) -> str:
+    """HTML of a page whose player asks the server that it comes from for running episodes."""
+    return _rendered(Page(title, subtitle, [], []), _script((*_RECORDED, *_LIVE), "live"), _Drawing(), True)
+
+
+def _rendered(page: Page, script: str, drawing: _Drawing, is_live: bool = False) -> str:
+    return _template().render(
         page=page, version=__version__, svgs=drawing.svgs, kind=lambda block: type(block).__name__,
         max_rows=_MAX_SHOWN_ROWS, text=_text,
         csv_uri=lambda data: "data:text/csv;charset=utf-8," + quote(data.csv()),
-        on_page=on_page, file_name=_file_name, data_uri=_data_uri, script=script,
+        on_page=on_page, file_name=_file_name, data_uri=_data_uri, script=script, is_live=is_live,
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )  # fmt: skip
-    return html, drawing.pngs
 
 
-_MODULES = ("decode", "view", "paint", "strip", "source", "player")
+_RECORDED = ("decode", "view", "paint", "strip", "source", "player")
+_LIVE = ("running", "steer", "live")
 _IMPORT = re.compile(r"^import [^\n]*\n|^export (?=[a-z])", re.MULTILINE)
 
 
 @cache
-def _script() -> Markup:
-    """The player's modules as one script: each stands after those that it imports."""
+def _script(names: tuple[str, ...], begin: str) -> Markup:
+    """The player's modules as one script, each after those that it imports; ``begin`` is called at the
+    end."""
     from markupsafe import Markup
 
     folder = resources.files("uuvtai") / "report" / "player"
-    modules = [(folder / f"{name}.mjs").read_text(encoding="utf-8") for name in _MODULES]
+    modules = [(folder / f"{name}.mjs").read_text(encoding="utf-8") for name in names]
     # safe: the package's own text, in which a test looks for what would end the element
-    return Markup("\n".join([*(_IMPORT.sub("", module) for module in modules), "start();"]))
+    return Markup("\n".join([*(_IMPORT.sub("", module) for module in modules), f"{begin}();"]))
 
 
 @cache

@@ -262,8 +262,24 @@ def _grid(recording: Recording) -> dict[str, Any] | None:
 def packed_scene(recordings: Sequence[Recording]) -> bytes:
     """The blob of the truth that all agents meet, in base64."""
     scenario = recordings[0].scenario
+    header, moving = scene_header(scenario)
     times = max((one["/pose"].times for one in recordings), key=lambda found: found[-1])
     times = times[:: -(-len(times) // _MOST_STEPS)]
+    for share in (1, 2, 5, 10, 50):  # the last step of this episode is always there
+        some = np.array([*times[:-1:share], times[-1]])
+        pack = _Packer()
+        pack.add("time", some, TIME_S)
+        places = [obstacle_positions(obstacle, some)[:, :2] for obstacle in moving]
+        pack.add("places", np.concatenate([np.empty((len(some), 0)), *places], axis=1), PLACE_M)
+        content = pack.packed(header)
+        if len(content) <= SCENE_BYTES and pack.numbers <= _MOST_NUMBERS:
+            return content
+    raise ValueError(f"{len(moving)} moving obstacles in {len(times)} steps")
+
+
+def scene_header(scenario: dict[str, Any]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """(what the player knows of a scenario beside places, its obstacles that move). ValueError for a tank
+    without depth."""
     obstacles = scenario["obstacles"]
     moving = [obstacle for obstacle in obstacles if obstacle["path"] is not None]
     tank = scenario["tank"]
@@ -281,16 +297,7 @@ def packed_scene(recordings: Sequence[Recording]) -> bytes:
         "obstacles": [_obstacle(one) for one in obstacles],
         "palette": palette(),
     }
-    for share in (1, 2, 5, 10, 50):  # the last step of this episode is always there
-        some = np.array([*times[:-1:share], times[-1]])
-        pack = _Packer()
-        pack.add("time", some, TIME_S)
-        places = [obstacle_positions(obstacle, some)[:, :2] for obstacle in moving]
-        pack.add("places", np.concatenate([np.empty((len(some), 0)), *places], axis=1), PLACE_M)
-        content = pack.packed(header)
-        if len(content) <= SCENE_BYTES and pack.numbers <= _MOST_NUMBERS:
-            return content
-    raise ValueError(f"{len(moving)} moving obstacles in {len(times)} steps")
+    return header, moving
 
 
 def _obstacle(obstacle: dict[str, Any]) -> dict[str, Any]:

@@ -49,6 +49,21 @@ export class Painter {
     this.side(source, agent, time, frame, places);
   }
 
+  /** One tank of many: the truth, the path and the vehicle. */
+  small(source, time) {
+    const { context, view, look } = this;
+    const [frame, [about]] = [source.frame(0, time), source.agents];
+    context.fillStyle = look.paper;
+    context.fillRect(0, 0, view.width, view.height);
+    this.polygon(tankOutline(source.scene.tank), look.water);
+    this.truth(source, source.places(time), frame.pose[2], about);
+    this.goal(source.scene);
+    this.path(source.history(0), frame.step, look.agents[0], 1.6);
+    this.vehicle(frame.pose, look.agents[0]);
+    if (about.failed) this.cross(frame.pose);
+    this.outline(tankOutline(source.scene.tank), look.ink, 2);
+  }
+
   // -------------------------------------------------------------------------------------------- what stands in the scene
 
   map(map) {
@@ -106,7 +121,7 @@ export class Painter {
     this.outline(circle(goal[0], goal[1], goal_radius_m, 72), look.ink, 1, [5, 4]);
     context.beginPath();
     for (let i = 0; i < 10; i++) {
-      const [angle, reach] = [-Math.PI / 2 + (i * Math.PI) / 5, i % 2 ? 4.6 : 11];
+      const [angle, reach] = [-Math.PI / 2 + (i * Math.PI) / 5, (i % 2 ? 0.42 : 1) * view.star];
       context.lineTo(view.x(goal[0]) + reach * Math.cos(angle), view.y(goal[1]) + reach * Math.sin(angle));
     }
     context.closePath();

@@ -26,6 +26,7 @@ export function command({ key, shiftKey, ctrlKey, metaKey, altKey }) {
 
 /** How an agent's episode ended, in words. */
 export function ending({ name, outcome, end, cause, meaning }) {
+  if (end === Infinity) return `${name}: under way`;
   const why = [cause, meaning].filter(Boolean).join(": ");
   return `${name}: ${outcome} after ${end.toFixed(1)} s${why ? `. ${why[0].toUpperCase()}${why.slice(1)}` : ""}`;
 }
@@ -209,21 +210,31 @@ export class Player {
     this.legend();
     this.help = add(root, "details", { className: "keys" });
     add(this.help, "summary", { textContent: "Keys" });
-    const keys = add(this.help, "dl");
-    for (const [key, words] of KEYS) add(keys, "dt", { textContent: key }), add(keys, "dd", { textContent: words });
+    add(this.help, "dl");
+    this.explain(KEYS);
     this.listen();
   }
 
+  explain(keys) {
+    const list = this.help.lastChild;
+    list.textContent = "";
+    for (const [key, words] of keys) add(list, "dt", { textContent: key }), add(list, "dd", { textContent: words });
+  }
+
+  press(words, title, act) {
+    return add(this.bar, "button", { type: "button", textContent: words, title, onclick: act });
+  }
+
   transport(bar) {
-    const press = (words, title, act) => add(bar, "button", { type: "button", textContent: words, title, onclick: act });
-    press("−0.1 s", "a step back (←)", () => this.step(-STEP_S));
-    this.button = press("Play", "play or pause (space)", () => this.toggle());
-    press("+0.1 s", "a step on (→)", () => this.step(STEP_S));
+    this.bar = bar;
+    this.press("−0.1 s", "a step back (←)", () => this.step(-STEP_S));
+    this.button = this.press("Play", "play or pause (space)", () => this.toggle());
+    this.press("+0.1 s", "a step on (→)", () => this.step(STEP_S));
     this.rate = add(bar, "select", { ariaLabel: "speed", onchange: () => this.run(["rated", Number(this.rate.value)]) });
     for (const speed of SPEEDS) add(this.rate, "option", { value: speed, textContent: `${speed}×` });
-    this.jump = press("To the failure", "to the moment of the failure (x)", () => this.failure());
-    this.zoomed = press("Near", "follow the vehicle from near (z)", () => this.zoom());
-    press("Dark, light", "switch the page (d)", () => this.theme());
+    this.jump = this.press("To the failure", "to the moment of the failure (x)", () => this.failure());
+    this.zoomed = this.press("Near", "follow the vehicle from near (z)", () => this.zoom());
+    this.press("Dark, light", "switch the page (d)", () => this.theme());
   }
 
   rated(speed) {
@@ -284,13 +295,13 @@ function left(names) {
   return names.length ? `. Left out to keep this page small: ${names.join(", ")}` : "";
 }
 
-function add(parent, tag, properties = {}) {
+export function add(parent, tag, properties = {}) {
   const made = parent.appendChild(document.createElement(tag));
   return Object.assign(made, properties);
 }
 
 /** The context of a canvas that is so large in CSS pixels, sharp on any screen. */
-function sized(canvas, width, height) {
+export function sized(canvas, width, height) {
   const dense = window.devicePixelRatio || 1;
   const [wide, high] = [Math.round(width * dense), Math.round(height * dense)];
   if (canvas.width !== wide) canvas.width = wide;

@@ -2,12 +2,13 @@
 
 /** Where the tank, or a window of it around a place, is drawn: from above, and below that from the side. */
 export class View {
-  /** `zoom`: [x, y] in the middle of a window, null = the whole tank. */
-  constructor(tank, width, zoom) {
+  /** `zoom`: [x, y] in the middle of a window, null = the whole tank. `bare`: without a ruler and the view from the side. */
+  constructor(tank, width, zoom, bare = false) {
     const [x, y, z] = [tank.x_m, tank.y_m, tank.z_m];
-    this.left = 34;
-    this.top = 14;
-    const across = width - this.left - 12;
+    this.star = bare ? 6 : 11; // [px]
+    this.left = bare ? 3 : 34;
+    this.top = bare ? 3 : 14;
+    const across = width - this.left - (bare ? 3 : 12);
     const most = Math.max(260, Math.min(0.62 * width, 560));
     const shown = zoom ? Math.min(9, x[1] - x[0]) : x[1] - x[0];
     this.scale = zoom ? across / shown : Math.min(across / shown, most / (y[1] - y[0]));
@@ -20,7 +21,7 @@ export class View {
     this.deep = Math.min(Math.max((z[1] - z[0]) * this.scale, 64), 150);
     this.side = this.top + this.high + 40;
     this.width = width;
-    this.height = this.side + this.deep + 26;
+    this.height = bare ? this.top + this.high + 3 : this.side + this.deep + 26;
   }
 
   x(x) {

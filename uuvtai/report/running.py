@@ -1,0 +1,227 @@
+"""Running episodes for the page's player, as messages in JSON: what every vehicle does, and of those that
+somebody follows what they sense, map and plan (``player/running.mjs`` reads them)."""
+
+from __future__ import annotations
+
+import base64
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from uuvtai.common.colours import PALETTE, agent_colours
+from uuvtai.common.enums import TRIGGERS, clearance_m, occupancy
+from uuvtai.common.obstacle_motion import describe_scenario
+from uuvtai.logs.encode import EpisodeEnd, dumped, numbered
+from uuvtai.logs.scenario import scenario_document
+from uuvtai.logs.topics.perception import map_origin
+from uuvtai.logs.topics.planning import code_name
+from uuvtai.logs.writer import Recordable, RecordedJob
+from uuvtai.report.recorded import SHARE, scene_header
+
+FRAME_S, MAP_S = 0.05, 0.5
+"""[s] of the clock between two frames, [s] of the episode between two maps"""
+_FAR_S, _CLEAR_M = 1e5, 0.1
+_LEAST_WEIGHT, _EVERY_POINT = 0.1, 5  # of forecasts, as recorded episodes have them
+_OUTCOMES = {"ttc": "TTC stop", "out_of_tank": "out of the tank"}
+_MOTION = (
+    *("clock.step", "vehicle.pos_w", "vehicle.quat_wb", "vehicle.vel_b", "ego.pos_w", "ego.rpy", "ego.vel_b"),
+    *("termination.clearance_m", "termination.ttc_s", "behavior.leaf", "world.pos_w"),
+)
+
+
+@dataclass
+class _Tank:
+    """An episode, as far as it was shown."""
+
+    head: dict[str, Any]
+    moving: list[int]  # slots of the obstacles that move
+    rows: list[tuple[list[Any], list[Any]]] = field(default_factory=list)
+    """time [s], x, y, z, yaw, clearance, time to collision, speed, leaf, places of what moves: by what the
+    vehicle knows, in truth"""
+    replans: list[tuple[float, str]] = field(default_factory=list)
+    map_s: float = -math.inf  # when the newest map was shown
+    end: dict[str, Any] | None = None
+
+    @property
+    def time_s(self) -> float:
+        return self.rows[-1][0][0]
+
+    def whole(self, with_truth: bool) -> str:
+        """All of it up to now."""
+        scene = self.head["scene"] | ({} if with_truth else {"obstacles": []})
+        rows = [pair[with_truth] for pair in self.rows]
+        return _text(self.head | {"scene": scene, "rows": rows, "replans": self.replans, "end": self.end})
+
+
+class RunningEpisodes:
+    """Shows every row of a simulator as a tank; an ``EpisodeObserver``."""
+
+    def __init__(self, audience: Any, world: str, agent: str, rate: float = 1.0) -> None:
+        """``audience``: a ``live.page.PageServer``; ``rate``: seconds of the episode in one of the clock's,
+        by which frames keep their distance; 0 = as fast as it goes."""
+        self._audience, self._world, self._agent, self._rate = audience, world, agent, rate
+        self._tanks: dict[int, _Tank] = {}
+        self._steps, self._shown_s = 0, -math.inf
+
+    def begin(self, sim: Recordable, row: int, job: RecordedJob) -> None:
+        """An episode was just reset in this row."""
+        described = describe_scenario(lambda name: _read(sim, name, [row])[0])
+        scene, moving = scene_header(
+            scenario_document(sim.config, described, self._world, job.seed, job.episode)
+        )
+        colour = agent_colours([self._agent])[self._agent]
+        head = {
+            "kind": "begin", "tank": row, "title": f"seed {job.seed}, episode {job.episode}", "scene": scene,
+            "agent": self._agent, "colour": [colour, PALETTE.index(colour) if colour in PALETTE else -1],
+            "leaves": numbered(sim.tree.names), "grid": _grid(sim), "of": len(sim.rows(sim.s.clock.step)),
+        }  # fmt: skip
+        tank = self._tanks[row] = _Tank(head, [one["slot"] for one in moving])
+        tank.rows += self._motion(sim, [row])
+        self._audience.note("")
+        self._audience.tell(tank.whole(self._audience.with_truth))
+        self._wait(sim, at_start=True)
+
+    def step(self, sim: Recordable) -> None:
+        """A control step has been done in all rows."""
+        self._steps += 1
+        running = [row for row, tank in self._tanks.items() if tank.end is None]
+        self._note_replans(sim, running)
+        if self._is_due(sim.config.episode.control_dt_s):
+            self._show(sim, running)
+        self._wait(sim)
+
+    def end(self, sim: Recordable, row: int, result: EpisodeEnd) -> None:
+        """The episode of this row is over."""
+        self._show(sim, [row])
+        said = _OUTCOMES.get(result.outcome, result.outcome)
+        tank = self._tanks[row]
+        tank.end = {"outcome": said, "failed": result.outcome != "success", "time": result.time_s}
+        self._audience.tell(_text({"kind": "end", "tank": row, "end": tank.end}))
+        if not self._audience.with_truth:  # now it does no harm
+            self._audience.tell(tank.whole(with_truth=True))
+
+    def _is_due(self, dt_s: float) -> bool:
+        """Whether a frame's time has come: by the episode's time, which the clock follows by the rate, so
+        that a busy machine shows as many; without a rate by the clock."""
+        if not self._rate:
+            return time.monotonic() >= self._shown_s + FRAME_S
+        gap = FRAME_S * self._rate / dt_s  # in steps
+        return self._steps // gap > (self._steps - 1) // gap
+
+    def _show(self, sim: Recordable, rows: list[int]) -> None:
+        """A frame of these rows, with what those who follow one of them see."""
+        self._shown_s, shown = time.monotonic(), []
+        for row, pair in zip(rows, self._motion(sim, rows), strict=True):
+            tank = self._tanks[row]
+            if pair[0][0] > tank.time_s:
+                tank.rows.append(pair)
+                shown.append([row, pair[self._audience.with_truth]])
+        if shown:
+            self._audience.tell(_text({"kind": "frame", "tanks": shown}))
+        for row in self._audience.followed().intersection(rows):
+            tank = self._tanks[row]
+            has_map = tank.time_s - tank.map_s >= MAP_S - 1e-6
+            if has_map:
+                tank.map_s = tank.time_s
+            self._audience.tell(_detail(sim, row, tank.time_s, has_map), tank=row)
+
+    def _wait(self, sim: Recordable, at_start: bool = False) -> None:
+        """Tell those who have come or have turned to another tank what there is, and wait while the episode
+        is held."""
+        while True:
+            for who, asked in self._audience.asked():
+                for row, tank in self._tanks.items():
+                    if asked < 0:
+                        self._audience.tell(tank.whole(self._audience.with_truth), to=who)
+                    elif asked == row:
+                        self._audience.tell(_detail(sim, row, tank.time_s, True), to=who)
+            if not self._audience.is_held(at_start):
+                return
+            at_start = False
+
+    def _motion(self, sim: Recordable, rows: list[int]) -> list[tuple[list[Any], list[Any]]]:
+        """What the vehicles do, as ``_Tank.rows`` has it."""
+        found = []
+        for row, *read in zip(rows, *(_read(sim, name, rows) for name in _MOTION), strict=True):
+            step, place, (w, x, y, z), velocity, own, rpy, own_velocity, clearance, ttc_s, leaf, at = read
+            yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+            time_s, moving = round(int(step) * sim.config.episode.control_dt_s, 4), self._tanks[row].moving
+            speeds = _rounded([np.linalg.norm(own_velocity), np.linalg.norm(velocity)], 2)
+            safety = _rounded([clearance, -1.0 if ttc_s > _FAR_S else ttc_s], 3)
+            known = [time_s, *_rounded([*own, rpy[2]], 3), None, None, speeds[0], int(leaf), []]
+            places = _rounded(at[moving, :2].ravel(), 2)
+            true = [time_s, *_rounded([*place, yaw], 3), *safety, speeds[1], int(leaf), places]
+            found.append((known, true))
+        return found
+
+    def _note_replans(self, sim: Recordable, rows: list[int]) -> None:
+        """Told as they come; those of the reset are in the first message of all."""
+        names = ("route.n_way", "route.plan_step", "clock.step", "route.trigger")
+        for row, count, planned, step, why in zip(rows, *(_read(sim, n, rows) for n in names), strict=True):
+            if count > 0 and planned == step:
+                replan = round(int(step) * sim.config.episode.control_dt_s, 4), code_name(TRIGGERS, why)
+                self._tanks[row].replans.append(replan)
+                self._audience.tell(_text({"kind": "replan", "tank": row, "replan": replan}))
+
+
+def _read(sim: Recordable, name: str, rows: list[int]) -> np.ndarray:
+    return sim.rows(attrgetter(name)(sim.s), rows)
+
+
+def _grid(sim: Recordable) -> dict[str, Any]:
+    shape = _read(sim, "grid_map.static_occ", [0])[0].shape
+    x, y = map_origin(sim.config, shape)
+    return {"rows": shape[0], "columns": shape[1], "x": x, "y": y, "cell_m": sim.config.mapping.cell_m}
+
+
+def _detail(sim: Recordable, row: int, time_s: float, with_map: bool) -> str:
+    """What a vehicle senses and plans at this time, and what it has mapped."""
+
+    def read(name: str) -> np.ndarray:
+        return _read(sim, name, [row])[0]
+
+    n_way, sonar = int(read("route.n_way")), sim.config.sensors.sonar
+    hit = np.flatnonzero(read("scan.hit") == 1)
+    bearing = float(read("scan.ping_yaw")) + sonar.first_beam_rad + sonar.beam_step_rad * hit
+    towards = np.column_stack([np.cos(bearing), np.sin(bearing)])
+    echoes = read("scan.ping_pos_w")[:2] + read("scan.range_m")[hit, None] * towards
+    moving = (read("tracks.alive") == 1) & (read("tracks.moving") == 1)
+    state, radius_m, cov = (read(f"tracks.{name}")[moving] for name in ("state", "radius_m", "cov"))
+    message = {
+        "kind": "detail", "tank": row, "time": time_s,
+        "route": _rounded(read("route.way_w")[:n_way], 2),
+        "ahead": _rounded(read("route.lookahead_w")[:2], 2) if n_way else None,
+        "echoes": _rounded(echoes, 2),
+        "tracks": _rounded(np.column_stack([state, radius_m, cov[:, [0, 1, 4]]]), 4),
+        "futures": _futures(read),
+    }  # fmt: skip
+    if with_map:
+        layers = [occupancy(read(f"grid_map.{name}_occ")) / SHARE for name in ("static", "dynamic")]
+        layers.append(clearance_m(read("clearance.site"), sim.config) / _CLEAR_M)
+        cells = [np.clip(np.rint(layer), 0, 255).astype(np.uint8).tobytes() for layer in layers]
+        message["map"] = [base64.b64encode(layer).decode() for layer in cells]
+    return _text(message)
+
+
+def _futures(read: Callable[[str], np.ndarray]) -> list[Any]:
+    """[weight, [[x, y], ..]] of where each moving track may go."""
+    shares, others, forecast = read("futures.share"), read("futures.pos_w"), read("forecast.pos_w")
+    found = []
+    for track in np.flatnonzero(read("forecast.radius_m")[:, 0] >= 0):
+        weights = [*shares[track], 1.0 - shares[track].sum()]
+        paths = zip(_rounded(weights, 2), [*others[track], forecast[track]], strict=True)
+        found += [[w, _rounded(points[::_EVERY_POINT], 2)] for w, points in paths if w >= _LEAST_WEIGHT]
+    return found
+
+
+def _rounded(values: Any, digits: int) -> list[Any]:
+    return np.round(np.asarray(values, float), digits).tolist()
+
+
+def _text(message: dict[str, Any]) -> str:
+    return dumped(message).decode()
