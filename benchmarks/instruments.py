@@ -278,7 +278,7 @@ _HORIZON = 6000  # twice the usual: the pilot first turns until the walls have t
 _RIG = """extends: {preset}
 sensors:
   localization: estimated
-  sonar: {{max_range_m: {range_m}}}
+  sonar: {{max_range_m: {range_m}, step_overhead_s: 0.03}}  # a step of a Ping360 as recorded
   dvl: {{yaw_deg: {yaw_deg}, sigma_m_s: 0.005, period_steps: 6}}
 """
 
