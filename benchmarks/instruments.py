@@ -244,7 +244,7 @@ class Link(AbstractContextManager["Link"]):
         self.autopilot, self.pilot = StandIn(("127.0.0.1", pilot_port)), pilot
         self._to, self._port = ("127.0.0.1", physics), f":{pilot_port:04X}"
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(60.0)
+        self._socket.settimeout(600.0)
         self.hurried = 0
         """how often the pilot was not waited for"""
 
@@ -274,10 +274,11 @@ class Link(AbstractContextManager["Link"]):
 
 MOST_AT_ONCE = 20
 _PHYSICS, _PILOT = 21002, 23000  # ports of the first instance, counted on by ten
+_HORIZON = 6000  # twice the usual: the pilot first turns until the walls have told where it is
 _RIG = """extends: {preset}
 sensors:
   localization: estimated
-  sonar: {{max_range_m: {range_m}}}
+  sonar: {{max_range_m: {range_m}, step_overhead_s: 0.03}}  # a step of a Ping360 as recorded
   dvl: {{yaw_deg: {yaw_deg}, sigma_m_s: 0.005, period_steps: 6}}
 """
 
@@ -304,7 +305,8 @@ class Setup:
     def overrides(self) -> list[str]:
         """Of the config, as ``--set`` takes them."""
         scene = {"n_static": self.static, "n_dynamic": self.dynamic, "dynamic_speed_m_s": 0.6}
-        return [*(f"world.{name}={value}" for name, value in scene.items()), *self.changes]
+        long = f"episode.horizon_steps={_HORIZON}"
+        return [*(f"world.{name}={value}" for name, value in scene.items()), long, *self.changes]
 
 
 class Waters:
@@ -345,12 +347,20 @@ class Waters:
         return next((match[2] for match in said if match and int(match[1]) == number), "")
 
 
-_LONGEST_EPISODE_S, _AFTER_S = 150.0, 10.0  # of the water's time; after the pilot has left
+_LONGEST_EPISODE_S, _AFTER_S = 200.0, 10.0  # of the water's time; after the pilot has left
 
 
 def flown(waters: Waters, pilots: SimpleQueue[Process], say: Callable[[str], None], number: int) -> str:
     """How an episode ends that ``uuv pilot --arm`` drives."""
-    pilot, begun_s = pilots.get(), time.monotonic()
+    pilot = pilots.get()
+    try:
+        return _flown(waters, pilot, say, number)
+    finally:
+        pilots.put(pilot)
+
+
+def _flown(waters: Waters, pilot: Process, say: Callable[[str], None], number: int) -> str:
+    begun_s = time.monotonic()
     waters.pilot(pilot, number, "--arm", "--depth", "0.05,1.55", "--max-speed", "1")
     with waters.link(number, pilot) as link:
         ready_s, left_s = time.monotonic(), _LONGEST_EPISODE_S
@@ -364,7 +374,6 @@ def flown(waters: Waters, pilots: SimpleQueue[Process], say: Callable[[str], Non
     last = [line for line in pilot.lines if not line.startswith("ended")][-1:]
     spent = f"{ready_s - begun_s:.1f} + {driven_s - ready_s:.1f} s, {link.hurried} times not waited for"
     say(f"{number}: {end or 'not ended'}, {link.autopilot.time_s:.1f} s in {spent}; {last}")
-    pilots.put(pilot)
     return end or "not ended"
 
 
