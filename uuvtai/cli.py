@@ -246,20 +246,15 @@ def train_policy(
     from uuvtai.evaluation.evaluate import evaluate_now
     from uuvtai.learning.runner import TrainRequest, train
 
-    own = parsing.reward(reward)
+    more: dict[str, Any] = {"iterations": iterations, "device": device, "reward": parsing.reward(reward)}
     if resume is None:
         config = scene.training(preset, [] if seed is None else [("train.seed", seed)])
-        new = {"start": start, "iterations": iterations, "device": device, "run_dir": run_dir}
-        request = TrainRequest(config, preset, **new, reward=own)
+        if scene.motion and config.surrogate.enabled:
+            raise UsageError("--motion: is of the simulator; train 'paper', or --set surrogate.enabled=false")
+        request = TrainRequest(config, preset, start=start, run_dir=run_dir, **more)
     else:
         parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides", "reward"))
-        request = TrainRequest(
-            resume=resume,
-            overrides=[*(scene.overrides or [])],
-            iterations=iterations,
-            device=device,
-            reward=own,
-        )
+        request = TrainRequest(resume=resume, overrides=[*(scene.overrides or [])], **more)
     result, folder = train(request, TrainingProgress(), evaluate_now)
     _report_if(with_report, folder)
     output.show(result, lambda screen: show_training(screen, result))
@@ -324,8 +319,7 @@ def report_run(
     written = report(runs, out, force)
     document = {"schema": 1, "report": str(written.page), "figures": list(map(str, written.figures))}
     output.show(document, lambda _screen: typer.echo(str(written.page)))
-    if open_page:
-        _open(written.page)
+    _open(written.page, open_page)
 
 
 def _report_if(with_report: bool, folder: Path, otherwise: str = "", opens: bool = False) -> None:
@@ -333,18 +327,16 @@ def _report_if(with_report: bool, folder: Path, otherwise: str = "", opens: bool
     if with_report:
         from uuvtai.report.build import report
 
-        page = report([folder]).page
-        say(f"report: {page}")
-        if opens:
-            _open(page)
+        say(f"report: {(page := report([folder]).page)}")
+        _open(page, opens)
     elif otherwise:
         say(f"next: {otherwise} {shlex.quote(str(folder))}")
 
 
-def _open(page: Path) -> None:
+def _open(page: Path, wanted: bool) -> None:
     import webbrowser
 
-    if not webbrowser.open_new_tab(page.resolve().as_uri()):
+    if wanted and not webbrowser.open_new_tab(page.resolve().as_uri()):
         say(f"--open: no browser was found here; open {page} in one")
 
 

@@ -14,7 +14,7 @@ from tests.evaluation.test_resume_eval import Watch
 from tests.sim.test_observation_only import KNOWN, Poison
 from uuvtai.common.errors import SettingError, UserError
 from uuvtai.config import Config, ObservationConfig
-from uuvtai.config.loader import ConfigError
+from uuvtai.config.loader import ConfigError, load_training
 from uuvtai.console import parsing
 from uuvtai.console.groups import SceneGroup
 from uuvtai.envs.vector_env import VectorEnv
@@ -33,6 +33,7 @@ from uuvtai.plugins.api import COMMAND, PluginError, PluginSpec, is_plugin, plug
 from uuvtai.report.evaluation import agents_table
 from uuvtai.report.tables import TERMINAL
 from uuvtai.sim.setup import array_sizes
+from uuvtai.surrogate.world import draw_bank
 
 AWAY = "import numpy as np\n\ndef act(view):\n    return np.tile([0.6, 0.0, 0.0, 0.0], (len(view.rows), 1))\n"
 N_OBS = observation_width(ObservationConfig())
@@ -907,6 +908,19 @@ def test_a_reward_where_there_is_no_use_for_it_is_refused(write, capfd, tmp_path
     assert code == 2 and says in err and not (tmp_path / "run").exists()
 
 
+def test_a_motion_is_of_the_simulator(write, capfd):
+    code, _, err = uuv(capfd, "train", "--motion", f"{write(MOTION)}:paths")
+    assert code == 2 and "--motion: is of the simulator; train 'paper'" in err
+    Path("long.yaml").write_text(f"extends: pool\nworld: {{fixed: {obstacles_as_yaml()}}}\n")
+    config = load_training("policy", [("surrogate.worlds", ["long.yaml"])])
+    with pytest.raises(ConfigError, match=r"surrogate.worlds: long.yaml has a path of more than 5 corners"):
+        draw_bank(config, ((0, 1, 0.5),), 0, 1)
+
+
+def obstacles_as_yaml():
+    return json.dumps(loading.obstacles_of(plugin_spec("mine.py", "motion")))
+
+
 def test_a_run_goes_on_with_the_reward_that_it_began_with(write, tmp_path):
     own = found(f"{write(REWARD)}:terms", "reward")
     runner._check_reward(tmp_path, None)
@@ -965,6 +979,10 @@ def test_a_motion_of_a_users_own_is_part_of_the_config(write):
         (
             "[{'kind': 'sphere', 'radius_m': 1, 'path': [(i, 1) for i in range(65)]}]",
             "must have 2 to 64 waypoints",
+        ),
+        (
+            "[{'kind': 'sphere', 'x_m': 1, 'y_m': 1, 'radius': 1}]",
+            "obstacle 0: radius: Extra inputs are not permitted; did you mean 'radius_m'?",
         ),
         ("1 / 0", "mine.py:3: ZeroDivisionError: division by zero (--motion mine.py:paths)"),
     ],

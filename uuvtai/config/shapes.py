@@ -102,7 +102,7 @@ def _grown(inside: np.ndarray, low: np.ndarray, high: np.ndarray, first: int) ->
     low, high = low.copy(), high.copy()
     for axis in (first, 1 - first):
         lines = inside if axis == 0 else inside.T
-        free = lines[low[1 - axis] : high[1 - axis]].all(axis=0)
+        free = np.logical_and.reduce(lines[low[1 - axis] : high[1 - axis]])
         while low[axis] > 0 and free[low[axis] - 1]:
             low[axis] -= 1
         while high[axis] < len(free) and free[high[axis]]:

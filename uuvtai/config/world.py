@@ -268,7 +268,8 @@ class WorldConfig(Section, Truth):
             (low, high), (start, end) = getattr(self.tank, f"{axis}_m"), getattr(self, f"spawn_{axis}_m")
             if start < low or end > high:
                 raise ValueError(
-                    f"spawn_{axis}_m ({start}, {end}) reaches out of tank.{axis}_m ({low}, {high})"
+                    f"spawn_{axis}_m: ({start:g}, {end:g}), where start and goal are drawn, reaches out of "
+                    f"tank.{axis}_m ({low:g}, {high:g}); give it beside the tank"
                 )
         for i, obstacle in enumerate(self.fixed):
             self._check_place(f"fixed.{i}", obstacle)

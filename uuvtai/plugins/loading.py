@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from uuvtai.common.files import read_bytes
 from uuvtai.config import FixedObstacle
+from uuvtai.config.loader import nearest
 from uuvtai.envs.vector_env import NUM_ACTIONS, VectorEnv
 from uuvtai.kernels.planning.observation import placed_columns
 from uuvtai.learning.export import graph as graph_check
@@ -442,7 +443,9 @@ def obstacles_of(spec: PluginSpec) -> list[dict[str, Any]]:
             given[i] = FixedObstacle.model_validate(one).model_dump(mode="json", exclude_defaults=True)
         except (TypeError, ValueError) as error:
             first = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": error}
-            reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}".lstrip(": ")
+            key, known = ".".join(map(str, first["loc"])), list(FixedObstacle.model_fields)
+            like = nearest(key, known) if first.get("type") == "extra_forbidden" else ""
+            reason = f"{key}: {first['msg']}{like}".lstrip(": ")
             raise PluginError(f"{place_of(give, spec)}: obstacle {i}: {reason}") from None
     return given
 

@@ -17,7 +17,7 @@ from uuvtai.config import TankConfig
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.sim.behavior_tree import read_tree
-from uuvtai.sim.setup import Scene
+from uuvtai.sim.setup import N_CORNER, Scene
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stages import bind
 from uuvtai.surrogate import motion, sensing
@@ -53,6 +53,8 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
     for world in config.surrogate.worlds:
         own = load_config(world, overrides=[("world.n_static", n_static), ("world.n_dynamic", n_dynamic)])
         _refuse_other_tank(world, own.world.tank, config.world.tank)
+        if any(len(one.path) > N_CORNER for one in own.world.fixed):
+            raise ConfigError(f"surrogate.worlds: {world} has a path of more than {N_CORNER} corners")
         sim = Sim(own, min(BATCH, count), read_tree(TRAINING_TREE))
         for scene in scenes:
             parts.append(drawn(sim, scene, seed, count))
