@@ -388,7 +388,7 @@ def test_driving_in_a_browser(tmp_path):
     assert seen["driven"]["speed"] > 0.05 and seen["driven"]["said"] == "ahead 100 %"
     assert f"Report: {folder}/report.html" in seen["note"]
     *_, won, report = err.strip().splitlines()
-    assert re.match(r"(bt won|nobody reached the goal) \(bt: |nobody .* \(human: ", won) and "human: " in won
+    assert re.match(r"(bt won|Nobody reached the goal) \((bt|human): ", won) and "human: " in won
     assert report == f"report: {folder / 'report.html'}"
     assert "human \u2020" in out and "the page showed what no vehicle senses" in out
     log = folder / "logs/human_seed0_episode0.mcap"
@@ -414,7 +414,7 @@ def test_who_won():
     assert who_won([slow, fast, lost]) == (
         "human won (human: success after 18.0 s; bt: success after 20.0 s; dwa: out of tank after 3.0 s)"
     )
-    assert who_won([lost]).startswith("nobody reached the goal")
+    assert who_won([lost]).startswith("Nobody reached the goal")
     assert who_won([slow, {**slow, "name": "best"}]).startswith("bt and best won")
     many = agent("bt", ["success", "timeout"], [9.0, 60.0])
     assert who_won([many]) == "bt won (bt: 1 of 2 episodes after 9.0 s on average)"

@@ -224,7 +224,7 @@ def who_won(agents: Sequence[dict[str, Any]]) -> str:
 
     ranked = sorted(agents, key=rank)
     best = [m["name"] for m in ranked if rank(m) == rank(ranked[0])]
-    won = f"{' and '.join(best)} won" if rank(ranked[0])[0] else "nobody reached the goal"
+    won = f"{' and '.join(best)} won" if rank(ranked[0])[0] else "Nobody reached the goal"
     return f"{won} ({'; '.join(map(told, ranked))})"
 
 
