@@ -11,6 +11,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -194,6 +195,15 @@ def test_a_page_that_is_opened_twice_has_one_helm(helm):
     assert role(second)["helm"]
 
 
+def test_who_asks_over_and_over_is_answered_once(server):
+    with look(server) as client:
+        until(lambda: server._clients)
+        for i in range(1000):
+            client.send(json.dumps({"follow": i % 16}))
+        until(lambda: server.followed() == {999 % 16})
+        assert [*server.asked().values()] == [True] and server.asked() == {}
+
+
 def test_who_is_on_another_machine_looks_and_steers_not(helm):
     server, _ = helm
     with look(server, source_address=("127.9.9.9", 0)) as far:
@@ -236,14 +246,19 @@ def test_a_port_that_is_taken_is_refused(server):
 # ---------------------------------------------------------------------------------------------- what is shown
 
 
+@dataclass(frozen=True)
+class Follower:
+    tank: int
+
+
 class Audience:
     """Keeps what it is told; follows tank 0."""
 
     def __init__(self, with_truth=True):
-        self.with_truth, self.newcomers, self.messages = with_truth, [], []
+        self.with_truth, self.newcomers, self.messages = with_truth, {}, []
 
     def asked(self):
-        newcomers, self.newcomers = self.newcomers, []
+        newcomers, self.newcomers = self.newcomers, {}
         return newcomers
 
     def followed(self):
@@ -315,7 +330,7 @@ def test_who_comes_late_is_told_all_there_was(small):
     audience = Audience()
     running = shown(small, audience)
     audience.messages.clear()
-    audience.newcomers = [("she", -1), ("she", 1), ("she", 7)]
+    audience.newcomers = {Follower(1): True, Follower(7): False}
     small.sim.step()
     running.step(small.sim)
     first, second = audience.of("begin")
@@ -335,7 +350,7 @@ def test_without_the_truth_nothing_of_it_is_told(small):
             for field in (s.vehicle.pos_w, s.vehicle.vel_b, s.world.pos_w, s.termination.clearance_m):
                 field.fill(7.0)
         audience.messages.clear()
-        audience.newcomers = [("she", -1)]
+        audience.newcomers = {Follower(-1): True}
         running._show(small.sim, [0, 1])
         running._wait(small.sim)
         told.append(audience.messages)
