@@ -45,7 +45,7 @@ def node(*arguments, **environment):
         pytest.skip("needs node (bootstrap.py brings one)")
     return subprocess.run(
         [found, *arguments], cwd=JS, env={**os.environ, **environment}, capture_output=True, text=True,
-        check=False, timeout=240,
+        check=False, timeout=500,
     )  # fmt: skip
 
 

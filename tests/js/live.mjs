@@ -9,7 +9,7 @@ const inPlayer = (tab, work) => tab.evaluate(`(() => { const { player } = docume
 
 /** Asks again and again: the page's policy lets nobody evaluate in it. */
 async function until(tab, work) {
-  for (const end = Date.now() + 100_000; Date.now() < end; await tab.waitForTimeout(30)) if (await inPlayer(tab, work)) return;
+  for (const end = Date.now() + 200_000; Date.now() < end; await tab.waitForTimeout(30)) if (await inPlayer(tab, work)) return;
   throw new Error(`never: ${work}`);
 }
 
@@ -43,6 +43,11 @@ async function wall(browser) {
   return { names, past, seen, paused, other, back, walled, errors: [...errors, ...second.errors], requests };
 }
 
+async function pause(tab, on) {
+  await tab.keyboard.press("p");
+  await until(tab, `(player.role.held === "pause") === ${on}`);
+}
+
 /** Waits for the start, steers, asks for the truth, lets go; a second page only looks on. */
 async function drive(browser) {
   const { tab, errors, requests } = await opened(browser, address, 1400, "light");
@@ -53,17 +58,19 @@ async function drive(browser) {
   await second.tab.keyboard.press("w");
   const begun = await inPlayer(tab, "({ end: player.source.end, held: player.role.held, words: player.state.textContent, truth: player.source.scene.obstacles.length })");
   await tab.keyboard.down("w");
-  await until(tab, "player.source.end > 1.5");
+  await until(tab, "player.source.end > 1");
+  await pause(tab, true); // whatever takes its time does it while the episode waits
   await shot(tab, "driven");
-  const driven = await inPlayer(tab, "({ speed: player.source.past.speed.at(-1), clearance: player.source.frame(0, 99).clearance, said: player.commanded.textContent })");
+  const driven = await inPlayer(tab, "({ end: player.source.end, speed: player.source.past.speed.at(-1), clearance: player.source.frame(0, 99).clearance, said: player.commanded.textContent })");
   await tab.keyboard.press("t");
-  await until(tab, "player.role.truth && player.source.scene.obstacles.length");
-  await until(tab, "player.source.frame(0, 99).clearance !== null");
+  await until(tab, "player.role.truth && player.source.scene.obstacles.length && player.source.frame(0, 99).clearance !== null");
   await shot(tab, "truth");
   await shot(second.tab, "second");
   await tab.keyboard.up("w");
   await tab.keyboard.press("Space");
   await until(tab, "player.commanded.textContent === 'stop'");
+  await pause(tab, false);
+  await until(tab, `player.source.end > ${driven.end + 0.3}`);
   await tab.keyboard.down("s"); // until it is over
   await until(tab, "/Report: /.test(player.role.note ?? '')");
   await shot(tab, "over");

@@ -11,6 +11,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -194,6 +195,15 @@ def test_a_page_that_is_opened_twice_has_one_helm(helm):
     assert role(second)["helm"]
 
 
+def test_who_asks_over_and_over_is_answered_once(server):
+    with look(server) as client:
+        until(lambda: server._clients)
+        for i in range(1000):
+            client.send(json.dumps({"follow": i % 16}))
+        until(lambda: server.followed() == {999 % 16})
+        assert [*server.asked().values()] == [True] and server.asked() == {}
+
+
 def test_who_is_on_another_machine_looks_and_steers_not(helm):
     server, _ = helm
     with look(server, source_address=("127.9.9.9", 0)) as far:
@@ -236,14 +246,19 @@ def test_a_port_that_is_taken_is_refused(server):
 # ---------------------------------------------------------------------------------------------- what is shown
 
 
+@dataclass(frozen=True)
+class Follower:
+    tank: int
+
+
 class Audience:
     """Keeps what it is told; follows tank 0."""
 
     def __init__(self, with_truth=True):
-        self.with_truth, self.newcomers, self.messages = with_truth, [], []
+        self.with_truth, self.newcomers, self.messages = with_truth, {}, []
 
     def asked(self):
-        newcomers, self.newcomers = self.newcomers, []
+        newcomers, self.newcomers = self.newcomers, {}
         return newcomers
 
     def followed(self):
@@ -315,7 +330,7 @@ def test_who_comes_late_is_told_all_there_was(small):
     audience = Audience()
     running = shown(small, audience)
     audience.messages.clear()
-    audience.newcomers = [("she", -1), ("she", 1), ("she", 7)]
+    audience.newcomers = {Follower(1): True, Follower(7): False}
     small.sim.step()
     running.step(small.sim)
     first, second = audience.of("begin")
@@ -335,7 +350,7 @@ def test_without_the_truth_nothing_of_it_is_told(small):
             for field in (s.vehicle.pos_w, s.vehicle.vel_b, s.world.pos_w, s.termination.clearance_m):
                 field.fill(7.0)
         audience.messages.clear()
-        audience.newcomers = [("she", -1)]
+        audience.newcomers = {Follower(-1): True}
         running._show(small.sim, [0, 1])
         running._wait(small.sim)
         told.append(audience.messages)
@@ -376,18 +391,19 @@ def test_a_wall_of_tanks_in_a_browser():
 def test_driving_in_a_browser(tmp_path):
     browser.require()
     folder = tmp_path / "driven"
-    typed = ("drive", "--sensors", "ping360", "-S", 8, "-D", 6, "--rate", 4, "--run-dir", folder)
+    short = ("--set", "episode.horizon_steps=400")
+    typed = ("drive", "--sensors", "ping360", "-S", 2, "-D", 1, *short, "--run-dir", folder)
     with command(*typed) as (process, address):
         seen = browser.told("live.mjs", "drive", address)
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=300)
     assert process.returncode == 0 and seen["errors"] == []
     assert seen["begun"]["end"] == 0 and seen["begun"]["held"] == "start", "the second page starts nothing"
     assert seen["begun"]["words"].startswith("The first key starts")
     assert seen["begun"]["truth"] == 0 and seen["driven"]["clearance"] is None
-    assert seen["driven"]["speed"] > 0.2 and seen["driven"]["said"] == "ahead 100 %"
+    assert seen["driven"]["speed"] > 0.05 and seen["driven"]["said"] == "ahead 100 %"
     assert f"Report: {folder}/report.html" in seen["note"]
     *_, won, report = err.strip().splitlines()
-    assert won.startswith("bt won (bt: success after ") and "human: " in won
+    assert re.match(r"(bt won|Nobody reached the goal) \((bt|human): ", won) and "human: " in won
     assert report == f"report: {folder / 'report.html'}"
     assert "human \u2020" in out and "the page showed what no vehicle senses" in out
     log = folder / "logs/human_seed0_episode0.mcap"

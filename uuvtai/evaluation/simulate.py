@@ -347,8 +347,8 @@ def _page_of(
     server = PageServer(page, live.host, live.port, live.origins, steered)
     watch.note(f"open {server.url} in a browser" + ("" if steered else "; Ctrl-C ends it"))
     server.note("The simulator starts.")
-    if live.opens:
-        webbrowser.open_new_tab(server.url)
+    if live.opens and not webbrowser.open_new_tab(server.url):
+        watch.note(f"--open: no browser was found here; open {server.url} in one")
     return server
 
 

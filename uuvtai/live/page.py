@@ -51,7 +51,7 @@ class PageServer(LiveServer):
         helm, and the truth is hidden. Raises LiveError."""
         self._page, self.steered, self._now = page, steered, now
         self._names = {host, *OWN_NAMES}
-        self._asked: list[tuple[Any, int]] = []
+        self._asked: dict[Client, bool] = {}
         self._driver: Client | None = None
         self._command, self._heard_s = STOP, 0.0
         self._held, self._note = "", ""
@@ -60,10 +60,11 @@ class PageServer(LiveServer):
 
     # ------------------------------------------------------------------------------ for who runs the episodes
 
-    def asked(self) -> list[tuple[Any, int]]:
-        """(who, tank) of those who have begun to follow a tank since the last call; -1 = who has come."""
+    def asked(self) -> dict[Client, bool]:
+        """Who has come or has turned to another ``tank`` since the last call, and whether she is to be told
+        all: one entry each, however often she asks."""
         with self._lock:
-            asked, self._asked = self._asked, []
+            asked, self._asked = self._asked, {}
         return asked
 
     def followed(self) -> set[int]:
@@ -121,7 +122,7 @@ class PageServer(LiveServer):
 
     def arrived(self, client: Client) -> None:
         """She is told all there is, and who may do what."""
-        self._asked.append((client, -1))
+        self._asked[client] = True
         self._tell_roles()
 
     def left(self, client: Client) -> None:
@@ -136,7 +137,7 @@ class PageServer(LiveServer):
         may = client is self._helm()
         if what == "follow" and type(value) is int and -1 <= value < MOST_TANKS:
             client.tank = value
-            self._asked += [(client, value)] if value >= 0 else []
+            self._asked.setdefault(client, False)
         elif what == "steer" and self.steered and (command := _command(value)) is not None:
             if may:
                 self._steer(client, command)
@@ -168,7 +169,7 @@ class PageServer(LiveServer):
     def _show_truth(self, with_truth: bool) -> None:
         self.with_truth = with_truth
         self.truth_was_seen |= with_truth
-        self._asked += [(client, -1) for client in self._clients]
+        self._asked |= dict.fromkeys(self._clients, True)
         self._tell_roles()
 
     def _tell_roles(self) -> None:

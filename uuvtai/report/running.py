@@ -134,11 +134,11 @@ class RunningEpisodes:
         """Tell those who have come or have turned to another tank what there is, and wait while the episode
         is held."""
         while True:
-            for who, asked in self._audience.asked():
+            for who, wants_all in self._audience.asked().items():
                 for row, tank in self._tanks.items():
-                    if asked < 0:
+                    if wants_all:
                         self._audience.tell(tank.whole(self._audience.with_truth), to=who)
-                    elif asked == row:
+                    if who.tank == row:
                         self._audience.tell(_detail(sim, row, tank.time_s, True), to=who)
             if not self._audience.is_held(at_start):
                 return
