@@ -162,8 +162,8 @@ def motion(theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle_cfg: 
     turns = np.concatenate([given.tilt_rate, given.up], axis=2)
     out = np.empty((len(theta), *given.velocity.shape))
     parts = max(1, int(np.ceil(given.dt_s / _LONGEST_STEP_S)))
-    arrays = map(np.ascontiguousarray, (told, start, loads, turns))
-    move_stretches(*arrays, given.dt_s / parts, parts, out)
+    told, start, loads, turns = map(np.ascontiguousarray, (told, start, loads, turns))
+    move_stretches(told, start, loads, turns, given.dt_s / parts, parts, out)
     return out
 
 
