@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from uuvtai.common.enums import Truth
-from uuvtai.config import shapes
 from uuvtai.config.base import (
     Count,
     Fraction,
@@ -23,6 +21,9 @@ from uuvtai.config.base import (
     Section,
     Vector3,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _LONGEST_M, _MOST_AREA_M2, _DEEPEST_M = 1000.0, 40_000.0, 100.0
 _MOST_CORNERS = 64
@@ -56,10 +57,12 @@ class TankConfig(Section):
 
     def holds(self, x_m: float, y_m: float) -> bool:
         """Whether a place is within the walls, or on them."""
-        return bool(self.from_wall(np.array(x_m), np.array(y_m)) >= -1e-6)
+        return bool(self.from_wall(x_m, y_m) >= -1e-6)
 
-    def from_wall(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    def from_wall(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> np.ndarray:
         """[m] from places to the nearest side wall; negative outside."""
+        import numpy as np  # not for the commands that read presets
+
         (x_low, x_high), (y_low, y_high) = self.x_m, self.y_m
         if self.shape == "circle":
             off = np.hypot(x_m - 0.5 * (x_low + x_high), y_m - 0.5 * (y_low + y_high))
@@ -180,6 +183,10 @@ class OccupancyPicture(Section):
 
     def outlines(self, tank: TankConfig) -> Iterator[list[np.ndarray]]:
         """Rings (n, 2) [m] of what it shows inside the tank: of each obstacle the outline and its holes."""
+        import numpy as np
+
+        from uuvtai.config import shapes
+
         bright = shapes.read_picture(self.image)
         dark = (bright if self.negate else 255 - bright) > 255 * self.occupied_thresh
         x0, y0, yaw = self.origin
@@ -235,6 +242,12 @@ class WorldConfig(Section, Truth):
     @model_validator(mode="after")
     def _boxed(self) -> WorldConfig:
         """All that is explicit in ``fixed``, outlines and pictures as boxes: nothing else knows them."""
+        if not (self.added or self.polygons or self.occupancy):
+            return self
+        import numpy as np
+
+        from uuvtai.config import shapes
+
         shown = self.occupancy.outlines(self.tank) if self.occupancy else ()
         fine_m = self.occupancy.resolution if self.occupancy else 0.0
         given = [(f"polygons.{i}", [np.array(corners)], 0.025) for i, corners in enumerate(self.polygons)]
@@ -249,13 +262,12 @@ class WorldConfig(Section, Truth):
                 raise ValueError(f"{name}: needs more than {shapes.MAX_BOXES} boxes: straighten outlines")
         if self.occupancy and name != "occupancy":
             raise ValueError("occupancy: shows nothing in the tank; look at resolution, origin and negate")
-        if boxes or self.added:  # a frozen section is still being made here
-            fixed = [
-                FixedObstacle(kind="box", x_m=x, y_m=y, half_extents_m=(a, b), yaw_deg=yaw)
-                for x, y, a, b, yaw in boxes
-            ]
-            empty = {"added": (), "polygons": (), "occupancy": None}
-            self.__dict__.update(fixed=(*self.fixed, *self.added, *fixed), **empty)
+        fixed = [
+            FixedObstacle(kind="box", x_m=x, y_m=y, half_extents_m=(a, b), yaw_deg=yaw)
+            for x, y, a, b, yaw in boxes
+        ]
+        all_of = {"fixed": (*self.fixed, *self.added, *fixed), "added": (), "polygons": (), "occupancy": None}
+        self.__dict__.update(all_of)  # a frozen section is still being made here
         return self
 
     @model_validator(mode="after")
