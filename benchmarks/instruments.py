@@ -79,7 +79,7 @@ def _driven(setup: Setup, count: int, job: Job) -> list[Row]:
                 with Process(folder) as process:
                     waters = Waters(process, setup, folder, first, some)
                     ends += threads.map(partial(flown, waters, pilots, job.say), range(some))
-        config = load_config("pool", str(setup.rig(folder)), "bluerov2_16v", overrides=setup.overrides)
+        config = load_config("pool", str(setup.rig(folder)), "bluerov2_16v", overrides=list(setup.overrides))
         sim = Sim(config, 1, read_tree("bt"))
         own = [simulated(sim, number) for number in range(count)]
     off = [100.0 * ((one == "success") - (other == "success")) for one, other in zip(ends, own, strict=True)]
@@ -125,7 +125,7 @@ def _a50() -> tuple[Callable[[float], None], Instrument]:
 
 def _ping360() -> tuple[Callable[[float], None], Instrument]:
     sonar, fake = load_config("pool", "ping360").sensors.sonar, FakePing360("127.0.0.1", 0)
-    fake._step_s = lambda _: sonar.step_us / 1e6
+    fake._step_s = lambda listening: sonar.step_us / 1e6
     channel = UdpChannel(InstrumentPlace("ping360", "127.0.0.1", fake.port), True, 2048)
     instrument = Ping360(channel, sonar, sonar.zero_gradian, sonar.min_range_m, sonar.sound_m_s)
     return lambda now_s: fake.step(now_s, lambda bearing: 3.0 + bearing), instrument
@@ -143,7 +143,11 @@ def _json() -> tuple[Callable[[float], None], Instrument]:
     channel = UdpChannel(InstrumentPlace("json", "127.0.0.1", _IMAGES + 1), False, 65507)
     other = UdpChannel(InstrumentPlace("json", "127.0.0.1", _IMAGES + 1), True, 65507)
     said = {"kind": "sonar", "range_m": [4.123] * 256, "hit": [1] * 256, "doppler_m_s": []}
-    return lambda _: other.write(json.dumps(said).encode()) and None, JsonUdp(channel)
+
+    def tell(_: float) -> None:
+        other.write(json.dumps(said).encode())
+
+    return tell, JsonUdp(channel)
 
 
 _IMAGES = 24747  # UDP port
