@@ -312,16 +312,18 @@ def test_a_frame_is_what_the_simulator_has(small):
         assert clearance == pytest.approx(sim.rows(sim.s.termination.clearance_m)[row], abs=1e-3)
         assert ttc == -1 or 0 <= ttc < 1e4
         assert leaf == sim.rows(sim.s.behavior.leaf)[row]
-        moving = [one["slot"] for one in audience.messages[row]["scene"]["obstacles"] if one["moves"]]
+        moving = [one["slot"] for one in audience.of("begin")[row]["scene"]["obstacles"] if one["moves"]]
         assert places == pytest.approx(sim.rows(sim.s.world.pos_w)[row][moving, :2].ravel(), abs=0.01)
     detail = audience.of("detail")
     assert {one["tank"] for one in detail} == {0} and len(detail) == 20
     maps = [one for one in detail if "map" in one]
     assert len(maps) == 2
     cells = np.frombuffer(base64.b64decode(maps[-1]["map"][0]), np.uint8)
-    grid = audience.messages[0]["grid"]
+    grid = audience.of("begin")[0]["grid"]
     assert cells.size == grid["rows"] * grid["columns"] and 0 < cells.max() <= 31
     assert len(detail[-1]["echoes"]) > 50 and detail[-1]["route"]
+    planned = [one["replan"] for one in audience.of("replan") if one["tank"] == 0]
+    assert planned[0] == [0, "initial"] and len(planned) == sim.rows(sim.s.route.replans)[0].sum()
     running.end(sim, 0, END)
     assert audience.of("end")[0]["end"] == {"outcome": "TTC stop", "failed": True, "time": 1.0}
 

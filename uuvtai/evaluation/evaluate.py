@@ -90,7 +90,7 @@ def compare(
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
     comparison = replace(comparison_of(request, num_envs, agents, watch), guest=guest)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
-    with _going_on(folder, watch):
+    with _going_on(folder, watch, can_resume=guest is None):
         device = comparison.any_simulator().device.type
         folder.write_json(REQUEST, document_of(request, num_envs, device, digests_of(agents)))
         runs = run_agents(comparison, folder)
@@ -121,13 +121,15 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
 
 
 @contextmanager
-def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
-    """Record how the work inside ends, and say how to go on where it was interrupted."""
+def _going_on(folder: RunFolder, watch: EvaluationWatch, can_resume: bool = True) -> Iterator[None]:
+    """Record how the work inside ends, and say how to go on where it was interrupted and can be."""
     try:
         with folder.recorded():
             yield
     except KeyboardInterrupt:
         watch.stop()
+        if not can_resume:
+            raise
         watch.note(f"finished episodes are kept; go on with: uuv eval --resume {folder.path}")
         if any((folder.path / "logs").glob("*.part")):
             watch.note(

@@ -84,6 +84,7 @@ class RunningEpisodes:
         tank.rows += self._motion(sim, [row])
         self._audience.note("")
         self._audience.tell(tank.whole(self._audience.with_truth))
+        self._note_replans(sim, [row])
         self._wait(sim, at_start=True)
 
     def step(self, sim: Recordable) -> None:
@@ -160,7 +161,7 @@ class RunningEpisodes:
         return found
 
     def _note_replans(self, sim: Recordable, rows: list[int]) -> None:
-        """Told as they come; those of the reset are in the first message of all."""
+        """Told as they come, that of the reset too."""
         names = ("route.n_way", "route.plan_step", "clock.step", "route.trigger")
         for row, count, planned, step, why in zip(rows, *(_read(sim, n, rows) for n in names), strict=True):
             if count > 0 and planned == step:
