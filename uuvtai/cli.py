@@ -91,7 +91,6 @@ def demo(
     output: groups.PlainOutputGroup,
     episodes: opt.EvalEpisodes = 64,
     open_page: opt.OpenPage = False,
-    run_dir: opt.RunDir = None,
 ) -> None:
     """Compare three agents in a pool, with a report to play.
 
@@ -102,7 +101,7 @@ def demo(
     from uuvtai.evaluation.results import Request
 
     agents = [*groups.AgentsGroup.default]
-    asked = {"seeds": [0], "episodes": episodes, "record": 2, "run_dir": run_dir}
+    asked = {"seeds": [0], "episodes": episodes, "record": 2}
     result, folder = compare(Request.typed(groups.SceneGroup(), agents, **asked), Progress())
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
     _report_if(True, folder, opens=open_page)
@@ -162,10 +161,9 @@ def watch_live(
     port: opt.Port = 8765,
     origin: opt.Origins = None,
     tanks: opt.Tanks = 1,
-    opens: opt.Opens = False,
+    opens: opt.OpenPage = False,
     foxglove: opt.Foxglove = False,
     depth_images: opt.DepthImages = False,
-    device: opt.Device = "auto",
 ) -> None:
     """Show episodes live in the browser, or in Foxglove."""
     seed_list = parsing.seeds("--seeds", seeds)
@@ -178,7 +176,7 @@ def watch_live(
     from uuvtai.evaluation.simulate import LiveOptions, watch_episodes
 
     request = Request.typed(
-        scene, agents.named(), seeds=seed_list, episodes=episodes, depth_images=depth_images, device=device
+        scene, agents.named(), seeds=seed_list, episodes=episodes, depth_images=depth_images, device="cpu"
     )
     live = LiveOptions(host, port, rate, origin or (), tanks, foxglove, opens)
     result = watch_episodes(request, live, Progress())
@@ -190,12 +188,11 @@ def watch_live(
 def drive_vehicle(
     agents: groups.AgentsOrTreeGroup,
     scene: groups.SceneGroup,
-    output: groups.OutputGroup,
+    output: groups.PlainOutputGroup,
     episodes: opt.EvalEpisodes = 1,
     seeds: opt.Seeds = "0",
-    rate: opt.Rate = 1.0,
     port: opt.Port = 8765,
-    opens: opt.Opens = False,
+    opens: opt.OpenPage = False,
     run_dir: opt.RunDir = None,
 ) -> None:
     """Steer a vehicle in the browser; bt drives the same episode.
@@ -203,9 +200,7 @@ def drive_vehicle(
     By keys or a gamepad, and by what the vehicle senses. Log and report are those of 'uuv eval'."""
     seed_list = parsing.seeds("--seeds", seeds)
     parsing.refuse_less("--episodes", episodes, 1)
-    parsing.refuse_odd_live(rate, port)
-    if not rate:
-        raise UsageError("--rate 0: a person needs a pace, for example --rate 0.5")
+    parsing.refuse_odd_live(1.0, port)
     from uuvtai.console.views import show_evaluation
     from uuvtai.evaluation.results import Request
     from uuvtai.evaluation.simulate import LiveOptions, drive_by_hand
@@ -213,7 +208,7 @@ def drive_vehicle(
     request = Request.typed(
         scene, agents.named(), seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
     )
-    live = LiveOptions(port=port, rate=rate, opens=opens)
+    live = LiveOptions(port=port, opens=opens)
     result, folder, page = drive_by_hand(request, live, Progress())
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
     say(f"report: {page}")

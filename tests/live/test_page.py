@@ -434,7 +434,6 @@ def test_who_arrived_sooner_is_named_first():
         (("watch", "--open", "--foxglove"), "--open: is of the page"),
         (("watch", "--depth-images"), "--depth-images: is of --foxglove"),
         (("watch", "--host", "no.such.host.invalid"), "cannot listen there"),
-        (("drive", "--rate", "0"), "--rate 0: a person needs a pace"),
         (("drive", "--episodes", "0"), "--episodes 0"),
         (("drive", "--port", "-1"), "--port -1"),
         (("drive", "--agent", "nobody"), "--agent nobody: is no preset"),

@@ -73,7 +73,7 @@ Motion = Annotated[
     _more("--motion", metavar="FILE.py:NAME", help="Moving obstacles that a function of yours gives."),
 ]
 Device = Annotated[str, parsing.device(**_PANEL)]
-OpenPage = Annotated[bool, Option("--open", help="Open the report in the browser.")]
+OpenPage = Annotated[bool, Option("--open", help="Open the page in the browser.")]
 RunDir = Annotated[Path | None, Option("--run-dir", help="Run folder \\[default: runs/TIME_PRESET].")]
 WithReport = Annotated[bool, Option("--report", help="Also write report.html into the run folder.")]
 Wide = Annotated[bool, _more("--wide", help="Show all columns even if they do not fit the terminal.")]
@@ -131,7 +131,6 @@ Workers = Annotated[int, Option("--workers", help="Processes of the local engine
 Address = Annotated[str, _more("--address", help="Ray cluster: host:port, auto, or local (this process).")]
 SweepResume = Annotated[Path | None, _run("Continue an interrupted sweep.")]
 Tanks = Annotated[int, Option("--tanks", help="Episodes at once, side by side: 1 to 16.")]
-Opens = Annotated[bool, Option("--open", help="Open the page in the browser.")]
 Foxglove = Annotated[bool, Option("--foxglove", help="Serve Foxglove and Lichtblick in place of a page.")]
 WatchEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed; 0 = until Ctrl-C.")]
 Rate = Annotated[float, Option("--rate", help="Episode seconds per second; 0 = as fast as possible.")]
