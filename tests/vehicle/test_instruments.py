@@ -453,6 +453,12 @@ def test_what_lies_level_is_a_scan_and_all_of_it_an_image():
     assert shot.depth_m[0, 64] > shot.depth_m[43, 64]  # above is row 7 of the device
 
 
+def test_the_preset_takes_the_rows_beside_the_middle():
+    """Of an image of eight rows too, none of which is as level as the preset asks for."""
+    scan, shot = rip2.Sonar3D(Played(GOLDEN), load_config("pool", "3d15")).poll(1.0)
+    assert scan.range_m[0] == pytest.approx(3.53, abs=0.05) and shot.depth_m.shape == (44, 128)
+
+
 def test_pieces_and_wrong_packets_are_counted_and_not_told():
     for at in (0, 3, 8, 12, len(GOLDEN) - 1):
         assert isinstance(rip2.image_of(GOLDEN[:at]), str)

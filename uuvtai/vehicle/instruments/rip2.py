@@ -200,7 +200,8 @@ class Sonar3D(Instrument):
 
         beams = self._sonar.first_beam_rad + self._sonar.beam_step_rad * np.arange(self._sonar.n_ray)
         up = np.linspace(-0.5 * high, 0.5 * high, rows)
-        level = np.abs(up) <= math.radians(self._sonar.vertical_half_aperture_deg)
+        aperture = math.radians(self._sonar.vertical_half_aperture_deg)
+        level = np.abs(up) <= max(aperture, np.abs(up).min())  # of a coarse image the rows beside the middle
         reach = math.tan(0.5 * math.radians(self._depth.fov_deg))
         across = reach * (1.0 - 2.0 * (np.arange(self._depth.cols) + 0.5) / self._depth.cols)
         above = reach * (self._depth.rows - 2.0 * (np.arange(self._depth.rows) + 0.5)) / self._depth.cols
