@@ -622,6 +622,22 @@ def test_what_an_instrument_tells_mavlink_tells_no_more(tmp_path):
     assert "dvl" in str(first)
 
 
+def test_when_our_clock_has_jumped_a_dvl_is_dated_anew():
+    """Else each of its readings would be as old as the jump was long."""
+    config, fake = link_config(), FakeA50("127.0.0.1", 0, lost=0.0)
+    with Rig(config, {"dvl": f"a50:127.0.0.1:{fake.port}"}) as rig:
+        ages = []
+        for step in range(200):
+            jump_s = 0.6 if step >= 100 else 0.0
+            if step == 100:
+                rig.forget_clocks()
+            fake.tell(0.02 * step, np.zeros(3), 1.0)
+            now_s = 0.02 * step + jump_s
+            ages += [now_s - reading.time_s for _, reading in rig.poll(now_s, np.zeros(3))]
+        fake.close()
+    assert len(ages) > 20 and max(ages) < 0.1
+
+
 def test_a_place_that_somebody_holds_is_refused_in_a_line(rig_config):
     with Rig(rig_config, {"dvl": "json::45993"}), pytest.raises(LinkError, match="45993"):
         Rig(rig_config, {"dvl": "json::45993"})

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from uuvtai.common.clocks import SourceClock
 from uuvtai.common.errors import SettingError
 from uuvtai.config import Config
 from uuvtai.vehicle.instruments.channel import Channel, Instrument
@@ -155,7 +154,6 @@ class Sonar3D(Instrument):
         self._sonar, self._depth = config.sensors.sonar, config.sensors.depth
         if self._sonar.is_ring or self._sonar.mechanical:
             raise SettingError("sensors.sonar: a 3D-15 looks ahead; take a fan: --sensors multibeam")
-        self._clock = SourceClock()
         self._maps: tuple[Any, ...] | None = None
         self._of: tuple[Any, ...] = ()
 
@@ -168,7 +166,7 @@ class Sonar3D(Instrument):
                 self.refuse(image)
                 continue
             self.heard += 1
-            found += self._told(image, self._clock.measured_s(image.sent_s, now_s))
+            found += self._told(image, self.clock.measured_s(image.sent_s, now_s))
         return found
 
     def _told(self, image: RangeImage, time_s: float) -> list[SensorMessage]:
