@@ -88,9 +88,7 @@ def evaluate(
 @app.command(epilog="Example: uuv demo --open")
 @groups.grouped
 def demo(
-    output: groups.PlainOutputGroup,
-    episodes: opt.EvalEpisodes = 64,
-    open_page: opt.OpenPage = False,
+    output: groups.PlainOutputGroup, episodes: opt.EvalEpisodes = 64, open_page: opt.OpenPage = False
 ) -> None:
     """Compare three agents in a pool, with a report to play.
 

@@ -453,6 +453,12 @@ def test_what_lies_level_is_a_scan_and_all_of_it_an_image():
     assert shot.depth_m[0, 64] > shot.depth_m[43, 64]  # above is row 7 of the device
 
 
+def test_the_preset_takes_the_rows_beside_the_middle():
+    """Of an image of eight rows too, none of which is as level as the preset asks for."""
+    scan, shot = rip2.Sonar3D(Played(GOLDEN), load_config("pool", "3d15")).poll(1.0)
+    assert scan.range_m[0] == pytest.approx(3.53, abs=0.05) and shot.depth_m.shape == (44, 128)
+
+
 def test_pieces_and_wrong_packets_are_counted_and_not_told():
     for at in (0, 3, 8, 12, len(GOLDEN) - 1):
         assert isinstance(rip2.image_of(GOLDEN[:at]), str)
@@ -614,6 +620,22 @@ def test_what_an_instrument_tells_mavlink_tells_no_more(tmp_path):
         flight.close()
     (first, *_) = read_messages(flight.log.path, ("/instruments/read",))
     assert "dvl" in str(first)
+
+
+def test_when_our_clock_has_jumped_a_dvl_is_dated_anew():
+    """Else each of its readings would be as old as the jump was long."""
+    config, fake = link_config(), FakeA50("127.0.0.1", 0, lost=0.0)
+    with Rig(config, {"dvl": f"a50:127.0.0.1:{fake.port}"}) as rig:
+        ages = []
+        for step in range(200):
+            jump_s = 0.6 if step >= 100 else 0.0
+            if step == 100:
+                rig.forget_clocks()
+            fake.tell(0.02 * step, np.zeros(3), 1.0)
+            now_s = 0.02 * step + jump_s
+            ages += [now_s - reading.time_s for _, reading in rig.poll(now_s, np.zeros(3))]
+        fake.close()
+    assert len(ages) > 20 and max(ages) < 0.1
 
 
 def test_a_place_that_somebody_holds_is_refused_in_a_line(rig_config):

@@ -198,12 +198,14 @@ def who_arrived(agents: list[AgentSpec]) -> str:
 
 
 def _opening(agents: list[AgentSpec], pairs: list[dict[str, Any]]) -> list[Block]:
-    """Who reached the goal how often, and the two best against each other; [] without episodes."""
+    """Who reached the goal how often, and the two best against each other; [] without episodes. One episode
+    tells nothing of the two."""
     if not (said := who_arrived(agents)):
         return []
     blocks: list[Block] = [Paragraph(said, leads=True)]
     best = {m["name"] for m in by_success(agents)[:2]}
-    return blocks + [Paragraph(_duel(pair)) for pair in pairs if {pair["a"], pair["b"]} == best][:1]
+    both = [pair for pair in pairs if {pair["a"], pair["b"]} == best and pair["episodes"] > 1]
+    return blocks + [Paragraph(_duel(pair)) for pair in both[:1]]
 
 
 def _duel(pair: dict[str, Any]) -> str:

@@ -371,6 +371,8 @@ class OnboardLoop:
         if self._endpoint.clock_jumps != self._clock_jumps:
             self._clock_jumps = self._endpoint.clock_jumps
             self._intake.forget_clocks()
+            if self._rig is not None:
+                self._rig.forget_clocks()
         for sender, datagram in datagrams:
             for message in self._codec.decode(datagram):
                 if self._is_leaving:

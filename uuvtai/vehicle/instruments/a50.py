@@ -29,13 +29,13 @@ class A50(Instrument):
         tell when a velocity was measured."""
         super().__init__(channel)
         self._turn, self._fom_most, self._latency_s = yaw_rad, fom_most_m_s, latency_s
-        self._rest, self._opened, self._clock = b"", 0, SourceClock()
+        self._rest, self._opened = b"", 0
 
     def poll(self, now_s: float) -> list[SensorMessage]:
         """As in ``Instrument``."""
         pieces = self.channel.read(now_s)
         if self.channel.opened != self._opened:
-            self._opened, self._rest, self._clock = self.channel.opened, b"", SourceClock()
+            self._opened, self._rest, self.clock = self.channel.opened, b"", SourceClock()
         *lines, self._rest = b"".join([self._rest, *pieces]).split(b"\n")
         if len(self._rest) > LONGEST:
             self._rest = b""
@@ -70,7 +70,7 @@ class A50(Instrument):
     def _measured_s(self, said: dict[str, Any], now_s: float) -> float:
         """The device's delay is the difference of its two stamps, whatever its clock says."""
         valid_s, sent_s = (1e-6 * _number(said, f"time_of_{name}") for name in ("validity", "transmission"))
-        come_s = self._clock.measured_s(sent_s if math.isfinite(sent_s) else None, now_s)
+        come_s = self.clock.measured_s(sent_s if math.isfinite(sent_s) else None, now_s)
         delay_s = sent_s - valid_s
         return come_s - (delay_s if 0.0 <= delay_s <= _LONGEST_S else self._latency_s)
 

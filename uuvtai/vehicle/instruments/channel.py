@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from uuvtai.common.clocks import SourceClock
 from uuvtai.config.base import WRITTEN_PLACE
 from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import SensorMessage
@@ -232,6 +233,8 @@ class Instrument(ABC):
         """messages that were understood"""
         self.refused: Counter[str] = Counter()
         """why something was not used -> how often; at most ``MOST_KINDS`` reasons"""
+        self.clock = SourceClock()
+        """of a device that stamps what it tells"""
         self.fom_m_s: float | None = None
         """of a DVL that tells it: figure of merit of its last valid velocity"""
 

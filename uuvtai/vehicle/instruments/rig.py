@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai.common.clocks import SourceClock
 from uuvtai.common.files import FileError, parsed_json
 from uuvtai.config import Config
 from uuvtai.vehicle.instruments import a50, ping, rip2
@@ -67,6 +68,11 @@ class Rig(AbstractContextManager["Rig"]):
                 else:
                     moved = np.cross(rate_b, self._lever)
                     yield instrument, dataclasses.replace(message, vel_b=message.vel_b - moved)
+
+    def forget_clocks(self) -> None:
+        """Date what comes anew: our clock has run on without those of the instruments."""
+        for instrument, _ in self._sources.values():
+            instrument.clock = SourceClock()
 
     def document(self) -> dict[str, dict[str, object]]:
         """By place: messages understood, why others were not used, datagrams of others, and (null: not told)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from uuvtai.common.clocks import SourceClock
 from uuvtai.common.errors import SettingError
 from uuvtai.config import Config
 from uuvtai.vehicle.instruments.channel import Channel, Instrument
@@ -155,7 +154,6 @@ class Sonar3D(Instrument):
         self._sonar, self._depth = config.sensors.sonar, config.sensors.depth
         if self._sonar.is_ring or self._sonar.mechanical:
             raise SettingError("sensors.sonar: a 3D-15 looks ahead; take a fan: --sensors multibeam")
-        self._clock = SourceClock()
         self._maps: tuple[Any, ...] | None = None
         self._of: tuple[Any, ...] = ()
 
@@ -168,7 +166,7 @@ class Sonar3D(Instrument):
                 self.refuse(image)
                 continue
             self.heard += 1
-            found += self._told(image, self._clock.measured_s(image.sent_s, now_s))
+            found += self._told(image, self.clock.measured_s(image.sent_s, now_s))
         return found
 
     def _told(self, image: RangeImage, time_s: float) -> list[SensorMessage]:
@@ -200,7 +198,8 @@ class Sonar3D(Instrument):
 
         beams = self._sonar.first_beam_rad + self._sonar.beam_step_rad * np.arange(self._sonar.n_ray)
         up = np.linspace(-0.5 * high, 0.5 * high, rows)
-        level = np.abs(up) <= math.radians(self._sonar.vertical_half_aperture_deg)
+        aperture = math.radians(self._sonar.vertical_half_aperture_deg)
+        level = np.abs(up) <= max(aperture, np.abs(up).min())  # of a coarse image the rows beside the middle
         reach = math.tan(0.5 * math.radians(self._depth.fov_deg))
         across = reach * (1.0 - 2.0 * (np.arange(self._depth.cols) + 0.5) / self._depth.cols)
         above = reach * (self._depth.rows - 2.0 * (np.arange(self._depth.rows) + 0.5)) / self._depth.cols
