@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from pymavlink import mavutil
 
-from benchmarks.closed_loop import SEED, ends_row, simulated
 from benchmarks.common import Job, Row
+from benchmarks.instruments import SEED, ends_row, simulated
 from uuvtai.config import Config
 from uuvtai.config.loader import load_config
 from uuvtai.sim.behavior_tree import read_tree

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
@@ -27,12 +28,13 @@ from pathlib import Path
 from queue import SimpleQueue
 
 import numpy as np
+import torch
 import yaml
 
-from benchmarks.closed_loop import ends_row, simulated
 from benchmarks.common import Job, Row
 from benchmarks.peers.stand_in_autopilot import RATE_HZ, StandIn
-from uuvtai.common.statistics import bootstrap_interval
+from uuvtai.common.enums import OUTCOMES, RUNNING
+from uuvtai.common.statistics import bootstrap_interval, wilson_interval
 from uuvtai.config.loader import load_config
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.sim import Sim
@@ -90,6 +92,30 @@ def _driven(setup: Setup, count: int, job: Job) -> list[Row]:
         ends_row(f"{what}, in the simulator's own loop", own),
         Row(f"{what}, difference", float(np.mean(off)), "points", note=note),
     ]
+
+
+def ends_row(what: str, found: list[str]) -> Row:
+    """How many episodes were a success, and how the others ended."""
+    count, ends = len(found), Counter(found)
+    low, high = wilson_interval(ends["success"], count) or (0.0, 1.0)
+    others = ", ".join(f"{end} {n}" for end, n in sorted(ends.items()) if end != "success") or "none"
+    return Row(
+        what,
+        100.0 * ends["success"] / count,
+        "% of the episodes a success",
+        note=f"{ends['success']} of {count} [{100 * low:.1f}, {100 * high:.1f}]; others: {others}",
+        details={"endings": found, "seed": SEED},
+    )
+
+
+def simulated(sim: Sim, number: int) -> str:
+    """How the same episode ends where the stack drives by the simulator's own velocity loop."""
+    one, seeds, numbers = (torch.ones(sim.num_envs, dtype=torch.int32) for _ in range(3))
+    sim.sleep()
+    sim.reset(one, SEED * seeds, number * numbers)
+    while (outcome := int(sim.rows(sim.s.termination.outcome, [0])[0])) == RUNNING:
+        sim.step()
+    return OUTCOMES[outcome]
 
 
 def _calibrations(count: int, job: Job) -> list[Row]:

@@ -246,7 +246,7 @@ def speeds(root: Path) -> str:
 
 
 TIMED = {
-    "scale": 3, "own": 2, "sonar": 4, "clearance": 6, "dynamics": 3, "route": 2, "tick": 3, "paced": 2,
+    "scale": 3, "sonar": 4, "clearance": 6, "dynamics": 3, "route": 2, "tick": 3, "paced": 2,
     "quadrants": 8,
 }  # fmt: skip
 """benchmarks of speed, and how many of their rows the page shows"""

@@ -9,9 +9,9 @@ import pytest
 gc.disable()  # until all is imported and collected, which makes millions of objects, few of them garbage
 
 BEGUN_FIRST = """
-docs native world aboard cuda cli wheel training replay tracking deploy log_alone security report set_export
-sonar examples identify telemetry signals sweep dynamics tuned logs resume_eval behavior localization
-media_formats link explain hostile_logs echoes voronoi
+docs instruments_chain page native world aboard cuda cli wheel training replay tracking deploy log_alone
+security report set_export sonar examples identify telemetry signals sweep dynamics tuned logs resume_eval
+behavior localization media_formats link explain hostile_logs echoes voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""
