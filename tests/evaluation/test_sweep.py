@@ -64,7 +64,7 @@ def test_one_at_a_time_varies_each_axis_around_the_condition():
         (["D=1.5"], "no number of obstacles"),
         (["v=fast"], "no speed"),
         (["v=.inf"], "no speed"),
-        (["sensors=sharp"], "no sensors preset; there are clean"),
+        (["sensors=sharp"], "no sensors preset; there are 3d15"),
         (["S=[1"], "not valid YAML"),
         (["nosuch"], "nosuch"),
         (["paper", "caution"], "one preset at most"),

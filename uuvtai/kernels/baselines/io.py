@@ -25,7 +25,6 @@ from uuvtai.state import (
     ForecastState,
     MissionState,
     Proprioception,
-    TrackState,
 )
 
 
@@ -40,7 +39,6 @@ class LocalPlannerIO:
     forecast: In[ForecastState]
     mission: In[MissionState]
     behavior: In[BehaviorState]
-    tracks: In[TrackState]
     baselines_cfg: Const[BaselinesConfig]
     behavior_cfg: Const[BehaviorConfig]
     clearance_cfg: Const[ClearanceConfig]
