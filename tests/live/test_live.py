@@ -27,7 +27,9 @@ END = SimpleNamespace(
 
 def open_socket(port, **options):
     place = f"ws://127.0.0.1:{port}"
-    return connect(place, subprotocols=["foxglove.sdk.v1"], max_size=None, ping_interval=None, **options)
+    return connect(
+        place, subprotocols=["foxglove.sdk.v1"], max_size=None, ping_interval=None, close_timeout=1, **options
+    )
 
 
 class Viewer:

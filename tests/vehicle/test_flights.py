@@ -16,7 +16,7 @@ FOUND = (1125,)
 """seeds that once found something"""
 
 
-@pytest.mark.parametrize("seeds", [*(range(first, first + 10) for first in range(0, 50, 10)), FOUND], ids=str)
+@pytest.mark.parametrize("seeds", [*(range(first, first + 10) for first in range(0, 30, 10)), FOUND], ids=str)
 def test_whatever_breaks_the_vehicle_is_safe(seeds):
     assert [text for seed in seeds for text in violations(seed)] == []
 

@@ -101,8 +101,11 @@ def test_the_oracles_vehicle_comes_back_within_its_intervals(table, capfd):
         assert entry["fitted"] and entry["low"] < entry["value"] < entry["high"]
         assert entry["low"] - (entry["high"] - entry["low"]) < value < 2 * entry["high"] - entry["low"], entry
     assert inside >= 11
-    gain = document["parameters"][model.GAIN]
+    gain, lag = (document["parameters"][place] for place in (model.GAIN, model.LAG))
     assert not gain["fitted"] and gain["value"] == 1.0
+    assert not lag["fitted"] and lag["value"] == TOLD.rotor_tau_s, "a log of turned speeds does not show it"
+    (warning,) = [text for text in document["warnings"] if text.startswith("rotor lag")]
+    assert "asked_1" in warning and "it stays that of the vehicle given" in warning
     ours, given = (document["horizons"][name]["100"] for name in ("identified", "given"))
     assert all(a < b for a, b in zip(ours, given, strict=True))
     found = load_config("open", vehicle=str(out)).vehicle
@@ -146,14 +149,6 @@ def test_the_rotors_lag_comes_back_from_commanded_speeds(tmp_path, capfd):
 def true_row():
     picked = [0, 1, 2, 5]
     return [*TRUE.added[picked], *TRUE.linear[picked], *TRUE.quadratic[picked], 3.0]
-
-
-def test_a_log_of_turned_speeds_says_nothing_of_the_lag(table):
-    document = identified(read_drives(table), TOLD).document
-    entry = document["parameters"][model.LAG]
-    assert not entry["fitted"] and entry["value"] == TOLD.rotor_tau_s
-    (warning,) = [text for text in document["warnings"] if text.startswith("rotor lag")]
-    assert "asked_1" in warning and "it stays that of the vehicle given" in warning
 
 
 def test_commands_that_change_slowly_do_not_show_the_lag():
