@@ -206,8 +206,7 @@ def drive_vehicle(
     request = Request.typed(
         scene, agents.named(), seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
     )
-    live = LiveOptions(port=port, opens=opens)
-    result, folder, page = drive_by_hand(request, live, Progress())
+    result, folder, page = drive_by_hand(request, LiveOptions(port=port, opens=opens), Progress())
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
     say(f"report: {page}")
 

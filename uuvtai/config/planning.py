@@ -82,7 +82,7 @@ class ObservationConfig(Section):
 
 
 # ------------------------------------------------------------------------------------------------------------
-# Local planners of the literature: dynamic window, potential field, velocity obstacle, path integral.
+# Local planners of the literature: dynamic window, path integral.
 
 
 N_AXIS = 11

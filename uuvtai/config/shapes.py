@@ -52,12 +52,14 @@ def boxes_of(what: str, rings: Sequence[np.ndarray], tolerance_m: float) -> list
         for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
             steps = np.linspace(a, b, 2 + int(2 * np.abs((b - a) / cell).max()))
             rest[tuple(np.clip((steps / cell).astype(int), 0, np.array(shape) - 1).T[::-1])] = True
-    enough = sum(map(len, rings))
-    filled, is_whole = _rectangles(inside, rest, enough, round(_HOLLOW_M / float(cell.min())))
+    filled, is_whole = _rectangles(inside, rest, sum(map(len, rings)), round(_HOLLOW_M / float(cell.min())))
     boxes = [(0.5 * (low + high) * cell, 0.5 * (high - low) * cell, 0.0) for low, high in filled]
     boxes += [] if is_whole else _edges(own, 2 * tolerance_m)
-    rows = [(*((at + corner) @ turn + middle), *half, math.degrees(angle + yaw)) for at, half, angle in boxes]
-    return [(*(round(float(v), 4) for v in row[:4]), round(row[4] % 180.0, 3)) for row in rows]  # type: ignore
+    found = []
+    for at, half, angle in boxes:
+        x, y, along, across = (round(float(v), 4) for v in (*((at + corner) @ turn + middle), *half))
+        found.append((x, y, along, across, round(math.degrees(angle + yaw) % 180.0, 3)))
+    return found
 
 
 def _inside(rings: Sequence[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -406,7 +406,7 @@ class _Hand(LoadedPlugin):
         return self.found.truth_was_seen
 
     def document(self) -> dict[str, Any]:
-        """There is no file of hers."""
+        """A person has no file."""
         return {}
 
 

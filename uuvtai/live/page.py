@@ -61,8 +61,8 @@ class PageServer(LiveServer):
     # ------------------------------------------------------------------------------ for who runs the episodes
 
     def asked(self) -> dict[Client, bool]:
-        """Who has come or has turned to another ``tank`` since the last call, and whether she is to be told
-        all: one entry each, however often she asks."""
+        """Clients that have come or follow another ``tank`` since the last call, and whether they are to be
+        told all: one entry each, however often they ask."""
         with self._lock:
             asked, self._asked = self._asked, {}
         return asked
@@ -121,7 +121,7 @@ class PageServer(LiveServer):
         return page
 
     def arrived(self, client: Client) -> None:
-        """She is told all there is, and who may do what."""
+        """Tell the new client everything, and who may do what."""
         self._asked[client] = True
         self._tell_roles()
 

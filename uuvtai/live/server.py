@@ -11,6 +11,7 @@ import struct
 import threading
 import time
 import uuid
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection, Coroutine, Mapping
 from http import HTTPStatus
@@ -121,7 +122,7 @@ class RealTime:
 
 MOST_CLIENTS = 8  # at once
 OWN_NAMES = ("localhost", "127.0.0.1", "::1")
-BACKLOG, MOST_WAITING = 64, 300  # messages that wait for a client: of bytes the oldest go; with more she goes
+BACKLOG, MOST_WAITING = 64, 300  # messages that wait: of bytes the oldest go; with more the client goes
 _MOST_SOCKETS = 4 * MOST_CLIENTS  # whether they have sent a request already or not
 _REQUEST_S, _CLOSE_S, _MOMENT_S = 5.0, 1.0, 0.02
 Answer = tuple[HTTPStatus, str]
@@ -179,25 +180,23 @@ class LiveServer(contextlib.AbstractContextManager["LiveServer"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # --------------------------------------------------------- what kinds of servers differ in; in its thread
-
+    @abstractmethod
     def refusal(self, connection: ServerConnection, request: Request) -> Answer | None:
-        """Why somebody may not connect; None = she may."""
-        raise NotImplementedError
+        """Why a client may not connect; None = it may."""
 
     def document(self, connection: ServerConnection) -> Response:
         """For who opens no WebSocket."""
         return connection.respond(HTTPStatus.UPGRADE_REQUIRED, "a WebSocket is served here\n")
 
     def arrived(self, client: Client) -> None:
-        """She has come; the lock is held."""
+        """A client has come; the lock is held."""
 
+    @abstractmethod
     def heard(self, client: Client, asked: Any) -> bool:
-        """She says something, read as JSON (None: it is none); whether she may stay. The lock is held."""
-        raise NotImplementedError
+        """A client says something, read as JSON (None: it is none); whether it may stay. The lock is held."""
 
     def left(self, client: Client) -> None:
-        """She has gone, and is no client any more; the lock is held."""
+        """A client has gone and is in the list no more; the lock is held."""
 
     # ------------------------------------------------------------------------------------ the server's thread
 

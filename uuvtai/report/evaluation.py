@@ -198,8 +198,7 @@ def who_arrived(agents: list[AgentSpec]) -> str:
 
 
 def _opening(agents: list[AgentSpec], pairs: list[dict[str, Any]]) -> list[Block]:
-    """Who reached the goal how often, and the two best against each other; [] without episodes. One episode
-    tells nothing of the two."""
+    """Who reached the goal how often, and the two best of several episodes; [] without any."""
     if not (said := who_arrived(agents)):
         return []
     blocks: list[Block] = [Paragraph(said, leads=True)]
