@@ -46,7 +46,7 @@ from uuvtai.kernels.perception.mapping import look_period_s, scans_in
 from uuvtai.kernels.planning.clearance_gpu import offset_bits
 from uuvtai.kernels.vehicle.thruster_fault import response_size
 from uuvtai.kernels.world.motion import FAULT_MOVING
-from uuvtai.kernels.world.scenario import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
+from uuvtai.kernels.world.scenario import FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC, coarse_size
 from uuvtai.sim.stages import SimState, Stages, bind_all
 from uuvtai.state import FixedTable, GridMask, SceneState
 
@@ -162,8 +162,8 @@ def scenario_sizes(world_cfg: WorldConfig) -> dict[str, int]:
         "n_dynamic": slots.n_dynamic,
         "n_fixed": max(1, len(world_cfg.fixed)),
         "n_corner": max(N_CORNER, *(len(obstacle.path) for obstacle in world_cfg.fixed), 0),
-        "n_coarse_row": math.ceil((tank.y_m[1] - tank.y_m[0]) / COARSE_M - 1e-9),
-        "n_coarse_col": math.ceil((tank.x_m[1] - tank.x_m[0]) / COARSE_M - 1e-9),
+        "n_coarse_row": coarse_size(tank)[0],
+        "n_coarse_word": -(-coarse_size(tank)[1] // WORD),
     }
 
 

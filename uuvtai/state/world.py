@@ -93,8 +93,10 @@ class FixedTable(Truth):
 class ScenarioScratch(Truth):
     """Scratch of scenario drawing: free space on a coarse grid, to see whether start and goal are joined."""
 
-    reach: ti.Field = array("n_env", "n_coarse_row", "n_coarse_col", dtype=ti.u8, scratch=True)
-    """0 = free, 1 = blocked, 2 = reached from the start"""
+    open: ti.Field = array("n_env", "n_coarse_row", "n_coarse_word", dtype=ti.u64, scratch=True)
+    """bits of the cells that are free"""
+    reach: ti.Field = array("n_env", "n_coarse_row", "n_coarse_word", dtype=ti.u64, scratch=True)
+    """bits of those that are reached from the start"""
     footprint: ti.Field = array("n_env", "n_obstacle", vec=7, scratch=True)
     """plan view of the static obstacles (footprint.py)"""
 

@@ -7,6 +7,8 @@ search is bounded; where its draws run out, ``WorldState.faults`` says so: a sce
 easier.
 """
 
+import math
+
 import taichi as ti
 
 from uuvtai.compile.launch import quick_launch
@@ -22,7 +24,8 @@ from uuvtai.kernels.core.geometry import (
     nearest_squared,
 )
 from uuvtai.kernels.core.noise import STREAM_SCENARIO, stream_key, uniform, uniform_in
-from uuvtai.kernels.core.stage import Bundle, loop_end, n_envs, shares
+from uuvtai.kernels.core.simd import WORD, bit_of, cell_bit
+from uuvtai.kernels.core.stage import Bundle, Const, loop_end, n_envs, shares
 from uuvtai.kernels.world.io import WorldIO
 from uuvtai.kernels.world.motion import (
     draw_moving_obstacles,
@@ -201,16 +204,28 @@ def is_joined(env, io: Bundle[WorldIO]):
     block_cells(env, io.world_cfg.static.joined_clearance_m + 0.5 * COARSE_M, io)
     start = coarse_cell(io.mission.start_w[env], io)
     goal = coarse_cell(io.mission.goal_w[env], io)
-    changed = ti.cast(io.scratch.reach[env, start[0], start[1]] == 0, ti.i32)
-    if changed == 1:
-        io.scratch.reach[env, start[0], start[1]] = ti.u8(2)
+    changed = 0
+    if (io.scratch.open[env, start[0], start[1] // WORD] & cell_bit(start[1])) != 0:
+        io.scratch.reach[env, start[0], start[1] // WORD] = cell_bit(start[1])
+        changed = 1
     sweep = 0
-    while changed == 1 and sweep < 2 * _SWEEPS and io.scratch.reach[env, goal[0], goal[1]] != 2:
+    while changed == 1 and sweep < 2 * _SWEEPS and is_reached(env, goal, io) == 0:
         changed = flood_sweep(env, sweep & 1, io)
         if changed == 0 and sweep == 0:
             changed = 1  # the first sweep runs one way only
         sweep += 1
-    return ti.cast(io.scratch.reach[env, goal[0], goal[1]] == 2, ti.i32)
+    return is_reached(env, goal, io)
+
+
+@ti.func
+def is_reached(env, cell, io: Bundle[WorldIO]):
+    """1 where a coarse cell was reached from the start."""
+    return bit_of(io.scratch.reach[env, cell[0], cell[1] // WORD], cell[1] % WORD)
+
+
+def coarse_size(tank):
+    """(rows, columns) of the coarse grid of a tank; plain Python."""
+    return [math.ceil((high - low) / COARSE_M - 1e-9) for low, high in (tank.y_m, tank.x_m)]
 
 
 @ti.func
@@ -218,12 +233,8 @@ def coarse_cell(pos_w, io: Bundle[WorldIO]):
     """(row, col) of the coarse cell that holds a position."""
     row = ti.cast((pos_w[1] - io.world_cfg.tank.y_m[0]) * (1.0 / COARSE_M), ti.i32)
     col = ti.cast((pos_w[0] - io.world_cfg.tank.x_m[0]) * (1.0 / COARSE_M), ti.i32)
-    return ti.Vector(
-        [
-            ti.math.clamp(row, 0, io.scratch.reach.shape[1] - 1),
-            ti.math.clamp(col, 0, io.scratch.reach.shape[2] - 1),
-        ]
-    )
+    n_row, n_col = ti.static(coarse_size(io.world_cfg.tank))
+    return ti.Vector([ti.math.clamp(row, 0, n_row - 1), ti.math.clamp(col, 0, n_col - 1)])
 
 
 @ti.func
@@ -237,11 +248,15 @@ def coarse_centre(row, col, io: Bundle[WorldIO]):
 @ti.func
 def block_cells(env, clearance_m, io: Bundle[WorldIO]):
     """Mark the cells whose centre is nearer than ``clearance_m`` to a wall or static obstacle."""
-    for row, col in ti.ndrange(io.scratch.reach.shape[1], io.scratch.reach.shape[2]):
-        center = coarse_centre(row, col, io)
-        io.scratch.reach[env, row, col] = ti.cast(
-            1 - is_inside(disc(center, 0.0), clearance_m, io.world_cfg.tank), ti.u8
-        )
+    n_col = ti.static(coarse_size(io.world_cfg.tank)[1])
+    for row, word in ti.ndrange(io.scratch.open.shape[1], io.scratch.open.shape[2]):
+        free = ti.cast(0, ti.u64)
+        for bit in range(ti.min(n_col - word * WORD, WORD)):
+            center = coarse_centre(row, word * WORD + bit, io)
+            inside = is_inside(disc(center, 0.0), clearance_m, io.world_cfg.tank)
+            free |= ti.cast(inside, ti.u64) << ti.cast(bit, ti.u64)
+        io.scratch.open[env, row, word] = free
+        io.scratch.reach[env, row, word] = ti.cast(0, ti.u64)
     for slot in range(ti.static(io.world_cfg.n_fixed_static + io.world_cfg.static_slots)):
         if io.world.kind[env, slot] != NONE:
             shape = io.scratch.footprint[env, slot]
@@ -257,35 +272,44 @@ def block_around(env, shape, reach, io: Bundle[WorldIO]):
     for row in range(low[0], high[0] + 1):
         for col in range(low[1], high[1] + 1):
             if nearest_squared(shape, coarse_centre(row, col, io)) < reach * reach:
-                io.scratch.reach[env, row, col] = ti.u8(1)
+                io.scratch.open[env, row, col // WORD] = io.scratch.open[env, row, col // WORD] & ~cell_bit(
+                    col
+                )
 
 
 @ti.func
 def flood_sweep(env, backward, io: Bundle[WorldIO]):
-    """Carry "reached" to free neighbours in raster order, forward or backward; 1 where anything changed."""
-    n_row = ti.static(io.scratch.reach.shape[1])
-    n_col = ti.static(io.scratch.reach.shape[2])
+    """Carry "reached" to free neighbours row by row, forward or backward; 1 where anything changed."""
+    n_row, n_word = ti.static(io.scratch.open.shape[1:])
     changed = 0
-    for i in range(n_row * n_col):
-        cell = i
-        if backward == 1:
-            cell = n_row * n_col - 1 - i
-        row = cell // n_col
-        col = cell - row * n_col
-        if io.scratch.reach[env, row, col] == 0:
-            near = 0
-            if row > 0 and io.scratch.reach[env, row - 1, col] == 2:
-                near = 1
-            if row < n_row - 1 and io.scratch.reach[env, row + 1, col] == 2:
-                near = 1
-            if col > 0 and io.scratch.reach[env, row, col - 1] == 2:
-                near = 1
-            if col < n_col - 1 and io.scratch.reach[env, row, col + 1] == 2:
-                near = 1
-            if near == 1:
-                io.scratch.reach[env, row, col] = ti.u8(2)
-                changed = 1
+    for i in range(n_row):
+        row = i if backward == 0 else n_row - 1 - i
+        last = row - 1 if backward == 0 else row + 1
+        for up in ti.static((True, False)):
+            carried = ti.cast(0, ti.u64)
+            for k in range(n_word):
+                word = k if ti.static(up) else n_word - 1 - k
+                free, old = io.scratch.open[env, row, word], io.scratch.reach[env, row, word]
+                new = old | carried
+                if i > 0:
+                    new |= io.scratch.reach[env, last, word]
+                new = filled_along(new & free, free, up)
+                carried = ti.bit_shr(new, ti.u64(WORD - 1)) if ti.static(up) else new << ti.u64(WORD - 1)
+                if new != old:
+                    io.scratch.reach[env, row, word] = new
+                    changed = 1
     return changed
+
+
+@ti.func
+def filled_along(seed, free, up: Const[bool]):
+    """The seeds' bits and, next to them towards higher bits (``up``) or lower ones, all that are free."""
+    out, run = seed, free
+    for shift in ti.static((1, 2, 4, 8, 16, 32)):
+        far = ti.u64(shift)
+        out |= run & (out << far if ti.static(up) else ti.bit_shr(out, far))
+        run &= run << far if ti.static(up) else ti.bit_shr(run, far)
+    return out
 
 
 # ------------------------------------------------------------------------------------------------------------
