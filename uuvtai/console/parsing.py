@@ -156,7 +156,7 @@ OF_A_SWEEP_RESUMED = (
 
 _TODAY = {
     "--controller": "--agent NAME",
-    "--num-envs": "--set train.num_envs=N",
+    "--num-envs": "--set train.num_envs=N; of 'uuv watch': --tanks N",
     "--policy": "--agent FILE",
     "--stack": "--agent NAME, or --set stack=NAME for all agents; of 'uuv export': --out",
     "-v": "--speed",
