@@ -494,6 +494,7 @@ def test_who_speaks_to_the_sensors_port_is_told(served):
         (["--instances", "0"], "--instances 0"),
         (["--instances", "65"], "--instances 65"),
         (["--instances", "9", "--port", "65500"], "beyond 65535"),
+        (["--instances", "10", "--as", "ping360"], "from 9092 up; --port 9003"),
         (["--seconds", "0"], "--seconds 0"),
         (["--rate", "-1"], "--rate"),
         (["--mavlink", "tcp:x:1"], "udp:HOST:PORT"),

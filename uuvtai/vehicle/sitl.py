@@ -25,6 +25,7 @@ from uuvtai.kernels.world import scenario
 from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
+from uuvtai.vehicle.instruments import ping
 from uuvtai.vehicle.instruments.emulate import KINDS, FakeRig, emulated
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
 from uuvtai.vehicle.messages import three
@@ -417,6 +418,11 @@ class SitlPlan:
         if (highest := max(port, *(place.port for place in places)) + last) > 65535:
             raise LinkError(
                 f"--port {port}: with --instances {instances} the ports go up to {highest}, beyond 65535"
+            )
+        if "ping360" in kinds and abs(port - ping.PORT) in range(0, last + 1, NEXT_PORT):
+            raise LinkError(
+                f"--port {port}: with --instances {instances} an ArduSub has the port of a Ping360, from "
+                f"{ping.PORT} up; --port {port + 1}"
             )
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
