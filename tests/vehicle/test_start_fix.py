@@ -94,7 +94,7 @@ def test_what_was_typed_wrongly_is_corrected(sensors, true, told, turn_deg, coar
 @pytest.mark.parametrize(
     ("true", "typed", "rate", "why"),
     [
-        ((2.0, 3.0, 0.0), (2.0, 3.0), 0.0, "x 0 nor at x 20"),
+        ((2.0, 3.0, 0.0), (2.0, 3.0), 0.0, "nor at x 20 is seen well, by a sonar to 12 m"),
         ((5.0, 3.0, 0.0), (2.0, 3.0), 0.35, "do not fit"),
         ((17.0, 3.0, 0.0), (15.0, 3.0), 0.0, "do not fit"),
     ],

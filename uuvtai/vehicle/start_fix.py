@@ -435,7 +435,8 @@ def unseen(config: Config, rays: Rays, fit: Fit) -> str:
         return "" if there else "the wall is hardly in view"
     missing = [axis for axis, walls in (("x", {0, 1}), ("y", {2, 3})) if not there & walls]
     words = (f"{_side(tank, 0)} nor at {_side(tank, 1)}", f"{_side(tank, 2)} nor at {_side(tank, 3)}")
-    return "; ".join(f"neither the wall at {words['xy'.index(axis)]} is seen well" for axis in missing)
+    told = "; ".join(f"neither the wall at {words['xy'.index(axis)]} is seen well" for axis in missing)
+    return f"{told}, by a sonar to {config.sensors.sonar.max_range_m:g} m" if missing else ""
 
 
 def turned_by_typed(
