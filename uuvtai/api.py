@@ -225,19 +225,23 @@ def train(
     sensors: str | None = None,
     vehicle: str | None = None,
     overrides: Overrides | None = None,
+    reward: Agent | None = None,
     start: str | os.PathLike[str] | None = None,
     resume: str | os.PathLike[str] | None = None,
     device: str = "auto",
     run_dir: str | os.PathLike[str] | None = None,
 ) -> Training:
     """Train an agent, as ``uuv train``: a preset's recipe, or go on with the run folder ``resume``;
-    ``start``: run with whose policy a new one begins. Raises ValueError for what cannot be trained,
-    RunFolderError, CheckpointError, TrainingError."""
+    ``reward``: function of yours whose terms are added, or its ``FILE.py:NAME``; ``start``: run with whose
+    policy a new one begins. Raises ValueError for what cannot be trained, RunFolderError, CheckpointError,
+    TrainingError, PluginError."""
+    from uuvtai.console.parsing import reward as own_reward
     from uuvtai.console.screen import TrainingProgress
     from uuvtai.evaluation.evaluate import evaluate_now
     from uuvtai.learning import runner
 
-    options: dict[str, Any] = {"iterations": iterations, "device": device}
+    own = None if reward is None else own_reward(_name(reward, ""))
+    options: dict[str, Any] = {"iterations": iterations, "device": device, "reward": own}
     if resume is not None:
         changes: Any = list((overrides or {}).items())
         request = runner.TrainRequest(resume=_path(resume), overrides=changes, **options)

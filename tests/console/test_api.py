@@ -26,6 +26,10 @@ class Plans:
 
 def same(inner):
     return [inner]
+
+
+def late(view):
+    return {"late": -0.125 * view.time_s}
 '''
 
 
@@ -130,7 +134,7 @@ def test_bad_input_is_refused_as_by_the_command():
     assert {"evaluate", "train", "make"} <= set(dir(uuvtai))
 
 
-def test_a_sweep_and_a_training_are_those_of_the_commands(tmp_path, pandas):
+def test_a_sweep_and_a_training_are_those_of_the_commands(run, tmp_path, pandas):
     cells = uuvtai.sweep("straight", {"D": [0, 9]}, episodes=2, run_dir=tmp_path / "sweep", **SMALL)
     assert [row["D"] for row in cells.to_pandas()] == [0, 9] and "2 cells x 2 episodes" in str(cells)
     few = SmallSim.CHANGES | {"train.num_envs": 8, "episode.horizon_steps": 400, "distillation.batch": 32}
@@ -138,6 +142,13 @@ def test_a_sweep_and_a_training_are_those_of_the_commands(tmp_path, pandas):
     first = uuvtai.train(
         "smoke", seed=1, iterations=1, overrides=few, device="cpu", run_dir=tmp_path / "train"
     )
+    reward = run[1].late
+    with pytest.raises(ValueError, match="began with no --reward"):
+        uuvtai.train(resume=first, iterations=2, device="cpu", reward=reward)
     again = uuvtai.train(resume=first, iterations=2, device="cpu")
     assert [row["iteration"] for row in again.to_pandas()] == [1, 2]
+    own = uuvtai.train(
+        "smoke", iterations=1, overrides=few, device="cpu", run_dir=tmp_path / "own", reward=reward
+    )
+    assert own.to_pandas()[0]["reward/late"] < 0.0
     assert f"next:uuveval--agent{first.folder}" in "".join(str(again).split())
