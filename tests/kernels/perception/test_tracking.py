@@ -322,18 +322,23 @@ def test_covariance_stays_positive_and_equals_joseph():
     loses positive definiteness."""
     n_step, n_run = 1000, 3
     mean, cov, link = (ti.Vector.field(size, ti.f32, n_run) for size in (4, 10, 5))
+    covs, links = (ti.Vector.field(size, ti.f32, (n_step, n_run)) for size in (10, 5))
     rate = ti.field(ti.f32, n_run)
     data = ti.Vector.field(5, ti.f32, (n_step, n_run))  # bearing; place, velocity along it; variance; dt
 
     @ti.kernel
-    def run(k: int):
+    def run():
         for i in range(n_run):
-            d = data[k, i]
-            x, p, c = kalman.predicted(mean[i], cov[i], rate[i], link[i], d[4], 0.03, 0.005)
-            h = ti.Vector([ti.cos(d[0]), ti.sin(d[0]), 0.0, 0.0])
-            x1, p1, r1, c1 = kalman.corrected(x, p, rate[i], c, h, d[1] - h.dot(x), d[3])
-            g = ti.Vector([0.0, 0.0, ti.cos(d[0]), ti.sin(d[0])])
-            mean[i], cov[i], rate[i], link[i] = kalman.corrected(x1, p1, r1, c1, g, d[2] - g.dot(x1), d[3])
+            for k in range(n_step):
+                d = data[k, i]
+                x, p, c = kalman.predicted(mean[i], cov[i], rate[i], link[i], d[4], 0.03, 0.005)
+                h = ti.Vector([ti.cos(d[0]), ti.sin(d[0]), 0.0, 0.0])
+                x1, p1, r1, c1 = kalman.corrected(x, p, rate[i], c, h, d[1] - h.dot(x), d[3])
+                g = ti.Vector([0.0, 0.0, ti.cos(d[0]), ti.sin(d[0])])
+                mean[i], cov[i], rate[i], link[i] = kalman.corrected(
+                    x1, p1, r1, c1, g, d[2] - g.dot(x1), d[3]
+                )
+                covs[k, i], links[k, i] = cov[i], link[i]
 
     rng = np.random.default_rng(3)
     size = (n_step, n_run)
@@ -353,10 +358,9 @@ def test_covariance_stays_positive_and_equals_joseph():
     P = np.tile(np.diag([1.0, 1.0, 9.0, 9.0, 1.0]), (n_run, 1, 1))
     cov.from_numpy(np.tile(P[0][:4, :4][np.triu_indices(4)], (n_run, 1)).astype(np.float32))
     link.from_numpy(np.tile(P[0][4], (n_run, 1)).astype(np.float32))
-    x = np.zeros((n_run, 5))
+    x, wanted = np.zeros((n_run, 5)), np.zeros((n_step, n_run, 5, 5))
+    run()
     for k in range(n_step):
-        run(k)
-        got, got_link = cov.to_numpy().astype(float), link.to_numpy().astype(float)
         for i in range(n_run):
             angle, at, way, var, dt = values[k, i].astype(float)
             x[i], P[i] = oracle.predicted(x[i], P[i], dt, 0.03, 0.005)
@@ -365,15 +369,16 @@ def test_covariance_stays_positive_and_equals_joseph():
                 (np.append([0, 0], oracle.unit(angle)), way),
             ):
                 x[i], P[i] = oracle.corrected(x[i], P[i], h, z - h @ x[i][:4], var)
-            full = np.zeros((5, 5))
-            full[np.triu_indices(4)] = got[i]
-            full[:, 4] = got_link[i]
-            full = full + np.triu(full, 1).T
-            sigma = np.sqrt(np.diag(full))
-            assert np.linalg.eigvalsh(full / np.outer(sigma, sigma))[0] > 0
-            np.testing.assert_allclose(
-                full / np.outer(sigma, sigma), P[i] / np.outer(sigma, sigma), atol=LONG_RUN_TOLERANCE
-            )
+        wanted[k] = P
+    full = np.zeros_like(wanted)
+    rows, columns = np.triu_indices(4)
+    full[..., rows, columns] = covs.to_numpy()
+    full[..., 4] = links.to_numpy()
+    full += np.swapaxes(np.triu(full, 1), -1, -2)
+    sigma = np.sqrt(np.diagonal(full, axis1=-2, axis2=-1))
+    scale = sigma[..., None] * sigma[..., None, :]
+    assert np.linalg.eigvalsh(full / scale).min() > 0
+    np.testing.assert_allclose(full / scale, wanted / scale, atol=LONG_RUN_TOLERANCE)
     np.testing.assert_allclose(mean.to_numpy(), x[:, :4], atol=10 * STATE_TOLERANCE)
     np.testing.assert_allclose(rate.to_numpy(), x[:, 4], atol=RATE_TOLERANCE)
     assert np.abs(x[:, 4] - turn).max() < 0.3, "the circles were not followed"
