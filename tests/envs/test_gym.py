@@ -476,22 +476,13 @@ def test_without_gymnasium_one_error_says_what_to_install():
     )
 
 
-_FOUND = """
-import gymnasium, sys
-for make in (gymnasium.make, gymnasium.make_vec):
-    assert "uuvtai" not in sys.modules and "uuvtai/Nav-v0" not in gymnasium.registry
-    try:
-        make("uuvtai.envs.gymnasium:uuvtai/Nav-v0", world="pol")
-    except ValueError as error:
-        print(type(error).__name__, error)
-    for name in [name for name in sys.modules if name.partition(".")[0] == "uuvtai"]:
-        del sys.modules[name]
-    gymnasium.registry.pop("uuvtai/Nav-v0")
-"""
-
-
-def test_gymnasium_finds_the_env_without_an_import_of_ours():
+@pytest.mark.parametrize("make", ["make", "make_vec"])
+def test_gymnasium_finds_the_env_without_an_import_of_ours(make):
     """A world that does not exist is refused by us, before anything is compiled."""
-    done = subprocess.run([sys.executable, "-c", _FOUND], capture_output=True, text=True, check=False)
-    told = [line for line in done.stdout.splitlines() if line.startswith("ConfigError")]
-    assert len(told) == 2 and all("did you mean 'pool'" in line for line in told), done.stderr
+    code = (
+        f"import gymnasium, sys\nassert 'uuvtai' not in sys.modules\n"
+        f"try: gymnasium.{make}('uuvtai.envs.gymnasium:uuvtai/Nav-v0', world='pol')\n"
+        "except ValueError as error: print(type(error).__name__, error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "ConfigError" in done.stdout and "did you mean 'pool'" in done.stdout, done.stderr
