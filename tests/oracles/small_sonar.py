@@ -91,6 +91,5 @@ def _walls(pos, u, tank):
     low, high = np.array([tank.x_m[0], tank.y_m[0]]), np.array([tank.x_m[1], tank.y_m[1]])
     edge = np.where(u > 0, high, low)
     along = np.abs(u) < 1e-12
-    return np.minimum(
-        *np.moveaxis(np.where(along, np.inf, (edge - pos[:, None, :]) / np.where(along, 1.0, u)), -1, 0)
-    )
+    far = np.where(along, np.inf, (edge - pos[:, None, :]) / np.where(along, 1.0, u))
+    return np.minimum(far[..., 0], far[..., 1])

@@ -89,12 +89,8 @@ class Drawn(Stage):
 @functools.cache
 def drawn_world(name):
     # one set of slots serves the preset's S and D and every other (S, D)
-    cfg = (
-        world_config("pool", static_capacity=12, dynamic_capacity=15)
-        if name == "pool"
-        else world_config(name)
-    )
-    world_of = Drawn(cfg)
+    room = {"static_capacity": 12, "dynamic_capacity": 15} if name == "pool" else {}
+    world_of = Drawn(world_config(name, **room))
     return world_of, world_of.draw()
 
 
@@ -439,7 +435,6 @@ start_taichi("cpu")
 from tests.kernels.world.test_world import Drawn, PURE, world_config
 drawn = Drawn(world_config("pool", static_capacity=8, dynamic_capacity=6), n_env=7)
 drawn = drawn.draw(numbers=[6, 5, 4, 3, 2, 1, 0])
-n_slot = 8
 np.savez(sys.argv[1], **{name: drawn[name][::-1] for name in PURE})
 """
 
