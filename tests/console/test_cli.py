@@ -152,24 +152,58 @@ def test_what_once_was_a_traceback_or_passed_for_a_failure_is_refused(
     assert_refused(uuv(capfd, *arguments), says, tmp_path)
 
 
-def test_a_simulation_that_diverges_is_refused_with_what_to_type(tmp_path):
-    steps = ["simulate", "--seconds", "4", "--dt", "0.5", "--wrench", "90,0,0,0,0,5"]
-    assert_refused(in_a_process(tmp_path, *steps), "use a smaller substep, --dt 0.125", tmp_path)
+_IN_TURN = """
+import contextlib, io, json, os, sys
+from uuvtai.cli import main
+ended = []
+for words, threads in json.loads(sys.argv[1]):
+    out, err = io.StringIO(), io.StringIO()
+    os.environ["UUV_NUM_THREADS"] = threads
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main(words)
+        except SystemExit as left:
+            ended.append((left.code, out.getvalue(), err.getvalue()))
+from uuvtai.compile.runtime import start_taichi
+start_taichi("cpu", "f64")  # what runs already, or it is refused
+print(json.dumps(ended))
+"""
 
 
-def assert_refused(ended, says, folder):
+@pytest.fixture(scope="module")
+def simulations(tmp_path_factory):
+    """How simulations ended, in turn in one process of their own: its folder, and (code, stdout, stderr) of
+    one with a nonsense thread count, of one that diverges, and of one whose vehicle looks like markup."""
+    folder = tmp_path_factory.mktemp("simulations")
+    (folder / "a[/x]").mkdir(parents=True)
+    shutil.copy(loader.preset_path("vehicle", "bluerov2"), folder / "a[/x]/odd.yaml")
+    brief = ["simulate", "--seconds", "0.1"]
+    diverging = ["simulate", "--seconds", "4", "--dt", "0.5", "--wrench", "90,0,0,0,0,5"]
+    told = [(brief, "0"), (diverging, "1"), ([*brief, "--vehicle", "a[/x]/odd.yaml"], "1")]
+    command = [sys.executable, "-c", _IN_TURN, json.dumps(told)]
+    environment = os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+    return folder, [tuple(ended) for ended in json.loads(done.stdout.splitlines()[-1])]
+
+
+def test_a_simulation_that_diverges_is_refused_with_what_to_type(simulations):
+    folder, (_, diverging, _) = simulations
+    assert_refused(diverging, "use a smaller substep, --dt 0.125", folder, left=["a["])
+
+
+def assert_refused(ended, says, folder, left=()):
     code, out, err = ended
     assert (code, out) == (2, "")
     assert says in " ".join(err.split())
     assert "Traceback" not in err and "a bug of ours" not in err
-    assert not list(folder.iterdir())
+    assert [path.name for path in folder.iterdir()] == list(left)
 
 
-def in_a_process(folder, *arguments, environment=None, stdout=subprocess.PIPE):
+def in_a_process(folder, *arguments, stdout=subprocess.PIPE):
     done = subprocess.run(
         [sys.executable, "-m", "uuvtai", *arguments], stdout=stdout, stderr=subprocess.PIPE, text=True,
         cwd=folder, check=False,
-        env=os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])} | (environment or {}),
+        env=os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])},
     )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
 
@@ -180,14 +214,12 @@ def test_a_nonsense_thread_count_is_named(text):
         _thread_count(text)
 
 
-def test_a_command_refuses_a_nonsense_thread_count(tmp_path):
-    code, _, err = in_a_process(
-        tmp_path, "simulate", "--seconds", "0.1", environment={"UUV_NUM_THREADS": "0"}
-    )
+def test_a_command_refuses_a_nonsense_thread_count(simulations):
+    code, _, err = simulations[1][0]
     assert code == 2 and "UUV_NUM_THREADS='0'" in err
 
 
-def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluation):
+def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluation, simulations):
     """Names of run folder, vehicle and agent that look like markup, in every table."""
     folder, document, _ = evaluation
     odd = json.loads(json.dumps(document))
@@ -198,9 +230,8 @@ def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluat
     monkeypatch.chdir(tmp_path)
     Path("a[/x]").mkdir(parents=True)
     shutil.copy(folder / "logs/bt_seed3_episode0.mcap", "a[/x]/log.mcap")
-    shutil.copy(loader.preset_path("vehicle", "bluerov2"), "a[/x]/odd.yaml")
     assert uuv(capfd, "log", "info", "a[/x]/log.mcap")[0] == 0
-    code, out, err = in_a_process(tmp_path, "simulate", "--seconds", "0.1", "--vehicle", "a[/x]/odd.yaml")
+    code, out, err = simulations[1][2]
     assert code == 0 and "a[/x]/odd.yaml: 0.1 s" in out, err
 
 

@@ -66,16 +66,15 @@ def made(monkeypatch):
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory, taichi_runtime):
-    """A small simulator that forecasts by a network which has learnt nothing."""
+    """A small simulator that forecasts by a network which has learnt nothing; else it is the stack with one,
+    whose kernels ``tests/sim/test_stack.py`` needs too."""
+    path = tmp_path_factory.mktemp("net") / "f.safetensors"
 
     class LearnedSim(SmallSim):
-        CHANGES = SmallSim.CHANGES | {
-            "forecast.learned": str(tmp_path_factory.mktemp("net") / "f.safetensors")
-        }
+        CHANGES = SmallSim.CHANGES | {"stack": "best", "forecast.learned": str(path)}
 
     net = MixtureNet(torch.Generator().manual_seed(3))
-    with open(LearnedSim.CHANGES["forecast.learned"], "wb") as file:
-        file.write(packed_weights(net.weights()))
+    path.write_bytes(packed_weights(net.weights()))
     found = LearnedSim()
     found.net = net
     return found

@@ -1,4 +1,4 @@
-"""NumPy float64 oracle of the evasion's roll-outs and costs: one candidate, obstacle, sample at a time."""
+"""NumPy float64 oracle of the evasion's roll-outs and costs: one candidate, one obstacle at a time."""
 
 import numpy as np
 
@@ -30,21 +30,19 @@ def depth_band(tank, cfg):
 
 
 def distance_to(body, radius, above, below, at, cfg):
-    """(distance [m] of a point to an upright cylinder, its slope along the level direction away from the
-    axis, doubt [m]).
+    """(distances [m] of points to an upright cylinder, their slopes along the level direction away from the
+    axis, doubts [m]).
 
     Between ``below`` and ``above`` the water is free: the cylinder may be anywhere above or anywhere below
     that slab, whichever is nearer. Level with it, a point inside is as far below zero as it is from the
     mantle. ``doubt`` is how near the case is to flipping.
     """
-    level = np.hypot(*(at[:2] - body)) - radius
-    room = min(above - at[2], at[2] - below)
-    doubt = abs(room) if level < 0.001 else np.inf
-    if room <= 0:
-        return level, 1.0, doubt
-    upright = cfg.vertical_weight * room
-    beside = max(level, 0.0)
-    return np.hypot(beside, upright), beside / np.hypot(beside, upright), doubt
+    level = np.hypot(*(at[:, :2] - body).T) - radius
+    room = np.minimum(above - at[:, 2], at[:, 2] - below)
+    doubt = np.where(level < 0.001, np.abs(room), np.inf)
+    beside = np.maximum(level, 0.0)
+    aslant = np.where(room > 0, np.hypot(beside, cfg.vertical_weight * room), 1.0)
+    return np.where(room > 0, aslant, level), np.where(room > 0, beside / aslant, 1.0), doubt
 
 
 def obstacle_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
@@ -57,6 +55,7 @@ def obstacle_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf
     n = round(cfg.horizon_s / dt_s)
     at, moving = rolled_out(pos, vel, command, cfg.lag_s, dt_s, n, burst_s)
     at[:, 2] = np.clip(at[:, 2], *depth_band(tank, cfg))
+    times_s = np.arange(1, n + 1) * dt_s
     peak, mean, contact, first, doubt = 0.0, 0.0, 0.0, np.inf, np.inf
     for body, radius, above, below, others, shares in zip(*forecast, strict=True):
         if radius[0] < 0:
@@ -66,20 +65,18 @@ def obstacle_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf
         heeded.append((body, 1.0 - sum(future[1] for future in heeded), 1.0))
         expected = np.zeros(2)
         for places, share, margin in heeded:
-            deepest, nearest = 0.0, 0.0
-            for k in range(1, n + 1):
-                distance, slope, unsure = distance_to(places[k], radius[k], above, below, at[k], cfg)
-                outward = (at[k, :2] - places[k]) / np.hypot(*(at[k, :2] - places[k]))
-                closing = max(0.0, -(moving[k, :2] - (places[k] - places[k - 1]) / dt_s) @ outward)
-                free = distance - cfg.hull_reach_m - cfg.closing_s * closing * slope
-                wanted = margin * cfg.caution * (cfg.margin_m + cfg.margin_growth_m_s * k * dt_s)
-                depth = max(0.0, cfg.contact_m + wanted - free)
-                deepest, nearest = max(deepest, depth), max(nearest, cfg.contact_m - free)
-                mean += share * depth / n
-                doubt = min(doubt, unsure)
-                if depth > 0 and share >= cfg.evade_probability:
-                    first = min(first, k * dt_s)
-            expected += share * np.array([deepest, nearest])
+            there, ahead = places[1 : n + 1], at[1:]
+            distance, slope, unsure = distance_to(there, radius[1 : n + 1], above, below, ahead, cfg)
+            outward = (ahead[:, :2] - there) / np.hypot(*(ahead[:, :2] - there).T)[:, None]
+            nearing = (np.diff(places[: n + 1], axis=0) / dt_s - moving[1:, :2]) * outward
+            free = distance - cfg.hull_reach_m - cfg.closing_s * np.maximum(0.0, nearing.sum(1)) * slope
+            wanted = margin * cfg.caution * (cfg.margin_m + cfg.margin_growth_m_s * times_s)
+            depth = np.maximum(0.0, cfg.contact_m + wanted - free)
+            mean += share * depth.sum() / n
+            doubt = min(doubt, unsure.min())
+            if share >= cfg.evade_probability:
+                first = min(first, times_s[depth > 0].min(initial=np.inf))
+            expected += share * np.array([depth.max(), max(0.0, cfg.contact_m - free.min())])
         peak, contact = max(peak, expected[0]), max(contact, expected[1])
     return peak, mean, contact, first, doubt
 

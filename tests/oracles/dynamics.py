@@ -6,7 +6,8 @@ matrix, nu).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -53,17 +54,21 @@ class Body:
     linear: np.ndarray = field(default_factory=lambda: np.array([4.03, 6.22, 5.18, 0.07, 0.07, 0.07]))
     quadratic: np.ndarray = field(default_factory=lambda: np.array([18.18, 21.66, 36.99, 1.55, 1.55, 1.55]))
 
-    @property
+    @cached_property
     def rigid_mass_matrix(self):
         return np.diag(np.concatenate([np.full(3, self.mass), self.inertia]))
 
-    @property
+    @cached_property
+    def added_mass_matrix(self):
+        return np.diag(self.added)
+
+    @cached_property
     def mass_matrix(self):
-        return np.diag(np.concatenate([np.full(3, self.mass), self.inertia]) + self.added)
+        return self.rigid_mass_matrix + self.added_mass_matrix
 
     def neutral(self):
         """The same obstacle with buoyancy equal to weight."""
-        return Body(**{**self.__dict__, "buoyancy": self.mass * self.gravity})
+        return replace(self, buoyancy=self.mass * self.gravity)
 
 
 def coriolis_matrix(mass_matrix, nu):
@@ -79,7 +84,7 @@ def coriolis_matrix(mass_matrix, nu):
 def nu_dot(body, rotation, nu, wrench, current_w):
     """d nu / dt by solving with the full mass matrix; ``wrench`` may be a function of (rotation, nu)."""
     nu_r = nu - np.concatenate([rotation.T @ current_w, np.zeros(3)])
-    up = rotation.T @ np.array([0.0, 0.0, 1.0])
+    up = rotation[2]
     restoring = np.concatenate(
         [
             -(body.buoyancy - body.mass * body.gravity) * up,
@@ -91,7 +96,7 @@ def nu_dot(body, rotation, nu, wrench, current_w):
     right = (
         tau
         - coriolis_matrix(body.rigid_mass_matrix, nu) @ nu
-        - coriolis_matrix(np.diag(body.added), nu_r) @ nu_r
+        - coriolis_matrix(body.added_mass_matrix, nu_r) @ nu_r
         - damping
         - restoring
     )

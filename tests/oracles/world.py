@@ -23,12 +23,16 @@ def outline(kind, pos, size, yaw, spacing=0.005):
 
 def plan_distances(points, kind, pos, size, yaw):
     """Distances [m] of points (..., 2) to an obstacle's plan view; 0 inside a box, negative inside a disc."""
-    q = np.asarray(points, float) - np.asarray(pos[:2])
+    points = np.asarray(points, float)
+    x, y = points[..., 0] - pos[0], points[..., 1] - pos[1]
     if kind != BOX:
-        return np.linalg.norm(q, axis=-1) - size[0]
-    c, s = np.cos(yaw), np.sin(yaw)
-    local = np.stack([c * q[..., 0] + s * q[..., 1], c * q[..., 1] - s * q[..., 0]], axis=-1)
-    return np.linalg.norm(np.maximum(np.abs(local) - size[:2], 0.0), axis=-1)
+        return np.hypot(x, y) - size[0]
+    c, s = math.cos(yaw), math.sin(yaw)
+    beside = (
+        np.maximum(np.abs(c * x + s * y) - size[0], 0.0),
+        np.maximum(np.abs(c * y - s * x) - size[1], 0.0),
+    )
+    return np.hypot(*beside)
 
 
 def gap(a, b):
@@ -47,7 +51,8 @@ def wall_distances(points, tank):
     x, y = points[..., 0], points[..., 1]
     if tank.shape == "circle":
         return tank.radius_m - np.hypot(x - 0.5 * sum(tank.x_m), y - 0.5 * sum(tank.y_m))
-    return np.min([x - tank.x_m[0], tank.x_m[1] - x, y - tank.y_m[0], tank.y_m[1] - y], axis=0)
+    along = np.minimum(x - tank.x_m[0], tank.x_m[1] - x)
+    return np.minimum(along, np.minimum(y - tank.y_m[0], tank.y_m[1] - y))
 
 
 def is_joined(start, goal, obstacles, tank, clearance):

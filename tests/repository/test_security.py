@@ -556,13 +556,12 @@ UNUSABLE = {
 """records of a run that cannot be gone on with"""
 ODD = {
     "argv": b'{"argv": 3}',
-    "argv of lists": b'{"argv": [[1], {"a": 2}, null]}',
+    "argv of lists, status": b'{"argv": [[1], {"a": 2}, null], "status": {"a": []}}',
     "hardware": b'{"hardware": 3, "versions": "none"}',
     "hardware as a list": b'{"hardware": ["cpu"]}',
     "seeds": b'{"seeds": 7}',
     "seeds null": b'{"seeds": null}',
     "resumed by numbers": b'{"resumed": [3]}',
-    "status": b'{"status": {"a": []}}',
 }
 
 

@@ -78,7 +78,8 @@ class Diver:
         ping = SonarPing(self.time_s, range_m, hit.astype(int), np.zeros(0), int(beams[0]))
         self.calibration.feed(ping)
 
-    def drive(self, seconds=400.0):
+    def drive(self, seconds=250.0):
+        """Twice as long as it takes to find what there is to find."""
         until_s = self.time_s + seconds
         while self.time_s < until_s and not (self.calibration.found or self.calibration.refusal):
             self.step()

@@ -182,11 +182,8 @@ def test_packets_equal_the_scalar_oracle(scene):
             best = found[env].argmin()
             mean = oracle.mean_velocity(commands, found[env], CFG.behavior.temperature)
             held = view.cost(mean, np.inf)[0]
-            taken = (
-                (mean, held)
-                if held <= found[env].min() + CFG.behavior.temperature
-                else (commands[best], found[env].min())
-            )
+            is_held = held <= found[env].min() + CFG.behavior.temperature
+            taken = (mean, held) if is_held else (commands[best], found[env].min())
             np.testing.assert_allclose(chosen[env], taken[0], atol=1e-3)
             assert price[env] == pytest.approx(taken[1], abs=COST_TOLERANCE)
             bests.append(best)

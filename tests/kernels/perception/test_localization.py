@@ -194,7 +194,7 @@ def test_without_a_wall_in_reach_the_uncertainty_grows_and_stays_honest(rig):
 
 def test_obstacles_at_a_round_wall_do_not_make_it_too_sure(rig):
     """The defaults: obstacles closer to the wall than the gate is wide pass for it."""
-    rig.begin(voyage("harsh", PEN, 13, obstacles=OBSTACLES), DEFAULT)
+    rig.begin(voyage("astray", PEN, 13, obstacles=OBSTACLES), DEFAULT)
     nees, _, off = rig.play()
     assert nees.mean() < chi2.ppf(0.975, 3 * N_ENV) / N_ENV
     assert np.quantile(off, 0.95) < 0.15

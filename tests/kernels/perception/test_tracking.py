@@ -140,13 +140,8 @@ def resting(rng, n, apart_m=1.7):
                 if all(np.hypot(*(centre[env, i] - other)) > apart_m for other in centre[env, :i]):
                     break
     radius = np.where(np.arange(n) % 2, rng.uniform(0.2, 0.4, (N_ENV, n)), 0.0)
-    return (
-        centre,
-        np.zeros((N_ENV, n, 2)),
-        radius,
-        rng.uniform(0.2, 0.5, (N_ENV, n, 2)),
-        rng.uniform(-np.pi, np.pi, (N_ENV, n)),
-    )
+    half, yaw = rng.uniform(0.2, 0.5, (N_ENV, n, 2)), rng.uniform(-np.pi, np.pi, (N_ENV, n))
+    return centre, np.zeros((N_ENV, n, 2)), radius, half, yaw
 
 
 def with_movers(still, centre, vel, radius):
@@ -176,11 +171,8 @@ def at_rest(x=10.0, y=3.0, yaw=0.0):
 
 def lines(rng, n, v):
     """Movers back and forth on lines of 2 to 6 m: a function of time to (centre, vel)."""
-    length, way, phase = (
-        rng.uniform(2, 6, (N_ENV, n)),
-        rng.uniform(-np.pi, np.pi, (N_ENV, n)),
-        rng.uniform(0, 12, (N_ENV, n)),
-    )
+    length, way = rng.uniform(2, 6, (N_ENV, n)), rng.uniform(-np.pi, np.pi, (N_ENV, n))
+    phase = rng.uniform(0, 12, (N_ENV, n))
     middle = rng.uniform([3, 1.5], [17, 4.5], (N_ENV, n, 2))
     u = np.stack([np.cos(way), np.sin(way)], -1)
 
@@ -194,18 +186,15 @@ def lines(rng, n, v):
 
 def circles(rng, n, v):
     """Movers around circles of radius 0.5 to 2 m."""
-    radius, phase = (
-        rng.uniform(0.5, 2, (N_ENV, n)) * rng.choice([-1, 1], (N_ENV, n)),
-        rng.uniform(-np.pi, np.pi, (N_ENV, n)),
-    )
+    radius = rng.uniform(0.5, 2, (N_ENV, n)) * rng.choice([-1, 1], (N_ENV, n))
+    phase = rng.uniform(-np.pi, np.pi, (N_ENV, n))
     middle = rng.uniform([2, 1.5], [18, 4.5], (N_ENV, n, 2))
 
     def at(t):
         a = phase + v * t / radius
         out = np.stack([np.cos(a), np.sin(a)], -1)
-        return middle + np.abs(radius)[..., None] * out, v * np.sign(radius)[..., None] * np.stack(
-            [-np.sin(a), np.cos(a)], -1
-        )
+        along = np.stack([-np.sin(a), np.cos(a)], -1)
+        return middle + np.abs(radius)[..., None] * out, v * np.sign(radius)[..., None] * along
 
     return at
 
@@ -261,12 +250,8 @@ def assert_equal_tracks(memory, env, expected):
             np.testing.assert_allclose(
                 memory[name][env, t], value, atol=STATE_TOLERANCE, rtol=1e-4, err_msg=name
             )
-        for name, value in (
-            ("moving", track.moving),
-            ("age", track.age),
-            ("misses", track.misses),
-            ("seen_step", track.seen),
-        ):
+        whole = {"moving": track.moving, "age": track.age, "misses": track.misses, "seen_step": track.seen}
+        for name, value in whole.items():
             assert memory[name][env, t] == value, name
 
 
@@ -286,21 +271,13 @@ def test_one_scan_equals_oracle(preset, cfg, request):
         lab.sense(
             step, drive.pos, drive.yaw, drive.vel, with_movers(still, centre, vel, np.full((N_ENV, 6), 0.25))
         )
-        after, scan = (
-            lab.everything(),
-            {n: getattr(lab.scan, n).to_numpy().astype(float) for n in ("range_m", "doppler_m_s", "hit")},
+        after = lab.everything()
+        scan, pose = (
+            [getattr(lab.scan, name).to_numpy().astype(float) for name in names]
+            for names in (("range_m", "doppler_m_s", "hit"), ("ping_pos_w", "ping_yaw", "ping_vel_b"))
         )
-        pose = [
-            getattr(lab.scan, n).to_numpy().astype(float) for n in ("ping_pos_w", "ping_yaw", "ping_vel_b")
-        ]
         for env in (k % N_ENV, (k + 8) % N_ENV):
-            sensed = oracle.Scan(
-                scan["range_m"][env],
-                scan["doppler_m_s"][env],
-                scan["hit"][env],
-                *(p[env] for p in pose),
-                step,
-            )
+            sensed = oracle.Scan(*(rows[env] for rows in scan), *(rows[env] for rows in pose), step)
             expected = oracle_tracks(before, env)
             clusters, beam_track = oracle.step(
                 expected, before["scan_step"][env], sensed, cfg, lab.sonar, TANK, DT_S
@@ -322,26 +299,28 @@ def test_covariance_stays_positive_and_equals_joseph():
     loses positive definiteness."""
     n_step, n_run = 1000, 3
     mean, cov, link = (ti.Vector.field(size, ti.f32, n_run) for size in (4, 10, 5))
+    covs, links = (ti.Vector.field(size, ti.f32, (n_step, n_run)) for size in (10, 5))
     rate = ti.field(ti.f32, n_run)
     data = ti.Vector.field(5, ti.f32, (n_step, n_run))  # bearing; place, velocity along it; variance; dt
 
     @ti.kernel
-    def run(k: int):
+    def run():
         for i in range(n_run):
-            d = data[k, i]
-            x, p, c = kalman.predicted(mean[i], cov[i], rate[i], link[i], d[4], 0.03, 0.005)
-            h = ti.Vector([ti.cos(d[0]), ti.sin(d[0]), 0.0, 0.0])
-            x1, p1, r1, c1 = kalman.corrected(x, p, rate[i], c, h, d[1] - h.dot(x), d[3])
-            g = ti.Vector([0.0, 0.0, ti.cos(d[0]), ti.sin(d[0])])
-            mean[i], cov[i], rate[i], link[i] = kalman.corrected(x1, p1, r1, c1, g, d[2] - g.dot(x1), d[3])
+            for k in range(n_step):
+                d = data[k, i]
+                x, p, c = kalman.predicted(mean[i], cov[i], rate[i], link[i], d[4], 0.03, 0.005)
+                h = ti.Vector([ti.cos(d[0]), ti.sin(d[0]), 0.0, 0.0])
+                x1, p1, r1, c1 = kalman.corrected(x, p, rate[i], c, h, d[1] - h.dot(x), d[3])
+                g = ti.Vector([0.0, 0.0, ti.cos(d[0]), ti.sin(d[0])])
+                mean[i], cov[i], rate[i], link[i] = kalman.corrected(
+                    x1, p1, r1, c1, g, d[2] - g.dot(x1), d[3]
+                )
+                covs[k, i], links[k, i] = cov[i], link[i]
 
     rng = np.random.default_rng(3)
     size = (n_step, n_run)
-    bearing, var, dt = (
-        rng.uniform(-3, 3, size),
-        10 ** rng.uniform(-4, -1, size),
-        rng.choice([0.02, 0.06, 0.1], size),
-    )
+    bearing, var = rng.uniform(-3, 3, size), 10 ** rng.uniform(-4, -1, size)
+    dt = rng.choice([0.02, 0.06, 0.1], size)
     turn = np.linspace(-2, 2, n_run)
     along = np.cumsum(dt, 0) * turn
     u = np.stack([np.cos(bearing), np.sin(bearing)], -1)
@@ -353,10 +332,9 @@ def test_covariance_stays_positive_and_equals_joseph():
     P = np.tile(np.diag([1.0, 1.0, 9.0, 9.0, 1.0]), (n_run, 1, 1))
     cov.from_numpy(np.tile(P[0][:4, :4][np.triu_indices(4)], (n_run, 1)).astype(np.float32))
     link.from_numpy(np.tile(P[0][4], (n_run, 1)).astype(np.float32))
-    x = np.zeros((n_run, 5))
+    x, wanted = np.zeros((n_run, 5)), np.zeros((n_step, n_run, 5, 5))
+    run()
     for k in range(n_step):
-        run(k)
-        got, got_link = cov.to_numpy().astype(float), link.to_numpy().astype(float)
         for i in range(n_run):
             angle, at, way, var, dt = values[k, i].astype(float)
             x[i], P[i] = oracle.predicted(x[i], P[i], dt, 0.03, 0.005)
@@ -365,15 +343,16 @@ def test_covariance_stays_positive_and_equals_joseph():
                 (np.append([0, 0], oracle.unit(angle)), way),
             ):
                 x[i], P[i] = oracle.corrected(x[i], P[i], h, z - h @ x[i][:4], var)
-            full = np.zeros((5, 5))
-            full[np.triu_indices(4)] = got[i]
-            full[:, 4] = got_link[i]
-            full = full + np.triu(full, 1).T
-            sigma = np.sqrt(np.diag(full))
-            assert np.linalg.eigvalsh(full / np.outer(sigma, sigma))[0] > 0
-            np.testing.assert_allclose(
-                full / np.outer(sigma, sigma), P[i] / np.outer(sigma, sigma), atol=LONG_RUN_TOLERANCE
-            )
+        wanted[k] = P
+    full = np.zeros_like(wanted)
+    rows, columns = np.triu_indices(4)
+    full[..., rows, columns] = covs.to_numpy()
+    full[..., 4] = links.to_numpy()
+    full += np.swapaxes(np.triu(full, 1), -1, -2)
+    sigma = np.sqrt(np.diagonal(full, axis1=-2, axis2=-1))
+    scale = sigma[..., None] * sigma[..., None, :]
+    assert np.linalg.eigvalsh(full / scale).min() > 0
+    np.testing.assert_allclose(full / scale, wanted / scale, atol=LONG_RUN_TOLERANCE)
     np.testing.assert_allclose(mean.to_numpy(), x[:, :4], atol=10 * STATE_TOLERANCE)
     np.testing.assert_allclose(rate.to_numpy(), x[:, 4], atol=RATE_TOLERANCE)
     assert np.abs(x[:, 4] - turn).max() < 0.3, "the circles were not followed"
@@ -400,9 +379,8 @@ def errors(lab, rng, paths, seconds, settle_s=1.0):
         in_moving = (beam_track >= 0) & (np.take_along_axis(moving, np.maximum(beam_track, 0), 1) == 1)
         gap = np.linalg.norm(still[0][:, :, None] - centre[:, None], axis=-1).min(-1)
         crossed = np.where(gap < 1.2, k * PERIOD_S, crossed)
-        alone = (crossed < k * PERIOD_S - 1.0) & (
-            np.linalg.norm(still[0] - drive.pos[:, None], axis=-1) > 0.9
-        )
+        alone = crossed < k * PERIOD_S - 1.0
+        alone &= np.linalg.norm(still[0] - drive.pos[:, None], axis=-1) > 0.9
         at_rest = (body >= 0) & (body < 8) & np.take_along_axis(alone, np.clip(body, 0, 7), 1)
         false, total = false + (in_moving & at_rest).sum(), total + at_rest.sum()
         for i in range(n):

@@ -89,12 +89,8 @@ class Drawn(Stage):
 @functools.cache
 def drawn_world(name):
     # one set of slots serves the preset's S and D and every other (S, D)
-    cfg = (
-        world_config("pool", static_capacity=12, dynamic_capacity=15)
-        if name == "pool"
-        else world_config(name)
-    )
-    world_of = Drawn(cfg)
+    room = {"static_capacity": 12, "dynamic_capacity": 15} if name == "pool" else {}
+    world_of = Drawn(world_config(name, **room))
     return world_of, world_of.draw()
 
 
@@ -277,10 +273,14 @@ def test_moving_obstacles_keep_constant_speed_on_their_paths(any_world):
 def test_obstacles_with_inertia_move_as_an_integrator_says(motion):
     """Turns, reversals and their moments by constant acceleration, integrated in float64; speeds that a path
     cannot have are lowered."""
-    dynamic = load_config("gauntlet").world.dynamic.model_copy(update={"motion": motion})
-    of = Drawn(world_config("gauntlet_inertial", dynamic_speed_m_s=1.5, dynamic=dynamic), n_env=8)
-    drawn, steps = of.draw(seed=5), np.arange(0, 1000, 50)
+    of = drawn_world("gauntlet_inertial")[0]
+    if motion != of.cfg.dynamic.motion:
+        dynamic = of.cfg.dynamic.model_copy(update={"motion": motion})
+        of = Drawn(world_config("gauntlet_inertial", dynamic=dynamic), n_env=8)
+    drawn = of.draw(seed=5, mask=np.arange(of.n_env) < 8, scene=(of.cfg.n_static, of.cfg.n_dynamic, 1.5))
+    drawn, steps = {name: rows[:8] for name, rows in drawn.items()}, np.arange(0, 1000, 50)
     shown = [of.at(step) for step in steps]
+    of.draw()
     speed, easing, n_way = (drawn[f"path_{name}"] for name in ("speed_m_s", "easing_m", "n_way"))
     assert easing[speed > 0] == pytest.approx(speed[speed > 0] ** 2 / 1.5, rel=1e-5)
     for env, lane in np.argwhere(speed > 0):
@@ -435,7 +435,6 @@ start_taichi("cpu")
 from tests.kernels.world.test_world import Drawn, PURE, world_config
 drawn = Drawn(world_config("pool", static_capacity=8, dynamic_capacity=6), n_env=7)
 drawn = drawn.draw(numbers=[6, 5, 4, 3, 2, 1, 0])
-n_slot = 8
 np.savez(sys.argv[1], **{name: drawn[name][::-1] for name in PURE})
 """
 
@@ -500,23 +499,26 @@ def test_explicit_obstacles_stand_and_move_as_written():
 
 
 def test_a_world_that_cannot_be_placed_is_told():
-    of = Drawn(
-        WorldConfig.model_validate({"n_static": 12, "n_dynamic": 0, "static": {"gap_m": 4.0}}), n_env=4
-    )
+    """By number of obstacles, and by what stands there: one compiled world."""
+    small = {"kind": "box", "x_m": 10, "y_m": 3, "half_extents_m": [0.1, 0.1]}
+    told = {
+        "n_static": 12, "n_dynamic": 1, "static": {"gap_m": 4.0}, "start_goal_gap_m": 9, "fixed": [small],
+        "dynamic": {"line_length_m": [30, 40], "circle_fraction": 0},
+    }  # fmt: skip
+    of = Drawn(WorldConfig.model_validate(told), n_env=4)
+
+    def faults(*scene):
+        return of.draw(scene=(*scene, 0.6))["faults"]
+
     with pytest.raises(RuntimeError, match=r"4 of 4 scenarios.*static obstacles find no place"):
-        setup.check_scenarios(of.draw()["faults"])
-    assert not of.draw(scene=(1, 0, 0.6))["faults"].any()
-    crowded = WorldConfig.model_validate(
-        {"n_static": 0, "n_dynamic": 1, "dynamic": {"line_length_m": [30, 40], "circle_fraction": 0}}
-    )
+        setup.check_scenarios(faults(12, 0))
+    assert not faults(1, 0).any()
     with pytest.raises(RuntimeError, match="moving obstacle finds no path"):
-        setup.check_scenarios(Drawn(crowded, n_env=4).draw()["faults"])
-    walled = {"kind": "box", "x_m": 10, "y_m": 3, "half_extents_m": [4.1, 3.0]}
-    far = WorldConfig.model_validate(
-        {"n_static": 0, "n_dynamic": 0, "start_goal_gap_m": 9, "fixed": [walled]}
-    )
+        setup.check_scenarios(faults(0, 1))
+    walled = told | {"fixed": [small | {"half_extents_m": [4.1, 3.0]}]}
+    setup.load_fixed(of.fixed, WorldConfig.model_validate(walled))
     with pytest.raises(RuntimeError, match="no layout joins start and goal"):
-        setup.check_scenarios(Drawn(far, n_env=4).draw()["faults"])
+        setup.check_scenarios(faults(0, 0))
 
 
 @pytest.mark.parametrize(
