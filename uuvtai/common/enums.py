@@ -100,8 +100,7 @@ N_OBSTACLE = 9  # moving obstacles that the policy sees, the nearest ones
 OBSTACLE_WIDTH = 22  # columns of an obstacle
 OWN_WIDTH = 22  # columns of the vehicle, its route and its goal
 N_RAY = 24  # rays of free distance around the vehicle
-WAY_STEPS, WAY_STEP_S = 6, 0.4  # for so long it is foreseen what meets a vehicle along each ray, or at rest
-EGO_COLUMNS = OWN_WIDTH + N_RAY + 2 * (N_RAY + 1)  # columns of the vehicle's own, rays and ways included
+EGO_COLUMNS = OWN_WIDTH + N_RAY  # columns of the vehicle's own, rays included
 
 TURN_GAIN = 2.5  # [1/s] yaw rate by the angle that is still to turn
 LEAST_SPEED_M_S = 0.1  # below it the vehicle keeps its heading

@@ -162,8 +162,6 @@ class SurrogateConfig(Section):
     warm_start_waves: Annotated[int, Field(ge=0, le=1000)] = 0
     """waves of episodes in the simulator in which the policy first learns to imitate the behaviour tree
     (DAgger), world by world and scene by scene; 0 = none"""
-    warm_start_stack: Annotated[str, Field(max_length=200)] = ""
-    """stack preset by which the tree drives then; "" = the run's own"""
 
 
 class ParameterSearchConfig(Section):

@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from uuvtai.common.enums import SUCCESS
 from uuvtai.config.learning import LearningConfig, UncertaintyConfig
-from uuvtai.config.loader import with_stack
 from uuvtai.learning.agents import SetAgent
 from uuvtai.learning.networks import AdamLearner, Policy
 from uuvtai.learning.parameter_search import run_search_episodes, simulator_of
@@ -182,8 +181,6 @@ def imitate(
     began, sims = time.perf_counter(), dict(sims or {})
     waves, rows = config.surrogate.warm_start_waves, min(WAVE_EPISODES, config.train.num_envs)
     few = config.model_copy(update={"train": config.train.model_copy(update={"num_envs": rows})})
-    if config.surrogate.warm_start_stack:
-        few = with_stack(few, config.surrogate.warm_start_stack)
     seed = config.train.seed + SEED
     generator = torch.Generator().manual_seed(seed)
     learner = AdamLearner(actor.net.parameters(), lr=RATE)

@@ -37,8 +37,8 @@ class SetEncoder(nn.Module):
         n_obstacle, n_own, n_out = sizes
         wide, head = config.surrogate.obstacle_hidden, config.surrogate.head_hidden
         self.obstacle = mlp((n_obstacle, wide, wide), "relu", generator, math.sqrt(2.0))
-        self.own = nn.Sequential(*mlp((n_own, head), "relu", generator, math.sqrt(2.0)), nn.ReLU())
-        self.head = mlp((2 * wide + head, head, head, n_out), "relu", generator, gain)
+        self.own = nn.Sequential(*mlp((n_own, wide), "relu", generator, math.sqrt(2.0)), nn.ReLU())
+        self.head = mlp((3 * wide, head, head, n_out), "relu", generator, gain)
 
     def forward(self, obstacles: Tensor, own: Tensor, mask: Tensor) -> Tensor:
         n, rows = obstacles.shape[-2], obstacles.shape[:-2]

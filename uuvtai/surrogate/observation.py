@@ -1,19 +1,9 @@
 """What the policy over a set of obstacles is told: the same columns of the surrogate, and of the simulator
 as the vehicle senses and remembers it."""
 
-import math
-
 import taichi as ti
 
-from uuvtai.common.enums import (
-    EGO_COLUMNS,
-    N_OBSTACLE,
-    N_RAY,
-    OBSTACLE_WIDTH,
-    OWN_WIDTH,
-    WAY_STEP_S,
-    WAY_STEPS,
-)
+from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH, OWN_WIDTH
 from uuvtai.envs.vector_env import ObservationColumn
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z
 from uuvtai.kernels.core.grid import cell_of, clearance_of
@@ -148,8 +138,7 @@ SET_TABLE = tuple(
     ObservationColumn(name, columns, unit, "mirrored world", meaning)
     for name, columns, unit, meaning in (
         ("set_own", slice(0, OWN_WIDTH), "mixed", "vehicle, route, goal, last action"),
-        ("set_rays", slice(OWN_WIDTH, OWN_WIDTH + N_RAY), "1/m", "nearness of walls"),
-        ("set_ways", slice(OWN_WIDTH + N_RAY, EGO_COLUMNS), "mixed", "what comes along each ray"),
+        ("set_rays", slice(OWN_WIDTH, EGO_COLUMNS), "1/m", "nearness of walls"),
         ("set_obstacles", slice(EGO_COLUMNS, _END), "mixed", "nearest tracks"),
     )
 )
@@ -157,8 +146,6 @@ SET_TABLE = tuple(
 
 HULL_M = 0.22
 """hull radius and half of its half length"""
-FASTEST_M_S, LAG_S = 0.85, 0.3
-"""of a vehicle that would drive along a ray: its speed, and how soon it has it"""
 
 
 @ti.func
@@ -225,62 +212,6 @@ def mirrored_ray(i, env, ego: FloatMatrix):
     return at
 
 
-def way_parts():
-    """Of each step of a way: metres at the end by the wished velocity, by the velocity now, in m/s."""
-    ends = [WAY_STEP_S * (k + 1) for k in range(WAY_STEPS)]
-    kept = [LAG_S * (1.0 - math.exp(-end / LAG_S)) for end in ends]
-    return [[FASTEST_M_S * (end - part), part] for end, part in zip(ends, kept, strict=True)]
-
-
-@ti.func
-def write_ways(env, flip, speed, ego: FloatMatrix, raw: AnyTensor, own: FloatMatrix):
-    """For the vehicle that drives along each ray from now on, and last for one that stops: the smallest gap
-    [m] to a track as it is forecast, from the second step on, and when one first is closer than the hull, in
-    parts of all steps."""
-    towards = ti.Matrix(ti.static(ray_directions()))
-    parts = ti.static(way_parts())
-    first = ti.static(OWN_WIDTH + N_RAY)
-    for i in ti.static(range(N_RAY + 1)):
-        own[env, first + i], own[env, first + N_RAY + 1 + i] = 2.0, 1.0
-    for lane in range(raw.shape[1]):
-        if raw[env, lane, 13] > 0.5:
-            reach = raw[env, lane, 5] + HULL_M
-            at = flip * ti.Vector(
-                [raw[env, lane, 0] - ego[env, At.POS], raw[env, lane, 1] - ego[env, At.POS + 1]]
-            )
-            one = flip * ti.Vector([raw[env, lane, 9], raw[env, lane, 10]])
-            two = flip * ti.Vector([raw[env, lane, 11], raw[env, lane, 12]])
-            places = ti.Matrix.zero(ti.f32, WAY_STEPS, 2)
-            for k in ti.static(range(WAY_STEPS)):
-                t = ti.static(WAY_STEP_S * (k + 1))
-                place = at + t * (2.0 - t) * one + (0.5 * t * (t - 1.0)) * two - parts[k][1] * speed
-                places[k, 0], places[k, 1] = place[0], place[1]
-            for i in range(N_RAY + 1):
-                to, gap, soon = ti.Vector([0.0, 0.0]), 9.0, 1.0
-                if i < N_RAY:
-                    to = ti.Vector([towards[i, 0], towards[i, 1]])
-                begin = at
-                for k in ti.static(range(WAY_STEPS)):
-                    end = ti.Vector([places[k, 0], places[k, 1]]) - parts[k][0] * to
-                    along = end - begin
-                    share = ti.math.clamp(-begin.dot(along) / ti.max(along.norm_sqr(), 1e-6), 0.0, 1.0)
-                    near = (begin + share * along).norm() - reach
-                    if ti.static(k > 0):
-                        gap = ti.min(gap, near)
-                    if near < 0.0:
-                        soon = ti.min(soon, (k + share) / WAY_STEPS)
-                    begin = end
-                own[env, first + i] = ti.min(own[env, first + i], ti.max(gap, -0.5))
-                at_soon = first + N_RAY + 1 + i
-                own[env, at_soon] = ti.min(own[env, at_soon], soon)
-
-
-def ray_directions():
-    """Unit vectors (x, y) of the rays; plain Python, constants of a kernel."""
-    angles = [i * TWO_PI / N_RAY for i in range(N_RAY)]
-    return [[math.cos(angle), math.sin(angle)] for angle in angles]
-
-
 @ti.func
 def write_columns_of(
     env, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, obstacles: AnyTensor, own: FloatMatrix
@@ -297,7 +228,6 @@ def write_columns_of(
     for i in range(N_RAY):
         free = ray[env, mirrored_ray(i, env, ego)]
         own[env, OWN_WIDTH + i] = 1.0 / (0.3 + ti.math.clamp(free - HULL_M, 0.0, 4.0)) - 0.5
-    write_ways(env, flip, speed, ego, raw, own)
 
 
 @ti.kernel

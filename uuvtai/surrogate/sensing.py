@@ -1,6 +1,8 @@
 """What the tracker delivers of the surrogate's obstacles: a model of its delays, noise, field of view and
 memory. Rays of free distance are those of the true walls and static obstacles."""
 
+import math
+
 import taichi as ti
 
 from uuvtai.common.enums import DECISION_S, N_RAY
@@ -9,7 +11,7 @@ from uuvtai.kernels.core.noise import episode_key, normal_pair_lanes, uniform
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, FloatMatrix, IntVector
 from uuvtai.surrogate.arrays import RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules
 from uuvtai.surrogate.motion import aim, part, path_places
-from uuvtai.surrogate.observation import put_row, ray_directions, write_columns_of
+from uuvtai.surrogate.observation import put_row, write_columns_of
 
 RANGE_M = 12.0
 FAN_SLOPE = 0.1763
@@ -69,6 +71,12 @@ def is_hidden(number, slot_count, here, at, obstacle: AnyTensor):
     return out
 
 
+def rays():
+    """Unit vectors (x, y) of the rays; plain Python, constants of the kernel."""
+    angles = [i * TWO_PI / N_RAY for i in range(N_RAY)]
+    return [[math.cos(angle), math.sin(angle)] for angle in angles]
+
+
 @ti.func
 def free_to_wall(at, to, io: Bundle[Rules]):
     """[m] from a place in a direction (x, y) to the nearest side wall."""
@@ -117,7 +125,7 @@ def rays_towards(dx, dy, reach):
 @ti.func
 def write_rays(env, number, slot_count, at, obstacle: AnyTensor, ray: FloatMatrix, io: Bundle[Rules]):
     """[m] from a place (x, y) along each ray to the nearest wall or static obstacle, without the hull."""
-    towards = ti.Matrix(ti.static(ray_directions()))
+    towards = ti.Matrix(ti.static(rays()))
     for i in ti.static(range(N_RAY)):
         ray[env, i] = free_to_wall(at, ti.Vector([towards[i, 0], towards[i, 1]]), io)
     for slot in range(slot_count):

@@ -333,15 +333,3 @@ route_aside | m | place left of the route, times flip.x flip.y, clip(v, -2, 2)
     }
     for i in range(N_RAY)
 ]
-_WAYS = [f"along ray[{i}]" for i in range(N_RAY)] + ["of a vehicle that stops"]
-OWN_COLUMNS += [
-    {
-        "name": f"way_gap[{i}]",
-        "unit": "m",
-        "meaning": f"smallest gap to a tracked obstacle {way} from 0.4 to 2.4 s, clip(v, -0.5, 2)",
-    }
-    for i, way in enumerate(_WAYS)
-] + [
-    {"name": f"way_free[{i}]", "unit": "2.4 s", "meaning": f"until one touches the hull {way}; 1 = none does"}
-    for i, way in enumerate(_WAYS)
-]
