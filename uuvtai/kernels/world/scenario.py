@@ -247,7 +247,7 @@ def coarse_centre(row, col, io: Bundle[WorldIO]):
 
 @ti.func
 def block_cells(env, clearance_m, io: Bundle[WorldIO]):
-    """Mark the cells whose centre is nearer than ``clearance_m`` to a wall or static obstacle."""
+    """Leave open the cells whose centre is ``clearance_m`` or more from walls and static obstacles."""
     n_col = ti.static(coarse_size(io.world_cfg.tank)[1])
     for row, word in ti.ndrange(io.scratch.open.shape[1], io.scratch.open.shape[2]):
         free = ti.cast(0, ti.u64)
@@ -265,16 +265,15 @@ def block_cells(env, clearance_m, io: Bundle[WorldIO]):
 
 @ti.func
 def block_around(env, shape, reach, io: Bundle[WorldIO]):
-    """Mark the cells whose centre is nearer than ``reach`` [m] to a footprint's core."""
+    """Close the cells whose centre is nearer than ``reach`` [m] to a footprint's core."""
     span = ti.Vector([1.0, 1.0]) * (reach + shape[4] + shape[5])  # bounds the turned rectangle
     low = coarse_cell(ti.Vector([shape[0], shape[1]]) - span, io)
     high = coarse_cell(ti.Vector([shape[0], shape[1]]) + span, io)
     for row in range(low[0], high[0] + 1):
         for col in range(low[1], high[1] + 1):
             if nearest_squared(shape, coarse_centre(row, col, io)) < reach * reach:
-                io.scratch.open[env, row, col // WORD] = io.scratch.open[env, row, col // WORD] & ~cell_bit(
-                    col
-                )
+                word = col // WORD
+                io.scratch.open[env, row, word] = io.scratch.open[env, row, word] & ~cell_bit(col)
 
 
 @ti.func
