@@ -658,8 +658,8 @@ SPECS = {
     b"{": "is not JSON",
     b"[" * 100_000: "is not JSON",
     b"[]": "is not the specification",
-    b'{"schema": 4}': "is not the specification of an exported policy of schema 5",
-    b'{"schema": 5, "files": {}}': "lists other files",
+    b'{"schema": 5}': "is not the specification of an exported policy of schema 6",
+    b'{"schema": 6, "files": {}}': "lists other files",
 }
 STRANGE = ["../../etc/passwd", "/etc/passwd", "sub/policy.onnx"]
 

@@ -11,7 +11,16 @@ from tests.learning.test_train import comparable, same
 from tests.oracles import hull_rule as reference
 from tests.oracles.world import plan_distances
 from tests.repository.test_architecture import TRUTH
-from uuvtai.common.enums import COLLISION, EGO_COLUMNS, N_RAY, OBSTACLE_WIDTH, RUNNING, SUCCESS, TIMEOUT
+from uuvtai.common.enums import (
+    COLLISION,
+    EGO_COLUMNS,
+    N_RAY,
+    OBSTACLE_WIDTH,
+    OWN_WIDTH,
+    RUNNING,
+    SUCCESS,
+    TIMEOUT,
+)
 from uuvtai.common.errors import UserError
 from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config import TankConfig, VehicleConfig
@@ -34,7 +43,7 @@ from uuvtai.learning.runner import TrainRequest, train
 from uuvtai.learning.set_networks import SetActor
 from uuvtai.learning.trainer import Trainer
 from uuvtai.sim.stages import bind, members_of
-from uuvtai.surrogate import arrays, motion, observation, sensing
+from uuvtai.surrogate import arrays, motion, observation, safety, sensing
 from uuvtai.surrogate.arrays import At, Rules
 from uuvtai.surrogate.world import draw_bank, scenario_rows
 
@@ -261,6 +270,57 @@ def test_the_referee_is_the_simulators(small, bank, config):
         compared, verdicts = compared + int(soon.sum()), verdicts | set(ended[near & ~edge])
     small.sim.use_tree(small.trees["bt"])
     assert compared > 5 and len(verdicts) >= 3
+
+
+NO_WALL = 1.0 / 4.3 - 0.5
+"""a ray that meets nothing"""
+
+
+def told(way=(9.0, 9.0), velocity=(0.0, 0.0), water_m=0.0):
+    """Columns (1, 1, OBSTACLE_WIDTH) of an obstacle of 0.6 m that goes straight."""
+    row, way, velocity = np.zeros(OBSTACLE_WIDTH), np.array(way), np.array(velocity)
+    row[0], row[7], row[8:10] = 1.0, 0.6, water_m
+    for first, at in ((1, way), (12, way + velocity), (14, way + 2 * velocity)):
+        row[first : first + 2] = at / 4
+    return torch.tensor(row, dtype=torch.float32)[None, None]
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "wall_m", "is_safe"),
+    [
+        (told((1.6, 0.0), (-1.5, 0.0)), None, False),
+        (told((1.6, 0.0), (1.5, 0.0)), None, True),
+        (told((1.6, 1.6), (-1.5, 0.0)), None, True),
+        (told((1.6, 0.0), (-1.5, 0.0), water_m=0.6), None, True),
+        (told((1.6, 0.0), (-1.5, 0.0), water_m=0.1), None, False),
+        (told(), 0.5, False),
+        (told(), 1.3, True),
+    ],
+)
+def test_an_unsafe_wish_gives_way_and_a_safe_one_does_not(config, obstacle, wall_m, is_safe):
+    """Straight on at full speed: towards an obstacle, beside, behind or below it, and towards a wall."""
+    own, wish = torch.full((1, EGO_COLUMNS), NO_WALL), torch.tensor([[1.0, 0.0, 0.4]])
+    own[0, 6:8] = torch.tensor([0.6, 0.0])
+    if wall_m:
+        own[0, OWN_WIDTH] = 1.0 / (0.3 + wall_m - 0.22) - 0.5
+    found, rules = wish.clone(), bind(arrays.SafetyRules, config)
+    safety.filter_wishes(rules, 1.8, torch.zeros(1, dtype=torch.int32), obstacle, own, found)
+    assert torch.equal(found, wish), "not due"
+    safety.filter_wishes(rules, 1.8, torch.ones(1, dtype=torch.int32), obstacle, own, found)
+    assert found[0, 2] == wish[0, 2] and torch.equal(found, wish) == is_safe
+    again = found.clone()
+    safety.filter_wishes(rules, 1.8, torch.ones(1, dtype=torch.int32), obstacle, own, again)
+    torch.testing.assert_close(again, found)  # what is left is safe, or the least unsafe
+
+
+def test_who_goes_straight_on_arrives_more_often_by_the_filter():
+    """A policy at birth goes along its route whatever comes: with the filter it makes way."""
+    won = {}
+    for horizon_s in (0.0, 1.8):
+        more = {"train.evaluate_episodes": 64, "surrogate.safety_horizon_s": horizon_s}
+        config = load_training("policy", overrides=SMALL | more)
+        won[horizon_s] = Trainer(InSurrogate(config), config).evaluate()["eval/success_rate"]
+    assert won[1.8] > won[0.0] + 0.1
 
 
 def test_far_obstacles_are_left_out(config):

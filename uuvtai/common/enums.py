@@ -104,3 +104,16 @@ EGO_COLUMNS = OWN_WIDTH + N_RAY  # columns of the vehicle's own, rays included
 
 TURN_GAIN = 2.5  # [1/s] yaw rate by the angle that is still to turn
 LEAST_SPEED_M_S = 0.1  # below it the vehicle keeps its heading
+
+
+class Safety:
+    """Numbers of the safety filter (``surrogate/safety.py``)."""
+
+    STEP_S, LAG_S = 0.1, 0.3  # the hull's velocity follows a wish like a lag of the first order, in steps
+    REACHED = 0.85  # part of the fastest velocity that it reaches: its diagonal has to turn to the motion
+    HULL_M, SPARE_M = 0.24, 0.06  # radius of the hull, and what is kept beyond it
+    SPARE_S = 0.08  # kept beyond the time to collision that ends an episode
+    WALL_HORIZON_S, WALL_S, WALL_M = 1.0, 0.1, 0.05  # the same of walls and static obstacles, as ends of rays
+    SIGHT_M = 1.4  # so far away no wall is reached by then
+    DIRECTIONS = 16  # wishes that are tried: none, and these at full and at half speed
+    LACK_COST = 100.0  # a metre of clearance that lacks counts as this square of a change of the wish

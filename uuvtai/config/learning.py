@@ -152,6 +152,9 @@ class SurrogateConfig(Section):
     """the policy begins as this part of full speed along the route"""
     vertical_gap_m: Positive = 0.26
     """[m] heave is held back so that the centre stays so far from floor and surface"""
+    safety_horizon_s: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
+    """[s] a wish that leads to a contact or to a stop by time to collision within it gives way to a safe one,
+    in training as on the vehicle (``surrogate/safety.py``); 0 = no wish does"""
     progress: NonNegative = 0.05
     """reward per metre nearer to the goal; arriving is worth 1, an accident costs 1"""
     time_cost: NonNegative = 0.01

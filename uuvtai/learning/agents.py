@@ -13,6 +13,7 @@ from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
 from uuvtai.common.files import parsed_json, read_bytes
 from uuvtai.common.presets import POLICY, PRESET_DIR
 from uuvtai.config.behavior import FAST, SLOW, TUNED
+from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError, load_training
 from uuvtai.learning.checkpoint import (
     LARGEST,
@@ -90,14 +91,14 @@ class SetAgent(HeldAgent):
     """A policy over a set of obstacles driving the rows of a simulator: a wish for a velocity ten times a
     second, laid on the hull in every control step. It looks at tracks, map and pose itself."""
 
-    def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
-        """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
+    def __init__(self, actor: SetActor, sim: Sim, config: LearningConfig) -> None:
+        """``config``: what the policy learnt with, how long it holds a decision and what keeps it safe."""
         from uuvtai.sim.stages import bind
-        from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO
+        from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO, SafetyRules
 
-        super().__init__(sim.num_envs, hold_steps, sim.device)
-        self.actor, self._gap_m = actor, gap_m
-        self._io = bind(ObserverIO, sim.s, sim.config)
+        super().__init__(sim.num_envs, config.policy.hold_steps, sim.device)
+        self.actor, self._limits = actor, config.surrogate
+        self._io, self._safe = bind(ObserverIO, sim.s, sim.config), bind(SafetyRules, sim.config)
         zeros = self._zeros
         self.ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_OBSTACLE, RAW_WIDTH), zeros(N_RAY)
         self.obstacles, self.own = zeros(N_OBSTACLE, OBSTACLE_WIDTH), zeros(EGO_COLUMNS)
@@ -118,6 +119,7 @@ class SetAgent(HeldAgent):
             self.look()
             (wish,) = by_chunk(lambda *row: (self.actor(*row),), self.obstacles[due], self.own[due])
             self.wish[due] = wish.clamp(-MOST_WISH, MOST_WISH)
+            self.keep_safe()
         self.decision = self.decision._replace(action=self.command())
         return self.decision
 
@@ -125,8 +127,16 @@ class SetAgent(HeldAgent):
         """(rows, 4) of the wish, by the hull rule, where each vehicle is now."""
         from uuvtai.surrogate.observation import command_hull
 
-        command_hull(self._io, self._gap_m, self.wish, self._command)
+        command_hull(self._io, self._limits.vertical_gap_m, self.wish, self._command)
         return self._command.clone()
+
+    def keep_safe(self) -> None:
+        """Filter the wishes of the rows whose decision is due."""
+        from uuvtai.surrogate.safety import filter_wishes
+
+        horizon_s, due = self._limits.safety_horizon_s, (self._age % self._hold == 0).int()
+        if horizon_s:
+            filter_wishes(self._safe, horizon_s, due, self.obstacles, self.own, self.wish)
 
     def memory(self) -> dict[str, Tensor]:
         """What the next decisions depend on."""
@@ -154,8 +164,7 @@ def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:
     from uuvtai.surrogate.observation import SET_TABLE
 
     checkpoint.check_table(SET_TABLE, sim.config)
-    config, actor = checkpoint.config, actor_of(checkpoint)
-    return SetAgent(actor.to(sim.device), sim, config.policy.hold_steps, config.surrogate.vertical_gap_m)
+    return SetAgent(actor_of(checkpoint).to(sim.device), sim, checkpoint.config)
 
 
 def find_policy(name: str, note: Note = lambda _text: None) -> Checkpoint:

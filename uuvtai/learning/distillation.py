@@ -148,7 +148,7 @@ class Student(SetAgent):
     """Drives with the tree, drawn anew for every decision, and keeps what the tree says of each."""
 
     def __init__(self, actor: SetActor, sim: Sim, config: LearningConfig, generator: torch.Generator) -> None:
-        super().__init__(actor, sim, config.policy.hold_steps, config.surrogate.vertical_gap_m)
+        super().__init__(actor, sim, config)
         self.simulator, self._generator = sim, generator
         self.tree_share = 1.0
         """chance that the tree drives, beta of DAgger"""

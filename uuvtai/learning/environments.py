@@ -186,8 +186,7 @@ class SimulatedSet(InSimulator):
 
     def agent(self, policy: SetPolicy) -> SetAgent:
         """The policy driving by its mean."""
-        gap_m = self.config.surrogate.vertical_gap_m
-        return SetAgent(policy.actor, self.env.sim, self.steps, gap_m)
+        return SetAgent(policy.actor, self.env.sim, self.config)
 
     def begin(self, policy: SetPolicy, world_model: WorldModel | None, generator: torch.Generator) -> None:
         self._hull = self.agent(policy)
@@ -198,6 +197,7 @@ class SimulatedSet(InSimulator):
     def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
         """Hold a wish (N, 3)."""
         self._hull.wish.copy_(action.clamp(-MOST_WISH, MOST_WISH))
+        self._hull.keep_safe()
         *_, reward, terminated, ended = self._hold(lambda _ended: self._hull.command(), sums)
         for _ in range(self.steps):
             self._hull.advance()

@@ -59,6 +59,14 @@ class Rules:
 
 
 @dataclass(frozen=True, eq=False)
+class SafetyRules:
+    """What the safety filter is compiled for."""
+
+    vehicle_cfg: Const[VehicleConfig]
+    episode_cfg: Const[EpisodeConfig]
+
+
+@dataclass(frozen=True, eq=False)
 class ObserverIO:
     """What a policy over a set of obstacles is told by the simulator: no truth."""
 

@@ -20,8 +20,8 @@ from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.setup import N_CORNER, Scene
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stages import bind
-from uuvtai.surrogate import motion, sensing
-from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules
+from uuvtai.surrogate import motion, safety, sensing
+from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules, SafetyRules
 
 BATCH = 256
 """envs of the simulator that draws"""
@@ -131,10 +131,11 @@ class Surrogate:
         """``seed`` opens the noise of the tracks."""
         start_taichi("cpu")
         self.bank, self.num_envs, self.seed = bank, num_envs, seed
-        self.rules, lanes = bind(Rules, config), bank.path.shape[1]
+        self.rules, self._safe, lanes = bind(Rules, config), bind(SafetyRules, config), bank.path.shape[1]
         self.ego, self.track = torch.zeros(num_envs, EGO_WIDTH), torch.zeros(num_envs, lanes, TRACK_WIDTH)
         self.scenario, self.outcome = (torch.zeros(num_envs, dtype=torch.int32) for _ in range(2))
         self.reward, self.count = torch.zeros(num_envs), torch.zeros(1, dtype=torch.int64)
+        self._every = torch.ones(num_envs, dtype=torch.int32)
         self._raw, self._ray = torch.zeros(num_envs, lanes, RAW_WIDTH), torch.zeros(num_envs, N_RAY)
         self.view = {
             "obstacles": torch.zeros(num_envs, lanes, OBSTACLE_WIDTH),
@@ -173,10 +174,17 @@ class Surrogate:
         return view
 
     def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Carry out a decision (N, 3): (reward, outcome code), both (N,)."""
-        b = self.bank
+        """Carry out a decision (N, 3), filtered: (reward, outcome code), both (N,)."""
+        b, action, horizon_s = (
+            self.bank,
+            action.contiguous().clone(),
+            self.rules.surrogate_cfg.safety_horizon_s,
+        )
+        if horizon_s:
+            view = self.view
+            safety.filter_wishes(self._safe, horizon_s, self._every, view["obstacles"], view["own"], action)
         motion.drive_surrogate(
-            self.rules, action.contiguous(), b.obstacle, b.path, b.route, self.scenario, self.ego,
+            self.rules, action, b.obstacle, b.path, b.route, self.scenario, self.ego,
             self.reward, self.outcome,
         )  # fmt: skip
         return self.reward, self.outcome

@@ -11,7 +11,7 @@ from safetensors.numpy import save
 from tests.command import run_cli
 from tests.learning.export.test_deploy import resigned
 from tests.oracles import hull_rule as reference
-from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, OBSTACLE_WIDTH
+from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH, OWN_WIDTH
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.config.loader import load_training
 from uuvtai.learning import checkpoint, set_networks
@@ -27,10 +27,13 @@ from uuvtai.learning.export.modules import (
     hull_rule_of,
     missing_packages,
     module_of,
+    safety_of,
 )
 from uuvtai.learning.set_networks import SetActor, SetCritic
-from uuvtai.surrogate.arrays import TRUTH_WIDTH
+from uuvtai.sim.stages import bind
+from uuvtai.surrogate.arrays import TRUTH_WIDTH, SafetyRules
 from uuvtai.surrogate.observation import SET_TABLE
+from uuvtai.surrogate.safety import filter_wishes
 
 NET = {"surrogate.obstacle_hidden": 8, "surrogate.head_hidden": 8}
 
@@ -191,9 +194,34 @@ def module_policy():
         },
         "network": {"goal_gain": 0.7},
         "hull_rule": hull_rule_of(config),
+        "safety": safety_of(config),
     }
     arrays = {f"actor.{name}": tensor.numpy() for name, tensor in actor.net.state_dict().items()}
     return run_policy.SetPolicy(spec, arrays)
+
+
+def test_the_safety_filter_is_that_of_the_vehicle():
+    """Obstacles on every side, level, above and below, near walls and far: the same wish is left."""
+    rng, n, config = np.random.default_rng(5), 200, load_training("policy", overrides=NET)
+    obstacles, own = np.zeros((n, 4, OBSTACLE_WIDTH), np.float32), np.zeros((n, EGO_COLUMNS), np.float32)
+    way, speed = rng.uniform(-5, 5, (n, 4, 2)), rng.uniform(-1.5, 1.5, (n, 4, 2))
+    turn = rng.uniform(-0.3, 0.3, (n, 4, 2))
+    for first, ahead in ((1, way), (12, way + speed + turn), (14, way + 2 * speed)):
+        obstacles[..., first : first + 2] = ahead / 4
+    obstacles[..., 0], obstacles[..., 7] = rng.integers(0, 2, (n, 4)), rng.uniform(0.2, 0.8, (n, 4))
+    obstacles[..., 8:10] = rng.uniform(0, 0.6, (n, 4, 2)) * rng.integers(0, 2, (n, 4, 1))
+    own[:, 6:8], own[:, OWN_WIDTH:] = rng.uniform(-0.8, 0.8, (n, 2)), rng.uniform(-0.26, 0.2, (n, N_RAY))
+    own[::4, OWN_WIDTH:] += rng.uniform(0, 2.6, (n // 4, N_RAY))
+    wish = rng.uniform(-2, 2, (n, 3)).astype(np.float32)
+    found, policy = torch.from_numpy(wish.copy()), module_policy()
+    filter_wishes(
+        bind(SafetyRules, config), config.surrogate.safety_horizon_s, torch.ones(n, dtype=torch.int32),
+        torch.from_numpy(obstacles), torch.from_numpy(own), found,
+    )  # fmt: skip
+    wanted = [policy.kept_safe(*row) for row in zip(wish, obstacles, own, strict=True)]
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
+    changed = (found.numpy() != wish).any(1)
+    assert 20 < changed.sum() < n - 20
 
 
 def test_order_and_number_of_obstacles_do_not_matter():

@@ -15,7 +15,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from uuvtai.common.enums import EGO_COLUMNS, LEAST_SPEED_M_S, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH, TURN_GAIN
+from uuvtai.common.enums import (
+    EGO_COLUMNS,
+    LEAST_SPEED_M_S,
+    N_OBSTACLE,
+    N_RAY,
+    OBSTACLE_WIDTH,
+    TURN_GAIN,
+    Safety,
+)
 from uuvtai.common.version import __version__
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint, action_rows
@@ -180,6 +188,7 @@ class OneWish(ExportedModule):
             "action": {"columns": ["ahead", "left", "up"], "meaning": _WISH},
             "rate": _rate(config),
             "hull_rule": hull_rule_of(config),
+            "safety": safety_of(config),
             "network": {"goal_gain": config.surrogate.goal_gain},
         }
 
@@ -269,6 +278,12 @@ def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
     }
 
 
+def safety_of(config: LearningConfig) -> dict[str, Any]:
+    """Numbers of the safety filter (``run_policy.SetPolicy.kept_safe``)."""
+    known = {name.lower(): value for name, value in vars(Safety).items() if name.isupper()}
+    return {"horizon_s": config.surrogate.safety_horizon_s, "ttc_s": config.episode.ttc_s, **known}
+
+
 # ------------------------------------------------------------------------------------------------------------
 # Columns of a policy over a set of obstacles, in words (``surrogate/observation.py`` writes them).
 
@@ -293,8 +308,8 @@ way.x way.y | 4 m | from the vehicle to the obstacle, in metres, / 4
 relative_velocity.x relative_velocity.y | m/s | the obstacle's less the vehicle's
 velocity.x velocity.y | m/s | of the obstacle
 width | m | twice its radius
-water_above | m | from the vehicle's depth up to the obstacle's top, where known: clip(v, 0, 1.6)
-water_below | m | from the obstacle's bottom up to the vehicle's depth, where known: clip(v, 0, 1.6)
+water_above | m | free water from the vehicle's depth up to an obstacle that is above: clip(v, 0, 1.6)
+water_below | m | the same below; both are 0 where the obstacle may be level with the vehicle
 unseen | 2 s | seconds since it was seen, at most 4, / 2
 turn | 2 rad/s | rate of its course, mirrored by flip.x flip.y, clip(v, -3, 3) / 2; 0 = a corner
 way_in_1s.x way_in_1s.y | 4 m | from the vehicle now to where the obstacle is forecast in 1 s, / 4

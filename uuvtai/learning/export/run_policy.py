@@ -31,12 +31,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 SPEC, WEIGHTS, GOLDEN = "policy_spec.json", "policy.safetensors", "golden.safetensors"
-SCHEMA = 5
+SCHEMA = 6
 FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py")
 """names that the spec may list; nothing else is ever opened"""
 N_TARGET, N_ACTION = 24, 4
 AT_THERE, AT_DIRECTION = 0, slice(3, 5)
-"""columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the goal"""
+"""columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the look-ahead point"""
+AT_WAYS, AT_WIDTH, AT_WATER, AT_SPEED = (
+    (slice(1, 3), slice(12, 14), slice(14, 16)),
+    7,
+    slice(8, 10),
+    slice(6, 8),
+)
+"""of an obstacle: the way to it now, in 1 and in 2 s, its width, free water above and below; of the vehicle's
+own, its speed"""
+N_RAY = 24
+"""the last columns of the vehicle's own, the first of them along x"""
 SUM_SCALE = 0.3
 MOST_WISH = 2.0
 MAX_BYTES = 64 << 20
@@ -189,9 +199,10 @@ class SetDecision(NamedTuple):
     """What the policy wishes."""
 
     wish: np.ndarray
-    """(3,) ahead, left, up in the mirrored world, in parts of the fastest velocity, within +-2"""
+    """(3,) ahead, left, up in the mirrored world, in parts of the fastest velocity, within +-2: what the
+    safety filter leaves of"""
     mean_wish: np.ndarray
-    """(3,) the same, not cut off"""
+    """(3,) what the network says, not cut off"""
 
 
 class SetPolicy(Exported):
@@ -201,7 +212,7 @@ class SetPolicy(Exported):
 
     def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
         super().__init__(spec, arrays)
-        self.rule = spec["hull_rule"]
+        self.rule, self.safety = spec["hull_rule"], spec["safety"]
         n_obstacle, n_own = (len(spec["observation"][name]["columns"]) for name in self.inputs)
         self.shapes = (None, n_obstacle), (n_own,)
         self._gain = np.float32(spec["network"]["goal_gain"])
@@ -214,7 +225,8 @@ class SetPolicy(Exported):
         other shapes, numbers that are not finite, or an obstacle that begins with neither 0 nor 1."""
         rows = {"obstacles": np.asarray(obstacles)[None], "own": np.asarray(own)[None]}
         mean = self.said(rows)["mean_wish"][0]
-        return SetDecision(np.clip(mean, -MOST_WISH, MOST_WISH), mean)
+        wish = np.clip(mean, -MOST_WISH, MOST_WISH)
+        return SetDecision(self.kept_safe(wish, rows["obstacles"][0], rows["own"][0]), mean)
 
     def said(self, given: Arrays) -> Arrays:
         """``mean_wish`` (N, 3): every obstacle through the same layers, then maximum and sum over those that
@@ -231,6 +243,54 @@ class SetPolicy(Exported):
         mean = _through(self._head, pooled, _relu)
         mean[:, :2] += self._gain * own[:, AT_DIRECTION]
         return {"mean_wish": mean}
+
+    def kept_safe(self, wish: np.ndarray, obstacles: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """(3,) the wish, or the nearest one that leads neither to a contact nor to a stop by time to
+        collision within the horizon, by the columns: the safety filter. Where none is safe it is the one
+        that comes least near; up stays as it is."""
+        rule, mine = self.safety, wish[:2] / max(1.0, math.hypot(*wish[:2]))
+        if not rule["horizon_s"] or not self._lacks(mine[None], obstacles, own)[0] > 0.0:
+            return wish
+        angles = 2.0 * math.pi / rule["directions"] * np.arange(rule["directions"])
+        around = np.stack([np.cos(angles), np.sin(angles)], 1)
+        tried = np.concatenate([mine[None], around, 0.5 * around, np.zeros((1, 2))])
+        cost = rule["lack_cost"] * self._lacks(tried, obstacles, own) + ((tried - mine) ** 2).sum(1)
+        return np.append(tried[cost.argmin()], wish[2])
+
+    def _lacks(self, wishes: np.ndarray, obstacles: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """(k,) metres of clearance that lack at the worst on the ways that the hull takes by wishes (k, 2),
+        not below 0; what lies later counts less."""
+        rule, dt = self.safety, self.safety["step_s"]
+        n = round(rule["horizon_s"] / dt)
+        target, t = (
+            rule["reached"] * self.rule["fastest_m_s"] * wishes[:, None, None],
+            dt * np.arange(1, n + 1)[:, None, None],
+        )
+        vel = (
+            target
+            + (own[AT_SPEED] - target) * math.exp(-dt / rule["lag_s"]) ** np.arange(n + 1)[:, None, None]
+        )
+        pos, vel = np.cumsum(0.5 * dt * (vel[:, 1:] + vel[:, :-1]), 1), vel[:, 1:]
+        later, there = (1.0 - 0.5 * t / rule["horizon_s"])[..., 0], obstacles[obstacles[:, AT_THERE] > 0.5]
+        place, one, two = (4.0 * there[:, at] for at in AT_WAYS)
+        bend = 0.5 * (two - place) - (one - place)
+        straight, over = one - place - bend, there[:, AT_WATER].min(1, initial=math.inf)
+        way, coming = place + straight * t + bend * t**2 - pos, vel - straight - 2.0 * t * bend
+        level = np.linalg.norm(way, axis=-1) - 0.5 * there[:, AT_WIDTH]
+        clear = np.maximum(level, 0.0)
+        apart = np.where(over > 0.0, np.hypot(clear, over), level)
+        coming = coming * np.where(over > 0.0, clear / np.maximum(apart, 1e-9), 1.0)[..., None]
+        lacks = (
+            _lack(apart - rule["hull_m"], way, coming, rule["spare_m"], rule["ttc_s"] + rule["spare_s"])
+            * later
+        )
+        free = 1.0 / (own[-N_RAY:] + 0.5) - 0.08
+        angles, seen = 2.0 * math.pi / N_RAY * np.arange(N_RAY), free < rule["sight_m"]
+        ends = (free * np.stack([np.cos(angles), np.sin(angles)])).T[seen]
+        soon = slice(round(rule["wall_horizon_s"] / dt))
+        way, apart = ends - pos[:, soon], np.linalg.norm(ends - pos[:, soon], axis=-1)
+        walls = _lack(apart - rule["hull_m"], way, vel[:, soon], rule["wall_m"], rule["wall_s"]) * later[soon]
+        return np.maximum(lacks.max((1, 2), initial=0.0), walls.max((1, 2), initial=0.0))
 
     def command(self, wish: Any, flip: Any, yaw_rad: float, z_m: float) -> np.ndarray:
         """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame: the hull rule. A
@@ -259,6 +319,14 @@ class SetPolicy(Exported):
 
 KINDS: dict[str, type[Exported]] = {"mlp": Policy, "set": SetPolicy}
 """by ``kind`` of policy_spec.json"""
+
+
+def _lack(
+    apart: np.ndarray, way: np.ndarray, coming: np.ndarray, spare_m: float, spare_s: float
+) -> np.ndarray:
+    """[m] that lack to what is ``apart`` in the direction ``way`` (..., 2) and comes nearer by ``coming``."""
+    closing = (coming * way).sum(-1) / np.maximum(np.linalg.norm(way, axis=-1), 1e-3)
+    return spare_m + np.maximum(closing, 0.0) * spare_s - apart
 
 
 def _elu(x: np.ndarray) -> np.ndarray:
