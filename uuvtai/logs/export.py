@@ -20,8 +20,8 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
 from uuvtai.common.errors import ODD
-from uuvtai.common.files import refuse_output, whole_folder
-from uuvtai.logs.container import McapFile
+from uuvtai.common.files import refuse_output, refusing, whole_folder
+from uuvtai.logs.container import McapFile, whole_log
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import DAMAGE, MAX_RECORD, info, opened, read_head, read_messages, records
 from uuvtai.logs.topics.perception import grid_values
@@ -74,15 +74,12 @@ def _refuse_place(out: Path) -> None:
 def _as_log_error(path: Path, out: Path) -> Iterator[None]:
     """What a log unlike its schemas, or the disk, raises, as LogError."""
     try:
-        yield
+        with refusing(LogError, f"{out}: cannot write the export", "choose another folder with --out DIR"):
+            yield
     except (*ODD, struct.error, csv.Error, cv2.error) as error:
         raise LogError(
             f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
             f"{path}"
-        ) from error
-    except OSError as error:
-        raise LogError(
-            f"{out}: cannot write the export ({error.strerror}); choose another folder with --out DIR"
         ) from error
 
 
@@ -253,18 +250,15 @@ def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
     out = path.with_name(f"{stem}.repaired.mcap") if out is None else Path(out)
     declared = _declared(path)
     refuse_output(out, [path], force)
-    try:
+    where = "choose another place with --out FILE"
+    with refusing(LogError, f"{out}: cannot write the repaired log", where):
         return _copied(path, declared, out)
-    except OSError as error:
-        raise LogError(
-            f"{out}: cannot write the repaired log ({error.strerror}); choose another place with --out FILE"
-        ) from error
 
 
 def _copied(path: Path, declared: list[Any], out: Path) -> Repair:
     damages: list[str] = []
-    copy = _Copy(McapFile(out))
-    try:
+    with whole_log(out) as file:
+        copy = _Copy(file)
         for record in itertools.chain(declared, records(path, damages=damages)):
             copy.add(record)
         if not copy.messages:
@@ -275,13 +269,7 @@ def _copied(path: Path, declared: list[Any], out: Path) -> Repair:
         more = len(damages) - MAX_DAMAGES
         listed = damages[:MAX_DAMAGES] + ([f"and {more} more"] if more > 0 else [])
         if listed:
-            copy.file.add_metadata(
-                "uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(listed)}
-            )
-        copy.file.finish()
-    except BaseException:
-        copy.file.discard()
-        raise
+            file.add_metadata("uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(listed)})
     return Repair(out, copy.messages, copy.last_ns / 1e9, not listed, tuple(listed))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from pydantic import ValidationError
 
-from uuvtai.common.files import read_bytes
+from uuvtai.common.files import read_bytes, refusing
 from uuvtai.config import FixedObstacle
 from uuvtai.config.loader import nearest
 from uuvtai.envs.vector_env import NUM_ACTIONS, VectorEnv
@@ -75,10 +75,8 @@ class _OwnSource(SourceFileLoader):
 
 def content_of(spec: PluginSpec, limit: int) -> bytes:
     """The plugin's file. Raises PluginError where there is none, FileError for what is no plain file."""
-    try:
+    with refusing(PluginError, f"{spec.option}: {spec.path} cannot be read"):
         return read_bytes(spec.path, limit)
-    except OSError as error:
-        raise PluginError(f"{spec.option}: {spec.path} cannot be read ({error.strerror})") from None
 
 
 def object_of(spec: PluginSpec) -> Any:
@@ -222,13 +220,9 @@ def graph_of(spec: PluginSpec) -> bytes:
     graph = content_of(spec, MAX_GRAPH_BYTES)
 
     def beside(name: str) -> bytes:
-        try:
+        told = f"{spec.path}: its weights are in {name}, which cannot be read"
+        with refusing(PluginError, told, "copy that file too, beside it"):
             return read_bytes(spec.path.parent / name, MAX_GRAPH_BYTES, spec.path.parent)
-        except OSError as error:
-            raise PluginError(
-                f"{spec.path}: its weights are in {name}, which cannot be read ({error.strerror}); copy that "
-                "file too, beside it"
-            ) from None
 
     try:
         return graph_check.with_weights(graph, beside)

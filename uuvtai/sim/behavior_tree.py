@@ -17,7 +17,7 @@ from xml.parsers import expat
 import numpy as np
 
 from uuvtai.common import tree_codes as codes
-from uuvtai.common.files import FileError, read_bytes, read_json
+from uuvtai.common.files import read_bytes, read_json, refusing
 from uuvtai.common.tree_codes import CONTROLS, DECORATORS, LEAVES, MAX_NODES, MAX_PORTS, Leaf
 from uuvtai.config.loader import ConfigError, preset_path
 
@@ -178,12 +178,8 @@ def read_tree(name: str) -> FlatTree:
 
 def read_tree_file(path: Path, folder: Path | None = None) -> FlatTree:
     """Tree of an XML file, which must lie below ``folder`` if one is given. Raises TreeError."""
-    try:
+    with refusing(TreeError, f"{path}: cannot be read", refused=""):
         text = read_bytes(path, MAX_BYTES, folder)
-    except FileError as error:
-        raise TreeError(str(error)) from None
-    except OSError as error:
-        raise TreeError(f"{path}: cannot be read: {error.strerror}") from None
     return parse_tree(text, str(path))
 
 
@@ -472,16 +468,11 @@ def _record(run: Path) -> dict[str, list[NodeUse]]:
     path = run / "eval" / "tree.json"
     if not run.is_dir():
         raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it)")
-    try:
+    give = "give the run folder of an evaluation ('uuv eval' prints it)"
+    with refusing(ConfigError, f"{path}: cannot be read", give, "run the evaluation again with 'uuv eval'"):
         record = read_json(path, folder=run)
+    try:
         return {name: [_use(node) for node in nodes] for name, nodes in record["use"].items()}
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' "
-            "prints it)"
-        ) from None
-    except FileError as error:
-        raise ConfigError(f"{error}; run the evaluation again with 'uuv eval'") from None
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ConfigError(
             f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'"
