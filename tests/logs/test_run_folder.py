@@ -165,7 +165,7 @@ def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
         evaluate, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0]
     )
     monkeypatch.setattr(evaluate, "agents_of", lambda *_: [])
-    monkeypatch.setattr(evaluate, "_any_tree", lambda: None)
+    monkeypatch.setattr(evaluate, "read_tree", lambda _: None)
     monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_: SimpleNamespace(device=torch.device("cpu")))
 
     def scenarios(_sim, _jobs):

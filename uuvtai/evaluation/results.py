@@ -449,14 +449,14 @@ def digests_of(agents: list[AgentSpec]) -> dict[str, str]:
     }
 
 
-def refuse_others(place: Path, before: dict[str, str], now: dict[str, str]) -> None:
+def refuse_others(place: Path, before: dict[str, str], now: dict[str, str], of: str = "evaluation") -> None:
     """RunFolderError where another tree or policy has an agent's name by now: episodes of both under one name
     would prove nothing."""
     changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     if changed:
-        what = ", ".join(changed)
         raise RunFolderError(
-            f"{place}: {what} has changed since this evaluation began; begin a new one with another --run-dir"
+            f"{place}: {', '.join(changed)} has changed since this {of} began; begin a new one with another "
+            "--run-dir"
         )
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 import webbrowser
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from uuvtai.report.running import RunningEpisodes
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.plant import Plant
 from uuvtai.sim.sim import Sim
+from uuvtai.state.vehicle import VehicleState
 
 CONTROL_DT_S = 0.02
 """Samples are this far apart, or one substep where that is longer."""
@@ -88,10 +89,10 @@ def simulate(config: Config, trial: Trial, runtime: Runtime | None = None) -> di
     plant = Plant(config, runtime or start_taichi(precision="f64"))
     plant.reset()
     _set_start(plant, vectors)
-    samples = [_sample(plant, 0.0)]
+    samples = [_sample(plant.vehicle, plant.read, 0.0)]
     for k in range(1, n_step + 1):
         plant.step(action)
-        samples.append(_sample(plant, k * control_dt))
+        samples.append(_sample(plant.vehicle, plant.read, k * control_dt))
         if not math.isfinite(sum(samples[-1]["nu"])):
             raise DivergenceError(
                 f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt "
@@ -187,17 +188,19 @@ def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
         plant.write(plant.actuation.external_wrench_b, vectors["wrench"])
 
 
-def _sample(plant: Plant, time_s: float) -> dict[str, Any]:
-    v = plant.vehicle
-    position, q, vel, rate = (
-        plant.read(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b)
+def _sample(
+    v: VehicleState, read: Callable[[Any], np.ndarray], time_s: float, start: np.ndarray | float = 0.0
+) -> dict[str, Any]:
+    """Of row 0; ``start`` (3,) [m]: where positions count from."""
+    position, q, vel, rate, rpm = (
+        read(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b, v.rpm)
     )
     return {
         "t": time_s,
-        "position": position.tolist(),
+        "position": (position - start).tolist(),
         "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
         "nu": [*vel.tolist(), *rate.tolist()],
-        "rpm": plant.read(v.rpm)[0].astype(float).tolist(),
+        "rpm": rpm.tolist(),
     }
 
 
@@ -255,29 +258,15 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     one, zero = torch.ones(1, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
     stepper.reset(one, zero, zero)
     start, goal = (sim.rows(field)[0].astype(float) for field in (sim.s.vehicle.pos_w, sim.s.mission.goal_w))
-    samples = [_drive_sample(sim, start, 0.0)]
+    samples = [_sample(sim.s.vehicle, sim.rows, 0.0, start)]
     for k in range(1, n_step + 1):
         stepper.step()
-        samples.append(_drive_sample(sim, start, k * control_dt))
+        samples.append(_sample(sim.s.vehicle, sim.rows, k * control_dt, start))
         if sim.rows(sim.s.termination.outcome)[0] != RUNNING:
             break
     if agent.own:
         agent.own.close()
     return {key: [s[key] for s in samples] for key in samples[0]} | {"goal": (goal - start).tolist()}
-
-
-def _drive_sample(sim: Sim, start: np.ndarray, time_s: float) -> dict[str, Any]:
-    v = sim.s.vehicle
-    position, q, vel, rate, rpm = (
-        sim.rows(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b, v.rpm)
-    )
-    return {
-        "t": time_s,
-        "position": (position - start).tolist(),
-        "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
-        "nu": [*vel.tolist(), *rate.tolist()],
-        "rpm": rpm.tolist(),
-    }
 
 
 # ------------------------------------------------------------------------------------------------------------
