@@ -330,32 +330,20 @@ def near(name: str) -> str:
 # Watched episodes in the terminal: how each ended.
 
 
-_COLUMNS = (
-    Column("agent"),
-    Column("seed"),
-    Column("episode"),
-    Column("outcome"),
-    Column("time s"),
-    Column("min clearance m", 1),
-    Column("real-time factor", 2),
+_WATCHED = (
+    Column("agent", of=lambda entry: entry["agent"]),
+    Column("seed", of=lambda entry: str(entry["seed"])),
+    Column("episode", of=lambda entry: str(entry["episode"])),
+    Column("outcome", of=lambda entry: entry["outcome"]),
+    Column("time s", of=lambda entry: f"{entry['time_s']:.1f}"),
+    Column("min clearance m", 1, of=lambda entry: f"{entry['min_clearance_m']:.2f}"),
+    Column("real-time factor", 2, of=lambda entry: f"{entry['real_time_factor']:.2f}"),
 )
 
 
 def show_watched(screen: Screen, watched: list[dict[str, Any]]) -> None:
     """A row per episode of ``uuv watch --json``."""
-    rows = [
-        [
-            entry["agent"],
-            str(entry["seed"]),
-            str(entry["episode"]),
-            entry["outcome"],
-            f"{entry['time_s']:.1f}",
-            f"{entry['min_clearance_m']:.2f}",
-            f"{entry['real_time_factor']:.2f}",
-        ]
-        for entry in watched
-    ]
-    screen.table(Table(_COLUMNS, rows))
+    screen.table(Table(_WATCHED, watched))
 
 
 # ------------------------------------------------------------------------------------------------------------

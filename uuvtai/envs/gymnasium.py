@@ -7,7 +7,6 @@ entry points from 1.0 on.
 
 from __future__ import annotations
 
-import math
 import operator
 from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple
@@ -31,6 +30,7 @@ from uuvtai.logs.drawing import (
     paint_water,
 )
 from uuvtai.logs.scenario import scenario_document
+from uuvtai.logs.topics.motion import angles_of
 from uuvtai.logs.topics.perception import Layer
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.sim import Sim
@@ -233,9 +233,11 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         ``hold_steps``: control steps (0.02 s) that an action is held for, one step to the user; ``backend``:
         'numpy' or 'torch' results. ValueError for modes and backends that do not exist.
         """
+        if backend not in BACKENDS:
+            raise ValueError(f"backend {backend!r} does not exist; there are: {', '.join(BACKENDS)}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # type: ignore[misc]
-        self.backend, self.hold_steps = _checked_backend(backend), checked_hold_steps(hold_steps)
+        self.backend, self.hold_steps = backend, checked_hold_steps(hold_steps)
         owns_sim = sim is None
         sim = sim or simulator(world, num_envs, sensors, vehicle, overrides, device, teacher)
         self.native = VectorEnv(sim, autoreset=False, owns_sim=owns_sim)
@@ -344,12 +346,6 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
             )
 
 
-def _checked_backend(backend: str) -> str:
-    if backend not in BACKENDS:
-        raise ValueError(f"backend {backend!r} does not exist; there are: {', '.join(BACKENDS)}")
-    return backend
-
-
 # ------------------------------------------------------------------------------------------------------------
 # A picture of one env as it stands: the tank from above, in the colours of the videos.
 
@@ -380,14 +376,8 @@ def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     paint_walls(canvas, scenario["tank"])
     canvas.line(read("route.way_w")[: int(read("route.n_way"))], ROUTE, 2)
     canvas.star(scenario["goal"], 12)
-    canvas.vehicle([*pos_w, _yaw(read("vehicle.quat_wb"))], agent_inks(["bt"])["bt"])
+    canvas.vehicle([*pos_w, angles_of(*read("vehicle.quat_wb"))[2]], agent_inks(["bt"])["bt"])
     return canvas.image[:, :, ::-1].copy()
-
-
-def _yaw(quat_wb: np.ndarray) -> float:
-    """Heading [rad] of a quaternion (w, x, y, z)."""
-    w, x, y, z = quat_wb
-    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 # ------------------------------------------------------------------------------------------------------------

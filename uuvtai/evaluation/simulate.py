@@ -26,6 +26,7 @@ from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, Guest, agent
 from uuvtai.evaluation.results import ORACLE, Request
 from uuvtai.live.page import PageServer
 from uuvtai.live.server import Broadcast, RealTime, ViewerServer
+from uuvtai.logs.topics.motion import angles_of, quaternion_of
 from uuvtai.plugins.adapters import CallMeter, Marks, OwnCode, PluginAgent
 from uuvtai.plugins.api import CONTROLLER, PluginSpec
 from uuvtai.plugins.loading import LoadedPlugin
@@ -180,7 +181,7 @@ def experiment(config: Config, trial: Trial) -> Config:
 
 def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
     if "initial_rpy_deg" in vectors:
-        plant.write(plant.vehicle.quat_wb, quaternion(*np.radians(vectors["initial_rpy_deg"])))
+        plant.write(plant.vehicle.quat_wb, quaternion_of(np.radians(vectors["initial_rpy_deg"])))
     if "initial_velocity" in vectors:
         plant.write(plant.vehicle.vel_b, vectors["initial_velocity"][:3])
         plant.write(plant.vehicle.rate_b, vectors["initial_velocity"][3:])
@@ -198,35 +199,10 @@ def _sample(
     return {
         "t": time_s,
         "position": (position - start).tolist(),
-        "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
+        "rpy_deg": np.degrees(angles_of(*q)).tolist(),
         "nu": [*vel.tolist(), *rate.tolist()],
         "rpm": rpm.tolist(),
     }
-
-
-def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """(w, x, y, z) of yaw-pitch-roll angles [rad]."""
-    cr, sr, cp, sp, cy, sy = (f(0.5 * a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    return np.array(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
-
-
-def roll_pitch_yaw(q: np.ndarray) -> np.ndarray:
-    """Angles [rad] of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = q
-    return np.array(
-        [
-            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-            math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        ]
-    )
 
 
 # ------------------------------------------------------------------------------------------------------------

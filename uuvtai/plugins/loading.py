@@ -121,13 +121,13 @@ def made(found: Any, spec: PluginSpec, about: About) -> Any:
     is_class, make = inspect.isclass(found), cast("Callable[..., Any]", found)
     if not is_class and not (spec.name == FACTORY and inspect.isroutine(found)):
         return found
-    takes = _parameters(found)
+    takes, may_take = _parameters(found)
     if takes > 1:
         raise PluginError(
             f"{place_of(found, spec)}: {spec.name} needs {takes} arguments; it gets one (about) or none"
         )
     try:
-        made_one = make(about) if takes or _may_take(found) else make()
+        made_one = make(about) if takes or may_take else make()
     except (Exception, SystemExit) as error:
         raise failed(error, spec.path, f"while {spec.option} was made") from error
     for name in ("rows", "arrays", "hold_steps"):  # a decorated ``load`` says it for what it returns
@@ -140,12 +140,8 @@ class _Marked:
     """An object of somebody else's library with the marks of ``plugin``."""
 
     def __init__(self, inner: Any, marks: dict[str, Any]) -> None:
-        self.inner, self.rows, self.arrays, self.hold_steps = (
-            inner,
-            marks["rows"],
-            marks["arrays"],
-            marks["hold_steps"],
-        )
+        self.inner = inner
+        vars(self).update(marks)
 
 
 def inner_of(found: Any) -> Any:
@@ -153,21 +149,15 @@ def inner_of(found: Any) -> Any:
     return found.inner if isinstance(found, _Marked) else found
 
 
-def _parameters(found: Any) -> int:
-    """How many arguments it needs at least."""
+def _parameters(found: Any) -> tuple[int, bool]:
+    """(arguments that it needs at least, whether the first is ``about``, though it may be left out)."""
     try:
-        given = inspect.signature(found).parameters.values()
+        given = inspect.signature(found).parameters
     except (TypeError, ValueError):  # of compiled code
-        return 0
-    return sum(p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in given)
-
-
-def _may_take(found: Any) -> bool:
-    """Whether its first argument is called ``about``, though it may be left out."""
-    try:
-        return next(iter(inspect.signature(found).parameters), "") == "about"
-    except (TypeError, ValueError):
-        return False
+        return 0, False
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    needed = sum(p.default is p.empty and p.kind in kinds for p in given.values())
+    return needed, next(iter(given), "") == "about"
 
 
 def agent_of(

@@ -496,26 +496,3 @@ def _document(name: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str,
             node |= vars(use[i])
         nodes.append(node)
     return {"schema": 1, "tree": name, "source": tree.source, "nodes": nodes}
-
-
-# ------------------------------------------------------------------------------------------------------------
-
-
-__all__ = [
-    "CONTROLS",
-    "DECORATORS",
-    "LEAVES",
-    "FlatTree",
-    "Leaf",
-    "NodeUse",
-    "TreeError",
-    "TreeReport",
-    "load_tree",
-    "node_use",
-    "parse_tree",
-    "read_tree",
-    "read_tree_file",
-    "tree_dot",
-    "tree_report",
-    "tree_text",
-]
