@@ -82,13 +82,8 @@ class ClearanceGrid:
     def checker(self, ends: Sequence[Point]) -> Callable:
         """OMPL validity function of a state; the ends themselves are judged by their own cell only. Plain
         Python inside: 0.6 us a call."""
-        rows, (n_row, n_col), (x0, y0), scale, pad = (
-            self._rows,
-            self._size,
-            self.origin,
-            1.0 / self.cell_m,
-            _PAD,
-        )
+        rows, (n_row, n_col), (x0, y0) = self._rows, self._size, self.origin
+        scale, pad = 1.0 / self.cell_m, _PAD
         near2 = (2.0 * pad * self.cell_m) ** 2
         (ax, ay), (bx, by) = ends
 
