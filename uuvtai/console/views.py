@@ -69,7 +69,11 @@ def show_agents(screen: Screen, result: dict[str, Any]) -> None:
     )
     screen.table(agents_table(result["agents"], title))
     for part in result["remainder"]:
-        _show_remainder(screen, part)
+        screen.line(
+            f"{part['agent']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing "
+            f"(told of the moving obstacles it arrives), {part['forecast_decision']} by forecast, decision "
+            f"and inertia (a point had a way), {part['physics']} by physics (the oracle finds none)"
+        )
     for m in result["agents"]:
         if m["privileged"]:
             screen.line(f"{DAGGER} {m['name']} is privileged: {_privilege(m['name'])}", "dim")
@@ -82,14 +86,6 @@ def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
         return
     screen.line("")
     screen.table(paired_table(pairs, f"the same {pairs[0]['episodes']} episodes, two agents at a time"))
-
-
-def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
-    screen.line(
-        f"{part['agent']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told "
-        f"of the moving obstacles it arrives), {part['forecast_decision']} by forecast, decision and inertia "
-        f"(a point had a way), {part['physics']} by physics (the oracle finds none)"
-    )
 
 
 def _privilege(name: str) -> str:

@@ -233,10 +233,8 @@ def summary(
     n = len(results)
     outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in FINAL_OUTCOMES}
     collided = sum(outcomes[o] for o in COLLIDED)
-    time_mean, to_goal = (
-        mean([r.time_s for r in results]),
-        [r.time_s for r in results if r.outcome == "success"],
-    )
+    time_mean = mean([r.time_s for r in results])
+    to_goal = [r.time_s for r in results if r.outcome == "success"]
     return {
         "name": name,
         "episodes": n,

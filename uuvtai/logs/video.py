@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
@@ -15,7 +14,7 @@ import numpy as np
 from av.error import FFmpegError
 from PIL import Image
 
-from uuvtai.common.files import refusing, whole_file
+from uuvtai.common.files import flush, refusing, whole_file
 from uuvtai.logs.drawing import (
     DYNAMIC,
     ECHO,
@@ -347,11 +346,7 @@ def check_whole(part: Path, n_frames: int, out: Path) -> None:
             f"{out}: the video could not be written whole; is the disk full? Make room or choose another "
             "place with --out FILE"
         )
-    handle = os.open(part, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    flush(part)
 
 
 def _write_video(part: Path, frames: Frames, fps: float) -> int:

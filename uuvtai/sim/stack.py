@@ -120,11 +120,6 @@ def track(stages: Stages, config: Config, privileged: bool) -> None:
     height.bound_heights(stages.tracking)
 
 
-def draw_map(stages: Stages, config: Config) -> None:
-    """The map's two layers."""
-    mapping.update_map(stages.mapping)
-
-
 def draw_true_map(stages: Stages) -> None:
     """The static layer as it truly is, for routes that are planned beforehand."""
     true_state.stamp_static(stages.true_map)
