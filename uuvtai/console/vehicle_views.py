@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -281,14 +280,10 @@ def show_identified(screen: Screen, document: dict[str, Any], known: str) -> Non
     title = f"{document['seconds']:g} s of drives, known: {known}"
     screen.table(Table(_PARAMETERS, document["parameters"], title))
     rows = [
-        [steps, name, *_errors(found[steps])]
+        [steps, name, *("-" if error is None else f"{error:.4f}" for error in found[steps])]
         for steps in document["horizons"]["identified"]
         for name, found in document["horizons"].items()
     ]
     screen.table(Table(_AHEAD, rows, "rms error of predictions, on stretches that the fit had not seen"))
     for text in document["warnings"]:
         screen.line(f"warning: {text}", "yellow")
-
-
-def _errors(values: Sequence[float | None]) -> list[str]:
-    return ["-" if value is None else f"{value:.4f}" for value in values]

@@ -273,9 +273,8 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         env that has ended is not reset; ValueError or TypeError for unfit actions.
         """
         self._refuse_ended()
-        obs, reward, terminated, truncated, info = carry_out(
-            self.native, self._action(actions), self.hold_steps
-        )
+        action = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
+        obs, reward, terminated, truncated, info = carry_out(self.native, action, self.hold_steps)
         ended, final = terminated | truncated, {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any()):
             final = self._final(obs, info, ended)
@@ -311,10 +310,6 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
     def _given(self, value: torch.Tensor) -> Any:
         """In the user's kind of array, in memory of its own."""
         return value.clone() if self.backend == "torch" else value.cpu().numpy().copy()
-
-    def _action(self, actions: Any) -> torch.Tensor:
-        """(num_envs, 4) float32 on the device; the environment refuses other shapes."""
-        return torch.as_tensor(actions, dtype=torch.float32, device=self.device)
 
     def _rows(self, options: dict[str, Any] | None) -> torch.Tensor:
         """Rows to reset; TypeError or ValueError for options that do not exist or fit."""

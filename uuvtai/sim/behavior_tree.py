@@ -83,7 +83,8 @@ def read_elements(text: bytes, source: str) -> Element:
             raise TreeError(f"{source}:1: the encoding {encoding!r:.40} is not read; save the tree as UTF-8")
 
     def words(data: str) -> None:
-        if data.strip() and not _described(stack):
+        described = any(element.tag == "TreeNodesModel" for element in stack)  # the editor's palette
+        if data.strip() and not described:
             raise TreeError(
                 f"{source}:{parser.CurrentLineNumber}: text {data.strip()[:20]!r} inside <{stack[-1].tag}>"
             )
@@ -100,11 +101,6 @@ def read_elements(text: bytes, source: str) -> Element:
             f"{source}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]}"
         ) from None
     return holder.children[0]
-
-
-def _described(stack: list[Element]) -> bool:
-    """Whether the innermost element is part of the editor's palette, which may hold descriptions."""
-    return any(element.tag == "TreeNodesModel" for element in stack)
 
 
 # ------------------------------------------------------------------------------------------------------------
