@@ -15,7 +15,7 @@ import numpy as np
 
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config, VehicleConfig
-from uuvtai.evaluation.simulate import quaternion, roll_pitch_yaw
+from uuvtai.logs.topics.motion import angles_of, quaternion_of
 from uuvtai.sim.plant import Plant
 
 
@@ -35,7 +35,7 @@ def run(plant: Plant, cases: list[dict], substeps: int, n_sample: int) -> dict:
     v = plant.vehicle
     plant.write(plant.actuation.external_wrench_b, [c.get("wrench", [0] * 6) for c in cases])
     plant.write(plant.current.vel_w, [c.get("current", [0] * 3) for c in cases])
-    plant.write(v.quat_wb, [quaternion(*np.radians(c.get("rpy_deg", [0] * 3))) for c in cases])
+    plant.write(v.quat_wb, [quaternion_of(np.radians(c.get("rpy_deg", [0] * 3))) for c in cases])
     nu = np.array([c.get("nu", [0] * 6) for c in cases], dtype=float)
     plant.write(v.vel_b, nu[:, :3])
     plant.write(v.rate_b, nu[:, 3:])
@@ -48,7 +48,7 @@ def run(plant: Plant, cases: list[dict], substeps: int, n_sample: int) -> dict:
         samples.append(
             (
                 v.pos_w.to_numpy(),
-                np.degrees([roll_pitch_yaw(x) for x in q]),
+                np.degrees([angles_of(*x) for x in q]),
                 np.c_[v.vel_b.to_numpy(), v.rate_b.to_numpy()],
             )
         )

@@ -10,7 +10,8 @@ from tests.oracles import dynamics as oracle
 from uuvtai.common.presets import preset_names
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config.loader import load_config
-from uuvtai.evaluation.simulate import Trial, control_step, quaternion, roll_pitch_yaw, simulate
+from uuvtai.evaluation.simulate import Trial, control_step, simulate
+from uuvtai.logs.topics.motion import angles_of, quaternion_of
 
 F32_POSITION_M = 2e-3
 """Single precision over some hundred substeps, far below the design's 1 cm."""
@@ -83,8 +84,8 @@ def test_control_step_follows_the_substep(dt, substeps, control):
 def test_angles_there_and_back():
     rng = np.random.default_rng(0)
     for rpy in rng.uniform(-1.5, 1.5, (20, 3)) * [2, 1, 2]:
-        assert np.allclose(roll_pitch_yaw(quaternion(*rpy)), rpy)
-        assert np.allclose(oracle.quaternion_rotation(quaternion(*rpy)), oracle.euler_rotation(*rpy))
+        assert np.allclose(angles_of(*quaternion_of(rpy)), rpy)
+        assert np.allclose(oracle.quaternion_rotation(quaternion_of(rpy)), oracle.euler_rotation(*rpy))
 
 
 @pytest.mark.parametrize(

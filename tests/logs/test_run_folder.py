@@ -161,11 +161,9 @@ def test_what_is_no_run_folder_is_left_as_it_is(tmp_path):
 def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
     """Of 25 pairs of evaluations that began in one folder all 50 succeeded, and their files were mixed."""
     made = []
-    monkeypatch.setattr(
-        evaluate, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0]
-    )
+    monkeypatch.setattr(evaluate, "RunFolder", lambda *given: made.append(RunFolder(*given)) or made[0])
     monkeypatch.setattr(evaluate, "agents_of", lambda *_: [])
-    monkeypatch.setattr(evaluate, "_any_tree", lambda: None)
+    monkeypatch.setattr(evaluate, "read_tree", lambda _: None)
     monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_: SimpleNamespace(device=torch.device("cpu")))
 
     def scenarios(_sim, _jobs):

@@ -48,6 +48,22 @@ class FileError(UserError):
     """A file that is not read: what it is, why not, what to do."""
 
 
+@contextmanager
+def refusing(
+    kind: type[Exception], what: str, instead: str = "", refused: str | None = None
+) -> Iterator[None]:
+    """What the system refuses inside (OSError) is told as ``kind``: ``what``, why, what to do ``instead``.
+    ``refused``: what to do about a FileError, which becomes such an error too; None = it stays one."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what} ({error.strerror or error}){instead and f'; {instead}'}") from None
+    except FileError as error:
+        if refused is None:
+            raise
+        raise kind(f"{error}{refused and f'; {refused}'}") from None
+
+
 def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) -> BufferedReader:
     """Open a regular file of at most ``limit`` bytes for reading; neither a FIFO nor a device is waited for.
 

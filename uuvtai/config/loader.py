@@ -22,7 +22,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from uuvtai.common.errors import UserError
-from uuvtai.common.files import FileError, read_text
+from uuvtai.common.files import read_text, refusing
 from uuvtai.common.presets import built_in_file, preset_names
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
@@ -371,14 +371,9 @@ def _composed(text: str, where: str) -> tuple[Any, yaml.Node | None]:
 
 
 def _read_yaml(path: Path, folder: Path | None = None) -> _Layer:
-    try:
+    look, small = "check the path and its permissions", "a config is a small YAML file"
+    with refusing(ConfigError, f"{path}: cannot be read", look, small):
         text = read_text(path, MAX_BYTES, folder)
-    except FileError as error:
-        raise ConfigError(f"{error}; a config is a small YAML file") from None
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
-        ) from None
     found, node = _composed(text, str(path))
     tree = found or {}
     if not isinstance(tree, dict):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uuvtai.common.files import read_bytes
+from uuvtai.common.files import read_bytes, refusing
 
 MAX_BOXES = 256
 """of all outlines and pictures of a world: each beam of a sonar looks at each of them"""
@@ -131,10 +131,8 @@ def read_picture(image: str) -> np.ndarray:
     file, and for one too large."""
     from PIL import Image
 
-    try:
+    with refusing(ValueError, f"occupancy.image: {image} cannot be read"):
         content = read_bytes(Path(image), _MAX_IMAGE_BYTES)
-    except OSError as error:
-        raise ValueError(f"occupancy.image: {image} cannot be read ({error.strerror})") from None
     try:
         with warnings.catch_warnings(), Image.open(io.BytesIO(content), formats=("PNG", "PPM")) as found:
             warnings.simplefilter("error")

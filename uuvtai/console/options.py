@@ -34,7 +34,7 @@ def _agents(help_text: str) -> Any:
 
 
 def _run(help_text: str, name: str = "--resume") -> Any:
-    return Option(name, metavar="RUN", help=help_text, autocompletion=parsing.runs)
+    return Option(name, metavar="RUN", help=help_text, autocompletion=parsing.runs("run.json"))
 
 
 def _out(help_text: str) -> Any:
@@ -72,7 +72,10 @@ Motion = Annotated[
     str | None,
     _more("--motion", metavar="FILE.py:NAME", help="Moving obstacles that a function of yours gives."),
 ]
-Device = Annotated[str, parsing.device(**_PANEL)]
+_MEANT = {"gpu": "cuda", "nvidia": "cuda"}
+"""what people type for a device, and what they mean by it"""
+_WHERE = "Where to compute; auto takes a GPU if there is one."
+Device = Annotated[str, parsing.choice("--device", ("auto", "cpu", "cuda"), _WHERE, _MEANT, **_PANEL)]
 OpenPage = Annotated[bool, Option("--open", help="Open the page in the browser.")]
 RunDir = Annotated[Path | None, Option("--run-dir", help="Run folder \\[default: runs/TIME_PRESET].")]
 WithReport = Annotated[bool, Option("--report", help="Also write report.html into the run folder.")]
@@ -183,7 +186,7 @@ ExportRun = Annotated[
     Argument(
         metavar="[RUN]",
         help="Run folder or checkpoint; or a log (.mcap), to export the whole stack that drove.",
-        autocompletion=parsing.policies,
+        autocompletion=parsing.runs("checkpoints"),
     ),
 ]
 ExportOut = Annotated[Path | None, _out("New folder \\[default: runs/NAME_export].")]
@@ -226,7 +229,7 @@ TreeUse = Annotated[
         "--run",
         metavar="RUN",
         help="Of a tree: how often its nodes ran in this evaluation.",
-        autocompletion=parsing.evaluations,
+        autocompletion=parsing.runs("eval/tree.json"),
     ),
 ]
 WorldPicture = Annotated[

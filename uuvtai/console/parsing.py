@@ -207,10 +207,6 @@ def refuse_beside_resume(ctx: typer.Context, kept: tuple[str, ...] = ()) -> None
 # was meant.
 
 
-DEVICES = ("auto", "cpu", "cuda")
-_MEANT = {"gpu": "cuda", "nvidia": "cuda"}
-"""what people type for a device, and what they mean by it"""
-
 Complete = Callable[[str], list[str]]
 """From what is typed so far to what it may become."""
 
@@ -230,15 +226,10 @@ def choice(
             raise UsageError(f"{option} {value}: use {', '.join(values[:-1])} or {values[-1]}{hint}")
         return value
 
-    words = "|".join(values)
     return typer.Option(
-        option, metavar=words, help=help_text, callback=check, autocompletion=_among(values), **shown
-    )
-
-
-def device(**shown: Any) -> Any:
-    """``--device``."""
-    return choice("--device", DEVICES, "Where to compute; auto takes a GPU if there is one.", _MEANT, **shown)
+        option, metavar="|".join(values), help=help_text, callback=check,
+        autocompletion=lambda incomplete: _starting(values, incomplete), **shown,
+    )  # fmt: skip
 
 
 def names(kind: str) -> str:
@@ -246,15 +237,9 @@ def names(kind: str) -> str:
     return ", ".join(preset_names(kind))
 
 
-def presets(kind: str, *more: str, suffix: str = ".yaml") -> Complete:
-    """Names of the presets of a kind, ``more`` words, and files."""
-
-    def complete(incomplete: str) -> list[str]:
-        return _starting([*preset_names(kind), *more], incomplete) + _paths(
-            incomplete, lambda path: path.suffix == suffix
-        )
-
-    return complete
+def presets(kind: str, suffix: str = ".yaml") -> Complete:
+    """Names of the presets of a kind, and files."""
+    return lambda incomplete: _starting(preset_names(kind), incomplete) + files(suffix)(incomplete)
 
 
 def agent_names(incomplete: str) -> list[str]:
@@ -271,10 +256,7 @@ def agent_names(incomplete: str) -> list[str]:
 def files(*suffixes: str) -> Complete:
     """Files with these endings."""
 
-    def complete(incomplete: str) -> list[str]:
-        return _paths(incomplete, lambda path: path.suffix in suffixes)
-
-    return complete
+    return lambda incomplete: _paths(incomplete, lambda path: path.suffix in suffixes)
 
 
 def grids(incomplete: str) -> list[str]:
@@ -282,19 +264,15 @@ def grids(incomplete: str) -> list[str]:
     return _starting([*preset_names("grid"), "S=", "D=", "v=", "sensors=", "vehicle="], incomplete)
 
 
-def policies(incomplete: str) -> list[str]:
-    """Run folders with checkpoints."""
-    return _runs(incomplete, "checkpoints")
+def runs(holds: str) -> Complete:
+    """Folders below the one that is typed, or below ``runs``, that hold this file or folder."""
 
+    def complete(incomplete: str) -> list[str]:
+        typed = _paths(incomplete, lambda path: (path / holds).exists())
+        below = [] if incomplete else _paths("runs/", lambda path: (path / holds).exists())
+        return list(dict.fromkeys([*below, *typed]))
 
-def runs(incomplete: str) -> list[str]:
-    """Run folders."""
-    return _runs(incomplete, "run.json")
-
-
-def evaluations(incomplete: str) -> list[str]:
-    """Run folders of evaluations."""
-    return _runs(incomplete, "eval/tree.json")
+    return complete
 
 
 def shown(incomplete: str) -> list[str]:
@@ -306,22 +284,8 @@ def shown(incomplete: str) -> list[str]:
     return _starting([*found, *(f"{kind}/" for kind in KINDS)], incomplete)
 
 
-def _among(values: Iterable[str]) -> Complete:
-    def complete(incomplete: str) -> list[str]:
-        return _starting(values, incomplete)
-
-    return complete
-
-
 def _starting(words: Iterable[str], incomplete: str) -> list[str]:
     return [word for word in words if word.startswith(incomplete)]
-
-
-def _runs(incomplete: str, holds: str) -> list[str]:
-    """Folders below the one that is typed, or below ``runs``, that hold this file or folder."""
-    typed = _paths(incomplete, lambda path: (path / holds).exists())
-    below = [] if incomplete else _paths("runs/", lambda path: (path / holds).exists())
-    return list(dict.fromkeys([*below, *typed]))
 
 
 def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:

@@ -202,7 +202,26 @@ def time_left(left_s: float | None) -> str:
     return f"ETA {left_s:.0f} s" if left_s < 120 else f"ETA {left_s / 60:.0f} min"
 
 
-class Progress:
+class _Told:
+    """What stands on a terminal while a job runs: a display of Rich's, or nothing."""
+
+    _live: Any = None
+
+    def note(self, text: str) -> None:
+        """A message for the person who waits."""
+        if self._live is not None:
+            self._live.console.print(Text(plain(text)), highlight=False)
+        else:
+            say(text)
+
+    def stop(self) -> None:
+        """The job is done."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+
+class Progress(_Told):
     """Rich progress with ETA on a terminal, one plain line every few seconds otherwise.
 
     A job that tells that nothing is done yet, in no steps, is compiling: that is shown, and the clock begins
@@ -211,7 +230,6 @@ class Progress:
 
     def __init__(self, what: str = "episodes") -> None:
         """``what``: of which things a job has so many."""
-        self._bar = None
         self._what = what
 
     def start(self, name: str, total: int, done: int = 0) -> None:
@@ -221,16 +239,9 @@ class Progress:
         self._env_steps = 0
         self._last = time.perf_counter()
         if sys.stderr.isatty():
-            self._bar = _bar()
-            self._bar.start()
-            self._task = self._bar.add_task(name, total=total, completed=done, remark="")
-
-    def note(self, text: str) -> None:
-        """A message for the person who waits."""
-        if self._bar is not None:
-            self._bar.console.print(Text(plain(text)), highlight=False)
-        else:
-            say(text)
+            self._live = _bar()
+            self._live.start()
+            self._task = self._live.add_task(name, total=total, completed=done, remark="")
 
     def update(self, done: int, total: int, env_steps: int = 0, left: int | None = None) -> None:
         """``done`` of ``total`` things are over after ``env_steps`` env steps; ``left``: env steps still to
@@ -258,17 +269,11 @@ class Progress:
 
     def _show(self, done: int, remark: str) -> None:
         now = time.perf_counter()
-        if self._bar is not None:
-            self._bar.update(self._task, completed=done, remark=remark)
+        if self._live is not None:
+            self._live.update(self._task, completed=done, remark=remark)
         elif now - self._last >= _PERIOD_S:
             self._last = now
             say(f"{self._name}: {done}/{self._total} {self._what}" + (f", {remark}" if remark else ""))
-
-    def stop(self) -> None:
-        """The job is done."""
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
 
 
 @contextmanager
@@ -311,12 +316,11 @@ def _bar():
 _REDRAW_S = 5.0
 
 
-class TrainingProgress:
+class TrainingProgress(_Told):
     """What ``learning.runner`` tells while it runs. The first iteration compiles: it is no part of the speed
     and of the time left."""
 
     def __init__(self) -> None:
-        self._live = None
         self._last = 0.0
         self._pace: Pace | None = None
         self._evaluated: dict[str, float] = {}
@@ -338,13 +342,6 @@ class TrainingProgress:
         else:
             say(f"{self._title}: compiling, and looking around once")
 
-    def note(self, text: str) -> None:
-        """A message for the person who waits."""
-        if self._live is not None:
-            self._live.console.print(text, highlight=False, markup=False)
-        else:
-            say(text)
-
     def update(self, done: int, metrics: dict[str, float], success_ci95: tuple[float, float] | None) -> None:
         """Iteration ``done`` is over."""
         now = time.perf_counter()
@@ -362,12 +359,6 @@ class TrainingProgress:
             say(
                 f"{done}/{self._total}: " + ", ".join(f"{name} {text}".strip() for name, text in rows.items())
             )
-
-    def stop(self) -> None:
-        """The run is over."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
 
 
 def _dashboard(title: str, rows: dict[str, str]) -> Group:

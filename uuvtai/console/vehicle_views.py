@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -227,26 +226,23 @@ def show_calibration(screen: Screen, found: dict[str, Any]) -> None:
     screen.line(f"log: {found['log']}")
 
 
-_INSTANCES = tuple(Column(name) for name in ("instance", "seconds", "driven s", "outcome"))
-_PACKETS = ("step", "reset", "again", "ignore", "bad")
+def _packets(name: str) -> Column:
+    return Column(name, 1, of=lambda row: str(row["packets"][name]))
+
+
+_INSTANCES = (
+    Column("instance", of=lambda row: str(row["row"])),
+    Column("seconds", of=lambda row: f"{row['seconds']:.1f}"),
+    Column("driven s", of=lambda row: f"{row['driven_s']:.1f}"),
+    Column("outcome", of=lambda row: row["outcome"]),
+    *map(_packets, ("step", "reset", "again", "ignore", "bad")),
+)
 
 
 def show_sitl(screen: Screen, found: dict[str, Any]) -> None:
     """A ``uuv sitl --json`` document."""
-    columns = (*_INSTANCES, *(Column(name, 1) for name in _PACKETS))
-    rows = [
-        [
-            str(row["row"]),
-            f"{row['seconds']:.1f}",
-            f"{row['driven_s']:.1f}",
-            row["outcome"],
-            *(str(row["packets"][name]) for name in _PACKETS),
-        ]
-        for row in found["instances"]
-    ]
-    screen.table(
-        Table(columns, rows, f"{found['seconds']:.0f} s by the clock; packets by what they asked for")
-    )
+    title = f"{found['seconds']:.0f} s by the clock; packets by what they asked for"
+    screen.table(Table(_INSTANCES, found["instances"], title))
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -284,14 +280,10 @@ def show_identified(screen: Screen, document: dict[str, Any], known: str) -> Non
     title = f"{document['seconds']:g} s of drives, known: {known}"
     screen.table(Table(_PARAMETERS, document["parameters"], title))
     rows = [
-        [steps, name, *_errors(found[steps])]
+        [steps, name, *("-" if error is None else f"{error:.4f}" for error in found[steps])]
         for steps in document["horizons"]["identified"]
         for name, found in document["horizons"].items()
     ]
     screen.table(Table(_AHEAD, rows, "rms error of predictions, on stretches that the fit had not seen"))
     for text in document["warnings"]:
         screen.line(f"warning: {text}", "yellow")
-
-
-def _errors(values: Sequence[float | None]) -> list[str]:
-    return ["-" if value is None else f"{value:.4f}" for value in values]

@@ -69,7 +69,11 @@ def show_agents(screen: Screen, result: dict[str, Any]) -> None:
     )
     screen.table(agents_table(result["agents"], title))
     for part in result["remainder"]:
-        _show_remainder(screen, part)
+        screen.line(
+            f"{part['agent']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing "
+            f"(told of the moving obstacles it arrives), {part['forecast_decision']} by forecast, decision "
+            f"and inertia (a point had a way), {part['physics']} by physics (the oracle finds none)"
+        )
     for m in result["agents"]:
         if m["privileged"]:
             screen.line(f"{DAGGER} {m['name']} is privileged: {_privilege(m['name'])}", "dim")
@@ -82,14 +86,6 @@ def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
         return
     screen.line("")
     screen.table(paired_table(pairs, f"the same {pairs[0]['episodes']} episodes, two agents at a time"))
-
-
-def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
-    screen.line(
-        f"{part['agent']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told "
-        f"of the moving obstacles it arrives), {part['forecast_decision']} by forecast, decision and inertia "
-        f"(a point had a way), {part['physics']} by physics (the oracle finds none)"
-    )
 
 
 def _privilege(name: str) -> str:
@@ -330,32 +326,20 @@ def near(name: str) -> str:
 # Watched episodes in the terminal: how each ended.
 
 
-_COLUMNS = (
-    Column("agent"),
-    Column("seed"),
-    Column("episode"),
-    Column("outcome"),
-    Column("time s"),
-    Column("min clearance m", 1),
-    Column("real-time factor", 2),
+_WATCHED = (
+    Column("agent", of=lambda entry: entry["agent"]),
+    Column("seed", of=lambda entry: str(entry["seed"])),
+    Column("episode", of=lambda entry: str(entry["episode"])),
+    Column("outcome", of=lambda entry: entry["outcome"]),
+    Column("time s", of=lambda entry: f"{entry['time_s']:.1f}"),
+    Column("min clearance m", 1, of=lambda entry: f"{entry['min_clearance_m']:.2f}"),
+    Column("real-time factor", 2, of=lambda entry: f"{entry['real_time_factor']:.2f}"),
 )
 
 
 def show_watched(screen: Screen, watched: list[dict[str, Any]]) -> None:
     """A row per episode of ``uuv watch --json``."""
-    rows = [
-        [
-            entry["agent"],
-            str(entry["seed"]),
-            str(entry["episode"]),
-            entry["outcome"],
-            f"{entry['time_s']:.1f}",
-            f"{entry['min_clearance_m']:.2f}",
-            f"{entry['real_time_factor']:.2f}",
-        ]
-        for entry in watched
-    ]
-    screen.table(Table(_COLUMNS, rows))
+    screen.table(Table(_WATCHED, watched))
 
 
 # ------------------------------------------------------------------------------------------------------------

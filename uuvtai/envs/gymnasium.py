@@ -7,7 +7,6 @@ entry points from 1.0 on.
 
 from __future__ import annotations
 
-import math
 import operator
 from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple
@@ -31,6 +30,7 @@ from uuvtai.logs.drawing import (
     paint_water,
 )
 from uuvtai.logs.scenario import scenario_document
+from uuvtai.logs.topics.motion import angles_of
 from uuvtai.logs.topics.perception import Layer
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.sim import Sim
@@ -233,9 +233,11 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         ``hold_steps``: control steps (0.02 s) that an action is held for, one step to the user; ``backend``:
         'numpy' or 'torch' results. ValueError for modes and backends that do not exist.
         """
+        if backend not in BACKENDS:
+            raise ValueError(f"backend {backend!r} does not exist; there are: {', '.join(BACKENDS)}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # type: ignore[misc]
-        self.backend, self.hold_steps = _checked_backend(backend), checked_hold_steps(hold_steps)
+        self.backend, self.hold_steps = backend, checked_hold_steps(hold_steps)
         owns_sim = sim is None
         sim = sim or simulator(world, num_envs, sensors, vehicle, overrides, device, teacher)
         self.native = VectorEnv(sim, autoreset=False, owns_sim=owns_sim)
@@ -271,9 +273,8 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         env that has ended is not reset; ValueError or TypeError for unfit actions.
         """
         self._refuse_ended()
-        obs, reward, terminated, truncated, info = carry_out(
-            self.native, self._action(actions), self.hold_steps
-        )
+        action = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
+        obs, reward, terminated, truncated, info = carry_out(self.native, action, self.hold_steps)
         ended, final = terminated | truncated, {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any()):
             final = self._final(obs, info, ended)
@@ -310,10 +311,6 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         """In the user's kind of array, in memory of its own."""
         return value.clone() if self.backend == "torch" else value.cpu().numpy().copy()
 
-    def _action(self, actions: Any) -> torch.Tensor:
-        """(num_envs, 4) float32 on the device; the environment refuses other shapes."""
-        return torch.as_tensor(actions, dtype=torch.float32, device=self.device)
-
     def _rows(self, options: dict[str, Any] | None) -> torch.Tensor:
         """Rows to reset; TypeError or ValueError for options that do not exist or fit."""
         given = dict(options or {})
@@ -342,12 +339,6 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
                 f'step after the end of env {rows}: call reset(options={{"reset_mask": terminated | '
                 f"truncated}}) first"
             )
-
-
-def _checked_backend(backend: str) -> str:
-    if backend not in BACKENDS:
-        raise ValueError(f"backend {backend!r} does not exist; there are: {', '.join(BACKENDS)}")
-    return backend
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -380,14 +371,8 @@ def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     paint_walls(canvas, scenario["tank"])
     canvas.line(read("route.way_w")[: int(read("route.n_way"))], ROUTE, 2)
     canvas.star(scenario["goal"], 12)
-    canvas.vehicle([*pos_w, _yaw(read("vehicle.quat_wb"))], agent_inks(["bt"])["bt"])
+    canvas.vehicle([*pos_w, angles_of(*read("vehicle.quat_wb"))[2]], agent_inks(["bt"])["bt"])
     return canvas.image[:, :, ::-1].copy()
-
-
-def _yaw(quat_wb: np.ndarray) -> float:
-    """Heading [rad] of a quaternion (w, x, y, z)."""
-    w, x, y, z = quat_wb
-    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 # ------------------------------------------------------------------------------------------------------------

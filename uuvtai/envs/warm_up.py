@@ -17,8 +17,10 @@ from uuvtai.common.errors import UserError
 from uuvtai.common.processes import LocalEngine
 from uuvtai.compile.launch import compiling, native
 from uuvtai.config import Config
+from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.scene import SceneOptions
+from uuvtai.sim.setup import check_size
 from uuvtai.sim.sim import Sim
 
 _STEPS = 6
@@ -35,8 +37,6 @@ class Shape:
 
 def shapes_of(scenes: Sequence[SceneOptions], sizes: Sequence[int]) -> list[Shape]:
     """Every scene in every size. ConfigError, and ValueError or MemoryError for sizes that cannot work."""
-    from uuvtai.sim.setup import check_size
-
     shapes = [Shape(scene, size) for scene in scenes for size in sizes]
     for shape in shapes:
         check_size(shape.scene.config(), shape.num_envs, "cpu")
@@ -56,10 +56,6 @@ def warm(shapes: Sequence[Shape], workers: int | None = None) -> list[dict[str, 
 
 def compiled(shape: Shape) -> dict[str, Any]:
     """Run a few steps of a shape in this process, so that all its kernels are compiled and kept."""
-    from uuvtai.envs.vector_env import VectorEnv
-    from uuvtai.sim.behavior_tree import read_tree
-    from uuvtai.sim.sim import Sim
-
     begun, before = time.perf_counter(), _counts()
     config = shape.scene.config()
     env = VectorEnv(Sim(config, shape.num_envs, read_tree("bt")))
@@ -79,8 +75,6 @@ def compiled(shape: Shape) -> dict[str, Any]:
 
 def _counts() -> tuple[int, int]:
     """Kernels that this process has made, and found, by machine code of their own."""
-    from uuvtai.compile.launch import native
-
     return (native[0].made, native[0].found) if native else (0, 0)
 
 

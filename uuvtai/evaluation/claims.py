@@ -32,6 +32,7 @@ from uuvtai.common.statistics import (
     time_to_success_s,
     wilson_interval,
 )
+from uuvtai.report.tables import seconds
 
 # ---- What the paper prints, as printed, and where its own figures do not add up.
 
@@ -284,7 +285,7 @@ def of_table_main(by_method: dict[str, list[dict[str, Any]]], note: str = "") ->
     success = {name: of_method(entries, "success") for name, entries in by_method.items()}
     collision = {name: of_method(entries, *COLLIDED) for name, entries in by_method.items()}
     ours, plain, tree = success["paper"], success["ppo"], of_agent(pooled(by_method["bt"], "success"))
-    times = [_seconds(tts_s(by_method[name])) for name in ("paper", "ppo")]
+    times = [seconds(tts_s(by_method[name])) for name in ("paper", "ppo")]
     without = "over PPO without distillation"
     found = [
         claim(
@@ -360,10 +361,6 @@ def tts_s(entries: Sequence[dict[str, Any]]) -> float | None:
         return None
     total = sum(time * entry["episodes"] for time, entry in zip(times, entries, strict=True))
     return time_to_success_s(total / n, pooled(entries, "success").rate)
-
-
-def _seconds(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f} s"
 
 
 # --------------------------------------------------------------------------------------------------- training

@@ -18,6 +18,7 @@ import torch
 from uuvtai.common.enums import PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.errors import SettingError
 from uuvtai.common.obstacle_motion import describe_scenario
+from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError
@@ -27,7 +28,6 @@ from uuvtai.evaluation.episodes import (
     EpisodeObserver,
     EpisodeResult,
     Job,
-    Progress,
     Recorders,
     StepClock,
     jobs_of,
@@ -51,14 +51,12 @@ from uuvtai.evaluation.results import REQUEST_FILE as REQUEST
 from uuvtai.logs.run_folder import RunFolder, default_run_dir, refuse_place
 from uuvtai.logs.writer import EpisodeRecorder, PolicyNote
 from uuvtai.plugins.api import refuse_code
+from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.rrt import RoutePlanner
 from uuvtai.sim.sim import Sim
 
 if TYPE_CHECKING:
     from uuvtai.learning.runner import AnyTrainer, Metrics
-    from uuvtai.sim.behavior_tree import FlatTree
-
-
 _BATCH = 256
 """Episodes run together by default: enough to fill the cores, few enough that the last stragglers cost
 little."""
@@ -166,7 +164,7 @@ def comparison_of(
         f"starting {num_envs} envs (sizes not used before compile their kernels first, about half a minute)"
     )
     configs = {agent.stack: agent.config_of(request.config) for agent in agents} or {None: request.config}
-    tree = agents[0].tree if agents else _any_tree()
+    tree = agents[0].tree if agents else read_tree(TRAINING_TREE)  # the oracle drives nothing
     sims = {stack: Sim(config, num_envs, tree, request.device) for stack, config in configs.items()}
     for agent in agents:
         if agent.own:
@@ -174,14 +172,6 @@ def comparison_of(
     policies = {agent.name: agent.agent_for(sims[agent.stack]) for agent in agents}
     planners = {agent.name: agent.planner_for(sims[agent.stack]) for agent in agents}
     return Comparison(request, agents, sims, policies, planners, watch)
-
-
-def _any_tree() -> FlatTree:
-    """The oracle drives no vehicle, but a simulator wants a tree."""
-    from uuvtai.common.presets import TRAINING_TREE
-    from uuvtai.sim.behavior_tree import read_tree
-
-    return read_tree(TRAINING_TREE)
 
 
 def run_agents(comparison: Comparison, folder: RunFolder) -> list[AgentRun]:
@@ -201,7 +191,7 @@ def write_results(comparison: Comparison, folder: RunFolder, runs: list[AgentRun
     entries = [agent_run.entry for agent_run in runs]
     scenarios = scenarios_of(comparison.any_simulator(), jobs)
     if ORACLE in request.agents:
-        entries.append(_ask_oracle(comparison, jobs, scenarios))
+        entries.append(oracle_entry(request.config, jobs, scenarios, comparison.watch))
     named = request.world, request.sensors, request.vehicle
     result = document(request.config, *named, request.seeds, request.episodes, entries)
     result |= {"remainder": remainder_of(entries), "scenarios_sha256": scenarios_sha256(scenarios)}
@@ -210,15 +200,6 @@ def write_results(comparison: Comparison, folder: RunFolder, runs: list[AgentRun
         explain(comparison, runs, result, folder)
     _draw(comparison, folder.path, [agent_run.logs for agent_run in runs if agent_run.logs])
     return result
-
-
-def _ask_oracle(comparison: Comparison, jobs: list[Job], scenarios: list[dict[str, Any]]) -> dict[str, Any]:
-
-    comparison.watch.start(ORACLE, len(jobs))
-    try:
-        return oracle_entry(comparison.request.config, jobs, scenarios, comparison.watch.update)
-    finally:
-        comparison.watch.stop()
 
 
 def _write_results(folder: RunFolder, result: dict[str, Any], runs: list[AgentRun]) -> None:
@@ -270,9 +251,9 @@ def _rounded(value: Any) -> Any:
 
 
 class EvaluationWatch(Protocol):
-    """Shows how far a comparison is."""
+    """Shows how far a comparison, a sweep or a reproduction is."""
 
-    def start(self, name: str, total: int) -> None: ...
+    def start(self, name: str, total: int, done: int = 0) -> None: ...
     def note(self, text: str) -> None: ...
     def update(self, done: int, total: int, env_steps: int, left: int | None = None) -> None: ...
     def stop(self) -> None: ...
@@ -511,15 +492,18 @@ def _drawn(sim: Sim, jobs: list[Job]) -> Iterator[dict[str, Any]]:
 
 
 def oracle_entry(
-    config: Config, jobs: list[Job], scenarios: list[dict[str, Any]], progress: Progress | None = None
+    config: Config, jobs: list[Job], scenarios: list[dict[str, Any]], watch: EvaluationWatch
 ) -> dict[str, Any]:
     """The oracle's entry of ``uuv eval --json``: success with the earliest arrival, or timeout, which here
     means "not reachable"."""
     begun, results = time.perf_counter(), []
-    for job, scenario in zip(jobs, scenarios, strict=True):
-        results.append(_result(job, earliest_arrival(scenario, config).time_s, config))
-        if progress:
-            progress(len(results), len(jobs), 0, None)
+    watch.start(ORACLE, len(jobs))
+    try:
+        for job, scenario in zip(jobs, scenarios, strict=True):
+            results.append(_result(job, earliest_arrival(scenario, config).time_s, config))
+            watch.update(len(results), len(jobs), 0, None)
+    finally:
+        watch.stop()
     entry = summary(ORACLE, results, 0, time.perf_counter() - begun)
     details = [detail | dict.fromkeys(_UNKNOWN_OF_EPISODE) for detail in entry["episodes_detail"]]
     return entry | dict.fromkeys(_UNKNOWN) | {"episodes_detail": details, "privileged": True}

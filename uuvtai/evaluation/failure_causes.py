@@ -458,10 +458,9 @@ def explain_failures(
     if not failed:
         return []
     recorder = FailureRecorder(sim.config, sim.tree, failed, own_code)
-    run_episodes(sim, [Job(r.seed, r.episode) for r in failed], recorder, progress, agent)
     jobs = [Job(r.seed, r.episode) for r in failed]
-    found = recorder.found
-    return [Row(r, found[job]) for r, job in zip(failed, jobs, strict=True) if job in found]
+    run_episodes(sim, jobs, recorder, progress, agent)
+    return [Row(r, recorder.found[job]) for r, job in zip(failed, jobs, strict=True) if job in recorder.found]
 
 
 def failures(results: list[EpisodeResult]) -> list[EpisodeResult]:

@@ -352,7 +352,8 @@ BLIND_S = 1.0
 BREAK_S = 0.3  # A leaf that lost charge for no longer than this still counts as in charge.
 LAST_S = 10.0  # Timeouts are judged by their last ten seconds.
 EVADING = ("Evade", "BackOff")  # Leaves that give way to something.
-WAITING = ("Hold",)  # leaves that stay in place on purpose; so do names that begin with Wait, Yield, Shelter
+WAITING, _WAIT = ("Hold",), ("Wait", "Yield", "Shelter")
+"""leaves that stay in place on purpose, and how names of others begin that do"""
 
 
 @dataclass
@@ -362,11 +363,6 @@ class Touched:
     moving: bool = False
     gap_m: float | None = None
     closing_m_s: float | None = None
-
-
-def is_waiting(leaf: str) -> bool:
-    """Whether a leaf of this type stays in place on purpose."""
-    return leaf in WAITING or leaf.startswith(("Wait", "Yield", "Shelter"))
 
 
 class Scene:
@@ -614,7 +610,7 @@ def timeout_facts(coarse: CoarseHistory) -> dict[str, Any]:
         "progress_m": _round(coarse.goal_m[first] - coarse.goal_m[-1]),
         "driven_m": _round(np.linalg.norm(np.diff(coarse.pos_w[first:], axis=0), axis=1).sum()),
         "no_route_share": _round(1.0 - coarse.has_route[last].mean()),
-        "waiting_share": _round(np.mean([is_waiting(name) for name in leaf])),
+        "waiting_share": _round(np.mean([name in WAITING or name.startswith(_WAIT) for name in leaf])),
         "evading_share": _round(np.mean([name in EVADING for name in leaf])),
     }
 

@@ -45,17 +45,14 @@ class Grid:
 
     def cells(self) -> list[Cell]:
         """Every cell once; where nothing moves (D = 0) one speed of obstacles stands for all."""
-        found = self._alone() if self.one_at_a_time else self._combined()
+        if self.one_at_a_time:
+            found = [{}, *({name: value} for name, values in self.axes.items() for value in values)]
+        else:
+            found = [
+                dict(zip(self.axes, each, strict=True)) for each in itertools.product(*self.axes.values())
+            ]
         cells = ({name: v for name, v in cell.items() if name != "v" or cell.get("D") != 0} for cell in found)
         return list({repr(sorted(cell.items())): cell for cell in cells}.values())
-
-    def _combined(self) -> list[Cell]:
-        return [
-            dict(zip(self.axes, values, strict=True)) for values in itertools.product(*self.axes.values())
-        ]
-
-    def _alone(self) -> list[Cell]:
-        return [{}, *({name: value} for name, values in self.axes.items() for value in values)]
 
     def document(self) -> dict[str, Any]:
         """As ``uuv sweep --json`` tells it."""

@@ -73,10 +73,8 @@ def level_excess(obstacle: Obstacle, dx: Array, dy: Array) -> tuple[Array, Array
         return dx * share, dy * share
     c, s = np.cos(obstacle.yaw), np.sin(obstacle.yaw)
     x, y = c * dx + s * dy, c * dy - s * dx
-    x, y = (
-        x - np.clip(x, -obstacle.size[0], obstacle.size[0]),
-        y - np.clip(y, -obstacle.size[1], obstacle.size[1]),
-    )
+    x = x - np.clip(x, -obstacle.size[0], obstacle.size[0])
+    y = y - np.clip(y, -obstacle.size[1], obstacle.size[1])
     return c * x - s * y, s * x + c * y
 
 

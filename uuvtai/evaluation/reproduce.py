@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from uuvtai.common.enums import COLLIDED, LETTERS
 from uuvtai.common.errors import SettingError
@@ -36,6 +36,9 @@ from uuvtai.report.build import report
 from uuvtai.report.reproduction import claim_table
 from uuvtai.report.tables import Table, markdown, number, seconds, text_table
 from uuvtai.report.timing import ENVS, SPEEDS, density_table, latency_table
+
+if TYPE_CHECKING:
+    from uuvtai.evaluation.evaluate import EvaluationWatch
 
 # ---- A reproduction as sections of the report: what the page shows, in the order of the paper.
 
@@ -250,14 +253,8 @@ _PARTS: dict[str, Callable[[dict[str, Any]], str]] = {
 REQUEST, RESULT, PAGE = "reproduce_request.json", "reproduce.json", "results.md"
 
 
-class ReproductionWatch(Protocol):
-    """Shows how far it is."""
-
-    def note(self, text: str) -> None: ...
-
-
 def reproduce(
-    budget: str, run_dir: Path | None, watch: ReproductionWatch, own: Sequence[str] = ()
+    budget: str, run_dir: Path | None, watch: EvaluationWatch, own: Sequence[str] = ()
 ) -> tuple[dict[str, Any], Path]:
     """Begin a reproduction: its document and its folder. ``own``: plugins of the user's, compared with ours.
     Raises ValueError for an unknown budget, RunFolderError, PluginError."""
@@ -273,7 +270,7 @@ def reproduce(
     return _run(folder, request, watch), root
 
 
-def resume(place: Path, watch: ReproductionWatch, allow_code: bool = False) -> tuple[dict[str, Any], Path]:
+def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tuple[dict[str, Any], Path]:
     """Go on with a reproduction that was killed or interrupted; finished steps stay as they are.
     ``allow_code``: Python files that the folder names may be run. Raises RunFolderError."""
     root = place.absolute()
@@ -303,7 +300,7 @@ def _request(root: Path) -> dict[str, Any]:
     return {"own": []} | request
 
 
-def _run(folder: RunFolder, request: dict[str, Any], watch: ReproductionWatch) -> dict[str, Any]:
+def _run(folder: RunFolder, request: dict[str, Any], watch: EvaluationWatch) -> dict[str, Any]:
     steps = steps_of(BUDGETS[request["budget"]], folder.path, request["own"])
     try:
         with folder.recorded():
@@ -321,7 +318,7 @@ def _run(folder: RunFolder, request: dict[str, Any], watch: ReproductionWatch) -
     return document
 
 
-def _step(step: Step, name: str, folder: RunFolder, watch: ReproductionWatch) -> None:
+def _step(step: Step, name: str, folder: RunFolder, watch: EvaluationWatch) -> None:
     if is_done(step, folder.path):
         watch.note(f"{name}: done before")
         return
@@ -383,9 +380,11 @@ def _shown(step: Step, root: Path) -> tuple[str, str]:
 
 def _row(root: Path, step: Step) -> dict[str, Any]:
     """All that counts of a training, once it is evaluated."""
+    from uuvtai.learning.runner import read_metrics
+
     training = root / "train" / step.row
     (agent,) = read_json(result_file(step, root), folder=root)["agents"]
-    rows = _metrics(training)
+    rows = read_metrics(training)
     trained = {"trained_steps": round(rows[-1]["time/env_steps"]) if rows else 0}
     records = [read_json(place / "run.json", folder=root) for place in (training, root / step.folder)]
     commits = [record["git_sha"] for record in records if record.get("git_sha")]
@@ -415,9 +414,3 @@ def _claims(
         found += claims.of_timing(results["profile"])
         found += claims.of_transfer(by_method[METHODS[0]][0], there)
     return claims.judged(found)
-
-
-def _metrics(run: Path) -> list[dict[str, Any]]:
-    from uuvtai.learning.runner import read_metrics
-
-    return read_metrics(run)

@@ -233,10 +233,8 @@ def summary(
     n = len(results)
     outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in FINAL_OUTCOMES}
     collided = sum(outcomes[o] for o in COLLIDED)
-    time_mean, to_goal = (
-        mean([r.time_s for r in results]),
-        [r.time_s for r in results if r.outcome == "success"],
-    )
+    time_mean = mean([r.time_s for r in results])
+    to_goal = [r.time_s for r in results if r.outcome == "success"]
     return {
         "name": name,
         "episodes": n,
@@ -449,14 +447,14 @@ def digests_of(agents: list[AgentSpec]) -> dict[str, str]:
     }
 
 
-def refuse_others(place: Path, before: dict[str, str], now: dict[str, str]) -> None:
+def refuse_others(place: Path, before: dict[str, str], now: dict[str, str], of: str = "evaluation") -> None:
     """RunFolderError where another tree or policy has an agent's name by now: episodes of both under one name
     would prove nothing."""
     changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     if changed:
-        what = ", ".join(changed)
         raise RunFolderError(
-            f"{place}: {what} has changed since this evaluation began; begin a new one with another --run-dir"
+            f"{place}: {', '.join(changed)} has changed since this {of} began; begin a new one with another "
+            "--run-dir"
         )
 
 

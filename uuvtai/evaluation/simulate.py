@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 import webbrowser
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, Guest, agent
 from uuvtai.evaluation.results import ORACLE, Request
 from uuvtai.live.page import PageServer
 from uuvtai.live.server import Broadcast, RealTime, ViewerServer
+from uuvtai.logs.topics.motion import angles_of, quaternion_of
 from uuvtai.plugins.adapters import CallMeter, Marks, OwnCode, PluginAgent
 from uuvtai.plugins.api import CONTROLLER, PluginSpec
 from uuvtai.plugins.loading import LoadedPlugin
@@ -36,6 +37,7 @@ from uuvtai.report.running import RunningEpisodes
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.plant import Plant
 from uuvtai.sim.sim import Sim
+from uuvtai.state.vehicle import VehicleState
 
 CONTROL_DT_S = 0.02
 """Samples are this far apart, or one substep where that is longer."""
@@ -88,10 +90,10 @@ def simulate(config: Config, trial: Trial, runtime: Runtime | None = None) -> di
     plant = Plant(config, runtime or start_taichi(precision="f64"))
     plant.reset()
     _set_start(plant, vectors)
-    samples = [_sample(plant, 0.0)]
+    samples = [_sample(plant.vehicle, plant.read, 0.0)]
     for k in range(1, n_step + 1):
         plant.step(action)
-        samples.append(_sample(plant, k * control_dt))
+        samples.append(_sample(plant.vehicle, plant.read, k * control_dt))
         if not math.isfinite(sum(samples[-1]["nu"])):
             raise DivergenceError(
                 f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt "
@@ -179,7 +181,7 @@ def experiment(config: Config, trial: Trial) -> Config:
 
 def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
     if "initial_rpy_deg" in vectors:
-        plant.write(plant.vehicle.quat_wb, quaternion(*np.radians(vectors["initial_rpy_deg"])))
+        plant.write(plant.vehicle.quat_wb, quaternion_of(np.radians(vectors["initial_rpy_deg"])))
     if "initial_velocity" in vectors:
         plant.write(plant.vehicle.vel_b, vectors["initial_velocity"][:3])
         plant.write(plant.vehicle.rate_b, vectors["initial_velocity"][3:])
@@ -187,43 +189,20 @@ def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
         plant.write(plant.actuation.external_wrench_b, vectors["wrench"])
 
 
-def _sample(plant: Plant, time_s: float) -> dict[str, Any]:
-    v = plant.vehicle
-    position, q, vel, rate = (
-        plant.read(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b)
+def _sample(
+    v: VehicleState, read: Callable[[Any], np.ndarray], time_s: float, start: np.ndarray | float = 0.0
+) -> dict[str, Any]:
+    """Of row 0; ``start`` (3,) [m]: where positions count from."""
+    position, q, vel, rate, rpm = (
+        read(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b, v.rpm)
     )
     return {
         "t": time_s,
-        "position": position.tolist(),
-        "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
+        "position": (position - start).tolist(),
+        "rpy_deg": np.degrees(angles_of(*q)).tolist(),
         "nu": [*vel.tolist(), *rate.tolist()],
-        "rpm": plant.read(v.rpm)[0].astype(float).tolist(),
+        "rpm": rpm.tolist(),
     }
-
-
-def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """(w, x, y, z) of yaw-pitch-roll angles [rad]."""
-    cr, sr, cp, sp, cy, sy = (f(0.5 * a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    return np.array(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
-
-
-def roll_pitch_yaw(q: np.ndarray) -> np.ndarray:
-    """Angles [rad] of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = q
-    return np.array(
-        [
-            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-            math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        ]
-    )
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -255,29 +234,15 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     one, zero = torch.ones(1, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
     stepper.reset(one, zero, zero)
     start, goal = (sim.rows(field)[0].astype(float) for field in (sim.s.vehicle.pos_w, sim.s.mission.goal_w))
-    samples = [_drive_sample(sim, start, 0.0)]
+    samples = [_sample(sim.s.vehicle, sim.rows, 0.0, start)]
     for k in range(1, n_step + 1):
         stepper.step()
-        samples.append(_drive_sample(sim, start, k * control_dt))
+        samples.append(_sample(sim.s.vehicle, sim.rows, k * control_dt, start))
         if sim.rows(sim.s.termination.outcome)[0] != RUNNING:
             break
     if agent.own:
         agent.own.close()
     return {key: [s[key] for s in samples] for key in samples[0]} | {"goal": (goal - start).tolist()}
-
-
-def _drive_sample(sim: Sim, start: np.ndarray, time_s: float) -> dict[str, Any]:
-    v = sim.s.vehicle
-    position, q, vel, rate, rpm = (
-        sim.rows(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b, v.rpm)
-    )
-    return {
-        "t": time_s,
-        "position": (position - start).tolist(),
-        "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
-        "nu": [*vel.tolist(), *rate.tolist()],
-        "rpm": rpm.tolist(),
-    }
 
 
 # ------------------------------------------------------------------------------------------------------------

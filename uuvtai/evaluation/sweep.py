@@ -32,6 +32,7 @@ from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code
 
 if TYPE_CHECKING:
     from uuvtai.evaluation.agents import AgentSpec
+    from uuvtai.evaluation.evaluate import EvaluationWatch
 
 
 # ---- Who does the work: processes on this machine, or a Ray cluster. A lost worker's task is done once more.
@@ -106,17 +107,8 @@ AgentKey = tuple[str, str]
 """(name in the table, agent)"""
 
 
-class SweepWatch(Protocol):
-    """Shows how far a sweep is."""
-
-    def start(self, name: str, total: int, done: int = 0) -> None: ...
-    def note(self, text: str) -> None: ...
-    def update(self, done: int, total: int, env_steps: int) -> None: ...
-    def stop(self) -> None: ...
-
-
 def sweep(
-    request: SweepRequest, engine: Engine, run_dir: Path | None, watch: SweepWatch
+    request: SweepRequest, engine: Engine, run_dir: Path | None, watch: EvaluationWatch
 ) -> tuple[dict[str, Any], Path]:
     """Begin a sweep: the ``uuv sweep --json`` document and the run folder. Whatever can be refused is refused
     before anything is written.
@@ -135,10 +127,13 @@ def sweep(
 
 
 def resume(
-    place: Path, engine: Engine, watch: SweepWatch, allow_code: bool = False
+    place: Path, engine: Engine, watch: EvaluationWatch, allow_code: bool = False
 ) -> tuple[dict[str, Any], Path]:
     """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are.
     ``allow_code``: Python files that the folder names may be run. Raises RunFolderError."""
+    from uuvtai.evaluation.agents import load_agents
+    from uuvtai.evaluation.results import refuse_others
+
     folder = RunFolder.held(place, "uuv sweep")
     try:
         try:
@@ -153,7 +148,7 @@ def resume(
             ) from None
         agents = [agent for _name, agent in named]
         refuse_code(place, [*request.agents, *agents], allow_code)
-        _refuse_other_policies(place, agents, checkpoints, watch)
+        refuse_others(place, checkpoints, _sha256_of(load_agents(agents, watch.note)), "sweep")
         keys = check_rows(request, [name for name, _agent in named])
         folder.go_on({"rows": len(read_rows(place))})
         return _run_cells(request, named, keys, engine, folder, watch), place
@@ -169,23 +164,9 @@ def _agent_key(given: Any) -> AgentKey:
     return name, agent
 
 
-def _refuse_other_policies(
-    place: Path, agents: Sequence[str], checkpoints: dict[str, str], watch: SweepWatch
-) -> None:
-    """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
-    nothing."""
-    from uuvtai.evaluation.agents import load_agents
-
-    now = _sha256_of(load_agents(agents, watch.note))
-    changed = [name for name, sha256 in checkpoints.items() if now.get(name) != sha256]
-    if changed:
-        raise RunFolderError(
-            f"{place}: {', '.join(changed)} has changed since this sweep began; begin a new sweep with "
-            "another --run-dir"
-        )
-
-
-def resolved(request: SweepRequest, watch: SweepWatch) -> tuple[SweepRequest, list[AgentKey], dict[str, str]]:
+def resolved(
+    request: SweepRequest, watch: EvaluationWatch
+) -> tuple[SweepRequest, list[AgentKey], dict[str, str]]:
     """The request with the columns that its policies see, its agents by their names in the table, and the
     sha256 of every policy.
 
@@ -220,7 +201,7 @@ def _run_cells(
     keys: list[str],
     engine: Engine,
     folder: RunFolder,
-    watch: SweepWatch,
+    watch: EvaluationWatch,
 ) -> dict[str, Any]:
     rows = _by_key(folder.path, request.grid)
     tasks = tasks_of(request, named, set(rows))

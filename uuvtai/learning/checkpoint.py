@@ -40,6 +40,7 @@ from uuvtai.common.files import (
     read_bytes,
     refuse_links,
     refuse_links_in,
+    refusing,
     unfinished,
     whole_folder,
 )
@@ -368,7 +369,8 @@ def save(
     ``train.keep_checkpoints`` and that of the highest ``score`` stay). Raises CheckpointError where the disk
     refuses; then nothing half-written is taken for a checkpoint."""
     target, plain = checkpoints / f"{_STEP}{step:06d}", config.model_dump(mode="json")
-    try:
+    mend = "make room or mend the folder, then: --resume"
+    with refusing(CheckpointError, f"{target}: cannot be written", mend, ""):
         checkpoints.mkdir(parents=True, exist_ok=True)
         refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
         refuse_links_in(checkpoints)
@@ -398,12 +400,6 @@ def save(
                 _remove(target)
         flush(checkpoints)
         _thin(checkpoints, config.train.keep_checkpoints)
-    except FileError as error:
-        raise CheckpointError(str(error)) from None
-    except OSError as error:
-        raise CheckpointError(
-            f"{target}: cannot be written ({error.strerror}); make room or mend the folder, then: --resume"
-        ) from None
     return target
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from mcap.writer import Writer
@@ -106,6 +107,18 @@ class McapFile:
         with contextlib.suppress(OSError):
             self._file.close()
         self.part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_log(path: Path, profile: str = "") -> Iterator[McapFile]:
+    """A file that is finished where all goes well inside, and discarded where not. Raises OSError."""
+    file = McapFile(path, profile)
+    try:
+        yield file
+        file.finish()
+    except BaseException:
+        file.discard()
+        raise
 
 
 def sync_folder(folder: Path) -> None:

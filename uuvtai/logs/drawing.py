@@ -17,7 +17,7 @@ import numpy as np
 
 from uuvtai.common.colours import agent_colours
 from uuvtai.common.obstacle_motion import obstacle_positions
-from uuvtai.logs.encode import LogError
+from uuvtai.logs.encode import LogError, unlike_schema
 from uuvtai.logs.reader import LogHead, read_head, read_messages
 from uuvtai.logs.topics import TOPICS
 from uuvtai.logs.topics.perception import Layer
@@ -450,20 +450,15 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
     found = Recording(path, head, head.scenario)
     _check_scenario(path, found.scenario)
     size = 0
-    try:
+    with unlike_schema(path):
         for message in read_messages(path, topics):
-            value = read_value(message.topic, message.data)
+            value = _READERS[message.topic](message.data)
             found[message.topic].add(message.time_s, value)
             size += _taken(value) + _OVERHEAD
             if size > _MAX_ARRAYS:
                 raise LogError(
                     f"{path}: holds more than {_MAX_ARRAYS >> 20} MiB to draw; no episode of ours does"
                 )
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise LogError(
-            f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
-            f"{path}"
-        ) from error
     if not found["/pose"].times:
         raise LogError(
             f"{path}: the log has no messages on /pose, so there is nothing to draw; see uuv log info {path}"
@@ -473,11 +468,6 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
             f"{path}: claims to last {found.duration_s:g} s; no episode is longer than {_MAX_DURATION_S:g} s"
         )
     return found
-
-
-def read_value(topic: str, data: dict[str, Any]) -> Any:
-    """What the table of topics reads of a message. Raises LogError, and what a message unlike ours raises."""
-    return _READERS[topic](data)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,8 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from uuvtai.common.enums import RUNNING
-from uuvtai.common.errors import UserError
+from uuvtai.common.errors import ODD, UserError
 from uuvtai.common.version import __version__
 from uuvtai.config import Config
 from uuvtai.logs.schemas import LINE_STRIP, Schema
@@ -339,6 +340,20 @@ EVENTS = When(
 
 class LogError(UserError, RuntimeError):
     """A log that cannot be written, read or drawn: what, where, why and what to type next."""
+
+
+@contextmanager
+def unlike_schema(path: Path, *also: type[Exception]) -> Iterator[None]:
+    """What a message unlike its schema raises inside, ``also`` these, is told as a LogError."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (*ODD, *also) as error:
+        raise LogError(
+            f"{path}: a message is not as its schema says ({error!r:.200}); see what is in it with: uuv log "
+            f"info {path}"
+        ) from None
 
 
 def checked_suffix(out: Path, formats: Sequence[str], what: str) -> str:

@@ -19,10 +19,9 @@ import numpy as np
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
-from uuvtai.common.errors import ODD
-from uuvtai.common.files import refuse_output, whole_folder
-from uuvtai.logs.container import McapFile
-from uuvtai.logs.encode import LogError
+from uuvtai.common.files import refuse_output, refusing, whole_folder
+from uuvtai.logs.container import McapFile, whole_log
+from uuvtai.logs.encode import LogError, unlike_schema
 from uuvtai.logs.reader import DAMAGE, MAX_RECORD, info, opened, read_head, read_messages, records
 from uuvtai.logs.topics.perception import grid_values
 from uuvtai.logs.topics.sensors import logged_image
@@ -55,7 +54,10 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
     if missing := [topic for topic in topics or () if topic not in known]:
         raise LogError(f"{path}: no messages on {', '.join(missing)}; it has {', '.join(known)}")
     wanted = list(dict.fromkeys(topics or known))
-    with _as_log_error(path, out_dir), whole_folder(out_dir) as staging:
+    other = "choose another folder with --out DIR"
+    unwritten = refusing(LogError, f"{out_dir}: cannot write the export", other)
+    odd = unlike_schema(path, struct.error, csv.Error, cv2.error)
+    with odd, unwritten, whole_folder(out_dir) as staging:
         names = _Names(staging)
         _write_attachments(path, staging, names)
         {"json": _write_jsonl, "csv": _write_csv, "npz": _write_npz}[fmt](path, wanted, names)
@@ -68,22 +70,6 @@ def _refuse_place(out: Path) -> None:
         refuse_output(out, [], force=False)
     elif any(out.iterdir()):
         raise LogError(f"{out}: is a folder that is not empty; give a new or an empty one with --out DIR")
-
-
-@contextlib.contextmanager
-def _as_log_error(path: Path, out: Path) -> Iterator[None]:
-    """What a log unlike its schemas, or the disk, raises, as LogError."""
-    try:
-        yield
-    except (*ODD, struct.error, csv.Error, cv2.error) as error:
-        raise LogError(
-            f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
-            f"{path}"
-        ) from error
-    except OSError as error:
-        raise LogError(
-            f"{out}: cannot write the export ({error.strerror}); choose another folder with --out DIR"
-        ) from error
 
 
 def file_name(name: str) -> str:
@@ -253,18 +239,15 @@ def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
     out = path.with_name(f"{stem}.repaired.mcap") if out is None else Path(out)
     declared = _declared(path)
     refuse_output(out, [path], force)
-    try:
+    where = "choose another place with --out FILE"
+    with refusing(LogError, f"{out}: cannot write the repaired log", where):
         return _copied(path, declared, out)
-    except OSError as error:
-        raise LogError(
-            f"{out}: cannot write the repaired log ({error.strerror}); choose another place with --out FILE"
-        ) from error
 
 
 def _copied(path: Path, declared: list[Any], out: Path) -> Repair:
     damages: list[str] = []
-    copy = _Copy(McapFile(out))
-    try:
+    with whole_log(out) as file:
+        copy = _Copy(file)
         for record in itertools.chain(declared, records(path, damages=damages)):
             copy.add(record)
         if not copy.messages:
@@ -275,13 +258,7 @@ def _copied(path: Path, declared: list[Any], out: Path) -> Repair:
         more = len(damages) - MAX_DAMAGES
         listed = damages[:MAX_DAMAGES] + ([f"and {more} more"] if more > 0 else [])
         if listed:
-            copy.file.add_metadata(
-                "uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(listed)}
-            )
-        copy.file.finish()
-    except BaseException:
-        copy.file.discard()
-        raise
+            file.add_metadata("uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(listed)})
     return Repair(out, copy.messages, copy.last_ns / 1e9, not listed, tuple(listed))
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from uuvtai.common.enums import COLLIDED
-from uuvtai.common.files import whole_file
+from uuvtai.common.files import refusing
 from uuvtai.logs.drawing import (
     DYNAMIC,
     FAILED,
@@ -36,6 +36,7 @@ from uuvtai.logs.drawing import (
     paint_water,
 )
 from uuvtai.logs.encode import LogError, checked_suffix
+from uuvtai.logs.run_folder import write_atomic
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 44, 96, 62
 _ROW = 30  # [px] per line of the legend
@@ -82,14 +83,8 @@ def check_same_episode(recordings: list[Recording]) -> None:
 
 def save_image(image: np.ndarray, out: Path) -> Path:
     """Write an image (height, width, 3), blue green red, as PNG, atomically. Raises LogError."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(out) as (file, _):
-            file.write(cv2.imencode(".png", image)[1].tobytes())
-    except OSError as error:
-        raise LogError(
-            f"{out}: cannot write the picture ({error.strerror}); choose another place with --out FILE"
-        ) from error
+    with refusing(LogError, f"{out}: cannot write the picture", "choose another place with --out FILE"):
+        write_atomic(out, cv2.imencode(".png", image)[1].tobytes())
     return out
 
 

@@ -22,7 +22,7 @@ from mcap.records import Attachment, Channel, Chunk, DataEnd, Message, Metadata,
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from uuvtai.common.files import open_file
+from uuvtai.common.files import open_file, refusing
 from uuvtai.logs.encode import LogError
 
 MAX_RECORD = 64 << 20  # [bytes] of a record, and of an unpacked chunk: six times the map of 200 x 100 m
@@ -188,10 +188,8 @@ class WholeReads(io.BufferedReader):
 
 def opened(path: Path) -> WholeReads:
     """The file, open for reading. Raises LogError where it cannot be opened, FileError for no plain file."""
-    try:
+    with refusing(LogError, f"{path}: cannot open the log", "see uuv log --help"):
         return WholeReads(open_file(path).detach())
-    except OSError as error:
-        raise LogError(f"{path}: cannot open the log ({error.strerror}); see uuv log --help") from None
 
 
 def _unpacked(chunk: Chunk, file: WholeReads, damages: list[str] | None) -> list[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,11 +9,10 @@ from typing import Any
 
 import yaml
 
-from uuvtai.common.errors import ODD
-from uuvtai.common.files import refuse_output, whole_folder
+from uuvtai.common.files import refuse_output, refusing, whole_folder
 from uuvtai.config.loader import ConfigError, parsed_yaml
-from uuvtai.logs.container import McapFile
-from uuvtai.logs.encode import LogError
+from uuvtai.logs.container import whole_log
+from uuvtai.logs.encode import LogError, unlike_schema
 from uuvtai.logs.reader import LogHead, read_head, read_messages
 from uuvtai.logs.ros2 import SOURCES, WRITTEN, RosMessages, Setup, ros_messages
 
@@ -29,21 +27,9 @@ def to_rosbag2(path: Path, out: Path) -> int:
         raise LogError(f"{out}: is already there, and a bag is a new folder; give a new --out DIR")
     head = read_head(path)
     setup = _setup(path, head)
-    with _as_log_error(path, out), whole_folder(out) as staging:
+    unwritten = refusing(LogError, f"{out}: cannot write", "choose another place with --out")
+    with unlike_schema(path), unwritten, whole_folder(out) as staging:
         return _write_bag(path, head, setup, ros, staging, out.name)
-
-
-@contextlib.contextmanager
-def _as_log_error(path: Path, out: Path) -> Iterator[None]:
-    try:
-        yield
-    except ODD as error:
-        raise LogError(
-            f"{path}: a message is not as its schema says ({str(error)[:200]!r}); see what is in it: uuv "
-            f"log info {path}"
-        ) from None
-    except OSError as error:
-        raise LogError(f"{out}: cannot write ({error.strerror}); choose another place with --out") from None
 
 
 def _setup(path: Path, head: LogHead) -> Setup:
@@ -57,8 +43,7 @@ def _setup(path: Path, head: LogHead) -> Setup:
 
 
 def _write_bag(path: Path, head: LogHead, setup: Setup, ros: RosMessages, folder: Path, name: str) -> int:
-    file = McapFile(folder / f"{name}.mcap", profile="ros2")
-    try:
+    with whole_log(folder / f"{name}.mcap", "ros2") as file:
         for key, entries in head.metadata.items():
             file.add_metadata(key, entries)
         for key, data in head.attachments.items():
@@ -78,10 +63,6 @@ def _write_bag(path: Path, head: LogHead, setup: Setup, ros: RosMessages, folder
             times = [times[0] if sum(counts.values()) else time_ns, time_ns]
         described = _description(f"{name}.mcap", counts, times[-1] - times[0], times[0])
         file.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(described)})
-        file.finish()
-    except BaseException:
-        file.discard()
-        raise
     text = yaml.safe_dump({"rosbag2_bagfile_information": described}, sort_keys=False)
     (folder / "metadata.yaml").write_text(text, encoding="utf-8")
     return sum(counts.values())

@@ -33,7 +33,8 @@ class RunFolderError(UserError, RuntimeError):
 def default_run_dir(preset: str) -> Path:
     """A new folder ``runs/<time>_<preset>``, numbered where the name is taken. Raises RunFolderError."""
     name, number = f"{time.strftime('%Y%m%d-%H%M%S')}_{Path(preset).stem}", 1
-    try:
+    where = "give a place: --run-dir DIR"
+    with files.refusing(RunFolderError, f"{_RUNS}: cannot make a folder there", where):
         _RUNS.mkdir(exist_ok=True)
         while True:
             path = _RUNS / (f"{name}-{number}" if number > 1 else name)
@@ -43,10 +44,6 @@ def default_run_dir(preset: str) -> Path:
                 number += 1
             else:
                 return path
-    except OSError as error:
-        raise RunFolderError(
-            f"{_RUNS}: cannot make a folder there ({error.strerror}); give a place: --run-dir DIR"
-        ) from None
 
 
 def refuse_place(path: Path | None) -> None:
@@ -252,15 +249,9 @@ class RunFolder:
             self.finish(status, code)
 
     def _guarded(self, what: str, work) -> None:
-        try:
+        where = "give a folder that can be written: --run-dir DIR"
+        with files.refusing(RunFolderError, f"{self.path}: cannot {what}", where, ""):
             work()
-        except files.FileError as error:
-            raise RunFolderError(str(error)) from None
-        except OSError as error:
-            raise RunFolderError(
-                f"{self.path}: cannot {what} ({error.strerror}); give a folder that can be written: "
-                "--run-dir DIR"
-            ) from None
 
 
 def write_atomic(target: Path, content: bytes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
@@ -15,7 +14,7 @@ import numpy as np
 from av.error import FFmpegError
 from PIL import Image
 
-from uuvtai.common.files import whole_file
+from uuvtai.common.files import flush, refusing, whole_file
 from uuvtai.logs.drawing import (
     DYNAMIC,
     ECHO,
@@ -99,15 +98,10 @@ def _encoded(
     out: Path, frames: Iterator[np.ndarray], fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
 ) -> Path:
     """Write frames as the video that the name of ``out`` asks for, whole or not at all. Raises LogError."""
-
-    try:
+    with refusing(LogError, f"{out}: cannot write the video", "choose another place with --out FILE"):
         out.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(out, f".tmp{out.suffix.lower()}") as (_, part):
             check_whole(part, write_video(part, frames, fps, samples, inks), out)
-    except OSError as error:
-        raise LogError(
-            f"{out}: cannot write the video ({error.strerror}); choose another place with --out FILE"
-        ) from error
     return out
 
 
@@ -352,11 +346,7 @@ def check_whole(part: Path, n_frames: int, out: Path) -> None:
             f"{out}: the video could not be written whole; is the disk full? Make room or choose another "
             "place with --out FILE"
         )
-    handle = os.open(part, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    flush(part)
 
 
 def _write_video(part: Path, frames: Frames, fps: float) -> int:

@@ -115,6 +115,16 @@ def _scan(read: list[Array], age_s: Array, sonar_cfg: SonarConfig) -> Scan:
     )
 
 
+def _group_named(name: str) -> Any:
+    """A view's property: a NamedTuple of the protocol, in the user's kind of arrays."""
+
+    def group(view: PluginView) -> Any:
+        found = view._readings.group(name)
+        return type(found)(*(view._given(values) for values in found))
+
+    return property(group)
+
+
 class PluginView:
     """A ``protocol.View`` of readings: the whole batch, or one row of it."""
 
@@ -146,30 +156,11 @@ class PluginView:
         """(n, 3) [m] world."""
         return self._given(self._readings.group("goal"))
 
-    @property
-    def ego(self) -> Ego:
-        """What the vehicle knows of itself."""
-        return self._group("ego")
-
-    @property
-    def scan(self) -> Scan:
-        """The newest sonar scan."""
-        return self._group("scan")
-
-    @property
-    def tracks(self) -> Tracks:
-        """Forecast that the tracker follows."""
-        return self._group("tracks")
-
-    @property
-    def map(self) -> OccupancyGrid:
-        """The map."""
-        return self._group("map")
-
-    @property
-    def route(self) -> Way:
-        """The route."""
-        return self._group("route")
+    ego = _group_named("ego")
+    scan = _group_named("scan")
+    tracks = _group_named("tracks")
+    map = _group_named("map")
+    route = _group_named("route")
 
     def __getitem__(self, column: str) -> Any:
         """Columns of the observation by name (n, width). KeyError says which there are."""
@@ -192,10 +183,6 @@ class PluginView:
             f"View(rows={self.rows}, columns: {', '.join(self.columns)}; obs, goal, time_s, ego, scan, "
             f"tracks, map, route; a command is {COMMAND})"
         )
-
-    def _group(self, name: str) -> Any:
-        found = self._readings.group(name)
-        return type(found)(*(self._given(values) for values in found))
 
     def _given(self, values: Array) -> Any:
         picked = values if self._pick is None else values[self._pick]
@@ -384,11 +371,9 @@ class CallMeter:
 
     def _add(self, took: float, decisions: int) -> None:
         each = took / max(1, decisions)
-        self.timed, self.decisions, self.seconds = (
-            self.timed + 1,
-            self.decisions + decisions,
-            self.seconds + took,
-        )
+        self.timed += 1
+        self.decisions += decisions
+        self.seconds += took
         self.worst_s = max(self.worst_s, each)
         self.late += each > self.budget_s
 

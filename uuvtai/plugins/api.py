@@ -264,10 +264,7 @@ def failed(error: BaseException, path: Path, what: str) -> PluginError:
         line = error.lineno
     place = f"{path}:{line}" if line else str(path)
     reason = " ".join(str(error).split())[:300]
-    told = f"{place}: {type(error).__name__}{f': {reason}' if reason else ''} ({what})"
-    found = PluginError(told)
-    found.__cause__ = error
-    return found
+    return PluginError(f"{place}: {type(error).__name__}{f': {reason}' if reason else ''} ({what})")
 
 
 def line_in(trace: TracebackType | None, path: Path) -> int | None:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from pydantic import ValidationError
 
-from uuvtai.common.files import read_bytes
+from uuvtai.common.files import read_bytes, refusing
 from uuvtai.config import FixedObstacle
 from uuvtai.config.loader import nearest
 from uuvtai.envs.vector_env import NUM_ACTIONS, VectorEnv
@@ -75,10 +75,8 @@ class _OwnSource(SourceFileLoader):
 
 def content_of(spec: PluginSpec, limit: int) -> bytes:
     """The plugin's file. Raises PluginError where there is none, FileError for what is no plain file."""
-    try:
+    with refusing(PluginError, f"{spec.option}: {spec.path} cannot be read"):
         return read_bytes(spec.path, limit)
-    except OSError as error:
-        raise PluginError(f"{spec.option}: {spec.path} cannot be read ({error.strerror})") from None
 
 
 def object_of(spec: PluginSpec) -> Any:
@@ -123,13 +121,13 @@ def made(found: Any, spec: PluginSpec, about: About) -> Any:
     is_class, make = inspect.isclass(found), cast("Callable[..., Any]", found)
     if not is_class and not (spec.name == FACTORY and inspect.isroutine(found)):
         return found
-    takes = _parameters(found)
+    takes, may_take = _parameters(found)
     if takes > 1:
         raise PluginError(
             f"{place_of(found, spec)}: {spec.name} needs {takes} arguments; it gets one (about) or none"
         )
     try:
-        made_one = make(about) if takes or _may_take(found) else make()
+        made_one = make(about) if takes or may_take else make()
     except (Exception, SystemExit) as error:
         raise failed(error, spec.path, f"while {spec.option} was made") from error
     for name in ("rows", "arrays", "hold_steps"):  # a decorated ``load`` says it for what it returns
@@ -142,12 +140,8 @@ class _Marked:
     """An object of somebody else's library with the marks of ``plugin``."""
 
     def __init__(self, inner: Any, marks: dict[str, Any]) -> None:
-        self.inner, self.rows, self.arrays, self.hold_steps = (
-            inner,
-            marks["rows"],
-            marks["arrays"],
-            marks["hold_steps"],
-        )
+        self.inner = inner
+        vars(self).update(marks)
 
 
 def inner_of(found: Any) -> Any:
@@ -155,21 +149,15 @@ def inner_of(found: Any) -> Any:
     return found.inner if isinstance(found, _Marked) else found
 
 
-def _parameters(found: Any) -> int:
-    """How many arguments it needs at least."""
+def _parameters(found: Any) -> tuple[int, bool]:
+    """(arguments that it needs at least, whether the first is ``about``, though it may be left out)."""
     try:
-        given = inspect.signature(found).parameters.values()
+        given = inspect.signature(found).parameters
     except (TypeError, ValueError):  # of compiled code
-        return 0
-    return sum(p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in given)
-
-
-def _may_take(found: Any) -> bool:
-    """Whether its first argument is called ``about``, though it may be left out."""
-    try:
-        return next(iter(inspect.signature(found).parameters), "") == "about"
-    except (TypeError, ValueError):
-        return False
+        return 0, False
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    needed = sum(p.default is p.empty and p.kind in kinds for p in given.values())
+    return needed, next(iter(given), "") == "about"
 
 
 def agent_of(
@@ -222,13 +210,9 @@ def graph_of(spec: PluginSpec) -> bytes:
     graph = content_of(spec, MAX_GRAPH_BYTES)
 
     def beside(name: str) -> bytes:
-        try:
+        told = f"{spec.path}: its weights are in {name}, which cannot be read"
+        with refusing(PluginError, told, "copy that file too, beside it"):
             return read_bytes(spec.path.parent / name, MAX_GRAPH_BYTES, spec.path.parent)
-        except OSError as error:
-            raise PluginError(
-                f"{spec.path}: its weights are in {name}, which cannot be read ({error.strerror}); copy that "
-                "file too, beside it"
-            ) from None
 
     try:
         return graph_check.with_weights(graph, beside)

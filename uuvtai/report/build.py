@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.common.errors import ODD, UserError
-from uuvtai.common.files import FileError, read_bytes, refuse_links_in, refuse_output
+from uuvtai.common.files import FileError, read_bytes, refuse_links_in, refuse_output, refusing
 from uuvtai.config.loader import ConfigError
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
@@ -374,10 +374,8 @@ def refuse_run(run: Path) -> None:
         raise ConfigError(
             f"{run}: is no run folder; give one that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
         )
-    try:
+    with refusing(ConfigError, f"{run}: cannot be read"):
         refuse_links_in(run)
-    except OSError as error:
-        raise ConfigError(f"{run}: cannot be read ({error.strerror})") from None
 
 
 def _refuse_place(target: Path, runs: list[Path], force: bool) -> None:
@@ -394,14 +392,11 @@ def _refuse_place(target: Path, runs: list[Path], force: bool) -> None:
 
 
 def _write(target: Path, html: str, figures: dict[Path, bytes]) -> Report:
-    try:
+    where = "give a place that can be written: --out FILE"
+    with refusing(RunFolderError, f"{target}: cannot write it", where):
         for path, content in figures.items():
             write_atomic(path, content)
         write_atomic(target, html.encode())
-    except OSError as error:
-        raise RunFolderError(
-            f"{target}: cannot write it ({error.strerror}); give a place that can be written: --out FILE"
-        ) from None
     return Report(target, list(figures))
 
 

@@ -7,6 +7,7 @@ import base64
 import hashlib
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
@@ -149,16 +150,14 @@ _MOST_VALUES = 10_000  # of an axis of a sweep
 def read_json(run: Path, name: str) -> dict[str, Any] | None:
     """The document ``name`` of a run, None = no such file. Raises ConfigError for no JSON object."""
     path = run / name
-    try:
-        document = files.read_json(path, folder=run)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except FileError as error:
-        raise ConfigError(f"{error}; write it again with the command in run.json") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    again = "write it again with the command in run.json"
+    with files.refusing(ConfigError, f"{path}: cannot be read", refused=again):
+        try:
+            document = files.read_json(path, folder=run)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
     if not isinstance(document, dict):
-        raise ConfigError(f"{path}: is no JSON object; write it again with the command in run.json")
+        raise ConfigError(f"{path}: is no JSON object; {again}")
     _refuse_many(document, path)
     return document
 
@@ -183,7 +182,7 @@ def _refuse_many(document: dict[str, Any], path: Path) -> None:
 def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
     """Objects of a JSONL file, [] = no file; a last line that a kill cut is left out. Raises ConfigError."""
     path, found, damaged = run / name, [], 0
-    try:
+    with files.refusing(ConfigError, f"{path}: cannot be read", refused=""), suppress(FileNotFoundError):
         for i, line in enumerate(files.read_lines(path, files.MAX_JSON_BYTES, run), start=1):
             if damaged or i > _MAX_LINES:
                 why = (
@@ -197,12 +196,6 @@ def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
                 damaged = i
             else:
                 found.append(row)
-    except FileNotFoundError:
-        return []
-    except FileError as error:
-        raise ConfigError(str(error)) from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     return found
 
 
@@ -221,14 +214,11 @@ def _object(line: bytes) -> dict[str, Any] | None:
 def read_config(run: Path) -> str | None:
     """Text of config.yaml, or None where there is none. Raises ConfigError for what is no small text."""
     path = run / "config.yaml"
-    try:
-        return files.read_text(path, MAX_YAML_BYTES, run)
-    except FileNotFoundError:
-        return None
-    except FileError as error:
-        raise ConfigError(str(error)) from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    with files.refusing(ConfigError, f"{path}: cannot be read", refused=""):
+        try:
+            return files.read_text(path, MAX_YAML_BYTES, run)
+        except FileNotFoundError:
+            return None
 
 
 # ---- Texts of files without what no figure and no table can show.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from uuvtai.common.files import refusing
 from uuvtai.common.statistics import holm_adjusted
 from uuvtai.config.loader import ConfigError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
@@ -563,11 +564,8 @@ def _markdown(items: Sequence[PaperItem]) -> str:
 
 
 def _write(folder: Path, files: dict[str, bytes]) -> list[Path]:
-    try:
+    where = "give a place that can be: --paper DIR"
+    with refusing(RunFolderError, f"{folder}: cannot be written", where):
         for name, content in files.items():
             write_atomic(folder / name, content)
-    except OSError as error:
-        raise RunFolderError(
-            f"{folder}: cannot be written ({error.strerror}); give a place that can be: --paper DIR"
-        ) from None
     return [folder / name for name in files]

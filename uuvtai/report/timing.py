@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from uuvtai.report.blocks import Block, Figure, Panel, Paragraph
+from uuvtai.report.blocks import Block, Figure, Paragraph
 from uuvtai.report.figures import Line, curves, stages
 from uuvtai.report.tables import Column, Data, Table, number
 
@@ -88,7 +88,8 @@ def _stages_figure(rows: list[dict[str, Any]], command: str) -> Figure:
         ["num_envs", "stage", "us_per_env_step"],
         [[row["num_envs"], *item] for row in rows for item in row["stages_us_per_env_step"].items()],
     )
-    panels = [_alone(bar, i, len(bars)) for i, bar in enumerate(bars)]
+    title = "Each batch size on its own scale" if len(bars) > 1 else ""  # they differ by orders of magnitude
+    panels = [stages([bar], "" if i else title) for i, bar in enumerate(bars)]
     return Figure(
         "stages",
         panels,
@@ -96,11 +97,6 @@ def _stages_figure(rows: list[dict[str, Any]], command: str) -> Figure:
         data,
         command,
     )
-
-
-def _alone(bar: tuple[str, dict[str, float]], i: int, n_bars: int) -> Panel:
-    """Batch sizes differ by orders of magnitude: each bar has its own scale."""
-    return stages([bar], "" if i or n_bars < 2 else "Each batch size on its own scale")
 
 
 def _latency(rows: list[dict[str, Any]]) -> list[Block]:

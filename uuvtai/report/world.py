@@ -42,11 +42,9 @@ def check(config: Config) -> tuple[list[str], str, np.ndarray]:
         f"start and goal may be in {sum(share):.0%} of the spawn area",
     ]
     if len(parts := sorted((part for part in share if part >= _LEAST_SHARE), reverse=True)) > 1:
-        clear, shares = (
-            f"{world.static.joined_clearance_m:g} m",
-            ", ".join(f"{part:.0%}" for part in parts[:5]),
-        )
-        told.append(f"look at it: no way with {clear} of clearance joins {len(parts)} parts of it ({shares})")
+        clear, shares = world.static.joined_clearance_m, ", ".join(f"{part:.0%}" for part in parts[:5])
+        joins = f"no way with {clear:g} m of clearance joins {len(parts)} parts of it"
+        told.append(f"look at it: {joins} ({shares})")
     problem = (
         "no episode can begin: no two free places of the spawn area are joined and "
         f"{world.start_goal_gap_m:g} m apart; widen spawn_x_m and spawn_y_m, move fixed obstacles, or "
@@ -109,11 +107,8 @@ def _remarkable(world: WorldConfig, across: float, along: float) -> list[str]:
 def picture(name: str, world: WorldConfig, label: np.ndarray, out: Path) -> Path:
     """Draw tank, fixed obstacles with their paths, and where start and goal may be. Raises LogError."""
     checked_suffix(out, (".png",), "picture")
-    tank, drawn, ((x0, x1), (y0, y1)) = (
-        tank_document(world.tank),
-        _drawn(world),
-        (world.spawn_x_m, world.spawn_y_m),
-    )
+    tank, drawn = tank_document(world.tank), _drawn(world)
+    (x0, x1), (y0, y1) = world.spawn_x_m, world.spawn_y_m
     canvas = drawing.map_canvas(tank, 1200, (62, 44, 74, 92))
     drawing.paint_water(canvas, tank)
     canvas.cells(np.array(_CLEAR), label > 0, (tank["x_m"][0], tank["y_m"][0]), _CELL_M)

@@ -17,7 +17,7 @@ from xml.parsers import expat
 import numpy as np
 
 from uuvtai.common import tree_codes as codes
-from uuvtai.common.files import FileError, read_bytes, read_json
+from uuvtai.common.files import read_bytes, read_json, refusing
 from uuvtai.common.tree_codes import CONTROLS, DECORATORS, LEAVES, MAX_NODES, MAX_PORTS, Leaf
 from uuvtai.config.loader import ConfigError, preset_path
 
@@ -83,7 +83,8 @@ def read_elements(text: bytes, source: str) -> Element:
             raise TreeError(f"{source}:1: the encoding {encoding!r:.40} is not read; save the tree as UTF-8")
 
     def words(data: str) -> None:
-        if data.strip() and not _described(stack):
+        described = any(element.tag == "TreeNodesModel" for element in stack)  # the editor's palette
+        if data.strip() and not described:
             raise TreeError(
                 f"{source}:{parser.CurrentLineNumber}: text {data.strip()[:20]!r} inside <{stack[-1].tag}>"
             )
@@ -100,11 +101,6 @@ def read_elements(text: bytes, source: str) -> Element:
             f"{source}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]}"
         ) from None
     return holder.children[0]
-
-
-def _described(stack: list[Element]) -> bool:
-    """Whether the innermost element is part of the editor's palette, which may hold descriptions."""
-    return any(element.tag == "TreeNodesModel" for element in stack)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -178,12 +174,8 @@ def read_tree(name: str) -> FlatTree:
 
 def read_tree_file(path: Path, folder: Path | None = None) -> FlatTree:
     """Tree of an XML file, which must lie below ``folder`` if one is given. Raises TreeError."""
-    try:
+    with refusing(TreeError, f"{path}: cannot be read", refused=""):
         text = read_bytes(path, MAX_BYTES, folder)
-    except FileError as error:
-        raise TreeError(str(error)) from None
-    except OSError as error:
-        raise TreeError(f"{path}: cannot be read: {error.strerror}") from None
     return parse_tree(text, str(path))
 
 
@@ -472,16 +464,11 @@ def _record(run: Path) -> dict[str, list[NodeUse]]:
     path = run / "eval" / "tree.json"
     if not run.is_dir():
         raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it)")
-    try:
+    give = "give the run folder of an evaluation ('uuv eval' prints it)"
+    with refusing(ConfigError, f"{path}: cannot be read", give, "run the evaluation again with 'uuv eval'"):
         record = read_json(path, folder=run)
+    try:
         return {name: [_use(node) for node in nodes] for name, nodes in record["use"].items()}
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' "
-            "prints it)"
-        ) from None
-    except FileError as error:
-        raise ConfigError(f"{error}; run the evaluation again with 'uuv eval'") from None
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ConfigError(
             f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'"
@@ -505,26 +492,3 @@ def _document(name: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str,
             node |= vars(use[i])
         nodes.append(node)
     return {"schema": 1, "tree": name, "source": tree.source, "nodes": nodes}
-
-
-# ------------------------------------------------------------------------------------------------------------
-
-
-__all__ = [
-    "CONTROLS",
-    "DECORATORS",
-    "LEAVES",
-    "FlatTree",
-    "Leaf",
-    "NodeUse",
-    "TreeError",
-    "TreeReport",
-    "load_tree",
-    "node_use",
-    "parse_tree",
-    "read_tree",
-    "read_tree_file",
-    "tree_dot",
-    "tree_report",
-    "tree_text",
-]

@@ -82,13 +82,8 @@ class ClearanceGrid:
     def checker(self, ends: Sequence[Point]) -> Callable:
         """OMPL validity function of a state; the ends themselves are judged by their own cell only. Plain
         Python inside: 0.6 us a call."""
-        rows, (n_row, n_col), (x0, y0), scale, pad = (
-            self._rows,
-            self._size,
-            self.origin,
-            1.0 / self.cell_m,
-            _PAD,
-        )
+        rows, (n_row, n_col), (x0, y0) = self._rows, self._size, self.origin
+        scale, pad = 1.0 / self.cell_m, _PAD
         near2 = (2.0 * pad * self.cell_m) ** 2
         (ax, ay), (bx, by) = ends
 
@@ -274,62 +269,49 @@ class RouteFallback:
         ``seed_of(env)`` gives the env's number of (seed, episode, step), ``read(field, envs)`` rows of a
         field (``Sim.rows``), ``count(field)`` its one number.
         """
-        if planner is not None:
-            return self._serve_by(planner, stages, read, count)
-        route, ego, mission = stages.route.route, stages.route.ego, stages.route.mission
-        n_failed = count(route.n_failed)
-        if n_failed == 0:
-            return 0
-        from uuvtai.kernels.planning.route import keep_route, load_route
-        from uuvtai.kernels.planning.voronoi import overlay_clearance
-
-        envs = sorted(read(route.failed)[:n_failed].tolist())
-        starts, goals = (read(field, envs)[:, :2].tolist() for field in (ego.pos_w, mission.goal_w))
-        for env, start, goal in zip(envs, starts, goals, strict=True):
-            overlay_clearance(stages.route, self.overlay, env)
-            corners = self.plan((start[0], start[1]), (goal[0], goal[1]), seed_of(env))
-            if corners is None:
-                keep_route(stages.route, env)
-            else:
-                load_route(stages.route, corners.astype(np.float32), env, PLANNER_RRT)
-        return n_failed
-
-    def _serve_by(
-        self,
-        planner: RoutePlanner,
-        stages: Stages,
-        read: Callable[..., np.ndarray],
-        count: Callable[[Any], int],
-    ) -> int:
         io = stages.route
-        n_queue = count(io.route.n_queue)
-        envs = sorted(read(io.route.queue)[:n_queue].tolist()) if n_queue else []
-        if not envs:
+        queue, length = (
+            (io.route.failed, io.route.n_failed) if planner is None else (io.route.queue, io.route.n_queue)
+        )
+        n_asked = count(length)
+        if n_asked == 0:
             return 0
         from uuvtai.kernels.planning.route import keep_route, load_route
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 
-        ends = [read(field, envs)[:, :2] - self.origin for field in (io.ego.pos_w, io.mission.goal_w)]
-        obstacles, radius = (
-            read(f, envs) for f in (stages.route.forecast.pos_w, stages.route.forecast.radius_m)
-        )
+        envs = sorted(read(queue)[:n_asked].tolist())
+        ends = [read(field, envs)[:, :2] for field in (io.ego.pos_w, io.mission.goal_w)]
+        known = () if planner is None else (io.forecast.pos_w, io.forecast.radius_m)
+        moving = [read(field, envs) for field in known]
         for i, env in enumerate(envs):
-            overlay_clearance(stages.route, self.overlay, env)
-            moves = radius[i, :, 0] >= 0
-            asked = PlanRequest(
-                env,
-                self.overlay.copy(),
-                ends[0][i],
-                ends[1][i],
-                obstacles[i, moves] - self.origin,
-                radius[i, moves],
-            )
-            corners = planner.plan(asked)
+            overlay_clearance(io, self.overlay, env)
+            if planner is None:
+                start, goal = (end[i].tolist() for end in ends)
+                corners = self.plan((start[0], start[1]), (goal[0], goal[1]), seed_of(env))
+                by = PLANNER_RRT
+            else:
+                corners = self._ask(planner, env, *(end[i] for end in ends), *(part[i] for part in moving))
+                by = PLANNER_OWN
             if corners is None:
                 keep_route(io, env)
             else:
-                load_route(io, (corners + self.origin).astype(np.float32), env, PLANNER_OWN)
-        return len(envs)
+                load_route(io, corners.astype(np.float32), env, by)
+        return n_asked
+
+    def _ask(
+        self,
+        planner: RoutePlanner,
+        env: int,
+        start_w: np.ndarray,
+        goal_w: np.ndarray,
+        forecast_w: np.ndarray,
+        radius_m: np.ndarray,
+    ) -> np.ndarray | None:
+        """Corners (n, 2) [m] in the world; None = no way."""
+        moves = radius_m[:, 0] >= 0
+        start, goal, forecast = (place - self.origin for place in (start_w, goal_w, forecast_w[moves]))
+        corners = planner.plan(PlanRequest(env, self.overlay.copy(), start, goal, forecast, radius_m[moves]))
+        return None if corners is None else corners + self.origin
 
     def plan(self, start_xy: Point, goal_xy: Point, seed: int) -> np.ndarray | None:
         """RRT on ``self.overlay`` with the config's floor and budget; None (with one warning) where OMPL is

@@ -21,7 +21,7 @@ from uuvtai.compile.launch import Rows
 from uuvtai.compile.memory import Memory, address_of
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
-from uuvtai.kernels.perception import localization
+from uuvtai.kernels.perception import localization, mapping
 from uuvtai.kernels.planning import clearance, observation, route
 from uuvtai.kernels.sensors import proprioception
 from uuvtai.kernels.task import episode, reward
@@ -176,7 +176,7 @@ class Sim:
         with self._stage("tracking"):
             stack.track(io, c, self.privileged)
         with self._stage("mapping"):
-            stack.draw_map(io, c)
+            mapping.update_map(io.mapping)
         with self._stage("clearance"):
             clearance.compute_clearance(io.clearance)
         with self._stage("planning"):

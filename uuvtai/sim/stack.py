@@ -120,11 +120,6 @@ def track(stages: Stages, config: Config, privileged: bool) -> None:
     height.bound_heights(stages.tracking)
 
 
-def draw_map(stages: Stages, config: Config) -> None:
-    """The map's two layers."""
-    mapping.update_map(stages.mapping)
-
-
 def draw_true_map(stages: Stages) -> None:
     """The static layer as it truly is, for routes that are planned beforehand."""
     true_state.stamp_static(stages.true_map)
@@ -141,29 +136,19 @@ def choose(stages: Stages, used: Collection[int], action: torch.Tensor) -> None:
     """The behaviour tree's choice, into ``action``; ``used``: codes of its leaves."""
     threats.assess_threats(stages.behavior)
     avoidance.plan_evasion(stages.behavior)
-    if _has_baseline(used):
-        _plan_by_baseline(stages, used)
+    if codes.DYNAMIC_WINDOW in used:
+        dwa.plan_dynamic_window(stages.local_planner)
+    if codes.PATH_INTEGRAL in used:
+        mppi.plan_path_integral(stages.local_planner)
     tree.tick_tree(stages.behavior, action)
 
 
 def clear_baselines(
     baselines: BaselineState, used: Collection[int], put: Callable[[ti.Field, np.ndarray], None]
 ) -> None:
-    """A tree with such leaves begins without the plans of an earlier one."""
-    for field in (baselines.vel_w, baselines.plan_w) if _has_baseline(used) else ():
+    """A tree with local planners of the literature begins without the plans of an earlier one."""
+    for field in (baselines.vel_w, baselines.plan_w) if max(used) >= codes.FIRST_BASELINE else ():
         put(field, np.zeros((*field.shape, 3), np.float32))
-
-
-def _has_baseline(used: Collection[int]) -> bool:
-    """Whether a local planner of the literature is among these leaves."""
-    return max(used) >= codes.FIRST_BASELINE
-
-
-def _plan_by_baseline(stages: Stages, used: Collection[int]) -> None:
-    if codes.DYNAMIC_WINDOW in used:
-        dwa.plan_dynamic_window(stages.local_planner)
-    if codes.PATH_INTEGRAL in used:
-        mppi.plan_path_integral(stages.local_planner)
 
 
 def observe(stages: Stages, observation_cfg: ObservationConfig, out: torch.Tensor) -> None:

@@ -146,8 +146,9 @@ def _limits(
 ) -> safety.SafetyLimits:
     """As typed; where nothing is, the tank's and the vehicle's own."""
     tank, vehicle = config.world.tank, config.vehicle
+    low_x, low_y, high_x, high_y = box or (tank.x_m[0], tank.y_m[0], tank.x_m[1], tank.y_m[1])
     return safety.SafetyLimits(
-        box_m=_four(box or (tank.x_m[0], tank.y_m[0], tank.x_m[1], tank.y_m[1])),
+        box_m=(low_x, low_y, high_x, high_y),
         depth_m=(depth[0], depth[1]) if depth else (EDGE_M - tank.z_m[1], -tank.z_m[0] - EDGE_M),
         speed_m_s=max_speed,
         heave_m_s=min(max_speed, vehicle.max_heave_m_s),
@@ -169,11 +170,6 @@ def _refuse_places(mission: Mission, limits: safety.SafetyLimits) -> None:
                 f"{option} {where}: is {out:.2f} m outside the fence; z is up and 0 at the surface, so a "
                 "depth of 0.8 m is -0.8; or widen --box and --depth"
             )
-
-
-def _four(values: Sequence[float]) -> tuple[float, float, float, float]:
-    low_x, low_y, high_x, high_y = values
-    return low_x, low_y, high_x, high_y
 
 
 _WANTED_HZ = {30: 50.0, 27: 50.0, 29: 10.0, 137: 10.0, 32: 20.0, 1: 2.0}

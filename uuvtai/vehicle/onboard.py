@@ -78,20 +78,18 @@ class SimStack:
 class OnboardPilot(FedPilot):
     """One vehicle's stack in a simulator's row 0. On the CPU."""
 
-    def __init__(self, sim: Sim, mission: Mission, limits: StaleLimits | None = None) -> None:
+    def __init__(self, sim: Sim, mission: Mission) -> None:
         """``sim``: its row 0 becomes the pilot's, its ``sensors`` are replaced. ValueError on a GPU."""
         self.config = sim.config
         if sim.device.type != "cpu":
             raise ValueError("the pilot runs on the CPU")
-        super().__init__(numbers_of(sim.config, sim.tree), SimStack(sim), mission, limits)
+        super().__init__(numbers_of(sim.config, sim.tree), SimStack(sim), mission)
 
     @classmethod
-    def built(
-        cls, config: Config, tree: FlatTree, mission: Mission, limits: StaleLimits | None = None
-    ) -> OnboardPilot:
+    def built(cls, config: Config, tree: FlatTree, mission: Mission) -> OnboardPilot:
         """A pilot with a simulator of its own; its kernels are compiled, or found compiled, at the first
         steps (``uuv doctor --compile --num-envs 1``)."""
-        return cls(Sim(config, 1, tree), mission, limits)
+        return cls(Sim(config, 1, tree), mission)
 
 
 def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:

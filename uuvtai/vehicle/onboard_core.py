@@ -65,10 +65,8 @@ class StackRunner(Protocol):
 class FedPilot:
     """One vehicle's stack, fed from outside."""
 
-    def __init__(
-        self, numbers: PilotNumbers, stack: StackRunner, mission: Mission, limits: StaleLimits | None = None
-    ) -> None:
-        self.limits, self.numbers, self.stack = limits or StaleLimits(), numbers, stack
+    def __init__(self, numbers: PilotNumbers, stack: StackRunner, mission: Mission) -> None:
+        self.limits, self.numbers, self.stack = StaleLimits(), numbers, stack
         views = stack.views
         self.begin_again(mission)
         self._behavior = {name: views[f"behavior.{name}"] for name in ("action", "last_vel_w", "leaf")}

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai.common.files import refusing
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.schemas import BOOLEAN, FOUR, INT, NUMBER, STRING, THREE, array_of, record
@@ -53,7 +54,7 @@ class LinkLog:
         """Raises LogError."""
         self.path, self.trouble = path, ""
         self._left, self.unwritten, self._closed = 0, 0, False
-        try:
+        with refusing(LogError, f"{path}: cannot write there", "try --log FILE"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = McapFile(path)
             self._file.add_metadata(ABOUT, about)
@@ -63,10 +64,6 @@ class LinkLog:
                 )
                 for topic, schema in _SCHEMAS.items()
             }
-        except OSError as error:
-            raise LogError(
-                f"{path}: cannot write there ({error.strerror or error}); try --log FILE"
-            ) from error
 
     def begin_step(self) -> None:
         self._left = MOST_SEEN

@@ -16,7 +16,7 @@ from uuvtai.common.errors import SettingError
 from uuvtai.config import Config
 from uuvtai.config.loader import LEARNING_SECTIONS, ConfigError, parsed_yaml, validated
 from uuvtai.logs.drawing import REPLAYED
-from uuvtai.logs.encode import LogError
+from uuvtai.logs.encode import LogError, unlike_schema
 from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import IMPORTED, LogHead, LogMessage, read_head, read_messages
 from uuvtai.logs.run_folder import RunFolder, default_run_dir
@@ -70,15 +70,9 @@ def read_feed(path: Path, tree: str | None = None) -> LogFeed:
     """Read a log; ``tree``: name or file of a tree in place of the one that it holds. Raises LogError
     for what cannot be replayed, TreeError and ConfigError for a tree that cannot be read."""
     head = read_head(path)
-    try:
+    with unlike_schema(path):
         feed = _begun(path, head, tree)
         _FeedReader(feed).run()
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        if isinstance(error, LogError):
-            raise
-        raise LogError(
-            f"{path}: a message is not as its schema says ({error!r}); see what is in it: uuv log info {path}"
-        ) from error
     return feed
 
 
@@ -408,14 +402,11 @@ def _agreement(name: str, commands: list[onboard.PilotCommand], feed: LogFeed) -
     ]
     first = None
     if wrong:
-        step, (ours, theirs) = wrong[0], map(_plain, pairs[wrong[0]])
+        step = wrong[0]
+        ours, theirs = (value if isinstance(value, str) else value.tolist() for value in pairs[step])
         time_s = round(step * feed.config.episode.control_dt_s, 9)
         first = {"step": step, "time_s": time_s, "replayed": ours, "logged": theirs}
     return {"what": name, "equal_steps": len(pairs) - len(wrong), "first_difference": first}
-
-
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, str) else value.tolist()
 
 
 def _change(commands: list[onboard.PilotCommand], feed: LogFeed) -> dict[str, Any]:

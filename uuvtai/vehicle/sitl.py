@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -77,35 +77,11 @@ def turn_of(count: int, last: int | None, waited_s: float) -> Turn:
     return "again" if waited_s >= DOUBLED_S else "ignore"
 
 
-class Water(Protocol):
-    """What an instance needs of ``WaterRows``."""
-
-    def begin(self, row: int) -> None: ...
-
-    def push(self, row: int, pwm: tuple[int, ...], dt_s: float) -> None:
-        """Move the vehicle by one step."""
-        ...
-
-    def control_step(self, row: int) -> str:
-        """The world by a control step; how the episode ended, '' = not yet."""
-        ...
-
-    def sense(self, row: int) -> None: ...
-
-    def motion(self, row: int, time_s: float) -> Motion: ...
-
-    def value(self, name: str, row: int) -> np.ndarray: ...
-
-    def turns(self, pwm: tuple[int, ...]) -> bool:
-        """Whether any thruster is asked to turn."""
-        ...
-
-
 class Instance:
     """Until a thruster turns for the first time the vehicle is held at its start and the obstacles stand
     still: an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
 
-    def __init__(self, config: Config, water: Water, row: int, rig: FakeRig | None = None) -> None:
+    def __init__(self, config: Config, water: WaterRows, row: int, rig: FakeRig | None = None) -> None:
         """``rig``: its DVL and sonar, where they speak their own protocols."""
         self._config, self._water, self._row, self._rig = config, water, row, rig
         self._dt = config.episode.control_dt_s

@@ -149,16 +149,8 @@ class Motors:
     def __init__(self, vehicle_cfg: VehicleConfig) -> None:
         """SettingError for a frame that ArduSub's two are not."""
         force_moment, _ = allocation_matrices(vehicle_cfg)
-        ours = np.stack(
-            [
-                force_moment[3],
-                -force_moment[4],
-                -force_moment[5],
-                force_moment[2],
-                force_moment[0],
-                -force_moment[1],
-            ]
-        ).T  # in ArduSub's axes and order
+        signs = np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
+        ours = force_moment[[3, 4, 5, 2, 0, 1]].T * signs  # in ArduSub's axes and order
         frame = _FRAMES.get(len(ours))
         if frame is None:
             raise SettingError(

@@ -68,6 +68,15 @@ def quaternion_of(rpy: Any) -> tuple[float, float, float, float]:
     )
 
 
+def angles_of(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Roll, pitch, yaw [rad] (Z-Y-X) of a unit quaternion."""
+    return (
+        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
+        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+
+
 _ESTIMATED = When(
     "every new scan, where the pose is estimated",
     lambda moment, waited: bool(moment["scan.fresh"]) and moment["ego.pose_cov"][0] > 0,

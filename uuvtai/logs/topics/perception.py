@@ -336,12 +336,13 @@ class Layer:
         return len(self.packed)
 
 
-def _static(moment: Moment) -> bytes:
-    return _grid(moment, moment.stamp, occupancy(moment["grid_map.static_occ"]), static_colors)
+def _occupied(layer: str, ink: tuple[int, int, int]) -> Callable[[Moment], bytes]:
+    """The fuller a cell, the less transparent."""
 
+    def paint(values: np.ndarray) -> tuple[Any, Any, Any, Any]:
+        return *ink, _byte(values)
 
-def _dynamic(moment: Moment) -> bytes:
-    return _grid(moment, moment.stamp, occupancy(moment["grid_map.dynamic_occ"]), dynamic_colors)
+    return lambda moment: _grid(moment, moment.stamp, occupancy(moment[layer]), paint)
 
 
 def _room(moment: Moment) -> np.ndarray:
@@ -409,14 +410,6 @@ def map_origin(config: Config, shape: tuple[int, ...]) -> tuple[float, float]:
     return first_x, first_y
 
 
-def static_colors(values: np.ndarray) -> tuple[int, int, int, np.ndarray]:
-    return 38, 44, 56, _byte(values)
-
-
-def dynamic_colors(values: np.ndarray) -> tuple[int, int, int, np.ndarray]:
-    return 229, 57, 70, _byte(values)
-
-
 def _clearance_colors(values: np.ndarray):
     blue, green, red = _color_mapped(values / max(float(values.max()), 1e-6), cv2.COLORMAP_VIRIDIS)
     return red, green, blue, 150
@@ -453,6 +446,7 @@ def _read_layer(data: dict[str, Any]) -> Layer:
 
 
 _LAYERS = ("grid_map.static_occ", "grid_map.dynamic_occ", "clearance.site")
+_static, _dynamic = _occupied(_LAYERS[0], (38, 44, 56)), _occupied(_LAYERS[1], (229, 57, 70))
 
 MAP_ROWS = (
     Topic("/map/static", MAPS, GRID, _static, _LAYERS[:1], _read_layer, in_picture=True),

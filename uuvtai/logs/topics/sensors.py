@@ -181,11 +181,8 @@ def depth_line(depth_m: np.ndarray, rpy: np.ndarray, config: Config) -> tuple[np
     left = (0.5 * camera.cols - 0.5 - np.arange(cols)) / focal
     up = (0.5 * camera.rows - 0.5 - np.arange(rows))[:, None] / focal
     roll, pitch = (float(v) for v in rpy[:2])
-    ahead_z, left_z, up_z = (
-        -math.sin(pitch),
-        math.sin(roll) * math.cos(pitch),
-        math.cos(roll) * math.cos(pitch),
-    )
+    ahead_z, left_z = -math.sin(pitch), math.sin(roll) * math.cos(pitch)
+    up_z = math.cos(roll) * math.cos(pitch)
     mount = np.dot((ahead_z, left_z, up_z), camera.offset_b_m)
     rise = mount + depth_m * (ahead_z + left_z * left + up_z * up)
     counts = (

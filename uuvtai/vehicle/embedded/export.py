@@ -117,14 +117,7 @@ class _TapeRecorder:
         """What the host does at this place."""
         self._lines.append({"do": what})
 
-    def serve(
-        self,
-        stages: Stages,
-        seed_of: Callable[[int], int],
-        read: Callable[..., Any],
-        count: Callable[[Any], int],
-        planner: Any = None,
-    ) -> int:
+    def serve(self, *_given: Any) -> int:
         """In place of the fallback planner."""
         self.note("route")
         return 0
@@ -271,7 +264,6 @@ def function_name(number: int) -> str:
 
 def library_of(kernels: Sequence[RecordedKernel], kind: MachineKind) -> bytes:
     """Library with ``function_name(i)(arguments, runtime)`` a kernel, ``uuv_parallel_for``. CrossError."""
-    words = linker()
     objects = [_object(PARALLEL_FOR, kind, "uuv_parallel_for")]
     for number, kernel in enumerate(kernels):
         text = kernel.text + _entry(kernel, function_name(number))
@@ -282,19 +274,9 @@ def library_of(kernels: Sequence[RecordedKernel], kind: MachineKind) -> bytes:
         for file, code in zip(files, objects, strict=True):
             file.write_bytes(code)
         out = folder / "stack.so"
-        words = [
-            *words,
-            "ld.lld",
-            "-m",
-            kind.emulation,
-            "-shared",
-            "-z",
-            "now",
-            "--build-id=none",
-            "-o",
-            str(out),
-        ]
-        done = subprocess.run([*words, *map(str, files)], capture_output=True, text=True, check=False)
+        options = ["-m", kind.emulation, "-shared", "-z", "now", "--build-id=none", "-o", str(out)]
+        command = [*linker(), "ld.lld", *options, *map(str, files)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode or not out.exists():
             raise CrossError(f"the linker refused ({done.stderr.strip()[:500]})")
         return out.read_bytes()
@@ -411,14 +393,7 @@ class _KeptRoutes:
 
     count = 0
 
-    def serve(
-        self,
-        stages: Stages,
-        seed_of: Callable[[int], int],
-        read: Callable[..., np.ndarray],
-        count: Callable[[Any], int],
-        planner: Any = None,
-    ) -> int:
+    def serve(self, stages: Stages, _seed_of: Any, _read: Any, count: Callable[[Any], int], *_: Any) -> int:
         """As ``RouteFallback.serve``."""
         if failed := count(stages.route.route.n_failed):
             keep_route(stages.route, 0)

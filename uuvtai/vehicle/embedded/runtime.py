@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.vehicle.messages import KINDS, Mission, PilotNumbers, SensorMessage
-from uuvtai.vehicle.onboard_core import FedPilot, StaleLimits
+from uuvtai.vehicle.onboard_core import FedPilot
 from uuvtai.vehicle.sensor_inputs import FedSensors
 
 SCHEMA = 3
@@ -96,7 +96,7 @@ class CarriedStack:
         for i, (kind, value) in enumerate(arguments):
             if kind == "array":
                 rank = self._tensors[value].ndim
-                fields += [(f"shape{i}", _Shape.of(rank))]
+                fields.append((f"shape{i}", _array_of(rank)))
             else:
                 fields.append((f"a{i}", ctypes.c_int32 if kind == "int" else ctypes.c_float))
         packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})()
@@ -127,19 +127,13 @@ class CarriedStack:
         return block
 
 
-class _Shape:
-    """Types of an array among a kernel's arguments."""
-
-    @staticmethod
-    def of(rank: int) -> type[ctypes.Structure]:
-        """Shape and address."""
-        fields = [("shape", ctypes.c_int32 * rank), ("data", ctypes.c_void_p)]
-        return type(f"Array{rank}", (ctypes.Structure,), {"_fields_": fields})
+def _array_of(rank: int) -> type[ctypes.Structure]:
+    """Type of an array among a kernel's arguments: shape and address."""
+    fields = [("shape", ctypes.c_int32 * rank), ("data", ctypes.c_void_p)]
+    return type(f"Array{rank}", (ctypes.Structure,), {"_fields_": fields})
 
 
-def carried_pilot(
-    folder: Path, mission: Mission | None = None, limits: StaleLimits | None = None
-) -> FedPilot:
+def carried_pilot(folder: Path, mission: Mission | None = None) -> FedPilot:
     """The pilot of a folder, on ``mission`` or that of the exported log. Raises StackFolderError."""
     stack = CarriedStack(folder)
     numbers: dict[str, Any] = {
@@ -148,7 +142,7 @@ def carried_pilot(
     }
     told = stack.spec["mission"]
     own = Mission(tuple(told["start"]), tuple(told["goal"]), told["seed"], told["episode"])
-    return FedPilot(PilotNumbers(**numbers), stack, mission or own, limits)
+    return FedPilot(PilotNumbers(**numbers), stack, mission or own)
 
 
 def spec_of(folder: Path) -> dict[str, Any]:
@@ -211,7 +205,6 @@ AGREES = 1e-4  # largest difference between two commands, each in [-1, 1], that 
 
 def packed_messages(arrivals: list[tuple[int, SensorMessage]]) -> dict[str, np.ndarray]:
     """Arrays of messages, each with the step before which it arrives, in the order of arrival."""
-    names = list(KINDS)
     found: dict[str, np.ndarray] = {
         "arrival_step": np.array([step for step, _ in arrivals], np.int32),
         "arrival_kind": np.array(
@@ -222,7 +215,7 @@ def packed_messages(arrivals: list[tuple[int, SensorMessage]]) -> dict[str, np.n
         messages = [message for _, message in arrivals if isinstance(message, kind)]
         for member in dataclasses.fields(kind):
             values = [np.asarray(getattr(message, member.name), np.float64) for message in messages]
-            key = f"{names[names.index(name)]}.{member.name}"
+            key = f"{name}.{member.name}"
             found[key] = np.concatenate([value.ravel() for value in values]) if values else np.zeros(0)
             found[f"{key}.length"] = np.array([value.size for value in values], np.int32)
     return found

@@ -24,7 +24,7 @@ import numpy as np
 
 from uuvtai.common.clocks import SEVERAL, SourceClock, stamp_of
 from uuvtai.common.errors import ODD
-from uuvtai.common.files import open_file
+from uuvtai.common.files import open_file, refusing
 from uuvtai.config import VehicleConfig
 from uuvtai.logs.reader import read_messages
 from uuvtai.vehicle.identify.drive_log import Drive, DriveError, drives_of, refuse_long, thrust_of, up_axis
@@ -267,11 +267,9 @@ def by_motor(pulse: np.ndarray, parameters: dict[str, float]) -> list[float]:
 
 def _boots(path: Path, system: int | None, note: Callable[[str], None]) -> list[_Heard]:
     """What one vehicle of a file said, by starts of its autopilot. Raises DriveError."""
-    try:
-        with open_file(path, _MOST_BYTES) as file:
-            head = file.read(len(_BIN_HEAD))
-    except OSError as error:
-        raise DriveError(f"{path}: cannot be read ({error.strerror}); give a .bin or .tlog") from None
+    unread = f"{path}: cannot be read"
+    with refusing(DriveError, unread, "give a .bin or .tlog"), open_file(path, _MOST_BYTES) as file:
+        head = file.read(len(_BIN_HEAD))
     is_bin = path.suffix.lower() == ".bin"
     if is_bin and head != _BIN_HEAD:
         raise DriveError(f"{path}: does not begin like a DataFlash log of ArduPilot's")

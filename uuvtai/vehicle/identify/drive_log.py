@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from uuvtai.common.errors import UserError
-from uuvtai.common.files import open_file
+from uuvtai.common.files import open_file, refusing
 from uuvtai.config import VehicleConfig
 from uuvtai.kernels.vehicle.dynamics import KGF, edge_rpm
 from uuvtai.logs.reader import read_messages
@@ -150,10 +150,10 @@ def _up_of(quaternion: Sequence[float]) -> list[float]:
 def _table(path: Path) -> tuple[np.ndarray, bool]:
     """(rows, whether their rotor speeds are as commanded)"""
     try:
-        with io.TextIOWrapper(open_file(path, _MAX_CSV_BYTES), "utf-8-sig", newline="") as file:
-            head, values = _columns(path, csv.reader(file))
-    except OSError as error:
-        raise DriveError(f"{path}: cannot be read ({error.strerror}); give a log, .mcap or .csv") from None
+        with refusing(DriveError, f"{path}: cannot be read", "give a log, .mcap or .csv"):
+            file = open_file(path, _MAX_CSV_BYTES)
+            with io.TextIOWrapper(file, "utf-8-sig", newline="") as text:
+                head, values = _columns(path, csv.reader(text))
     except (csv.Error, UnicodeDecodeError) as error:
         raise DriveError(f"{path}: is no table ({error}); save it as CSV in UTF-8") from None
     asked, turned = ([name for name in head if name.startswith(prefix)] for prefix in ("asked_", "rpm_"))

@@ -73,10 +73,8 @@ def first_echo(profile: np.ndarray, bin_m: float, blind_m: float) -> float:
     """[m] to the first echo beyond ``blind_m`` of a profile (n,) of u8 with bins of ``bin_m``; infinite where
     the whole profile is quiet, NaN where it is neither: then nobody knows."""
     n, total = len(profile), np.concatenate([[0.0], np.cumsum(profile, dtype=float)])
-    at, smooth, guard, around = (
-        np.arange(n),
-        *(max(1, round(m / bin_m)) for m in (_SMOOTH_M, _GUARD_M, _AROUND_M)),
-    )
+    smooth, guard, around = (max(1, round(m / bin_m)) for m in (_SMOOTH_M, _GUARD_M, _AROUND_M))
+    at = np.arange(n)
 
     def mean(first: np.ndarray, stop: np.ndarray) -> np.ndarray:
         first, stop = np.clip(first, 0, n), np.clip(stop, 0, n)

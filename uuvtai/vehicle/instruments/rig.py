@@ -146,10 +146,5 @@ class JsonUdp(Instrument):
 def as_fields(said: Mapping[str, Any]) -> dict[str, Any]:
     """A message's fields as JSON has them. ValueError, TypeError, OverflowError."""
     arrays = {name: np.array(value, np.float64) for name, value in said.items()}
-    return {name: array if array.ndim else _plain(name, array) for name, array in arrays.items()}
-
-
-def _plain(name: str, value: np.ndarray) -> float | int:
-    """A number, of ``first_beam`` a whole one. ValueError, OverflowError."""
-    number = float(value)
-    return int(number) if name == "first_beam" else number
+    whole = {"first_beam": int}
+    return {name: a if a.ndim else whole.get(name, float)(float(a)) for name, a in arrays.items()}

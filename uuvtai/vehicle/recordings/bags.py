@@ -26,6 +26,7 @@ from uuvtai.common.files import open_file, refuse_links
 from uuvtai.config import Config
 from uuvtai.logs.reader import MAX_RECORD, records
 from uuvtai.logs.ros2 import INVALID_VAR, RosMessages
+from uuvtai.logs.topics.motion import angles_of
 from uuvtai.vehicle.instruments import ping
 from uuvtai.vehicle.messages import SonarPing
 from uuvtai.vehicle.recordings import sources
@@ -329,11 +330,7 @@ def _angles(w: float, x: float, y: float, z: float) -> tuple[float, float, float
     """Roll, pitch, yaw [rad]."""
     if not abs(w * w + x * x + y * y + z * z - 1.0) < 0.1:
         raise ValueError("an orientation that is none")
-    return (
-        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x)))),
-        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )
+    return angles_of(w, x, y, z)
 
 
 def _column(m: Any, name: str) -> np.ndarray:

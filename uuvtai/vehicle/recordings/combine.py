@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from uuvtai.common.files import open_file, refuse_output
+from uuvtai.common.files import open_file, refuse_output, refusing
 from uuvtai.config import Config
 from uuvtai.config.loader import to_yaml
-from uuvtai.logs.container import McapFile
+from uuvtai.logs.container import McapFile, whole_log
 from uuvtai.logs.encode import IDENTITY, LogError, dumped
 from uuvtai.logs.reader import IMPORTED
 from uuvtai.logs.scenario import scenario_document
@@ -61,11 +61,9 @@ def kind_of(path: Path) -> str:
     """What a file is, by how it begins: a key of the readers. Raises RecordingError, FileError."""
     if path.is_dir():
         return "bag"
-    try:
-        with open_file(path, sources.MOST_BYTES) as file:
-            head = file.read(4096)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror}); name a recording") from None
+    unread = f"{path}: cannot be read"
+    with refusing(RecordingError, unread, "name a recording"), open_file(path, sources.MOST_BYTES) as file:
+        head = file.read(4096)
     if not head:
         raise RecordingError(f"{path}: is empty; give another copy of the recording")
     if head.startswith(b"\x89MCAP0") and ABOUT.encode() in head:
@@ -185,10 +183,8 @@ class _Import:
         return self._document(begin_s, told[-1].time_s, counts)
 
     def _read(self, source: Source, offset: float) -> None:
-        try:
+        with refusing(RecordingError, f"{source.path}: cannot be read"):
             _READERS[source.kind](source, self.config, self.start)
-        except OSError as error:
-            raise RecordingError(f"{source.path}: cannot be read ({error.strerror})") from None
         times = np.array([reading.time_s for reading in source.readings])
         if not len(times):
             return
@@ -246,30 +242,23 @@ class _Import:
 
     def _write(self, told: list[Told], begin_s: float) -> None:
         out = self.plan.out
-        try:
+        with refusing(LogError, f"{out}: cannot write there", "give another --out"):
             out.parent.mkdir(parents=True, exist_ok=True)
-            file = McapFile(out)
-        except OSError as error:
-            raise _unwritten(out, error) from None
-        try:
-            self._write_head(file)
-            channels: dict[str, int] = {}
-            writer = _Messages(self.config, self.start, self.yaw, self._levers())
-            for reading in told:
-                time_ns = round(1e9 * (reading.time_s - begin_s))
-                for topic, data in writer.of(reading, time_ns):
-                    if topic not in channels:
-                        schema = SCHEMAS[topic]
-                        known = file.add_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
-                        channels[topic] = file.add_channel(topic, known)
-                    file.add_message(channels[topic], time_ns, data)
-            file.finish()
-        except OSError as error:
-            file.discard()
-            raise _unwritten(out, error) from None
-        except BaseException:
-            file.discard()
-            raise
+            with whole_log(out) as file:
+                self._write_messages(file, told, begin_s)
+
+    def _write_messages(self, file: McapFile, told: list[Told], begin_s: float) -> None:
+        self._write_head(file)
+        channels: dict[str, int] = {}
+        writer = _Messages(self.config, self.start, self.yaw, self._levers())
+        for reading in told:
+            time_ns = round(1e9 * (reading.time_s - begin_s))
+            for topic, data in writer.of(reading, time_ns):
+                if topic not in channels:
+                    schema = SCHEMAS[topic]
+                    known = file.add_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
+                    channels[topic] = file.add_channel(topic, known)
+                file.add_message(channels[topic], time_ns, data)
 
     def _levers(self) -> set[int]:
         """Readings of a DVL that speaks of its own place."""
@@ -303,10 +292,6 @@ class _Import:
             "to_s": round(last - begin_s, 3), "offset_s": self.offsets[self.sources.index(source)],
             "dropped": [{"what": what, "why": why, "count": count} for (what, why), count in rows],
         }  # fmt: skip
-
-
-def _unwritten(out: Path, error: OSError) -> LogError:
-    return LogError(f"{out}: cannot write there ({error.strerror or error}); give another --out")
 
 
 def _names(source: Source, text: str) -> bool:

@@ -348,8 +348,7 @@ def read_a50(source: Source, config: Config) -> None:
         try:
             said = parsed_json(line[at:], "a line")
         except FileError:
-            source.drop("a line", "no JSON object")
-            continue
+            said = None
         if not isinstance(said, dict):
             source.drop("a line", "no JSON object")
             continue
