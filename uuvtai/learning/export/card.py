@@ -136,8 +136,9 @@ _HOW = {
     "mlp": """`policy.reset()` when a mission begins, `policy.act(observation)` at every control step
 ({control_hz:g} Hz). A decision is made every {hold_steps} control step(s); in between the action is kept.""",
     "set": """`said = policy.act(obstacles, own)` {decision_hz:g} times a second, and at every control step
-({control_hz:g} Hz) `policy.command(said.wish, flip, yaw_rad, z_m)`, the hull rule: its code is in
-`run_policy.py`, its numbers are `hull_rule` of `policy_spec.json`.""",
+({control_hz:g} Hz) `policy.command(said.wish, flip, yaw_rad, z_m)`, the hull rule. `said.wish` has passed the
+safety filter; the graph's `mean_wish` has not (`policy.kept_safe`). The code of both is in `run_policy.py`,
+their numbers are `safety` and `hull_rule` of `policy_spec.json`.""",
 }
 _STACK = {"mlp": "sonar, map, route, tracking{tree}", "set": "tracks, map, route, pose"}
 _NONE = "No evaluation was at hand. Evaluate it with `uuv eval RUN`, export again with `--evaluation FOLDER`."
