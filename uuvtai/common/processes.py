@@ -6,11 +6,13 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection, popen_spawn_posix
+from types import ModuleType
 from typing import Any, TypeVar
 
 from uuvtai.common import signals
@@ -97,7 +99,7 @@ class LocalEngine:
     ) -> None:
         """Give every free worker a task, and no more: what waits inside a broken pool is lost too."""
         while todo and len(running) < self._workers:
-            with _ctrl_c_held():
+            with _ctrl_c_held(), _main_hidden():
                 future = pool.submit(work, items[todo[0]])
             running[future] = todo.pop(0)
 
@@ -113,6 +115,16 @@ def _ctrl_c_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def _main_hidden() -> Iterator[None]:
+    """Processes started inside do not import the user's script, which would run it again."""
+    before, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = before
 
 
 def _begin_worker(threads: int) -> None:
