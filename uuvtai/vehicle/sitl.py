@@ -27,6 +27,7 @@ from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
 from uuvtai.vehicle.instruments import ping
 from uuvtai.vehicle.instruments.emulate import KINDS, FakeRig, emulated
+from uuvtai.vehicle.instruments.rig import PORTS
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
 from uuvtai.vehicle.messages import three
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
@@ -353,7 +354,7 @@ class ServingNotes:
                 f"{self._name}: nothing of ArduSub's has come to UDP port {self._port} yet: start it with "
                 "--model JSON:127.0.0.1, or give its port: --port"
             ]
-        return [f"{self._name}: ArduSub has been silent for {SILENT_S:g} s; the water waits"]
+        return [f"{self._name}: ArduSub has been silent for {SILENT_S:g} s; the physics waits"]
 
     def _episode(self, instance: Instance) -> list[str]:
         seen, found = self._seen, []
@@ -536,13 +537,21 @@ def serve_water(
         signals.engage()  # there is a document to print
         shown = ", ".join(f"{plan.host}:{plan.port + NEXT_PORT * number}" for number in range(plan.instances))
         note(
-            f"water for ArduSub at UDP {shown}; start it with: ardusub --model JSON:{plan.host}; Ctrl-C ends"
+            f"physics for ArduSub at UDP {shown}; start it with: ardusub --model JSON:{plan.host}; Ctrl-C ends"
         )
         for number in range(plan.instances):
             water.begin(number)
             start, goal = (_written(water.value(f"mission.{name}_w", number)) for name in ("start", "goal"))
             heading = f"{config.world.tank.heading_deg or 0.0:g}"
-            note(f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading {heading}")
+            heard = "".join(
+                f" --{option} {kind}:{plan.host}:{ports_of[kind] + NEXT_PORT * number}"
+                for option, ports_of in PORTS.items()
+                for kind in plan.emulated
+                if kind in ports_of
+            )
+            note(
+                f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading {heading}{heard}"
+            )
         _serve(ports, plan, begun, note)
     except KeyboardInterrupt:
         note("interrupted")
