@@ -348,7 +348,7 @@ def _printed(shown: Shown) -> tuple[str, list[Table]]:
 
     found: list[Table] = []
     width = shutil.get_terminal_size((100, 24)).columns
-    console = Console(file=(text := StringIO()), width=width, force_jupyter=False)
+    console = Console(file=(text := StringIO()), width=width, force_terminal=False, force_jupyter=False)
     shown._show(Keeping(console=console, more="to_pandas()"))
     return text.getvalue().rstrip(), found
 

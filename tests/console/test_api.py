@@ -75,7 +75,8 @@ def test_results_print_as_tables_in_a_terminal_and_in_a_notebook(run, monkeypatc
     page = found._repr_html_()
     assert page.count("<table>") == 2 and "<td>own-act</td>" in page and str(found.folder) in repr(found)
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)  # there Rich shows instead of writing
-    assert "own-act" in str(found) and found._repr_html_() == page
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert "own-act" in str(found) and "\x1b" not in str(found) and found._repr_html_() == page
     odd = api._html(found.tables()[0].__class__((), (), "<script>"))
     assert "<script>" not in odd and "&lt;script&gt;" in odd
 

@@ -536,22 +536,13 @@ def serve_water(
         begun = time.monotonic()
         signals.engage()  # there is a document to print
         shown = ", ".join(f"{plan.host}:{plan.port + NEXT_PORT * number}" for number in range(plan.instances))
-        note(
-            f"physics for ArduSub at UDP {shown}; start it with: ardusub --model JSON:{plan.host}; Ctrl-C ends"
-        )
+        begin = f"start it with: ardusub --model JSON:{plan.host}"
+        note(f"physics for ArduSub at UDP {shown}; {begin}; Ctrl-C ends")
         for number in range(plan.instances):
             water.begin(number)
             start, goal = (_written(water.value(f"mission.{name}_w", number)) for name in ("start", "goal"))
-            heading = f"{config.world.tank.heading_deg or 0.0:g}"
-            heard = "".join(
-                f" --{option} {kind}:{plan.host}:{ports_of[kind] + NEXT_PORT * number}"
-                for option, ports_of in PORTS.items()
-                for kind in plan.emulated
-                if kind in ports_of
-            )
-            note(
-                f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading {heading}{heard}"
-            )
+            words = f"--start {start} --goal {goal} --heading {config.world.tank.heading_deg or 0.0:g}"
+            note(f"instance {number}: uuv pilot needs {words}{_heard(plan, number)}")
         _serve(ports, plan, begun, note)
     except KeyboardInterrupt:
         note("interrupted")
@@ -561,6 +552,16 @@ def serve_water(
     spent = time.monotonic() - begun
     instances = [port.instance.document() for port in ports]
     return {"schema": 1, "seconds": round(spent, 3), "instances": instances}
+
+
+def _heard(plan: SitlPlan, number: int) -> str:
+    """The pilot's options that hear the instruments of an instance."""
+    return "".join(
+        f" --{option} {kind}:{plan.host}:{ports[kind] + NEXT_PORT * number}"
+        for option, ports in PORTS.items()
+        for kind in plan.emulated
+        if kind in ports
+    )
 
 
 def _written(place: np.ndarray) -> str:
