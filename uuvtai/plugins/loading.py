@@ -102,10 +102,8 @@ def _module(spec: PluginSpec) -> ModuleType:
     if key not in _loaded:
         name = f"uuv_own_{spec.path.stem}_{digest[:8]}"
         if name in sys.modules:
-            raise PluginError(
-                f"{spec.path}: runs itself again; move all but imports, functions and classes below "
-                "'if __name__ == \"__main__\":'"
-            )
+            below = "move all but imports, functions and classes below 'if __name__ == \"__main__\":'"
+            raise PluginError(f"{spec.path}: runs itself again; {below}")
         found = importlib.util.spec_from_loader(name, _OwnSource(name, str(spec.path)))
         assert found is not None  # a loader was given
         module = importlib.util.module_from_spec(found)

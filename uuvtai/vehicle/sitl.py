@@ -26,7 +26,7 @@ from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
 from uuvtai.vehicle.instruments import ping
-from uuvtai.vehicle.instruments.emulate import KINDS, FakeRig, emulated
+from uuvtai.vehicle.instruments.emulate import KINDS, NEXT_PORT, FakeRig, emulated
 from uuvtai.vehicle.instruments.rig import PORTS
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
 from uuvtai.vehicle.messages import three
@@ -366,7 +366,6 @@ class ServingNotes:
         return found
 
 
-NEXT_PORT = 10  # from one instance's port to the next one's, as ArduPilot counts
 SENSORS = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _LONGEST = 128  # [bytes] a longer packet is none of ArduSub's
 _SILENT_S = 2.0  # who has been silent for so long may be followed by somebody else
