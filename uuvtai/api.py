@@ -12,7 +12,7 @@ import shutil
 import tempfile
 import webbrowser
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -176,8 +176,8 @@ def evaluate(
     from uuvtai.evaluation.evaluate import compare
     from uuvtai.evaluation.results import Request
 
-    if episodes < 1:
-        raise SettingError(f"episodes={episodes}: at least 1")
+    _check(1, episodes=episodes)
+    _check(0, record=record)
     request = Request.typed(
         _scene(world, sensors, vehicle, overrides), [*_named(agents), *_named(planners, "planner")],
         seeds=_seeds(seeds), episodes=episodes, record=record, explain=explain,
@@ -207,8 +207,10 @@ def sweep(
     from uuvtai.evaluation import sweep as sweeps
     from uuvtai.evaluation.grid import Grid, SweepRequest, checked, grid_of
 
+    _check(1, episodes=episodes, workers=workers)
     engine = sweeps.engine_of("local", workers, "")
-    axes = grid_of([grid]) if isinstance(grid, str) else checked(Grid({k: tuple(v) for k, v in grid.items()}))
+    own = {} if isinstance(grid, str) else {axis: tuple(_several(values)) for axis, values in grid.items()}
+    axes = grid_of([grid]) if isinstance(grid, str) else checked(Grid(own))
     request = SweepRequest.typed(
         _scene(world, sensors, vehicle, overrides), _named(agents), grid=axes, episodes=episodes,
         seeds=tuple(_seeds(seeds)), num_envs=num_envs, device=device,
@@ -287,10 +289,23 @@ def _scene(
     return SceneOptions(world, sensors, vehicle, overrides=changes)
 
 
+def _check(least: int, **counts: int) -> None:
+    """SettingError for what is no count."""
+    for name, value in counts.items():
+        if not hasattr(value, "__index__") or value < least:
+            raise SettingError(f"{name}={value!r}: must be a whole number, at least {least}")
+
+
+def _several(given: Any) -> list[Any]:
+    """What was given, alone or in a row."""
+    return [*given] if isinstance(given, Iterable) and not isinstance(given, str) else [given]
+
+
 def _seeds(seeds: int | Sequence[int]) -> list[int]:
     from uuvtai.envs.vector_env import checked_seed
 
-    return [checked_seed(seed) for seed in ([seeds] if isinstance(seeds, int) else seeds)]
+    _check(1, seeds=len(found := _several(seeds)))
+    return [checked_seed(seed) for seed in found]
 
 
 def _path(place: str | os.PathLike[str] | None) -> Path | None:
@@ -299,8 +314,7 @@ def _path(place: str | os.PathLike[str] | None) -> Path | None:
 
 def _named(given: Agent | Sequence[Agent], kind: str = "") -> list[str]:
     """As ``--agent`` takes them. SettingError for a function that lies in no file."""
-    several = [*given] if isinstance(given, Sequence) and not isinstance(given, str) else [given]
-    return [_name(one, f"{kind}:" if kind else "") for one in several]
+    return [_name(one, f"{kind}:" if kind else "") for one in _several(given)]
 
 
 def _name(agent: Agent, kind: str) -> str:
@@ -334,7 +348,8 @@ def _printed(shown: Shown) -> tuple[str, list[Table]]:
 
     found: list[Table] = []
     width = shutil.get_terminal_size((100, 24)).columns
-    shown._show(Keeping(console=Console(file=(text := StringIO()), width=width), more="to_pandas()"))
+    console = Console(file=(text := StringIO()), width=width, force_terminal=False, force_jupyter=False)
+    shown._show(Keeping(console=console, more="to_pandas()"))
     return text.getvalue().rstrip(), found
 
 

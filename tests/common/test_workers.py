@@ -19,6 +19,16 @@ def test_local_workers_give_every_result_once():
     assert sorted(LocalEngine(2).run(worker_work.square, [3, 1, 2])) == [(0, 9), (1, 1), (2, 4)]
 
 
+def test_a_script_that_starts_workers_runs_once(tmp_path):
+    """Notebooks and first scripts have no ``if __name__ == "__main__"``."""
+    (script := tmp_path / "mine.py").write_text(
+        "from uuvtai.common.processes import LocalEngine\n"
+        "print('begun', list(LocalEngine().run(abs, [-2])))\n"
+    )
+    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=100, check=False)
+    assert (ran.stdout, ran.stderr, ran.returncode) == ("begun [(0, 2)]\n", "", 0)
+
+
 def test_a_lost_worker_costs_its_task_once_more(tmp_path):
     assert list(LocalEngine(1).run(worker_work.fall_once, [str(tmp_path / "a"), str(tmp_path / "b")])) == [
         (0, "a"),

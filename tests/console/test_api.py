@@ -74,6 +74,9 @@ def test_results_print_as_tables_in_a_terminal_and_in_a_notebook(run, monkeypatc
     )
     page = found._repr_html_()
     assert page.count("<table>") == 2 and "<td>own-act</td>" in page and str(found.folder) in repr(found)
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)  # there Rich shows instead of writing
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert "own-act" in str(found) and "\x1b" not in str(found) and found._repr_html_() == page
     odd = api._html(found.tables()[0].__class__((), (), "<script>"))
     assert "<script>" not in odd and "&lt;script&gt;" in odd
 
@@ -119,7 +122,10 @@ def test_functions_and_classes_of_a_file_are_agents_and_others_are_refused(run, 
 
 def test_bad_input_is_refused_as_by_the_command():
     for error, words in (
-        ("at least 1", {"episodes": 0}),
+        ("episodes=0: .* at least 1", {"episodes": 0}),
+        ("episodes='8': must be a whole number", {"episodes": "8"}),
+        ("record=-1: .* at least 0", {"record": -1}),
+        ("seeds=0: .* at least 1", {"seeds": []}),
         ("negative", {"seeds": -1}),
         ("given twice", {"seeds": [1, 1]}),
         ("did you mean 'pool'", {"world": "poool"}),
@@ -127,8 +133,14 @@ def test_bad_input_is_refused_as_by_the_command():
     ):
         with pytest.raises(ValueError, match=error):
             uuvtai.evaluate("straight", **words)
-    with pytest.raises(ValueError, match="axis"):
-        uuvtai.sweep("straight", {"nothing": [1]})
+    for error, grid, words in (
+        ("axis", {"nothing": [1]}, {}),
+        ("episodes=0", {"D": 3}, {"episodes": 0}),
+        ("workers=0", {"D": 3}, {"workers": 0}),
+        ("'poool' is no world preset", {"world": "poool"}, {}),
+    ):
+        with pytest.raises(ValueError, match=error):
+            uuvtai.sweep("straight", grid, **words)
     with pytest.raises(AttributeError, match="nowhere"):
         uuvtai.nowhere()
     assert {"evaluate", "train", "make"} <= set(dir(uuvtai))
@@ -136,6 +148,7 @@ def test_bad_input_is_refused_as_by_the_command():
 
 def test_a_sweep_and_a_training_are_those_of_the_commands(run, tmp_path, pandas):
     cells = uuvtai.sweep("straight", {"D": [0, 9]}, episodes=2, run_dir=tmp_path / "sweep", **SMALL)
+    assert api._several(3) == [3] and api._several((1, 2)) == [1, 2]
     assert [row["D"] for row in cells.to_pandas()] == [0, 9] and "2 cells x 2 episodes" in str(cells)
     few = SmallSim.CHANGES | {"train.num_envs": 8, "episode.horizon_steps": 400, "distillation.batch": 32}
     few |= {"world_model.batch": 32}

@@ -153,6 +153,11 @@ def test_two_rows_never_share_a_name(write):
         (None, "mine.py:act", "mine.py cannot be read (No such file or directory)"),
         ("def act(view:\n", "mine.py:act", "mine.py:1: SyntaxError"),
         ("x = 1\nprint(y)\n", "mine.py:act", "mine.py:2: NameError: name 'y' is not defined (while --agent"),
+        (
+            "import uuvtai\nuuvtai.evaluate('mine.py:act')\n",
+            "mine.py:act",
+            "mine.py: runs itself again; move all but imports, functions and classes below",
+        ),
         ("raise SystemExit(3)\n", "mine.py:act", "mine.py:1: SystemExit: 3"),
         ("def drive(view): ...\n", "mine.py:act", "mine.py has no 'act'; it has drive"),
         (

@@ -1,6 +1,7 @@
 """The player of recorded episodes: what it holds is the log's, small, harmless, and drawn in its place."""
 
 import base64
+import copy
 import hashlib
 import json
 import re
@@ -130,6 +131,13 @@ def test_what_is_too_much_is_left_out(log, monkeypatch):
     header, arrays = unpacked(blob)
     assert len(blob) <= 9_000 and header["left_out"][0] == "echoes"
     assert "pose" in arrays and "echoes.of" not in arrays
+
+
+def test_of_a_replay_nothing_is_told_that_nobody_knows(log):
+    replayed = copy.deepcopy(log)
+    replayed.head.metadata["uuv.result"] = {"outcome": drawing.REPLAYED}
+    told, known = (unpacked(packed_agent(one, "#0072b2", FACT))[1] for one in (replayed, log))
+    assert known.keys() - told.keys() == {"clearance", "ttc"} and "speed" in told
 
 
 EVIL = "</script><script>alert(1)</script>"

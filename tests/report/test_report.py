@@ -810,3 +810,11 @@ def test_a_small_file_cannot_make_a_page_without_end(tmp_path, file, document, s
     (run / file).write_text(json.dumps(document))
     with pytest.raises(ConfigError, match=re.escape(says)):
         report([run])
+
+
+@pytest.mark.parametrize(("argv", "told"), [
+    (["/usr/bin/uuv", "eval", "-S", "8"], "uuv eval -S 8"), (["/lib/uuvtai/cli.py", "eval"], "uuv eval"),
+    (["/lib/ipykernel_launcher.py", "-f", "/tmp/x.json"], "called from Python"), ([], ""),
+])  # fmt: skip
+def test_a_command_is_told_as_it_was_typed(argv, told):
+    assert build.command_of({"argv": argv}) == told

@@ -569,6 +569,8 @@ def test_a_log_that_is_opened_gives_log_picture_and_report(log, build, tmp_path,
     assert Path(found["picture"]).stat().st_size > 1000
     own, other = ([m.data["behavior"] for m in read_messages(Path(path), ["/action"])]
         for path in (log, found["recorded"]))  # fmt: skip
+    speeds = [np.linalg.norm(m.data["velocity"]) for m in read_messages(Path(found["recorded"]), ["/state"])]
+    assert max(speeds) > 0.05, "as estimated, in place of the truth"
     assert own == other and read_head(Path(found["recorded"])).metadata["uuv.result"]["outcome"] == "replayed"
     assert json.loads((run / "run.json").read_text())["status"] == "finished"
 

@@ -1,5 +1,6 @@
 """Our water behind ArduSub's JSON interface: bytes, lockstep, restarts, axes, sensors the pilot knows."""
 
+import io
 import json
 import math
 import re
@@ -540,8 +541,10 @@ def test_the_command_serves_and_tells(capfd, monkeypatch, small, words):
     monkeypatch.setattr(sitl, "Sim", lambda config, rows, tree: small.sim)
     number = free_port()
     place = ["--port", str(number), "--mavlink", "udpout:127.0.0.1:9", "--seconds", "0.2"]
-    code, out, err = uuv(capfd, "sitl", *place, *words)
-    assert code == 0 and f"water for ArduSub at UDP 127.0.0.1:{number}" in err
+    monkeypatch.setattr(sitl, "FakeRig", lambda *_: io.BytesIO())  # closes
+    code, out, err = uuv(capfd, "sitl", *place, "--as", "a50,ping360", *words)
+    assert code == 0 and f"physics for ArduSub at UDP 127.0.0.1:{number}" in err
+    assert "--heading 0 --dvl a50:127.0.0.1:16171 --sonar ping360:127.0.0.1:9092\n" in err
     if words:
         assert json.loads(out)["instances"][0]["outcome"] == "waiting"
     else:

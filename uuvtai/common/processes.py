@@ -6,11 +6,13 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection, popen_spawn_posix
+from types import ModuleType
 from typing import Any, TypeVar
 
 from uuvtai.common import signals
@@ -97,22 +99,25 @@ class LocalEngine:
     ) -> None:
         """Give every free worker a task, and no more: what waits inside a broken pool is lost too."""
         while todo and len(running) < self._workers:
-            with _ctrl_c_held():
+            with _apart():
                 future = pool.submit(work, items[todo[0]])
             running[future] = todo.pop(0)
 
 
 @contextlib.contextmanager
-def _ctrl_c_held() -> Iterator[None]:
-    """Processes started inside do not hear Ctrl-C, sent to all by a terminal, before they can ignore it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _apart() -> Iterator[None]:
+    """Processes started inside do not hear Ctrl-C, sent to all by a terminal, before they can ignore it, and
+    do not import the user's script, which would run it again."""
+    script, mask = sys.modules["__main__"], None
+    if hasattr(signal, "pthread_sigmask"):
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    sys.modules["__main__"] = ModuleType("__main__")
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        sys.modules["__main__"] = script
+        if mask is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _begin_worker(threads: int) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import subprocess
 import sys
@@ -92,7 +93,8 @@ def start_taichi(device: str = "cpu", precision: str = "f32") -> Runtime:
         options = {}
     if threads := os.environ.get("UUV_NUM_THREADS"):
         options["cpu_max_num_threads"] = _thread_count(threads)
-    with contextlib.redirect_stdout(sys.stderr):  # Taichi greets on stdout, which belongs to results
+    print("starting; kernels of sizes not used before are compiled, about half a minute", file=sys.stderr)
+    with contextlib.redirect_stdout(io.StringIO()):  # Taichi greets on stdout, which belongs to results
         ti.init(
             arch=ti.cuda if wanted.device == "cuda" else ti.cpu,
             default_fp=wanted.real,

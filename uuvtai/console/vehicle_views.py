@@ -164,7 +164,8 @@ def show_flight(screen: Screen, found: dict[str, Any]) -> None:
     rows = [[name, str(count), f"{100 * count / steps:.0f} %"] for name, count in found["actions"].items()]
     screen.table(Table(_ACTIONS, rows, title))
     counts = [[name, str(row["said"]), str(row["sent"])] for name, row in found["said"].items()]
-    screen.table(Table(_ORDERS, counts, f"driven in {found['driven_in'] or 'no mode'}"))
+    if counts:
+        screen.table(Table(_ORDERS, counts, f"driven in {found['driven_in'] or 'no mode'}"))
     sensors = [[name, *(str(row[key]) for key in _FATES)] for name, row in found["sensors"].items()]
     screen.table(Table(_SENSORS, sensors, "messages"))
     show_instruments(screen, found["instruments"])
@@ -172,7 +173,7 @@ def show_flight(screen: Screen, found: dict[str, Any]) -> None:
         screen.line(f"not used, {count} times: {name}")
     if found["log_trouble"]:
         screen.line(found["log_trouble"])
-    screen.line(f"ended: {found['ended']}; log: {found['log']}")
+    screen.line(f"ended: {found['ended']}; next: uuv log import {shlex.quote(found['log'])}")
 
 
 def show_instruments(screen: Screen, places: dict[str, dict[str, Any]]) -> None:

@@ -160,9 +160,6 @@ def comparison_of(
     the same in all. And the policies, ready for them."""
     from uuvtai.sim.sim import Sim
 
-    watch.note(
-        f"starting {num_envs} envs (sizes not used before compile their kernels first, about half a minute)"
-    )
     configs = {agent.stack: agent.config_of(request.config) for agent in agents} or {None: request.config}
     tree = agents[0].tree if agents else read_tree(TRAINING_TREE)  # the oracle drives nothing
     sims = {stack: Sim(config, num_envs, tree, request.device) for stack, config in configs.items()}

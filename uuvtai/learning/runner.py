@@ -119,7 +119,6 @@ def _train(
         folder.settle(found.step >= config.train.iterations)
         done, more = f"{found.step} of {total} iterations", f"--iterations {2 * found.step}"
         raise ConfigError(f"{folder.path}: has done {done}; to go on give more: {more}")
-    watch.note(f"starting {config.train.num_envs} envs (new sizes compile kernels first: half a minute)")
     trainer = _trainer(config, request.device, request.reward)
     for checked in filter(None, (found, start)):
         checked.check_table(trainer.observation_table, config)

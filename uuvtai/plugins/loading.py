@@ -99,6 +99,9 @@ def _module(spec: PluginSpec) -> ModuleType:
     key = str(spec.path.resolve()), digest
     if key not in _loaded:
         name = f"uuv_own_{spec.path.stem}_{digest[:8]}"
+        if name in sys.modules:
+            below = "move all but imports, functions and classes below 'if __name__ == \"__main__\":'"
+            raise PluginError(f"{spec.path}: runs itself again; {below}")
         found = importlib.util.spec_from_loader(name, _OwnSource(name, str(spec.path)))
         assert found is not None  # a loader was given
         module = importlib.util.module_from_spec(found)

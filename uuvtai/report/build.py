@@ -246,9 +246,11 @@ MANIFEST_BYTES = 16 << 20  # [bytes] more than any manifest of a checkpoint has
 
 
 def command_of(record: dict[str, Any]) -> str:
-    """The command line of run.json as a person types it."""
-    argv = [str(word) for word in record.get("argv", [])]
-    return shlex.join(["uuv", *argv[1:]]) if argv else ""
+    """The command line of run.json as a person types it; of a script or notebook that it was one."""
+    program, *words = [str(word) for word in record.get("argv", [])] or [""]
+    if program and Path(program).stem not in ("uuv", "cli"):
+        return "called from Python"
+    return shlex.join(["uuv", *words]) if program else ""
 
 
 def status_notice(record: dict[str, Any]) -> list[Block]:

@@ -159,7 +159,7 @@ def packed_agent(recording: Recording, colour: str, fact: Fact) -> bytes:
 def _add_along(pack: _Packer, recording: Recording, times: Sequence[float]) -> None:
     """What there is at every step, as of that moment."""
     safety, leaves = recording["/safety"], [str(leaf)[:40] for leaf in recording["/action"].values]
-    if safety.times:
+    if safety.times and recording.outcome != drawing.REPLAYED:  # nobody knows the truth
         first = safety.values[0]
         rows = [safety.at(time_s) or first for time_s in times]
         pack.add("clearance", [row[0] for row in rows], PLACE_M)

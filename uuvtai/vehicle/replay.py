@@ -464,6 +464,7 @@ def open_replay(
 
         def record(step: int) -> None:
             views["vehicle.pos_w"][0] = views["ego.pos_w"][0]
+            views["vehicle.vel_b"][0] = views["ego.vel_b"][0]
             views["vehicle.quat_wb"][0] = quaternion_of(views["ego.rpy"][0])
             if step:
                 recorder.step(sim)

@@ -26,7 +26,8 @@ from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
 from uuvtai.vehicle.instruments import ping
-from uuvtai.vehicle.instruments.emulate import KINDS, FakeRig, emulated
+from uuvtai.vehicle.instruments.emulate import KINDS, NEXT_PORT, FakeRig, emulated
+from uuvtai.vehicle.instruments.rig import PORTS
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
 from uuvtai.vehicle.messages import three
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
@@ -329,7 +330,7 @@ class ServingNotes:
                 f"{self._name}: nothing of ArduSub's has come to UDP port {self._port} yet: start it with "
                 "--model JSON:127.0.0.1, or give its port: --port"
             ]
-        return [f"{self._name}: ArduSub has been silent for {SILENT_S:g} s; the water waits"]
+        return [f"{self._name}: ArduSub has been silent for {SILENT_S:g} s; the physics waits"]
 
     def _episode(self, instance: Instance) -> list[str]:
         seen, found = self._seen, []
@@ -341,7 +342,6 @@ class ServingNotes:
         return found
 
 
-NEXT_PORT = 10  # from one instance's port to the next one's, as ArduPilot counts
 SENSORS = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _LONGEST = 128  # [bytes] a longer packet is none of ArduSub's
 _SILENT_S = 2.0  # who has been silent for so long may be followed by somebody else
@@ -511,14 +511,13 @@ def serve_water(
         begun = time.monotonic()
         signals.engage()  # there is a document to print
         shown = ", ".join(f"{plan.host}:{plan.port + NEXT_PORT * number}" for number in range(plan.instances))
-        note(
-            f"water for ArduSub at UDP {shown}; start it with: ardusub --model JSON:{plan.host}; Ctrl-C ends"
-        )
+        begin = f"start it with: ardusub --model JSON:{plan.host}"
+        note(f"physics for ArduSub at UDP {shown}; {begin}; Ctrl-C ends")
         for number in range(plan.instances):
             water.begin(number)
             start, goal = (_written(water.value(f"mission.{name}_w", number)) for name in ("start", "goal"))
-            heading = f"{config.world.tank.heading_deg or 0.0:g}"
-            note(f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading {heading}")
+            words = f"--start {start} --goal {goal} --heading {config.world.tank.heading_deg or 0.0:g}"
+            note(f"instance {number}: uuv pilot needs {words}{_heard(plan, number)}")
         _serve(ports, plan, begun, note)
     except KeyboardInterrupt:
         note("interrupted")
@@ -528,6 +527,16 @@ def serve_water(
     spent = time.monotonic() - begun
     instances = [port.instance.document() for port in ports]
     return {"schema": 1, "seconds": round(spent, 3), "instances": instances}
+
+
+def _heard(plan: SitlPlan, number: int) -> str:
+    """The pilot's options that hear the instruments of an instance."""
+    return "".join(
+        f" --{option} {kind}:{plan.host}:{ports[kind] + NEXT_PORT * number}"
+        for option, ports in PORTS.items()
+        for kind in plan.emulated
+        if kind in ports
+    )
 
 
 def _written(place: np.ndarray) -> str:

@@ -219,7 +219,7 @@ CAMERA = {
     "sigma_slope": 0.0,
 }
 """of a simulated camera behind a 3D-15: wider and higher than it sees"""
-_NEXT_PORT = 10  # as from one ArduSub's port to the next one's
+NEXT_PORT = 10  # from one instance's port to the next one's, as ArduPilot counts
 
 
 def emulated(config: Config, kinds: tuple[str, ...]) -> Config:
@@ -242,7 +242,7 @@ class FakeRig:
         self._dvl: FakeA50 | None = None
         self._head: FakePing360 | None = None
         self._image: FakeSonar3D | None = None
-        port, next_port = 0, _NEXT_PORT * number
+        port, next_port = 0, NEXT_PORT * number
         try:
             if "a50" in kinds:
                 self._dvl = FakeA50(host, port := a50.PORT + next_port, number)
