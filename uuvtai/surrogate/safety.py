@@ -36,7 +36,7 @@ def lack_to_obstacle(env, lane, vel, target, horizon_s, obstacles: AnyTensor, io
     two = 4.0 * ti.Vector([obstacles[env, lane, 14], obstacles[env, lane, 15]]) - place
     bend, over = 0.5 * two - one, ti.min(obstacles[env, lane, 8], obstacles[env, lane, 9])
     out, pos = 0.0, ti.Vector([0.0, 0.0])
-    for k in range(ti.cast(horizon_s / Safety.STEP_S + 0.5, ti.i32)):
+    for k in range(ti.cast(horizon_s / Safety.STEP_S + 0.5, ti.i32)):  # type: ignore[arg-type]
         t = (k + 1) * Safety.STEP_S
         pos, vel = moved(pos, vel, target)
         way = place + (one - bend) * t + bend * (t * t) - pos
