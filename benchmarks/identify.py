@@ -19,7 +19,7 @@ from uuvtai.common.statistics import wilson_interval
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config, VehicleConfig
 from uuvtai.config.loader import load_config
-from uuvtai.evaluation.simulate import roll_pitch_yaw
+from uuvtai.logs.topics.motion import angles_of
 from uuvtai.sim.plant import Plant
 from uuvtai.vehicle.identify.drive_log import Drive, up_axis
 from uuvtai.vehicle.identify.fit import KNOWN, fitted_drives
@@ -183,7 +183,7 @@ def commands(rng: np.random.Generator, count: int, steps: int, dt_s: float) -> n
 
 
 def _sample(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-    tilt = np.array([roll_pitch_yaw(q)[:2] for q in plant.read(plant.vehicle.quat_wb).astype(float)])
+    tilt = np.array([angles_of(*q)[:2] for q in plant.read(plant.vehicle.quat_wb).astype(float)])
     return tilt, plant.read(plant.vehicle.rpm)
 
 

@@ -58,6 +58,7 @@ FACTORY = "load"
 """a function of this name is called once; what it returns drives"""
 
 _loaded: dict[tuple[str, str], ModuleType] = {}
+_importing: set[tuple[str, str]] = set()
 
 
 class _OwnSource(SourceFileLoader):
@@ -99,7 +100,7 @@ def _module(spec: PluginSpec) -> ModuleType:
     key = str(spec.path.resolve()), digest
     if key not in _loaded:
         name = f"uuv_own_{spec.path.stem}_{digest[:8]}"
-        if name in sys.modules:
+        if key in _importing:
             below = "move all but imports, functions and classes below 'if __name__ == \"__main__\":'"
             raise PluginError(f"{spec.path}: runs itself again; {below}")
         found = importlib.util.spec_from_loader(name, _OwnSource(name, str(spec.path)))
@@ -109,11 +110,14 @@ def _module(spec: PluginSpec) -> ModuleType:
         if folder not in sys.path:  # what lies beside it can be imported, as for 'python mine.py'
             sys.path.insert(0, folder)
         sys.modules[name] = module  # dataclasses and pickles look for it
+        _importing.add(key)
         try:
             _OwnSource(name, str(spec.path)).exec_module(module)
         except (Exception, SystemExit) as error:
             del sys.modules[name]
             raise failed(error, spec.path, f"while {spec.option} was imported") from error
+        finally:
+            _importing.discard(key)
         _loaded[key] = module
     return _loaded[key]
 

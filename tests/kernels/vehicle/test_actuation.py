@@ -8,9 +8,9 @@ from tests.oracles import actuation as oracle
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config, Thruster, VehicleConfig
 from uuvtai.config.loader import load_config
-from uuvtai.evaluation.simulate import roll_pitch_yaw
 from uuvtai.kernels.core.stage import Const
 from uuvtai.kernels.vehicle.dynamics import rpm_of_thrust, thrust_limits, thrust_of_rpm
+from uuvtai.logs.topics.motion import angles_of
 from uuvtai.sim.plant import Plant
 from uuvtai.sim.setup import allocation_matrices, controllable_axes
 
@@ -48,9 +48,7 @@ def drive(plant, actions, steps):
     for _ in range(steps):
         plant.step(actions)
         velocity.append(np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()[:, 2]])
-        tilt.append(
-            [np.degrees(np.abs(roll_pitch_yaw(q)[:2]).max()) for q in plant.vehicle.quat_wb.to_numpy()]
-        )
+        tilt.append([np.degrees(np.abs(angles_of(*q)[:2]).max()) for q in plant.vehicle.quat_wb.to_numpy()])
     return np.array(velocity), np.array(tilt)
 
 
