@@ -29,9 +29,9 @@ async function wall(browser) {
   const seen = await inPlayer(tab, "({ tank: player.tank, echoes: player.source.details.at(-1).echoes.length, words: player.ending.textContent })");
   await tab.keyboard.press("Space");
   await until(tab, "player.role.held === 'pause'");
-  const paused = await inPlayer(tab, "player.source.end");
   const second = await opened(browser, address, 390, "dark"); // comes while it is paused
   await ready(second.tab);
+  const paused = await inPlayer(tab, "player.source.end"); // what was on its way has come
   const other = await inPlayer(second.tab, "({ end: player.tanks[1].end, helm: player.role.helm })");
   await tab.keyboard.press("ArrowLeft");
   const back = await inPlayer(tab, "({ time: player.time, now: player.now })");
