@@ -116,4 +116,4 @@ class Safety:
     WALL_HORIZON_S, WALL_S, WALL_M = 1.0, 0.1, 0.05  # the same of walls and static obstacles, as ends of rays
     SIGHT_M = 1.4  # so far away no wall is reached by then
     DIRECTIONS = 16  # wishes that are tried: none, and these at full and at half speed
-    LACK_COST = 100.0  # a metre of clearance that lacks counts as this square of a change of the wish
+    LACK_COST = 100.0  # a missing metre of clearance counts as this square of a change of the wish

@@ -15,8 +15,8 @@ from uuvtai.surrogate.motion import carried_out, part
 
 @ti.func
 def lack_of(clearance_m, way, vel, spare_m, spare_s):
-    """[m] of clearance that lacks to something ``clearance_m`` away in the direction ``way`` (x, y), which
-    comes nearer by ``vel``."""
+    """[m] of clearance that is missing to something ``clearance_m`` away in the direction ``way`` (x, y),
+    which comes nearer by ``vel``."""
     closing = vel.dot(way) / ti.max(way.norm(), 1e-3)
     return spare_m + ti.max(closing, 0.0) * spare_s - clearance_m
 
@@ -30,7 +30,8 @@ def moved(pos, vel, target):
 
 @ti.func
 def lack_to_obstacle(env, lane, vel, target, horizon_s, obstacles: AnyTensor, io: Bundle[SafetyRules]):
-    """[m] that lacks at the worst to one obstacle, which goes on as forecast; what is later counts less."""
+    """[m] of clearance that is missing at the worst to one obstacle, which goes on as forecast; what is later
+    counts less."""
     place = 4.0 * ti.Vector([obstacles[env, lane, 1], obstacles[env, lane, 2]])
     one = 4.0 * ti.Vector([obstacles[env, lane, 12], obstacles[env, lane, 13]]) - place
     two = 4.0 * ti.Vector([obstacles[env, lane, 14], obstacles[env, lane, 15]]) - place
@@ -53,8 +54,7 @@ def lack_to_obstacle(env, lane, vel, target, horizon_s, obstacles: AnyTensor, io
 
 @ti.func
 def worst_lack(env, wish, horizon_s, obstacles: AnyTensor, own: FloatMatrix, io: Bundle[SafetyRules]):
-    """[m] of clearance that lacks at the worst on the way that the hull takes by a wish (x, y), not below
-    0."""
+    """[m] of clearance that is missing at the worst on the way of the hull by a wish (x, y), not below 0."""
     fastest = ti.sqrt(io.vehicle_cfg.max_surge_m_s**2 + io.vehicle_cfg.max_sway_m_s**2)
     target, vel, out = Safety.REACHED * fastest * wish, ti.Vector([own[env, 6], own[env, 7]]), 0.0
     for lane in range(obstacles.shape[1]):

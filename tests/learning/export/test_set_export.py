@@ -182,7 +182,7 @@ def test_the_hull_rule_is_that_of_the_oracle():
     assert decision.command((0.01, 0.0, 0.0), (1, 1), 0.3, -0.8)[3] == 0.0, "too slow to turn for"
 
 
-def module_policy():
+def module_policy(safety=()):
     """A policy of made-up weights, without a folder."""
     config = load_training("policy", overrides=NET)
     actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
@@ -194,7 +194,7 @@ def module_policy():
         },
         "network": {"goal_gain": 0.7},
         "hull_rule": hull_rule_of(config),
-        "safety": safety_of(config),
+        "safety": safety_of(config) | dict(safety),
     }
     arrays = {f"actor.{name}": tensor.numpy() for name, tensor in actor.net.state_dict().items()}
     return run_policy.SetPolicy(spec, arrays)
@@ -222,6 +222,22 @@ def test_the_safety_filter_is_that_of_the_vehicle():
     np.testing.assert_allclose(found, wanted, atol=1e-5)
     changed = (found.numpy() != wish).any(1)
     assert 20 < changed.sum() < n - 20
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"directions": 1e9},
+        {"step_s": 0.0},
+        {"step_s": 1e-9},
+        {"horizon_s": -1.0},
+        {"lag_s": 0.0},
+        {"hull_m": "wide"},
+    ],
+)
+def test_a_filter_with_impossible_numbers_is_refused_before_it_drives(change):
+    with pytest.raises((ValueError, ArithmeticError)):
+        module_policy(change)
 
 
 def test_order_and_number_of_obstacles_do_not_matter():

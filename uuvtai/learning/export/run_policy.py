@@ -51,6 +51,8 @@ SUM_SCALE = 0.3
 MOST_WISH = 2.0
 MAX_BYTES = 64 << 20
 """of any file of the folder: sixteen million parameters"""
+MOST_TRIED = 360
+"""steps and directions that a safety filter may look at"""
 CALLS = 330
 """decisions that a latency is measured with"""
 TOLERANCE = 1e-5
@@ -212,9 +214,16 @@ class SetPolicy(Exported):
 
     def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
         super().__init__(spec, arrays)
-        self.rule, self.safety = spec["hull_rule"], spec["safety"]
+        self.rule = spec["hull_rule"]
+        self.safety = {name: float(value) for name, value in spec["safety"].items()}
         n_obstacle, n_own = (len(spec["observation"][name]["columns"]) for name in self.inputs)
         self.shapes = (None, n_obstacle), (n_own,)
+        steps, directions = self.safety["horizon_s"] / self.safety["step_s"], self.safety["directions"]
+        if not (
+            0.0 <= steps <= MOST_TRIED and 1.0 <= directions <= MOST_TRIED and self.safety["lag_s"] > 0.0
+        ):
+            raise ValueError("safety")
+        self.kept_safe(np.zeros(3), np.ones((1, n_obstacle)), np.zeros(n_own))
         self._gain = np.float32(spec["network"]["goal_gain"])
         self._each = _layers(arrays, "actor.obstacle", n_obstacle)
         self._own = _layers(arrays, "actor.own", n_own)
@@ -258,8 +267,8 @@ class SetPolicy(Exported):
         return np.append(tried[cost.argmin()], wish[2])
 
     def _lacks(self, wishes: np.ndarray, obstacles: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """(k,) metres of clearance that lack at the worst on the ways that the hull takes by wishes (k, 2),
-        not below 0; what lies later counts less."""
+        """(k,) metres of clearance that are missing at the worst on the ways of the hull by wishes (k, 2), not
+        below 0; what lies later counts less."""
         rule, dt = self.safety, self.safety["step_s"]
         n = round(rule["horizon_s"] / dt)
         target, t = (
@@ -324,7 +333,7 @@ KINDS: dict[str, type[Exported]] = {"mlp": Policy, "set": SetPolicy}
 def _lack(
     apart: np.ndarray, way: np.ndarray, coming: np.ndarray, spare_m: float, spare_s: float
 ) -> np.ndarray:
-    """[m] that lack to what is ``apart`` in the direction ``way`` (..., 2) and comes nearer by ``coming``."""
+    """[m] that are missing to what is ``apart`` in the direction ``way`` (..., 2) and comes by ``coming``."""
     closing = (coming * way).sum(-1) / np.maximum(np.linalg.norm(way, axis=-1), 1e-3)
     return spare_m + np.maximum(closing, 0.0) * spare_s - apart
 
