@@ -267,8 +267,8 @@ class SetPolicy(Exported):
         return np.append(tried[cost.argmin()], wish[2])
 
     def _lacks(self, wishes: np.ndarray, obstacles: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """(k,) metres of clearance that are missing at the worst on the ways of the hull by wishes (k, 2), not
-        below 0; what lies later counts less."""
+        """(k,) metres of clearance that are missing at the worst on the ways of the hull by wishes (k, 2),
+        not below 0; what lies later counts less."""
         rule, dt = self.safety, self.safety["step_s"]
         n = round(rule["horizon_s"] / dt)
         target, t = (
