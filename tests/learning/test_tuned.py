@@ -316,7 +316,7 @@ def test_the_shipped_stack_holds_factors_that_a_training_can_find():
     changed = ("slow", "fast", "tracking", "forecast", "quiet", "route", "behavior")
     own = {name: getattr(usual, name) for name in changed}
     assert ours.model_copy(update=own) == usual
-    brisk = {"heading_clearance_m": 0.48, "slow_fraction": 1.0, "patience_s": 0.0}
+    brisk = {"heading_clearance_m": 0.48, "slow_fraction": 1.0, "patience_s": 0.0, "travel_diagonal": True}
     assert ours.behavior == usual.behavior.model_copy(update=brisk)
     assert ours.route == usual.route.model_copy(update={"lookahead_m": 0.8})
     assert ours.quiet == usual.quiet.model_copy(update={"room_m": 0.8})

@@ -8,7 +8,7 @@ import torch
 
 from tests.command import Quiet
 from uuvtai.config.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
-from uuvtai.evaluation.agents import load_agents
+from uuvtai.evaluation.agents import differences, load_agents
 from uuvtai.evaluation.evaluate import Request, compare
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.sim import Sim
@@ -108,3 +108,13 @@ def test_every_stack_plans_and_drives(small, stack):
     moved = sim.rows(sim.s.vehicle.pos_w) - sim.rows(sim.s.mission.start_w)
     assert np.hypot(*moved[:, :2].T).min() > 0.3
     sim.close()
+
+
+def test_what_a_stack_keeps_from_set_is_told():
+    """An agent's stack wins over ``--set`` in its own row: nobody should think that his key counted."""
+    best, bt = load_agents(["best", "bt"])
+    asked = load_config(overrides={"behavior.slow_fraction": 0.5, "behavior.travel_diagonal": True})
+    assert differences(best, asked) == (
+        "best: its stack has behavior.slow_fraction = 1.0, not 0.5; write a stack that 'extends: best'"
+    )
+    assert differences(bt, asked) == differences(best, load_config("gauntlet_inertial")) == ""

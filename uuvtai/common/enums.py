@@ -54,16 +54,16 @@ def clearance_m(site: Any, config: Any) -> Any:
 
 PACKET = 16  # columns and units come in whole packets (``kernels.core.simd.LANES``)
 
-N_PAST, PAST_S = 10, 0.3  # places remembered of each track, and the time between them
+N_PAST, PAST_S = 9, 0.3  # places remembered of each track, and the time between them
 N_BEND = 4  # turns remembered of each track
 LENGTH_M, FAR = 4.0, 2.0
 AHEAD_STEPS = (5, 10, 15, 20, 25)  # samples of the forecast that are told
 N_FRAME = 5
-N_MOTION, N_AHEAD = 12, 9
+N_MOTION, N_AHEAD = 13, 9
 COLUMNS = N_MOTION + N_AHEAD + 2 * len(AHEAD_STEPS) + 3 * N_BEND + 2 * N_PAST + 1
 N_COLUMN = PACKET * -(-COLUMNS // PACKET)  # with padding, which is 0
 SIDE_COLUMNS = (
-    1,
+    2,
     N_MOTION + 6,
     *(N_MOTION + N_AHEAD + 2 * i + 1 for i in range(len(AHEAD_STEPS))),
     *(N_MOTION + N_AHEAD + 2 * len(AHEAD_STEPS) + 3 * i + 1 for i in range(N_BEND)),

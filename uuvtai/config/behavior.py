@@ -134,7 +134,7 @@ class BehaviorConfig(Section):
     """where the way is narrower the vehicle slows down until its nose lies along it"""
     travel_diagonal: bool = False
     """on a route with room, a diagonal of the body goes along the way, wherever the camera then looks, for
-    diagonals are faster"""
+    diagonals are faster; not with a sonar that looks ahead"""
     heading_off_deg: NonNegative = 25.0
     """the nose may be so far off the body that is looked at, towards a diagonal of the body along the way"""
     sight_margin_deg: NonNegative = 20.0

@@ -198,7 +198,12 @@ class ForecastTrainingConfig(Section):
 
     enabled: bool = False
     """learn a forecast"""
-    worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("pool", "gauntlet", "maze")
+    worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = (
+        "pool",
+        "gauntlet",
+        "maze",
+        "gauntlet_inertial",
+    )
     """world presets whose episodes are run in turn, ``train.scenes`` dealt out to the envs"""
     episode_steps: PositiveCount = 1500
     """control steps after which an episode is left"""

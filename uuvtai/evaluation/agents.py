@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from uuvtai.common.errors import SettingError
 from uuvtai.common.presets import POLICY, TRAINING_TREE, built_in_agents, preset_names
 from uuvtai.config import Config
-from uuvtai.config.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
+from uuvtai.config.loader import STACK_SECTIONS, ConfigError, nearest, preset_path, tree_of_stack, with_stack
 from uuvtai.learning.agents import find_policy
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.export.folder import export
@@ -177,10 +177,22 @@ def observation_of(names: Sequence[str]) -> list[tuple[str, Any]]:
 
 
 def differences(agent: AgentSpec, config: Config) -> str:
-    """Keys of the stack that differ from the policy's training, in words; empty = none."""
+    """Keys of the stack that differ from the policy's training, or that the agent's own stack sets in place
+    of what was asked for, in words; empty = none."""
+    ours = config.model_dump(mode="json")
+    if agent.stack is not None:
+        own, usual = (any_cfg.model_dump(mode="json") for any_cfg in (agent.config_of(config), Config()))
+        lost = [
+            f"{section}.{key} = {own[section][key]}, not {value}"
+            for section in STACK_SECTIONS
+            for key, value in ours[section].items()
+            if value not in (own[section][key], usual[section][key])
+        ]
+        said = f"{agent.name}: its stack has {', '.join(lost)}; write a stack that 'extends: {agent.stack}'"
+        return said if lost else ""
     if agent.checkpoint is None:
         return ""
-    ours, trained = config.model_dump(mode="json"), agent.checkpoint.config.model_dump(mode="json")
+    trained = agent.checkpoint.config.model_dump(mode="json")
     parts = [
         f"{section}.{key} = {value} (trained with {trained[section].get(key)})"
         for section in _STACK

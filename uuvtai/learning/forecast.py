@@ -80,7 +80,7 @@ class MixtureNet(nn.Module):
             self.spread.bias.fill_(math.log(0.3))
 
     def forward(self, columns: Tensor) -> Mixture:
-        """``columns`` (n, N_COLUMN), of which the first is the speed [m/s]."""
+        """``columns`` (n, N_COLUMN), of which the first is the speed that it can go [m/s]."""
         hidden = torch.relu(self.middle(torch.relu(self.into(columns))))
         said = self.said(hidden)
         reach = (columns[:, :1] * TIMES_S)[:, None, :, None]
@@ -192,7 +192,7 @@ def _moments(sim: Sim, envs: list[int], paths: list[list[dict[str, Any]]], now_s
         for lane, path in enumerate(paths[env]):
             obstacles[row, lane] = path_positions(path, times)
     velocity = (obstacles[:, :, 2] - obstacles[:, :, 0]) / 0.1
-    own_velocity = frame[..., 2:4] * frame[..., 4:]
+    own_velocity = sim.rows(sim.s.tracks.state, envs)[..., 2:4]
     away = np.linalg.norm(obstacles[:, None, :, 1] - frame[:, :, None, :2], axis=-1)
     cost = away + _SPEED_S * np.linalg.norm(velocity[:, None] - own_velocity[:, :, None], axis=-1)
     cost = np.where(away < _OBSTACLE_M, cost, np.inf)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS
 from uuvtai.common.presets import TRAINING_TREE
+from uuvtai.config import Config
 from uuvtai.config.behavior import FAST, SLOW, TUNED, configured_factors, log_bounds
 from uuvtai.config.learning import LearningConfig, SearchScene
 from uuvtai.config.loader import ConfigError
@@ -117,13 +118,21 @@ def best_near(centre: Array, slope: Array, bend: Array, spread: Array, low: Arra
 
 
 def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
-    """A simulator of a world with room for every scene, on the run's sensors and stack. ConfigError."""
+    """A simulator of a world with room for every scene, on the run's sensors and stack; what the world says
+    is known of its traffic counts. ConfigError."""
     from uuvtai.config.loader import load_config
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim
 
     most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
-    config = config.model_copy(update={"world": load_config(world, overrides=[*most]).world})
+    there, usual = load_config(world, overrides=[*most]), Config()
+    update: dict[str, Any] = {"world": there.world}
+    for name in ("traffic", "tracking"):
+        said = {
+            key: value for key, value in getattr(there, name) if value != getattr(getattr(usual, name), key)
+        }
+        update[name] = getattr(config, name).model_copy(update=said)
+    config = config.model_copy(update=update)
     return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE))
 
 

@@ -758,7 +758,7 @@ def polar(degrees, length=1.0):
 
 def turns(
     scene, xml, yaw: Any = 0.0, gaze: Any = None, way: Any = None, way_of="follow_vel_w", speed=0.5,
-    room_m=2.0, **changes,
+    room_m=2.0, sonar=CFG.sensors.sonar, **changes,
 ):  # fmt: skip
     """[degree] that the nose is told to turn by; bearings of the gaze and of the velocity, None = none."""
     for name, degrees, length in (("heading_w", gaze, 1.5), (way_of, way, speed)):
@@ -774,7 +774,7 @@ def turns(
     )
     scene.tree = parse_tree(f'<root BTCPP_format="4"><BehaviorTree ID="main">{xml}</BehaviorTree></root>')
     load_tree(scene.table, scene.tree)
-    tick(scene, CFG.behavior.model_copy(update=changes))
+    tick(scene, CFG.behavior.model_copy(update=changes), sonar)
     return np.degrees(scene.action[:, 3].numpy() * CFG.vehicle.max_yaw_rate_rad_s / CFG.behavior.yaw_gain)
 
 
@@ -860,6 +860,11 @@ def test_a_diagonal_goes_along_an_open_way_whatever_is_looked_at(scene):
     for xml, more in (("<FollowRoute/>", narrow), ("<Evade/>", {"way_of": "evade_vel_w"})):
         as_ever = turns(scene, xml, yaw, gaze, way, **more)
         np.testing.assert_allclose(turns(scene, xml, yaw, gaze, way, **more, travel_diagonal=True), as_ever)
+    fan = CFG.sensors.sonar.model_copy(update={"horizontal_aperture_deg": 130.0})
+    ahead = [
+        turns(scene, "<FollowRoute/>", yaw, gaze, way, sonar=fan, travel_diagonal=on) for on in (True, False)
+    ]
+    np.testing.assert_array_equal(*ahead, err_msg="who sees ahead alone looks ahead")
 
 
 def test_backing_off_the_nose_keeps_to_the_diagonal_near_the_gaze(scene):

@@ -137,7 +137,7 @@ def test_a_straight_way_is_told_by_its_places_and_walls(stage):
     begin, velocity = np.array([3.0, 2.0]), np.array([1.0, 0.0])
     last = drive(stage, begin, velocity, 4.0)
     columns = stage.columns()[0, 0]
-    assert columns[0] == pytest.approx(1.0)
+    np.testing.assert_allclose(columns[:2], 1.0, atol=1e-5)
     at = enums.N_MOTION
     x, y = begin + 0.02 * last * velocity
     far = enums.FAR
@@ -149,6 +149,17 @@ def test_a_straight_way_is_told_by_its_places_and_walls(stage):
     late = columns[enums.COLUMNS - 1]
     assert past[0] == pytest.approx(-late / 4, abs=1e-5)
     assert 0 <= late < 0.3
+
+
+def test_a_track_that_slows_down_can_still_go_as_fast_as_before(stage):
+    """What reverses stands for a moment: its forecast is not to stand with it."""
+    stage.begin()
+    drive(stage, np.array([3.0, 2.0]), np.array([1.2, 0.0]), 2.0)
+    state = stage.tracks.state.to_numpy()
+    state[..., 2] = 0.1
+    put(stage.tracks, state=state)
+    assert stage.columns()[0, 0, :2] == pytest.approx([1.2, 0.1], rel=1e-3)
+    assert stage.mixture.frame.to_numpy()[0, 0, 4] == pytest.approx(1.2, rel=1e-3)
 
 
 def test_a_mirrored_track_has_mirrored_columns(stage):

@@ -380,7 +380,7 @@ def _turn(env, leaf, velocity, heading, yaw, room, io: Bundle[BehaviorIO]):
     In danger, and to cruise faster than the nose drives ahead, a diagonal of the body goes along the way,
     because diagonals are faster: that whose nose is nearest to what is to be looked at, not farther off than
     the camera sees well, or else nearest to the present heading. With ``travel_diagonal`` one does in all
-    open water, the nearest to the present heading.
+    open water, the nearest to the present heading, where the sonar sees all around.
     """
     has_heading = heading[0] * heading[0] + heading[1] * heading[1] > 0.0
     look = wrapped_angle(ti.atan2(heading[1], heading[0]) - yaw)
@@ -391,7 +391,7 @@ def _turn(env, leaf, velocity, heading, yaw, room, io: Bundle[BehaviorIO]):
         fast = leaf == codes.FOLLOW_ROUTE and level_m_s > ti.static(1.01 * io.vehicle_cfg.max_surge_m_s)
         is_open = leaf == codes.FOLLOW_ROUTE and room > ti.static(io.behavior_cfg.heading_clearance_m)
         quarter = 0.5 * PI
-        if ti.static(io.behavior_cfg.travel_diagonal) and is_open:
+        if ti.static(io.behavior_cfg.travel_diagonal and io.sonar_cfg.is_ring) and is_open:
             turn = way - quarter * (ti.floor(way / quarter) + 0.5)
         elif fast or (leaf >= codes.BACK_OFF and leaf <= codes.EVADE):
             off = wrapped_angle(way - turn)

@@ -3,7 +3,7 @@ and how probable that is. It sees the columns of ``motion_columns`` and nothing 
 
 It says the logits of ``N_MODE`` futures, then each one's places at ``ANCHORS`` times ``ANCHOR_S`` apart, in
 the track's frame and in parts of the way that it can go till then. Between them obstacles go straight, never
-faster than now. The trained network says spreads too; they are not needed here.
+faster than of late. The trained network says spreads too; they are not needed here.
 """
 
 import taichi as ti
@@ -137,6 +137,8 @@ def _place_at(env, track, future, ahead_s, io: Bundle[TrackingIO]):
 _SLOWEST_M_S = 0.1
 _NEW_BEND_M = 0.3
 """a turn this far from the newest one is another"""
+_FAST_LEGS = 3
+"""of the legs between remembered places: over so many a speed is measured"""
 _BACK_COS = -0.9
 """cosine of the change of course that makes a turn back"""
 
@@ -182,11 +184,11 @@ def describe_motion(io: Bundle[TrackingIO]):
             speed = ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
             scale = 1.0 / ti.max(speed, 1.0e-6)
             course = ti.Vector([mean[2] * scale, mean[3] * scale])
-            speed = ti.max(speed, _SLOWEST_M_S)
-            frame = ti.Vector([place[0], place[1], mean[2] * scale, mean[3] * scale, speed])
+            fastest = _fastest(env, track, ti.max(speed, _SLOWEST_M_S), io)
+            frame = ti.Vector([place[0], place[1], mean[2] * scale, mean[3] * scale, fastest])
             for i in ti.static(range(N_FRAME)):
                 io.mixture.frame[env, track, i] = frame[i]
-            _put_motion(env, track, speed, course, io)
+            _put_motion(env, track, fastest, speed, course, io)
             _put_ahead(env, track, place, course, io)
             _put_behind(env, track, place, course, io)
 
@@ -223,6 +225,17 @@ def _remember(env, track, io: Bundle[TrackingIO]):
 
 
 @ti.func
+def _fastest(env, track, speed, io: Bundle[TrackingIO]):
+    """[m/s] ``speed``, or that over ``_FAST_LEGS`` of the track's remembered legs, if that is more: what
+    slows down for a turn comes out of it as fast as it went in."""
+    for i in range(N_PAST - _FAST_LEGS):
+        if i + _FAST_LEGS < io.past.past_count[env, track]:
+            leg = io.past.past_w[env, track, i] - io.past.past_w[env, track, i + _FAST_LEGS]
+            speed = ti.max(speed, ti.math.length(leg) / ti.static(_FAST_LEGS * PAST_S))
+    return speed
+
+
+@ti.func
 def _scaled(length_m):
     return ti.math.clamp(length_m * ti.static(1.0 / LENGTH_M), -FAR, FAR)
 
@@ -235,7 +248,7 @@ def _put_place(env, track, column, off, course, io: Bundle[TrackingIO]):
 
 
 @ti.func
-def _put_motion(env, track, speed, course, io: Bundle[TrackingIO]):
+def _put_motion(env, track, fastest, speed, course, io: Bundle[TrackingIO]):
     """How it moves, how well that is known, and how long it has gone straight."""
     dt, cov, turn_var = (
         io.episode_cfg.control_dt_s,
@@ -248,6 +261,7 @@ def _put_motion(env, track, speed, course, io: Bundle[TrackingIO]):
         begun = (io.forecast.pos_w[env, track, 0] - io.turn_history.run_from_w[env, track]).dot(course)
     spread_v = ti.sqrt(ti.max(cov[7] + cov[9], 0.0))
     values = ti.Vector([
+        fastest,
         speed,
         ti.math.clamp(io.tracks.turn_rate[env, track], -4.0, 4.0),
         ti.sqrt(turn_var),
