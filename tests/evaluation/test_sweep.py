@@ -167,6 +167,14 @@ def test_wrong_keys_are_refused_before_anything_is_written(tmp_path):
     assert not place.exists()
 
 
+def test_an_axis_that_a_stack_sets_itself_is_told():
+    watch, grid = Quiet(), Grid({"D": (0, 6), "behavior.slow_fraction": (0.4, 0.5)})
+    sweep_run.resolved(asked(grid, agents=("best", "bt")), watch)
+    assert watch.answer == [
+        "note: best: its stack has behavior.slow_fraction = 1.0, not 0.4; write a stack that 'extends: best'"
+    ]
+
+
 # ----------------------------------------------------------------------------------------------------- folder
 
 

@@ -15,6 +15,7 @@ from uuvtai.common.files import FileError, open_to_append, parsed_json, read_jso
 from uuvtai.common.presets import built_in_agents
 from uuvtai.common.processes import ATTEMPTS, EngineError, Item, LocalEngine, Work
 from uuvtai.evaluation.grid import (
+    SCENE_AXES,
     Grid,
     Row,
     SweepRequest,
@@ -172,13 +173,18 @@ def resolved(
 
     Paths are made absolute. Raises ConfigError, CheckpointError.
     """
-    from uuvtai.evaluation.agents import load_agents, observation_of
+    from uuvtai.evaluation.agents import differences, load_agents, observation_of
 
     agents = tuple(map(_located, request.agents))
     loaded = load_agents(agents, watch.note)
     named = [(agent.name, name) for agent, name in zip(loaded, agents, strict=True)]
-    overrides = (*observation_of(agents), *request.overrides)
-    return replace(request, overrides=overrides, agents=agents), named, _sha256_of(loaded)
+    request = replace(request, overrides=(*observation_of(agents), *request.overrides), agents=agents)
+    cells = request.grid.cells() if request.grid.axes.keys() - SCENE_AXES else [None]
+    for agent in loaded:
+        changes = (differences(agent, base_config(request, cell)) for cell in cells)
+        if first := next(filter(None, changes), ""):
+            watch.note(f"note: {first}")
+    return request, named, _sha256_of(loaded)
 
 
 def _located(name: str) -> str:
