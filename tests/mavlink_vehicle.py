@@ -38,7 +38,7 @@ class WishfulPilot:
 
     def __init__(self):
         self.velocity, self.held, self.pos_w, self.fed = (0.3, 0.0, 0.0, 0.1), (), START, []
-        self.tallies = {name: Tally() for name in KINDS}
+        self.place_sigma_m, self.tallies = 0.0, {name: Tally() for name in KINDS}
 
     def feed(self, message):
         self.fed.append(message)
@@ -46,8 +46,9 @@ class WishfulPilot:
 
     def tick(self):
         return SimpleNamespace(
-            velocity=np.array(self.velocity), held=self.held, leaf="FollowRoute", pos_w=np.array(self.pos_w)
-        )
+            velocity=np.array(self.velocity), held=self.held, leaf="FollowRoute", pos_w=np.array(self.pos_w),
+            place_sigma_m=self.place_sigma_m,
+        )  # fmt: skip
 
 
 class FakeSub:

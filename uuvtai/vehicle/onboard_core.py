@@ -13,7 +13,8 @@ from uuvtai.common.enums import TRIGGERS
 from uuvtai.vehicle.messages import ANY, Inbox, Mission, PilotNumbers, SensorMessage, SonarPing, Tally
 from uuvtai.vehicle.sensor_inputs import FedSensors
 
-_START = [0, 1, 2, 9, 10, 17]  # places of x, y and heading in the covariance of perception/pose.py
+_START = [0, 1, 2, 9, 10, 17]  # places of x, y and heading in the covariance of perception/localization.py
+_X_Y = [0, 9]  # and of the variances of x and y
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class PilotCommand:
     trigger: str  # why the route was planned in this step, '' = it was not
     pos_w: np.ndarray  # (3,) [m] where the vehicle takes itself to be
     held: tuple[str, ...]  # why the pilot stops instead of doing what the tree chose; none = it does it
+    place_sigma_m: float = 0.0  # standard deviation of x or y, the larger; 0 where the position is given
 
 
 class StackRunner(Protocol):
@@ -71,7 +73,7 @@ class FedPilot:
         self.begin_again(mission)
         self._behavior = {name: views[f"behavior.{name}"] for name in ("action", "last_vel_w", "leaf")}
         self._route = {name: views[f"route.{name}"] for name in ("n_way", "plan_step", "trigger")}
-        self._pos_w = views["ego.pos_w"]
+        self._pos_w, self._cov = views["ego.pos_w"], views["localization.cov"]
         self._top = np.array(numbers.top, np.float32)
 
     def begin_again(self, mission: Mission) -> None:
@@ -119,6 +121,7 @@ class FedPilot:
             trigger=TRIGGERS[trigger - 1] if planned and trigger > 0 else "",
             pos_w=self._pos_w[0].copy(),
             held=held,
+            place_sigma_m=math.sqrt(self._cov[0, _X_Y].max()) if self.numbers.estimated else 0.0,
         )
 
     def _reasons_to_stop(self, chosen: np.ndarray) -> tuple[str, ...]:
