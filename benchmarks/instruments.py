@@ -1,6 +1,7 @@
 """Instruments by their own protocols (pool, S = 8, D = 6 and 0, v = 0.6 m/s): CPU of the adapters; ``uuv sitl
---as``, ``uuv pilot --rate 0`` that hears an A50 and a Ping360 or a 3D-15, and between them the autopilot of a
-hundred lines, every part a process of its own. Beside it the same episodes in ``uuv eval``'s loop.
+--as``, ``uuv pilot --rate 0`` that hears an A50 and a Ping360, a 3D-15 or a ring as MAVLink tells it, and
+between them the autopilot of a hundred lines, every part a process of its own. Beside it the same episodes in
+``uuv eval``'s loop.
 
 All of them go by the water's clock: the autopilot waits for the water's answer and for the pilot, so a busy
 machine makes them slow and changes nothing else.
@@ -41,7 +42,7 @@ from uuvtai.sim.sim import Sim
 from uuvtai.vehicle.calibrate import WAYS
 from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Instrument, InstrumentPlace, TcpChannel, UdpChannel
-from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeSonar3D, emulated
+from uuvtai.vehicle.instruments.emulate import KINDS, FakeA50, FakePing360, FakeSonar3D, emulated
 from uuvtai.vehicle.instruments.ping import Ping360
 from uuvtai.vehicle.instruments.rig import JsonUdp
 from uuvtai.vehicle.instruments.rip2 import LONGEST, Sonar3D
@@ -61,7 +62,7 @@ def measure(job: Job) -> list[Row]:
     """CPU of each adapter; arrivals beside the simulator's own loop; errors of calibrations."""
     count = 2 if job.quick else EPISODES
     rows = [_adapter(name, job) for name in ADAPTERS]
-    for kinds in ("a50,ping360", "a50,3d15"):
+    for kinds in ("a50,ping360", "a50,3d15", "a50,nominal"):
         for dynamic in (0, 6):
             rows += _driven(Setup(kinds, dynamic), count, job)
     return [*rows, *_calibrations(2 if job.quick else CALIBRATIONS, job)]
@@ -308,7 +309,7 @@ _HORIZON = 6000  # twice the usual: the pilot first turns until the walls have t
 _RIG = """extends: {preset}
 sensors:
   localization: estimated
-  sonar: {{max_range_m: {range_m}, step_overhead_s: 0.03}}  # a step of a Ping360 as recorded
+  sonar: {{max_range_m: {range_m}, step_overhead_s: 0.03, doppler: false}}  # a step of a Ping360 as recorded
   dvl: {{yaw_deg: {yaw_deg}, sigma_m_s: 0.005, period_steps: 6}}
 """
 
@@ -317,7 +318,8 @@ sensors:
 class Setup:
     """A scene with a rig."""
 
-    kinds: str = "a50,ping360"  # what ``--as`` names: a DVL, and a sonar as its preset is called
+    kinds: str = "a50,ping360"
+    """a DVL, and a preset of a sonar: what ``--as`` can be is, the rest is told by MAVLink"""
     dynamic: int = 0
     static: int = 8
     yaw_deg: float = 0.0
@@ -330,6 +332,11 @@ class Setup:
         path, preset = folder / "rig.yaml", self.kinds.partition(",")[2]
         path.write_text(_RIG.format(preset=preset, yaw_deg=self.yaw_deg, range_m=self.range_m))
         return path
+
+    @property
+    def emulated(self) -> list[str]:
+        """What ``--as`` names."""
+        return [kind for kind in self.kinds.split(",") if kind in KINDS]
 
     @property
     def overrides(self) -> list[str]:
@@ -347,7 +354,7 @@ class Waters:
         words = ["sitl", "--world", "pool", "--sensors", str(self.rig), "--vehicle", "bluerov2_16v"]
         words += [f"--set={text}" for text in setup.overrides]
         words += ["--seed", str(SEED), "--episode", str(first), "--instances", str(count)]
-        words += ["--as", setup.kinds, "--port", str(_PHYSICS)]
+        words += ["--as", ",".join(setup.emulated), "--port", str(_PHYSICS)]
         words += ["--mavlink", f"udpout:127.0.0.1:{_PILOT}", "--json"]
         self.process = process
         process.begin(words)
@@ -358,10 +365,11 @@ class Waters:
         """``uuv pilot`` for an instance, until it listens."""
         own = 10 * number
         ports = {"a50": 16171 + own, "ping360": 9092 + own, "3d15": 4747 + own}
-        dvl, sonar = (f"{kind}:127.0.0.1:{ports[kind]}" for kind in self.setup.kinds.split(","))
+        instruments = [f"{kind}:127.0.0.1:{ports[kind]}" for kind in self.setup.emulated]
         start, goal = self.places[number]
         words = ["pilot", "--mavlink", f"udp:127.0.0.1:{_PILOT + own}", "--rate", "0", "--world", "pool"]
-        words += ["--sensors", str(self.rig), "--vehicle", "bluerov2_16v", "--dvl", dvl, "--sonar", sonar]
+        words += ["--sensors", str(self.rig), "--vehicle", "bluerov2_16v"]
+        words += [word for pair in zip(("--dvl", "--sonar"), instruments, strict=False) for word in pair]
         words += ["--start", start, "--goal", goal, "--heading", "0", "--battery", "0", "--json"]
         words += ["--log", str(self.folder / f"pilot{number}.mcap"), "--force", *more]
         process.begin(words)

@@ -255,6 +255,15 @@ def test_a_sensor_that_has_lost_the_bottom_says_nothing():
     assert "VISION_POSITION_DELTA" not in {order.kind for order in said}
 
 
+@pytest.mark.parametrize("own", [(), ("dvl",), ("sonar",), ("dvl", "sonar")])
+def test_what_speaks_for_itself_alone_is_not_told_by_mavlink(own):
+    """With an emulated DVL the sonar still has to be heard."""
+    water, kinds = StillWater(), {"dvl": "VISION_POSITION_DELTA", "sonar": "OBSTACLE_DISTANCE"}
+    said = ReportedSensors(CONFIG, own).report(0.0, 0.8, lambda name: water.value(name, 0))
+    told = {order.kind for order in said}
+    assert told >= {"DISTANCE_SENSOR"} and {name for name in kinds if kinds[name] not in told} == set(own)
+
+
 # -------------------------------------------------------------------------------------------------- thrusters
 
 

@@ -100,7 +100,7 @@ class Instance:
     def _forget(self) -> None:
         self.time_s = self.driven_s = 0.0
         self.is_held, self._ticks, self.outcome = True, 0, ""
-        self._sensors = ReportedSensors(self._config, self._rig is not None)
+        self._sensors = ReportedSensors(self._config, self._rig.speaks if self._rig else ())
 
     def answer(self, packet: bytes, now_s: float) -> tuple[bytes, list[Order]]:
         """(what to send back, empty = nothing; what the sensors say) to a packet that came at ``now_s``."""

@@ -7,7 +7,7 @@ vector, and a line between two line feeds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,9 +74,9 @@ Value = Callable[[str], np.ndarray]
 class ReportedSensors:
     """One vehicle's. ``report`` is called in every control step."""
 
-    def __init__(self, config: Config, is_rig: bool = False) -> None:
-        """``is_rig``: DVL and sonar speak their own protocols."""
-        sensors, self._is_rig = config.sensors, is_rig
+    def __init__(self, config: Config, silent: Collection[str] = ()) -> None:
+        """``silent``: what speaks its own protocol, of 'dvl' and 'sonar'."""
+        sensors, self._silent = config.sensors, silent
         dt = config.episode.control_dt_s
         self._sonar = sensors.sonar
         self._dvl_steps = max(LEAST_STEPS, sensors.dvl.period_steps)
@@ -87,9 +87,10 @@ class ReportedSensors:
     def report(self, time_s: float, altitude_m: float, value: Value) -> list[Order]:
         """Messages of this step; ``value`` gives arrays of the vehicle by 'struct.field'."""
         found = []
-        if not self._is_rig and self._steps % self._dvl_steps == 0 and int(value("ego.dvl_fresh")):
+        is_due = self._steps % self._dvl_steps == 0 and int(value("ego.dvl_fresh"))
+        if "dvl" not in self._silent and is_due:
             found.append(self._velocity(time_s, value("ego.dvl_b"), value("ego.rate_b")))
-        if not self._is_rig and self._steps % self._scan_steps == 0:
+        if "sonar" not in self._silent and self._steps % self._scan_steps == 0:
             found.append(self._scan(time_s, value("scan.range_m"), value("scan.hit")))
         if self._steps % LEAST_STEPS == 0:
             found.append(_altitude(time_s, altitude_m))

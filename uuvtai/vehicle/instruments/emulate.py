@@ -238,6 +238,8 @@ class FakeRig:
     def __init__(self, config: Config, kinds: tuple[str, ...], host: str, number: int) -> None:
         """``number``: of the vehicle; ports count on with it. Raises LinkError."""
         self._sonar, dvl = config.sensors.sonar, config.sensors.dvl
+        self.speaks = {"dvl" if kind == "a50" else "sonar" for kind in kinds}
+        """what MAVLink need not tell"""
         self._lever, self._yaw = np.array(dvl.position_b_m), math.radians(dvl.yaw_deg)
         self._dvl: FakeA50 | None = None
         self._head: FakePing360 | None = None
