@@ -24,7 +24,7 @@ from benchmarks.digest import digest
 from uuvtai.common.enums import COLLIDED, FINAL_OUTCOMES, LETTERS
 from uuvtai.evaluation import claims
 from uuvtai.evaluation.claims import ends_of, pooled
-from uuvtai.evaluation.reproduce import results_page
+from uuvtai.evaluation.reproduce import claims_of, results_page
 from uuvtai.evaluation.reproduce_steps import BUDGETS, RETIRED_SEEDS
 from uuvtai.report.tables import cell_name, place_of, seconds, text_table
 from uuvtai.vehicle.safety import RULES
@@ -294,7 +294,9 @@ def pages(root: Path = ROOT) -> dict[str, str]:
         for page, made in TABLES.items()
     }
     kept = json.loads((root / REPRODUCTION).read_text("utf-8"), object_hook=_unpacked)
-    return found | {RESULTS: results_page(*(kept[budget] for budget in BUDGETS if budget in kept))}
+    told = [kept[budget] for budget in BUDGETS if budget in kept]
+    judged = [document | {"claims": [vars(claim) for claim in claims_of(document)]} for document in told]
+    return found | {RESULTS: results_page(*judged)}
 
 
 def _read(path: Path) -> Document:
@@ -332,14 +334,15 @@ def keep_row(name: str, run: Path, root: Path = ROOT) -> None:
 
 
 def keep_reproduction(run: Path, root: Path = ROOT) -> None:
-    """Keep what the page needs of a reproduction, beside those of other budgets."""
+    """Keep what the page needs of a reproduction, beside those of other budgets; verdicts are made anew."""
     document, kept = _read(run / "reproduce.json"), _read(root / REPRODUCTION)
-    small = {name: value for name, value in document.items() if name not in ("sections", "transfer")}
+    small = {name: value for name, value in document.items() if name not in ("sections", "claims")}
     for entries in small["table_main"].values():
-        entries[:] = [_packed(entry, "trained_steps", *_TIMES) for entry in entries]
+        entries[:] = [_packed(entry, "trained_steps", "return_mean", *_TIMES) for entry in entries]
     if document["sweep"]:
         cells = document["sweep"]["cells"]
         small["sweep"] = {"cells": [_packed(cell, "agent", "S", "D", "v_m_s") for cell in cells]}
+        small["transfer"] = {"agents": [_packed(agent, "name") for agent in document["transfer"]["agents"]]}
     kept.pop("quick", None)
     _write(root / REPRODUCTION, kept | {document["budget"]: small})
 

@@ -14,7 +14,7 @@ from tests.evaluation.test_reproduce import cell, ended, minimal
 from tests.repository.test_docs import fault
 from uuvtai.evaluation import claims
 from uuvtai.evaluation.claims import Share
-from uuvtai.evaluation.reproduce import results_page
+from uuvtai.evaluation.reproduce import claims_of, results_page
 from uuvtai.evaluation.reproduce_steps import EVALUATION_SEED
 
 
@@ -151,10 +151,14 @@ def test_reproductions_are_kept_small_and_make_the_page_that_they_made(copy, tmp
     for budget in ("tenfold", "paper"):
         words = ["".join(draws.choices("scxot", (75, 15, 5, 1, 4), k=500)) for _ in range(11)]
         own = [ended(word, trained_steps=614_912, return_mean=3.0) for word in words]
-        document = minimal(claims.Claim("it swims", "1", "2", claims.HOLDS, 0.03)) | {"budget": budget}
-        document |= {"table_main": {"paper": own[:5], "ppo": own[5:10], "bt": own[10:]}, "sections": [{}]}
+        document = minimal() | {"budget": budget, "sections": [{}]}
+        document["mechanism"] = {"paper": [claims.training_facts([], 2.0)]}
+        document |= {"table_main": {"paper": own[:5], "ppo": own[5:10], "bt": own[10:]}}
         if budget == "paper":
             document["sweep"] = {"cells": [cell(8, 6, v, success=90, collision=5) for v in (0.6, 1.5)]}
+            document["sweep"]["cells"] += [one | {"agent": "paper-0"} for one in document["sweep"]["cells"]]
+            document["transfer"] = {"agents": [own[0] | {"name": "paper-0"}]}
+        document["claims"] = [vars(claim) for claim in claims_of(document)]
         found = [document, *found]
         (tmp_path / "reproduce.json").write_text(json.dumps(document))
         render_results.keep_reproduction(tmp_path, copy)

@@ -40,15 +40,16 @@ from uuvtai.report.tables import seconds
 class PrintedRow(NamedTuple):
     success: float
     collision: float
+    episode_return: float
     mean_time_s: float
     tts_s: float
 
 
 TABLE_MAIN = {
-    "ppo": PrintedRow(0.20, 0.40, 22.84, 114.2),
-    "constant_20": PrintedRow(0.46, 0.20, 13.44, 67.2),
-    "paper": PrintedRow(0.87, 0.15, 11.41, 15.8),
-    "bt": PrintedRow(0.80, 0.10, 14.50, 32.5),
+    "ppo": PrintedRow(0.20, 0.40, 197.3, 22.84, 114.2),
+    "constant_20": PrintedRow(0.46, 0.20, 173.4, 13.44, 67.2),
+    "paper": PrintedRow(0.87, 0.15, 176.4, 11.41, 15.8),
+    "bt": PrintedRow(0.80, 0.10, 40.0, 14.50, 32.5),
 }
 """by the names of our presets; 25 episodes an agent"""
 
@@ -66,6 +67,8 @@ INCONSISTENCIES = (
     "0.48, 0.84 or 0.88, 0.12 or 0.16.",
     "Table main: TTS is defined as mean time over success rate; 22.84 / 0.20 = 114.2 holds, but 13.44 / 0.46 "
     "= 29.2 is printed as 67.2, 11.41 / 0.87 = 13.1 as 15.8, and 14.50 / 0.80 = 18.1 as 32.5.",
+    "The curriculum collides in 0.15 of the episodes of Table main, but in 0.011 of those of the sweep with "
+    "S <= 8, D <= 9, v <= 1.5.",
     "The schedule of lambda ends at iteration 1600, but runs last 1200 iterations: lambda never reaches 0, "
     "its last value is 0.1.",
     "The sweep counts 40 conditions with S <= 8, D <= 9, v <= 1.5; its own grid has 2 x 4 x 5 = 40 only if D "
@@ -284,8 +287,9 @@ def of_table_main(by_method: dict[str, list[dict[str, Any]]], note: str = "") ->
     goes behind each text."""
     success = {name: of_method(entries, "success") for name, entries in by_method.items()}
     collision = {name: of_method(entries, *COLLIDED) for name, entries in by_method.items()}
-    ours, plain, tree = success["paper"], success["ppo"], of_agent(pooled(by_method["bt"], "success"))
+    ours, plain = success["paper"], success["ppo"]
     times = [seconds(tts_s(by_method[name])) for name in ("paper", "ppo")]
+    returns = [over_seeds([entry["return_mean"] for entry in by_method[name]]) for name in ("ppo", "paper")]
     without = "over PPO without distillation"
     found = [
         claim(
@@ -314,11 +318,12 @@ def of_table_main(by_method: dict[str, list[dict[str, Any]]], note: str = "") ->
             compared(_quickness(by_method["paper"]), _quickness(by_method["ppo"]), 2.0),
         ),
         claim(
-            "Curriculum distillation approaches the robustness of the behavior tree (within 10 points)",
-            "0.87 against 0.80",
-            f"{ours} against {tree}",
-            compared(ours, tree, margin=MARGIN),
+            "PPO without distillation collects more return than curriculum distillation (by our weights)",
+            "197.3 against 176.4",
+            " against ".join(f"{estimate.mean:.1f}" for estimate in returns),
+            compared(*returns),
         ),
+        *_beside_tree(by_method["paper"], by_method["bt"]),
         *[
             claim(text, theirs, f"{success[a]} against {success[b]}", compared(success[a], success[b]))
             for a, b, text, theirs in _PAIRS
@@ -326,6 +331,27 @@ def of_table_main(by_method: dict[str, list[dict[str, Any]]], note: str = "") ->
         ],
     ]
     return [replace(c, text=c.text + note) for c in found]
+
+
+def _beside_tree(method: list[dict[str, Any]], tree: list[dict[str, Any]]) -> list[Claim]:
+    """The distilled policy beside its teacher, whose mean time counts as exact."""
+    ours, theirs = of_method(method, "success"), of_agent(pooled(tree, "success"))
+    quick, at = _quickness(tree), theirs.mean or 1.0
+    quick = replace(quick, variance=theirs.variance * (quick.mean / at) ** 2, freedom=theirs.freedom)
+    return [
+        claim(
+            "Curriculum distillation approaches the robustness of the behavior tree (within 10 points)",
+            "0.87 against 0.80",
+            f"{ours} against {theirs}",
+            compared(ours, theirs, margin=MARGIN),
+        ),
+        claim(
+            "Curriculum distillation is more efficient than the behavior tree (mean time / success rate)",
+            "15.8 s against 32.5 s",
+            f"{seconds(tts_s(method))} against {seconds(tts_s(tree))}",
+            compared(_quickness(method), quick),
+        ),
+    ]
 
 
 _NEARLY_FOUR = 3.5
