@@ -190,7 +190,7 @@ _HOW = (
     "test (intervals: Wilson's, 95 %). Episodes of one number go together in all cells of a grid: only as "
     "many count as independent ones would say the same. Claims without a p value set one number beside "
     "another: one run, one machine, no test. The paper's rates are of another simulator: one that is reached "
-    "says nothing about who is better."
+    "says nothing about who is better. Not judged: how soon a training converges, trajectories, larger margins."
 )
 
 
