@@ -172,11 +172,9 @@ def test_the_same_episodes_again_decide_nothing():
     assert claims.larger(often, other).p == pytest.approx(claims.larger(once, Share(27, 30)).p, rel=0.3)
 
 
-def test_episodes_that_were_not_kept_allow_neither_interval_nor_test():
-    lost = claims.pooled([entry(50), entry(70, n=200)], "success")
-    assert str(lost) == "120/300 = 40.0 %" and lost.interval is None and lost.counts() is None
-    found = [claims.larger(lost, Share(9, 10)), claims.at_least(lost, 0.3), claims.at_most(lost, 0.3)]
-    assert found == [claims.Finding(OPEN, None, "single episodes were not kept")] * 3
+def test_episodes_that_were_not_kept_are_not_pooled():
+    with pytest.raises(ValueError, match="0 of 100 episodes say"):
+        claims.pooled([entry(50), entry(70, n=200)], "success")
 
 
 def cell(n_static, n_dynamic, speed, agent="best", **more):

@@ -98,9 +98,6 @@ def test_the_newest_speed_of_a_kind_is_shown_and_marked_unless_it_is_of_todays_c
 
 def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
     """Then rates over many cells have an interval, by episode number."""
-    kept = copy / "docs/data/sweep_pool.csv"
-    kept.write_text("\n".join(line.rpartition(",")[0] for line in kept.read_text().splitlines()))
-    assert "`bt` | 503/512 = 98.2 % |" in render_results.grid(copy), "without: none"
     cells = [
         {"S": 8, "D": d, "v_m_s": v, "agent": "bt", "episodes": 40, "time_to_success_mean_s": 9.0,
          "outcomes": {"success": 39, "collision": 0, "ttc": 1, "out_of_tank": 0, "timeout": 0},

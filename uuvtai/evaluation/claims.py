@@ -129,8 +129,8 @@ class Share:
 
     k: int
     n: int
-    design: float | None = 1.0
-    """how many times fewer independent episodes would say as much; None: single episodes were not kept"""
+    design: float = 1.0
+    """how many times fewer independent episodes would say as much"""
 
     @property
     def rate(self) -> float:
@@ -138,16 +138,12 @@ class Share:
         return rate(self.k, self.n) or 0.0
 
     @property
-    def interval(self) -> tuple[float, float] | None:
-        """95 % Wilson of the independent episodes; everything for nothing, None = not known."""
-        if self.design is None:
-            return None
+    def interval(self) -> tuple[float, float]:
+        """95 % Wilson of the independent episodes; everything for nothing."""
         return wilson_interval(self.k / self.design, self.n / self.design) or (0.0, 1.0)
 
-    def counts(self, against: float | None = None) -> tuple[int, int] | None:
-        """(k, n) of as few independent episodes, rounded towards the rate ``against``; None: not known."""
-        if self.design is None:
-            return None
+    def counts(self, against: float | None = None) -> tuple[int, int]:
+        """(k, n) of as few independent episodes, rounded towards the rate ``against``."""
         n = math.floor(self.n / self.design + 1e-9)
         k, nearest = self.rate * n, round(self.rate * n)
         if against is None or abs(k - nearest) < 1e-9:
@@ -156,27 +152,24 @@ class Share:
 
     def __str__(self) -> str:
         """k/n = p % [low, high]."""
-        share = f"{self.k}/{self.n} = {100 * self.rate:.1f} %"
-        return (
-            f"{share} [{100 * low_high[0]:.1f}, {100 * low_high[1]:.1f}]"
-            if (low_high := self.interval)
-            else share
-        )
+        low, high = self.interval
+        return f"{self.k}/{self.n} = {100 * self.rate:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def pooled(agents: Sequence[dict[str, Any]], *outcomes: str) -> Share:
-    """Share of the episodes of these entries (of ``uuv eval`` or a sweep) that ended in ``outcomes``."""
+    """Share of the episodes of these entries (of ``uuv eval`` or a sweep) that ended in ``outcomes``. Raises
+    ValueError for several entries without the end of every episode."""
     k, n = sum(m["outcomes"][o] for m in agents for o in outcomes), sum(m["episodes"] for m in agents)
     return Share(k, n, _design(agents, outcomes) if len(agents) > 1 else 1.0)
 
 
-def _design(agents: Sequence[dict[str, Any]], outcomes: Sequence[str]) -> float | None:
+def _design(agents: Sequence[dict[str, Any]], outcomes: Sequence[str]) -> float:
     """Of entries that share episodes by their numbers."""
     won, ran = Counter[Hashable](), Counter[Hashable]()
     for agent in agents:
         ends = ends_of(agent)
         if len(ends) != agent["episodes"]:
-            return None
+            raise ValueError(f"{len(ends)} of {agent['episodes']} episodes say how they ended")
         ran.update(ends.keys())
         won.update(key for key, end in ends.items() if end in outcomes)
     return design_effect([won[key] for key in ran], list(ran.values()))
@@ -190,30 +183,19 @@ def ends_of(entry: dict[str, Any]) -> dict[Hashable, str]:
     return dict(enumerate(entry.get("episode_outcomes") or [names[c] for c in entry.get("ends") or ""]))
 
 
-_NOT_KEPT = Finding(OPEN, None, "single episodes were not kept")
-
-
 def larger(a: Share, b: Share) -> Finding:
     """Whether a's rate is the larger one (Fisher's exact test)."""
-    ours, theirs = a.counts(), b.counts()
-    if ours is None or theirs is None:
-        return _NOT_KEPT
-    return Finding(HOLDS if a.rate > b.rate else FAILS, fisher_p(*ours, *theirs))
+    return Finding(HOLDS if a.rate > b.rate else FAILS, fisher_p(*a.counts(), *b.counts()))
 
 
 def at_least(a: Share, value: float) -> Finding:
     """Whether a's rate reaches a value (exact binomial test)."""
-    return _by_binomial(a, value, a.rate >= value)
+    return Finding(HOLDS if a.rate >= value else FAILS, binomial_p(*a.counts(value), value))
 
 
 def at_most(a: Share, value: float) -> Finding:
     """Whether a's rate stays below a value (exact binomial test)."""
-    return _by_binomial(a, value, a.rate <= value)
-
-
-def _by_binomial(a: Share, value: float, holds: bool) -> Finding:
-    counts = a.counts(value)
-    return _NOT_KEPT if counts is None else Finding(HOLDS if holds else FAILS, binomial_p(*counts, value))
+    return Finding(HOLDS if a.rate <= value else FAILS, binomial_p(*a.counts(value), value))
 
 
 @dataclass(frozen=True)
@@ -386,7 +368,7 @@ def tts_s(entries: Sequence[dict[str, Any]]) -> float | None:
     if not n or any(time is None for time in times):
         return None
     total = sum(time * entry["episodes"] for time, entry in zip(times, entries, strict=True))
-    return time_to_success_s(total / n, pooled(entries, "success").rate)
+    return time_to_success_s(total / n, sum(entry["outcomes"]["success"] for entry in entries) / n)
 
 
 # --------------------------------------------------------------------------------------------------- training

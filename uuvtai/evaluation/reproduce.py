@@ -168,14 +168,12 @@ def _head(document: dict[str, Any]) -> str:
     tuned = "was looked at while tuning" if seed in RETIRED_SEEDS else "was never trained or tuned on"
     others = ", ".join(document["trained_at"])
     trained = f" (trained or evaluated at: {others})" if others else ""
-    lines = [
+    return (
         f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit "
         f"{document['git_sha'] or 'unknown'}{trained}, {machine['cpu']}, {machine['cores']} cores. RUN is "
         "the reproduction's folder. All drive on the paper's stack, `bt` too; the evaluations' seed, "
-        f"{seed}, {tuned}.",
-        *document.get("notes", []),
-    ]
-    return "\n".join(lines)
+        f"{seed}, {tuned}."
+    )
 
 
 def _titled(title: str, document: dict[str, Any]) -> str:
@@ -190,7 +188,7 @@ _HOW = (
     "test (intervals: Wilson's, 95 %). Episodes of one number go together in all cells of a grid: only as "
     "many count as independent ones would say the same. Claims without a p value set one number beside "
     "another: one run, one machine, no test. The paper's rates are of another simulator: one that is reached "
-    "says nothing about who is better. Not judged: how soon a training converges, trajectories, larger margins."
+    "says nothing about who is better. Not judged: when a training converges, trajectories, larger margins."
 )
 
 
