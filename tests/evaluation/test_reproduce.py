@@ -425,5 +425,8 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ValueError, match="quick or paper or tenfold"):
         reproduce("slow", tmp_path / "run", Quiet())
     assert not (tmp_path / "run").exists()
-    with pytest.raises(RunFolderError, match="give the folder"):
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(
+        RunFolderError, match=r"no plain file reproduce_request\.json; give the run folder that"
+    ):
         resume(tmp_path, Quiet())

@@ -284,7 +284,7 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
     """Go on with a reproduction that was killed or interrupted; finished steps stay as they are.
     ``allow_code``: Python files that the folder names may be run. Raises RunFolderError."""
     root = place.absolute()
-    folder = RunFolder.held(root, "uuv reproduce")
+    folder = RunFolder.held(root, "uuv reproduce", REQUEST)
     try:
         request = _request(root)
         refuse_code(root, request["own"], allow_code)
