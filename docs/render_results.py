@@ -61,8 +61,8 @@ def measured(root: Path) -> str:
     seen = "This seed was looked at while tuning." if seed in RETIRED_SEEDS else "No tuning used this seed."
     commits = ", ".join(sorted({agent["commit"][:7] for agent in agents}))
     return (
-        f"{document['episodes']:,} episodes of seed {seed} a row, eight static obstacles or the world's own; "
-        f"{max(agent['date'] for agent in agents)[:10]}, {commits}.\n{seen}"
+        f"{document['episodes']:,} episodes of seed {seed} a row, eight static obstacles or its own; "
+        f"{max(agent['date'] for agent in agents)[:10]}, commits {commits}.\n{seen}"
     )
 
 

@@ -303,7 +303,7 @@ def of_table_main(by_method: dict[str, list[dict[str, Any]]], note: str = "") ->
             "PPO without distillation collects more return than curriculum distillation (by our weights)",
             "197.3 against 176.4",
             " against ".join(f"{estimate.mean:.1f}" for estimate in returns),
-            compared(*returns),
+            compared(returns[0], returns[1]),
         ),
         *_beside_tree(by_method["paper"], by_method["bt"]),
         *[
