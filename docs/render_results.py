@@ -24,7 +24,7 @@ from benchmarks.digest import digest
 from uuvtai.common.enums import COLLIDED, FINAL_OUTCOMES, LETTERS
 from uuvtai.evaluation import claims
 from uuvtai.evaluation.claims import ends_of, pooled
-from uuvtai.evaluation.reproduce import results_page
+from uuvtai.evaluation.reproduce import claims_of, results_page
 from uuvtai.evaluation.reproduce_steps import BUDGETS, RETIRED_SEEDS
 from uuvtai.report.tables import cell_name, place_of, seconds, text_table
 from uuvtai.vehicle.safety import RULES
@@ -57,9 +57,13 @@ SHORT = {  # rows of README's table
 def measured(root: Path) -> str:
     """The lines above a table of evaluations."""
     document = _read(root / EVALUATIONS)
-    seed = document["seed"]
+    seed, agents = document["seed"], [agent for row in document["rows"] for agent in row["agents"].values()]
     seen = "This seed was looked at while tuning." if seed in RETIRED_SEEDS else "No tuning used this seed."
-    return f"{document['episodes']:,} episodes of seed {seed} in each row, eight static obstacles.\n{seen}"
+    commits = ", ".join(sorted({agent["commit"][:7] for agent in agents}))
+    return (
+        f"{document['episodes']:,} episodes of seed {seed} a row, eight static obstacles or its own; "
+        f"{max(agent['date'] for agent in agents)[:10]}, commits {commits}.\n{seen}"
+    )
 
 
 def short(root: Path) -> str:
@@ -77,11 +81,11 @@ def evaluations(root: Path) -> str:
     document = _read(root / EVALUATIONS)
     head = [
         "world (D, v in m/s)", "success", "collision", "contact / TTC stop / out / timeout",
-        "`best`: success / collision", "`planner`", "most frequent causes of failure",
+        "`best`: success / collision (p)", "`planner`", "most frequent causes of failure",
     ]  # fmt: skip
     shown = [row for row in document["rows"] if row["agents"] and LITERATURE.isdisjoint(row["agents"])]
     note = (
-        "Success, collision and endings are those of `bt`, in the last row of `paper`; `-` = not evaluated.\n"
+        "Success, collision and endings are those of `bt`, in the last row of `paper`; p: McNemar's.\n"
         f"Counts: `{EVALUATIONS}`.\n\n"
     )
     return note + text_table(head, [_evaluated(row) for row in shown])
@@ -90,7 +94,7 @@ def evaluations(root: Path) -> str:
 def _evaluated(row: Document) -> list[str]:
     agents, own = row["agents"], row["agents"][row["shows"]]
     ends = " / ".join(str(own["outcomes"][end]) for end in ("collision", "ttc", "out_of_tank", "timeout"))
-    best = _both(agents["best"]) if "best" in agents else "-"
+    best = _both(agents["best"]) + _p(row, "best") if "best" in agents else "-"
     planner = f"{_percent(agents['planner'], 'success')} %" if "planner" in agents else "-"
     causes = ", ".join(f"{cause['label']} {cause['count']}" for cause in own["causes"][:2])
     collision = str(pooled([own], *COLLIDED)).partition(" = ")[2]
@@ -123,8 +127,13 @@ def _beside_bt(row: Document, name: str) -> str:
         return "-"
     own = row["agents"][name]
     said = f"{_both(own)}, {own['time_to_success_mean_s']:.1f} s"
+    return said + _p(row, name)
+
+
+def _p(row: Document, name: str) -> str:
+    """Of McNemar's test against the tree; nothing for the tree itself."""
     pair = next((pair for pair in row["paired"] if {pair["a"], pair["b"]} == {"bt", name}), None)
-    return said + (f", p = {pair['mcnemar_p']:.2g}" if pair else "")
+    return f" ({pair['mcnemar_p']:.2g})" if pair else ""
 
 
 def _both(agent: Document) -> str:
@@ -150,6 +159,7 @@ def grid(root: Path) -> str:
          f"below {100 * claims.FEW_MOVERS_COLLISION:.1f} %", "", ""],
         *_by_agent(few, "`pool`, D <= 3, all S and v"),
         *_by_agent(corner, "the corner S = 12, D = 15, v = 3.0"),
+        *_by_agent(pool, "`pool`, all cells"),
         *_by_agent(_moderate(gauntlet), f"`gauntlet`, {moderate}", True),
         *_by_agent(gauntlet, "`gauntlet`, all cells"),
     ]  # fmt: skip
@@ -201,12 +211,12 @@ def caution(root: Path) -> str:
     cells, lines = _moderate(_cells(root, "caution")), []
     for value in dict.fromkeys(cell["behavior.caution"] for cell in cells):
         own = [cell for cell in cells if cell["behavior.caution"] == value]
-        (row,) = _by_agent(own, "", True)
+        (row,) = _by_agent(own, "")
         arrived = sum(cell["outcomes"]["success"] for cell in own)
         total_s = sum(cell["outcomes"]["success"] * (cell["time_to_success_mean_s"] or 0.0) for cell in own)
         named = f"{value}" + (" (default)" if value == 1.0 else "")
-        lines.append([named, *row[1:4], seconds(total_s / arrived if arrived else None)])
-    return text_table(["caution", "success", "collision", "weighted", "time to success"], lines)
+        lines.append([named, *row[1:3], seconds(total_s / arrived if arrived else None)])
+    return text_table(["caution", "success", "collision", "time to success"], lines)
 
 
 def one_at_a_time(root: Path) -> str:
@@ -294,7 +304,9 @@ def pages(root: Path = ROOT) -> dict[str, str]:
         for page, made in TABLES.items()
     }
     kept = json.loads((root / REPRODUCTION).read_text("utf-8"), object_hook=_unpacked)
-    return found | {RESULTS: results_page(*(kept[budget] for budget in BUDGETS if budget in kept))}
+    told = [kept[budget] for budget in BUDGETS if budget in kept]
+    judged = [document | {"claims": [vars(claim) for claim in claims_of(document)]} for document in told]
+    return found | {RESULTS: results_page(*judged)}
 
 
 def _read(path: Path) -> Document:
@@ -332,14 +344,15 @@ def keep_row(name: str, run: Path, root: Path = ROOT) -> None:
 
 
 def keep_reproduction(run: Path, root: Path = ROOT) -> None:
-    """Keep what the page needs of a reproduction, beside those of other budgets."""
+    """Keep what the page needs of a reproduction, beside those of other budgets; verdicts are made anew."""
     document, kept = _read(run / "reproduce.json"), _read(root / REPRODUCTION)
-    small = {name: value for name, value in document.items() if name not in ("sections", "transfer")}
+    small = {name: value for name, value in document.items() if name not in ("sections", "claims")}
     for entries in small["table_main"].values():
-        entries[:] = [_packed(entry, "trained_steps", *_TIMES) for entry in entries]
+        entries[:] = [_packed(entry, "trained_steps", "return_mean", *_TIMES) for entry in entries]
     if document["sweep"]:
         cells = document["sweep"]["cells"]
         small["sweep"] = {"cells": [_packed(cell, "agent", "S", "D", "v_m_s") for cell in cells]}
+        small["transfer"] = {"agents": [_packed(agent, "name") for agent in document["transfer"]["agents"]]}
     kept.pop("quick", None)
     _write(root / REPRODUCTION, kept | {document["budget"]: small})
 

@@ -9,13 +9,23 @@ import pytest
 
 from benchmarks.digest import digest
 from docs import render_results
-from docs.render_results import BENCHMARKS, EVALUATIONS, README, REPRODUCTION, RESULTS, ROBUSTNESS, ROOT
+from docs.render_results import (
+    BENCHMARKS,
+    EVALUATIONS,
+    README,
+    REPRODUCTION,
+    RESULTS,
+    ROBUSTNESS,
+    ROOT,
+    SWEEPS,
+)
 from tests.evaluation.test_reproduce import cell, ended, minimal
 from tests.repository.test_docs import fault
 from uuvtai.evaluation import claims
+from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.claims import Share
-from uuvtai.evaluation.reproduce import results_page
-from uuvtai.evaluation.reproduce_steps import EVALUATION_SEED
+from uuvtai.evaluation.reproduce import claims_of, results_page
+from uuvtai.evaluation.reproduce_steps import EVALUATION_SEED, RETIRED_SEEDS
 
 
 def test_the_pages_are_those_of_the_results(capsys):
@@ -74,6 +84,7 @@ def test_a_seed_that_was_tuned_on_is_called_so(copy):
     for seed, said in ((EVALUATION_SEED, "No tuning used this seed"), (90008, "was looked at while tuning")):
         (copy / EVALUATIONS).write_text(json.dumps(document | {"seed": seed}))
         assert said in render_results.measured(copy)
+        assert "2026-11-27, commits 7f1f749, ff1b7e9." in render_results.measured(copy)
 
 
 def test_the_newest_speed_of_a_kind_is_shown_and_marked_unless_it_is_of_todays_code(copy):
@@ -87,9 +98,6 @@ def test_the_newest_speed_of_a_kind_is_shown_and_marked_unless_it_is_of_todays_c
 
 def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
     """Then rates over many cells have an interval, by episode number."""
-    kept = copy / "docs/data/sweep_pool.csv"
-    kept.write_text("\n".join(line.rpartition(",")[0] for line in kept.read_text().splitlines()))
-    assert "`bt` | 503/512 = 98.2 % |" in render_results.grid(copy), "without: none"
     cells = [
         {"S": 8, "D": d, "v_m_s": v, "agent": "bt", "episodes": 40, "time_to_success_mean_s": 9.0,
          "outcomes": {"success": 39, "collision": 0, "ttc": 1, "out_of_tank": 0, "timeout": 0},
@@ -110,10 +118,24 @@ def test_a_sweep_is_kept_with_the_end_of_every_episode(copy, tmp_path):
         render_results.keep_sweep("puddle", tmp_path, copy)
 
 
-def test_every_row_says_how_it_can_be_evaluated_again():
+def test_every_row_says_how_its_agents_can_be_evaluated_again():
     for row in json.loads((ROOT / EVALUATIONS).read_text())["rows"]:
         first, *words = shlex.split(row["command"])
         assert first == "uuv" and fault(words) is None
+        named = [words[i + 1] for i, word in enumerate(words) if word == "--agent"]
+        assert named == list(row["agents"]), "those that were removed since, too, are left out"
+        load_agents(named)
+    for sweep in json.loads((ROOT / SWEEPS).read_text()).values():
+        assert fault(shlex.split(sweep["command"])[1:]) is None
+
+
+def test_the_pages_agree_on_what_a_seed_is_for():
+    """What a page calls untouched no other page may call a seed for tuning."""
+    said = " ".join((ROOT / "docs/evaluate.md").read_text().split())
+    kept = json.loads((ROOT / EVALUATIONS).read_text())["seed"]
+    assert f"nobody has tuned on: {kept} (README" in said and f"for what is new, {EVALUATION_SEED}." in said
+    tuned = f"90001 to {RETIRED_SEEDS[-1]}"
+    assert f"and {tuned}." in said and f"1234, {tuned} (" in (ROOT / "research/LOG.md").read_text()
 
 
 def evaluation(folder, n=1000):
@@ -151,10 +173,14 @@ def test_reproductions_are_kept_small_and_make_the_page_that_they_made(copy, tmp
     for budget in ("tenfold", "paper"):
         words = ["".join(draws.choices("scxot", (75, 15, 5, 1, 4), k=500)) for _ in range(11)]
         own = [ended(word, trained_steps=614_912, return_mean=3.0) for word in words]
-        document = minimal(claims.Claim("it swims", "1", "2", claims.HOLDS, 0.03)) | {"budget": budget}
-        document |= {"table_main": {"paper": own[:5], "ppo": own[5:10], "bt": own[10:]}, "sections": [{}]}
+        document = minimal() | {"budget": budget, "sections": [{}]}
+        document["mechanism"] = {"paper": [claims.training_facts([], 2.0)]}
+        document |= {"table_main": {"paper": own[:5], "ppo": own[5:10], "bt": own[10:]}}
         if budget == "paper":
             document["sweep"] = {"cells": [cell(8, 6, v, success=90, collision=5) for v in (0.6, 1.5)]}
+            document["sweep"]["cells"] += [one | {"agent": "paper-0"} for one in document["sweep"]["cells"]]
+            document["transfer"] = {"agents": [own[0] | {"name": "paper-0"}]}
+        document["claims"] = [vars(claim) for claim in claims_of(document)]
         found = [document, *found]
         (tmp_path / "reproduce.json").write_text(json.dumps(document))
         render_results.keep_reproduction(tmp_path, copy)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -22,7 +23,6 @@ from uuvtai.evaluation.reproduce_steps import (
     EVALUATION_SEED,
     METHODS,
     RETIRED_SEEDS,
-    Budget,
     Step,
     is_done,
     result_file,
@@ -95,16 +95,18 @@ def main_table(document: dict[str, Any]) -> Rows:
     rows = []
     for name, entries in document["table_main"].items():
         printed = claims.TABLE_MAIN.get(name)
-        theirs = ["-"] * 3
+        theirs = ["-"] * 4
         if printed:
             shares = f"{printed.success:.2f} / {printed.collision:.2f}"
-            theirs = [shares, f"{printed.tts_s} s", f"{printed.mean_time_s} s"]
+            theirs = [shares, f"{printed.episode_return}", f"{printed.tts_s} s", f"{printed.mean_time_s} s"]
         all_s = mean([m["time_mean_s"] for m in entries if m["time_mean_s"] is not None])
         arrived = [m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None]
-        times = [seconds(tts_s(entries)), theirs[1], seconds(all_s), theirs[2], seconds(mean(arrived))]
-        rows.append([f"`{name}`", *_rates(entries), theirs[0], *times])
+        paid = number(mean([m["return_mean"] for m in entries]), 1)
+        times = [seconds(tts_s(entries)), theirs[2], seconds(all_s), theirs[3], seconds(mean(arrived))]
+        rows.append([f"`{name}`", *_rates(entries), theirs[0], paid, theirs[1], *times])
     columns = ["agent", "success by training seed", "success", "collision", "the paper: success / collision"]
-    columns += ["TTS", "the paper: TTS", "mean time", "the paper: mean time", "mean time of successes"]
+    columns += ["return", "the paper: return", "TTS", "the paper: TTS", "mean time", "the paper: mean time"]
+    columns += ["mean time of successes"]
     return columns, rows
 
 
@@ -122,15 +124,16 @@ def mechanism_tables(document: dict[str, Any]) -> list[tuple[str, Rows]]:
     scales = {name: [facts["scale"] for facts in own if facts["scale"]] for name, own in found.items()}
     scale = [[f"`{name}`", *map(_and_range, zip(*own, strict=True))] for name, own in scales.items() if own]
     skilled = {name: own for name, own in found.items() if own[0]["skill"]}
-    targets = dict.fromkeys(target for own in skilled.values() for facts in own for target in facts["skill"])
-    skill = [[target, *(_skill(own, target) for own in skilled.values())] for target in targets]
+    told = dict.fromkeys(target for own in skilled.values() for facts in own for target in facts["skill"])
+    kinds = Counter(target.rpartition("_")[0] for target in told)
+    skill = [[f"{kind} ({n})", *(_skill(own, kind) for own in skilled.values())] for kind, n in kinds.items()]
     columns = ["training", "s_t: first", "median", "last", "share of iterations at its limit"]
-    return [(_SCALE, (columns, scale)), (_SKILL, (["target", *(f"`{name}`" for name in skilled)], skill))]
+    return [(_SCALE, (columns, scale)), (_SKILL, (["targets", *(f"`{name}`" for name in skilled)], skill))]
 
 
-def _skill(own: Sequence[dict[str, Any]], target: str) -> str:
-    found = [facts["skill"].get(target) for facts in own]
-    return _and_range([value for value in found if value is not None])
+def _skill(own: Sequence[dict[str, Any]], kind: str) -> str:
+    found = [item for facts in own for item in facts["skill"].items() if item[1] is not None]
+    return _and_range([value for target, value in found if target.rpartition("_")[0] == kind])
 
 
 def _and_range(values: Sequence[float]) -> str:
@@ -144,7 +147,8 @@ def _and_range(values: Sequence[float]) -> str:
 _SCALE = "The scale s_t of the distillation over a training: mean over the training seeds (range)."
 _SKILL = (
     "Skill of the world model in the last quarter of a training: 1 - mean squared error of its prediction / "
-    "that of saying *as before*, mean over the training seeds (range). Below 0 it is worse than no model."
+    "that of saying *as before*, mean over training seeds and targets of a kind (range). Below 0 it is worse "
+    "than no model."
 )
 
 
@@ -164,13 +168,12 @@ def _head(document: dict[str, Any]) -> str:
     tuned = "was looked at while tuning" if seed in RETIRED_SEEDS else "was never trained or tuned on"
     others = ", ".join(document["trained_at"])
     trained = f" (trained or evaluated at: {others})" if others else ""
-    lines = [
+    return (
         f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit "
         f"{document['git_sha'] or 'unknown'}{trained}, {machine['cpu']}, {machine['cores']} cores. RUN is "
-        f"the reproduction's folder; the evaluations' seed, {seed}, {tuned}.",
-        *document.get("notes", []),
-    ]
-    return "\n".join(lines)
+        "the reproduction's folder. All drive on the paper's stack, `bt` too; the evaluations' seed, "
+        f"{seed}, {tuned}."
+    )
 
 
 def _titled(title: str, document: dict[str, Any]) -> str:
@@ -180,11 +183,12 @@ def _titled(title: str, document: dict[str, Any]) -> str:
 _HOW = (
     "A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, is "
     f"below {LEVEL}; else it cannot be judged. Methods are compared by Welch's t over their training seeds "
-    "(intervals: Student's, 95 %), rates of one agent by Fisher's exact test, with a printed value by the "
-    "exact binomial test (intervals: Wilson's, 95 %). Episodes of one number go together in all cells of a "
-    "grid: only as many count as independent ones would say the same. Claims without a p value set one "
-    "number beside another: one run, one machine, no test. The paper's rates are of another simulator: one "
-    "that is reached says nothing about who is better."
+    "(intervals: Student's, 95 %; the variance is no less than by the episodes), and so are rates within a "
+    "margin; other rates of one agent by Fisher's exact test, with a printed value by the exact binomial "
+    "test (intervals: Wilson's, 95 %). Episodes of one number go together in all cells of a grid: only as "
+    "many count as independent ones would say the same. Claims without a p value set one number beside "
+    "another: one run, one machine, no test. The paper's rates are of another simulator: one that is reached "
+    "says nothing about who is better. Not judged: when a training converges, trajectories, larger margins."
 )
 
 
@@ -195,11 +199,17 @@ def _claim_lines(document: dict[str, Any]) -> str:
 
 def _main(document: dict[str, Any]) -> str:
     entries = [entry for entries in document["table_main"].values() for entry in entries]
-    steps = sorted({entry["trained_steps"] for entry in entries if "trained_steps" in entry})
-    trained = f"Env-steps of a training: {', '.join(f'{n:,}' for n in steps)}."
-    commands = "\n".join(f"`{document['commands'][at]}`" for at in ("eval/NAME-SEED", "eval/main"))
+    counts = sorted({entry["trained_steps"] for entry in entries if "trained_steps" in entry})
+    trained = f"Env-steps of a training: {', '.join(f'{n:,}' for n in counts)}."
+    steps = [step for step in steps_of(BUDGETS[document["budget"]], _RUN) if step.folder in _EXAMPLES]
+    told = [" ".join(["uuv", *step.argv(_RUN)]) for step in steps]
+    told += [document["commands"][at] for at in ("eval/NAME-SEED", "eval/main")]
+    commands = "\n".join(f"`{command}`" for command in told)
     title = f"{_titled('Table main and ablations', document)}\n{commands}"
     return f"{title}\n\n{trained} {_TTS}\n\n" + text_table(*main_table(document))
+
+
+_RUN, _EXAMPLES = Path("RUN"), ("train/paper-0", "train/paper_10hz-0")  # trainings whose commands are shown
 
 
 def _mechanism(document: dict[str, Any]) -> str:
@@ -274,7 +284,7 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
     """Go on with a reproduction that was killed or interrupted; finished steps stay as they are.
     ``allow_code``: Python files that the folder names may be run. Raises RunFolderError."""
     root = place.absolute()
-    folder = RunFolder.held(root, "uuv reproduce")
+    folder = RunFolder.held(root, "uuv reproduce", REQUEST)
     try:
         request = _request(root)
         refuse_code(root, request["own"], allow_code)
@@ -360,12 +370,12 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
         "python": sys.version.split()[0],
         "commands": dict(_shown(step, root) for step in steps if step.command[0] != "train"),
         "table_main": by_method,
-        "claims": [vars(claim) for claim in _claims(results, by_method, facts[METHODS[0]], budget, own)],
         "mechanism": {name: found for name, found in facts.items() if name.startswith(METHODS[0])},
         "transfer": results.get("eval/transfer"),
         "sweep": results.get("sweep/pool"),
         "profile": results.get("profile"),
     }
+    document["claims"] = [vars(claim) for claim in claims_of(document)]
     made = [step.folder for step in steps if step.command[0] == "train" and (root / step.folder).is_dir()]
     return document | {"sections": sections_of(document, made)}
 
@@ -399,18 +409,15 @@ def _entry(agent: dict[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in agent.items() if k != "episodes_detail"} | {"ends": ends}
 
 
-def _claims(
-    results: dict[str, Any],
-    by_method: dict[str, Any],
-    trainings: list[dict[str, Any]],
-    budget: Budget,
-    own: Sequence[str],
-) -> list[Claim]:
-    found = [*claims.of_table_main(by_method, budget.note), *claims.of_training(trainings, budget.note)]
-    if "sweep/pool" in results:
-        cells = results["sweep/pool"]["cells"]
-        there = next(e for e in results["eval/transfer"]["agents"] if e["name"] not in ("bt", *own))
-        found += [claim for name in (there["name"], "bt") for claim in claims.of_sweep(cells, name)]
-        found += claims.of_timing(results["profile"])
-        found += claims.of_transfer(by_method[METHODS[0]][0], there)
+def claims_of(document: dict[str, Any]) -> list[Claim]:
+    """The paper's claims, judged by what the document holds of methods, sweep, times and transfer."""
+    note, main, distilled = BUDGETS[document["budget"]].note, document["table_main"], METHODS[0]
+    found = [*claims.of_table_main(main, note), *claims.of_training(document["mechanism"][distilled], note)]
+    if document["sweep"]:
+        policy = f"{distilled}-0"
+        for name in (policy, "bt"):
+            found += claims.of_sweep(document["sweep"]["cells"], name)
+        found += claims.of_timing(document["profile"])
+        (there,) = [agent for agent in document["transfer"]["agents"] if agent["name"] == policy]
+        found += claims.of_transfer(main[distilled][0], there)
     return claims.judged(found)

@@ -135,7 +135,7 @@ def resume(
     from uuvtai.evaluation.agents import load_agents
     from uuvtai.evaluation.results import refuse_others
 
-    folder = RunFolder.held(place, "uuv sweep")
+    folder = RunFolder.held(place, "uuv sweep", REQUEST)
     try:
         try:
             document = read_json(place / REQUEST, folder=place)

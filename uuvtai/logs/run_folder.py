@@ -96,20 +96,21 @@ class RunFolder:
         self.write_json(_RECORD, self._record)
 
     @classmethod
-    def held(cls, path: Path, command: str = "uuv") -> RunFolder:
+    def held(cls, path: Path, command: str = "uuv", request: str = _RECORD) -> RunFolder:
         """The folder of a run that ended or was killed, held, and nothing read or changed in it yet;
         ``go_on`` comes next.
 
-        ``command`` makes such folders, for the message. Raises RunFolderError for what is no run folder, for
-        one that another process works in, and for one with a link anywhere in it.
+        ``command``, which makes such folders, is for the message; ``request`` is a file that it leaves there.
+        Raises RunFolderError for what is no such folder, for one that another process works in, and for one
+        with a link anywhere in it.
         """
         folder = cls.__new__(cls)
         folder.path, folder._started = path, time.time()
-        if not _is_plain(path / _RECORD):
-            raise RunFolderError(
-                f"{path}: is no run folder, it has no plain file {_RECORD}; give the folder that '{command}' "
-                "printed"
-            )
+        for name in (_RECORD, request):
+            if not _is_plain(path / name):
+                raise RunFolderError(
+                    f"{path}: has no plain file {name}; give the run folder that '{command}' printed"
+                )
         folder.hold()
         try:
             folder._guarded("read it", lambda: files.refuse_links_in(path))
