@@ -41,7 +41,6 @@ ROBUSTNESS, SAFETY, SPEEDS = "docs/robustness.md", "docs/safety.md", "benchmarks
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(?P<foot>^<!-- end -->)", re.M | re.S
 )
-LITERATURE = {"mppi", "dwa"}  # rows with a table of their own
 SHORT = {  # rows of README's table
     "pool_6": "`pool`, 6 at 0.6 m/s",
     "gauntlet_9_fast": "`gauntlet`, 9 at 1.5 m/s",
@@ -67,13 +66,11 @@ def measured(root: Path) -> str:
 
 
 def short(root: Path) -> str:
-    """README's table: success and collision of the tree and of the best agent in five worlds."""
+    """README's table: success and collision of the tree, the best agent and the policy in five worlds."""
     rows, lines = {row["name"]: row["agents"] for row in _read(root / EVALUATIONS)["rows"]}, []
     for name, title in SHORT.items():
-        bt, best = (_both(rows[name][agent]) if agent in rows[name] else "-" for agent in ("bt", "best"))
-        lines.append([title, *(bt.split(" / ") * 2)[:2], best])
-    head = ["world, dynamic obstacles", "`bt`: success", "collision", "`best`: success / collision"]
-    return text_table(head, lines)
+        lines.append([title, *(_beside(rows[name], agent) for agent in ("bt", "best", "policy"))])
+    return text_table(["world, dynamic obstacles", "`bt`", "`best`", "`policy`"], lines)
 
 
 def evaluations(root: Path) -> str:
@@ -81,24 +78,23 @@ def evaluations(root: Path) -> str:
     document = _read(root / EVALUATIONS)
     head = [
         "world (D, v in m/s)", "success", "collision", "contact / TTC stop / out / timeout",
-        "`best`: success / collision (p)", "`planner`", "most frequent causes of failure",
+        "`best`: success / collision (p)", "`policy`: the same", "`planner`", "most frequent causes of failure",
     ]  # fmt: skip
-    shown = [row for row in document["rows"] if row["agents"] and LITERATURE.isdisjoint(row["agents"])]
     note = (
-        "Success, collision and endings are those of `bt`, in the last row of `paper`; p: McNemar's.\n"
+        "Success, collision and endings are those of `bt`; `-` = not evaluated; p: McNemar's, beside `bt`.\n"
         f"Counts: `{EVALUATIONS}`.\n\n"
     )
-    return note + text_table(head, [_evaluated(row) for row in shown])
+    return note + text_table(head, [_evaluated(row) for row in document["rows"] if row["agents"]])
 
 
 def _evaluated(row: Document) -> list[str]:
     agents, own = row["agents"], row["agents"][row["shows"]]
     ends = " / ".join(str(own["outcomes"][end]) for end in ("collision", "ttc", "out_of_tank", "timeout"))
-    best = _both(agents["best"]) + _p(row, "best") if "best" in agents else "-"
+    best, policy = (_beside(agents, name) + _p(row, name) for name in ("best", "policy"))
     planner = f"{_percent(agents['planner'], 'success')} %" if "planner" in agents else "-"
     causes = ", ".join(f"{cause['label']} {cause['count']}" for cause in own["causes"][:2])
     collision = str(pooled([own], *COLLIDED)).partition(" = ")[2]
-    return [row["title"], str(pooled([own], "success")), collision, ends, best, planner, causes]
+    return [row["title"], str(pooled([own], "success")), collision, ends, best, policy, planner, causes]
 
 
 def _percent(agent: Document, *outcomes: str) -> str:
@@ -109,15 +105,10 @@ def _percent(agent: Document, *outcomes: str) -> str:
 
 
 def local_planners(root: Path) -> str:
-    """Planners of the literature and the paper's stack beside the tree."""
+    """Every agent beside the tree, planners of the literature and the paper's stack among them."""
     rows = {row["name"]: row for row in _read(root / EVALUATIONS)["rows"]}
-    worlds = [rows[name] for name in ("pool_6_local", "pool_9_fast_local", "gauntlet_9_fast_local")]
-    paper = rows["pool_6_paper"]
-    worlds[0] = worlds[0] | {
-        "agents": paper["agents"] | worlds[0]["agents"],
-        "paired": [*worlds[0]["paired"], *paper["paired"]],
-    }
-    names = ("bt", "paper", "mppi", "dwa")
+    worlds = [rows[name] for name in ("pool_6", "pool_9_fast", "gauntlet_9_fast")]
+    names = ("bt", "best", "policy", "capped", "paper", "mppi", "dwa")
     lines = [[f"`{name}`", *(_beside_bt(row, name) for row in worlds)] for name in names]
     return text_table(["", *(row["title"] for row in worlds)], lines)
 
@@ -134,6 +125,11 @@ def _p(row: Document, name: str) -> str:
     """Of McNemar's test against the tree; nothing for the tree itself."""
     pair = next((pair for pair in row["paired"] if {pair["a"], pair["b"]} == {"bt", name}), None)
     return f" ({pair['mcnemar_p']:.2g})" if pair else ""
+
+
+def _beside(agents: Document, name: str) -> str:
+    """Success / collision; - = not evaluated."""
+    return _both(agents[name]) if name in agents else "-"
 
 
 def _both(agent: Document) -> str:
