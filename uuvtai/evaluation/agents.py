@@ -177,17 +177,26 @@ def observation_of(names: Sequence[str]) -> list[tuple[str, Any]]:
 
 
 def differences(agent: AgentSpec, config: Config) -> str:
-    """Keys of the stack that differ from the policy's training, in words; empty = none."""
-    if agent.checkpoint is None:
+    """What of the stack is not as in the policy's training, in words, and the preset that makes it so, if one
+    does; empty = nothing."""
+    if agent.checkpoint is None or not (parts := _unlike(config, trained := agent.checkpoint.config)):
         return ""
-    ours, trained = config.model_dump(mode="json"), agent.checkpoint.config.model_dump(mode="json")
-    parts = [
-        f"{section}.{key} = {value} (trained with {trained[section].get(key)})"
+    names = preset_names("stack")
+    stack = next((name for name in names if not _unlike(with_stack(config, name), trained)), None)
+    mend = f"; as it was trained: --set stack={stack}" if stack else ""
+    told = ", ".join(parts[:2]) + (f" and {len(parts) - 2} more" if len(parts) > 2 else "")
+    return f"{agent.name} drives another stack than in its training: {told}{mend}"
+
+
+def _unlike(config: Config, trained: Config) -> list[str]:
+    """Keys of the stack that differ."""
+    ours, theirs = config.model_dump(mode="json"), trained.model_dump(mode="json")
+    return [
+        f"{section}.{key} = {value} (trained with {theirs[section].get(key)})"
         for section in _STACK
         for key, value in ours[section].items()
-        if value != trained[section].get(key)
+        if value != theirs[section].get(key)
     ]
-    return f"{agent.name}: {', '.join(parts)}" if parts else ""
 
 
 def policy_name(name: str, checkpoint: Checkpoint) -> str:
