@@ -29,7 +29,7 @@ from uuvtai.learning import runner
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins import adapters, loading, plugin
 from uuvtai.plugins.adapters import CallMeter
-from uuvtai.plugins.api import COMMAND, PluginError, PluginSpec, is_plugin, plugin_spec
+from uuvtai.plugins.api import COMMAND, PluginError, PluginSpec, is_plugin, plugin_spec, to_resume
 from uuvtai.report.evaluation import agents_table
 from uuvtai.report.tables import TERMINAL
 from uuvtai.sim.setup import array_sizes
@@ -940,6 +940,12 @@ def test_a_run_goes_on_with_the_reward_that_it_began_with(write, tmp_path):
         (tmp_path / runner.REWARD).write_text(json.dumps(strange))
         with pytest.raises(ConfigError, match="began with --reward"):
             runner._check_reward(tmp_path, own)
+
+
+def test_what_goes_on_with_a_run_names_all_that_is_asked_for():
+    """The line after Ctrl-C is one that works: code of the user's is allowed anew each time."""
+    assert to_resume(Path("runs/a b"), ["bt", "policy:net.onnx"]) == "--resume 'runs/a b'"
+    assert to_resume(Path("runs/a"), ["bt", "controller:mine.py:act"]) == "--resume runs/a --allow-code"
 
 
 MOTION = """import numpy as np
