@@ -872,7 +872,6 @@ def test_the_sums_begin_anew_with_an_episode_and_who_rests_earns_nothing(sim, wr
         ("{'near': ['a'] * 8}", "near: gave list of <U1; wanted are real numbers"),
         ("{'effort': view.clearance}", "effort is a built-in term; name yours otherwise, or weight that one"),
         ("view.obstacles", "a view has no 'obstacles'; there are action, cell_m, clearance, columns"),
-        ("view.goal_", "tracks, ttc (--reward mine.py:terms); its traceback"),
         ("view.yaw_rate", "a view has no 'yaw_rate'; a column is view['yaw_rate']; there are"),
     ],
 )
