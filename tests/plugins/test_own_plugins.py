@@ -933,7 +933,7 @@ def test_a_run_goes_on_with_the_reward_that_it_began_with(write, tmp_path):
     (tmp_path / runner.REWARD).write_text(json.dumps(kept))
     runner._check_reward(tmp_path, own)
     for other in (None, found(f"{write(REWARD + '# changed')}:terms", "reward")):
-        with pytest.raises(ConfigError, match=f"began with --reward {own.spec.typed}; give it as it was, or"):
+        with pytest.raises(ConfigError, match=f"began with --reward {own.spec.typed}; give it unchanged"):
             runner._check_reward(tmp_path, other)
     for strange in ([], kept | {"argument": "other"}, kept | {"name": "other"}):
         (tmp_path / runner.REWARD).write_text(json.dumps(strange))

@@ -180,7 +180,7 @@ def _check_reward(folder: Path, own: RewardSource | None) -> None:
     began = found if isinstance(found, dict) else {}
     if there == bool(own) and all(began.get(key) == now[key] for key in now if key != "typed"):
         return
-    typed = f"--reward {began.get('typed', '')}; give it as it was" if there else "no --reward; leave it out"
+    typed = f"--reward {began.get('typed', '')}; give it unchanged" if there else "no --reward; leave it out"
     more = f" --reward {own.spec.typed}" if own else ""
     start = f"begin a new run with its policy: uuv train PRESET --start {folder}{more}"
     raise ConfigError(f"{folder}: began with {typed}, or {start}")
