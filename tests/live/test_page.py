@@ -27,7 +27,7 @@ from uuvtai.live import server as live_server
 from uuvtai.live.page import STALE_S, STOP, PageServer
 from uuvtai.live.server import MOST_CLIENTS, MOST_WAITING, LiveError
 from uuvtai.logs.reader import read_messages
-from uuvtai.report.evaluation import who_arrived
+from uuvtai.report.evaluation import limit_of_p, who_arrived
 from uuvtai.report.html import live_page
 from uuvtai.report.running import RunningEpisodes
 
@@ -414,6 +414,12 @@ def test_driving_in_a_browser(tmp_path):
     assert first <= 5 and actions[first] == [1, 0, 0, 0]
     assert any(not any(action) for action in actions[first:]), "space stopped it"
     assert [-1, 0, 0, 0] in actions and len(list((folder / "logs").iterdir())) == 2
+
+
+def test_two_policies_of_ones_own_say_nothing_about_the_way_to_train():
+    bt, built_in, one, two = {}, {"path": "built-in"}, {"path": "runs/a"}, {"path": "runs/b"}
+    rows = [{"checkpoint": found} if found else {} for found in (bt, built_in, one, two)]
+    assert "train each with several --seed" in limit_of_p(rows) and limit_of_p(rows[:3]) == ""
 
 
 def test_who_arrived_sooner_is_named_first():
