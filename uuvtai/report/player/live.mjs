@@ -214,7 +214,7 @@ export class Live extends Player {
     this.back = this.press("All tanks", "back to the wall (esc)", () => this.follow(-1));
     this.back.classList.add("one");
     this.asks = this.press("Truth", "show what no vehicle senses (T)", () => this.truth());
-    const pair = add(this.root.querySelector(".figures"), "div");
+    const pair = add(this.root.querySelector(".figures"), "div", { className: "words" });
     add(pair, "dt", { textContent: "command" });
     this.commanded = add(pair, "dd", { textContent: "stop" });
   }

@@ -1,18 +1,18 @@
 // The scene of a moment: from above what an agent senses, maps, plans and does, with the truth; below that from the side.
 import { HULL_RADIUS_M, circle, ellipse, gap, halfWidth, hullOutline, obstacleOutline, tankOutline } from "./view.mjs";
 
-/** What can be switched off, in the legend's order: name, colour of the palette, words, and whether it is shown at first. */
+/** What can be switched off, in the legend's order: name, colour of the palette, words, mark, and whether it is shown at first. */
 export const LAYERS = [
-  ["truth", "mover", "true obstacles (static: grey)", true],
-  ["static", "static", "mapped", true],
-  ["dynamic", "dynamic", "mapped, dynamic", true],
-  ["tracks", "dynamic", "tracked, 2 sigma", true],
-  ["futures", "mover", "forecasts", true],
-  ["route", "route", "route", true],
-  ["path", "", "path driven", true],
-  ["echoes", "echo", "sonar", true],
-  ["ghosts", "grey", "other agents", true],
-  ["clearance", "intersection", "clearance field", false],
+  ["truth", "mover", "true obstacles (static: grey)", "thin ring", true],
+  ["static", "static", "mapped", "", true],
+  ["dynamic", "dynamic", "mapped, dynamic", "", true],
+  ["tracks", "dynamic", "tracked, 2 sigma", "ring", true],
+  ["futures", "mover", "forecasts", "dot", true],
+  ["route", "route", "route", "line", true],
+  ["path", "", "path driven", "line", true],
+  ["echoes", "echo", "sonar", "dot", true],
+  ["ghosts", "grey", "other agents", "line", true],
+  ["clearance", "intersection", "clearance field", "", false],
 ];
 
 /** Draws a scene into a 2D context of CSS pixels. `look`: colours by name, colours of the agents, layers that are on. */
@@ -38,7 +38,7 @@ export class Painter {
     this.goal(source.scene);
     if (look.on.route) this.route(frame);
     if (look.on.ghosts) this.others(source, agent, time);
-    this.path(source.history(agent), frame.step, look.agents[agent], 2);
+    this.path(source.history(agent), frame.step, look.agents[agent], 2.5, 2.5);
     if (look.on.echoes) for (const [x, y] of frame.echoes) this.dot(x, y, 1.7, look.echo);
     if (look.on.tracks) this.tracks(frame.tracks);
     this.vehicle(frame.pose, look.agents[agent]);
@@ -157,12 +157,15 @@ export class Painter {
     context.globalAlpha = 1;
   }
 
-  path({ pose }, step, colour, width) {
+  /** From a ring at the start; `halo`: [px] of paper around it. */
+  path({ pose }, step, colour, width, halo = 0) {
     const { context, view, look } = this;
     if (!look.on.path) return;
     context.beginPath();
     for (let i = 0; i <= step; i++) context.lineTo(view.x(pose[4 * i]), view.y(pose[4 * i + 1]));
+    if (halo) this.stroked(look.paper, width + halo);
     this.stroked(colour, width);
+    if (halo) this.dot(pose[0], pose[1], 5, look.ink), this.dot(pose[0], pose[1], 2.8, look.paper);
   }
 
   vehicle(pose, colour) {

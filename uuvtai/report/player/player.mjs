@@ -35,7 +35,7 @@ export class Player {
   /** `episodes`: [{title, open: () => Promise of a Source}] */
   constructor(root, episodes) {
     Object.assign(this, { root, episodes, time: 0, speed: 1, agent: 0, playing: false, near: false, images: {} });
-    this.on = Object.fromEntries(LAYERS.map(([name, , , shown]) => [name, shown]));
+    this.on = Object.fromEntries(LAYERS.map(([name, , , , shown]) => [name, shown]));
     this.build();
     root.player = this;
     const redraw = () => this.draw();
@@ -182,7 +182,7 @@ export class Player {
     this.strip.setAttribute("aria-valuemax", source.end.toFixed(1));
     this.strip.setAttribute("aria-valuetext", `${time.toFixed(1)} of ${source.end.toFixed(1)} s`);
     const colours = Object.fromEntries(LAYERS);
-    for (const [name, swatch] of Object.entries(this.swatches)) swatch.style.background = look[colours[name] ?? name] ?? look.agents[agent];
+    for (const [name, swatch] of Object.entries(this.swatches)) swatch.style.color = look[colours[name] ?? name] ?? look.agents[agent];
   }
 
   // -------------------------------------------------------------------------------------------------------- the page
@@ -201,7 +201,7 @@ export class Player {
     this.scene = add(root, "canvas", { className: "scene", role: "img", ariaLabel: "the episode from above and from the side" });
     const figures = add(root, "dl", { className: "figures" });
     this.values = ["time", "clearance", "time to collision", "speed", "tree", "replans"].map((name) => {
-      const pair = add(figures, "div");
+      const pair = add(figures, "div", { className: name === "tree" ? "words" : "" });
       add(pair, "dt", { textContent: name });
       return add(pair, "dd");
     });
@@ -247,11 +247,11 @@ export class Player {
     add(this.layers, "summary", { textContent: "Layers and legend" });
     const box = add(this.layers, "div");
     this.swatches = {};
-    for (const [name, , words] of LAYERS) {
+    for (const [name, , words, mark] of LAYERS) {
       const label = add(box, "label");
       const tick = add(label, "input", { type: "checkbox", checked: this.on[name] });
       tick.onchange = () => ((this.on[name] = tick.checked), this.draw());
-      this.swatches[name] = add(label, "span", { className: "swatch" });
+      this.swatches[name] = add(label, "span", { className: `swatch ${mark}` });
       label.append(words);
     }
     for (const why of ["initial", "stuck", "safety", "intersection"]) {
