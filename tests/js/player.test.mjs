@@ -65,8 +65,21 @@ test("places on the canvas", () => {
     assert.ok(Math.abs((view.x(20) - view.x(0)) / 20 - (view.y(0) - view.y(6)) / 6) < 1e-9, "a metre is as long both ways");
     assert.deepEqual([view.depth(0), view.depth(-1.6)], [view.side, view.side + view.deep]);
   }
-  const near = new View(TANK, 1180, [19, 1]);
+  const near = new View(TANK, 1180, { x: 19, y: 1, metres: 9 });
   assert.ok(Math.abs(near.x(20) - near.left - near.wide) < 1e-9 && Math.abs(near.y(0) - near.top - near.high) < 1e-9, "no farther than the walls");
+});
+
+test("fingers zoom and move, and no farther than the whole tank", () => {
+  const whole = new View(TANK, 340, null);
+  const [from, to] = [{ x: 200, y: 50 }, { x: 180, y: 60 }];
+  const zoom = whole.zoomed(TANK, 8, from, to);
+  const large = new View(TANK, 340, zoom);
+  assert.ok(Math.abs(large.scale - 8 * whole.scale) < 1e-9);
+  whole.world(from).forEach((part, i) => assert.ok(Math.abs(part - large.world(to)[i]) < 1e-9, "what was under the fingers still is"));
+  assert.equal(large.zoomed(TANK, 0.12, to, from), null);
+  const far = new View(TANK, 340, large.zoomed(TANK, 1, from, { x: 9000, y: -9000 }));
+  assert.deepEqual([far.x0, Math.round(1e6 * (far.y1 - far.high / far.scale))], [0, 0]);
+  assert.equal(whole.zoomed(TANK, 1e9, from, to).metres, 1.5);
 });
 
 test("shapes", () => {
@@ -131,6 +144,10 @@ test("steering by keys and gamepad", () => {
   assert.equal(said(steering.command(none)), "ahead 33 %, down 33 %, turn left 33 %");
   assert.ok(steering.key({ ...plain, code: "Space" }, true) && !steering.key({ ...plain, code: "KeyX" }, true) && !steering.key({ ...plain, code: "KeyW", ctrlKey: true }, true));
   assert.deepEqual([steering.command(none), said([0, 0, 0, 0])], [[0, 0, 0, 0], "stop"]);
+  steering.thumb(true, -0.56, 1);
+  steering.thumb(false, 0.1, -1);
+  assert.deepEqual(steering.command(none).map((value) => Math.round(100 * value)), [100, 50, -100, 0]);
+  steering.release();
   const pad = { connected: true, axes: [0.1, -1, 1, 0.56], buttons: [{ pressed: false }] };
   assert.deepEqual(steering.command([null, pad]).map((value) => Math.round(100 * value)), [100, 0, -50, -100]);
   assert.deepEqual(steering.command([{ ...pad, buttons: [{ pressed: true }] }]), [0, 0, 0, 0]);

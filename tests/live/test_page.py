@@ -400,9 +400,10 @@ def test_driving_in_a_browser(tmp_path):
         out, err = process.communicate(timeout=300)
     assert process.returncode == 0 and seen["errors"] == []
     assert seen["begun"]["end"] == 0 and seen["begun"]["held"] == "start", "the second page starts nothing"
-    assert seen["begun"]["words"].startswith("The first key starts")
+    assert seen["begun"]["words"].startswith("The first command starts")
     assert seen["begun"]["truth"] == 0 and seen["driven"]["clearance"] is None
     assert seen["driven"]["speed"] > 0.05 and seen["driven"]["said"] == "ahead 100 %"
+    assert seen["touched"] == [False, 2], "pads are there where the screen is touched"
     assert f"Report: {folder}/report.html" in seen["note"]
     *_, report = err.strip().splitlines()
     assert re.search(r"^(bt|human) reached the goal in [01] of 1 episode.*, (bt|human) in [01]", out, re.M)

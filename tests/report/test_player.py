@@ -248,9 +248,13 @@ def test_the_player_in_a_browser_shows_the_log(page, log):
             log["/safety"].at(moment["time"])[0], abs=recorded.PLACE_M
         )
         place = moment["left"] + moment["scale"] * x, moment["top"] + moment["scale"] * (6.0 - y)
-        assert moment["middle"] == pytest.approx(place, abs=1.5)
+        assert moment["middle"] == pytest.approx(place, abs=0.5)
     pressed = seen["pressed"]
     times = [round(pressed[key]["time"], 3) for key in ("Home", "ArrowRight", "Shift+ArrowRight", "End", "x")]
     assert times == [0, 0.1, 1.1, pytest.approx(log.duration_s, abs=0.01), pytest.approx(1.8, abs=0.05)]
     assert pressed["x"]["words"].startswith("straight: collision after 1.8 s. Late detection: seen too late")
     assert (pressed["2"]["agent"], pressed["+"]["speed"], pressed["l"]["open"]) == (1, 2, False)
+    whole, wide, dragged, tapped, again, back = seen["touched"]
+    assert whole["metres"] / wide["metres"] == pytest.approx(3) and wide["x"] > 2
+    assert dragged["x"] - wide["x"] == pytest.approx(200 / seen["moments"][0]["scale"] / 3, abs=0.02)
+    assert [one["playing"] for one in (dragged, tapped, again)] == [False, True, False] and back == whole

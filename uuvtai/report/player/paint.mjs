@@ -13,7 +13,10 @@ export const LAYERS = [
   ["echoes", "echo", "sonar", "dot", true],
   ["ghosts", "grey", "other agents", "line", true],
   ["clearance", "intersection", "clearance field", "", false],
+  ["around", "ink", "around the vehicle", "ring", false],
 ];
+export const AROUND_PX = 132;
+const AROUND_M = 6;
 
 /** Draws a scene into a 2D context of CSS pixels. `look`: colours by name, colours of the agents, layers that are on. */
 export class Painter {
@@ -306,6 +309,40 @@ export class Painter {
     context.fillStyle = look.grey;
     context.fillText(words, x, y);
   }
+}
+
+/** What the vehicle senses around it, its bow up, as a sonar's display shows it: returns, tracks, the point it steers at, the goal's way. */
+export function paintAround(context, { pose: [x, y, , yaw], echoes, tracks, ahead }, goal, colour, look) {
+  const [middle, scale, [c, s]] = [AROUND_PX / 2, (AROUND_PX / 2 - 9) / AROUND_M, [Math.cos(yaw), Math.sin(yaw)]];
+  const place = (u, v) => [middle + (s * (u - x) - c * (v - y)) * scale, middle - (c * (u - x) + s * (v - y)) * scale];
+  const round = ([u, v], radius, fill, edge, width = 1.5) => {
+    context.beginPath();
+    context.arc(u, v, radius, 0, 7);
+    context.fillStyle = fill;
+    context.fill();
+    if (!edge) return;
+    context.strokeStyle = edge;
+    context.lineWidth = width;
+    context.stroke();
+  };
+  context.fillStyle = look.paper;
+  context.fillRect(0, 0, AROUND_PX, AROUND_PX);
+  round([middle, middle], AROUND_M * scale, look.water, look.ink);
+  for (const ring of [2, 4]) round([middle, middle], ring * scale, "transparent", look.faint, 1);
+  const far = (u, v) => Math.hypot(u - x, v - y) > AROUND_M;
+  for (const [u, v] of echoes) if (!far(u, v)) round(place(u, v), 1.6, look.echo);
+  for (const track of tracks) if (!far(track.x, track.y)) round(place(track.x, track.y), track.radius * scale, "transparent", look.dynamic);
+  if (ahead && !far(...ahead)) round(place(...ahead), 3, look.route);
+  const share = Math.min(AROUND_M / (Math.hypot(goal[0] - x, goal[1] - y) || 1), 1);
+  round(place(x + share * (goal[0] - x), y + share * (goal[1] - y)), 4, look.goal, look.ink, 1);
+  context.fillStyle = colour;
+  context.beginPath();
+  for (const [u, v] of [[0, -7], [5, 5], [-5, 5]]) context.lineTo(middle + u, middle + v);
+  context.fill();
+  context.font = `10px ${look.font}`;
+  context.textAlign = "right";
+  context.fillStyle = look.grey;
+  context.fillText(`${AROUND_M} m`, AROUND_PX, AROUND_PX - 2);
 }
 
 export function ended(agent, time) {
