@@ -1,7 +1,7 @@
 // A picture, or with .gif an episode, as a report's player shows it, light:
-// node picture.mjs PAGE --episode 3 --agent bt --out FILE.png --time 9.4 --width 900 (.gif: --speed 4 --fps 5 in place of --time)
+// node picture.mjs PAGE --episode 3 --agent bt --time 9.4 --out FILE.png, or --speed 4 --fps 5 --out FILE.gif
 import { execFileSync } from "node:child_process";
-import { mkdtempSync } from "node:fs";
+import { mkdtempSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { inBrowser, opened } from "./browser.mjs";
@@ -24,7 +24,7 @@ some = frames[:: max(len(frames) // 4, 1)]
 sheet = Image.new("RGB", (frames[0].width, len(some) * frames[0].height))
 for i, frame in enumerate(some):
     sheet.paste(frame, (0, i * frame.height))
-known = sheet.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+known = sheet.quantize(64, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 frames = [frame.quantize(palette=known, dither=Image.Dither.NONE) for frame in frames]
 times = [int(gap)] * (len(frames) - 1) + [2000]
 frames[0].save(out, save_all=True, append_images=frames[1:], duration=times, loop=0, optimize=True)`;
@@ -35,12 +35,14 @@ async function opens({ episode, agent }) {
   const wanted = player.episodes.findIndex(({ title }) => title.split(":")[0].endsWith(`episode ${episode}`));
   if (wanted < 0) throw new Error(`no episode ${episode} on this page`);
   await player.open(wanted);
-  player.follow(player.source.agents.findIndex(({ name }) => name === agent));
+  const followed = player.source.agents.findIndex(({ name }) => name === agent);
+  if (followed < 0) throw new Error(`no agent ${agent} in this episode`);
+  player.follow(followed);
   return player.source.agents[player.agent].end;
 }
 
 await inBrowser(async (browser) => {
-  const { tab } = await opened(browser, page, Number(given.width ?? 900), "light", moves ? 1 : 2);
+  const { tab } = await opened(browser, page, ...(moves ? [640, "light", 1] : [900, "light", 2]));
   await tab.waitForFunction(() => document.querySelector(".player").player?.view);
   await tab.addStyleTag({ content: STYLE });
   const end = await tab.evaluate(opens, given);
@@ -55,5 +57,6 @@ await inBrowser(async (browser) => {
   for (let i = 0; i * given.speed < end * given.fps; i++) frames.push(await show((i * given.speed) / given.fps, join(folder, `${i}.png`)));
   frames.push(await show(end, join(folder, "end.png")));
   execFileSync("python3", ["-c", GIF, given.out, String(1000 / given.fps), ...frames]);
+  rmSync(folder, { recursive: true });
   return given.out;
 });

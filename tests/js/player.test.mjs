@@ -124,10 +124,11 @@ test("a running episode", () => {
   const [first, second] = [0, 0.05].map((time) => source.frame(0, time));
   assert.deepEqual([first.pose, first.clearance, first.ttc, first.leaf, first.map], [[1, 2, -1, 0], 2, null, "Follow", null]);
   assert.deepEqual([second.step, second.clearance, second.ttc, second.speed, second.leaf], [1, null, null, 0.5, "Evade"]);
-  source.detail({ time: 0.05, route: [[0, 0]], ahead: [1, 1], echoes: [[2, 2]], tracks: [[1, 2, 3, 4, 0.5, 0.1, 0, 0.2]], futures: [[0.7, [[1, 1]]]], map: ["AR8=", "AAA=", "/wA="] });
+  source.detail({ time: 0.05, route: [[0, 0]], ahead: [1, 1], echoes: [[2, 2]], tracks: [[1, 2, 3, 4, 0.5, 0.1, 0, 0.2]], futures: [[0.7, [[1, 1]]]], camera: "AR8=", map: ["AR8=", "AAA=", "/wA="] });
   source.add([2, 3, 2, -1, 0, 1, 4, 0.5, 0, [5, 6]]);
   const [seen, later] = [0.1, 2].map((time) => source.frame(0, time));
   assert.deepEqual([seen.tracks[0].cov, seen.futures[0].weight, [...seen.map.layers.static.cells]], [[0.1, 0, 0.2], 0.7, [1, 31]]);
+  assert.deepEqual([[...seen.camera], later.camera], [[1, 31], null]);
   assert.deepEqual([later.echoes, later.ttc, [...later.map.layers.clearance.cells]], [[], 4, [255, 0]]);
   source.finish({ outcome: "collision", failed: true, time: 2 });
   assert.deepEqual([source.agents[0].end, source.agents[0].failed], [2, true]);
@@ -161,6 +162,7 @@ test("agents of an episode in step", async () => {
     time: [0.1, 1, [0, 5, 10]], pose: [0.001, 4, [0, 0, 0, 0, 500, 0, 0, 0, 1000, 0, 0, 0]], leaf: [1, 1, [0, 1, 1]], ttc: [0.01, 1, [-100, 250, 0]],
     "route.time": [0.1, 1, [5]], "route.rows": [1, 1, [2]], "route.of": [1, 2, [0, 0, 1, 1]], "route.why": [1, 1, [0]],
     "futures.time": [0.1, 1, [5]], "futures.rows": [1, 1, [1]], "futures.of": [1, 4, [1, 2, 3, 4]], "futures.weight": [0.1, 1, [7]],
+    "camera.time": [0.1, 1, [5]], "camera.of": [1, 2304, Array(2304).fill(9)],
   });
   const source = await recorded([scene, agent]);
   assert.deepEqual([source.end, source.agents[0].name, ...source.places(0.5)], [1, "bt", 5, 1, 1.5, 2]);
@@ -168,6 +170,7 @@ test("agents of an episode in step", async () => {
   assert.deepEqual([first.pose[0], second.pose[0], last.pose[0]], [0, 0.5, 1]);
   assert.deepEqual([first.ttc, second.ttc, last.ttc], [null, 2.5, 0]);
   assert.deepEqual([first.leaf, second.leaf, first.route.length, second.route.length, first.map], ["Follow", "Evade", 0, 2, null]);
+  assert.deepEqual([first.camera, second.camera.length, second.camera[2303]], [null, 2304, 9]);
   assert.deepEqual([second.futures, last.futures], [[{ weight: 0.7000000000000001, points: [[1, 2], [3, 4]] }], []]);
   assert.deepEqual(source.history(0).replans, [{ time: 0.5, why: "initial" }]);
 });

@@ -15,6 +15,7 @@ from typing import Any
 from uuvtai.common.errors import ODD, UserError
 from uuvtai.common.files import FileError, read_bytes, refuse_links_in, refuse_output, refusing
 from uuvtai.config.loader import ConfigError
+from uuvtai.logs.drawing import OUTCOME_NAMES
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
 from uuvtai.report.blocks import (
@@ -47,7 +48,6 @@ _MOST_LOGS = 24  # that are read for a page: each takes a second or two
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
 _SUCCESS = "success"
-_OUTCOMES = {"ttc": "TTC stop", "out_of_tank": "out of the tank"}
 
 Detail = dict[str, Any]
 
@@ -237,7 +237,7 @@ def _outcome(detail: Detail) -> str:
 
 
 def _outcome_name(detail: Detail) -> str:
-    return _OUTCOMES.get(detail["outcome"], str(detail["outcome"]))
+    return OUTCOME_NAMES.get(detail["outcome"], str(detail["outcome"]))
 
 
 # ---- Where figures come from: the command, the machine, the versions, the config.

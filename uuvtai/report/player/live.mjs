@@ -71,7 +71,7 @@ export class Live extends Player {
     this.role = role;
     if (first) {
       this.explain(role.steered ? DRIVING : WATCHING);
-      if (role.steered) this.ticks.around.click(); // who steers looks ahead
+      if (role.steered) this.ticks.around.click(), this.ticks.camera.click(); // who steers looks around
     }
     this.tellRole();
   }

@@ -14,6 +14,7 @@ export const LAYERS = [
   ["ghosts", "grey", "other agents", "line", true],
   ["clearance", "intersection", "clearance field", "", false],
   ["around", "ink", "around the vehicle", "ring", false],
+  ["camera", "ink", "camera, if recorded: what is near stands out", "", false],
 ];
 export const AROUND_PX = 132;
 const AROUND_M = 6;
@@ -343,6 +344,15 @@ export function paintAround(context, { pose: [x, y, , yaw], echoes, tracks, ahea
   context.textAlign = "right";
   context.fillStyle = look.grey;
   context.fillText(`${AROUND_M} m`, AROUND_PX, AROUND_PX - 2);
+}
+
+/** What the camera sees: of the water's colour what is far, of the ink's what is near. */
+export function paintCamera(canvas, cells, look) {
+  [canvas.width, canvas.height] = [64, 36];
+  const image = new ImageData(64, 36);
+  const [far, near] = [look.water, look.ink].map((colour) => [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16)));
+  cells.forEach((cell, i) => image.data.set([...near.map((part, k) => part + (far[k] - part) * (cell / 31)), 255], 4 * i));
+  canvas.getContext("2d").putImageData(image, 0, 0);
 }
 
 export function ended(agent, time) {

@@ -1,5 +1,5 @@
 // The player: a source's scene, strip and figures, and whatever moves through its time.
-import { AROUND_PX, LAYERS, Painter, ended, paintAround } from "./paint.mjs";
+import { AROUND_PX, LAYERS, Painter, ended, paintAround, paintCamera } from "./paint.mjs";
 import { recorded } from "./source.mjs";
 import { STRIP_HEIGHT, moment, paintStrip } from "./strip.mjs";
 import { gestures } from "./touch.mjs";
@@ -177,6 +177,8 @@ export class Player {
     paintStrip(sized(this.strip, width, STRIP_HEIGHT), width, this.source, this.agent, this.time, look);
     this.around.hidden = !this.on.around;
     if (this.on.around) paintAround(sized(this.around, AROUND_PX, AROUND_PX), frame, this.source.scene.goal, look.agents[this.agent], look);
+    this.camera.hidden = !(this.on.camera && frame.camera);
+    if (!this.camera.hidden) paintCamera(this.camera, frame.camera, look);
     this.figures(frame, look);
   }
 
@@ -221,6 +223,7 @@ export class Player {
     const beside = add(root, "div", { className: "beside" });
     const figures = add(beside, "dl", { className: "figures" });
     this.around = add(beside, "canvas", { className: "around", role: "img", ariaLabel: "what the vehicle senses around it, its bow up", hidden: true });
+    this.camera = add(beside, "canvas", { className: "camera", role: "img", ariaLabel: "what its camera sees", hidden: true });
     this.values = ["time", "clearance", "time to collision", "speed", "tree", "replans"].map((name) => {
       const pair = add(figures, "div", { className: name === "tree" ? "words" : "" });
       add(pair, "dt", { textContent: name });
