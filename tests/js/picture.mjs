@@ -56,7 +56,7 @@ await inBrowser(async (browser) => {
   const frames = [];
   for (let i = 0; i * given.speed < end * given.fps; i++) frames.push(await show((i * given.speed) / given.fps, join(folder, `${i}.png`)));
   frames.push(await show(end, join(folder, "end.png")));
-  execFileSync("python3", ["-c", GIF, given.out, String(1000 / given.fps), ...frames]);
+  execFileSync("python3", ["-c", GIF, given.out, String(Math.round(1000 / given.fps)), ...frames]);
   rmSync(folder, { recursive: true });
   return given.out;
 });
