@@ -88,9 +88,12 @@ class _Packer:
     def numbers(self) -> int:
         return sum(integers.size for integers, _ in self._arrays.values())
 
-    def drop(self, prefix: str) -> None:
-        for name in [name for name in self._arrays if name.split(".")[0] == prefix]:
+    def drop(self, prefix: str) -> bool:
+        """Whether there was anything of that name."""
+        names = [name for name in self._arrays if name.split(".")[0] == prefix]
+        for name in names:
             del self._arrays[name]
+        return bool(names)
 
     def packed(self, header: dict[str, Any]) -> bytes:
         table, parts, place = {}, [], 0
@@ -145,9 +148,9 @@ def packed_agent(recording: Recording, colour: str, fact: Fact) -> bytes:
     for name in _SHED:
         if len(content) <= RECORDING_BYTES and pack.numbers <= _MOST_NUMBERS:
             break
-        pack.drop(name)
-        header["left_out"].append(name.replace("_", " "))
-        content = pack.packed(header)
+        if pack.drop(name):
+            header["left_out"].append(name.replace("_", " "))
+            content = pack.packed(header)
     if len(content) > RECORDING_BYTES:
         raise ValueError(f"an episode of {len(times)} steps that takes {len(content)} bytes")
     return content
