@@ -242,7 +242,7 @@ def train_policy(
     if resume is None:
         config = scene.training(preset, [] if seed is None else [("train.seed", seed)])
         if scene.motion and config.surrogate.enabled:
-            raise UsageError("--motion: is of the simulator; train 'paper', or --set surrogate.enabled=false")
+            raise UsageError("--motion: needs a preset that trains in the simulator, such as ppo or paper")
         request = TrainRequest(config, preset, start=start, run_dir=run_dir, **more)
     else:
         parsing.refuse_beside_resume(ctx, ("iterations", "device", "overrides", "reward"))
@@ -278,7 +278,7 @@ def export_policy(
         written = export_log(Path(run), out, machines.split(","))
         return output.show(written, lambda _: show_stack(written))
     found = export.check(check, say) if check else export_run(run or "", out, evaluation or [], say, force)
-    output.show(found, lambda screen: show_export(screen, found))
+    output.show(found, lambda screen: show_export(screen, found, is_ours=check is None))
     if not found["agrees"]:
         raise typer.Exit(GATE)
 

@@ -275,7 +275,7 @@ def test_sigterm_ends_a_training_as_ctrl_c_does(tmp_path):
     wait_for(lambda: process.poll() is not None or (metrics.exists() and metrics.stat().st_size), 400)
     process.send_signal(signal.SIGTERM)
     code, err = ended(process, signal.SIGTERM)
-    assert code == 143 and "saved; go on with: uuv train --resume run" in err
+    assert code == 143 and "saved; go on with: uuv train --resume run --iterations 5000" in err
     record = json.loads((tmp_path / "run/run.json").read_text())
     assert (record["status"], record["exit"]) == ("interrupted", 143)
     assert any((tmp_path / "run/checkpoints").glob("step_*"))

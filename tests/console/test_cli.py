@@ -69,6 +69,7 @@ from uuvtai.console.views import show_evaluation
         (["eval", "-v", "1"], "No such option: -v; now it is --speed"),
         (["train", "--stack", "paper"], "No such option: --stack; now it is --agent NAME, or --set stack="),
         (["train", "--num-envs", "4"], "No such option: --num-envs; now it is --set train.num_envs=N"),
+        (["train", "--lr", "1e-4"], "No such option: --lr; config keys: --set KEY=VALUE\n"),
         (["warm"], "No such command 'warm'; now it is uuv doctor --compile"),
         (["tree", "--dot"], "No such command 'tree'; now it is uuv presets show bt"),
         (["log", "video", "a.mcap"], "now it is uuv log render FILE --out NAME.mp4"),
@@ -516,7 +517,6 @@ def test_without_a_preset_the_policy_trains(capfd, monkeypatch):
     code, out, _ = uuv(capfd, "train")
     assert code == 0 and out.splitlines() == [
         f"best checkpoint: {run}/checkpoints/step_000006 (50.0 % in its evaluation)",
-        f"TensorBoard: tensorboard --logdir '{run}/tensorboard'",
         f"next: uuv eval --agent '{run}' --agent bt",
     ]
     assert [(request.preset, request.config) for request in asked] == [

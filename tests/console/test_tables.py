@@ -54,7 +54,12 @@ ENGINE = {
     "engine": "ONNX Runtime 1.31.0", "agrees": True, "p50_ms": 0.123, "p99_ms": 4.567,
     "difference": {"action": 1.2e-7, "uncertainty": 3.4e-6},
 }  # fmt: skip
-EXPORTED = {"folder": "runs/" + "long_" * 20 + "export", "engines": [ENGINE, ENGINE], "damages": []}
+EXPORTED = {
+    "folder": "runs/" + "long_" * 20 + "export",
+    "engines": [ENGINE, ENGINE],
+    "damages": [],
+    "agrees": True,
+}
 LOG = {
     "topics": [{"topic": f"/topic/{i}", "schema": "foxglove.CompressedImage", "messages": 10**i,
     "rate_hz": 50.0} for i in range(6)],
@@ -76,7 +81,7 @@ SHOWS = {
     "sweep": (lambda s: views.show_sweep(s, samples.robustness_sweep()),
         ["changed", "agent", "success [95 %]", "collision [95 %]"]),
     "profile": (lambda s: views.show_profile(s, PROFILE), ["us per env-step", "65536 env"]),
-    "export": (lambda s: views.show_export(s, EXPORTED), ["engine"]),
+    "export": (lambda s: views.show_export(s, EXPORTED, is_ours=True), ["engine"]),
     "log": (lambda s: views.show_log(s, LOG, "x" * 200 + ".mcap"), ["topic", "messages", "Hz"]),
     "doctor": (lambda s: show_checks(s, CHECKS), []),
     "claims": (lambda s: s.table(claim_table(CLAIMS)), ["claim", "the paper", "here", "verdict"]),

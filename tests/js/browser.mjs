@@ -23,9 +23,9 @@ async function launch() {
 }
 
 /** A page from disk without a network, or one of a server here; and what goes wrong or leaves it. */
-export async function opened(browser, page, width, colorScheme) {
+export async function opened(browser, page, width, colorScheme, deviceScaleFactor = 1) {
   const served = page.startsWith("http://127.0.0.1:");
-  const context = await browser.newContext({ viewport: { width, height: 900 }, colorScheme, offline: !served });
+  const context = await browser.newContext({ viewport: { width, height: 900 }, deviceScaleFactor, colorScheme, offline: !served });
   const tab = await context.newPage();
   const errors = [];
   const requests = [];

@@ -48,9 +48,22 @@ async function pause(tab, on) {
   await until(tab, `(player.role.held === "pause") === ${on}`);
 }
 
+/** Pads are there for thumbs only; the left one is held at its upper edge. */
+async function thumb(tab, session) {
+  const before = await tab.locator(".pad").first().isVisible();
+  await session.send("Emulation.setTouchEmulationEnabled", { enabled: true, maxTouchPoints: 2 });
+  const { x, y, width } = await tab.locator(".pad").first().boundingBox();
+  await session.send("Input.dispatchTouchEvent", { type: "touchStart", touchPoints: [{ x: x + width / 2, y: y + 20 }] });
+  await until(tab, "player.commanded.textContent === 'ahead 100 %'");
+  await shot(tab, "thumbs");
+  await session.send("Input.dispatchTouchEvent", { type: "touchEnd", touchPoints: [] });
+  await until(tab, "player.commanded.textContent === 'stop'");
+  return [before, await tab.locator(".pad").count()];
+}
+
 /** Waits for the start, steers, asks for the truth, lets go; a second page only looks on. */
 async function drive(browser) {
-  const { tab, errors, requests } = await opened(browser, address, 1400, "light");
+  const { context, tab, errors, requests } = await opened(browser, address, 1400, "light");
   await ready(tab);
   const second = await opened(browser, address, 390, "dark");
   await ready(second.tab);
@@ -69,12 +82,13 @@ async function drive(browser) {
   await tab.keyboard.up("w");
   await tab.keyboard.press("Space");
   await until(tab, "player.commanded.textContent === 'stop'");
+  const touched = await thumb(tab, await context.newCDPSession(tab));
   await pause(tab, false);
   await until(tab, `player.source.end > ${driven.end + 0.3}`);
   await tab.keyboard.down("s"); // until it is over
   await until(tab, "/Report: /.test(player.role.note ?? '')");
   await shot(tab, "over");
-  return { begun, driven, note: await inPlayer(tab, "player.state.textContent"), errors: [...errors, ...second.errors], requests };
+  return { begun, driven, touched, note: await inPlayer(tab, "player.state.textContent"), errors: [...errors, ...second.errors], requests };
 }
 
 /** Wall and one tank as they are, at both widths, light and dark. */

@@ -2,11 +2,39 @@
 // node play.mjs PAGE
 import { inBrowser, opened } from "./browser.mjs";
 
+const DENSE = 4; // pixels of the screen to one of the page: what is found on the canvas is as exact
+
+/** Two fingers part on the scene, one moves it, one taps: how wide the window is, and where it begins. */
+async function touch(tab, session) {
+  await session.send("Emulation.setTouchEmulationEnabled", { enabled: true, maxTouchPoints: 2 });
+  const box = await tab.locator(".scene").boundingBox();
+  const window = () => tab.evaluate(() => {
+    const { player } = document.querySelector(".player");
+    const { view, playing } = player;
+    return { metres: view.wide / view.scale, x: view.x0, playing };
+  });
+  const move = async (...places) => {
+    for (const [i, fingers] of [...places, []].entries()) {
+      const touchPoints = fingers.map(([x, y], id) => ({ x: box.x + x, y: box.y + y, id }));
+      await session.send("Input.dispatchTouchEvent", { type: i ? (fingers.length ? "touchMove" : "touchEnd") : "touchStart", touchPoints });
+    }
+    return window();
+  };
+  return [
+    await window(),
+    await move([[500, 100], [600, 100]], [[400, 100], [700, 100]]), // three times as large
+    await move([[600, 100]], [[500, 100]], [[400, 100]]),
+    await move([[600, 100]]),
+    await move([[600, 100]]),
+    await move([[400, 100], [700, 100]], [[549, 100], [551, 100]]),
+  ];
+}
+
 await inBrowser(async (browser) => {
-  const { tab, errors, requests } = await opened(browser, process.argv[2], 1400, "light");
+  const { context, tab, errors, requests } = await opened(browser, process.argv[2], 1400, "light", DENSE);
   await tab.waitForFunction(() => document.querySelector(".player").player?.view);
   const ready_ms = await tab.evaluate(() => performance.now());
-  const moments = await tab.evaluate(() => {
+  const moments = await tab.evaluate((dense) => {
     const { player } = document.querySelector(".player");
     for (const name of Object.keys(player.on)) player.on[name] = false;
     return Array.from({ length: 10 }, (_, i) => shown((player.source.end * i) / 9));
@@ -16,7 +44,7 @@ await inBrowser(async (browser) => {
       player.seek(time);
       const { view, source, scene } = player;
       const { pose, clearance } = source.frame(0, time);
-      const [high, wide] = [Math.round(view.top + view.high), scene.width];
+      const [high, wide] = [Math.round(dense * (view.top + view.high)), scene.width];
       const copy = new OffscreenCanvas(wide, high).getContext("2d", { willReadFrequently: true });
       copy.drawImage(scene, 0, 0);
       const { data } = copy.getImageData(0, 0, wide, high);
@@ -30,11 +58,11 @@ await inBrowser(async (browser) => {
             beside.push(s * (x + 0.5) + c * (y + 0.5));
           }
         }
-      const [u, v] = [ahead, beside].map((places) => (Math.min(...places) + Math.max(...places)) / 2);
+      const [u, v] = [ahead, beside].map((places) => places.reduce((low, one) => Math.min(low, one)) / 2 / dense + places.reduce((high, one) => Math.max(high, one)) / 2 / dense);
       const middle = [c * u + s * v, c * v - s * u];
       return { time, pose: [...pose], clearance, middle, scale: view.scale, left: view.left, top: view.top };
     }
-  });
+  }, DENSE);
   await tab.focus(".player");
   const pressed = {};
   for (const key of ["Home", "ArrowRight", "Shift+ArrowRight", "End", "x", "2", "+", "l"]) {
@@ -44,8 +72,9 @@ await inBrowser(async (browser) => {
       return { time: player.time, agent: player.agent, speed: player.speed, open: player.layers.open, words: player.ending.textContent };
     });
   }
+  const touched = await touch(tab, await context.newCDPSession(tab));
   await tab.keyboard.press("Home");
   await tab.keyboard.press("Space");
   await tab.waitForFunction(() => document.querySelector(".player").player.time > 0.2);
-  return { ready_ms, moments, pressed, errors, requests };
+  return { ready_ms, moments, pressed, touched, errors, requests };
 });

@@ -65,8 +65,21 @@ test("places on the canvas", () => {
     assert.ok(Math.abs((view.x(20) - view.x(0)) / 20 - (view.y(0) - view.y(6)) / 6) < 1e-9, "a metre is as long both ways");
     assert.deepEqual([view.depth(0), view.depth(-1.6)], [view.side, view.side + view.deep]);
   }
-  const near = new View(TANK, 1180, [19, 1]);
+  const near = new View(TANK, 1180, { x: 19, y: 1, metres: 9 });
   assert.ok(Math.abs(near.x(20) - near.left - near.wide) < 1e-9 && Math.abs(near.y(0) - near.top - near.high) < 1e-9, "no farther than the walls");
+});
+
+test("fingers zoom and move, and no farther than the whole tank", () => {
+  const whole = new View(TANK, 340, null);
+  const [from, to] = [{ x: 200, y: 50 }, { x: 180, y: 60 }];
+  const zoom = whole.zoomed(TANK, 8, from, to);
+  const large = new View(TANK, 340, zoom);
+  assert.ok(Math.abs(large.scale - 8 * whole.scale) < 1e-9);
+  whole.world(from).forEach((part, i) => assert.ok(Math.abs(part - large.world(to)[i]) < 1e-9, "what was under the fingers still is"));
+  assert.equal(large.zoomed(TANK, 0.12, to, from), null);
+  const far = new View(TANK, 340, large.zoomed(TANK, 1, from, { x: 9000, y: -9000 }));
+  assert.deepEqual([far.x0, Math.round(1e6 * (far.y1 - far.high / far.scale))], [0, 0]);
+  assert.equal(whole.zoomed(TANK, 1e9, from, to).metres, 1.5);
 });
 
 test("shapes", () => {
@@ -111,10 +124,11 @@ test("a running episode", () => {
   const [first, second] = [0, 0.05].map((time) => source.frame(0, time));
   assert.deepEqual([first.pose, first.clearance, first.ttc, first.leaf, first.map], [[1, 2, -1, 0], 2, null, "Follow", null]);
   assert.deepEqual([second.step, second.clearance, second.ttc, second.speed, second.leaf], [1, null, null, 0.5, "Evade"]);
-  source.detail({ time: 0.05, route: [[0, 0]], ahead: [1, 1], echoes: [[2, 2]], tracks: [[1, 2, 3, 4, 0.5, 0.1, 0, 0.2]], futures: [[0.7, [[1, 1]]]], map: ["AR8=", "AAA=", "/wA="] });
+  source.detail({ time: 0.05, route: [[0, 0]], ahead: [1, 1], echoes: [[2, 2]], tracks: [[1, 2, 3, 4, 0.5, 0.1, 0, 0.2]], futures: [[0.7, [[1, 1]]]], camera: "AR8=", map: ["AR8=", "AAA=", "/wA="] });
   source.add([2, 3, 2, -1, 0, 1, 4, 0.5, 0, [5, 6]]);
   const [seen, later] = [0.1, 2].map((time) => source.frame(0, time));
   assert.deepEqual([seen.tracks[0].cov, seen.futures[0].weight, [...seen.map.layers.static.cells]], [[0.1, 0, 0.2], 0.7, [1, 31]]);
+  assert.deepEqual([[...seen.camera], later.camera], [[1, 31], null]);
   assert.deepEqual([later.echoes, later.ttc, [...later.map.layers.clearance.cells]], [[], 4, [255, 0]]);
   source.finish({ outcome: "collision", failed: true, time: 2 });
   assert.deepEqual([source.agents[0].end, source.agents[0].failed], [2, true]);
@@ -131,6 +145,10 @@ test("steering by keys and gamepad", () => {
   assert.equal(said(steering.command(none)), "ahead 33 %, down 33 %, turn left 33 %");
   assert.ok(steering.key({ ...plain, code: "Space" }, true) && !steering.key({ ...plain, code: "KeyX" }, true) && !steering.key({ ...plain, code: "KeyW", ctrlKey: true }, true));
   assert.deepEqual([steering.command(none), said([0, 0, 0, 0])], [[0, 0, 0, 0], "stop"]);
+  steering.thumb(true, -0.56, 1);
+  steering.thumb(false, 0.1, -1);
+  assert.deepEqual(steering.command(none).map((value) => Math.round(100 * value)), [100, 50, -100, 0]);
+  steering.release();
   const pad = { connected: true, axes: [0.1, -1, 1, 0.56], buttons: [{ pressed: false }] };
   assert.deepEqual(steering.command([null, pad]).map((value) => Math.round(100 * value)), [100, 0, -50, -100]);
   assert.deepEqual(steering.command([{ ...pad, buttons: [{ pressed: true }] }]), [0, 0, 0, 0]);
@@ -144,6 +162,7 @@ test("agents of an episode in step", async () => {
     time: [0.1, 1, [0, 5, 10]], pose: [0.001, 4, [0, 0, 0, 0, 500, 0, 0, 0, 1000, 0, 0, 0]], leaf: [1, 1, [0, 1, 1]], ttc: [0.01, 1, [-100, 250, 0]],
     "route.time": [0.1, 1, [5]], "route.rows": [1, 1, [2]], "route.of": [1, 2, [0, 0, 1, 1]], "route.why": [1, 1, [0]],
     "futures.time": [0.1, 1, [5]], "futures.rows": [1, 1, [1]], "futures.of": [1, 4, [1, 2, 3, 4]], "futures.weight": [0.1, 1, [7]],
+    "camera.time": [0.1, 1, [5]], "camera.of": [1, 2304, Array(2304).fill(9)],
   });
   const source = await recorded([scene, agent]);
   assert.deepEqual([source.end, source.agents[0].name, ...source.places(0.5)], [1, "bt", 5, 1, 1.5, 2]);
@@ -151,6 +170,7 @@ test("agents of an episode in step", async () => {
   assert.deepEqual([first.pose[0], second.pose[0], last.pose[0]], [0, 0.5, 1]);
   assert.deepEqual([first.ttc, second.ttc, last.ttc], [null, 2.5, 0]);
   assert.deepEqual([first.leaf, second.leaf, first.route.length, second.route.length, first.map], ["Follow", "Evade", 0, 2, null]);
+  assert.deepEqual([first.camera, second.camera.length, second.camera[2303]], [null, 2304, 9]);
   assert.deepEqual([second.futures, last.futures], [[{ weight: 0.7000000000000001, points: [[1, 2], [3, 4]] }], []]);
   assert.deepEqual(source.history(0).replans, [{ time: 0.5, why: "initial" }]);
 });

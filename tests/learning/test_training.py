@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,6 +16,7 @@ import torch
 from tests.command import uuv
 from tests.point_env import PointEnv
 from tests.small_sim import SmallSim
+from uuvtai.common.errors import OwnCodeError
 from uuvtai.config.loader import ConfigError, load_config, load_training
 from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.evaluation.evaluate import evaluate_now
@@ -25,6 +28,7 @@ from uuvtai.learning.networks import TrainingError
 from uuvtai.learning.runner import TrainRequest, read_metrics
 from uuvtai.learning.trainer import Trainer
 from uuvtai.logs.run_folder import RunFolder, RunFolderError
+from uuvtai.plugins.api import PluginSpec
 
 TINY = {
     "policy.hidden": [8, 8], "world_model.hidden": [8], "world_model.latent": 4,
@@ -158,6 +162,27 @@ def test_a_failed_run_is_marked_and_keeps_its_checkpoints(points, tmp_path):
         train(TrainRequest(config=config, run_dir=tmp_path / "run"), Poisoned())
     assert (run_json(tmp_path / "run")["status"], run_json(tmp_path / "run")["exit"]) == ("failed", 1)
     assert checkpoint.newest(tmp_path / "run", resumable=True).step == 2
+
+
+def test_what_was_learned_before_a_reward_failed_is_kept(points, tmp_path):
+    """Also where no checkpoint was due."""
+
+    class Failing(Quiet):
+        def update(self, done, metrics, success_ci95):
+            if done == 3:
+                points[-1].step = self.fail
+
+        def fail(self, *_):
+            raise OwnCodeError("mine.py:3: terms: near is nan in env 0")
+
+    watch = Failing()
+    own = SimpleNamespace(spec=PluginSpec("reward", Path("my own.py"), "terms"), sha256="0", reward=id)
+    config = config_of(train__checkpoint_every=100)
+    with pytest.raises(OwnCodeError, match="near is nan"):
+        train(TrainRequest(config=config, run_dir=tmp_path / "run", iterations=5, reward=own), watch)
+    typed = f"--start {tmp_path}/run --reward 'my own.py:terms' --iterations 5"
+    assert watch.notes[-1] == f"saved; mend the reward, then: uuv train PRESET {typed}"
+    assert checkpoint.newest(tmp_path / "run").step == 3
 
 
 def test_a_damaged_checkpoint_is_told_and_the_one_before_goes_on(points, tmp_path):

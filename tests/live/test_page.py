@@ -27,7 +27,7 @@ from uuvtai.live import server as live_server
 from uuvtai.live.page import STALE_S, STOP, PageServer
 from uuvtai.live.server import MOST_CLIENTS, MOST_WAITING, LiveError
 from uuvtai.logs.reader import read_messages
-from uuvtai.report.evaluation import who_arrived
+from uuvtai.report.evaluation import limit_of_p, who_arrived
 from uuvtai.report.html import live_page
 from uuvtai.report.running import RunningEpisodes
 
@@ -322,6 +322,9 @@ def test_a_frame_is_what_the_simulator_has(small):
     grid = audience.of("begin")[0]["grid"]
     assert cells.size == grid["rows"] * grid["columns"] and 0 < cells.max() <= 31
     assert len(detail[-1]["echoes"]) > 50 and detail[-1]["route"]
+    seen = np.frombuffer(base64.b64decode(detail[-1]["camera"]), np.uint8).reshape(36, 64)
+    nearest_m = np.minimum(sim.rows(sim.s.image.depth_m)[0].reshape(36, 2, 64, 2).mean(axis=(1, 3)), 10)
+    assert seen * 10 / 31 == pytest.approx(nearest_m, abs=1)
     planned = [one["replan"] for one in audience.of("replan") if one["tank"] == 0]
     assert planned[0] == [0, "initial"] and len(planned) == sim.rows(sim.s.route.replans)[0].sum()
     running.end(sim, 0, END)
@@ -400,9 +403,10 @@ def test_driving_in_a_browser(tmp_path):
         out, err = process.communicate(timeout=300)
     assert process.returncode == 0 and seen["errors"] == []
     assert seen["begun"]["end"] == 0 and seen["begun"]["held"] == "start", "the second page starts nothing"
-    assert seen["begun"]["words"].startswith("The first key starts")
+    assert seen["begun"]["words"].startswith("The first command starts")
     assert seen["begun"]["truth"] == 0 and seen["driven"]["clearance"] is None
     assert seen["driven"]["speed"] > 0.05 and seen["driven"]["said"] == "ahead 100 %"
+    assert seen["touched"] == [False, 2], "pads are there where the screen is touched"
     assert f"Report: {folder}/report.html" in seen["note"]
     *_, report = err.strip().splitlines()
     assert re.search(r"^(bt|human) reached the goal in [01] of 1 episode.*, (bt|human) in [01]", out, re.M)
@@ -414,6 +418,12 @@ def test_driving_in_a_browser(tmp_path):
     assert first <= 5 and actions[first] == [1, 0, 0, 0]
     assert any(not any(action) for action in actions[first:]), "space stopped it"
     assert [-1, 0, 0, 0] in actions and len(list((folder / "logs").iterdir())) == 2
+
+
+def test_two_policies_of_ones_own_say_nothing_about_the_way_to_train():
+    bt, built_in, one, two = {}, {"path": "built-in"}, {"path": "runs/a"}, {"path": "runs/b"}
+    rows = [{"checkpoint": found} if found else {} for found in (bt, built_in, one, two)]
+    assert "train each with several --seed" in limit_of_p(rows) and limit_of_p(rows[:3]) == ""
 
 
 def test_who_arrived_sooner_is_named_first():

@@ -29,7 +29,7 @@ from uuvtai.learning import runner
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins import adapters, loading, plugin
 from uuvtai.plugins.adapters import CallMeter
-from uuvtai.plugins.api import COMMAND, PluginError, PluginSpec, is_plugin, plugin_spec
+from uuvtai.plugins.api import COMMAND, PluginError, PluginSpec, is_plugin, plugin_spec, to_resume
 from uuvtai.report.evaluation import agents_table
 from uuvtai.report.tables import TERMINAL
 from uuvtai.sim.setup import array_sizes
@@ -870,7 +870,9 @@ def test_the_sums_begin_anew_with_an_episode_and_who_rests_earns_nothing(sim, wr
         ("{'near': 1.0}", "near has shape ()"),
         ("{'near': view.clearance / 0.0 * 0.0}", "near is nan in env 0, and 7 more"),
         ("{'near': ['a'] * 8}", "near: gave list of <U1; wanted are real numbers"),
-        ("view.obstacles", "'JudgedView' object has no attribute 'obstacles' (--reward mine.py:terms)"),
+        ("{'effort': view.clearance}", "effort is a built-in term; name yours otherwise, or weight that one"),
+        ("view.obstacles", "a view has no 'obstacles'; there are action, cell_m, clearance, columns"),
+        ("view.yaw_rate", "a view has no 'yaw_rate'; a column is view['yaw_rate']; there are"),
     ],
 )
 def test_a_wrong_reward_is_told_by_its_line(sim, write, answer, says):
@@ -891,12 +893,8 @@ def test_terms_that_change_their_names_are_told(sim, write):
 @pytest.mark.parametrize(
     ("preset", "more", "says"),
     [
-        (
-            "policy",
-            [],
-            "is of a policy that learns in the simulator; train 'paper' or --set surrogate.enabled",
-        ),
-        ("best", [], "is of a policy that learns in the simulator; train 'paper'"),
+        ("policy", [], "needs a preset that trains in the simulator, such as ppo or paper: uuv train ppo"),
+        ("best", [], "--reward mine.py:terms: needs a preset that trains in the simulator"),
         ("paper", ["--reward", "none.py:terms"], "none.py cannot be read (No such file"),
         ("paper", ["--reward", "mine.py:term"], "has no 'term'; it has terms"),
         (
@@ -915,7 +913,7 @@ def test_a_reward_where_there_is_no_use_for_it_is_refused(write, capfd, tmp_path
 
 def test_a_motion_is_of_the_simulator(write, capfd):
     code, _, err = uuv(capfd, "train", "--motion", f"{write(MOTION)}:paths")
-    assert code == 2 and "--motion: is of the simulator; train 'paper'" in err
+    assert code == 2 and "--motion: needs a preset that trains in the simulator" in err
     Path("long.yaml").write_text(f"extends: pool\nworld: {{fixed: {obstacles_as_yaml()}}}\n")
     config = load_training("policy", [("surrogate.worlds", ["long.yaml"])])
     with pytest.raises(ConfigError, match=r"surrogate.worlds: long.yaml has a path of more than 5 corners"):
@@ -929,16 +927,24 @@ def obstacles_as_yaml():
 def test_a_run_goes_on_with_the_reward_that_it_began_with(write, tmp_path):
     own = found(f"{write(REWARD)}:terms", "reward")
     runner._check_reward(tmp_path, None)
-    with pytest.raises(ConfigError, match="began with no --reward"):
+    with pytest.raises(ConfigError, match="began with no --reward; leave it out, or begin a new run"):
         runner._check_reward(tmp_path, own)
-    (tmp_path / runner.REWARD).write_text(json.dumps({"schema": 1, "name": "mine", "sha256": own.sha256}))
+    kept = runner._kept(own)
+    (tmp_path / runner.REWARD).write_text(json.dumps(kept))
     runner._check_reward(tmp_path, own)
     for other in (None, found(f"{write(REWARD + '# changed')}:terms", "reward")):
-        with pytest.raises(ConfigError, match="began with another --reward; give the same again"):
+        with pytest.raises(ConfigError, match=f"began with --reward {own.spec.typed}; give it unchanged"):
             runner._check_reward(tmp_path, other)
-    (tmp_path / runner.REWARD).write_text("[]")
-    with pytest.raises(ConfigError, match="began with another --reward"):
-        runner._check_reward(tmp_path, own)
+    for strange in ([], kept | {"argument": "other"}, kept | {"name": "other"}):
+        (tmp_path / runner.REWARD).write_text(json.dumps(strange))
+        with pytest.raises(ConfigError, match="began with --reward"):
+            runner._check_reward(tmp_path, own)
+
+
+def test_what_goes_on_with_a_run_names_all_that_is_asked_for():
+    """The line after Ctrl-C is one that works: code of the user's is allowed anew each time."""
+    assert to_resume(Path("runs/a b"), ["bt", "policy:net.onnx"]) == "--resume 'runs/a b'"
+    assert to_resume(Path("runs/a"), ["bt", "controller:mine.py:act"]) == "--resume runs/a --allow-code"
 
 
 MOTION = """import numpy as np

@@ -479,6 +479,22 @@ def test_the_same_run_is_the_same_page(evil):
     assert not list(folder.rglob("*.tmp"))
 
 
+TITLES = {
+    "bt over S, D, v m/s in pool": {"sweep": samples.sweep_document()},
+    "bt, best over sensors in pool": {"sweep": samples.noise_sweep()},
+    "Replay: dive.mcap": {"argv": ("uuv", "replay", "there/dive.mcap", "--open")},
+    "Training: policy": {"argv": ("uuv", "train", "policy")},
+    "folder": {"argv": ("uuv", "drive", "-S", "8")},
+    "Profile: folder": {"argv": ("uuv", "profile", "--steps", "8")},
+}
+
+
+@pytest.mark.parametrize(("title", "files"), TITLES.items())
+def test_a_page_says_in_its_title_what_it_is_of(title, files, tmp_path):
+    samples.write_run(tmp_path / "folder", **files, profile=samples.PROFILE)
+    assert f"<h1>{title}</h1>" in report([tmp_path / "folder"]).page.read_text()
+
+
 def test_the_data_of_a_figure_can_be_had_as_csv(tmp_path):
     data = Data(["name", "value"], [["a, b", 0.1], ['"c"', None]])
     html, _ = render(Page("t", "", [], []))

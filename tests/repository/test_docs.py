@@ -271,7 +271,8 @@ def test_every_picture_of_the_gallery_has_its_command_and_is_small():
 def test_the_gifs_are_those_of_their_commands():
     for _mark, lines in shell_blocks(GALLERY):
         for words in (shlex.split(line) for line in lines if ".gif" in line):
-            chosen = dict(zip(words[4::2], words[5::2], strict=True))
+            first = words.index("--speed" if words[1] == "log" else "--episode")
+            chosen = {"--width": 640, **dict(zip(words[first::2], words[first + 1 :: 2], strict=True))}
             with Image.open(ROOT / chosen["--out"]) as gif:
                 assert gif.width == int(chosen["--width"]) and gif.n_frames > 10
                 assert gif.info["duration"] == pytest.approx(1000 / int(chosen["--fps"]), abs=10)

@@ -1,6 +1,7 @@
 """A stack as a row of its own: which simulator it gets, the same episodes, its entry in the table."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from tests.command import Quiet
 from uuvtai.config.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
-from uuvtai.evaluation.agents import differences, load_agents
+from uuvtai.evaluation.agents import AgentSpec, differences, load_agents
 from uuvtai.evaluation.evaluate import Request, compare
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.sim import Sim
@@ -47,6 +48,21 @@ def test_a_stack_touches_nothing_that_makes_an_episode():
     } == same  # fmt: skip
     assert all(getattr(other, name) == getattr(config, name) for name in same)
     assert any(getattr(other, name) != getattr(config, name) for name in STACK_SECTIONS)
+
+
+def test_a_policy_that_meets_another_stack_than_in_training_is_told():
+    """With the option that gives it its own, where a preset is that."""
+    config, tree = load_config("pool"), read_tree("bt")
+
+    def told(trained, now=config):
+        return differences(AgentSpec("mine", tree, SimpleNamespace(config=trained)), now)
+
+    paper = with_stack(config, "paper")
+    assert told(config) == told(paper, paper) == differences(AgentSpec("bt", tree), config) == ""
+    assert told(paper).startswith("mine drives another stack than in its training: tracking.")
+    assert told(paper).endswith(" more; as it was trained: --set stack=paper") and len(told(paper)) < 260
+    found = told(load_config("pool", overrides=["behavior.caution=0.7"]))
+    assert found.endswith("training: behavior.caution = 1.0 (trained with 0.7)")
 
 
 @pytest.fixture(scope="module")

@@ -575,6 +575,14 @@ def test_a_log_that_is_opened_gives_log_picture_and_report(log, build, tmp_path,
     assert json.loads((run / "run.json").read_text())["status"] == "finished"
 
 
+def test_while_the_stack_is_held_no_node_drives(log, build, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    blind = replaying.Faults(outages=(replaying.Outage("sonar", 0.0, 9.0),))
+    found, _ = replaying.open_replay(log, blind, build=build)
+    leaves = [m.data["leaf"] for m in read_messages(Path(found["recorded"]), ["/action"])]
+    assert found["held_steps"] == leaves.count("") > 50 and len(leaves) == 91
+
+
 def test_hours_are_too_long(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(combine, "_FAR_S", math.inf)
     lines = f"{T0} {a50_line()}\n{T0 + 4000} {a50_line(altitude=2)}\n"

@@ -461,24 +461,26 @@ _MOST_GOT = 200
 
 
 def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseModel]) -> str:
-    lines = []
+    lines, is_strange = [], False
     for problem in error.errors():
         dotted = ".".join(str(part) for part in problem["loc"])
         where = _origin_of(dotted, origin)
         if problem["type"] == "extra_forbidden":
             if isinstance(given := problem["input"], dict) and given and renamed(dotted):
                 dotted = f"{dotted}.{next(iter(given))}"
-            like = renamed(dotted) or nearest(str(problem["loc"][-1]), _siblings(problem["loc"], model))
+            like = renamed(dotted) or _alike(problem["loc"], model)
             lines.append(f"{where}unknown key '{dotted}'{like}")
+            is_strange |= not like
         elif found := _WITHIN.match(problem["msg"]):  # a check of the whole names the part itself
             dotted = f"{dotted}.{found[1]}".lstrip(".")
             lines.append(f"{_origin_of(dotted, origin)}{dotted}: {found[2]}")
         else:
             got = repr(problem.get("input"))
             shown = got if len(got) <= _MOST_GOT else f"{got[:_MOST_GOT]} ..."
-            lines.append(f"{where}{dotted}: {problem['msg']} (got {shown})")
+            where = where.removesuffix(f"{dotted}: ") + f"{dotted}: "  # an override says its key
+            lines.append(f"{where}{problem['msg']} (got {shown})")
     lines.append("'uuv presets show NAME --all' prints every key with its value")
-    if any(problem["type"] == "extra_forbidden" for problem in error.errors()):
+    if is_strange:
         lines[-1] += "; delete a key of an older version that is not among them"
     return "\n".join(lines)
 
@@ -492,6 +494,16 @@ def _origin_of(dotted: str, origin: dict[str, str]) -> str:
             return f"{origin[inner]}: "
         dotted = dotted.rpartition(".")[0]
     return ""
+
+
+def _alike(location: tuple[Any, ...], root: type[BaseModel]) -> str:
+    """What an unknown key may have meant: one of this name in a section, one like it, or all of a section."""
+    leaf, there = str(location[-1]), _siblings(location, root)
+    told = [f"{name}.{leaf}" for name in root.model_fields if leaf in _siblings((name, leaf), root)]
+    if not told and (found := nearest(leaf, there)):
+        return found
+    told = told or (there if len(location) > 1 and len(there) <= 16 else [])
+    return f"; there are: {', '.join(told)}" if told else ""
 
 
 def _siblings(location: tuple[Any, ...], root: type[BaseModel]) -> list[str]:

@@ -95,7 +95,9 @@ DepthImages = Annotated[
 _KINDS = "a preset, a tree's .xml, mine.py:act, mine.py:load, model.onnx, a run folder (repeatable)"
 Agents = Annotated[
     list[str] | None,
-    _agents(f"Who drives: bt, best, dwa, bt+truth, oracle ..; {_KINDS} \\[default: straight, planner, bt]."),
+    _agents(
+        f"Who drives: bt, best, policy, bt+truth, oracle ..; {_KINDS} \\[default: straight, planner, bt]."
+    ),
 ]
 AgentsOrTree = Annotated[list[str] | None, _agents(f"Who drives: {_KINDS} \\[default: bt].")]
 Planners = Annotated[
@@ -154,11 +156,11 @@ TrainPreset = Annotated[
     str,
     Argument(
         metavar="PRESET",
-        help=f"Training preset: {parsing.names('train')}, or a YAML file.",
+        help=f"What to train ('uuv presets' tells): {parsing.names('train')}, or a YAML file.",
         autocompletion=parsing.presets("train"),
     ),
 ]
-TrainResume = Annotated[Path | None, _run("Continue this training with its own config.")]
+TrainResume = Annotated[Path | None, _run("Continue this training; repeat its --reward and --iterations.")]
 Iterations = Annotated[
     int | None, Option("--iterations", help="Total iterations. Schedules still span train.iterations.")
 ]
@@ -167,9 +169,7 @@ TrainStart = Annotated[
 ]
 Reward = Annotated[
     str | None,
-    Option(
-        "--reward", metavar="FILE.py:NAME", help="Terms of yours beside the built-in ones, in the simulator."
-    ),
+    Option("--reward", metavar="FILE.py:NAME", help="Terms of yours beside the built-in ones (ppo, paper)."),
 ]
 TrainSeed = Annotated[int | None, Option("--seed", help="Random seed (train.seed).")]
 TrainWorld = Annotated[
@@ -192,7 +192,7 @@ ExportRun = Annotated[
 ExportOut = Annotated[Path | None, _out("New folder \\[default: runs/NAME_export].")]
 ExportEvaluation = Annotated[
     list[Path] | None,
-    Option("--evaluation", help="Evaluation (run folder) to quote in the model card (repeatable)."),
+    Option("--evaluation", metavar="RUN", help="Evaluation to quote in the model card (repeatable)."),
 ]
 ExportCheck = Annotated[Path | None, Option("--check", help="Check this exported folder instead.")]
 ExportForce = Annotated[bool, Option("--force", help="Replace the exported policy that --out names.")]
@@ -451,8 +451,9 @@ SitlEpisode = Annotated[int, _more("--episode", min=0, help="Episode of the firs
 DriveLogs = Annotated[
     list[Path],
     Argument(
+        metavar="FILE",
         help="Logs: our .mcap, ArduSub's .bin or .tlog, or .csv with t,u,v,w,r,rpm_1,.."
-        " (docs/on_a_vehicle.md)."
+        " (docs/on_a_vehicle.md).",
     ),
 ]
 BaseVehicle = Annotated[str, _preset("--vehicle", "vehicle", f"Vehicle: {_VEHICLES}, or a YAML file.")]

@@ -177,9 +177,14 @@ def telling_new_names(app: Callable[..., Any], arguments: list[str] | None) -> A
         return app(args=arguments, prog_name="uuv", standalone_mode=False)
     except UsageError as error:
         found = re.match(r"No such (?:option: |command ')(-*[\w-]+)|Got unexpected extra", error.message)
-        drives = error.ctx is not None and any(p.name == "agent" for p in error.ctx.command.params)
-        if found and (now := _TODAY.get(found[1]) if found[1] else "--agent NAME|FILE" if drives else None):
-            error.message = f"{error.message.rstrip('.')}; now it is {now}"
+        takes = {p.name for p in error.ctx.command.params} if error.ctx else set()
+        typed = found[1] if found else None
+        now = _TODAY.get(typed) if typed else "--agent NAME|FILE" if found and "agent" in takes else None
+        like = {*(getattr(error, "possibilities", None) or ())} - {"--help"}
+        if now or (typed and typed.startswith("--") and "overrides" in takes and not like):
+            mend = f"now it is {now}" if now else "config keys: --set KEY=VALUE"
+            error.message = f"{error.message.rstrip('.')}; {mend}"
+            vars(error)["possibilities"] = None  # --help, for --lr
         raise
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -328,7 +329,7 @@ class TrainingProgress(_Told):
 
     def start(self, folder: Path, config: Any, done: int, total: int) -> None:
         """``done`` of ``total`` iterations are over as the run begins in ``folder``."""
-        say(f"run folder: {folder}")
+        say(f"run folder: {folder}; watch it: tensorboard --logdir {shlex.quote(f'{folder}/tensorboard')}")
         self._folder, self._total, self._pace = folder, total, None
         own = f"{obstacles(config.world.obstacles)}, v = {config.world.dynamic_speed_m_s} m/s"
         worlds = ", ".join(config.worlds)
@@ -338,9 +339,9 @@ class TrainingProgress(_Told):
 
             self._live = Live(console=Console(stderr=True), refresh_per_second=4, transient=False)
             self._live.start()
-            self._live.update(Text(f"{self._title}: compiling, and looking around once"))
+            self._live.update(Text(f"{self._title}: compiling"))
         else:
-            say(f"{self._title}: compiling, and looking around once")
+            say(f"{self._title}: compiling")
 
     def update(self, done: int, metrics: dict[str, float], success_ci95: tuple[float, float] | None) -> None:
         """Iteration ``done`` is over."""
@@ -389,8 +390,8 @@ def training_rows(
         "reward": number(of("rollout/ep_rew_mean"), 2),
         unit.replace("_", "-"): f"{of(f'time/{unit}', 0.0):,.0f}{per_s}",
     }
-    if "distillation/lambda_risk" in metrics:
-        rows["lambda"] = number(of("distillation/lambda_risk"), 3)
+    if of("distillation/lambda_risk"):
+        rows["distillation weight"] = number(of("distillation/lambda_risk"), 3)
     if left_s is not None:
         rows["ETA"] = time_left(left_s).removeprefix("ETA ")
     if "eval/success_rate" in metrics:

@@ -18,7 +18,7 @@ from uuvtai.common.files import read_text
 from uuvtai.common.presets import KINDS, built_in_file, preset_names
 from uuvtai.common.tree_codes import ACTION, LEAVES
 from uuvtai.console.screen import Screen, print_heat_maps
-from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, paired_table, who_arrived
+from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, limit_of_p, paired_table, who_arrived
 from uuvtai.report.sweep import cell_table
 from uuvtai.report.tables import (
     Column,
@@ -41,6 +41,8 @@ def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> Non
     """All of a ``uuv eval --json`` document: agents, pairs, and why episodes failed."""
     show_agents(screen, result)
     show_pairs(screen, result["paired"])
+    if limit := limit_of_p(result["agents"]):
+        screen.line(limit, "dim")
     if any("causes" in agent for agent in result["agents"]):
         show_causes(screen, result)
         say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
@@ -49,13 +51,12 @@ def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> Non
 
 
 def show_training(screen: Screen, result: dict[str, Any]) -> None:
-    """What a ``uuv train --json`` document leads on to: checkpoint, TensorBoard, the next command."""
-    run, events = shlex.quote(result["run"]), shlex.quote(f"{result['run']}/tensorboard")
+    """What a ``uuv train --json`` document leads on to: checkpoint, the next command."""
+    run = shlex.quote(result["run"])
     learner, score = result["learner"], result["score"]
     told = "" if score is None or learner != "ppo" else f" ({percent(score)} in its evaluation)"
     given = {"search": f"--agent {run}/stack.yaml", "forecast": f"--set forecast.learned={run}"}
-    screen.line(f"best checkpoint: {result['checkpoint']}{told}")
-    screen.line(f"TensorBoard: tensorboard --logdir {events}")
+    screen.line(f"{'newest' if score is None else 'best'} checkpoint: {result['checkpoint']}{told}")
     screen.line(f"next: uuv eval {given.get(learner, f'--agent {run}')} --agent bt")
 
 
@@ -368,12 +369,15 @@ def show_stack(document: dict[str, Any]) -> None:
     say(f"there: python3 -m uuv_stack decides {document['checked_steps']} steps of the log anew")
 
 
-def show_export(screen: Screen, found: dict[str, Any]) -> None:
-    """One row per engine of a ``learning.export`` result, where any could run, and what is damaged."""
+def show_export(screen: Screen, found: dict[str, Any], is_ours: bool = False) -> None:
+    """One row per engine of a ``learning.export`` result, where any could run, and what is damaged;
+    ``is_ours``: the folder was written just now, so that its program may be named."""
     for damage in found["damages"]:
         say(damage)
     if found["engines"]:
         screen.table(Table(_ENGINES, found["engines"], found["folder"]))
+    if is_ours and found["agrees"]:
+        screen.line(f"next: python {shlex.quote(str(Path(found['folder']) / 'run_policy.py'))}")
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -177,29 +177,42 @@ def observation_of(names: Sequence[str]) -> list[tuple[str, Any]]:
 
 
 def differences(agent: AgentSpec, config: Config) -> str:
-    """Keys of the stack that differ from the policy's training, or that the agent's own stack sets in place
-    of what was asked for, in words; empty = none."""
-    ours = config.model_dump(mode="json")
+    """What of the stack is not as in the policy's training, in words, and the preset that makes it so, if one
+    does; or what an agent's own stack sets in place of what was asked for; empty = nothing."""
     if agent.stack is not None:
-        own, usual = (any_cfg.model_dump(mode="json") for any_cfg in (agent.config_of(config), Config()))
-        lost = [
-            f"{section}.{key} = {own[section][key]}, not {value}"
-            for section in STACK_SECTIONS
-            for key, value in ours[section].items()
-            if value not in (own[section][key], usual[section][key])
-        ]
-        said = f"{agent.name}: its stack has {', '.join(lost)}; write a stack that 'extends: {agent.stack}'"
-        return said if lost else ""
-    if agent.checkpoint is None:
+        return _lost(agent, config)
+    if agent.checkpoint is None or not (parts := _unlike(config, trained := agent.checkpoint.config)):
         return ""
-    trained = agent.checkpoint.config.model_dump(mode="json")
-    parts = [
-        f"{section}.{key} = {value} (trained with {trained[section].get(key)})"
+    names = preset_names("stack")
+    stack = next((name for name in names if not _unlike(with_stack(config, name), trained)), None)
+    mend = f"; as it was trained: --set stack={stack}" if stack else ""
+    told = ", ".join(parts[:2]) + (f" and {len(parts) - 2} more" if len(parts) > 2 else "")
+    return f"{agent.name} drives another stack than in its training: {told}{mend}"
+
+
+def _lost(agent: AgentSpec, config: Config) -> str:
+    asked, own, usual = (
+        any_cfg.model_dump(mode="json") for any_cfg in (config, agent.config_of(config), Config())
+    )
+    lost = [
+        f"{section}.{key} = {own[section][key]}, not {value}"
+        for section in STACK_SECTIONS
+        for key, value in asked[section].items()
+        if value not in (own[section][key], usual[section][key])
+    ]
+    said = f"{agent.name}: its stack has {', '.join(lost)}; write a stack that 'extends: {agent.stack}'"
+    return said if lost else ""
+
+
+def _unlike(config: Config, trained: Config) -> list[str]:
+    """Keys of the stack that differ."""
+    ours, theirs = config.model_dump(mode="json"), trained.model_dump(mode="json")
+    return [
+        f"{section}.{key} = {value} (trained with {theirs[section].get(key)})"
         for section in _STACK
         for key, value in ours[section].items()
-        if value != trained[section].get(key)
+        if value != theirs[section].get(key)
     ]
-    return f"{agent.name}: {', '.join(parts)}" if parts else ""
 
 
 def policy_name(name: str, checkpoint: Checkpoint) -> str:

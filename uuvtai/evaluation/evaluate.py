@@ -50,7 +50,7 @@ from uuvtai.evaluation.results import (
 from uuvtai.evaluation.results import REQUEST_FILE as REQUEST
 from uuvtai.logs.run_folder import RunFolder, default_run_dir, refuse_place
 from uuvtai.logs.writer import EpisodeRecorder, PolicyNote
-from uuvtai.plugins.api import refuse_code
+from uuvtai.plugins.api import refuse_code, to_resume
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.rrt import RoutePlanner
 from uuvtai.sim.sim import Sim
@@ -88,7 +88,7 @@ def compare(
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
     comparison = replace(comparison_of(request, num_envs, agents, watch), guest=guest)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
-    with _going_on(folder, watch, can_resume=guest is None):
+    with _going_on(folder, watch, request.agents, can_resume=guest is None):
         device = comparison.any_simulator().device.type
         folder.write_json(REQUEST, document_of(request, num_envs, device, digests_of(agents)))
         runs = run_agents(comparison, folder)
@@ -112,14 +112,16 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
     except BaseException:
         folder.release()
         raise
-    with _going_on(folder, watch):
+    with _going_on(folder, watch, request.agents):
         assert request.num_envs is not None  # the file states it
         comparison = comparison_of(request, request.num_envs, agents, watch)
         return write_results(comparison, folder, run_agents(comparison, folder)), place
 
 
 @contextmanager
-def _going_on(folder: RunFolder, watch: EvaluationWatch, can_resume: bool = True) -> Iterator[None]:
+def _going_on(
+    folder: RunFolder, watch: EvaluationWatch, agents: list[str], can_resume: bool = True
+) -> Iterator[None]:
     """Record how the work inside ends, and say how to go on where it was interrupted and can be."""
     try:
         with folder.recorded():
@@ -128,7 +130,7 @@ def _going_on(folder: RunFolder, watch: EvaluationWatch, can_resume: bool = True
         watch.stop()
         if not can_resume:
             raise
-        watch.note(f"finished episodes are kept; go on with: uuv eval --resume {folder.path}")
+        watch.note(f"finished episodes are kept; go on with: uuv eval {to_resume(folder.path, agents)}")
         if any((folder.path / "logs").glob("*.part")):
             watch.note(
                 f"{folder.path / 'logs'}: .part files end where it was interrupted; --resume records them "

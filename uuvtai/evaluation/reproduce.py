@@ -31,7 +31,7 @@ from uuvtai.evaluation.reproduce_steps import (
     steps_of,
 )
 from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
-from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code
+from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code, to_resume
 from uuvtai.report.build import report
 from uuvtai.report.reproduction import claim_table
 from uuvtai.report.tables import Table, markdown, number, seconds, text_table
@@ -322,7 +322,8 @@ def _run(folder: RunFolder, request: dict[str, Any], watch: EvaluationWatch) -> 
             folder.write_json(RESULT, document)
             folder.write(PAGE, results_page(document))
     except KeyboardInterrupt:
-        watch.note(f"what is finished is kept; go on with: uuv reproduce --resume {folder.path}")
+        again = to_resume(folder.path, request["own"])
+        watch.note(f"what is finished is kept; go on with: uuv reproduce {again}")
         raise
     watch.note(f"report: {report([folder.path]).page}")  # the page tells how the run ended
     return document

@@ -29,7 +29,7 @@ from uuvtai.evaluation.grid import (
     unchanged,
 )
 from uuvtai.logs.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
-from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code
+from uuvtai.plugins.api import is_plugin, plugin_spec, refuse_code, to_resume
 
 if TYPE_CHECKING:
     from uuvtai.evaluation.agents import AgentSpec
@@ -224,7 +224,8 @@ def _run_cells(
             folder.write_json(RESULT, document)
             return document
     except KeyboardInterrupt:
-        watch.note(f"finished rows are kept; go on with: uuv sweep --resume {folder.path}")
+        again = to_resume(folder.path, request.agents)
+        watch.note(f"finished rows are kept; go on with: uuv sweep {again}")
         raise
     finally:
         watch.stop()

@@ -369,7 +369,7 @@ def save(
     ``train.keep_checkpoints`` and that of the highest ``score`` stay). Raises CheckpointError where the disk
     refuses; then nothing half-written is taken for a checkpoint."""
     target, plain = checkpoints / f"{_STEP}{step:06d}", config.model_dump(mode="json")
-    mend = "make room or mend the folder, then: --resume"
+    mend = "make room or mend the folder; then --resume, or begin anew if this was the first checkpoint"
     with refusing(CheckpointError, f"{target}: cannot be written", mend, ""):
         checkpoints.mkdir(parents=True, exist_ok=True)
         refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
@@ -468,7 +468,9 @@ def newest(
             reasons.append(str(error))
         note(f"left out: {reasons[-1]}")
     why = f" ({reasons[0]})" if reasons else ""
-    raise CheckpointError(f"{checkpoints}: holds no usable checkpoint{why}; give a run of 'uuv train'")
+    raise CheckpointError(
+        f"{checkpoints}: holds no usable checkpoint{why}; give a run with one, or begin anew"
+    )
 
 
 def best(run: Path, note: Note = lambda _text: None) -> Checkpoint:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import shlex
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.common import signals
+from uuvtai.common.errors import OwnCodeError
 from uuvtai.common.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
 from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.common.statistics import wilson_interval
@@ -64,6 +66,8 @@ class TrainRequest:
 class RewardSource(Protocol):
     """Reward terms in a file of the user's (``plugins.loading.LoadedPlugin``)."""
 
+    spec: Any
+    """``plugins.api.PluginSpec``: as it was named"""
     sha256: str
 
     def reward(self, env: VectorEnv) -> None: ...
@@ -131,12 +135,12 @@ def _train(
     if folder is None or found is None:
         folder = RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
         if own := request.reward:
-            folder.write_json(REWARD, {"schema": 1, "sha256": own.sha256})
+            folder.write_json(REWARD, {"schema": 1} | _kept(own))
     else:
         folder.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
         if request.overrides:
             folder.write(CONFIG, to_yaml(config))
-    run = _Run(trainer, config, folder, watch, evaluate, total)
+    run = _Run(trainer, config, folder, watch, evaluate, total, request.reward)
     with folder.recorded(), contextlib.closing(run), signals.StopEvent() as pressed:
         if not run.go(pressed):
             raise KeyboardInterrupt
@@ -163,19 +167,32 @@ def _started(
     return found, config.model_copy(update=update)
 
 
+def _kept(own: RewardSource) -> dict[str, Any]:
+    """What a run folder keeps of a reward: all but ``typed`` must be the same where the run goes on."""
+    spec = own.spec
+    return {"typed": spec.typed, "name": spec.name, "argument": spec.argument, "sha256": own.sha256}
+
+
 def _check_reward(folder: Path, own: RewardSource | None) -> None:
     """ConfigError where a run goes on with another reward than it began with."""
-    kept = read_json(folder / REWARD, folder=folder) if (folder / REWARD).exists() else {"sha256": None}
-    if not isinstance(kept, dict) or kept.get("sha256") != (own.sha256 if own else None):
-        began = "another --reward" if (folder / REWARD).exists() else "no --reward"
-        raise ConfigError(f"{folder}: began with {began}; give the same again, or begin a new run by --start")
+    there = (folder / REWARD).exists()
+    found, now = read_json(folder / REWARD, folder=folder) if there else {}, _kept(own) if own else {}
+    began = found if isinstance(found, dict) else {}
+    if there == bool(own) and all(began.get(key) == now[key] for key in now if key != "typed"):
+        return
+    typed = f"--reward {began.get('typed', '')}; give it unchanged" if there else "no --reward; leave it out"
+    more = f" --reward {own.spec.typed}" if own else ""
+    start = f"begin a new run with its policy: uuv train PRESET --start {folder}{more}"
+    raise ConfigError(f"{folder}: began with {typed}, or {start}")
 
 
 def _trainer(config: LearningConfig, device: str, own: RewardSource | None) -> AnyTrainer:
     """What learns. Raises ConfigError for a GPU or a reward where there is no use for it."""
     if own and (config.surrogate.enabled or config.learner != "ppo"):
-        more = " or --set surrogate.enabled=false" if config.learner == "ppo" else ""
-        raise ConfigError(f"--reward: is of a policy that learns in the simulator; train 'paper'{more}")
+        raise ConfigError(
+            f"--reward {own.spec.typed}: needs a preset that trains in the simulator, such as ppo or paper: "
+            f"uuv train ppo --reward {own.spec.typed}"
+        )
     for section in ("surrogate", "parameter_search", "forecast_training"):
         if device == "cuda" and getattr(config, section).enabled:
             raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
@@ -221,6 +238,7 @@ class _Run:
     evaluate: Evaluate
     total: int
     """iterations in all"""
+    own: RewardSource | None = None
     metrics: Metrics = field(default_factory=dict)
     """of the last one"""
 
@@ -233,7 +251,7 @@ class _Run:
         """Iterate to the end, or until an interrupt: then save and return False."""
         train, is_stopped = self.config.train, False
         while self.trainer.iteration < self.total and not is_stopped:
-            self.metrics, done = self.trainer.iterate(), self.trainer.iteration
+            self.metrics, done = self._iterate(), self.trainer.iteration
             # an interrupt that something has swallowed within the iteration was received all the same
             is_stopped = pressed.is_set() or signals.was_received()
             is_evaluated = not is_stopped and train.evaluate_every > 0 and done % train.evaluate_every == 0
@@ -246,8 +264,25 @@ class _Run:
         if self.saved != self.trainer.iteration:
             self._save()
         if is_stopped:
-            self.watch.note(f"saved; go on with: uuv train --resume {self.folder.path}")
+            self.watch.note(f"saved; go on with: uuv train {self._again('--resume')}")
         return not is_stopped
+
+    def _iterate(self) -> Metrics:
+        """One iteration. Where the user's reward fails, what was learned before is kept."""
+        try:
+            return self.trainer.iterate()
+        except OwnCodeError:
+            if self.trainer.iteration > self.saved:
+                self._save()
+                self.watch.note(f"saved; mend the reward, then: uuv train PRESET {self._again('--start')}")
+            raise
+
+    def _again(self, option: str) -> str:
+        """The run folder behind an option, and what its config does not keep."""
+        typed = [option, str(self.folder.path)] + (["--reward", self.own.spec.typed] if self.own else [])
+        if self.total != self.config.train.iterations:
+            typed += ["--iterations", str(self.total)]
+        return shlex.join(typed)
 
     def document(self) -> dict[str, Any]:
         """What ``uuv train --json`` prints."""

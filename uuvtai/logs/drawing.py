@@ -401,7 +401,7 @@ class Recording:
 
     @property
     def outcome_text(self) -> str:
-        return _OUTCOME_NAMES.get(self.outcome, self.outcome.replace("_", " "))
+        return OUTCOME_NAMES.get(self.outcome, self.outcome.replace("_", " "))
 
     @property
     def duration_s(self) -> float:
@@ -432,7 +432,7 @@ class Recording:
 
 
 _ECHO_BEAMS = 64  # A scan of fewer beams is shown together with those before it.
-_OUTCOME_NAMES = {"ttc": "TTC stop"}
+OUTCOME_NAMES = {"ttc": "TTC stop", "out_of_tank": "out of the tank"}
 REPLAYED = "replayed"  # outcome of a recording: there is none
 _MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_OBSTACLES = 3600.0, 1000.0, 1e4, 1000
 """what is drawn must fit a picture and a video that somebody waits for"""

@@ -46,6 +46,9 @@ def default_run_dir(preset: str) -> Path:
                 return path
 
 
+_TAKEN = "is already there and not empty; give another --run-dir, or go on with that run by --resume"
+
+
 def refuse_place(path: Path | None) -> None:
     """Raise RunFolderError at once where a run folder plainly cannot be made, not after minutes of compiling;
     nothing is written.
@@ -54,7 +57,7 @@ def refuse_place(path: Path | None) -> None:
     """
     path = path or _RUNS / "new"
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise RunFolderError(f"{path}: is already there and not empty; give another --run-dir or remove it")
+        raise RunFolderError(f"{path}: {_TAKEN}")
     nearest = next(place for place in (path, *path.absolute().parents) if place.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         reason = "Permission denied" if nearest.is_dir() else "Not a directory"
@@ -196,9 +199,7 @@ class RunFolder:
         self.hold()
         if any(place.name != _LOCK for place in self.path.iterdir()):
             self.release()
-            raise RunFolderError(
-                f"{self.path}: is already there and not empty; give another --run-dir or remove it"
-            )
+            raise RunFolderError(f"{self.path}: {_TAKEN}")
 
     def _make_lock(self) -> None:
         signals.engage()

@@ -16,6 +16,7 @@ import torch
 
 from uuvtai.common.enums import clearance_m, occupancy
 from uuvtai.config import SonarConfig
+from uuvtai.config.task import TERMS
 from uuvtai.learning.policy_agent import CHUNK, AgentDecision
 from uuvtai.plugins.api import (
     ACTION,
@@ -168,6 +169,12 @@ class PluginView:
             raise KeyError(f"no column {column!r}; there are {', '.join(self.columns)}")
         return self.obs[..., self.columns[column]]
 
+    def __getattr__(self, name: str) -> Any:
+        """Only asked for what is not there: AttributeError says what is."""
+        there = ", ".join(each for each in dir(self) if not each.startswith("_"))
+        like = f"; a column is view[{name!r}]" if name in self.__dict__.get("columns", ()) else ""
+        raise AttributeError(f"a view has no {name!r}{like}; there are {there}")
+
     def in_body(self, vectors_w: Any) -> Any:
         """World vectors (n, 2 or 3) turned by the own yaw: ahead, left(, up)."""
         yaw = self.ego.rpy[..., 2]
@@ -250,6 +257,11 @@ def terms(found: Any, n: int, place: str, device: torch.device) -> dict[str, tor
     wanted = f"a dict of arrays ({n},), what each term adds to the reward"
     if not isinstance(found, dict) or not found or not all(str(name).isidentifier() for name in found):
         raise PluginError(f"{place}: gave {type(found).__name__} {found!r:.60}; wanted is {wanted}, by name")
+    if taken := [name for name in found if name in TERMS]:
+        raise PluginError(
+            f"{place}: {taken[0]} is a built-in term; name yours otherwise, or weight that one: "
+            f"--set reward.{taken[0]}=0"
+        )
     values = {str(name): _tensor(value, f"{place}: {name}", wanted) for name, value in found.items()}
     for name, value in values.items():
         if value.shape != (n,):

@@ -7,6 +7,7 @@ A planner is a function ``plan`` or an object with that method, a controller one
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -394,10 +395,19 @@ def plugin_spec(text: str, kind: str = "") -> PluginSpec:
     return PluginSpec(kind, Path(found["file"]), name, found["argument"] or "")
 
 
+def _code_of(names: Sequence[str]) -> list[Path]:
+    return [spec.path for name in names if is_plugin(name) and (spec := plugin_spec(name)).is_code]
+
+
+def to_resume(place: Path, names: Sequence[str]) -> str:
+    """What is typed to go on with a run of these agents."""
+    return shlex.join(["--resume", str(place)] + (["--allow-code"] if _code_of(names) else []))
+
+
 def refuse_code(place: Path, names: Sequence[str], allowed: bool) -> None:
     """SettingError where going on with a run folder would run Python that the folder names, unless the user
     said that it is hers: a folder may come from anybody."""
-    code = [spec.path for name in names if is_plugin(name) and (spec := plugin_spec(name)).is_code]
+    code = _code_of(names)
     if code and not allowed:
         files = ", ".join(map(str, dict.fromkeys(code)))
         raise SettingError(

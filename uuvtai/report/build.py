@@ -15,6 +15,7 @@ from typing import Any
 from uuvtai.common.errors import ODD, UserError
 from uuvtai.common.files import FileError, read_bytes, refuse_links_in, refuse_output, refusing
 from uuvtai.config.loader import ConfigError
+from uuvtai.logs.drawing import OUTCOME_NAMES
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
 from uuvtai.report.blocks import (
@@ -34,8 +35,8 @@ from uuvtai.report.evaluation import evaluation
 from uuvtai.report.html import Page, read_config, read_json, read_lines, render, shown
 from uuvtai.report.recorded import Fact, packed_episode
 from uuvtai.report.reproduction import reproduction
-from uuvtai.report.sweep import sweep
-from uuvtai.report.tables import Table, heads, megabytes, number
+from uuvtai.report.sweep import by_agent, sweep
+from uuvtai.report.tables import Table, axis_name, heads, megabytes, number, varying
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, training
 
@@ -47,7 +48,6 @@ _MOST_LOGS = 24  # that are read for a page: each takes a second or two
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
 _SUCCESS = "success"
-_OUTCOMES = {"ttc": "TTC stop", "out_of_tank": "out of the tank"}
 
 Detail = dict[str, Any]
 
@@ -237,7 +237,7 @@ def _outcome(detail: Detail) -> str:
 
 
 def _outcome_name(detail: Detail) -> str:
-    return _OUTCOMES.get(detail["outcome"], str(detail["outcome"]))
+    return OUTCOME_NAMES.get(detail["outcome"], str(detail["outcome"]))
 
 
 # ---- Where figures come from: the command, the machine, the versions, the config.
@@ -415,7 +415,7 @@ def _of_run(run: Path) -> Page:
             f"{run}: {NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
         )
     name = run.resolve().name
-    title = str(document["title"]) if document else _title_of(read_json(run, "eval/result.json")) or name
+    title = str(document["title"]) if document else _title_of(run, record)
     closing = PageSection(
         "Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)]
     )
@@ -425,14 +425,25 @@ def _of_run(run: Path) -> Page:
     )
 
 
-def _title_of(result: dict[str, Any] | None) -> str:
-    """'best, bt in gauntlet', '' of what is no evaluation."""
-    names = [str(m["name"]) for m in (result or {}).get("agents", [])]
-    who = ", ".join(names) if len(names) <= _MOST_IN_TITLE else f"{len(names)} agents"
-    return f"{who} in {Path(str(result['world'])).stem}" if result and names else ""
+def _title_of(run: Path, record: dict[str, Any]) -> str:
+    """'best, bt in gauntlet', 'bt over S, D in pool', 'Replay: dive.mcap'; else the folder's name."""
+    result, swept = read_json(run, "eval/result.json") or {}, read_json(run, "sweep.json") or {}
+    names = [str(m["name"]) for m in result.get("agents", [])] or [*by_agent(swept.get("cells", []))]
+    if names:
+        axes = [] if result else [axis_name(name) for name in varying(swept["axes"])]
+        over = f" over {_few(axes, 'settings')}" if axes else ""
+        return f"{_few(names, 'agents')}{over} in {Path(str((result or swept).get('world', '-'))).stem}"
+    command, what = [*map(str, record.get("argv", [])), "", "", ""][1:3]
+    name = run.resolve().name if what.startswith("-") or not what else Path(what).name
+    return f"{_KINDS[command]}: {name}" if command in _KINDS else run.resolve().name
 
 
 _MOST_IN_TITLE = 4
+_KINDS = {"replay": "Replay", "train": "Training", "profile": "Profile"}
+
+
+def _few(names: list[str], what: str) -> str:
+    return ", ".join(names) if len(names) <= _MOST_IN_TITLE else f"{len(names)} {what}"
 
 
 def _of_several(runs: list[Path]) -> Page:
@@ -447,7 +458,8 @@ def _of_several(runs: list[Path]) -> Page:
         for run in runs
         for block in (Heading(run.name), *provenance(read_json(run, "run.json") or {}), *config_text(run))
     ]
-    title = ", ".join(run.resolve().name for run in runs) if others else f"{len(runs)} trainings"
+    titles = [_title_of(run, read_json(run, "run.json") or {}) for run in runs]
+    title = "; ".join(titles) if others else f"{len(runs)} trainings"
     return Page(title, "", [], [*sections, PageSection("Where this comes from", closing)])
 
 

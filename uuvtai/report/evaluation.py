@@ -125,6 +125,17 @@ def paired_table(pairs: list[dict[str, Any]], title: str, **page: Any) -> Table:
     return Table(_PAIRS, pairs, title, **page)
 
 
+def limit_of_p(agents: list[dict[str, Any]]) -> str:
+    """What p does not say where several policies of the user's own training are compared; '' elsewhere."""
+    paths = [(m.get("checkpoint") or {}).get("path", "built-in") for m in agents]
+    if sum(path != "built-in" for path in paths) < 2:
+        return ""
+    return (
+        "p is of these policies, not of the way to train: for that, train each with several --seed, and "
+        "compare success rates, one number a training."
+    )
+
+
 def _median(cause: dict[str, Any], key: str) -> Cell:
     return Cell(number(cause[key]), seconds(cause[key]))
 
@@ -161,6 +172,7 @@ def evaluation(result: dict[str, Any], command: str = "", episodes: Sequence[Blo
     if agents:
         blocks.append(_rates_figure(agents, command))
     blocks += _paired(result.get("paired", []))
+    blocks += [Paragraph(limit)] if (limit := limit_of_p(agents)) else []
     blocks.append(Table(_PLANNING, agents, "Planning", swatches=_swatches(agents)))
     for agent in agents:
         blocks += _causes(agent)

@@ -88,7 +88,7 @@ def _rendered(page: Page, script: str, drawing: _Drawing, is_live: bool = False)
     )  # fmt: skip
 
 
-_RECORDED = ("decode", "view", "paint", "strip", "source", "player")
+_RECORDED = ("decode", "view", "paint", "strip", "source", "touch", "player")
 _LIVE = ("running", "steer", "live")
 _IMPORT = re.compile(r"^import [^\n]*\n|^export (?=[a-z])", re.MULTILINE)
 

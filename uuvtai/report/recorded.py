@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from uuvtai.common.colours import PALETTE, agent_colours
@@ -28,12 +29,13 @@ RECORDING_BYTES, SCENE_BYTES = 300_000, 100_000
 """the most that an agent's episode, and what all agents of one share, may take of a page"""
 PLACE_M, TIME_S, SPEED_M_S, SHARE, TRACK_M, VARIANCE_M2 = 1e-3, 1e-3, 1e-2, 1 / 31, 1e-2, 1e-3
 """steps of the quantised values: an error is at most half of one; ``SHARE`` of an occupancy"""
-_POINT_M, _FAR_M, _CLEAR_M, _MOST_TTC_S = 0.02, 0.05, 0.1, 100.0
+_POINT_M, _FAR_M, CLEAR_M, _MOST_TTC_S = 0.02, 0.05, 0.1, 100.0
+_SEEN_M = 10.0  # as far as the camera's image shows differences
 _GAP_S, _MOST_MOMENTS = 0.0999, 150
 """[s] between tracks that are shown, and how many scans and forecasts are; a log may have 50 a second"""
-_LEAST_WEIGHT, _EVERY_POINT = 0.1, 5  # of forecasts: less likely ones, and points between, are not shown
+LEAST_WEIGHT, EVERY_POINT = 0.1, 5  # of forecasts: less likely ones, and points between, are not shown
 _MOST_STEPS, _MOST_CELLS, _MOST_NUMBERS = 20_000, 4_000_000, 3_000_000  # zeros pack well, and fill a memory
-_SHED = ("echoes", "map_clearance", "futures", "tracks", "map_dynamic", "map_static", "route")
+_SHED = ("camera", "echoes", "map_clearance", "futures", "tracks", "map_dynamic", "map_static", "route")
 """what is left out first where an episode is too long to be held whole"""
 
 _DARK = {
@@ -86,9 +88,12 @@ class _Packer:
     def numbers(self) -> int:
         return sum(integers.size for integers, _ in self._arrays.values())
 
-    def drop(self, prefix: str) -> None:
-        for name in [name for name in self._arrays if name.split(".")[0] == prefix]:
+    def drop(self, prefix: str) -> bool:
+        """Whether there was anything of that name."""
+        names = [name for name in self._arrays if name.split(".")[0] == prefix]
+        for name in names:
             del self._arrays[name]
+        return bool(names)
 
     def packed(self, header: dict[str, Any]) -> bytes:
         table, parts, place = {}, [], 0
@@ -97,13 +102,8 @@ class _Packer:
             kind = next(kind for kind in ("i1", "i2", "i4") if max(-low - 1, high) <= np.iinfo(kind).max)
             flat = integers.astype(f"<{kind}").ravel(order="F")
             data = flat.view(np.uint8).reshape(-1, flat.itemsize).T.tobytes()
-            table[name] = {
-                "at": place,
-                "bytes": int(kind[1]),
-                "rows": len(integers),
-                "columns": integers.shape[1],
-            }
-            table[name]["step"] = step
+            rows, columns = integers.shape
+            table[name] = {"at": place, "bytes": int(kind[1]), "rows": rows, "columns": columns, "step": step}
             parts.append(data)
             place += len(data)
         head = json.dumps({**header, "arrays": table}, allow_nan=False, separators=(",", ":")).encode()
@@ -127,7 +127,7 @@ def packed_agent(recording: Recording, colour: str, fact: Fact) -> bytes:
     grid = _grid(recording)
     if grid is not None:
         shape = grid["rows"], grid["columns"]
-        for name, step in (("static", SHARE), ("dynamic", SHARE), ("clearance", _CLEAR_M)):
+        for name, step in (("static", SHARE), ("dynamic", SHARE), ("clearance", CLEAR_M)):
             _add_map(pack, f"map_{name}", recording[f"/map/{name}"], step, shape)
     leaves = recording["/action"].values
     header = {
@@ -148,9 +148,9 @@ def packed_agent(recording: Recording, colour: str, fact: Fact) -> bytes:
     for name in _SHED:
         if len(content) <= RECORDING_BYTES and pack.numbers <= _MOST_NUMBERS:
             break
-        pack.drop(name)
-        header["left_out"].append(name.replace("_", " "))
-        content = pack.packed(header)
+        if pack.drop(name):
+            header["left_out"].append(name.replace("_", " "))
+            content = pack.packed(header)
     if len(content) > RECORDING_BYTES:
         raise ValueError(f"an episode of {len(times)} steps that takes {len(content)} bytes")
     return content
@@ -189,8 +189,8 @@ def _add_events(pack: _Packer, recording: Recording) -> None:
     )
     gap_s = _rare_s(recording)
     futures = _spaced(recording["/futures"], gap_s)
-    likely = [(weight >= _LEAST_WEIGHT, weight, points) for weight, points in futures.values]
-    paths = [points[keep, ::_EVERY_POINT] for keep, _, points in likely]
+    likely = [(weight >= LEAST_WEIGHT, weight, points) for weight, points in futures.values]
+    paths = [points[keep, ::EVERY_POINT] for keep, _, points in likely]
     if len({part.shape[1] for part in paths if len(part)}) == 1:
         flat = [part.reshape(len(part), -1) for part in paths if len(part)]
         moments = [time_s for time_s, part in zip(futures.times, paths, strict=True) if len(part)]
@@ -199,6 +199,17 @@ def _add_events(pack: _Packer, recording: Recording) -> None:
     scans = recording["/sonar/scan"]
     moments = _spaced(Series(scans.times, scans.times), gap_s).times
     _add_rows(pack, "echoes", moments, [recording.echoes(time_s) for time_s in moments], _POINT_M)
+    seen = recording["/camera/depth"]
+    if seen.times:
+        pack.add("camera.time", seen.times, TIME_S)
+        pack.add("camera.of", [camera_view(image / 1000.0).ravel() for image in seen.values])
+
+
+def camera_view(depth_m: np.ndarray) -> np.ndarray:
+    """What a depth image (rows, columns) [m] shows of the nearest ``_SEEN_M``, uint8 (36, 64): 0 = near,
+    31 = that far or farther."""
+    near = cv2.resize(np.minimum(depth_m, _SEEN_M).astype(np.float32), (64, 36), interpolation=cv2.INTER_AREA)
+    return np.rint(near * (31 / _SEEN_M)).astype(np.uint8)
 
 
 def _rare_s(recording: Recording) -> float:

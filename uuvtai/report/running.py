@@ -16,18 +16,17 @@ import numpy as np
 from uuvtai.common.colours import PALETTE, agent_colours
 from uuvtai.common.enums import TRIGGERS, clearance_m, occupancy
 from uuvtai.common.obstacle_motion import describe_scenario
+from uuvtai.logs.drawing import OUTCOME_NAMES
 from uuvtai.logs.encode import EpisodeEnd, dumped, numbered
 from uuvtai.logs.scenario import scenario_document
 from uuvtai.logs.topics.perception import map_origin
 from uuvtai.logs.topics.planning import code_name
 from uuvtai.logs.writer import Recordable, RecordedJob
-from uuvtai.report.recorded import SHARE, scene_header
+from uuvtai.report.recorded import CLEAR_M, EVERY_POINT, LEAST_WEIGHT, SHARE, camera_view, scene_header
 
 FRAME_S, MAP_S = 0.05, 0.5
 """[s] of the clock between two frames, [s] of the episode between two maps"""
-_FAR_S, _CLEAR_M = 1e5, 0.1
-_LEAST_WEIGHT, _EVERY_POINT = 0.1, 5  # of forecasts, as recorded episodes have them
-_OUTCOMES = {"ttc": "TTC stop", "out_of_tank": "out of the tank"}
+_FAR_S = 1e5
 _MOTION = (
     *("clock.step", "vehicle.pos_w", "vehicle.quat_wb", "vehicle.vel_b", "ego.pos_w", "ego.rpy", "ego.vel_b"),
     *("termination.clearance_m", "termination.ttc_s", "behavior.leaf", "world.pos_w"),
@@ -99,7 +98,7 @@ class RunningEpisodes:
     def end(self, sim: Recordable, row: int, result: EpisodeEnd) -> None:
         """The episode of this row is over."""
         self._show(sim, [row])
-        said = _OUTCOMES.get(result.outcome, result.outcome)
+        said = OUTCOME_NAMES.get(result.outcome, result.outcome)
         tank = self._tanks[row]
         tank.end = {"outcome": said, "failed": result.outcome != "success", "time": result.time_s}
         self._audience.tell(_text({"kind": "end", "tank": row, "end": tank.end}))
@@ -200,10 +199,11 @@ def _detail(sim: Recordable, row: int, time_s: float, with_map: bool) -> str:
         "echoes": _rounded(echoes, 2),
         "tracks": _rounded(np.column_stack([state, radius_m, cov[:, [0, 1, 4]]]), 4),
         "futures": _futures(read),
+        "camera": base64.b64encode(camera_view(read("image.depth_m")).tobytes()).decode(),
     }  # fmt: skip
     if with_map:
         layers = [occupancy(read(f"grid_map.{name}_occ")) / SHARE for name in ("static", "dynamic")]
-        layers.append(clearance_m(read("clearance.site"), sim.config) / _CLEAR_M)
+        layers.append(clearance_m(read("clearance.site"), sim.config) / CLEAR_M)
         cells = [np.clip(np.rint(layer), 0, 255).astype(np.uint8).tobytes() for layer in layers]
         message["map"] = [base64.b64encode(layer).decode() for layer in cells]
     return _text(message)
@@ -216,7 +216,7 @@ def _futures(read: Callable[[str], np.ndarray]) -> list[Any]:
     for track in np.flatnonzero(read("forecast.radius_m")[:, 0] >= 0):
         weights = [*shares[track], 1.0 - shares[track].sum()]
         paths = zip(_rounded(weights, 2), [*others[track], forecast[track]], strict=True)
-        found += [[w, _rounded(points[::_EVERY_POINT], 2)] for w, points in paths if w >= _LEAST_WEIGHT]
+        found += [[w, _rounded(points[::EVERY_POINT], 2)] for w, points in paths if w >= LEAST_WEIGHT]
     return found
 
 

@@ -358,9 +358,9 @@ def _played(
     pilot: onboard.OnboardPilot,
     feed: LogFeed,
     told: Disturbed,
-    after: Callable[[int], None] = lambda step: None,
+    after: Callable[[int, onboard.PilotCommand], None] = lambda step, command: None,
 ) -> tuple[list[onboard.PilotCommand], list[float]]:
-    """(commands of all steps, seconds that each took); ``after`` is called at the end of each step."""
+    """(commands of all steps, seconds that each took); ``after`` gets each step and its command."""
     commands, tick_s, sent = [], [], 0
     dt, arrivals = feed.config.episode.control_dt_s, told.arrivals
     last_s = max((arrival.message.time_s for arrival in feed.arrivals), default=0.0)
@@ -375,7 +375,7 @@ def _played(
             sent += 1
         commands.append(pilot.tick())
         tick_s.append(time.perf_counter() - began)
-        after(step)
+        after(step, commands[-1])
     return commands, tick_s
 
 
@@ -462,14 +462,18 @@ def open_replay(
     with run.recorded():
         recorder = EpisodeRecorder(run.path / "logs", feed.run["world"], feed.run["agent"], [mission])
 
-        def record(step: int) -> None:
+        def record(step: int, command: onboard.PilotCommand) -> None:
             views["vehicle.pos_w"][0] = views["ego.pos_w"][0]
             views["vehicle.vel_b"][0] = views["ego.vel_b"][0]
             views["vehicle.quat_wb"][0] = quaternion_of(views["ego.rpy"][0])
+            leaf = int(views["behavior.leaf"][0])
+            if command.held:
+                views["behavior.leaf"][0] = -1  # the log says that no node drove
             if step:
                 recorder.step(sim)
             else:
                 recorder.begin(sim, 0, mission)
+            views["behavior.leaf"][0] = leaf
 
         try:
             commands, tick_s = _played(pilot, feed, told, record)

@@ -248,7 +248,7 @@ def exact_image(data: dict[str, Any], shape: tuple[int, int]) -> np.ndarray:
 
 CAMERA_ROWS = (
     Topic("/camera/line", NEW_IMAGE, _DEPTH_LINE, _line, ("image.depth_m", "image.shot_rpy")),
-    Topic("/camera/depth", IMAGES, _DEPTH_IMAGE, _png, ("image.depth_m",), on_request=True),
+    Topic("/camera/depth", IMAGES, _DEPTH_IMAGE, _png, ("image.depth_m",), logged_image, on_request=True),
     Topic(
         "/camera/exact",
         NEW_IMAGE,

@@ -3,6 +3,7 @@ import { Painter, ended } from "./paint.mjs";
 import { Player, add, sized } from "./player.mjs";
 import { Running } from "./running.mjs";
 import { STEERING, Steering, said } from "./steer.mjs";
+import { pad } from "./touch.mjs";
 import { View } from "./view.mjs";
 
 const AGAIN_MS = 1000;
@@ -68,7 +69,10 @@ export class Live extends Player {
   take(role) {
     const first = this.role.steered === undefined;
     this.role = role;
-    if (first) this.explain(role.steered ? DRIVING : WATCHING);
+    if (first) {
+      this.explain(role.steered ? DRIVING : WATCHING);
+      if (role.steered) this.ticks.around.click(), this.ticks.camera.click(); // who steers looks around
+    }
     this.tellRole();
   }
 
@@ -175,7 +179,7 @@ export class Live extends Player {
   tellRole() {
     const { held, steered, helm, note, truth } = this.role;
     const over = steered && this.tanks[0] && ended(this.tanks[0].agents[0], this.tanks[0].end);
-    const start = helm ? "The first key starts: W A S D and arrows, R F for the depth, or a gamepad." : "Nobody has begun to drive yet.";
+    const start = helm ? "The first command starts: W A S D and arrows, R F for the depth, a gamepad, or thumbs." : "Nobody has begun to drive yet.";
     const words = [
       note,
       over && !note && "It is over. Others now drive the same episode; who won is told here.",
@@ -187,8 +191,19 @@ export class Live extends Player {
     this.asks.hidden = !steered;
     this.asks.setAttribute("aria-pressed", Boolean(truth));
     this.asks.disabled = this.button.disabled = !helm;
-    this.commanded.parentElement.hidden = !(steered && helm);
+    this.commanded.parentElement.hidden = this.thumbs.hidden = !(steered && helm);
     this.soon();
+  }
+
+  /** A pad for each thumb, where the screen is touched. */
+  pads() {
+    this.thumbs = add(this.root, "div", { className: "thumbs", hidden: true });
+    for (const [isLeft, words] of [[true, "ahead, sideways"], [false, "depth, turn"]]) {
+      const round = add(this.thumbs, "div", { className: "pad", ariaLabel: words });
+      add(round, "span", { textContent: words });
+      pad(round, (right, up) => this.steering.thumb(isLeft, right, up));
+    }
+    this.scene.after(this.thumbs);
   }
 
   /** The wall: a picture a tank. */
@@ -214,7 +229,8 @@ export class Live extends Player {
     this.back = this.press("All tanks", "back to the wall (esc)", () => this.follow(-1));
     this.back.classList.add("one");
     this.asks = this.press("Truth", "show what no vehicle senses (T)", () => this.truth());
-    const pair = add(this.root.querySelector(".figures"), "div");
+    this.pads();
+    const pair = add(this.root.querySelector(".figures"), "div", { className: "words" });
     add(pair, "dt", { textContent: "command" });
     this.commanded = add(pair, "dd", { textContent: "stop" });
   }

@@ -1,19 +1,23 @@
 // The scene of a moment: from above what an agent senses, maps, plans and does, with the truth; below that from the side.
 import { HULL_RADIUS_M, circle, ellipse, gap, halfWidth, hullOutline, obstacleOutline, tankOutline } from "./view.mjs";
 
-/** What can be switched off, in the legend's order: name, colour of the palette, words, and whether it is shown at first. */
+/** What can be switched off, in the legend's order: name, colour of the palette, words, mark, and whether it is shown at first. */
 export const LAYERS = [
-  ["truth", "mover", "true obstacles (static: grey)", true],
-  ["static", "static", "mapped", true],
-  ["dynamic", "dynamic", "mapped, dynamic", true],
-  ["tracks", "dynamic", "tracked, 2 sigma", true],
-  ["futures", "mover", "forecasts", true],
-  ["route", "route", "route", true],
-  ["path", "", "path driven", true],
-  ["echoes", "echo", "sonar", true],
-  ["ghosts", "grey", "other agents", true],
-  ["clearance", "intersection", "clearance field", false],
+  ["truth", "mover", "true obstacles (static: grey)", "thin ring", true],
+  ["static", "static", "mapped", "", true],
+  ["dynamic", "dynamic", "mapped, dynamic", "", true],
+  ["tracks", "dynamic", "tracked, 2 sigma", "ring", true],
+  ["futures", "mover", "forecasts", "dot", true],
+  ["route", "route", "route", "line", true],
+  ["path", "", "path driven", "line", true],
+  ["echoes", "echo", "sonar", "dot", true],
+  ["ghosts", "grey", "other agents", "line", true],
+  ["clearance", "intersection", "clearance field", "", false],
+  ["around", "ink", "around the vehicle", "ring", false],
+  ["camera", "ink", "camera, if recorded: what is near stands out", "", false],
 ];
+export const AROUND_PX = 132;
+const AROUND_M = 6;
 
 /** Draws a scene into a 2D context of CSS pixels. `look`: colours by name, colours of the agents, layers that are on. */
 export class Painter {
@@ -38,7 +42,7 @@ export class Painter {
     this.goal(source.scene);
     if (look.on.route) this.route(frame);
     if (look.on.ghosts) this.others(source, agent, time);
-    this.path(source.history(agent), frame.step, look.agents[agent], 2);
+    this.path(source.history(agent), frame.step, look.agents[agent], 2.5, 2.5);
     if (look.on.echoes) for (const [x, y] of frame.echoes) this.dot(x, y, 1.7, look.echo);
     if (look.on.tracks) this.tracks(frame.tracks);
     this.vehicle(frame.pose, look.agents[agent]);
@@ -157,12 +161,15 @@ export class Painter {
     context.globalAlpha = 1;
   }
 
-  path({ pose }, step, colour, width) {
+  /** From a ring at the start; `halo`: [px] of paper around it. */
+  path({ pose }, step, colour, width, halo = 0) {
     const { context, view, look } = this;
     if (!look.on.path) return;
     context.beginPath();
     for (let i = 0; i <= step; i++) context.lineTo(view.x(pose[4 * i]), view.y(pose[4 * i + 1]));
+    if (halo) this.stroked(look.paper, width + halo);
     this.stroked(colour, width);
+    if (halo) this.dot(pose[0], pose[1], 5, look.ink), this.dot(pose[0], pose[1], 2.8, look.paper);
   }
 
   vehicle(pose, colour) {
@@ -303,6 +310,49 @@ export class Painter {
     context.fillStyle = look.grey;
     context.fillText(words, x, y);
   }
+}
+
+/** What the vehicle senses around it, its bow up, as a sonar's display shows it: returns, tracks, the point it steers at, the goal's way. */
+export function paintAround(context, { pose: [x, y, , yaw], echoes, tracks, ahead }, goal, colour, look) {
+  const [middle, scale, [c, s]] = [AROUND_PX / 2, (AROUND_PX / 2 - 9) / AROUND_M, [Math.cos(yaw), Math.sin(yaw)]];
+  const place = (u, v) => [middle + (s * (u - x) - c * (v - y)) * scale, middle - (c * (u - x) + s * (v - y)) * scale];
+  const round = ([u, v], radius, fill, edge, width = 1.5) => {
+    context.beginPath();
+    context.arc(u, v, radius, 0, 7);
+    context.fillStyle = fill;
+    context.fill();
+    if (!edge) return;
+    context.strokeStyle = edge;
+    context.lineWidth = width;
+    context.stroke();
+  };
+  context.fillStyle = look.paper;
+  context.fillRect(0, 0, AROUND_PX, AROUND_PX);
+  round([middle, middle], AROUND_M * scale, look.water, look.ink);
+  for (const ring of [2, 4]) round([middle, middle], ring * scale, "transparent", look.faint, 1);
+  const far = (u, v) => Math.hypot(u - x, v - y) > AROUND_M;
+  for (const [u, v] of echoes) if (!far(u, v)) round(place(u, v), 1.6, look.echo);
+  for (const track of tracks) if (!far(track.x, track.y)) round(place(track.x, track.y), track.radius * scale, "transparent", look.dynamic);
+  if (ahead && !far(...ahead)) round(place(...ahead), 3, look.route);
+  const share = Math.min(AROUND_M / (Math.hypot(goal[0] - x, goal[1] - y) || 1), 1);
+  round(place(x + share * (goal[0] - x), y + share * (goal[1] - y)), 4, look.goal, look.ink, 1);
+  context.fillStyle = colour;
+  context.beginPath();
+  for (const [u, v] of [[0, -7], [5, 5], [-5, 5]]) context.lineTo(middle + u, middle + v);
+  context.fill();
+  context.font = `10px ${look.font}`;
+  context.textAlign = "right";
+  context.fillStyle = look.grey;
+  context.fillText(`${AROUND_M} m`, AROUND_PX, AROUND_PX - 2);
+}
+
+/** What the camera sees: of the water's colour what is far, of the ink's what is near. */
+export function paintCamera(canvas, cells, look) {
+  [canvas.width, canvas.height] = [64, 36];
+  const image = new ImageData(64, 36);
+  const [far, near] = [look.water, look.ink].map((colour) => [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16)));
+  cells.forEach((cell, i) => image.data.set([...near.map((part, k) => part + (far[k] - part) * (cell / 31)), 255], 4 * i));
+  canvas.getContext("2d").putImageData(image, 0, 0);
 }
 
 export function ended(agent, time) {

@@ -1,15 +1,17 @@
 // The player: a source's scene, strip and figures, and whatever moves through its time.
-import { LAYERS, Painter, ended } from "./paint.mjs";
+import { AROUND_PX, LAYERS, Painter, ended, paintAround, paintCamera } from "./paint.mjs";
 import { recorded } from "./source.mjs";
 import { STRIP_HEIGHT, moment, paintStrip } from "./strip.mjs";
+import { gestures } from "./touch.mjs";
 import { View } from "./view.mjs";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 const STEP_S = 0.1;
+const NEAR_M = 9;
 export const KEYS = [
   ["space", "play, pause"], ["← →", "0.1 s back, on (shift: 1 s)"], ["home end", "start, end"], ["+ −", "faster, slower"],
   ["1 … 9", "follow that agent"], ["n p", "next, previous episode"], ["x", "to the failure"], ["z", "near, whole tank"],
-  ["l", "layers"], ["d", "dark, light"], ["?", "these keys"],
+  ["l", "layers"], ["d", "dark, light"], ["?", "these keys"], ["two fingers", "zoom, move; then drag"],
 ];
 
 /** What a key does, by its name in the browser: [command, argument], null = nothing of ours. */
@@ -34,8 +36,8 @@ export function ending({ name, outcome, end, cause, meaning }) {
 export class Player {
   /** `episodes`: [{title, open: () => Promise of a Source}] */
   constructor(root, episodes) {
-    Object.assign(this, { root, episodes, time: 0, speed: 1, agent: 0, playing: false, near: false, images: {} });
-    this.on = Object.fromEntries(LAYERS.map(([name, , , shown]) => [name, shown]));
+    Object.assign(this, { root, episodes, time: 0, speed: 1, agent: 0, playing: false, near: false, window: null, images: {} });
+    this.on = Object.fromEntries(LAYERS.map(([name, , , , shown]) => [name, shown]));
     this.build();
     root.player = this;
     const redraw = () => this.draw();
@@ -48,6 +50,7 @@ export class Player {
     this.stop();
     this.source = await this.episodes[this.index].open();
     this.time = this.source.end;
+    this.window = null;
     this.agent = Math.min(this.agent, this.source.agents.length - 1);
     this.select.value = this.index;
     this.buttons();
@@ -114,8 +117,19 @@ export class Player {
     this.seek(agents[failed].end);
   }
 
+  /** From near, following the vehicle, or the whole tank. */
   zoom() {
-    this.near = !this.near;
+    this.near = !this.near && !this.window;
+    this.window = null;
+    this.draw();
+  }
+
+  /** Fingers have moved the scene: it stays where they leave it. From the side they move it along. */
+  moved(factor, ...places) {
+    const low = this.view.top + this.view.high;
+    const [from, to] = places.map(({ x, y }) => ({ x, y: Math.min(y, low) }));
+    this.window = this.view.zoomed(this.source.scene.tank, factor, from, to);
+    this.near = false;
     this.draw();
   }
 
@@ -154,10 +168,17 @@ export class Player {
     if (!this.source || !width) return;
     const look = this.look();
     const frame = this.source.frame(this.agent, this.time);
-    this.view = new View(this.source.scene.tank, width, this.near ? frame.pose : null);
+    const { tank } = this.source.scene;
+    const near = this.near && { x: frame.pose[0], y: frame.pose[1], metres: Math.min(NEAR_M, tank.x_m[1] - tank.x_m[0]) };
+    this.view = new View(tank, width, near || this.window);
+    this.scene.style.touchAction = near || this.window ? "none" : "pan-y"; // else a finger scrolls the page
     const scene = sized(this.scene, width, this.view.height);
     new Painter(scene, this.view, look).scene(this.source, this.agent, this.time);
     paintStrip(sized(this.strip, width, STRIP_HEIGHT), width, this.source, this.agent, this.time, look);
+    this.around.hidden = !this.on.around;
+    if (this.on.around) paintAround(sized(this.around, AROUND_PX, AROUND_PX), frame, this.source.scene.goal, look.agents[this.agent], look);
+    this.camera.hidden = !(this.on.camera && frame.camera);
+    if (!this.camera.hidden) paintCamera(this.camera, frame.camera, look);
     this.figures(frame, look);
   }
 
@@ -170,7 +191,7 @@ export class Player {
     this.values[1].classList.toggle("near", frame.clearance !== null && frame.clearance < 0.3);
     this.button.textContent = this.playing ? "Pause" : "Play";
     this.rate.value = this.speed;
-    this.zoomed.setAttribute("aria-pressed", this.near);
+    this.zoomed.setAttribute("aria-pressed", this.near || this.window !== null);
     [...this.chips.children].forEach((chip, i) => {
       chip.setAttribute("aria-pressed", i === agent);
       chip.firstChild.style.background = look.agents[i];
@@ -182,7 +203,7 @@ export class Player {
     this.strip.setAttribute("aria-valuemax", source.end.toFixed(1));
     this.strip.setAttribute("aria-valuetext", `${time.toFixed(1)} of ${source.end.toFixed(1)} s`);
     const colours = Object.fromEntries(LAYERS);
-    for (const [name, swatch] of Object.entries(this.swatches)) swatch.style.background = look[colours[name] ?? name] ?? look.agents[agent];
+    for (const [name, swatch] of Object.entries(this.swatches)) swatch.style.color = look[colours[name] ?? name] ?? look.agents[agent];
   }
 
   // -------------------------------------------------------------------------------------------------------- the page
@@ -199,9 +220,12 @@ export class Player {
     this.chips = add(root, "div", { className: "chips" });
     this.transport(add(root, "div", { className: "transport" }));
     this.scene = add(root, "canvas", { className: "scene", role: "img", ariaLabel: "the episode from above and from the side" });
-    const figures = add(root, "dl", { className: "figures" });
+    const beside = add(root, "div", { className: "beside" });
+    const figures = add(beside, "dl", { className: "figures" });
+    this.around = add(beside, "canvas", { className: "around", role: "img", ariaLabel: "what the vehicle senses around it, its bow up", hidden: true });
+    this.camera = add(beside, "canvas", { className: "camera", role: "img", ariaLabel: "what its camera sees", hidden: true });
     this.values = ["time", "clearance", "time to collision", "speed", "tree", "replans"].map((name) => {
-      const pair = add(figures, "div");
+      const pair = add(figures, "div", { className: name === "tree" ? "words" : "" });
       add(pair, "dt", { textContent: name });
       return add(pair, "dd");
     });
@@ -246,12 +270,12 @@ export class Player {
     this.layers = add(this.root, "details", { className: "layers", open: true });
     add(this.layers, "summary", { textContent: "Layers and legend" });
     const box = add(this.layers, "div");
-    this.swatches = {};
-    for (const [name, , words] of LAYERS) {
+    Object.assign(this, { swatches: {}, ticks: {} });
+    for (const [name, , words, mark] of LAYERS) {
       const label = add(box, "label");
-      const tick = add(label, "input", { type: "checkbox", checked: this.on[name] });
+      const tick = (this.ticks[name] = add(label, "input", { type: "checkbox", checked: this.on[name] }));
       tick.onchange = () => ((this.on[name] = tick.checked), this.draw());
-      this.swatches[name] = add(label, "span", { className: "swatch" });
+      this.swatches[name] = add(label, "span", { className: `swatch ${mark}` });
       label.append(words);
     }
     for (const why of ["initial", "stuck", "safety", "intersection"]) {
@@ -287,6 +311,7 @@ export class Player {
     };
     this.strip.addEventListener("pointerdown", (event) => (this.strip.setPointerCapture(event.pointerId), scrub(event)));
     this.strip.addEventListener("pointermove", scrub);
+    gestures(this.scene, (...moved) => this.moved(...moved));
     this.scene.addEventListener("click", () => this.toggle());
   }
 }

@@ -35,11 +35,11 @@ export class Running {
   }
 
   /** What the vehicle senses, maps and plans at one time. */
-  detail({ time, route, ahead, echoes, tracks, futures, map }) {
+  detail({ time, route, ahead, echoes, tracks, futures, camera, map }) {
     const moving = tracks.map(([x, y, vx, vy, radius, ...cov]) => ({ x, y, vx, vy, radius, z: 0, cov }));
     const weighed = futures.map(([weight, points]) => ({ weight, points }));
-    this.details.push({ time, route, ahead, echoes, tracks: moving, futures: weighed });
-    if (map) this.maps.push({ time, layers: map.map((text) => Uint8Array.from(atob(text), (character) => character.charCodeAt(0))) });
+    this.details.push({ time, route, ahead, echoes, tracks: moving, futures: weighed, camera: bytes(camera) });
+    if (map) this.maps.push({ time, layers: map.map(bytes) });
   }
 
   replan([time, why]) {
@@ -59,7 +59,7 @@ export class Running {
     const step = Math.max(newest(past.time, time), 0);
     const known = (value) => (value >= 0 || value < -1 ? value : null);
     const found = latest(this.details, time);
-    const fresh = found && time - found.time <= STALE_S ? found : { route: [], ahead: null, echoes: [], tracks: [], futures: [] };
+    const fresh = found && time - found.time <= STALE_S ? found : { route: [], ahead: null, echoes: [], tracks: [], futures: [], camera: null };
     return {
       step, pose: past.pose.slice(4 * step, 4 * step + 4), speed: past.speed[step], leaf: past.leaves[past.leaf[step]] ?? "",
       clearance: Number.isNaN(past.clearance[step]) ? null : past.clearance[step], ttc: known(past.ttc[step]), ...fresh, map: this.map(time),
@@ -78,6 +78,10 @@ export class Running {
     let next = 0;
     return this.scene.obstacles.flatMap(({ at, moves }) => (moves ? [moving[next++], moving[next++]] : [at[0], at[1]]));
   }
+}
+
+function bytes(text) {
+  return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
 }
 
 /** The newest of these at a time; undefined before the first. */

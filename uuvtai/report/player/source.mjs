@@ -22,6 +22,7 @@ import { Layer, Rows, newest, unpacked } from "./decode.mjs";
  * @property {number[][]} echoes points [m]
  * @property {object[]} tracks x, y, radius, z [m], vx, vy [m/s], cov: xx, xy, yy [m^2]
  * @property {object[]} futures weight and points [m] of each hypothesis
+ * @property {?Float64Array} camera how far it sees, 36 rows of 64 from the left above: 0 = near, 31 = 10 m or more
  * @property {?object} map rows, columns, x, y, cell_m, and of each layer cells 0 to 255 with their version
  */
 
@@ -88,6 +89,7 @@ class Agent {
     this.ahead = of("ahead");
     this.cov = of("tracks.cov");
     this.weight = of("futures.weight");
+    this.camera = { times: of("camera.time") ?? [], values: of("camera.of") };
     this.grid = header.grid;
     this.rare = header.rare_s;
     const cells = this.grid ? this.grid.rows * this.grid.columns : 0;
@@ -105,8 +107,14 @@ class Agent {
       speed: history.speed?.[step] ?? null,
       leaf: history.leaf ? history.leaves[history.leaf[step]] : "",
       route, ahead: this.ahead && route.length ? this.ahead.subarray(2 * step, 2 * step + 2) : null,
-      echoes: this.points_of("echoes", time), tracks: this.tracks(time), futures: this.futures(time), map: this.map(time),
+      echoes: this.points_of("echoes", time), tracks: this.tracks(time), futures: this.futures(time), map: this.map(time), camera: this.seen(time),
     };
+  }
+
+  /** The newest image. */
+  seen(time) {
+    const i = newest(this.camera.times, time);
+    return i < 0 ? null : this.camera.values.subarray(2304 * i, 2304 * (i + 1));
   }
 
   points_of(name, time) {

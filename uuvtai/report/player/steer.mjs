@@ -1,4 +1,4 @@
-// Steering by keys and gamepad: a command is surge, sway, heave and yaw rate, each from -1 to 1 of the vehicle's limits.
+// Steering by keys, thumb pads and gamepad: a command is surge, sway, heave and yaw rate, each from -1 to 1 of the vehicle's limits.
 
 /** Which part of the command a key moves, and which way; keys by their place, whatever is printed on them. */
 const PARTS = {
@@ -10,13 +10,14 @@ const SLOWLY = 1 / 3;
 const REST = 0.12; // a stick that is moved less is at rest
 export const STEERING = [
   ["W S, ↑ ↓", "ahead, back"], ["A D", "left, right"], ["Q E, ← →", "turn left, right"], ["R F, page ↑ ↓", "up, down"],
-  ["shift", "slowly"], ["space", "stop"], ["T", "the truth, what it senses"], ["gamepad", "left stick: ahead, sideways; right: turn, depth; A: stop"],
+  ["shift", "slowly"], ["space", "stop"], ["T", "the truth, what it senses"], ["gamepad, thumb pads", "left: ahead, sideways; right: turn, depth; A: stop"],
 ];
 
 export class Steering {
   constructor() {
     this.pressed = new Set();
     this.slow = false;
+    this.pads = [0, 0, 0, 0]; // by thumbs
   }
 
   /** Takes a key that is pressed or let go; whether it is one of ours. */
@@ -27,15 +28,21 @@ export class Steering {
     return (code === "Space" || code in PARTS) && !(ctrlKey || metaKey || altKey);
   }
 
-  /** Lets go of all keys. */
+  /** Lets go of all keys and pads. */
   release() {
     this.pressed.clear();
+    this.pads.fill(0);
   }
 
-  /** By keys and the first gamepad that is there. */
+  /** A thumb is there on a pad, the left one or the right one. */
+  thumb(isLeft, right, up) {
+    this.pads.splice(isLeft ? 0 : 2, 2, moved(up), -moved(right));
+  }
+
+  /** By keys, thumbs and the first gamepad that is there. */
   command(pads) {
     const pad = [...pads].find((one) => one?.connected);
-    const asked = [0, 0, 0, 0];
+    const asked = this.pads.slice();
     for (const code of this.pressed) asked[PARTS[code][0]] += PARTS[code][1] * (this.slow ? SLOWLY : 1);
     if (pad) {
       if (pad.buttons[0]?.pressed) return [0, 0, 0, 0];

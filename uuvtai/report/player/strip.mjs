@@ -68,7 +68,7 @@ function curve(context, times, values, x, low, top, colour, alpha) {
   context.globalAlpha = 1;
 }
 
-/** Which node of the tree drove, as bars; the names of those long enough stand in them. */
+/** Which node of the tree drove, as bars with names where they fit; a gap where the vehicle was held and none did. */
 function band(context, history, x, top, look) {
   text(context, look, "tree", LEFT - 8, top + 12, "right");
   const { time, leaf, leaves } = history;
@@ -78,7 +78,7 @@ function band(context, history, x, top, look) {
     const [left, right] = [x(time[from]), x(time[Math.min(i, time.length - 1)])];
     const name = leaves[leaf[from]] ?? "";
     context.fillStyle = leafColour(name, look);
-    context.fillRect(left, top, Math.max(right - left, 1), BAND);
+    if (name) context.fillRect(left, top, Math.max(right - left, 1), BAND);
     context.font = `11px ${look.font}`;
     if (context.measureText(name).width < right - left - 8) text(context, { ...look, grey: look.paper }, name, left + 4, top + 12, "left", 11);
     from = i;

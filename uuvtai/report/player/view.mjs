@@ -1,8 +1,10 @@
 // Places: from the world [m] to the pixels of a canvas, and the shapes of what is drawn there.
 
+const LEAST_M = 1.5; // of a window
+
 /** Where the tank, or a window of it around a place, is drawn: from above, and below that from the side. */
 export class View {
-  /** `zoom`: [x, y] in the middle of a window, null = the whole tank. `bare`: without a ruler and the view from the side. */
+  /** `zoom`: x, y [m] in the middle of a window so many metres wide, null = the whole tank. `bare`: from above and without a ruler. */
   constructor(tank, width, zoom, bare = false) {
     const [x, y, z] = [tank.x_m, tank.y_m, tank.z_m];
     this.star = bare ? 6 : 11; // [px]
@@ -10,13 +12,12 @@ export class View {
     this.top = bare ? 3 : 14;
     const across = width - this.left - (bare ? 3 : 12);
     const most = Math.max(260, Math.min(0.62 * width, 560));
-    const shown = zoom ? Math.min(9, x[1] - x[0]) : x[1] - x[0];
-    this.scale = zoom ? across / shown : Math.min(across / shown, most / (y[1] - y[0]));
+    this.scale = zoom ? across / zoom.metres : Math.min(across / (x[1] - x[0]), most / (y[1] - y[0]));
     this.high = zoom ? Math.min(most, (y[1] - y[0]) * this.scale) : (y[1] - y[0]) * this.scale;
     this.wide = Math.min(across, (x[1] - x[0]) * this.scale);
     this.left += 0.5 * (across - this.wide);
-    this.x0 = zoom ? within(zoom[0] - 0.5 * shown, x[0], x[1] - this.wide / this.scale) : x[0];
-    this.y1 = zoom ? within(zoom[1] + 0.5 * (this.high / this.scale), y[0] + this.high / this.scale, y[1]) : y[1];
+    this.x0 = zoom ? within(zoom.x - 0.5 * (this.wide / this.scale), x[0], x[1] - this.wide / this.scale) : x[0];
+    this.y1 = zoom ? within(zoom.y + 0.5 * (this.high / this.scale), y[0] + this.high / this.scale, y[1]) : y[1];
     this.z = z;
     this.deep = Math.min(Math.max((z[1] - z[0]) * this.scale, 64), 150);
     this.side = this.top + this.high + 40;
@@ -30,6 +31,22 @@ export class View {
 
   y(y) {
     return this.top + (this.y1 - y) * this.scale;
+  }
+
+  /** [x, y] in the world of a pixel. */
+  world({ x, y }) {
+    return [this.x0 + (x - this.left) / this.scale, this.y1 - (y - this.top) / this.scale];
+  }
+
+  /** The zoom of a view so many times as large, in which what is at pixel `from` here is at `to`; null = the whole tank. */
+  zoomed(tank, factor, from, to) {
+    const metres = Math.max((this.width - 46) / (this.scale * factor), LEAST_M);
+    const next = (x, y) => new View(tank, this.width, { x, y, metres });
+    if (next(0, 0).scale <= new View(tank, this.width, null).scale) return null;
+    const [x, y] = this.world(from);
+    const trial = next(x, y);
+    const [u, v] = trial.world(to);
+    return { x: trial.x0 + 0.5 * (trial.wide / trial.scale) + x - u, y: trial.y1 - 0.5 * (trial.high / trial.scale) + y - v, metres };
   }
 
   /** Of a height, in the view from the side. */
