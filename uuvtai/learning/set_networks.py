@@ -80,9 +80,7 @@ class SetCritic(nn.Module):
         self.value_norm = RunningNorm(1, math.inf)
 
     def forward(self, obstacles: Tensor, own: Tensor, truth: Tensor) -> Tensor:
-        there = obstacles[..., :1]
-        if truth.shape[-1]:
-            there = torch.maximum(there, truth[..., 2:3])
+        there = torch.maximum(obstacles[..., :1], truth[..., 2:3])
         return self.net(torch.cat([obstacles, truth], dim=-1), own, there).squeeze(-1)
 
 
