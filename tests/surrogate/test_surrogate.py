@@ -479,7 +479,7 @@ def test_what_is_seen_badly_is_born_late_or_missed():
 
 
 def test_neither_order_nor_empty_rows_matter(config):
-    actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    actor = SetActor(config, torch.Generator().manual_seed(1))
     for parameter in actor.parameters():  # biases too: an empty row must not count for what it gives
         torch.nn.init.normal_(parameter, std=0.3, generator=torch.Generator().manual_seed(2))
     obstacles, own = torch.randn(5, 4, OBSTACLE_WIDTH), torch.randn(5, EGO_COLUMNS)
@@ -495,7 +495,7 @@ def test_what_drives_knows_nothing_that_only_the_simulator_knows(saved):
     assert not set(members_of(arrays.ObserverIO).values()) & TRUTH
     found = saved()
     assert list(found.model()) == ["policy"]
-    own = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, found.config, torch.Generator()).state_dict()
+    own = SetActor(found.config, torch.Generator()).state_dict()
     assert {n: t.shape for n, t in found.model()["policy"].items()} == {n: t.shape for n, t in own.items()}
     assert max(row["stop"] for row in found.manifest.observation_table) == EGO_COLUMNS + 9 * OBSTACLE_WIDTH
 
@@ -571,7 +571,7 @@ def test_it_learns_what_the_tree_says(small, monkeypatch):
     )
     for passes in (1, 20):
         monkeypatch.setattr(distillation, "LAST_PASSES", passes)
-        actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+        actor = SetActor(config, torch.Generator().manual_seed(1))
         std = actor.log_std.detach().clone()
         found = imitate(actor, config, ((8, 6, 0.6),), told.append, {"pool": small.sim})
         losses.append(found["warm_start/loss"])
@@ -583,7 +583,7 @@ def test_it_learns_what_the_tree_says(small, monkeypatch):
 
 def test_the_tree_alone_drives_as_without_a_student(small):
     config = load_training("policy", overrides=SMALL)
-    actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    actor = SetActor(config, torch.Generator().manual_seed(1))
     student = Student(actor, small.sim, config, torch.Generator().manual_seed(0))
     small.begin(range(small.N), seed=9)
     student.reset(torch.ones(small.N))
