@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,11 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from tests.command import uuv
 from tests.mavlink_vehicle import START, free_port, link_config
+from tests.oracles.actuation import thrust_of_rpm
 from uuvtai.common import signals
 from uuvtai.common.errors import SettingError
 from uuvtai.compile import launch
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.vehicle import dynamics
+from uuvtai.sim.setup import allocation_matrices
 from uuvtai.vehicle import sitl
 from uuvtai.vehicle.mavlink import LinkError, LinkPlace, MavCodec
 from uuvtai.vehicle.onboard import DvlReading, SonarPing
@@ -276,6 +279,21 @@ def test_pulse_and_speed_are_the_makers():
     assert motors.rpm((0,) * 16) == pytest.approx(np.zeros(6)), "a channel that is off"
     assert np.abs(motors.rpm((1900,) * 16)) == pytest.approx(np.full(6, 3465.0)), "one limit both ways"
     assert np.abs(motors.rpm((1420,) * 16)) == pytest.approx(np.full(6, 1016.0))
+
+
+@pytest.mark.parametrize(("axis", "name"), [(0, "forward"), (1, "lateral")])
+@pytest.mark.parametrize("speed", [0.3, 0.45, 0.6])
+def test_the_example_feeds_forward_what_the_vehicle_needs(axis, name, speed):
+    """ArduSub makes of an acceleration an angle, and of its share of ANGLE_MAX (45 degrees) a thrust."""
+    text = (Path(__file__).parents[2] / "examples/ardusub.parm").read_text()
+    gain = float(text.partition("PSC_VELXY_FF ")[2].partition("\n")[0])
+    vehicle = load_config("pool", "multibeam", "bluerov2_16v").vehicle
+    share = math.degrees(math.atan(gain * speed / 9.81)) / 45.0
+    thrust_n = thrust_of_rpm(Motors(vehicle).rpm(pulses(**{name: share})), vehicle)
+    force_n = abs(float(allocation_matrices(vehicle)[0][axis] @ thrust_n))
+    linear, quadratic = vehicle.linear_damping[axis], vehicle.quadratic_damping[axis]
+    reached = (math.sqrt(linear**2 + 4 * quadratic * force_n) - linear) / (2 * quadratic)
+    assert 0.6 < reached / speed < 1.2, "the feedback does the rest"
 
 
 def test_frames_that_ardusub_does_not_have_are_refused():
