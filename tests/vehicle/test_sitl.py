@@ -111,8 +111,8 @@ def test_turning_over_the_axes_turns_attitudes_over():
 @pytest.mark.parametrize(
     "data",
     [
-        b"", b"\x1a", GOLDEN_PACKET[:-1], GOLDEN_PACKET + b"\0", packet(1, magic=1), packet(1, rate=0),
-        packet(1, rate=65535), packet(1, (1500,) * 32), packet(1, magic=29569), b"\xff" * 40,
+        b"", b"\x1a", GOLDEN_PACKET[:-1], GOLDEN_PACKET + b"\0", packet(1, magic=1),
+        packet(1, (1500,) * 32), packet(1, magic=29569), b"\xff" * 40,
     ],
 )  # fmt: skip
 def test_what_is_no_packet(data):
@@ -210,6 +210,16 @@ def test_lockstep():
     again = one.answer(packet(0, TURNING), 3.0)[0]
     assert again == replies[0] and water.asked["begin"] == 2, "ArduSub has begun anew"
     assert one.document()["packets"] == {"step": 40, "reset": 2, "again": 1, "ignore": 1, "bad": 1}
+
+
+@pytest.mark.parametrize(
+    "rate", [0, 16959, 65535]
+)  # the second by a real ArduSub, which then waited for ever
+def test_a_rate_that_is_not_believed_is_the_last_one(rate):
+    one = Instance(CONFIG, StillWater(), 0)
+    assert one.answer(packet(0, rate=rate), 0.0) == (b"", []) and one.counts["bad"] == 1
+    one.answer(packet(0), 0.0)
+    assert time_of(one.answer(packet(1, rate=rate), 0.01)[0]) == pytest.approx(2 / 400)
 
 
 def test_the_vehicle_is_held_until_a_thruster_turns():
