@@ -39,10 +39,7 @@ from uuvtai.vehicle.telemetry import Motors
 
 _HEAD = struct.Struct("<HHI")
 _CHANNELS = {18458: 16, 29569: 32}  # magic -> channels
-RATES_HZ = (
-    50,
-    4000,
-)  # physics steps in a second that are believed; after a stall ArduSub has told 16959 once
+RATES_HZ = (50, 4000)  # physics steps in a second that are believed; ArduSub has told 16959 after a stall
 DOUBLED_S = 0.5  # ArduSub repeats a packet after a second without answer; sooner it was doubled
 
 Turn = Literal["reset", "step", "again", "ignore"]
