@@ -14,7 +14,6 @@ from mcap.reader import make_reader
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
-from tests.command import uuv
 from uuvtai.evaluation.episodes import Job
 from uuvtai.live.server import BACKLOG, MOST_CLIENTS, Broadcast, LiveError, RealTime, ViewerServer
 from uuvtai.logs.writer import EpisodeRecorder, TopicMessage
@@ -309,22 +308,3 @@ def test_as_fast_as_it_goes():
         clock.s += 0.001
         pace.step(None)
     assert clock.slept == 0
-
-
-# --------------------------------------------------------------------------------------------------- command
-
-
-@pytest.mark.parametrize(
-    ("typed", "told"),
-    [
-        (("--rate", "-1"), "--rate -1"),
-        (("--rate", "nan"), "--rate nan"),
-        (("--port", "70000"), "--port 70000"),
-        (("--episodes", "-1"), "--episodes -1"),
-        (("--agent", "oracle"), "drives no vehicle"),
-        (("--agent", "nobody"), "--agent nobody: is no preset"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(typed, told, capfd):
-    code, out, err = uuv(capfd, "watch", *typed)
-    assert (code, out) == (2, "") and told in err

@@ -15,7 +15,6 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC as MAGIC
-from safetensors.numpy import save
 
 from tests.command import run_cli
 from tests.learning.export import test_deploy as deployed
@@ -23,7 +22,6 @@ from tests.oracles import logs as episode
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import FileError
 from uuvtai.learning.export import graph as graph_check
-from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.folder import of_onnx
 from uuvtai.learning.export.graph import GraphError, refuse_strange
 from uuvtai.logs.container import McapFile
@@ -472,26 +470,6 @@ def test_a_pipe_in_an_exported_folder_is_not_waited_for(folder, name):
         [sys.executable, folder / "run_policy.py"], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 1 and "no plain file" in done.stderr and "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("arrays", [
-    {"pair_value": np.array(1, np.float32)},
-    {"pair_obs": np.array(1, np.float32)},
-    {"pair_has_last": np.array(1, np.float32)},
-    {"pair_obs": np.zeros((0, 40), np.float32), "pair_has_last": np.zeros(0, bool)},
-    {"pair_obs": np.zeros((64, 3), np.float32)},
-    {"pair_obs": np.zeros(64, bool)},
-    {"pair_mean_action": np.array(True)},
-    {"pair_obs": np.zeros((70_000, 40), np.float32), "pair_has_last": np.zeros(70_000, bool)},
-], ids=str)  # fmt: skip
-def test_golden_pairs_of_other_shapes_are_one_line(folder, arrays, capfd):
-    golden = folder / "golden.safetensors"
-    golden.write_bytes(save(run_policy.read_safetensors(golden) | arrays))
-    deployed.resigned(folder, golden.name, golden.read_bytes())
-    assert run_policy.main([str(folder)]) in (1, 3)
-    assert "Traceback" not in capfd.readouterr().err
-    assert run_cli("export", "--check", folder) in (2, 3)
-    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_only_an_exported_policy_is_replaced(folder, tmp_path, monkeypatch):

@@ -132,11 +132,14 @@ def candidates(follow, last, yaw, own_z, cfg, vehicle, tank):
     return np.array(held + dashes), np.array([np.inf] * len(held) + [cfg.burst_s] * len(dashes))
 
 
-def cost(pos, vel, command, burst_s, follow, last, forecast, clearance, origin, cell_m, cfg, tank, dt_s):
-    """(cost of one command, how near any sample is to a case that float32 may decide otherwise [m])."""
+def cost(
+    pos, vel, command, burst_s, follow, last, forecast, clearance, origin, cell_m, cfg, tank, dt_s, still=None
+):
+    """(cost of one command, how near any sample is to a case that float32 may decide otherwise [m]);
+    ``still``: the numbers for what stands still, where they are others."""
     peak, mean, contact, _, doubt = obstacle_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s)
     static_mean, static_contact, border = static_depths(
-        pos, vel, command, clearance, origin, cell_m, cfg, burst_s
+        pos, vel, command, clearance, origin, cell_m, still or cfg, burst_s
     )
     total = cfg.weight_peak * peak + cfg.weight_mean * mean + cfg.weight_contact * contact
     total += cfg.weight_static * static_mean + cfg.weight_static_contact * static_contact

@@ -17,13 +17,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 
 from tests import report_samples as samples
 from uuvtai.common.colours import PALETTE, agent_colours, contrast, ink_on, shade
 from uuvtai.common.errors import UserError
 from uuvtai.config.loader import ConfigError
-from uuvtai.console.screen import print_heat_maps
 from uuvtai.evaluation.results import paired
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.report import build, recorded
@@ -33,7 +31,7 @@ from uuvtai.report.build import media, report
 from uuvtai.report.evaluation import evaluation, paired_table
 from uuvtai.report.figures import Line, curves, heat_map, intervals
 from uuvtai.report.html import Page, render
-from uuvtai.report.sweep import sweep
+from uuvtai.report.sweep import grid_table, sweep
 from uuvtai.report.tables import PAGE, Data, Table, pivot
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, grouped, training
@@ -107,36 +105,13 @@ def test_a_grid_that_cannot_be_laid_out_says_why():
         pivot([{"S": 4, "D": 3, "v_m_s": 9.9}], document["axes"])
 
 
-def printed(document, width, **more):
-    console = Console(file=io.StringIO(), width=width, **more)
-    print_heat_maps(document, console)
-    return console.file.getvalue()
-
-
-def test_heat_maps_in_the_terminal_stand_side_by_side_and_are_read_without_colour():
-    plain = printed(samples.sweep_document(), 120)
-    head = plain.splitlines()[0]
-    assert head.index("bt: collision") < head.index("bt: success")
-    assert "\x1b" not in plain
-    row = next(line for line in plain.splitlines() if line.count("12 · 15") == 2)
-    assert " ".join(row.split()) == "12 · 15 0 % 6 % 6 % 12 % 25 % 44 % 12 · 15 94 % 88 % 81 % 75 % 50 % 6 %"
-    assert max(map(len, printed(samples.sweep_document(), 80).splitlines())) <= 80
-
-
-def test_heat_maps_in_the_terminal_are_coloured_where_colours_are_shown():
-    red, green, blue = (int(shade(6 / 16 / 6)[i : i + 2], 16) for i in (1, 3, 5))
-    assert f"48;2;{red};{green};{blue}m   6 % " in printed(
-        samples.sweep_document(), 120, force_terminal=True, color_system="truecolor"
-    )
-
-
 def test_a_cell_without_episodes_is_a_dash():
     document = samples.sweep_document(axes={"S": [4], "D": [3], "v_m_s": [0.2, 0.4]})
     document["cells"][0] |= {
         "success_rate": None, "collision_rate": None, "success_ci95": None, "time_to_success_mean_s": None,
     }  # fmt: skip
-    assert "-" in printed(document, 120)
-    assert "0 %" in printed(document, 120)
+    table, _note = grid_table(document["cells"], document)
+    assert str(table.rows[0][1]) == "- / -"
     hover = drawn(heat_map(pivot(document["cells"], document["axes"]), "success_rate", "x"))[1]
     assert hover["cell-0"] == "S = 4, D = 3, v m/s = 0.2\ncollision -\nmean time to success - s".replace(
         "\ncollision -", ""

@@ -262,7 +262,7 @@ def test_the_choice_among_evasions_is_redone(logs):
 
 def test_costs_of_evasions_are_redone_from_the_tracks_and_the_map(logs):
     """Of every candidate, and of the mean where it was chosen: equal where the clearance of the decision's
-    own step is in the log, and never more elsewhere, where what stands still is left out."""
+    own step is in the log, and never more elsewhere, of every eighth, where what stands still is left out."""
     equal, rest, n_track = [], [], 0
     for log in logs.values():
         for own in decision_alone.decisions(log):
@@ -270,8 +270,9 @@ def test_costs_of_evasions_are_redone_from_the_tracks_and_the_map(logs):
             if own.candidate < 0:
                 velocities, lasts = np.vstack([velocities, own.velocity]), np.append(lasts, np.inf)
                 own.costs = np.append(own.costs, own.cost)
-            redone = decision_alone.costs(log, own, velocities, lasts)
-            left = (own.costs - redone) / np.maximum(own.costs, 1.0)
+            some = slice(None, None, 8 if own.grid is None else 1)
+            redone = decision_alone.costs(log, own, velocities[some], lasts[some])
+            left = (own.costs[some] - redone) / np.maximum(own.costs[some], 1.0)
             (rest if own.grid is None else equal).append(left)
             n_track += len(own.tracks)
     equal, rest = np.concatenate(equal), np.concatenate(rest)

@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,11 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from tests.command import uuv
 from tests.mavlink_vehicle import START, free_port, link_config
+from tests.oracles.actuation import thrust_of_rpm
 from uuvtai.common import signals
 from uuvtai.common.errors import SettingError
 from uuvtai.compile import launch
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.vehicle import dynamics
+from uuvtai.sim.setup import allocation_matrices
 from uuvtai.vehicle import sitl
 from uuvtai.vehicle.mavlink import LinkError, LinkPlace, MavCodec
 from uuvtai.vehicle.onboard import DvlReading, SonarPing
@@ -108,8 +111,8 @@ def test_turning_over_the_axes_turns_attitudes_over():
 @pytest.mark.parametrize(
     "data",
     [
-        b"", b"\x1a", GOLDEN_PACKET[:-1], GOLDEN_PACKET + b"\0", packet(1, magic=1), packet(1, rate=0),
-        packet(1, rate=65535), packet(1, (1500,) * 32), packet(1, magic=29569), b"\xff" * 40,
+        b"", b"\x1a", GOLDEN_PACKET[:-1], GOLDEN_PACKET + b"\0", packet(1, magic=1),
+        packet(1, (1500,) * 32), packet(1, magic=29569), b"\xff" * 40,
     ],
 )  # fmt: skip
 def test_what_is_no_packet(data):
@@ -209,6 +212,16 @@ def test_lockstep():
     assert one.document()["packets"] == {"step": 40, "reset": 2, "again": 1, "ignore": 1, "bad": 1}
 
 
+@pytest.mark.parametrize(
+    "rate", [0, 16959, 65535]
+)  # the second by a real ArduSub, which then waited for ever
+def test_a_rate_that_is_not_believed_is_the_last_one(rate):
+    one = Instance(CONFIG, StillWater(), 0)
+    assert one.answer(packet(0, rate=rate), 0.0) == (b"", []) and one.counts["bad"] == 1
+    one.answer(packet(0), 0.0)
+    assert time_of(one.answer(packet(1, rate=rate), 0.01)[0]) == pytest.approx(2 / 400)
+
+
 def test_the_vehicle_is_held_until_a_thruster_turns():
     water = StillWater()
     one = Instance(CONFIG, water, 0)
@@ -285,6 +298,21 @@ def test_pulse_and_speed_are_the_makers():
     assert motors.rpm((0,) * 16) == pytest.approx(np.zeros(6)), "a channel that is off"
     assert np.abs(motors.rpm((1900,) * 16)) == pytest.approx(np.full(6, 3465.0)), "one limit both ways"
     assert np.abs(motors.rpm((1420,) * 16)) == pytest.approx(np.full(6, 1016.0))
+
+
+@pytest.mark.parametrize(("axis", "name"), [(0, "forward"), (1, "lateral")])
+@pytest.mark.parametrize("speed", [0.3, 0.45, 0.6])
+def test_the_example_feeds_forward_what_the_vehicle_needs(axis, name, speed):
+    """ArduSub makes of an acceleration an angle, and of its share of ANGLE_MAX (45 degrees) a thrust."""
+    text = (Path(__file__).parents[2] / "examples/ardusub.parm").read_text()
+    gain = float(text.partition("PSC_VELXY_FF ")[2].partition("\n")[0])
+    vehicle = load_config("pool", "multibeam", "bluerov2_16v").vehicle
+    share = math.degrees(math.atan(gain * speed / 9.81)) / 45.0
+    thrust_n = thrust_of_rpm(Motors(vehicle).rpm(pulses(**{name: share})), vehicle)
+    force_n = abs(float(allocation_matrices(vehicle)[0][axis] @ thrust_n))
+    linear, quadratic = vehicle.linear_damping[axis], vehicle.quadratic_damping[axis]
+    reached = (math.sqrt(linear**2 + 4 * quadratic * force_n) - linear) / (2 * quadratic)
+    assert 0.6 < reached / speed < 1.2, "the feedback does the rest"
 
 
 def test_frames_that_ardusub_does_not_have_are_refused():

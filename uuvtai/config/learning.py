@@ -23,8 +23,6 @@ SearchScene = tuple[Annotated[str, Field(min_length=1, max_length=200)], Count, 
 class PolicyConfig(Section):
     """Actor and critic."""
 
-    encoder: Literal["mlp", "set"] | None = None
-    """of an observation vector, or over a set of obstacles; None = set in the surrogate, else mlp"""
     hidden: tuple[PositiveCount, ...] = (256, 256)
     """widths of both networks' layers (Table app_repro)"""
     activation: Literal["elu", "tanh", "relu"] = "elu"
@@ -245,5 +243,6 @@ class LearningConfig(Config):
 
     @property
     def encoder(self) -> str:
-        """What a policy's network takes: mlp, an observation vector; set, a set of obstacles."""
-        return self.policy.encoder or ("set" if self.surrogate.enabled else "mlp")
+        """What a policy's network takes: set, a set of obstacles, in the surrogate; mlp, an observation
+        vector, in the simulator."""
+        return "set" if self.surrogate.enabled else "mlp"

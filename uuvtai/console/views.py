@@ -7,6 +7,7 @@ import json
 import math
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +18,9 @@ from uuvtai.common.exits import UsageError, plain, say
 from uuvtai.common.files import read_text
 from uuvtai.common.presets import KINDS, built_in_file, preset_names
 from uuvtai.common.tree_codes import ACTION, LEAVES
-from uuvtai.console.screen import Screen, print_heat_maps
+from uuvtai.console.screen import Screen
 from uuvtai.report.evaluation import DAGGER, agents_table, causes_table, limit_of_p, paired_table, who_arrived
-from uuvtai.report.sweep import cell_table
+from uuvtai.report.sweep import by_agent, cell_table, grid_table
 from uuvtai.report.tables import (
     Column,
     Table,
@@ -437,13 +438,16 @@ def show_tree(screen: Screen, text: str, nodes: list[dict[str, Any]]) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------
-# A sweep in the terminal: heat maps where two axes vary, else one row per cell.
+# A sweep in the terminal: a grid for each agent where two axes vary, else one row per cell.
 
 
 def show_sweep(screen: Screen, result: dict[str, Any]) -> None:
     """Cells of a ``uuv sweep --json`` document."""
     if len(varying(result["axes"])) > 1 and not varies_alone(result):
-        print_heat_maps(result, screen.console, is_whole=screen.wide)
+        for agent, own in by_agent(result["cells"]).items():
+            table, note = grid_table(own, result)
+            said = f"{agent}: success / collision [%], below it the mean time to success [s].{note}"
+            screen.table(replace(table, title=said))
         return
     title = f"{result['world']}: {len(result['cells'])} cells x {result['episodes_per_seed']} episodes"
     screen.table(cell_table(result["cells"], result, title))

@@ -367,10 +367,10 @@ def _recorder(
 def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been."""
-    from uuvtai.learning.environments import Simulated, SimulatedSet
+    from uuvtai.learning.environments import Simulated
     from uuvtai.learning.trainer import Trainer
 
-    if not isinstance(trainer, Trainer) or not isinstance(trainer.env, Simulated | SimulatedSet):
+    if not isinstance(trainer, Trainer) or not isinstance(trainer.env, Simulated):
         return trainer.evaluate()  # the others run episodes by themselves
     env, agent = trainer.env.env, trainer.env.agent(trainer.policy)  # type: ignore[arg-type]
     held = env.capture()

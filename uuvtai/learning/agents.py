@@ -114,49 +114,29 @@ class SetAgent(HeldAgent):
     @torch.no_grad()
     def decide(self, obs: Tensor) -> AgentDecision:
         """``obs`` is not looked at."""
-        due = self._due()
-        if len(due):
-            self.look()
-            (wish,) = by_chunk(lambda *row: (self.actor(*row),), self.obstacles[due], self.own[due])
-            self.wish[due] = wish.clamp(-MOST_WISH, MOST_WISH)
-            self.keep_safe()
-        self.decision = self.decision._replace(action=self.command())
-        return self.decision
-
-    def command(self) -> Tensor:
-        """(rows, 4) of the wish, by the hull rule, where each vehicle is now."""
-        from uuvtai.surrogate.observation import command_hull
-
-        command_hull(self._io, self._limits.vertical_gap_m, self.wish, self._command)
-        return self._command.clone()
-
-    def keep_safe(self) -> None:
-        """Filter the wishes of the rows whose decision is due."""
+        from uuvtai.surrogate.arrays import At
+        from uuvtai.surrogate.observation import command_hull, observe_obstacles, write_set_columns
         from uuvtai.surrogate.safety import filter_wishes
 
-        horizon_s, due = self._limits.safety_horizon_s, (self._age % self._hold == 0).int()
-        if horizon_s:
-            filter_wishes(self._safe, horizon_s, due, self.obstacles, self.own, self.wish)
-
-    def memory(self) -> dict[str, Tensor]:
-        """What the next decisions depend on."""
-        return {"last": self._last, "age": self._age}
+        due = self._due()
+        if len(due):
+            is_due, horizon_s = (self._age % self._hold == 0).int(), self._limits.safety_horizon_s
+            self.ego[:, At.LAST : At.LAST + NUM_WISHES] = self._last
+            observe_obstacles(self._io, is_due, self.ego, self._raw, self._ray)
+            write_set_columns(self.ego, self._raw, self._ray, self.obstacles, self.own)
+            (wish,) = by_chunk(lambda *row: (self.actor(*row),), self.obstacles[due], self.own[due])
+            self.wish[due] = wish.clamp(-MOST_WISH, MOST_WISH)
+            if horizon_s:
+                filter_wishes(self._safe, horizon_s, is_due, self.obstacles, self.own, self.wish)
+        command_hull(self._io, self._limits.vertical_gap_m, self.wish, self._command)
+        self.decision = self.decision._replace(action=self._command.clone())
+        return self.decision
 
     def advance(self) -> None:
         due, wish = self._due(), self.wish
         long = wish[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
         self._last[due] = torch.cat([wish[:, :2] / long, wish[:, 2:].clamp(-1.0, 1.0)], dim=1)[due]
         super().advance()
-
-    def look(self) -> None:
-        """Columns of the rows whose decision is due, as they are now."""
-        from uuvtai.surrogate.arrays import At
-        from uuvtai.surrogate.observation import observe_obstacles, write_set_columns
-
-        self.ego[:, At.LAST : At.LAST + NUM_WISHES] = self._last
-        due = (self._age % self._hold == 0).int()
-        observe_obstacles(self._io, due, self.ego, self._raw, self._ray)
-        write_set_columns(self.ego, self._raw, self._ray, self.obstacles, self.own)
 
 
 def load_set_agent(checkpoint: Checkpoint, sim: Sim) -> SetAgent:

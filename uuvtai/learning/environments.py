@@ -9,25 +9,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from uuvtai.common.enums import (
-    DECISION_S,
-    EGO_COLUMNS,
-    HOLD_STEPS,
-    N_OBSTACLE,
-    OBSTACLE_WIDTH,
-    OUTCOMES,
-    RUNNING,
-    SUCCESS,
-    TIMEOUT,
-)
+from uuvtai.common.enums import DECISION_S, HOLD_STEPS, OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.agents import SetAgent
-from uuvtai.learning.distillation import imitate, wish_of
+from uuvtai.learning.distillation import imitate
 from uuvtai.learning.networks import NUM_ACTIONS, OBSERVATION, ActorCritic, Guard, Policy, View, by_part
 from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.rollout import Environment, Rollout, RolloutSums, Step
-from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetPolicy
+from uuvtai.learning.set_networks import MOST_WISH, SetPolicy
 from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
 if TYPE_CHECKING:
@@ -35,53 +24,15 @@ if TYPE_CHECKING:
     from uuvtai.surrogate.world import ScenarioBank, Surrogate
 
 
-class InSimulator(Environment):
-    """What the views of the simulator share."""
-
-    rests = False
-    """until the next decision an env whose episode ended rests; else the tree drives its next episode"""
-
-    def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
-        self.env, self.config, self.steps = env, config, config.policy.hold_steps
-        self.num_envs, self.device = env.num_envs, env.device
-        self.outcomes, self.reward_terms, self.node_names = env.outcomes, env.reward_terms, env.node_names
-        self._reward = torch.zeros(self.num_envs, device=self.device)
-        self.info: View = {}
-        """what ``VectorEnv.step`` told last beside the observation"""
-
-    @property
-    def scenarios(self) -> tuple[Tensor, Tensor]:
-        return self.info["seed"], self.info["episode"]
-
-    def _hold(self, command: Callable[[Tensor], Tensor], sums: RolloutSums | None) -> tuple[Tensor, ...]:
-        """Hold a decision for ``steps`` control steps; ``command`` gives the action (N, 4) of each, told
-        which episodes (N,) have ended on the way. (observation of the next decision; of the episode in which
-        this one was made: observation that it led to, reward, terminated, ended)."""
-        obs = final = torch.zeros(self.num_envs, self.env.num_obs, device=self.device)
-        reward = torch.zeros_like(self._reward)
-        terminated = ended = torch.zeros_like(self._reward, dtype=torch.bool)
-        for _ in range(self.steps):
-            obs, earned, failed, late, self.info = self.env.step(command(ended))
-            newly = failed | late
-            if sums is not None:
-                sums.count(newly & ~ended if self.rests else newly, self.info)
-            final = torch.where(ended[:, None], final, self.info["final_obs"])
-            reward += torch.where(ended, 0.0, earned)
-            terminated, ended = terminated | (failed & ~ended), ended | newly
-        return obs, final, reward, terminated, ended
-
-    def _commanded(self) -> Tensor:
-        """(N, 4) what the behavior tree would do now, 0 in place of what is not finite."""
-        return self.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-
-
-class Simulated(InSimulator):
+class Simulated(Environment):
     """The simulator for a policy on observation vectors. Its view: ``x``, the observation and the world
     model's residual and uncertainty of it (zero without one, and in the first step of an episode);
     ``teacher_action`` (N, 4) and ``leaf`` (N,) of the behavior tree. What is not finite is replaced."""
 
     def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
-        super().__init__(env, config)
+        self.env, self.config, self.steps = env, config, config.policy.hold_steps
+        self.num_envs, self.device = env.num_envs, env.device
+        self.outcomes, self.reward_terms, self.node_names = env.outcomes, env.reward_terms, env.node_names
         self.observation_table = env.observation_table
         n, n_in, device = self.num_envs, env.num_obs + N_FEATURES, self.device
         self.view: View = {
@@ -92,11 +43,14 @@ class Simulated(InSimulator):
         columns = [(c.name, c.slice) for c in self.observation_table]
         self.guard = Guard(columns, n, config.train.patience, device)
         self.world_model: WorldModel | None = None
+        self._reward = torch.zeros(n, device=device)
         self._final = torch.zeros(n, n_in, device=device)
         self._features = torch.zeros(n, N_FEATURES, device=device)
         self._bad = torch.zeros(n, dtype=torch.bool, device=device)
         self.carried = {"x": self.view["x"], "bad": self._bad}
         """the input too: its world-model columns remember the last step"""
+        self.info: View = {}
+        """what ``VectorEnv.step`` told last beside the observation"""
 
     def make_policy(self, generator: torch.Generator) -> ActorCritic:
         return ActorCritic(self.view["x"].shape[1], self.config.policy, generator).to(self.device)
@@ -129,11 +83,31 @@ class Simulated(InSimulator):
             found = self.world_model.features(x[t - 1, :, :n], rollout["action"][t - 1], x[t, :, :n])
             x[t, :, n:] = torch.where(rollout["ended"][t - 1, :, None], 0.0, found)
 
+    @property
+    def scenarios(self) -> tuple[Tensor, Tensor]:
+        return self.info["seed"], self.info["episode"]
+
+    def _hold(self, action: Tensor, sums: RolloutSums | None) -> tuple[Tensor, ...]:
+        """Hold a decision for ``steps`` control steps; the tree drives what begins on the way. (Observation
+        of the next decision; of the episode in which this one was made: observation that it led to, reward,
+        terminated, ended)."""
+        obs = final = torch.zeros(self.num_envs, self.env.num_obs, device=self.device)
+        reward = torch.zeros_like(self._reward)
+        terminated = ended = torch.zeros_like(self._reward, dtype=torch.bool)
+        for _ in range(self.steps):
+            tree = self.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+            obs, earned, failed, late, self.info = self.env.step(torch.where(ended[:, None], tree, action))
+            newly = failed | late
+            if sums is not None:
+                sums.count(newly, self.info)
+            final = torch.where(ended[:, None], final, self.info["final_obs"])
+            reward += torch.where(ended, 0.0, earned)
+            terminated, ended = terminated | (failed & ~ended), ended | newly
+        return obs, final, reward, terminated, ended
+
     def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
         """Hold a decision (N, 4); the reward is NaN for samples with anything bad."""
-        obs, final, reward, terminated, ended = self._hold(
-            lambda ended: torch.where(ended[:, None], self._commanded(), action), sums
-        )
+        obs, final, reward, terminated, ended = self._hold(action, sums)
         self._bad |= self.guard.values("reward", reward, self._reward)
         self._bad |= self._cleaned(final, self._final, ended)
         if self.world_model is not None:
@@ -161,67 +135,6 @@ class Simulated(InSimulator):
         """Write the observation into an input, means for what is not finite; which rows were bad."""
         n = self.env.num_obs
         return self.guard.values(OBSERVATION, obs, x[:, :n], self._norm.mean[:n].float(), counted)
-
-
-class SimulatedSet(InSimulator):
-    """The simulator for a policy over a set of obstacles. Its view: ``obstacles`` and ``own``, as the vehicle
-    knows them, no ``truth``, and what the tree would wish."""
-
-    rests = True
-
-    def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
-        """``env`` resets nothing by itself."""
-        from uuvtai.surrogate.observation import SET_TABLE
-
-        super().__init__(env, config)
-        self.observation_table = SET_TABLE
-        self.guard = Guard((), self.num_envs, config.train.patience, self.device)
-        widths = {"obstacles": (N_OBSTACLE, OBSTACLE_WIDTH), "own": (EGO_COLUMNS,), "truth": (N_OBSTACLE, 0)}
-        widths |= {"teacher_action": (NUM_WISHES,), "leaf": ()}
-        self.view = {n: torch.zeros(self.num_envs, *width, device=self.device) for n, width in widths.items()}
-        self.view["leaf"] = self.view["leaf"].int()
-
-    def make_policy(self, generator: torch.Generator) -> SetPolicy:
-        return SetPolicy(self.view, self.config, generator).to(self.device)
-
-    def agent(self, policy: SetPolicy) -> SetAgent:
-        """The policy driving by its mean."""
-        return SetAgent(policy.actor, self.env.sim, self.config)
-
-    def begin(self, policy: SetPolicy, world_model: WorldModel | None, generator: torch.Generator) -> None:
-        self._hull = self.agent(policy)
-        self.carried = self.view | self._hull.memory()
-        _, self.info = self.env.reset(self.config.train.seed)
-        self._look()
-
-    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
-        """Hold a wish (N, 3)."""
-        self._hull.wish.copy_(action.clamp(-MOST_WISH, MOST_WISH))
-        self._hull.keep_safe()
-        *_, reward, terminated, ended = self._hold(lambda _ended: self._hull.command(), sums)
-        for _ in range(self.steps):
-            self._hull.advance()
-        bad = self.guard.values("reward", reward, self._reward)
-        self._reward.masked_fill_(bad, math.nan)
-        self._look()
-        final = None
-        if bool(ended.any()):
-            final = {name: part.clone() for name, part in self.view.items()}
-            _, self.info = self.env.reset(mask=ended)
-            self._hull.reset(ended)
-            self._look()
-        return Step(self._reward, terminated, ended, final, {"uncertainty": torch.zeros_like(reward)})
-
-    def restore(self, arrays: dict[str, Any]) -> None:
-        _, self.info = self.env.restore(arrays)
-
-    def _look(self) -> None:
-        hull, view = self._hull, self.view
-        hull.look()
-        view["obstacles"].copy_(hull.obstacles)
-        view["own"].copy_(hull.own)
-        view["leaf"].copy_(self.info["leaf"])
-        view["teacher_action"].copy_(wish_of(self._commanded(), hull.ego, self.env.config.vehicle))
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -318,9 +231,6 @@ class InSurrogate(Environment):
 
 
 def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
-    if config.encoder != "set":
-        told = "the surrogate has no observation vectors; learn in the simulator: surrogate.enabled=false"
-        raise SettingError(f"policy.encoder={config.encoder}: {told}")
     held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
         told = f"the surrogate decides every {DECISION_S} s, after {HOLD_STEPS} control steps"

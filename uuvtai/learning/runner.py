@@ -23,7 +23,7 @@ from uuvtai.config.loader import ConfigError, Overrides, load_resolved, to_yaml
 from uuvtai.learning import checkpoint
 from uuvtai.learning.agents import find_policy
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.environments import InSurrogate, Simulated, SimulatedSet
+from uuvtai.learning.environments import InSurrogate, Simulated
 from uuvtai.learning.forecast import ForecastTrainer
 from uuvtai.learning.parameter_search import ParameterSearchTrainer
 from uuvtai.learning.policy_agent import load_agent
@@ -156,11 +156,14 @@ def _started(
     found = find_policy(str(place), note)
     if config.learner != "ppo" or found.config.learner != "ppo":
         raise ConfigError(f"--start {place}: policies alone can be begun with, by a preset that trains one")
-    actor_of(found) if found.config.encoder == "set" else load_agent(found, 1)  # as wide as its config says
+    if config.encoder != found.config.encoder:
+        other = "simulator" if config.surrogate.enabled else "surrogate"
+        raise ConfigError(f"--start {place}: learned in the {other} and goes on there alone; take its preset")
+    actor_of(found) if config.encoder == "set" else load_agent(found, 1)  # as wide as its config says
     theirs, sizes = found.config, ("obstacle_hidden", "head_hidden", "goal_gain")
     own = {name: getattr(theirs.policy, name) for name in ("hidden", "activation")}
     update = {
-        "policy": config.policy.model_copy(update=own | {"encoder": theirs.encoder}),
+        "policy": config.policy.model_copy(update=own),
         "surrogate": config.surrogate.model_copy(update={n: getattr(theirs.surrogate, n) for n in sizes}),
         "observation": theirs.observation,
     }
@@ -202,11 +205,10 @@ def _trainer(config: LearningConfig, device: str, own: RewardSource | None) -> A
 def _policy_trainer(config: LearningConfig, device: str, own: RewardSource | None) -> Trainer:
     if config.surrogate.enabled:
         return Trainer(InSurrogate(config), config)
-    kind = SimulatedSet if config.encoder == "set" else Simulated
     env = _env(config, device)
     if own:
         own.reward(env)
-    return Trainer(kind(env, config), config)
+    return Trainer(Simulated(env, config), config)
 
 
 TRAINERS: dict[str, Callable[[LearningConfig, str, RewardSource | None], AnyTrainer]] = {
@@ -224,7 +226,7 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
 
     sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE), device)
     sim.set_scenes(config.train.scenes)
-    return VectorEnv(sim, config.train.seed, autoreset=config.encoder != "set")
+    return VectorEnv(sim, config.train.seed)
 
 
 @dataclass

@@ -53,13 +53,10 @@ class SetEncoder(nn.Module):
 class SetActor(nn.Module):
     """A diagonal Gaussian over the wish for a velocity, of what the vehicle knows."""
 
-    def __init__(
-        self, n_obstacle: int, n_own: int, config: LearningConfig, generator: torch.Generator
-    ) -> None:
+    def __init__(self, config: LearningConfig, generator: torch.Generator) -> None:
         super().__init__()
-        self.n_obstacle, self.n_own = n_obstacle, n_own
         self.goal_gain = config.surrogate.goal_gain
-        self.net = SetEncoder((n_obstacle, n_own, NUM_WISHES), config, 0.01, generator)
+        self.net = SetEncoder((OBSTACLE_WIDTH, EGO_COLUMNS, NUM_WISHES), config, 0.01, generator)
         self.log_std = nn.Parameter(torch.full((NUM_WISHES,), math.log(config.policy.initial_std)))
 
     def forward(self, obstacles: Tensor, own: Tensor) -> Tensor:
@@ -72,17 +69,13 @@ class SetActor(nn.Module):
 class SetCritic(nn.Module):
     """Expected return, also by the obstacles' true places, now and later: it serves training alone."""
 
-    def __init__(
-        self, n_obstacle: int, n_own: int, n_truth: int, config: LearningConfig, generator: torch.Generator
-    ) -> None:
+    def __init__(self, n_truth: int, config: LearningConfig, generator: torch.Generator) -> None:
         super().__init__()
-        self.net = SetEncoder((n_obstacle + n_truth, n_own, 1), config, 1.0, generator)
+        self.net = SetEncoder((OBSTACLE_WIDTH + n_truth, EGO_COLUMNS, 1), config, 1.0, generator)
         self.value_norm = RunningNorm(1, math.inf)
 
     def forward(self, obstacles: Tensor, own: Tensor, truth: Tensor) -> Tensor:
-        there = obstacles[..., :1]
-        if truth.shape[-1]:
-            there = torch.maximum(there, truth[..., 2:3])
+        there = torch.maximum(obstacles[..., :1], truth[..., 2:3])
         return self.net(torch.cat([obstacles, truth], dim=-1), own, there).squeeze(-1)
 
 
@@ -94,9 +87,8 @@ class SetPolicy(Policy):
 
     def __init__(self, view: View, config: LearningConfig, generator: torch.Generator) -> None:
         super().__init__(config.policy)
-        n_obstacle, n_own, n_truth = (view[name].shape[-1] for name in self.inputs)
-        self.actor = SetActor(n_obstacle, n_own, config, generator)
-        self.critic = SetCritic(n_obstacle, n_own, n_truth, config, generator)
+        self.actor = SetActor(config, generator)
+        self.critic = SetCritic(view["truth"].shape[-1], config, generator)
         self.log_std, self.value_norm = self.actor.log_std, self.critic.value_norm
 
     def mean_of(self, inputs: View) -> Tensor:
@@ -132,5 +124,4 @@ class MaxAndSum(torch.autograd.Function):
 
 def actor_of(checkpoint: Checkpoint) -> SetActor:
     """A checkpoint's policy over a set. Raises CheckpointError for networks that do not fit its config."""
-    sizes = OBSTACLE_WIDTH, EGO_COLUMNS
-    return network(checkpoint, "policy", lambda: SetActor(*sizes, checkpoint.config, torch.Generator()))
+    return network(checkpoint, "policy", lambda: SetActor(checkpoint.config, torch.Generator()))

@@ -17,17 +17,13 @@ from uuvtai.report.blocks import Block, Figure
 from uuvtai.report.build import NOTHING, command_of, damage_named, refuse_run, training_of
 from uuvtai.report.evaluation import causes_table, conditions, evaluation_data, paired_data
 from uuvtai.report.html import all_shown, read_json, shown
-from uuvtai.report.sweep import ON_HOVER, agent_of, axis_column, by_agent, cells_data, sweep
+from uuvtai.report.sweep import ON_HOVER, agent_of, axis_column, by_agent, cells_data, grid_table, sweep
 from uuvtai.report.tables import (
     PAGE,
     Column,
     Data,
     Table,
-    axis_name,
     change_name,
-    heads,
-    number,
-    pivot,
     probability,
     varies_alone,
     varying,
@@ -240,7 +236,7 @@ def _of_sweep(document: dict[str, Any], origin: str) -> list[PaperItem]:
         caption = f"Every cell of the sweep. World {document.get('world', '-')}; {n}, {_WILSON}."
         return [*found, PaperItem("cells", caption, origin, cells_data(cells), table=_cells(cells, document))]
     for agent, own in by_agent(cells).items():
-        table, note = _grid(own, document)
+        table, note = grid_table(own, document)
         caption = (
             f"{agent}: success / collision [%]. World {document.get('world', '-')}; {n}{_widest(own)}.{note}"
         )
@@ -263,24 +259,6 @@ def _widest(cells: list[dict[str, Any]]) -> str:
         return ""
     most = max(100 * (high - low) for low, high in bounds)
     return f", {_WILSON} at most {most:.0f} points wide, each in the CSV beside it"
-
-
-def _both(cell: dict[str, Any]) -> str:
-    """'98.4 / 1.6'."""
-    rates = [cell.get(f"{key}_rate") for key in ("success", "collision")]
-    return " / ".join(number(None if share is None else 100 * share) for share in rates)
-
-
-def _grid(own: list[dict[str, Any]], document: dict[str, Any]) -> tuple[Table, str]:
-    """Rows and columns as in the heat map, and what has to be said of cells that span a row."""
-    chosen = pivot(own, document["axes"])
-    rows = [[name, *[""] * len(chosen.column_values)] for name in chosen.row_names]
-    for place in chosen.places:
-        rows[place.row][1 + place.first] = _both(place.cell)
-    spans = any(place.n_columns > 1 for place in chosen.places)
-    across = axis_name(chosen.column_axis)
-    note = f" A row with one entry does not depend on {across}." if spans else ""
-    return Table(heads(f"{chosen.row_title} / {across}", *chosen.column_names), rows), note
 
 
 def _cells(cells: list[dict[str, Any]], document: dict[str, Any]) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from uuvtai.common.colours import agent_colours
+from uuvtai.common.colours import agent_colours, ink_on, shade
 from uuvtai.common.enums import FINAL_OUTCOMES
 from uuvtai.report.blocks import Block, Figure, Notice, Paragraph
 from uuvtai.report.evaluation import COLLISION, ENDS, SUCCESS, TIME, TTS
@@ -13,6 +13,7 @@ from uuvtai.report.figures import Line, heat_map, hover_text, intervals
 from uuvtai.report.tables import (
     PAGE,
     TERMINAL,
+    Cell,
     Column,
     Data,
     MapCell,
@@ -183,6 +184,24 @@ def _line(agent: str, own: list[MapCell], key: str, axis: str, places: list[Any]
         said,
         colour,
     )
+
+
+def grid_table(own: list[MapCell], document: dict[str, Any]) -> tuple[Table, str]:
+    """Success and collision [%] of one agent, rows and columns as in the heat map, and what has to be said of
+    cells that span a row. A terminal shows the time, too, and the heat map's colour."""
+    chosen = pivot(own, document["axes"])
+    rows: list[list[str | Cell]] = [[name, *[""] * len(chosen.column_values)] for name in chosen.row_names]
+    for place in chosen.places:
+        rates = [place.cell.get(f"{key}_rate") for key in ("success", "collision")]
+        shares, ground = [None if rate is None else 100 * rate for rate in rates], shade(rates[0] or 0.0)
+        said, brief = (" / ".join(number(share, digits) for share in shares) for digits in (1, 0))
+        brief += f"\n{number(place.cell.get('time_to_success_mean_s'))}"
+        rows[place.row][1 + place.first] = Cell(said, brief, f"{ink_on(ground)} on {ground}")
+    across = axis_name(chosen.column_axis)
+    columns = [Column(name, priority=i) for i, name in enumerate(chosen.column_names)]
+    spans = any(place.n_columns > 1 for place in chosen.places)
+    note = f" A row with one entry does not depend on {across}." if spans else ""
+    return Table([Column(f"{chosen.row_title} / {across}", left=True), *columns], rows), note
 
 
 def by_agent(cells: list[MapCell]) -> dict[str, list[MapCell]]:

@@ -39,7 +39,7 @@ from uuvtai.vehicle.telemetry import Motors
 
 _HEAD = struct.Struct("<HHI")
 _CHANNELS = {18458: 16, 29569: 32}  # magic -> channels
-RATES_HZ = (50, 4000)  # physics steps in a second that are believed
+RATES_HZ = (50, 4000)  # physics steps in a second that are believed; ArduSub has told 16959 after a stall
 DOUBLED_S = 0.5  # ArduSub repeats a packet after a second without answer; sooner it was doubled
 
 Turn = Literal["reset", "step", "again", "ignore"]
@@ -60,7 +60,7 @@ def frame_of(packet: bytes) -> ServoFrame | None:
         return None
     magic, rate, count = _HEAD.unpack_from(packet)
     channels = _CHANNELS.get(magic, 0)
-    if channels == 0 or len(packet) != _HEAD.size + 2 * channels or not RATES_HZ[0] <= rate <= RATES_HZ[1]:
+    if channels == 0 or len(packet) != _HEAD.size + 2 * channels:
         return None
     return ServoFrame(rate, count, struct.unpack_from(f"<{channels}H", packet, _HEAD.size))
 
@@ -87,7 +87,7 @@ class Instance:
         self._config, self._water, self._row, self._rig = config, water, row, rig
         self._dt = config.episode.control_dt_s
         self._count: int | None = None
-        self._answered_s, self._answer = 0.0, b""
+        self._answered_s, self._answer, self._rate_hz = 0.0, b"", 0
         self._forget()
         self.counts: Counter[str] = Counter()
         """by turn, and 'bad' packets"""
@@ -105,7 +105,9 @@ class Instance:
     def answer(self, packet: bytes, now_s: float) -> tuple[bytes, list[Order]]:
         """(what to send back, empty = nothing; what the sensors say) to a packet that came at ``now_s``."""
         frame = frame_of(packet)
-        if frame is None:
+        if frame is not None and RATES_HZ[0] <= frame.rate_hz <= RATES_HZ[1]:
+            self._rate_hz = frame.rate_hz
+        if frame is None or not self._rate_hz:
             self.counts["bad"] += 1
             return b"", []
         turn = turn_of(frame.count, self._count, now_s - self._answered_s)
@@ -118,7 +120,7 @@ class Instance:
             self._forget()
             self.joined_late = self._water.turns(frame.pwm)
         if turn != "again":
-            said = self._step(frame.pwm, 1.0 / frame.rate_hz)
+            said = self._step(frame.pwm, 1.0 / self._rate_hz)
             self._answer = reply_of(self._water.motion(self._row, self.time_s))
         self._count, self._answered_s = frame.count, now_s
         return self._answer, said

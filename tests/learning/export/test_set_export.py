@@ -50,8 +50,8 @@ def filled(module, seed, spread=0.3):
 def saved(folder, change=None):
     """A run folder with one checkpoint, after ``change`` of its state."""
     config, rng = load_training("policy", overrides=NET), torch.Generator().manual_seed(1)
-    actor = filled(SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, rng), 2)
-    critic = SetCritic(OBSTACLE_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, rng)
+    actor = filled(SetActor(config, rng), 2)
+    critic = SetCritic(TRUTH_WIDTH, config, rng)
     state = {"policy": actor.state_dict(), "critic": critic.state_dict(), "counters": {}, "env": {}}
     state = copy.deepcopy(state)
     if change:
@@ -185,7 +185,7 @@ def test_the_hull_rule_is_that_of_the_oracle():
 def module_policy(safety=()):
     """A policy of made-up weights, without a folder."""
     config = load_training("policy", overrides=NET)
-    actor = SetActor(OBSTACLE_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    actor = SetActor(config, torch.Generator().manual_seed(1))
     spec = {
         "observation": {
             "meaning": "",
