@@ -271,8 +271,7 @@ def _velocity_row(rig: Rig, what: str, ahead: float, turn: float, seconds: float
     off = 100.0 * abs(float(mean[index]) - asked) / asked
     return Row(
         what, off, "% off in the mean", less_is_better=True, floor=10.0,
-        note=f"mode taken: {took}; after 2 s {early:.3f}; "
-        f"mean {mean[index]:.3f}, standard deviation {spread[index]:.3f}",
+        note=f"mode taken: {took}; after 2 s {early:.3f}; mean {mean[index]:.3f} +- {spread[index]:.3f}",
     )  # fmt: skip
 
 
