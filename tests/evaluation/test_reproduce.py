@@ -426,7 +426,5 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path):
         reproduce("slow", tmp_path / "run", Quiet())
     assert not (tmp_path / "run").exists()
     (tmp_path / "run.json").write_text("{}")
-    with pytest.raises(
-        RunFolderError, match=r"no plain file reproduce_request\.json; give the run folder that"
-    ):
+    with pytest.raises(RunFolderError, match=r"no plain file reproduce_request\.json; give the folder that"):
         resume(tmp_path, Quiet())

@@ -185,6 +185,6 @@ def test_paths_of_the_request_are_found_from_another_folder(ask, tmp_path, monke
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     with pytest.raises(
-        UserError, match=r"has no plain file run\.json; give the run folder that 'uuv eval' printed"
+        UserError, match=r"has no plain file run\.json; give the folder that 'uuv eval' printed"
     ):
         resume(tmp_path, Watch())

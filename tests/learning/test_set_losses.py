@@ -3,13 +3,14 @@
 import pytest
 import torch
 
+from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning import networks
 from uuvtai.learning.networks import CACHE_ROWS, by_part, log_prob, side_by_side
 from uuvtai.learning.ppo import Ppo, surrogate_loss
 from uuvtai.learning.set_networks import MaxAndSum, SetPolicy
 
-ROWS, LANES, N_OBSTACLE, N_OWN, N_TRUTH = CACHE_ROWS + 77, 3, 5, 7, 4
+ROWS, LANES, N_TRUTH = CACHE_ROWS + 77, 3, 4
 
 
 @pytest.fixture
@@ -18,7 +19,7 @@ def ppo(monkeypatch):
     config = LearningConfig.model_validate(
         {"surrogate": {"obstacle_hidden": 8, "head_hidden": 8}, "ppo": {"entropy_weight": 0.0}}
     )
-    widths = {"obstacles": N_OBSTACLE, "own": N_OWN, "truth": N_TRUTH}
+    widths = {"obstacles": OBSTACLE_WIDTH, "own": EGO_COLUMNS, "truth": N_TRUTH}
     view = {name: torch.zeros(1, width) for name, width in widths.items()}
     made = Ppo(SetPolicy(view, config, torch.Generator().manual_seed(0)), config.ppo)
     monkeypatch.setattr(made, "step", lambda **_options: False)
@@ -32,10 +33,10 @@ def batch():
     def drawn(*shape):
         return torch.randn(ROWS, *shape, generator=generator)
 
-    obstacles = drawn(LANES, N_OBSTACLE)
+    obstacles = drawn(LANES, OBSTACLE_WIDTH)
     obstacles[..., 0] = (obstacles[..., 0] > 0).float()
     return {
-        "obstacles": obstacles, "own": drawn(N_OWN), "truth": drawn(LANES, N_TRUTH), "action": drawn(3),
+        "obstacles": obstacles, "own": drawn(EGO_COLUMNS), "truth": drawn(LANES, N_TRUTH), "action": drawn(3),
         "log_prob": drawn() - 3.0, "advantage": drawn(), "target": drawn(), "valid": torch.ones(ROWS),
     }  # fmt: skip
 

@@ -1,6 +1,5 @@
 """Our water behind ArduSub's JSON interface: bytes, lockstep, restarts, axes, sensors the pilot knows."""
 
-import io
 import json
 import math
 import re
@@ -9,6 +8,7 @@ import struct
 import threading
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -578,7 +578,7 @@ def test_the_command_serves_and_tells(capfd, monkeypatch, small, words):
     monkeypatch.setattr(sitl, "Sim", lambda config, rows, tree: small.sim)
     number = free_port()
     place = ["--port", str(number), "--mavlink", "udpout:127.0.0.1:9", "--seconds", "0.2"]
-    monkeypatch.setattr(sitl, "FakeRig", lambda *_: io.BytesIO())  # closes
+    monkeypatch.setattr(sitl, "FakeRig", lambda *_: SimpleNamespace(speaks=(), close=lambda: None))
     code, out, err = uuv(capfd, "sitl", *place, "--as", "a50,ping360", *words)
     assert code == 0 and f"physics for ArduSub at UDP 127.0.0.1:{number}" in err
     assert "--heading 0 --dvl a50:127.0.0.1:16171 --sonar ping360:127.0.0.1:9092\n" in err

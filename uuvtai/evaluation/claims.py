@@ -21,6 +21,7 @@ from statistics import fmean, median
 from typing import Any, NamedTuple
 
 from uuvtai.common.enums import COLLIDED, LETTERS
+from uuvtai.common.errors import SettingError
 from uuvtai.common.statistics import (
     binomial_p,
     design_effect,
@@ -169,7 +170,7 @@ def _design(agents: Sequence[dict[str, Any]], outcomes: Sequence[str]) -> float:
     for agent in agents:
         ends = ends_of(agent)
         if len(ends) != agent["episodes"]:
-            raise ValueError(f"{len(ends)} of {agent['episodes']} episodes say how they ended")
+            raise SettingError(f"{len(ends)} of {agent['episodes']} episodes say how they ended")
         ran.update(ends.keys())
         won.update(key for key, end in ends.items() if end in outcomes)
     return design_effect([won[key] for key in ran], list(ran.values()))

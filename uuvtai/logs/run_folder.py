@@ -109,14 +109,14 @@ class RunFolder:
         """
         folder = cls.__new__(cls)
         folder.path, folder._started = path, time.time()
-        for name in (_RECORD, request):
-            if not _is_plain(path / name):
-                raise RunFolderError(
-                    f"{path}: has no plain file {name}; give the run folder that '{command}' printed"
-                )
+        hint = f"give the folder that '{command}' printed"
+        if not _is_plain(path / _RECORD):
+            raise RunFolderError(f"{path}: is no run folder, it has no plain file {_RECORD}; {hint}")
         folder.hold()
         try:
             folder._guarded("read it", lambda: files.refuse_links_in(path))
+            if not _is_plain(path / request):
+                raise RunFolderError(f"{path}: has no plain file {request}; {hint}")
             folder._guarded("tidy it", folder._sweep)
         except BaseException:
             folder.release()
