@@ -1,5 +1,7 @@
 """Losses of a policy over a set, by pieces on threads: gradients of the whole, for any number of threads."""
 
+import time
+
 import pytest
 import torch
 
@@ -126,3 +128,15 @@ def test_what_goes_wrong_in_a_piece_is_told(monkeypatch):
     with pytest.raises(ZeroDivisionError):
         side_by_side(lambda: 1, lambda: 1 // 0)
     assert side_by_side(lambda: 1, lambda: 2) == [1, 2]
+
+
+def test_a_piece_has_one_thread_whatever_is_set_after_its_own_began():
+    before = torch.get_num_threads()
+    networks._pool.cache_clear()
+    try:
+        torch.set_num_threads(2)
+        side_by_side(*[lambda: time.sleep(0.05)] * 2)  # nothing of torch: it counts its threads at first use
+        torch.set_num_threads(2)
+        assert side_by_side(*[torch.get_num_threads] * 4) == [1] * 4
+    finally:
+        torch.set_num_threads(before)

@@ -318,6 +318,7 @@ def side_by_side(*pieces: Callable[[], _T], device: str = "cpu") -> list[_T]:
 @functools.cache
 def _pool(threads: int, flushes: bool) -> ThreadPoolExecutor:
     def begin() -> None:
+        torch.get_num_threads()  # else the thread's first product sets it to what counts for all then
         torch.set_num_threads(1)
         torch.set_flush_denormal(flushes)
 
