@@ -56,7 +56,8 @@ SHORT = {  # rows of README's table
 def measured(root: Path) -> str:
     """The lines above a table of evaluations."""
     document = _read(root / EVALUATIONS)
-    seed, agents = document["seed"], [agent for row in document["rows"] for agent in row["agents"].values()]
+    seed, rows = document["seed"], [row for row in document["rows"] if "seed" not in row]
+    agents = [agent for row in rows for agent in row["agents"].values()]
     seen = "This seed was looked at while tuning." if seed in RETIRED_SEEDS else "No tuning used this seed."
     commits = ", ".join(sorted({agent["commit"][:7] for agent in agents}))
     return (
@@ -66,11 +67,11 @@ def measured(root: Path) -> str:
 
 
 def short(root: Path) -> str:
-    """README's table: success and collision of the tree, the best agent and the policy in five worlds."""
-    rows, lines = {row["name"]: row["agents"] for row in _read(root / EVALUATIONS)["rows"]}, []
-    for name, title in SHORT.items():
-        lines.append([title, *(_beside(rows[name], agent) for agent in ("bt", "best", "policy"))])
-    return text_table(["world, dynamic obstacles", "`bt`", "`best`", "`policy`"], lines)
+    """README's table: success of the tree, the best agent and the policy in five worlds."""
+    rows, names = {row["name"]: row["agents"] for row in _read(root / EVALUATIONS)["rows"]}, SHORT.items()
+    agents = ("bt", "best", "policy")
+    lines = [[title, *(_percent(rows[name][who], "success") for who in agents)] for name, title in names]
+    return text_table(["world, dynamic obstacles", *(f"`{who}`" for who in agents)], lines)
 
 
 def evaluations(root: Path) -> str:
@@ -94,7 +95,8 @@ def _evaluated(row: Document) -> list[str]:
     planner = f"{_percent(agents['planner'], 'success')} %" if "planner" in agents else "-"
     causes = ", ".join(f"{cause['label']} {cause['count']}" for cause in own["causes"][:2])
     collision = str(pooled([own], *COLLIDED)).partition(" = ")[2]
-    return [row["title"], str(pooled([own], "success")), collision, ends, best, policy, planner, causes]
+    title = row["title"] + (f", seed {row['seed']}" if "seed" in row else "")
+    return [title, str(pooled([own], "success")), collision, ends, best, policy, planner, causes]
 
 
 def _percent(agent: Document, *outcomes: str) -> str:
@@ -333,6 +335,8 @@ def keep_row(name: str, run: Path, root: Path = ROOT) -> None:
     agents = {agent["name"]: _kept(agent) | how for agent in result["agents"]}
     if wrong := [agent for agent, kept in agents.items() if kept["episodes"] != document["episodes"]]:
         raise ValueError(f"{', '.join(wrong)}: not {document['episodes']} episodes")
+    if row.pop("seed", None):  # it was of an older one
+        row |= {"agents": {}, "paired": []}
     row["agents"] |= agents
     row["paired"] = [pair for pair in row["paired"] if agents.keys().isdisjoint({pair["a"], pair["b"]})]
     row["paired"] += result["paired"]

@@ -69,9 +69,9 @@ def test_a_cell_that_was_changed_by_hand_is_caught(copy, page, cell, changed):
 
 def test_results_that_move_on_leave_the_pages_behind(copy):
     document = json.loads((copy / EVALUATIONS).read_text())
-    document["rows"][0]["agents"]["bt"]["outcomes"] |= {"success": 999, "collision": 1}
+    document["rows"][1]["agents"]["bt"]["outcomes"] |= {"success": 999, "collision": 1}
     (copy / EVALUATIONS).write_text(json.dumps(document))
-    assert "+| `pool` (0) | 999/1000 = 99.9 %" in "\n".join(render_results.differences(copy))
+    assert "+| `pool` (6, 0.6) | 999/1000 = 99.9 %" in "\n".join(render_results.differences(copy))
     document = json.loads((copy / REPRODUCTION).read_text())
     speed = document[min(document)]["profile"]["rows"][0]["env_steps_per_s"]
     speed["step"] = 7777.0
@@ -84,7 +84,7 @@ def test_a_seed_that_was_tuned_on_is_called_so(copy):
     for seed, said in ((EVALUATION_SEED, "No tuning used this seed"), (90008, "was looked at while tuning")):
         (copy / EVALUATIONS).write_text(json.dumps(document | {"seed": seed}))
         assert said in render_results.measured(copy)
-        assert "2026-11-27, commits 7f1f749, ff1b7e9." in render_results.measured(copy)
+        assert "2026-11-29, commits c0daae9." in render_results.measured(copy)
 
 
 def test_the_newest_speed_of_a_kind_is_shown_and_marked_unless_it_is_of_todays_code(copy):
@@ -151,15 +151,16 @@ def evaluation(folder, n=1000):
 
 def test_an_evaluation_is_kept_in_its_row_alone(copy, tmp_path):
     before = json.loads((copy / EVALUATIONS).read_text())
-    render_results.keep_row("pool_0", evaluation(tmp_path / "run"), copy)
+    render_results.keep_row("pool_6", evaluation(tmp_path / "run"), copy)
     after = json.loads((copy / EVALUATIONS).read_text())
-    assert after["rows"][1:] == before["rows"][1:]
-    agents = after["rows"][0]["agents"]
+    others = [nth for nth in range(len(before["rows"])) if nth != 1]
+    assert all(after["rows"][nth] == before["rows"][nth] for nth in others)
+    agents = after["rows"][1]["agents"]
     assert agents["bt"]["commit"] == "abc" and "episodes_detail" not in agents["bt"]
-    assert agents["best"] == before["rows"][0]["agents"]["best"]
-    assert all("bt" not in (pair["a"], pair["b"]) for pair in after["rows"][0]["paired"])
+    assert agents["best"] == before["rows"][1]["agents"]["best"]
+    assert all("bt" not in (pair["a"], pair["b"]) for pair in after["rows"][1]["paired"])
     assert (
-        "| `pool` (0) | 997/1000 = 99.7 % [99.1, 99.9] | 0.2 % [0.1, 0.7] | 1 / 1 / 0 / 1 |"
+        "| `pool` (6, 0.6) | 997/1000 = 99.7 % [99.1, 99.9] | 0.2 % [0.1, 0.7] | 1 / 1 / 0 / 1 |"
         in (render_results.pages(copy)[ROBUSTNESS])
     )
     with pytest.raises(ValueError, match="there are pool_0"):
