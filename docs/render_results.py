@@ -79,7 +79,7 @@ def evaluations(root: Path) -> str:
     document = _read(root / EVALUATIONS)
     head = [
         "world (D, v in m/s)", "success", "collision", "contact / TTC stop / out / timeout",
-        "`best`: success / collision (p)", "`policy`: the same", "`planner`", "most frequent causes of failure",
+        "`best`: success / collision (p)", "`policy`: the same", "`planner`", "most frequent causes",
     ]  # fmt: skip
     note = (
         "Success, collision and endings are those of `bt`; `-` = not evaluated; p: McNemar's, beside `bt`.\n"
