@@ -564,7 +564,7 @@ class OnboardLoop:
 
     def _farewell(self, now_s: float, command: PilotCommand) -> str:
         goal, radius = self._plan.mission.goal, self._config.episode.goal_radius_m
-        sure_m = radius - min(2.0 * command.place_sigma_m, 0.5 * radius)  # near, wherever it is
+        sure_m = radius - min(0.5 * radius, 2.0 * command.place_sigma_m)  # near, wherever it is
         if self._handover.engaged and math.dist(command.pos_w.tolist(), goal) <= sure_m:
             return _REACHED
         if self._calibration is not None and (self._calibration.found or self._calibration.refusal):

@@ -121,7 +121,7 @@ class FedPilot:
             trigger=TRIGGERS[trigger - 1] if planned and trigger > 0 else "",
             pos_w=self._pos_w[0].copy(),
             held=held,
-            place_sigma_m=math.sqrt(self._cov[0, _X_Y].max()) if self.numbers.estimated else 0.0,
+            place_sigma_m=math.sqrt(max(0.0, self._cov[0, _X_Y].max())) if self.numbers.estimated else 0.0,
         )
 
     def _reasons_to_stop(self, chosen: np.ndarray) -> tuple[str, ...]:
