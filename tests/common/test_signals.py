@@ -182,16 +182,16 @@ sys.exit(guarded(work))
 )
 def test_what_is_kept_is_tidied_up(tmp_path, number, work):
     (tmp_path / "slow.py").write_text(
-        "import time\ntry:\n    time.sleep(1)\nexcept BaseException:\n    print('swallowed')\n    raise "
+        "import time\ntry:\n    time.sleep(0.5)\nexcept BaseException:\n    print('swallowed')\n    raise "
         "ImportError\n"
     )
     (tmp_path / "collecting.py").write_text(
-        "import time\nclass Slow:\n    def __del__(self):\n        time.sleep(1)\nSlow()\n"
+        "import time\nclass Slow:\n    def __del__(self):\n        time.sleep(0.5)\nSlow()\n"
     )
     process = started(
         tmp_path, program=KEEPS.format(work=work + ("" if "sleep" in work else "; time.sleep(30)"))
     )
-    time.sleep(0.4)
+    time.sleep(0.2)
     process.send_signal(number)
     code, err = ended(process, number)
     assert (code, err) == (128 + number, "interrupted\n")
@@ -221,7 +221,7 @@ def test_the_second_one_does_not_wait_for_compiled_code(tmp_path, number):
 def test_an_ignored_signal_stays_ignored(tmp_path):
     """nohup, and a shell's background."""
     program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + KEEPS.format(
-        work="time.sleep(1.5)"
+        work="time.sleep(0.5)"
     )
     process = started(tmp_path, program=program)
     process.send_signal(signal.SIGINT)
@@ -248,7 +248,7 @@ def test_nor_one_while_python_tidies_up_its_modules(tmp_path, number):
     )
     program += (
         "class Slow:\n    def __del__(self, sleep=time.sleep):\n        print('now', flush=True); "
-        "sleep(1)\nslow = Slow()"
+        "sleep(0.5)\nslow = Slow()"
     )
     process = started(tmp_path, program=program)
     assert process.stdout.readline() == "now\n"

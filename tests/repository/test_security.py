@@ -251,7 +251,8 @@ def test_yaml(here, text, says):
     run = samples.write_run(here / "run", metrics=samples.metrics(3), config=text)
     file = run / "config.yaml"
     reads = [lambda: load_config(str(file)), lambda: load_resolved(file)]
-    for read in reads + ([] if "unknown key" in says else [lambda: report([run])]):
+    reads += [] if "unknown key" in says else [lambda: report([run])]
+    for read in reads[: 1 if len(text) > 300_000 else 3]:  # what takes a second to refuse is refused once
         with pytest.raises(ConfigError, match=rf"config\.yaml.*{says}"):
             read()
 
