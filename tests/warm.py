@@ -1,5 +1,6 @@
 """Compile the kernels of the tests' small simulator once, for every process that will need them:
-``python -m tests.warm``; and those of one vehicle with a mechanical sonar: ``python -m tests.warm one``.
+``python -m tests.warm``; and those of one vehicle with a mechanical sonar, and of the small simulator in the
+shape for a GPU: ``python -m tests.warm one``.
 
 Test processes that run side by side would each compile them. ``bootstrap.py test`` runs this while packages
 of the tests are installed, so it needs none of them.
@@ -19,16 +20,17 @@ STEPS = 6
 
 
 def main(what: str) -> None:
-    """The small simulator with and without sensor errors, and for a GPU; or the one vehicle (``one``)."""
+    """The small simulator with and without sensor errors; or the one vehicle and the small one for a GPU
+    (``one``)."""
     start_taichi("cpu")
     if what == "one":
         sim, one = sim_with_one_beam(), torch.ones(1, dtype=torch.int32)
         sim.reset(one, one, one)
-        return step(sim)
+        step(sim)
+        os.execve(sys.executable, [sys.executable, "-m", "tests.warm"], os.environ | {VARIABLE: "gpu"})
     play(SmallSim())
     if asked_shape() == "cpu":
         play(SmallSim("clean"))
-        os.execve(sys.executable, [sys.executable, "-m", "tests.warm"], os.environ | {VARIABLE: "gpu"})
 
 
 def play(small: SmallSim) -> None:
