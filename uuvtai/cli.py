@@ -163,10 +163,10 @@ def watch_live(
     foxglove: opt.Foxglove = False,
     depth_images: opt.DepthImages = False,
 ) -> None:
-    """Show episodes live in the browser, or in Foxglove."""
+    """Show episodes live in the browser, agents side by side, or in Foxglove."""
     seed_list = parsing.seeds("--seeds", seeds)
     parsing.refuse_less("--episodes", episodes, 0)
-    parsing.refuse_odd_live(rate, port, tanks, foxglove)
+    parsing.refuse_odd_live(rate, port, tanks, len(agents.named()), foxglove)
     if (opens and foxglove) or (depth_images and not foxglove):
         raise UsageError("--open: is of the page; --depth-images: is of --foxglove")
     from uuvtai.console.views import show_watched

@@ -284,7 +284,7 @@ def shown(small, audience, steps=50, rate=1.0):
     """Two episodes side by side, for a second."""
     small.sim.sleep()
     small.begin([3, 4], seed=77001)
-    running = RunningEpisodes(audience, "pool", "bt", rate)
+    running = RunningEpisodes(audience, "pool", ["bt"], rate)
     for row, number in enumerate((3, 4)):
         running.begin(small.sim, row, Job(77001, number))
     for _ in range(steps):
@@ -356,8 +356,8 @@ def test_without_the_truth_nothing_of_it_is_told(small):
                 field.fill(7.0)
         audience.messages.clear()
         audience.newcomers = {Follower(-1): True}
-        running._show(small.sim, [0, 1])
-        running._wait(small.sim)
+        running._show([*running._tanks.values()])
+        running._wait()
         told.append(audience.messages)
     assert told[0] == told[1] and told[0][-1]["scene"]["obstacles"] == []
     audience.messages.clear()
@@ -380,11 +380,14 @@ def command(*typed):
 
 
 def test_a_wall_of_tanks_in_a_browser():
+    """Two agents side by side in the same episodes."""
     browser.require()
-    with command("watch", "--tanks", SmallSim.N, "-S", 4, "-D", 3, *SmallSim.OPTIONS[2:4]) as (_, address):
+    typed = ("--agent", "planner,bt", "--tanks", SmallSim.N, "-S", 4, "-D", 3, *SmallSim.OPTIONS[2:4])
+    with command("watch", *typed) as (_, address):
         seen = browser.told("live.mjs", "wall", address)
     assert seen["errors"] == [] and seen["requests"] == []
-    assert len(seen["names"]) == SmallSim.N and seen["names"][1].startswith("bt, seed 0, episode ")
+    who = [name.partition(":")[0] for name in seen["names"]]
+    assert who == [f"{a}, seed 0, episode {i}" for i in range(SmallSim.N) for a in ("planner", "bt")]
     past = seen["past"]
     assert len(past) - 1 == pytest.approx(20 * (past[-1] - past[0]), abs=2), "20 in a second of the episode"
     assert seen["seen"]["tank"] == 1 and seen["seen"]["echoes"] > 0
@@ -440,6 +443,7 @@ def test_who_arrived_sooner_is_named_first():
     [
         (("watch", "--tanks", "17"), "--tanks 17: 1 to 16"),
         (("watch", "--tanks", "0"), "--tanks 0: 1 to 16"),
+        (("watch", "--agent", "bt,planner", "--tanks", "9"), "--tanks 9: 1 to 8 with 2 agents"),
         (("watch", "--tanks", "2", "--foxglove"), "1 with --foxglove"),
         (("watch", "--open", "--foxglove"), "--open: is of the page"),
         (("watch", "--depth-images"), "--depth-images: is of --foxglove"),

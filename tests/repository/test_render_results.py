@@ -59,12 +59,12 @@ CELLS = [
 
 
 def test_cells_that_were_changed_by_hand_are_caught(copy):
-    for page, cell, changed in CELLS:
+    for page, before, changed in CELLS:
         text = (copy / page).read_text()
-        assert cell in text
-        (copy / page).write_text(text.replace(cell, changed, 1))
+        assert before in text
+        (copy / page).write_text(text.replace(before, changed, 1))
     found = "\n".join(render_results.differences(copy))
-    assert all(changed in found and cell in found for _page, cell, changed in CELLS)
+    assert all(changed in found and before in found for _page, before, changed in CELLS)
 
 
 def test_results_that_move_on_leave_the_pages_behind(copy):

@@ -43,9 +43,9 @@ NAMES = {
     # the world and the rows of a simulator
     r"bodies\b|(?:moving|static|resting|nearest) body\b(?! (?:frame|ax))": "obstacles",
     r"resting (?:bod|obstacle)": "static",
-    r"(?<=[\"'])methods?[\"']": "oracle",
-    r"(?<=[\"'])methods?[\"']": "termination",
-    r"(?<=[\"'])methods?[\"']": "journal",
+    r"[Yy]ardsticks?\b|PrivilegedStages\b": "oracle",
+    r"[Rr]eferee\b|RefereeState\b": "termination",
+    r"[Ll]edger\w*": "journal",
     r"awake\b|n_awake\b": "active",
     r"shipped\b|SHIPPED\b": "built-in",
     r"write_film\b|films?\b": "video",

@@ -139,12 +139,15 @@ def refuse_odd_rate(rate: float) -> None:
         raise UsageError(f"--rate {rate:g}: give a number at least 0, for example --rate 2")
 
 
-def refuse_odd_live(rate: float, port: int, tanks: int = 1, foxglove: bool = False) -> None:
+def refuse_odd_live(rate: float, port: int, tanks: int = 1, agents: int = 1, foxglove: bool = False) -> None:
     """UsageError for numbers of ``uuv watch`` and ``uuv drive`` that make no sense."""
     refuse_odd_rate(rate)
-    if not 1 <= tanks <= (1 if foxglove else 16):
-        most = "1 with --foxglove, for it shows one vehicle" if foxglove else "1 to 16"
-        raise UsageError(f"--tanks {tanks}: {most}")
+    most = 1 if foxglove else 16 // agents or 1
+    if not 1 <= tanks <= most:
+        why = "1 with --foxglove, for it shows one vehicle" if foxglove else f"1 to {most}"
+        raise UsageError(f"--tanks {tanks}: {why}" + (f" with {agents} agents" if agents > 1 else ""))
+    if not foxglove and agents > 16:
+        raise UsageError(f"--agent: {agents} of them; a page shows 16 side by side")
     if not 0 <= port < 65536:
         raise UsageError(f"--port {port}: ports go from 0 (a free one) to 65535, for example --port 8765")
 

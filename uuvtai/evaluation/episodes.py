@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -172,6 +172,10 @@ def jobs_of(seeds: Iterable[int], episodes: int) -> list[Job]:
     return [Job(seed, episode) for seed in seeds for episode in range(episodes)]
 
 
+Ran = tuple[list[EpisodeResult], int]
+"""results in the order of the jobs, and the env steps that they took"""
+
+
 def run_episodes(
     sim: Sim,
     jobs: list[Job],
@@ -179,9 +183,34 @@ def run_episodes(
     progress: Progress | None = None,
     agent: Agent | None = None,
     clock: StepClock | None = None,
-) -> tuple[list[EpisodeResult], int]:
-    """Run every job; results in the order of ``jobs``, and the env steps it took. Without an agent the
-    simulator's tree drives.
+) -> Ran:
+    """Run every job: ``episodes_in_steps`` to its end."""
+    (ran,) = run_in_turn([episodes_in_steps(sim, jobs, recorder, progress, agent, clock)])
+    return ran
+
+
+def run_in_turn(going: Sequence[Generator[None, None, Ran]]) -> list[Ran]:
+    """Advance all of them to their ends, a control step each in turn."""
+    ran: dict[int, Ran] = {}
+    while len(ran) < len(going):
+        for i, one in enumerate(going):
+            try:
+                if i not in ran:
+                    next(one)
+            except StopIteration as ended:
+                ran[i] = ended.value
+    return [ran[i] for i in range(len(going))]
+
+
+def episodes_in_steps(
+    sim: Sim,
+    jobs: list[Job],
+    recorder: EpisodeObserver | None = None,
+    progress: Progress | None = None,
+    agent: Agent | None = None,
+    clock: StepClock | None = None,
+) -> Generator[None, None, Ran]:
+    """Run every job, a control step each time. Without an agent the simulator's tree drives.
 
     ``clock`` is told the time of simulating, without what the recorder takes.
     """
@@ -217,6 +246,7 @@ def run_episodes(
             recorder.step(sim)
         if progress and passes % _PROGRESS_EVERY == 1:
             progress(len(results), len(jobs), env_steps, left())
+        yield
         ended = [row for row in sorted(running) if outcome[row] != RUNNING]
         if not ended:
             continue

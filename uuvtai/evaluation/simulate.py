@@ -21,7 +21,14 @@ from uuvtai.compile.runtime import Runtime, start_taichi
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError
 from uuvtai.evaluation.agents import AgentSpec, load_agents
-from uuvtai.evaluation.episodes import Job, Recorders, Stepper, run_episodes
+from uuvtai.evaluation.episodes import (
+    EpisodeObserver,
+    Job,
+    Recorders,
+    Stepper,
+    episodes_in_steps,
+    run_in_turn,
+)
 from uuvtai.evaluation.evaluate import Comparison, EvaluationWatch, Guest, agents_of, compare, comparison_of
 from uuvtai.evaluation.results import ORACLE, Request
 from uuvtai.live.page import PageServer
@@ -275,9 +282,9 @@ class LiveOptions:
 
 
 def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) -> list[dict[str, Any]]:
-    """Run the request's episodes, ``live.tanks`` at once, by every agent in turn, and serve them;
-    ``episodes`` 0 = on and on, until it is interrupted. How each ended. Raises LiveError, ConfigError,
-    CheckpointError, PluginError."""
+    """Run the request's episodes, ``live.tanks`` at once, and serve them: by all agents side by side, in
+    Foxglove by one after the other; ``episodes`` 0 = on and on, until it is interrupted. How each ended.
+    Raises LiveError, ConfigError, CheckpointError, PluginError."""
     if ORACLE in request.agents:
         raise ConfigError("--agent oracle: it drives no vehicle; name who does, for example bt")
     agents = agents_of(request, watch)
@@ -288,13 +295,14 @@ def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) 
     else:
         server = _page_of(request, [agent.name for agent in agents], live, watch)
     with server:
-        comparison = comparison_of(request, live.tanks, agents, watch)
+        alone = [comparison_of(request, live.tanks, [agent], watch) for agent in agents]
+        groups = [[one] for one in alone] if live.foxglove else [alone]
         try:
             return [
                 entry
                 for jobs in _batches(request, live.tanks)
-                for agent in agents
-                for entry in _watched(comparison, agent, jobs, server, live.rate)
+                for group in groups
+                for entry in _watched(group, jobs, server, live.rate)
             ]
         finally:
             for agent in agents:
@@ -325,35 +333,42 @@ def _batches(request: Request, size: int) -> Iterable[list[Job]]:
 
 
 def _watched(
-    comparison: Comparison, agent: AgentSpec, jobs: list[Job], server: ViewerServer | PageServer, rate: float
+    side_by_side: list[Comparison], jobs: list[Job], server: ViewerServer | PageServer, rate: float
 ) -> list[dict[str, Any]]:
-    """Run episodes for all to see; how they ended."""
-    request, policy = comparison.request, comparison.policies[agent.name]
-    sim, world = comparison.simulator_for(agent), Path(request.world).stem
-    clock = RealTime(request.config.episode.control_dt_s, rate)
+    """Run episodes for all to see, by the one agent of each comparison; how they ended."""
+    request, watch = side_by_side[0].request, side_by_side[0].watch
+    agents, world = [one.agents[0] for one in side_by_side], Path(request.world).stem
+    clocks = [RealTime(request.config.episode.control_dt_s, rate) for _ in agents]
+    policies = [one.policies[agent.name] for one, agent in zip(side_by_side, agents, strict=True)]
+    shown: list[EpisodeObserver]
     if isinstance(server, ViewerServer):
-        shown = Broadcast(server, world, agent.name, request.depth_images, policy)
+        shown = [Broadcast(server, world, agents[0].name, request.depth_images, policies[0])]
     else:
-        shown = RunningEpisodes(server, world, agent.name, rate)
-    acting = policy.agent if policy else None
-    results, _ = run_episodes(sim, jobs, Recorders([shown, clock]), agent=acting)
-    entries = [
-        {
-            "agent": agent.name,
-            "seed": result.seed,
-            "episode": result.episode,
-            "outcome": result.outcome,
-            "time_s": result.time_s,
-            "min_clearance_m": round(result.min_clearance_m, 4),
-            "real_time_factor": round(clock.real_time_factor, 2),
-        }
-        for result in results
-    ]
-    for entry in entries:
-        comparison.watch.note(
-            f"{agent.name}, seed {entry['seed']}, episode {entry['episode']}: {entry['outcome']} after "
-            f"{entry['time_s']:.1f} s ({entry['real_time_factor']:.2f} of real time)"
+        first = RunningEpisodes(server, world, [agent.name for agent in agents], rate)
+        shown = [*first.side_by_side()]
+    going = [
+        episodes_in_steps(
+            one.simulator_for(agent), jobs, Recorders([see, clock]), agent=policy.agent if policy else None
         )
+        for one, agent, see, clock, policy in zip(side_by_side, agents, shown, clocks, policies, strict=True)
+    ]
+    entries = []
+    for agent, (results, _), clock in zip(agents, run_in_turn(going), clocks, strict=True):
+        for result in results:
+            entry = {
+                "agent": agent.name,
+                "seed": result.seed,
+                "episode": result.episode,
+                "outcome": result.outcome,
+                "time_s": result.time_s,
+                "min_clearance_m": round(result.min_clearance_m, 4),
+                "real_time_factor": round(clock.real_time_factor, 2),
+            }
+            entries.append(entry)
+            watch.note(
+                f"{agent.name}, seed {entry['seed']}, episode {entry['episode']}: {entry['outcome']} after "
+                f"{entry['time_s']:.1f} s ({entry['real_time_factor']:.2f} of real time)"
+            )
     return entries
 
 
@@ -386,7 +401,7 @@ def drive_by_hand(
     with _page_of(request, [PERSON, *request.agents], live, watch, steered=True) as server:
         own = _Hand(PluginSpec(CONTROLLER, Path(PERSON)), "", server, watch.note)
         dt_s = request.config.episode.control_dt_s
-        shown = RunningEpisodes(server, Path(request.world).stem, PERSON, live.rate)
+        shown = RunningEpisodes(server, Path(request.world).stem, [PERSON], live.rate)
         observer = Recorders([shown, RealTime(dt_s, live.rate)])
         hand = AgentSpec(PERSON, read_tree(TRAINING_TREE), own=own)
         result, folder = compare(request, watch, Guest(hand, observer))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import base64
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any
@@ -37,6 +37,9 @@ _MOTION = (
 class _Tank:
     """An episode, as far as it was shown."""
 
+    sim: Recordable
+    row: int
+    number: int
     head: dict[str, Any]
     moving: list[int]  # slots of the obstacles that move
     rows: list[tuple[list[Any], list[Any]]] = field(default_factory=list)
@@ -60,12 +63,25 @@ class _Tank:
 class RunningEpisodes:
     """Shows every row of a simulator as a tank; an ``EpisodeObserver``."""
 
-    def __init__(self, audience: Any, world: str, agent: str, rate: float = 1.0) -> None:
+    def __init__(
+        self, audience: Any, world: str, agents: Sequence[str], rate: float = 1.0, which: int = 0
+    ) -> None:
         """``audience``: a ``live.page.PageServer``; ``rate``: seconds of the episode in one of the clock's,
-        by which frames keep their distance; 0 = as fast as it goes."""
-        self._audience, self._world, self._agent, self._rate = audience, world, agent, rate
+        by which frames keep their distance; 0 = as fast as it goes; ``which`` of the agents drives here."""
+        self._audience, self._world, self._rate = audience, world, rate
+        self._agents, self._which = agents, which
         self._tanks: dict[int, _Tank] = {}
         self._steps, self._shown_s = 0, -math.inf
+
+    def side_by_side(self) -> list[RunningEpisodes]:
+        """This, and one for each other agent, whose episodes are the same: their tanks stand beside its."""
+        others = [
+            RunningEpisodes(self._audience, self._world, self._agents, self._rate, which)
+            for which in range(1, len(self._agents))
+        ]
+        for other in others:
+            other._tanks = self._tanks
+        return [self, *others]
 
     def begin(self, sim: Recordable, row: int, job: RecordedJob) -> None:
         """An episode was just reset in this row."""
@@ -73,35 +89,37 @@ class RunningEpisodes:
         scene, moving = scene_header(
             scenario_document(sim.config, described, self._world, job.seed, job.episode)
         )
-        colour = agent_colours([self._agent])[self._agent]
+        agent, rows = self._agents[self._which], len(sim.rows(sim.s.clock.step))
+        colour, number = agent_colours(self._agents)[agent], row * len(self._agents) + self._which
         head = {
-            "kind": "begin", "tank": row, "title": f"seed {job.seed}, episode {job.episode}", "scene": scene,
-            "agent": self._agent, "colour": [colour, PALETTE.index(colour) if colour in PALETTE else -1],
-            "leaves": numbered(sim.tree.names), "grid": _grid(sim), "of": len(sim.rows(sim.s.clock.step)),
+            "kind": "begin", "tank": number, "title": f"seed {job.seed}, episode {job.episode}",
+            "scene": scene, "agent": agent, "leaves": numbered(sim.tree.names), "grid": _grid(sim),
+            "colour": [colour, PALETTE.index(colour) if colour in PALETTE else -1],
+            "of": len(self._agents) * rows,
         }  # fmt: skip
-        tank = self._tanks[row] = _Tank(head, [one["slot"] for one in moving])
-        tank.rows += self._motion(sim, [row])
+        tank = self._tanks[number] = _Tank(sim, row, number, head, [one["slot"] for one in moving])
+        tank.rows += _motion([tank])
         self._audience.note("")
         self._audience.tell(tank.whole(self._audience.with_truth))
-        self._note_replans(sim, [row])
-        self._wait(sim, at_start=True)
+        self._note_replans([tank])
+        self._wait(at_start=True)
 
     def step(self, sim: Recordable) -> None:
         """A control step has been done in all rows."""
         self._steps += 1
-        running = [row for row, tank in self._tanks.items() if tank.end is None]
-        self._note_replans(sim, running)
+        running = [tank for tank in self._tanks.values() if tank.sim is sim and tank.end is None]
+        self._note_replans(running)
         if self._is_due(sim.config.episode.control_dt_s):
-            self._show(sim, running)
-        self._wait(sim)
+            self._show(running)
+        self._wait()
 
     def end(self, sim: Recordable, row: int, result: EpisodeEnd) -> None:
         """The episode of this row is over."""
-        self._show(sim, [row])
+        (tank,) = (one for one in self._tanks.values() if one.sim is sim and one.row == row)
+        self._show([tank])
         said = OUTCOME_NAMES.get(result.outcome, result.outcome)
-        tank = self._tanks[row]
         tank.end = {"outcome": said, "failed": result.outcome != "success", "time": result.time_s}
-        self._audience.tell(_text({"kind": "end", "tank": row, "end": tank.end}))
+        self._audience.tell(_text({"kind": "end", "tank": tank.number, "end": tank.end}))
         if not self._audience.with_truth:  # now it does no harm
             self._audience.tell(tank.whole(with_truth=True))
 
@@ -113,60 +131,67 @@ class RunningEpisodes:
         gap = FRAME_S * self._rate / dt_s  # in steps
         return self._steps // gap > (self._steps - 1) // gap
 
-    def _show(self, sim: Recordable, rows: list[int]) -> None:
-        """A frame of these rows, with what those who follow one of them see."""
+    def _show(self, tanks: list[_Tank]) -> None:
+        """A frame of these tanks, with what those who follow one of them see."""
         self._shown_s, shown = time.monotonic(), []
-        for row, pair in zip(rows, self._motion(sim, rows), strict=True):
-            tank = self._tanks[row]
+        for tank, pair in zip(tanks, _motion(tanks), strict=True):
             if pair[0][0] > tank.time_s:
                 tank.rows.append(pair)
-                shown.append([row, pair[self._audience.with_truth]])
+                shown.append([tank.number, pair[self._audience.with_truth]])
         if shown:
             self._audience.tell(_text({"kind": "frame", "tanks": shown}))
-        for row in self._audience.followed().intersection(rows):
-            tank = self._tanks[row]
-            has_map = tank.time_s - tank.map_s >= MAP_S - 1e-6
-            if has_map:
-                tank.map_s = tank.time_s
-            self._audience.tell(_detail(sim, row, tank.time_s, has_map), tank=row)
+        followed = self._audience.followed()
+        for tank in tanks:
+            if tank.number in followed:
+                has_map = tank.time_s - tank.map_s >= MAP_S - 1e-6
+                if has_map:
+                    tank.map_s = tank.time_s
+                self._audience.tell(_detail(tank, has_map), tank=tank.number)
 
-    def _wait(self, sim: Recordable, at_start: bool = False) -> None:
+    def _wait(self, at_start: bool = False) -> None:
         """Tell those who have come or have turned to another tank what there is, and wait while the episode
         is held."""
         while True:
             for who, wants_all in self._audience.asked().items():
-                for row, tank in self._tanks.items():
+                for tank in self._tanks.values():
                     if wants_all:
                         self._audience.tell(tank.whole(self._audience.with_truth), to=who)
-                    if who.tank == row:
-                        self._audience.tell(_detail(sim, row, tank.time_s, True), to=who)
+                    if who.tank == tank.number:
+                        self._audience.tell(_detail(tank, True), to=who)
             if not self._audience.is_held(at_start):
                 return
             at_start = False
 
-    def _motion(self, sim: Recordable, rows: list[int]) -> list[tuple[list[Any], list[Any]]]:
-        """What the vehicles do, as ``_Tank.rows`` has it."""
-        found = []
-        for row, *read in zip(rows, *(_read(sim, name, rows) for name in _MOTION), strict=True):
-            step, place, (w, x, y, z), velocity, own, rpy, own_velocity, clearance, ttc_s, leaf, at = read
-            yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-            time_s, moving = round(int(step) * sim.config.episode.control_dt_s, 4), self._tanks[row].moving
-            speeds = _rounded([np.linalg.norm(own_velocity), np.linalg.norm(velocity)], 2)
-            safety = _rounded([clearance, -1.0 if ttc_s > _FAR_S else ttc_s], 3)
-            known = [time_s, *_rounded([*own, rpy[2]], 3), None, None, speeds[0], int(leaf), []]
-            places = _rounded(at[moving, :2].ravel(), 2)
-            true = [time_s, *_rounded([*place, yaw], 3), *safety, speeds[1], int(leaf), places]
-            found.append((known, true))
-        return found
-
-    def _note_replans(self, sim: Recordable, rows: list[int]) -> None:
+    def _note_replans(self, tanks: list[_Tank]) -> None:
         """Told as they come, that of the reset too."""
         names = ("route.n_way", "route.plan_step", "clock.step", "route.trigger")
-        for row, count, planned, step, why in zip(rows, *(_read(sim, n, rows) for n in names), strict=True):
+        for tank, count, planned, step, why in zip(tanks, *_read_all(tanks, names), strict=True):
             if count > 0 and planned == step:
-                replan = round(int(step) * sim.config.episode.control_dt_s, 4), code_name(TRIGGERS, why)
-                self._tanks[row].replans.append(replan)
-                self._audience.tell(_text({"kind": "replan", "tank": row, "replan": replan}))
+                dt_s = tank.sim.config.episode.control_dt_s
+                replan = round(int(step) * dt_s, 4), code_name(TRIGGERS, why)
+                tank.replans.append(replan)
+                self._audience.tell(_text({"kind": "replan", "tank": tank.number, "replan": replan}))
+
+
+def _motion(tanks: list[_Tank]) -> list[tuple[list[Any], list[Any]]]:
+    """What the vehicles do, as ``_Tank.rows`` has it."""
+    found = []
+    for tank, *read in zip(tanks, *_read_all(tanks, _MOTION), strict=True):
+        step, place, (w, x, y, z), velocity, own, rpy, own_velocity, clearance, ttc_s, leaf, at = read
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        time_s = round(int(step) * tank.sim.config.episode.control_dt_s, 4)
+        speeds = _rounded([np.linalg.norm(own_velocity), np.linalg.norm(velocity)], 2)
+        safety = _rounded([clearance, -1.0 if ttc_s > _FAR_S else ttc_s], 3)
+        known = [time_s, *_rounded([*own, rpy[2]], 3), None, None, speeds[0], int(leaf), []]
+        places = _rounded(at[tank.moving, :2].ravel(), 2)
+        true = [time_s, *_rounded([*place, yaw], 3), *safety, speeds[1], int(leaf), places]
+        found.append((known, true))
+    return found
+
+
+def _read_all(tanks: list[_Tank], names: Sequence[str]) -> list[np.ndarray]:
+    """Of tanks of one simulator."""
+    return [_read(tanks[0].sim, name, [tank.row for tank in tanks]) for name in names] if tanks else []
 
 
 def _read(sim: Recordable, name: str, rows: list[int]) -> np.ndarray:
@@ -179,11 +204,12 @@ def _grid(sim: Recordable) -> dict[str, Any]:
     return {"rows": shape[0], "columns": shape[1], "x": x, "y": y, "cell_m": sim.config.mapping.cell_m}
 
 
-def _detail(sim: Recordable, row: int, time_s: float, with_map: bool) -> str:
+def _detail(tank: _Tank, with_map: bool) -> str:
     """What a vehicle senses and plans at this time, and what it has mapped."""
+    sim = tank.sim
 
     def read(name: str) -> np.ndarray:
-        return _read(sim, name, [row])[0]
+        return _read(sim, name, [tank.row])[0]
 
     n_way, sonar = int(read("route.n_way")), sim.config.sensors.sonar
     hit = np.flatnonzero(read("scan.hit") == 1)
@@ -193,7 +219,7 @@ def _detail(sim: Recordable, row: int, time_s: float, with_map: bool) -> str:
     moving = (read("tracks.alive") == 1) & (read("tracks.moving") == 1)
     state, radius_m, cov = (read(f"tracks.{name}")[moving] for name in ("state", "radius_m", "cov"))
     message = {
-        "kind": "detail", "tank": row, "time": time_s,
+        "kind": "detail", "tank": tank.number, "time": tank.time_s,
         "route": _rounded(read("route.way_w")[:n_way], 2),
         "ahead": _rounded(read("route.lookahead_w")[:2], 2) if n_way else None,
         "echoes": _rounded(echoes, 2),

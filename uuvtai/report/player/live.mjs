@@ -63,7 +63,7 @@ export class Live extends Player {
     this.tanks[tank] = new Running(message, this.tanks[tank]);
     if (this.tank < 0 && (message.of === 1 || this.role.steered)) this.follow(tank);
     else if (this.tank === tank) Object.assign(this, { source: this.tanks[tank], now: true }), this.buttons();
-    if (this.wall.children.length !== this.tanks.length) this.hang();
+    if (this.wall.children.length !== message.of) this.hang(message.of);
   }
 
   take(role) {
@@ -162,14 +162,13 @@ export class Live extends Player {
   }
 
   drawWall() {
-    this.source = this.tanks.find(Boolean);
-    const look = this.look();
     this.button.textContent = this.role.held ? "Play" : "Pause";
     this.tanks.forEach((source, i) => {
       const [canvas, words] = this.wall.children[i].children;
       const [width, time] = [canvas.clientWidth, source.end];
       const view = new View(source.scene.tank, width, null, true);
-      new Painter(sized(canvas, width, view.height), view, look).small(source, time);
+      this.source = source; // whose colour it is
+      new Painter(sized(canvas, width, view.height), view, this.look()).small(source, time);
       const [{ name, outcome, failed }] = source.agents;
       words.textContent = `${name}, ${source.title}: ${outcome || ""} ${time.toFixed(1)} s`;
       words.className = failed ? "failed" : "";
@@ -207,13 +206,13 @@ export class Live extends Player {
   }
 
   /** The wall: a picture a tank. */
-  hang() {
+  hang(count) {
     this.wall.textContent = "";
-    this.tanks.forEach((_, i) => {
+    for (let i = 0; i < count; i++) {
       const tank = add(this.wall, "button", { type: "button", className: "tank", title: `follow (${i + 1})`, onclick: () => this.follow(i) });
       add(tank, "canvas");
       add(tank, "span");
-    });
+    }
     this.root.classList.toggle("walled", this.tank < 0);
   }
 
