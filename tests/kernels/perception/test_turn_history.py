@@ -99,7 +99,7 @@ class Loops:
 
 
 def test_learning_equals_the_oracle(stage):
-    """Noisy tracks on loops and lines, now and then unsettled or unseen: memory after every scan, of half the envs."""
+    """Noisy tracks on loops and lines, now and then unsettled or unseen: every scan, in half of the envs."""
     stage.begin()
     rng = np.random.default_rng(1)
     paths = Loops(rng, 3, 1.5)
