@@ -351,12 +351,12 @@ def test_sizes_are_known_before_taichi_has_started(forks):
     assert forks("size") == ([], [0])
 
 
-def test_three_processes_at_once_leave_one_whole_file_also_where_one_was_killed_while_it_wrote(forks, place):
+def test_processes_at_once_leave_one_whole_file_also_where_one_was_killed_while_it_wrote(forks, place):
     assert forks("killed", 1, place) == ([], [-signal.SIGKILL])
     (part,) = place.iterdir()
     assert part.suffix == ".tmp"
-    results, codes = forks("launch", 3, place)
-    assert len(results) == 3 and codes == [0, 0, 0]
+    results, codes = forks("launch", 2, place)
+    assert len(results) == 2 and codes == [0, 0]
     assert all(int(made) + int(found) == 1 for made, found, _ in results)
     assert any(made == "1" for made, *_ in results) and len({digest for *_, digest in results}) == 1
     os.utime(part, (0, 0))

@@ -161,10 +161,10 @@ POSE_COV = np.zeros(45)
 POSE_COV[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
 
 
-def corrected(stage, place, sensors, tank, **scan):
+def corrected(stage, place, **scan):
     """What one scan makes of the pose of a vehicle that rests at a place, of covariance ``POSE_COV``."""
     pos = [*place, -0.8]
-    io = stage.io(LocalizationIO, LocalizationConfig(), sensors, tank, RULES, VehicleConfig())
+    io = stage.io(LocalizationIO, LocalizationConfig(), SENSORS, POND, RULES, VehicleConfig())
     put(stage.clock, active=1)
     put(stage.ego, pos_w=pos, specific_force_b=[0.0, 0.0, 9.81])
     localization.reset_pose(io)
@@ -180,7 +180,11 @@ def test_the_pose_filter_uses_a_beam_once():
     left, stage = {}, Stage(n_env=1, n_ray=64)
     for count in (1, 3):
         scan = {"range_m": 3.0 / np.cos(away), "hit": np.abs(away) < 0.6, "new_from": 32, "new_count": count}
-        left[count] = corrected(stage, (9.0, 4.0), SENSORS, POND, **scan).cov.to_numpy()[0, 0]
+        state = corrected(stage, (9.0, 4.0), doppler_m_s=np.nan, **scan)
+        after = state.cov.to_numpy()[0]
+        assert np.isfinite(after).all() and np.isfinite(state.mean.to_numpy()).all()
+        np.testing.assert_allclose(after[[24, 30]], 0.04, rtol=1e-3, err_msg="walls tell no speed")
+        left[count] = after[0]
     one = 1 / (1 / 0.01 + 1 / (0.02**2 + 0.005**2 / 12 + LocalizationConfig().wall_sigma_m ** 2))
     assert left[1] == pytest.approx(one, rel=0.4), "what one range tells, and no more"
     assert left[3] < 0.7 * left[1] < 0.007

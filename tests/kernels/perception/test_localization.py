@@ -169,14 +169,13 @@ def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
     assert scans > 20, "beams at the edge of a gate are few"
 
 
-@pytest.mark.parametrize("preset", ["harsh", "astray"])
-def test_errors_are_as_large_as_the_covariance_says(rig, preset):
-    """200 independent runs of 4 s; in harsh water every second one loses the DVL for 1.5 s."""
-    rig.begin(voyage(preset, POOL, 21), PLAIN)
+def test_errors_are_as_large_as_the_covariance_says(rig):
+    """200 independent runs of 4 s in harsh water; every second one loses the DVL for 1.5 s."""
+    rig.begin(voyage("harsh", POOL, 21), PLAIN)
     nees, of_z, off = rig.play()
     assert_consistent(nees, 3)
     assert_consistent(of_z, 1)
-    assert np.quantile(off, 0.95) < {"harsh": 0.10, "astray": 0.12}[preset]
+    assert np.quantile(off, 0.95) < 0.10
 
 
 def test_without_a_wall_in_reach_the_uncertainty_grows_and_stays_honest(rig):

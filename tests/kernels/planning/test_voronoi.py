@@ -36,9 +36,11 @@ STRICT = CONFIG.model_copy(
     update={
         "voronoi": V.model_copy(update={"use": "fused", "min_clearance_m": 0.3, "max_pops": 5000}),
         "quiet": CONFIG.quiet.model_copy(update={"room_m": 0.7}),
+        "route": CONFIG.route.model_copy(update={"spacing_m": 0.05}),
     }
 )
-"""One other compiled variant for all switches: both layers, another d_min, small budget, less room."""
+"""One other compiled variant for all switches: both layers, another d_min, small budget, less room, finer
+routes."""
 
 
 @lru_cache(maxsize=1)
@@ -256,8 +258,7 @@ def test_a_route_too_long_for_its_waypoints_is_spaced_wider():
         maps.box(occ, 1.5 + i, 2.45 if i % 2 == 0 else 3.55, 0.06, 2.45)
     put_maps([occ] * N_ENV)
     put_ends([(0.7, 3.0)] * N_ENV, [(19.0, 3.0)] * N_ENV)
-    fine = CONFIG.model_copy(update={"route": CONFIG.route.model_copy(update={"spacing_m": 0.05})})
-    plan([0], fine)
+    plan([0], STRICT)
     length = np.linalg.norm(np.diff(way_of(0), axis=0), axis=1)
     assert s.route.fallback_reason[0] == enums.FAIL_NONE
     assert length.sum() / 0.05 > CONFIG.route.n_way >= s.route.n_way[0] > 0.5 * CONFIG.route.n_way

@@ -28,6 +28,14 @@ HARSH = load_config("pool", "harsh", overrides={"sensors.localization": "truth"}
 SLOW_AND_BIASED = SensorsConfig(
     dvl=DvlConfig(sigma_m_s=0.01, scale_error=0.02, period_steps=5), imu=ImuConfig(accel_bias_m_s2=0.2)
 )
+LOSSY_AND_NOISY = SensorsConfig(
+    dvl=DvlConfig(period_steps=5, dropout=0.017),
+    imu=ImuConfig(accel_sigma_m_s2=0.05, attitude_sigma_rad=0.01),
+)
+DRIFTING = SensorsConfig(
+    imu=ImuConfig(heading_drift_rad_s=0.001), pressure=PressureConfig(bias_m=0.5, sigma_m=0.02)
+)
+"""configs of several tests, for each is compiled"""
 READINGS = ("vel_b", "vel_valid", "rpy", "rate_b", "specific_force_b", "depth_m", "pos_w")
 
 
@@ -114,7 +122,7 @@ def test_dvl_noise_scale_and_period(rig):
 
 
 def test_dvl_dropout_of_single_readings(rig):
-    sensors = SensorsConfig(dvl=DvlConfig(period_steps=5, dropout=0.017))
+    sensors = LOSSY_AND_NOISY
     rig.start(sensors)
     assert np.all(rig.sense(sensors, 0)["vel_valid"] == 1), "the bottom is in sight at the start"
     lost = []
@@ -159,7 +167,7 @@ def test_gyro_noise_follows_its_density_and_turns_the_heading(rig):
 
 
 def test_heading_drifts_at_a_constant_rate(rig):
-    sensors = SensorsConfig(imu=ImuConfig(heading_drift_rad_s=0.001))
+    sensors = DRIFTING
     rig.start(sensors)
     outs = [rig.sense(sensors, step)["rpy"][:, 2] for step in range(101)]
     assert np.all(outs[0] == 0)
@@ -185,16 +193,15 @@ def test_heading_and_place_at_the_start_are_off_for_a_whole_episode(rig):
 
 
 def test_yaw_stays_wrapped_under_drift(rig):
-    sensors = SensorsConfig(imu=ImuConfig(heading_drift_rad_s=0.001))
+    sensors = DRIFTING
     rig.start(sensors, quat_wb=(np.cos(np.pi / 2 - 1e-6), 0, 0, np.sin(np.pi / 2 - 1e-6)))
     yaw = [rig.sense(sensors, step)["rpy"][:, 2] for step in range(50)][-1]
     assert np.abs(yaw).max() <= np.pi + 1e-6 and yaw.min() < -3.1 and yaw.max() > 3.1
 
 
 def test_accelerometer_and_attitude_noise(rig):
-    sensors = SensorsConfig(imu=ImuConfig(accel_sigma_m_s2=0.05, attitude_sigma_rad=0.01))
-    rig.start(sensors)
-    out = rig.sense(sensors, 0)
+    rig.start(LOSSY_AND_NOISY)
+    out = rig.sense(LOSSY_AND_NOISY, 0)
     assert_normal(out["specific_force_b"] - (0, 0, 9.81), 0.05)
     assert_normal(out["rpy"], 0.01)
 
@@ -208,7 +215,7 @@ def test_the_accelerometers_error_stays_the_same_over_an_episode(rig):
 
 
 def test_pressure_bias_and_sigma(rig):
-    sensors = SensorsConfig(pressure=PressureConfig(bias_m=0.5, sigma_m=0.02))
+    sensors = DRIFTING
     rig.start(sensors)
     bias = rig.ego_memory.pressure_bias_m.to_numpy()
     assert np.abs(bias).max() <= 0.5 and bias.std() == pytest.approx(1 / np.sqrt(12), rel=0.05)
@@ -303,11 +310,11 @@ def test_dead_reckoning_zeroes_the_pressure_sensor_at_the_known_start(rig):
     depth = np.stack([out["depth_m"] for out in outputs], 1)
     assert np.allclose(depth[:, 0], 1.0, atol=1e-6)
     assert_normal(depth[:, 3] - 1.5, 0.02 * np.sqrt(2.0))
-    rig.start(SensorsConfig(pressure=sensors.pressure))
+    rig.start(DRIFTING)
     raw = []
     for step, height in enumerate(z):
         put(rig.vehicle, pos_w=(5.0, 3.0, height))
-        raw.append(rig.sense(SensorsConfig(pressure=sensors.pressure), step)["depth_m"])
+        raw.append(rig.sense(DRIFTING, step)["depth_m"])
     noise = np.stack(raw, 1) + z - bias[:, None]
     expected = [zeroed_depth(-1.0, z, b, n) for b, n in zip(bias, noise, strict=True)]
     assert np.abs(depth - expected).max() < ROUNDING

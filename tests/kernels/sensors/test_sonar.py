@@ -83,33 +83,9 @@ def assert_ranges(got, hit, lowest, truth, highest, max_range_m):
     assert wrong.mean() < GRAZING_SHARE
 
 
-def test_random_scenes_against_mujoco(rig, batches):
-    """Aperture 0: a beam is a line in space, which MuJoCo casts at the solids themselves."""
-    scene = batches[0]
-    rig.start(scene)
-    out = rig.cast(FLAT)
-    found = []
-    for env in range(N_ENV):
-        caster = scenes.Caster(scene, env, TANK)
-        bearing = beam_headings(scene["quat"][env], N_RAY)
-        rays = np.stack([np.cos(bearing), np.sin(bearing), np.zeros(N_RAY)], axis=1)
-        truth = caster.distances(scene["pos"][env], rays)
-        off = np.abs(out["range_m"][env] - np.minimum(truth, CLEAN.max_range_m)) > RANGE_TOLERANCE_M
-        off |= out["hit"][env] != (truth <= CLEAN.max_range_m)
-        low, high = truth.copy(), truth.copy()
-        if off.any():
-            low[off], high[off] = scenes.envelope(
-                lambda r, c=caster, s=scene["pos"][env]: c.distances(s, r), rays[off], GRAZING_RAD
-            )
-        found.append((low, truth, high))
-    low, truth, high = (np.array(column) for column in zip(*found, strict=True))
-    assert_ranges(out["range_m"], out["hit"], low, truth, high, CLEAN.max_range_m)
-    assert 0.9 < out["hit"].mean() < 1.0
-
-
 def test_random_scenes_against_oracle_with_aperture(rig, batches):
     """Ranges, hits, intensity and Doppler; most obstacles are above or below the beams' plane."""
-    scene, different, obstacles, compared = batches[1], 0, 0, 0
+    scene, different, obstacles, compared = batches[0], 0, 0, 0
     rig.start(scene)
     out = rig.cast(CLEAN)
     oracle = [
@@ -314,7 +290,7 @@ def test_ghost_takes_the_mirrored_path(rig):
     scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (15.0, 4.0, -1.0))
     scene["vel_b"][:] = (0.3, 0.1, 0.0)
     rig.start(scene)
-    out = rig.cast(LATE_GHOSTS)
+    out = rig.cast(LATE)
     u = np.sqrt(0.5)
     assert out["range_m"][0, 32] == pytest.approx(5.0 / u, abs=1e-4)
     assert out["doppler_m_s"][0, 32] == pytest.approx(-(0.3 + 0.1) * u, abs=1e-5)
@@ -326,7 +302,7 @@ def test_ghost_takes_the_mirrored_path(rig):
         size=(0.5, 1.0, 0.5), obstacle_vel=(-0.7, 0.2, 0.0),
     )  # fmt: skip
     rig.start(moving)
-    out = rig.cast(LATE_GHOSTS)
+    out = rig.cast(LATE)
     assert out["range_m"][0, 32] == pytest.approx(4.0 / u, abs=1e-4), (
         "wall at (12, 6), then the box's face x = 14 at (14, 4)"
     )
@@ -334,8 +310,8 @@ def test_ghost_takes_the_mirrored_path(rig):
     assert out["range_m"][0, 0] == pytest.approx(4.0, abs=1e-4)
 
 
-LATE_GHOSTS = SonarConfig(ghost=1.0, period_steps=2, latency_steps=3)
-"""of two tests: one kernel"""
+LATE = SonarConfig(ghost=1.0, bubble_clouds_per_s=0.5, period_steps=5, latency_steps=10)
+"""of three tests: one kernel"""
 HARSH = load_config("pool", "harsh").sensors.sonar
 
 
@@ -383,7 +359,6 @@ def test_harsh_preset_shows_every_error_at_its_rate(rig):
 
 def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
     """Share of covered beams = rate x mean duration x mean width / n_ray; runs of 3-8 beams at one range."""
-    config = SonarConfig(bubble_clouds_per_s=0.5, period_steps=5)
     scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 3.0, -0.8))
     rig.start(scene)
     clean = rig.cast(CLEAN)
@@ -391,7 +366,7 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
     covered, runs, lives = [], [], np.zeros((N_ENV, N_RAY), int)
     for step in range(0, 1000, 5):
         set_step(rig.clock, step)
-        out = rig.cast(config, names=("range_m",))
+        out = rig.cast(LATE, names=("range_m",))
         nearer = out["range_m"] < clean["range_m"] - 1e-3
         covered.append(nearer.mean())
         lives = np.where(nearer, lives + 1, 0)
@@ -411,29 +386,29 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
 
 
 def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
-    """Ping every 2 steps, delivered 3 steps later (two scans under way at once)."""
+    """Ping every 5 steps, delivered 10 steps later (two scans under way at once)."""
     scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 3.0, -0.8))
     rig.start(scene)
     fresh = {}
-    for step in range(12):
+    for step in range(28):
         set_step(rig.clock, step)
-        scene["pos"][:, 0] = 10.0 - 0.1 * step
+        scene["pos"][:, 0] = 10.0 - 0.05 * step
         scenes.load(scene, rig.vehicle, rig.world)
         put(rig.ego, pos_w=step, vel_b=-step, vel_valid=step % 4 == 0, rpy=0.01 * step)
-        out = rig.cast(LATE_GHOSTS)
+        out = rig.cast(LATE)
         assert len(set(out["fresh"])) == 1
         if out["fresh"][0]:
             fresh[step] = out["ping_step"][0]
         last = fresh[max(fresh)]
         assert np.all(out["ping_step"] == last), "between deliveries the old scan stays"
-        assert out["range_m"][0, N_RAY // 2] == pytest.approx(10.0 - 0.1 * last, abs=1e-4), (
+        assert out["range_m"][0, N_RAY // 2] == pytest.approx(10.0 - 0.05 * last, abs=1e-4), (
             "what was true when it was pinged"
         )
         assert np.all(rig.scan.ping_pos_w.to_numpy() == last)
         assert np.all(rig.scan.ping_vel_b.to_numpy() == -last)
         assert np.all(rig.scan.ping_vel_valid.to_numpy() == (last % 4 == 0))
         assert np.allclose(rig.scan.ping_yaw.to_numpy(), 0.01 * last)
-    assert fresh == {0: 0, 5: 2, 7: 4, 9: 6, 11: 8}, "the first scan is delivered at once, and only then"
+    assert fresh == {0: 0, 15: 5, 20: 10, 25: 15}, "the first scan is delivered at once, and only then"
 
 
 def test_sleeping_rows_keep_their_scan(rig, batches):
