@@ -33,7 +33,7 @@ from uuvtai.sim.setup import load_bounds
 N_ENV, N_OBSTACLE = 24, 14
 TANK, RULES = TankConfig(), EpisodeConfig()
 SIZES = {
-    "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_ray": 512, "n_latency": 2, "n_cloud": 1, "n_thruster": 6,
+    "n_env": N_ENV, "n_obstacle": N_OBSTACLE, "n_ray": 256, "n_latency": 2, "n_cloud": 1, "n_thruster": 6,
 }  # fmt: skip
 TOLERANCE_M = 2e-3
 GRAZING_SHARE = 2e-4

@@ -315,14 +315,6 @@ def test_a_tether_drags_across_as_a_third_of_its_length(tethered_plant):
         assert np.abs(nu[env] - found).max() < SPEED_M_S < np.abs(found - free).max()
 
 
-def test_coriolis_matrix_is_skew_and_mass_matrix_positive():
-    nu = np.random.default_rng(0).normal(size=6)
-    for matrix in (oracle.Body().mass_matrix, np.diag(oracle.Body().added)):
-        c = oracle.coriolis_matrix(matrix, nu)
-        assert np.array_equal(c, -c.T)
-        assert np.linalg.eigvalsh(matrix).min() > 0
-
-
 WRONG = [
     {"mass_kg": 0}, {"inertia_kg_m2": (0.3, 0, 0.5)}, {"added_mass": (5, -1, 1, 0, 0, 0)},
     {"linear_damping": (-1,) * 6}, {"thrust_forward": (-4.7e-7, 0, 0)}, {"rotor_max_rpm": 150},
