@@ -61,6 +61,7 @@ class Head(Stage):
     def hear(self, beam, pos, yaw, range_m):
         """Deliver one beam (range None = no return), and recall."""
         put(self.scan, ping_yaw=yaw, ping_pos_w=[*pos, -0.8], ping_vel_b=0.0, ping_vel_valid=1)
+        put(self.scan, doppler_m_s=np.nan)
         put(self.scan, new_from=beam, new_count=1, fresh=1, ping_step=self.step)
         self.scan.range_m[0, beam] = SONAR.max_range_m if range_m is None else range_m
         self.scan.hit[0, beam] = int(range_m is not None)
@@ -147,6 +148,9 @@ def test_hits_are_marked_once_and_where_the_vehicle_was_when_the_beam_was_taken(
     off = np.array([np.hypot(x - dx, y - dy) - radius for dx, dy, radius in discs])
     assert np.abs(off).min(0).max() < 0.15, "within a cell and a half of a disc's outline"
     assert (np.abs(off).argmin(0) == 0).sum() >= 4 and (np.abs(off).argmin(0) == 1).sum() >= 4
+    assert not found["dynamic"][0].any(), "no speed is read from a beam without Doppler"
+    seen = found["seen"][0].any(0)
+    assert seen.any() and not seen[: int((2.8 - x0) / MAP.cell_m)].any(), "nothing behind the fan"
     before = found["static"][0].copy()
     beam_head.hear(0, (4.0, 4.0), 0.0, None)  # elsewhere: the old returns are not marked from here again
     mapping.update_map(beam_head.mapping)

@@ -7,28 +7,16 @@ import pytest
 import taichi as ti
 
 from tests.bundles import Stage, put
-from tests.map_bits import get_map
 from tests.oracles import scenes
 from uuvtai.common.errors import UserError
-from uuvtai.config import (
-    DepthConfig,
-    EpisodeConfig,
-    MappingConfig,
-    ObservationConfig,
-    SonarConfig,
-    TankConfig,
-)
+from uuvtai.config import EpisodeConfig, ObservationConfig, SonarConfig, TankConfig
 from uuvtai.config.loader import load_config
 from uuvtai.kernels.core.beams import beam_bearing, beam_there, beam_towards
-from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 from uuvtai.kernels.core.stage import AnyTensor, Const
-from uuvtai.kernels.perception import mapping
-from uuvtai.kernels.perception.io import MappingIO
 from uuvtai.kernels.planning.io import ObservationIO
 from uuvtai.kernels.planning.observation import sense_sectors
 from uuvtai.kernels.sensors import sonar
 from uuvtai.kernels.sensors.io import SonarIO
-from uuvtai.sim.setup import load_bounds
 
 N_ENV, N_OBSTACLE = 24, 14
 TANK, RULES = TankConfig(), EpisodeConfig()
@@ -128,44 +116,6 @@ def test_a_fans_ranges_are_mujocos(scene):
 
 
 # ------------------------------------------------------------------------------------- what is made of a scan
-
-POND = TankConfig(x_m=(0.0, 6.0), y_m=(0.0, 4.0))
-MAP, CAMERA = MappingConfig(period_steps=1), DepthConfig(rows=6, cols=16)
-SMALL = SonarConfig(n_ray=64, horizontal_aperture_deg=100.0, doppler=False)
-
-
-def test_only_what_lies_in_the_fan_is_seen_and_no_speed_is_read_from_a_beam():
-    """From (2, 2), nose to +y: free water within 50 degrees, an obstacle at (2, 3), Doppler not a number."""
-    shape = grid_shape(POND, MAP.cell_m)
-    stage = Stage(
-        n_env=1, n_row=shape[0], n_col=shape[1], n_ray=64, n_track=4, n_cluster=4, n_height=16, n_slot=1,
-        n_pixel_row=6, n_pixel_col=16,
-    )  # fmt: skip
-    scan, grid = stage.scan, stage.grid_map
-    load_bounds(stage.mask, np.array(outside_cells(POND, MAP.cell_m)))
-    world = np.pi / 2 + bearings(SMALL)
-    to_wall = np.minimum(2.0 / np.sin(world), 2.0 / np.maximum(np.abs(np.cos(world)), 1e-9))
-    hits_obstacle = np.abs(bearings(SMALL)) < np.radians(10.0)
-    put(scan, range_m=np.where(hits_obstacle, 1.0, to_wall)[None], hit=1, doppler_m_s=np.nan)
-    put(scan, ping_yaw=np.pi / 2, ping_pos_w=[[2.0, 2.0, -0.8]], ping_vel_b=[[0.6, 0.0, 0.0]])
-    put(scan, ping_vel_valid=1, fresh=1)
-    stage.tracks.beam_track.fill(-1)
-    stage.clock.active.fill(1)
-    io = stage.io(MappingIO, MAP, SMALL, CAMERA, POND, RULES)
-    mapping.reset_map(io)
-    for step in range(20):
-        stage.clock.step.fill(step)
-        mapping.update_map(io)
-    found = get_map(grid)
-    x0, y0 = grid_origin(POND, MAP.cell_m)
-    x = x0 + (np.arange(shape[1]) + 0.5) * MAP.cell_m - 2.0
-    y = y0 + (np.arange(shape[0]) + 0.5) * MAP.cell_m - 2.0
-    off = np.degrees(np.abs(np.arctan2(x[None, :], y[:, None])))
-    seen = found["seen"][0].astype(bool)
-    assert not seen[off > 52.0].any(), "nothing beside or behind the fan"
-    inside = (np.hypot(x[None, :], y[:, None]) < 0.8) & (off < 46.0)
-    assert seen[inside].all() and inside.sum() > 30
-    assert found["static"][0].max() > 0.5 and not found["dynamic"][0].any()
 
 
 @cache

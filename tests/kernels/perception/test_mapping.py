@@ -614,6 +614,3 @@ def test_reset_empties_awake_rows_only(stage):
             )
     # and a reset row starts to map at once, whatever its last scan was
     assert stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 1)["static"][cell(*FACE)] > 0
-
-
-# ---------------------------------------------------------------------------------------------------- threads

@@ -22,9 +22,9 @@ from uuvtai.sim import setup
 
 RULES = EpisodeConfig()
 """one object: a kernel is compiled anew for another"""
-N = 96
+N = 64
 """Episodes drawn per world."""
-N_FLOOD = 12
+N_FLOOD = 8
 """of which the flood fill is repeated independently"""
 FLOAT_TOL_M = 1e-4
 """float32 at coordinates up to 20 m, and outlines sampled every 5 mm"""
@@ -306,7 +306,7 @@ def test_obstacles_with_inertia_move_as_an_integrator_says(motion):
 
 
 def test_turns_with_inertia_keep_clear_of_static_obstacles_too():
-    """Five of the first 64 scenarios would have one in a way that nobody counted."""
+    """Five of these scenarios would have one in a way that nobody counted."""
     of, drawn = drawn_world("inertial")
     moving = slice(of.slots.first_dynamic, None)
     place = np.stack([of.move(step)[:, moving, :2].astype(float) for step in range(0, 3000, 15)])
