@@ -1,7 +1,6 @@
 """Few sizes are ever compiled: other batches, obstacles and speeds find the machine code that is there."""
 
 import json
-import subprocess
 import sys
 from typing import get_type_hints
 
@@ -99,11 +98,3 @@ def test_warm_makes_what_another_process_finds(capfd):
     (shape,) = json.loads(out)["shapes"]
     assert code == 0 and (shape["sensors"], shape["num_envs"]) == ("paper", 8)
     assert shape["compiled"] + shape["found"] > 30
-
-
-def test_sizes_are_known_before_taichi_has_started():
-    """``uuv profile`` asks whether all sizes fit before it makes the first simulator."""
-    code = "from uuvtai.config import loader; from uuvtai.sim import setup; "
-    code += "setup.check_size(loader.load_config(), 8, 'cpu')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr

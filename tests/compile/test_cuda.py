@@ -64,10 +64,10 @@ def test_sizes_of_a_gpu_grow_with_the_batch(monkeypatch):
 
 
 def test_kernels_in_the_shape_for_a_gpu_give_the_same_bits(small):
-    """200 steps with resets; the whole stack, so that no kernel can be forgotten."""
+    """75 steps with resets; the whole stack, so that no kernel can be forgotten."""
     assert os.environ.get(launch.VARIABLE) in (None, "", "cpu")
-    ours = shape_bits.play(small.sim, 200)
-    apart = shape_bits.played_apart("gpu", SmallSim.N, "paper", 200)
+    ours = shape_bits.play(small.sim, 75)
+    apart = shape_bits.played_apart("gpu", SmallSim.N, "paper", 75)
     assert len(ours) > 200 and shape_bits.differing(ours, apart) == []
 
 

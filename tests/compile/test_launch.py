@@ -70,10 +70,3 @@ def test_wrong_arguments_are_still_refused(fields):
         add_scaled(fields[0], 1.0, out, 0.0)  # pyright: ignore[reportCallIssue]
     with pytest.raises(Exception, match="type"):
         add_scaled(fields[0], 1.0, out, "far", 0)  # pyright: ignore[reportArgumentType]
-
-
-def test_it_keeps_name_and_text_of_its_kernel():
-    assert (add_scaled.__name__, add_scaled.__doc__) == (
-        "add_scaled",
-        "out += scale * field + shift + count.",
-    )

@@ -15,8 +15,10 @@ def write(folder, text, name="mine.yaml"):
     return str(path)
 
 
-@pytest.mark.parametrize("world", loader.preset_names("world"))
-@pytest.mark.parametrize("sensors", [None, *loader.preset_names("sensors")])
+@pytest.mark.parametrize(
+    ("world", "sensors"),
+    [(world, None) for world in preset_names("world")] + [("pool", name) for name in preset_names("sensors")],
+)
 def test_every_preset_loads_and_survives_yaml(world, sensors):
     config = load_config(world, sensors)
     assert validated(yaml.safe_load(to_yaml(config))) == config

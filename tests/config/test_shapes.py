@@ -61,7 +61,7 @@ def test_a_rectangle_is_one_box(degrees):
     assert box[:2] == pytest.approx((10, 8), abs=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(5))
 def test_any_outline_is_covered_and_nothing_beyond_it(seed):
     """Its edge has boxes all along, none sticks out, and what is empty inside is too small for a start."""
     draw = np.random.default_rng(seed)
@@ -78,7 +78,7 @@ def test_any_outline_is_covered_and_nothing_beyond_it(seed):
         [a + np.linspace(0, 1, 60)[:, None] * (b - a) for a, b in zip(corners, ends, strict=True)]
     )
     assert covered(boxes, edge, TOLERANCE_M).all()
-    points = draw.uniform((10, 5), (20, 15), (4000, 2))
+    points = draw.uniform((10, 5), (20, 15), (1500, 2))
     inside = np.array([shapes._inside([corners], p[:1], p[1:])[0, 0] for p in points])
     near = np.array([np.hypot(*(edge - p).T).min() for p in points])
     assert not covered(boxes, points[~inside & (near > 2 * TOLERANCE_M)]).any()
@@ -209,7 +209,7 @@ def _white_named(folder):
 
 
 def test_noise_and_knots_are_refused_soon(tmp_path):
-    noise = Image.fromarray((np.random.default_rng(0).random((400, 600)) * 255).astype(np.uint8))
+    noise = Image.fromarray((np.random.default_rng(0).random((200, 300)) * 255).astype(np.uint8))
     assert "obstacles, and 256 may be: remove specks" in refusal(
         tmp_path, "occupancy: {image: tank.png, resolution: 0.05, occupied_thresh: 0.8}", image=noise
     )

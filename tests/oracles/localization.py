@@ -13,8 +13,6 @@ GRAVITY = 9.81
 NEWEST_SHARE, JUMP_SHARE, ACCEL_DENSITY = 0.8, 0.12, 1e-6
 SIDE = 2
 """beams on either side that are looked at together, in packets of sixteen"""
-UP = np.triu_indices(N)
-UP3 = np.triu_indices(3)
 
 
 def full(triangle, n):

@@ -51,6 +51,8 @@ CFG = Config.model_validate(
         "behavior": TEACHER,
     }
 )
+SLOW = CFG.behavior.model_copy(update={"evade_m_s": 0.1, "back_off_m_s": 0.1, "patience_s": 0.0})
+"""evades slowly, with endless patience"""
 TANK = CFG.world.tank
 N_SAMPLE = round(CFG.tracking.horizon_s / CFG.tracking.forecast_dt_s) + 1
 TIMES = np.arange(N_SAMPLE) * CFG.tracking.forecast_dt_s
@@ -520,10 +522,9 @@ def test_patience_falls_while_it_does_not_come_on_and_comes_back(scene):
     for _ in range(100):
         assess(scene)
     assert np.all(scene.behavior.patience.to_numpy() == 1)
-    endless = CFG.behavior.model_copy(update={"patience_s": 0.0})
     bundles.put(scene.ego, vel_b=0)
     for _ in range(50):
-        assess(scene, endless)
+        assess(scene, SLOW)
     assert np.all(scene.behavior.patience.to_numpy() == 1)
 
 
@@ -569,7 +570,7 @@ def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene)
     body(scene, 0, 0, (6.7, 3.0), (0.0, 0.0))
     assess(scene)
     sooner = scene.behavior.conflict_s.to_numpy()[0]
-    assess(scene, CFG.behavior.model_copy(update={"evade_m_s": 0.1, "back_off_m_s": 0.1}))
+    assess(scene, SLOW)
     assert scene.behavior.conflict_s.to_numpy()[0] == sooner < FAR_M
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.bundles import Stage, put
+from tests.bundles import STRUCTS, Stage, clear, put
 from tests.kernels.perception.test_tracking import CONFIG, ELEVATION, FORECAST
 from tests.map_bits import get_map
 from uuvtai.config import (
@@ -37,8 +37,8 @@ class Head(Stage):
 
     sizes = SIZES
 
-    def __init__(self):
-        super().__init__()
+    def begin(self):
+        clear(*(struct for noun, struct in vars(self).items() if noun in STRUCTS))
         load_bounds(self.mask, np.array(outside_cells(POND, MAP.cell_m)))
         self.clock.active.fill(1)
         self.recall = self.io(EchoesIO, SONAR)
@@ -48,6 +48,7 @@ class Head(Stage):
         tracking.reset_tracks(self.tracking)
         mapping.reset_map(self.mapping)
         self.taken, self.step = 0, 0
+        return self
 
     def due(self):
         """The beam that is taken in this control step, None = none."""
@@ -60,6 +61,7 @@ class Head(Stage):
     def hear(self, beam, pos, yaw, range_m):
         """Deliver one beam (range None = no return), and recall."""
         put(self.scan, ping_yaw=yaw, ping_pos_w=[*pos, -0.8], ping_vel_b=0.0, ping_vel_valid=1)
+        put(self.scan, doppler_m_s=np.nan)
         put(self.scan, new_from=beam, new_count=1, fresh=1, ping_step=self.step)
         self.scan.range_m[0, beam] = SONAR.max_range_m if range_m is None else range_m
         self.scan.hit[0, beam] = int(range_m is not None)
@@ -75,9 +77,7 @@ class Head(Stage):
         return {int(b): float(range_m[b]) for b in np.flatnonzero(hit)}
 
 
-@pytest.fixture
-def beam_head():
-    return Head()
+beam_head = Head.begun()
 
 
 def disc_range(pos, bearing, discs):
@@ -148,6 +148,9 @@ def test_hits_are_marked_once_and_where_the_vehicle_was_when_the_beam_was_taken(
     off = np.array([np.hypot(x - dx, y - dy) - radius for dx, dy, radius in discs])
     assert np.abs(off).min(0).max() < 0.15, "within a cell and a half of a disc's outline"
     assert (np.abs(off).argmin(0) == 0).sum() >= 4 and (np.abs(off).argmin(0) == 1).sum() >= 4
+    assert not found["dynamic"][0].any(), "no speed is read from a beam without Doppler"
+    seen = found["seen"][0].any(0)
+    assert seen.any() and not seen[: int((2.8 - x0) / MAP.cell_m)].any(), "nothing behind the fan"
     before = found["static"][0].copy()
     beam_head.hear(0, (4.0, 4.0), 0.0, None)  # elsewhere: the old returns are not marked from here again
     mapping.update_map(beam_head.mapping)
@@ -162,10 +165,10 @@ POSE_COV = np.zeros(45)
 POSE_COV[[0, 9, 17, 24, 30, 35, 39, 42, 44]] = [0.01, 0.01, 1e-4, 0.04, 0.04, 1e-6, 1e-6, 1e-6, 1e-6]
 
 
-def corrected(place, sensors, tank, **scan):
+def corrected(stage, place, **scan):
     """What one scan makes of the pose of a vehicle that rests at a place, of covariance ``POSE_COV``."""
-    stage, pos = Stage(n_env=1, n_ray=sensors.sonar.n_ray), [*place, -0.8]
-    io = stage.io(LocalizationIO, LocalizationConfig(), sensors, tank, RULES, VehicleConfig())
+    pos = [*place, -0.8]
+    io = stage.io(LocalizationIO, LocalizationConfig(), SENSORS, POND, RULES, VehicleConfig())
     put(stage.clock, active=1)
     put(stage.ego, pos_w=pos, specific_force_b=[0.0, 0.0, 9.81])
     localization.reset_pose(io)
@@ -178,10 +181,14 @@ def corrected(place, sensors, tank, **scan):
 def test_the_pose_filter_uses_a_beam_once():
     """A wall is heard by one beam; the other beams of the scan hold what was heard before."""
     away = SONAR.first_beam_rad + SONAR.beam_step_rad * np.arange(64)
-    left = {}
+    left, stage = {}, Stage(n_env=1, n_ray=64)
     for count in (1, 3):
         scan = {"range_m": 3.0 / np.cos(away), "hit": np.abs(away) < 0.6, "new_from": 32, "new_count": count}
-        left[count] = corrected((9.0, 4.0), SENSORS, POND, **scan).cov.to_numpy()[0, 0]
+        state = corrected(stage, (9.0, 4.0), doppler_m_s=np.nan, **scan)
+        after = state.cov.to_numpy()[0]
+        assert np.isfinite(after).all() and np.isfinite(state.mean.to_numpy()).all()
+        np.testing.assert_allclose(after[[24, 30]], 0.04, rtol=1e-3, err_msg="walls tell no speed")
+        left[count] = after[0]
     one = 1 / (1 / 0.01 + 1 / (0.02**2 + 0.005**2 / 12 + LocalizationConfig().wall_sigma_m ** 2))
     assert left[1] == pytest.approx(one, rel=0.4), "what one range tells, and no more"
     assert left[3] < 0.7 * left[1] < 0.007

@@ -80,11 +80,10 @@ def lay_out(stage, state, cov, radius, rate, sigma):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("use_turn_rate", [True, False])
-def test_forecast_equals_the_arc(stage, use_turn_rate):
+def test_forecast_equals_the_arc(stage):
     """The scan is two steps old: sample k lies 0.04 + 0.1 k seconds along the arc (along the tangent where
-    the switch is off, and where the turn rate does not stand out of its noise)."""
-    stage.begin(ForecastConfig(use_turn_rate=use_turn_rate, use_reflection=False))
+    the turn rate does not stand out of its noise)."""
+    stage.begin(ForecastConfig(use_reflection=False))
     state, cov, radius, rate, sigma = random_tracks(1)
     lay_out(stage, state, cov, radius, rate, sigma)
     stage.clock.step.fill(2)
@@ -102,7 +101,7 @@ def test_forecast_equals_the_arc(stage, use_turn_rate):
             )
             grown = radius[env, track] + oracle.growth(cov[env, track].astype(float), t, TRACKING)
             np.testing.assert_allclose(size[env, track, k], grown, atol=GROWTH_TOLERANCE)
-    assert (5 < arcs < N_ENV * N_TRACK - 5) if use_turn_rate else arcs == 0
+    assert 5 < arcs < N_ENV * N_TRACK - 5
 
 
 def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
@@ -130,12 +129,16 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
 
 @pytest.mark.parametrize("switches", [(True, True), (True, False), (False, True)])
 def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
-    """Straight courses with remembered turns: the oracle's walk, in leaps of the samples."""
+    """Straight courses with remembered turns: the oracle's walk, in leaps of the samples; without the history
+    the turn rate is left out too."""
     stage.begin(
-        ForecastConfig(n_turn=SIZES["n_turn"], use_turn_history=switches[0], use_reflection=switches[1])
-    )
-    state, cov, radius, _, sigma = random_tracks(3)
-    lay_out(stage, state, cov, radius, np.zeros_like(sigma), sigma)
+        ForecastConfig(
+            n_turn=SIZES["n_turn"], use_turn_history=switches[0], use_reflection=switches[1],
+            use_turn_rate=switches[0],
+        )
+    )  # fmt: skip
+    state, cov, radius, rate, sigma = random_tracks(3)
+    lay_out(stage, state, cov, radius, 0 * rate if switches[0] else rate, sigma)
     rng = np.random.default_rng(4)
     turns = [
         [habit_oracle.Turn(np.zeros(2), np.ones(2), np.ones(2), 0.0) for _ in range(SIZES["n_turn"])]

@@ -14,7 +14,7 @@ from uuvtai.kernels.perception.io import LocalizationIO
 
 N_ENV, STEPS = 200, 201
 RULES = EpisodeConfig()
-SENSORS = {name: load_config("pool", name).sensors for name in ("nominal", "harsh")}
+SENSORS = {"harsh": load_config("pool", "harsh").sensors}
 ASTRAY = {"sensors.start_sigma_m": 0.1, "sensors.imu.heading_sigma_rad": 0.03}
 SENSORS["astray"] = load_config("pool", "harsh", overrides=ASTRAY).sensors
 POOL, PEN = TankConfig(), TankConfig(shape="circle", x_m=(0.0, 8.0), y_m=(0.0, 8.0))
@@ -130,7 +130,7 @@ def assert_close(found, filters, rows):
             assert np.all(np.abs(own - theirs_cov) <= ROUNDING_SHARE * np.outer(sigma, sigma) + 1e-12)
 
 
-@pytest.mark.parametrize(("preset", "cfg", "tank"), [("astray", DEFAULT, PEN), ("nominal", PLAIN, POOL)])
+@pytest.mark.parametrize(("preset", "cfg", "tank"), [("astray", DEFAULT, PEN), ("harsh", PLAIN, POOL)])
 def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
     """Each step from what the kernel had before it: rounding does not add up, a wrong term shows at once."""
     rows, v = (0, 75, 150), voyage(preset, tank, 3, obstacles=OBSTACLES)
@@ -138,7 +138,7 @@ def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
     filters = {row: oracle.Filter(v.told[row], v.sensors, cfg, tank, RULES.control_dt_s) for row in rows}
     assert_close(rig.state(), filters, rows)
     scans = 0
-    for k in range(91):
+    for k in range(61):
         before, lost = rig.state(), v.valid[k - k % v.sensors.dvl.period_steps] == 0
         rig.sense(k)
         for row, ours in filters.items():
@@ -169,14 +169,13 @@ def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
     assert scans > 20, "beams at the edge of a gate are few"
 
 
-@pytest.mark.parametrize("preset", ["nominal", "harsh", "astray"])
-def test_errors_are_as_large_as_the_covariance_says(rig, preset):
-    """200 independent runs of 4 s; in harsh water every second one loses the DVL for 1.5 s."""
-    rig.begin(voyage(preset, POOL, 21), PLAIN)
+def test_errors_are_as_large_as_the_covariance_says(rig):
+    """200 independent runs of 4 s in harsh water; every second one loses the DVL for 1.5 s."""
+    rig.begin(voyage("harsh", POOL, 21), PLAIN)
     nees, of_z, off = rig.play()
     assert_consistent(nees, 3)
     assert_consistent(of_z, 1)
-    assert np.quantile(off, 0.95) < {"nominal": 0.03, "harsh": 0.10, "astray": 0.12}[preset]
+    assert np.quantile(off, 0.95) < 0.10
 
 
 def test_without_a_wall_in_reach_the_uncertainty_grows_and_stays_honest(rig):

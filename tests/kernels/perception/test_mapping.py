@@ -268,7 +268,7 @@ def check_against_oracle(stage, tank, seed):
     assert seen["dynamic"] > 10 and seen["static"] > 20
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_update_equals_the_oracle(stage, seed):
     check_against_oracle(stage, TANK, seed)
 
@@ -435,11 +435,11 @@ def test_no_temporal_evidence_before_the_cell_was_free_for_long(stage):
 
 
 def test_noisy_edges_of_a_static_obstacle_never_become_dynamic(stage):
-    """Twelve seconds of range noise and slow turning around an obstacle whose rim cells are partly free."""
+    """Six seconds of range noise and slow turning around an obstacle whose rim cells are partly free."""
     stage.reset()
     noise = np.random.default_rng(3)
     worst = 0.0
-    for second in range(12):
+    for second in range(6):
         after = stage.run(
             lambda k: ring(EYE, [(*BODY, 0, 0)], yaw=0.004 * k, noise=noise), 25, first=25 * second
         )
@@ -563,7 +563,7 @@ def random_run(stage, order, seed, n_scan=6, twist=None):
     return stage.read()
 
 
-@settings(max_examples=5, deadline=None, derandomize=True)
+@settings(max_examples=3, deadline=None, derandomize=True)
 @given(order=st.permutations(range(N_ENV)), seed=st.integers(0, 1000))
 def test_permuting_envs_permutes_maps(stage, order, seed):
     straight, permuted = random_run(stage, range(N_ENV), seed), random_run(stage, order, seed)
@@ -582,7 +582,7 @@ def test_one_env_never_touches_another(stage, changed, seed):
         np.testing.assert_array_equal(plain[name][others], twisted[name][others])
 
 
-@settings(max_examples=8, deadline=None, derandomize=True)
+@settings(max_examples=4, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6), n_scan=st.integers(1, 12))
 def test_occupancy_stays_in_its_bounds(stage, seed, n_scan):
     after = random_run(stage, range(N_ENV), seed, n_scan)
@@ -614,6 +614,3 @@ def test_reset_empties_awake_rows_only(stage):
             )
     # and a reset row starts to map at once, whatever its last scan was
     assert stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 1)["static"][cell(*FACE)] > 0
-
-
-# ---------------------------------------------------------------------------------------------------- threads

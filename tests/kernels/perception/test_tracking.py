@@ -263,7 +263,7 @@ def test_one_scan_equals_oracle(preset, cfg, request):
     rng = np.random.default_rng(11)
     drive, still, at = Drive(rng), resting(rng, 8), lines(rng, 6, 1.0)
     seen = {"moving": 0, "hidden": 0, "turning": 0, "missed": 0}
-    n_scan = 30
+    n_scan = 14
     for k in range(n_scan):
         step = 5 * k
         before = lab.everything()
@@ -297,7 +297,7 @@ def test_one_scan_equals_oracle(preset, cfg, request):
 def test_covariance_stays_positive_and_equals_joseph():
     """A filter run for a thousand scans of obstacles on circles in float32 equals the float64 one and never
     loses positive definiteness."""
-    n_step, n_run = 1000, 3
+    n_step, n_run = 1000, 2
     mean, cov, link = (ti.Vector.field(size, ti.f32, n_run) for size in (4, 10, 5))
     covs, links = (ti.Vector.field(size, ti.f32, (n_step, n_run)) for size in (10, 5))
     rate = ti.field(ti.f32, n_run)
@@ -396,23 +396,22 @@ def errors(lab, rng, paths, seconds, settle_s=1.0):
     return np.array(out), false, total
 
 
-@pytest.mark.parametrize("paths", [lines, circles])
-@pytest.mark.parametrize("v", [0.2, 0.6, 1.5])
+@pytest.mark.parametrize(("v", "paths"), [(0.2, lines), (0.6, circles), (1.5, lines)])
 def test_velocity_and_position_of_movers(paper, v, paths):
     """Median errors among static boxes and cylinders, with own motion and yaw; movers pass through each other
     and turn back unannounced."""
     rng = np.random.default_rng(5)
-    found, false, total = errors(paper.begin(2), rng, paths(rng, 6, v), 5.0)
-    assert len(found) > 500
+    found, false, total = errors(paper.begin(2), rng, paths(rng, 6, v), 3.0)
+    assert len(found) > 200
     assert np.median(found[:, 0]) <= 0.06
     assert np.percentile(found[:, 1], 90) <= 0.10
     assert found[:, 2].mean() >= 0.9
-    assert total > 10000
+    assert total > 5000
     assert false <= 0.01 * total
 
 
 @pytest.mark.parametrize(("preset", "seeds", "yaw_rate", "n", "n_scan", "step", "share"), [
-    ("paper", (6, 3), 0.8, 12, 100, CONFIG.period_steps, 0.01),
+    ("paper", (6, 3), 0.8, 12, 50, CONFIG.period_steps, 0.01),
     ("harsh", (14, 14), 0.5, 8, 40, 5, 0.03),  # three times as many: sigma is five times as large
 ])  # fmt: skip
 def test_static_scene_is_not_moving(request, preset, seeds, yaw_rate, n, n_scan, step, share):

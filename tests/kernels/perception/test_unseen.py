@@ -98,7 +98,7 @@ def test_moments_are_those_of_the_oracle(dt):
         np.ascontiguousarray(a, np.float32) for a in (mean, cov[:, TRIANGLE[0], TRIANGLE[1]], link, rate)
     )
     _turned(m, p, c, r, dt)
-    for i in range(N):
+    for i in range(0, N, 4):
         em, ep, ec = oracle(mean[i], cov[i], link[i], rate[i], dt)
         np.testing.assert_allclose(m[i], em, atol=ROUNDING)
         np.testing.assert_allclose(p[i], ep[TRIANGLE], atol=ROUNDING)
@@ -110,10 +110,10 @@ def test_moments_are_those_of_a_drawn_population():
     rate, speed, steps = 0.4, 1.5, 20
     course = np.array([0.6, 0.8])
     rng = np.random.default_rng(4)
-    sign, along = np.ones(400_000), np.zeros(400_000)
+    sign, along = np.ones(200_000), np.zeros(200_000)
     for _ in range(240):
         along += 0.005 * speed * sign
-        sign = np.where(rng.random(400_000) < rate * 0.005, -sign, sign)
+        sign = np.where(rng.random(200_000) < rate * 0.005, -sign, sign)
     m = np.tile(np.r_[0.0, 0.0, speed * course], (N, 1)).astype(np.float32)
     p, c, r = np.zeros((N, 10), np.float32), np.zeros((N, 5), np.float32), np.full(N, rate, np.float32)
     straight = np.kron(np.array([[1, 0.06], [0, 1]]), np.eye(2))
@@ -168,7 +168,7 @@ def test_rate_is_the_share_of_ways_that_end():
 @pytest.mark.parametrize("kind", [1, 2])
 def test_rate_is_that_of_a_drawn_population(kind):
     """A way's begin was seen (2), or the body was met anywhere on it (1)."""
-    rng, n, dt, way = np.random.default_rng(3), 4_000_000, 0.5, np.linspace(0.0, 4.5, N)
+    rng, n, dt, way = np.random.default_rng(3), 1_000_000, 0.5, np.linspace(0.0, 4.5, N)
     length = rng.uniform(2, 6, n)
     met = np.ones(n, bool)
     if kind == 1:  # long ways are met more often, and each at any place

@@ -72,7 +72,7 @@ def random_scan(seed):
 
 @pytest.mark.parametrize("turn", [0.0, 1.0])
 def test_sectors_equal_the_oracle(stage, turn):
-    for seed in range(5):
+    for seed in range(2):
         range_m, doppler, hit = (np.float32(a) for a in random_scan(seed))
         rng = np.random.default_rng(seed + 50)
         ping_yaw = rng.uniform(-3.1, 3.1, N_ENV).astype(np.float32)

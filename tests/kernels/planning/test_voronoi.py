@@ -17,7 +17,7 @@ from uuvtai.kernels.core.stage import Out
 from uuvtai.kernels.planning import medial_axis
 from uuvtai.state import VoronoiState
 
-N_MAP = 300
+N_MAP = 96
 COST_BOUND = 1.15
 """Demanded by the design: cost <= 1.15 x the exact optimum."""
 MEAN_BOUND = 1.05
@@ -36,9 +36,11 @@ STRICT = CONFIG.model_copy(
     update={
         "voronoi": V.model_copy(update={"use": "fused", "min_clearance_m": 0.3, "max_pops": 5000}),
         "quiet": CONFIG.quiet.model_copy(update={"room_m": 0.7}),
+        "route": CONFIG.route.model_copy(update={"spacing_m": 0.05}),
     }
 )
-"""One other compiled variant for all switches: both layers, another d_min, small budget, less room."""
+"""One other compiled variant for all switches: both layers, another d_min, small budget, less room, finer
+routes."""
 
 
 @lru_cache(maxsize=1)
@@ -69,7 +71,7 @@ def planned_maps():
 
 
 def test_a_route_is_found_exactly_where_there_is_one():
-    assert 200 < len([row for row in planned_maps() if np.isfinite(row[1])]) < len(planned_maps())
+    assert 64 < len([row for row in planned_maps() if np.isfinite(row[1])]) < len(planned_maps())
     for seed, exact, reason, way, *_ in planned_maps():
         assert (reason == enums.FAIL_NONE) == np.isfinite(exact), (
             f"map {seed}: reason {reason}, exact cost {exact}"
@@ -118,7 +120,7 @@ def test_the_skeleton_alone_serves_nearly_every_map():
 def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
     """By the distance between sites alone: every cell that a plan asked about, on a few maps."""
     asked = on_it = 0
-    for first in range(0, 12, N_PLAN):
+    for first in range(0, 8, N_PLAN):
         drawn = [maps.random_map(first + i) for i in range(N_ENV)]
         s = clean()
         put_maps([d[0] for d in drawn])
@@ -137,7 +139,7 @@ def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
             known = bits & medial_axis.KNOWN != 0
             assert np.array_equal((bits & medial_axis.SKELETON != 0)[known], expected[known])
             asked, on_it = asked + known.sum(), on_it + expected[known].sum()
-    assert asked > 10_000 and 0 < on_it < asked
+    assert asked > 6_000 and 0 < on_it < asked
 
 
 def test_the_papers_sum_agrees_with_the_cost():
@@ -256,8 +258,7 @@ def test_a_route_too_long_for_its_waypoints_is_spaced_wider():
         maps.box(occ, 1.5 + i, 2.45 if i % 2 == 0 else 3.55, 0.06, 2.45)
     put_maps([occ] * N_ENV)
     put_ends([(0.7, 3.0)] * N_ENV, [(19.0, 3.0)] * N_ENV)
-    fine = CONFIG.model_copy(update={"route": CONFIG.route.model_copy(update={"spacing_m": 0.05})})
-    plan([0], fine)
+    plan([0], STRICT)
     length = np.linalg.norm(np.diff(way_of(0), axis=0), axis=1)
     assert s.route.fallback_reason[0] == enums.FAIL_NONE
     assert length.sum() / 0.05 > CONFIG.route.n_way >= s.route.n_way[0] > 0.5 * CONFIG.route.n_way

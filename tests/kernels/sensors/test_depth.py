@@ -89,27 +89,21 @@ def assert_images(images, scene, tank, truth_of, envs=range(N_ENV)):
     assert counts[:, 0].sum() < GRAZING_SHARE * counts[:, 1].sum()
 
 
-def test_random_scenes_against_mujoco(rig, batches):
-    showing_obstacles = 0.0
-    for scene in batches:
-        rig.start(scene)
-        images = rig.shoot()
-        assert_images(images, scene, TANK, by_mujoco)
-        rig.start({**scene, "kind": np.zeros_like(scene["kind"])})
-        showing_obstacles += np.mean(np.abs(images - rig.shoot()) > 0.01) / N_BATCH
-    assert 0.1 < showing_obstacles < 0.9, "the scenes must show obstacles and walls"
-
-
 def test_random_scenes_against_oracle(rig, batches):
-    for scene in batches:
-        rig.start(scene)
-        assert_images(rig.shoot(), scene, TANK, by_oracle)
+    scene = batches[0]
+    rig.start(scene)
+    images = rig.shoot()
+    assert_images(images, scene, TANK, by_oracle)
+    rig.start({**scene, "kind": np.zeros_like(scene["kind"])})
+    assert 0.1 < np.mean(np.abs(images - rig.shoot()) > 0.01) < 0.9, (
+        "the scenes must show obstacles and walls"
+    )
 
 
 def test_round_tank_against_mujoco(rig):
     scene = scenes.random_scenes(np.random.default_rng(4), N_ENV, N_OBSTACLE, ROUND_TANK)
     rig.start(scene)
-    assert_images(rig.shoot(CLEAN, ROUND_TANK), scene, ROUND_TANK, by_mujoco, range(40))
+    assert_images(rig.shoot(CLEAN, ROUND_TANK), scene, ROUND_TANK, by_mujoco, range(80))
 
 
 def test_axes_and_scale_of_the_image(rig):

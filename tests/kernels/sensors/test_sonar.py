@@ -83,66 +83,39 @@ def assert_ranges(got, hit, lowest, truth, highest, max_range_m):
     assert wrong.mean() < GRAZING_SHARE
 
 
-def test_random_scenes_against_mujoco(rig, batches):
-    """Aperture 0: a beam is a line in space, which MuJoCo casts at the solids themselves."""
-    hits = 0
-    for scene in batches:
-        rig.start(scene)
-        out = rig.cast(FLAT)
-        found = []
-        for env in range(N_ENV):
-            caster = scenes.Caster(scene, env, TANK)
-            bearing = beam_headings(scene["quat"][env], N_RAY)
-            rays = np.stack([np.cos(bearing), np.sin(bearing), np.zeros(N_RAY)], axis=1)
-            truth = caster.distances(scene["pos"][env], rays)
-            off = np.abs(out["range_m"][env] - np.minimum(truth, CLEAN.max_range_m)) > RANGE_TOLERANCE_M
-            off |= out["hit"][env] != (truth <= CLEAN.max_range_m)
-            low, high = truth.copy(), truth.copy()
-            if off.any():
-                low[off], high[off] = scenes.envelope(
-                    lambda r, c=caster, s=scene["pos"][env]: c.distances(s, r), rays[off], GRAZING_RAD
-                )
-            found.append((low, truth, high))
-        low, truth, high = (np.array(column) for column in zip(*found, strict=True))
-        assert_ranges(out["range_m"], out["hit"], low, truth, high, CLEAN.max_range_m)
-        hits += out["hit"].sum()
-    assert 0.9 < hits / (N_BATCH * N_ENV * N_RAY) < 1.0
-
-
 def test_random_scenes_against_oracle_with_aperture(rig, batches):
     """Ranges, hits, intensity and Doppler; most obstacles are above or below the beams' plane."""
-    different, obstacles, compared = 0, 0, 0
-    for scene in batches:
-        rig.start(scene)
-        out = rig.cast(CLEAN)
-        oracle = [
-            [sonar_scan(scene, env, TANK, N_RAY, 10.0, turn) for env in range(N_ENV)]
-            for turn in (0.0, GRAZING_RAD, -GRAZING_RAD)
-        ]
-        ranges = np.array([[answer[0] for answer in row] for row in oracle])
-        assert_ranges(
-            out["range_m"], out["hit"], ranges.min(axis=0), ranges[0], ranges.max(axis=0), CLEAN.max_range_m
+    scene, different, obstacles, compared = batches[0], 0, 0, 0
+    rig.start(scene)
+    out = rig.cast(CLEAN)
+    oracle = [
+        [sonar_scan(scene, env, TANK, N_RAY, 10.0, turn) for env in range(N_ENV)]
+        for turn in (0.0, GRAZING_RAD, -GRAZING_RAD)
+    ]
+    ranges = np.array([[answer[0] for answer in row] for row in oracle])
+    assert_ranges(
+        out["range_m"], out["hit"], ranges.min(axis=0), ranges[0], ranges.max(axis=0), CLEAN.max_range_m
+    )
+    for env in range(N_ENV):
+        truth, cosine, who = oracle[0][env]
+        same = np.all(
+            [(turned[env][2] == who) & (np.abs(turned[env][1] - cosine) < 1e-3) for turned in oracle[1:]],
+            axis=0,
         )
-        for env in range(N_ENV):
-            truth, cosine, who = oracle[0][env]
-            same = np.all(
-                [(turned[env][2] == who) & (np.abs(turned[env][1] - cosine) < 1e-3) for turned in oracle[1:]],
-                axis=0,
-            )
-            steady = same & (np.abs(out["range_m"][env] - truth) < RANGE_TOLERANCE_M) & (out["hit"][env] == 1)
-            compared += steady.sum()
-            bearing = beam_headings(scene["quat"][env], N_RAY)
-            u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-            rate = doppler_by_differences(scene, env, u, truth, who)
-            assert np.abs(out["doppler_m_s"][env] - rate)[steady].max() < DOPPLER_TOLERANCE_M_S
-            intensity = np.maximum(cosine, 0.01) * (1 - 0.9 * truth / 12.0)
-            gently = steady & (cosine > 0.05)
-            assert np.abs(out["intensity"][env] - intensity)[gently].max() < 1.0e-3
-            assert np.all(out["doppler_m_s"][env][out["hit"][env] == 0] == 0)
-            obstacles += np.sum(who != WALL)
-            different += np.sum(np.abs(truth - sonar_scan(scene, env, TANK, N_RAY, 0.0)[0]) > 0.1)
-    assert compared > 0.9 * N_BATCH * N_ENV * N_RAY
-    assert obstacles > 5000 and different > 1250, (
+        steady = same & (np.abs(out["range_m"][env] - truth) < RANGE_TOLERANCE_M) & (out["hit"][env] == 1)
+        compared += steady.sum()
+        bearing = beam_headings(scene["quat"][env], N_RAY)
+        u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        rate = doppler_by_differences(scene, env, u, truth, who)
+        assert np.abs(out["doppler_m_s"][env] - rate)[steady].max() < DOPPLER_TOLERANCE_M_S
+        intensity = np.maximum(cosine, 0.01) * (1 - 0.9 * truth / 12.0)
+        gently = steady & (cosine > 0.05)
+        assert np.abs(out["intensity"][env] - intensity)[gently].max() < 1.0e-3
+        assert np.all(out["doppler_m_s"][env][out["hit"][env] == 0] == 0)
+        obstacles += np.sum(who != WALL)
+        different += np.sum(np.abs(truth - sonar_scan(scene, env, TANK, N_RAY, 0.0)[0]) > 0.1)
+    assert compared > 0.9 * N_ENV * N_RAY
+    assert obstacles > 2500 and different > 625, (
         "the scenes must show obstacles, many of them only thanks to the aperture"
     )
 
@@ -165,26 +138,6 @@ def test_round_tank_against_mujoco(rig):
     assert_ranges(
         out["range_m"], out["hit"], np.array(low), np.array(truth), np.array(high), FLAT.max_range_m
     )
-
-
-@pytest.mark.parametrize("distance, seen", [(3.0, True), (1.5, False)])
-def test_obstacle_above_the_beams_is_seen_from_afar_and_lost_close_by(rig, distance, seen):
-    """A short cylinder whose lower end is 0.4 m above the beams: seen beyond 0.4 / tan 10 deg = 2.27 m."""
-    scene = scenes.one_obstacle_scene(
-        N_ENV, N_OBSTACLE, (5.0, 3.0, -1.2), kind=scenes.CYLINDER,
-        obstacle_pos=(5.0 + distance + 0.2, 3.0, -0.6), size=(0.2, 0.2, 0.2),
-    )  # fmt: skip
-    rig.start(scene)
-    assert rig.cast()["range_m"][0, 0] == pytest.approx(distance if seen else 12.0, abs=1e-4)
-
-
-def test_own_motion_along_the_beam_is_negative_doppler_of_everything_still(rig):
-    scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 3.0, -1.0))
-    scene["vel_b"][:] = (0.5, 0.2, 0.1)
-    rig.start(scene)
-    out = rig.cast()
-    bearing = 2 * np.pi * np.arange(N_RAY) / N_RAY
-    assert np.abs(out["doppler_m_s"][0] + 0.5 * np.cos(bearing) + 0.2 * np.sin(bearing)).max() < 1e-5
 
 
 # ----------------------------------------------------------------------------------------------------- errors
@@ -314,11 +267,10 @@ def test_every_error_is_absent_at_zero(which):
 
 def test_ghost_takes_the_mirrored_path(rig):
     """In an empty tank beam 32 (45 deg) bounces off y = 6, then meets x = 20 (or the range limit)."""
-    config = SonarConfig(ghost=1.0)
     scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (15.0, 4.0, -1.0))
     scene["vel_b"][:] = (0.3, 0.1, 0.0)
     rig.start(scene)
-    out = rig.cast(config)
+    out = rig.cast(LATE)
     u = np.sqrt(0.5)
     assert out["range_m"][0, 32] == pytest.approx(5.0 / u, abs=1e-4)
     assert out["doppler_m_s"][0, 32] == pytest.approx(-(0.3 + 0.1) * u, abs=1e-5)
@@ -330,7 +282,7 @@ def test_ghost_takes_the_mirrored_path(rig):
         size=(0.5, 1.0, 0.5), obstacle_vel=(-0.7, 0.2, 0.0),
     )  # fmt: skip
     rig.start(moving)
-    out = rig.cast(config)
+    out = rig.cast(LATE)
     assert out["range_m"][0, 32] == pytest.approx(4.0 / u, abs=1e-4), (
         "wall at (12, 6), then the box's face x = 14 at (14, 4)"
     )
@@ -338,6 +290,8 @@ def test_ghost_takes_the_mirrored_path(rig):
     assert out["range_m"][0, 0] == pytest.approx(4.0, abs=1e-4)
 
 
+LATE = SonarConfig(ghost=1.0, bubble_clouds_per_s=0.5, period_steps=5, latency_steps=10)
+"""of three tests: one kernel"""
 HARSH = load_config("pool", "harsh").sensors.sonar
 
 
@@ -385,7 +339,6 @@ def test_harsh_preset_shows_every_error_at_its_rate(rig):
 
 def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
     """Share of covered beams = rate x mean duration x mean width / n_ray; runs of 3-8 beams at one range."""
-    config = SonarConfig(bubble_clouds_per_s=0.5, period_steps=5)
     scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 3.0, -0.8))
     rig.start(scene)
     clean = rig.cast(CLEAN)
@@ -393,7 +346,7 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
     covered, runs, lives = [], [], np.zeros((N_ENV, N_RAY), int)
     for step in range(0, 1000, 5):
         set_step(rig.clock, step)
-        out = rig.cast(config, names=("range_m",))
+        out = rig.cast(LATE, names=("range_m",))
         nearer = out["range_m"] < clean["range_m"] - 1e-3
         covered.append(nearer.mean())
         lives = np.where(nearer, lives + 1, 0)
@@ -413,30 +366,29 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
 
 
 def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
-    """Ping every 2 steps, delivered 3 steps later (two scans under way at once)."""
-    config = SonarConfig(period_steps=2, latency_steps=3)
+    """Ping every 5 steps, delivered 10 steps later (two scans under way at once)."""
     scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (10.0, 3.0, -0.8))
     rig.start(scene)
     fresh = {}
-    for step in range(12):
+    for step in range(28):
         set_step(rig.clock, step)
-        scene["pos"][:, 0] = 10.0 - 0.1 * step
+        scene["pos"][:, 0] = 10.0 - 0.05 * step
         scenes.load(scene, rig.vehicle, rig.world)
         put(rig.ego, pos_w=step, vel_b=-step, vel_valid=step % 4 == 0, rpy=0.01 * step)
-        out = rig.cast(config)
+        out = rig.cast(LATE)
         assert len(set(out["fresh"])) == 1
         if out["fresh"][0]:
             fresh[step] = out["ping_step"][0]
         last = fresh[max(fresh)]
         assert np.all(out["ping_step"] == last), "between deliveries the old scan stays"
-        assert out["range_m"][0, N_RAY // 2] == pytest.approx(10.0 - 0.1 * last, abs=1e-4), (
+        assert out["range_m"][0, N_RAY // 2] == pytest.approx(10.0 - 0.05 * last, abs=1e-4), (
             "what was true when it was pinged"
         )
         assert np.all(rig.scan.ping_pos_w.to_numpy() == last)
         assert np.all(rig.scan.ping_vel_b.to_numpy() == -last)
         assert np.all(rig.scan.ping_vel_valid.to_numpy() == (last % 4 == 0))
         assert np.allclose(rig.scan.ping_yaw.to_numpy(), 0.01 * last)
-    assert fresh == {0: 0, 5: 2, 7: 4, 9: 6, 11: 8}, "the first scan is delivered at once, and only then"
+    assert fresh == {0: 0, 15: 5, 20: 10, 25: 15}, "the first scan is delivered at once, and only then"
 
 
 def test_sleeping_rows_keep_their_scan(rig, batches):

@@ -111,7 +111,7 @@ def test_power_is_the_oracles(rig, scene):
 def test_what_is_heard_has_the_scenes_mean_and_rayleighs_speckle(rig, scene):
     rig.start(scene, range(N_ENV))
     heard = []
-    for ping in range(60):
+    for ping in range(30):
         rig.clock.step.fill(5 * ping)
         heard.append(rig.ping()[2][:, :, :N_BIN])
     heard = np.array(heard)
@@ -273,10 +273,10 @@ def rendered(scene, beams):
     return multibeam.beam_pattern(beams[:, None] - bearing[None]) ** 2 @ power
 
 
-@pytest.mark.parametrize("centre", [(4.0, 0.0, 0.0), (6.0, 2.0, 0.8), (3.0, -1.0, -0.7)])
+@pytest.mark.parametrize("centre", [(6.0, 2.0, 0.8), (3.0, -1.0, -0.7)])
 def test_a_sphere_returns_what_its_points_return(centre):
     """Power in all to 5 %, power of each beam to 6 % of the strongest."""
-    beams = np.radians(np.arange(-40, 40.1, 0.5))
+    beams = np.radians(np.arange(-40, 40.1, 1.0))
     found = rendered(scene_of(body("sphere", list(centre), [0.4] * 3)), beams)
     normal = np.random.default_rng(1).normal(size=(n := 100_000, 3))
     normal /= np.linalg.norm(normal, axis=1)[:, None]

@@ -43,12 +43,15 @@ def plant(request):
 
 
 def drive(plant, actions, steps):
-    """Velocities (steps, n_env, 4) [u, v, w, r] and tilt (steps, n_env) [deg] under constant actions."""
+    """Velocities (steps, n_env, 4) [u, v, w, r] and every tenth tilt (n_env) [deg] under constant actions."""
     velocity, tilt = [], []
-    for _ in range(steps):
+    for step in range(steps):
         plant.step(actions)
         velocity.append(np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()[:, 2]])
-        tilt.append([np.degrees(np.abs(angles_of(*q)[:2]).max()) for q in plant.vehicle.quat_wb.to_numpy()])
+        if step % 10 == 0:
+            tilt.append(
+                [np.degrees(np.abs(angles_of(*q)[:2]).max()) for q in plant.vehicle.quat_wb.to_numpy()]
+            )
     return np.array(velocity), np.array(tilt)
 
 
@@ -57,9 +60,9 @@ def drive(plant, actions, steps):
 
 @pytest.fixture(scope="module")
 def response(plant):
-    """Ten seconds of every action from rest."""
+    """Six seconds of every action from rest."""
     plant.reset()
-    return (*drive(plant, ACTIONS, 500), plant.vehicle.pos_w.to_numpy())
+    return (*drive(plant, ACTIONS, 300), plant.vehicle.pos_w.to_numpy())
 
 
 def test_full_surge_is_reached_within_two_seconds(response):
@@ -83,7 +86,7 @@ def test_roll_and_pitch_stay_small(response):
 
 
 def test_depth_is_held_under_the_net_buoyancy(response):
-    assert np.abs(response[2][-1]).max() < 0.03  # left alone it would rise by 0.47 m
+    assert np.abs(response[2][-1]).max() < 0.03  # left alone it would rise by 0.2 m
 
 
 def test_braking_ends_at_rest(plant):
@@ -153,11 +156,11 @@ def test_saturation_keeps_the_direction(plant):
 
 @pytest.mark.parametrize("speed", [1.0, 0.2])
 def test_blocked_vehicle_does_not_wind_up(plant, speed):
-    """A minute against a wall, then free: no overshoot, six seconds at worst to forget."""
+    """Half a minute against a wall, then free: no overshoot, six seconds at worst to forget."""
     plant.reset()
     set_ego(plant, 0.0, 0.0, 0.0)
     action = np.tile(np.array([speed, 0, 0, 0], np.float32), (N_ENV, 1))
-    for _ in range(3000):
+    for _ in range(1500):
         plant.command(action)
     assert np.abs(plant.actuation.integral.to_numpy()).max() <= plant.config.actuation.max_integral_n
     velocity, _ = drive(plant, action, 350)

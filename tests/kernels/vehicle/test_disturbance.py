@@ -48,7 +48,6 @@ def test_off_by_default(calm):
     assert (p.linear_damping.to_numpy() == np.float32(v.linear_damping)).all()
     assert (p.quadratic_damping.to_numpy() == np.float32(v.quadratic_damping)).all()
     assert (p.thruster_gain.to_numpy() == 1).all() and not p.delay_steps.to_numpy().any()
-    calm.step()
     assert not calm.current.vel_w.to_numpy().any()
 
 

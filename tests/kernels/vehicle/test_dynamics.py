@@ -101,7 +101,7 @@ def reference(case, seconds):
 @cache
 def random_reference(index):
     """That of a random case."""
-    return reference(random_cases(6)[index], 5.0)
+    return reference(random_cases(3)[index], 5.0)
 
 
 # ------------------------------------------------------------------------------------------- double precision
@@ -110,7 +110,7 @@ def random_reference(index):
 @pytest.fixture(scope="module")
 def exact_runs():
     """Table first, then random cases, at one, two and four substeps of a control step of 0.02 s."""
-    return run_f64([*TABLE.values(), *random_cases(6)], [1, 2, 4], 101)
+    return run_f64([*TABLE.values(), *random_cases(3)], [1, 2, 4], 101)
 
 
 @pytest.mark.parametrize(("case", "time_s", "quantity", "component", "value", "digits"), EXPECTED)
@@ -121,7 +121,7 @@ def test_reference_table(exact_runs, case, time_s, quantity, component, value, d
     assert abs(fine - value) < 1.5 * digits
 
 
-@pytest.mark.parametrize("index", range(6))
+@pytest.mark.parametrize("index", range(3))
 def test_random_experiments_agree_with_rk4(exact_runs, index):
     want = random_reference(index)
     column = len(TABLE) + index
@@ -134,7 +134,7 @@ def test_random_experiments_agree_with_rk4(exact_runs, index):
 
 
 def test_halving_dt_divides_the_error_by_four(exact_runs):
-    for index, case in enumerate([TABLE["roll release"], *random_cases(6)]):
+    for index, case in enumerate([TABLE["roll release"], *random_cases(3)]):
         column = list(TABLE).index("roll release") if index == 0 else len(TABLE) + index - 1
         want = random_reference(index - 1) if index else reference(case, 3.0)
         error = [np.abs(exact_runs[n]["nu"][15, column] - want["nu"][15]).max() for n in (1, 2, 4)]
@@ -186,7 +186,7 @@ def motion(plant):
 
 def test_acceleration_equals_the_oracle(plant):
     dt = 2.0**-10  # small enough that the change over it is dt times the derivative at its middle
-    for seed in range(5):
+    for seed in range(3):
         q, nu, wrench, current = random_state(plant, seed)
         plant.step(substeps=1, dt_s=dt)
         after = np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()].astype(float)
@@ -219,7 +219,7 @@ def test_imu_acceleration_is_the_derivative_of_the_world_velocity(plant):
         assert np.allclose(turned.T @ change, v.acc_b.to_numpy()[env], atol=5e-3)
 
 
-@settings(max_examples=20, derandomize=True, deadline=None)
+@settings(max_examples=8, derandomize=True, deadline=None)
 @given(st.integers(0, 10**6))
 def test_energy_never_grows_without_thrust_and_current(plant, seed):
     random_state(plant, seed)
@@ -263,14 +263,20 @@ def test_frictionless_body_keeps_its_energy(plant):
     assert np.abs(kinetic() / before - 1).max() < 1e-3
 
 
-def test_added_mass_that_follows_the_water_knows_no_uniform_current():
+TETHER = {"tether_m": 30.0, "tether_at_b_m": (-0.2, 0.0, 0.1)}
+
+
+@pytest.fixture(scope="module")
+def tethered_plant():
+    """A tether, and added mass that follows the water."""
+    vehicle = VehicleConfig(attitude_hold="none", added_mass_follows="water", **TETHER)
+    return Plant(Config(vehicle=vehicle), start_taichi("cpu"), n_env=2)
+
+
+def test_added_mass_that_follows_the_water_knows_no_uniform_current(tethered_plant):
     """Galilei: in a uniform current everything is as in still water, plus the drift."""
     current = np.array([0.3, -0.2, 0.0], np.float32)
-    plant = Plant(
-        Config(vehicle=VehicleConfig(attitude_hold="none", added_mass_follows="water")),
-        start_taichi("cpu"),
-        n_env=2,
-    )
+    plant = tethered_plant
     plant.reset()
     plant.write(plant.actuation.external_wrench_b, [4, 1, 0, 0, 0, 0.4])
     plant.write(plant.current.vel_w, [current, 0 * current])
@@ -284,11 +290,9 @@ def test_added_mass_that_follows_the_water_knows_no_uniform_current():
     assert np.abs(plant.vehicle.rate_b.to_numpy()[0] - plant.vehicle.rate_b.to_numpy()[1]).max() < F32_DRIFT_M
 
 
-def test_a_tether_drags_across_as_a_third_of_its_length():
+def test_a_tether_drags_across_as_a_third_of_its_length(tethered_plant):
     """Beside the oracle, whose wrench it is: towed level, and turned on the spot."""
-    length_m, wide_m, at = 30.0, 0.0076, np.array([-0.2, 0.0, 0.1])
-    vehicle = VehicleConfig(attitude_hold="none", tether_m=length_m, tether_at_b_m=tuple(at))
-    plant = Plant(Config(vehicle=vehicle), start_taichi("cpu"), n_env=2)
+    plant, wide_m, (length_m, at) = tethered_plant, 0.0076, TETHER.values()
     pushes = np.array([[20.0, 10.0, 3.0, 0, 0, 0], [0, 0, 0, 0, 0, 2.0]])
 
     def tethered(push):
@@ -302,21 +306,13 @@ def test_a_tether_drags_across_as_a_third_of_its_length():
 
     plant.reset()
     plant.write(plant.actuation.external_wrench_b, pushes)
-    for _ in range(100):
+    for _ in range(50):
         plant.step()
     nu = np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()]
     for env, push in enumerate(pushes):
-        found = oracle.simulate(oracle.Body(), 2.0, DT_S, tethered(push))["nu"][-1]
-        free = oracle.simulate(oracle.Body(), 2.0, DT_S, push)["nu"][-1]
+        found = oracle.simulate(oracle.Body(), 1.0, DT_S, tethered(push))["nu"][-1]
+        free = oracle.simulate(oracle.Body(), 1.0, DT_S, push)["nu"][-1]
         assert np.abs(nu[env] - found).max() < SPEED_M_S < np.abs(found - free).max()
-
-
-def test_coriolis_matrix_is_skew_and_mass_matrix_positive():
-    nu = np.random.default_rng(0).normal(size=6)
-    for matrix in (oracle.Body().mass_matrix, np.diag(oracle.Body().added)):
-        c = oracle.coriolis_matrix(matrix, nu)
-        assert np.array_equal(c, -c.T)
-        assert np.linalg.eigvalsh(matrix).min() > 0
 
 
 WRONG = [
@@ -335,7 +331,7 @@ def test_neutral_body_rests(plant):
     plant.reset()
     plant.write(plant.params.buoyancy_n, plant.params.mass_kg.to_numpy() * np.float32(9.81))
     plant.write(plant.vehicle.quat_wb, [1, 0, 0, 0])
-    for _ in range(100):
+    for _ in range(50):
         plant.step()
     assert np.array_equal(plant.vehicle.pos_w.to_numpy(), np.zeros((N_ENV, 3), np.float32))
 
