@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.command import Quiet
+from tests.conftest import configure
 from uuvtai.config.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
 from uuvtai.evaluation.agents import AgentSpec, differences, load_agents
 from uuvtai.evaluation.evaluate import Request, compare
@@ -69,9 +70,11 @@ def test_a_policy_that_meets_another_stack_than_in_training_is_told():
 def compared(small, tmp_path_factory):
     """The session's simulator stands for both, to compile none: what each row asked for is kept."""
     asked = []
+    episode = small.config.episode.model_copy(update={"horizon_steps": 100})
+    config = small.config.model_copy(update={"episode": episode})
     request = Request(
-        config=small.config, world="pool", sensors="paper", agents=["bt", "paper"], seeds=[5],
-        episodes=3, num_envs=small.N,
+        config=config, world="pool", sensors="paper", agents=["bt", "paper"], seeds=[5],
+        episodes=2, num_envs=small.N,
         record=1, device="cpu", run_dir=tmp_path_factory.mktemp("runs") / "run",
     )  # fmt: skip
 
@@ -82,10 +85,11 @@ def compared(small, tmp_path_factory):
         return small.sim
 
     with pytest.MonkeyPatch.context() as patch:
+        configure(patch, small.sim, config)
         patch.setattr("uuvtai.sim.sim.Sim", made)
         found = compare(request, Quiet())
     small.sim.use_tree(small.trees["bt"])
-    assert asked == [small.config, with_stack(small.config, "paper")]
+    assert asked == [config, with_stack(config, "paper")]
     assert asked[1].voronoi.use == "fused" and not asked[1].forecast.use_turn_rate
     return found
 
@@ -111,11 +115,10 @@ def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
     assert json.loads((folder / "eval/result.json").read_text())["agents"][1]["stack"]["preset"] == "paper"
 
 
-@pytest.mark.parametrize("stack", ["paper", "best"])
-def test_every_stack_plans_and_drives(small, stack):
-    """Their kernels differ from those of all other tests by more than numbers."""
-    config = with_stack(small.config, stack)
-    sim = Sim(config, small.N, read_tree(tree_of_stack(stack)))
+def test_the_papers_stack_plans_and_drives(small):
+    """Its kernels differ from those of all other tests by more than numbers; those of the best one:
+    ``tests/learning/test_learned_forecast.py``."""
+    sim = Sim(with_stack(small.config, "paper"), small.N, read_tree(tree_of_stack("paper")))
     every = torch.ones(small.N, dtype=torch.int32)
     sim.reset(every, 5 * every, torch.arange(small.N, dtype=torch.int32))
     for _ in range(100):
