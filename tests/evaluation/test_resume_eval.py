@@ -60,6 +60,7 @@ def ask(small, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         configure(patch, small.sim, config)
+        patch.setattr("uuvtai.evaluation.evaluate._draw", lambda *_arguments: None)
         patch.setattr(
             "uuvtai.sim.sim.Sim",
             lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim,
