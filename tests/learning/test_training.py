@@ -118,16 +118,6 @@ def test_a_run_leaves_a_complete_folder(points, tmp_path):
     assert all(interval[0] <= rate <= interval[1] for rate, interval in rates if rate is not None)
 
 
-def test_2n_iterations_are_n_and_a_resumed_n_bit_for_bit(points, tmp_path):
-    whole, half = tmp_path / "whole", tmp_path / "half"
-    train(TrainRequest(config=config_of(), run_dir=whole), Quiet())
-    train(TrainRequest(config=config_of(), run_dir=half, iterations=3), Quiet())
-    train(TrainRequest(resume=half, iterations=6), Quiet())
-    assert content_of(whole / "checkpoints/step_000006") == content_of(half / "checkpoints/step_000006")
-    assert notes(whole) == notes(half)
-    assert [entry["iteration"] for entry in run_json(half)["resumed"]] == [3]
-
-
 def test_an_interrupt_finishes_the_iteration_and_saves(points, tmp_path):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     watch = Quiet(press_at=3)
@@ -140,7 +130,7 @@ def test_an_interrupt_finishes_the_iteration_and_saves(points, tmp_path):
     train(TrainRequest(config=config_of(), run_dir=whole), Quiet())
     assert content_of(whole / "checkpoints/step_000006") == content_of(cut / "checkpoints/step_000006")
     assert notes(whole) == notes(cut)
-    assert run_json(cut)["status"] == "finished"
+    assert run_json(cut)["status"] == "finished" and len(run_json(cut)["resumed"]) == 1
 
 
 def test_a_second_interrupt_stops_at_once(points, tmp_path):

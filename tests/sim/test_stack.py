@@ -94,7 +94,7 @@ def compared(small, tmp_path_factory):
     return found
 
 
-def test_bt_and_paper_are_two_rows_of_one_table(compared):
+def test_bt_and_paper_are_two_rows_of_one_table_and_recorded(compared):
     result, folder = compared
     bt, paper = result["agents"]
     assert (bt["name"], paper["name"], paper["stack"]["tree"]) == ("bt", "paper", tree_of_stack("paper"))
@@ -103,11 +103,6 @@ def test_bt_and_paper_are_two_rows_of_one_table(compared):
     ]
     assert len(result["paired"]) == 1
     assert (folder / "eval/trees/paper.xml").read_text() == (folder / "eval/trees/bt.xml").read_text()
-
-
-def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
-    """Here one simulator; scenarios: ``test_a_stack_touches_nothing_that_makes_an_episode``."""
-    _, folder = compared
     assert sorted(log.name for log in (folder / "logs").iterdir()) == [
         "bt_seed5_episode0.mcap",
         "paper_seed5_episode0.mcap",
