@@ -12,7 +12,9 @@ from tests.command import uuv
 from tests.small_sim import SmallSim
 from uuvtai import api
 
-SMALL = {"num_envs": SmallSim.N, "device": "cpu", "overrides": SmallSim.CHANGES}
+HORIZON = 300
+CHANGES = SmallSim.CHANGES | {"episode.horizon_steps": HORIZON}
+SMALL = {"num_envs": SmallSim.N, "device": "cpu", "overrides": CHANGES}
 OWN = '''"""Drives."""
 
 def act(view):
@@ -56,7 +58,8 @@ def pandas(monkeypatch):
 
 def test_an_evaluation_is_that_of_the_command(run, capfd, tmp_path):
     typed = ["eval", "--agent", "straight", "--seeds", "3", "--episodes", "4", "--run-dir", tmp_path / "run"]
-    code, printed, _ = uuv(capfd, *typed, "--json", *SmallSim.OPTIONS)
+    horizon = f"episode.horizon_steps={HORIZON}"
+    code, printed, _ = uuv(capfd, *typed, "--json", *SmallSim.OPTIONS, "--set", horizon)
     found = run[0]
     ours, theirs = found.document["agents"][0], json.loads(printed)["agents"][0]
     clock = ("wall_s", "env_steps_per_s")
@@ -146,12 +149,19 @@ def test_bad_input_is_refused_as_by_the_command():
     assert {"evaluate", "train", "make"} <= set(dir(uuvtai))
 
 
-def test_a_sweep_and_a_training_are_those_of_the_commands(run, tmp_path, pandas):
+class Here:
+    """An engine that needs no other process."""
+
+    def run(self, work, items):
+        yield from enumerate(map(work, items))
+
+
+def test_a_sweep_and_a_training_are_those_of_the_commands(run, tmp_path, pandas, monkeypatch):
+    monkeypatch.setattr("uuvtai.evaluation.sweep.engine_of", lambda *_asked: Here())
     cells = uuvtai.sweep("straight", {"D": [0, 9]}, episodes=2, run_dir=tmp_path / "sweep", **SMALL)
     assert api._several(3) == [3] and api._several((1, 2)) == [1, 2]
     assert [row["D"] for row in cells.to_pandas()] == [0, 9] and "2 cells x 2 episodes" in str(cells)
-    few = SmallSim.CHANGES | {"train.num_envs": 8, "episode.horizon_steps": 400, "distillation.batch": 32}
-    few |= {"world_model.batch": 32}
+    few = CHANGES | {"train.num_envs": 8, "distillation.batch": 32, "world_model.batch": 32}
     first = uuvtai.train(
         "smoke", seed=1, iterations=1, overrides=few, device="cpu", run_dir=tmp_path / "train"
     )

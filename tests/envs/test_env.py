@@ -276,7 +276,7 @@ def test_obstacles_and_advice_stand_behind_the_paper_observation(small, env, mon
     """Switched on by the config: what was there stays, and the tree's action is the one that is told."""
     plain = VectorEnv(small.sim, seed=SEED)
     wanted = [plain.reset()[0].clone(), *(plain.step(full([0.6, 0, 0, 0.05]))[0].clone() for _ in range(80))]
-    more = small.config.observation.model_copy(update={"n_track": 2, "behavior": True})
+    more = small.config.observation.model_copy(update={"n_track": 4, "behavior": True})
     configure(monkeypatch, small.sim, small.config.model_copy(update={"observation": more}))
     with VectorEnv(small.sim, seed=SEED) as shown:
         assert shown.observation_sha256 != plain.observation_sha256
@@ -291,7 +291,7 @@ def test_obstacles_and_advice_stand_behind_the_paper_observation(small, env, mon
             assert (obs[:, shown.columns["behavior_class"]].sum(dim=1) == (info["leaf"] >= 0)).all()
             moving = (small.sim.s.tracks.alive.to_numpy() * small.sim.s.tracks.moving.to_numpy()).sum(axis=1)
             np.testing.assert_array_equal(
-                obs[:, shown.columns["obstacle_valid"]].sum(dim=1), moving.clip(max=2)
+                obs[:, shown.columns["obstacle_valid"]].sum(dim=1), moving.clip(max=4)
             )
             seen += int(moving.sum())
             obs, *_rest, info = shown.step(full([0.6, 0, 0, 0.05]))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import configure
 from uuvtai.common.errors import UserError
 from uuvtai.config.loader import preset_path
 from uuvtai.evaluation import results
@@ -43,18 +44,23 @@ class Watch:
 
 @pytest.fixture(scope="module")
 def ask(small, tmp_path_factory):
-    """Requests of the session's simulator; the blind oracle drives, twice: its episodes are short."""
+    """Requests of the session's simulator; the blind oracle drives, twice. Its second episode is over before
+    the horizon."""
+    episode = small.config.episode.model_copy(update={"horizon_steps": 125})
+    config = small.config.model_copy(update={"episode": episode})
     second = tmp_path_factory.mktemp("trees") / "second.xml"
     second.write_text(preset_path("tree", "straight").read_text())
 
     def request(folder, **others):
         given = {
-            "agents": ["straight", str(second)], "episodes": EPISODES, "seeds": [77], "num_envs": 2,
+            "agents": ["straight", str(second)], "episodes": EPISODES, "seeds": [3], "num_envs": 2,
             "device": "cpu", "record": 2,
         }  # fmt: skip
-        return Request(config=small.config, world="pool", sensors="paper", run_dir=folder, **given | others)
+        return Request(config=config, world="pool", sensors="paper", run_dir=folder, **given | others)
 
     with pytest.MonkeyPatch.context() as patch:
+        configure(patch, small.sim, config)
+        patch.setattr("uuvtai.evaluation.evaluate._draw", lambda *_arguments: None)
         patch.setattr(
             "uuvtai.sim.sim.Sim",
             lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim,

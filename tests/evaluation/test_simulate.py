@@ -1,5 +1,6 @@
 """uuv simulate's function: what it returns, at which times, and what it refuses."""
 
+import functools
 import json
 import math
 
@@ -17,8 +18,10 @@ F32_POSITION_M = 2e-3
 """Single precision over some hundred substeps, far below the design's 1 cm."""
 
 
-def raw(**overrides):
-    return load_config("open", overrides={"vehicle.attitude_hold": "none", **overrides})
+@functools.cache
+def raw():
+    """One object: kernels are compiled anew for another."""
+    return load_config("open", overrides={"vehicle.attitude_hold": "none"})
 
 
 def run(config, **kwargs):

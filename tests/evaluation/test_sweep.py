@@ -286,7 +286,7 @@ HORIZON_S = 8.0
 OPTIONS = [*SmallSim.OPTIONS, "--set", "episode.horizon_steps=400", "-S", "4", "--episodes", "4", "--json"]
 
 
-def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
+def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path, capfd):
     """To the last digit, also after SIGKILL."""
     place = tmp_path / "sweep"
     command = ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--agent", "bt", *OPTIONS]
@@ -300,10 +300,9 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
         time.sleep(0.02)
     child.kill()
     child.wait()
-    words = [sys.executable, "-m", "uuvtai", "sweep", "--resume", str(place), "--json"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    cells = json.loads(done.stdout)["cells"]
+    code, out, err = uuv(capfd, "sweep", "--resume", place, "--json")
+    assert code == 0, err
+    cells = json.loads(out)["cells"]
     assert [(cell["D"], cell["v_m_s"]) for cell in cells] == [(2, 1.5), (6, 1.5)]
     results, _ = run_episodes(small.sim, [Job(0, episode, (4, 2, 1.5)) for episode in range(4)])
     small.sim.set_scenes()

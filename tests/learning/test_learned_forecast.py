@@ -66,8 +66,8 @@ def made(monkeypatch):
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory, taichi_runtime):
-    """A small simulator that forecasts by a network which has learnt nothing; else it is the stack with one,
-    whose kernels ``tests/sim/test_stack.py`` needs too."""
+    """A small simulator that forecasts by a network which has learnt nothing; else it is the stack with
+    one."""
     path = tmp_path_factory.mktemp("net") / "f.safetensors"
 
     class LearnedSim(SmallSim):

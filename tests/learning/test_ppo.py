@@ -422,18 +422,11 @@ def play(policy, ppo, task, generator, rollouts):
 
 def test_a_point_learns_to_go_home():
     """The best policy goes straight home and stays: about -0.2; drifting at random costs more than 1."""
-
-    def train():
-        generator = torch.Generator().manual_seed(3)
-        policy = ActorCritic(4, PolicyConfig(hidden=(32, 32), initial_std=0.5), generator)
-        ppo = Ppo(
-            policy, PpoConfig(rollout_steps=32, learning_rate=3e-3, epochs=4, gamma=0.9, entropy_weight=0.0)
-        )
-        return play(policy, ppo, PointTask(generator), generator, 25), weights(policy)
-
-    means, trained = train()
+    generator = torch.Generator().manual_seed(3)
+    policy = ActorCritic(4, PolicyConfig(hidden=(32, 32), initial_std=0.5), generator)
+    ppo = Ppo(
+        policy, PpoConfig(rollout_steps=32, learning_rate=3e-3, epochs=4, gamma=0.9, entropy_weight=0.0)
+    )
+    means = play(policy, ppo, PointTask(generator), generator, 25)
     assert sum(means[:2]) / 2 < -1.0
     assert sum(means[-5:]) / 5 > -0.4
-    again, same = train()
-    assert again == means
-    assert torch.equal(same, trained)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.command import Quiet
+from tests.conftest import configure
 from uuvtai.config.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
 from uuvtai.evaluation.agents import AgentSpec, differences, load_agents
 from uuvtai.evaluation.evaluate import Request, compare
@@ -69,9 +70,11 @@ def test_a_policy_that_meets_another_stack_than_in_training_is_told():
 def compared(small, tmp_path_factory):
     """The session's simulator stands for both, to compile none: what each row asked for is kept."""
     asked = []
+    episode = small.config.episode.model_copy(update={"horizon_steps": 100})
+    config = small.config.model_copy(update={"episode": episode})
     request = Request(
-        config=small.config, world="pool", sensors="paper", agents=["bt", "paper"], seeds=[5],
-        episodes=3, num_envs=small.N,
+        config=config, world="pool", sensors="paper", agents=["bt", "paper"], seeds=[5],
+        episodes=2, num_envs=small.N,
         record=1, device="cpu", run_dir=tmp_path_factory.mktemp("runs") / "run",
     )  # fmt: skip
 
@@ -82,15 +85,16 @@ def compared(small, tmp_path_factory):
         return small.sim
 
     with pytest.MonkeyPatch.context() as patch:
+        configure(patch, small.sim, config)
         patch.setattr("uuvtai.sim.sim.Sim", made)
         found = compare(request, Quiet())
     small.sim.use_tree(small.trees["bt"])
-    assert asked == [small.config, with_stack(small.config, "paper")]
+    assert asked == [config, with_stack(config, "paper")]
     assert asked[1].voronoi.use == "fused" and not asked[1].forecast.use_turn_rate
     return found
 
 
-def test_bt_and_paper_are_two_rows_of_one_table(compared):
+def test_bt_and_paper_are_two_rows_of_one_table_and_recorded(compared):
     result, folder = compared
     bt, paper = result["agents"]
     assert (bt["name"], paper["name"], paper["stack"]["tree"]) == ("bt", "paper", tree_of_stack("paper"))
@@ -99,11 +103,6 @@ def test_bt_and_paper_are_two_rows_of_one_table(compared):
     ]
     assert len(result["paired"]) == 1
     assert (folder / "eval/trees/paper.xml").read_text() == (folder / "eval/trees/bt.xml").read_text()
-
-
-def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
-    """Here one simulator; scenarios: ``test_a_stack_touches_nothing_that_makes_an_episode``."""
-    _, folder = compared
     assert sorted(log.name for log in (folder / "logs").iterdir()) == [
         "bt_seed5_episode0.mcap",
         "paper_seed5_episode0.mcap",
@@ -111,11 +110,10 @@ def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
     assert json.loads((folder / "eval/result.json").read_text())["agents"][1]["stack"]["preset"] == "paper"
 
 
-@pytest.mark.parametrize("stack", ["paper", "best"])
-def test_every_stack_plans_and_drives(small, stack):
-    """Their kernels differ from those of all other tests by more than numbers."""
-    config = with_stack(small.config, stack)
-    sim = Sim(config, small.N, read_tree(tree_of_stack(stack)))
+def test_the_papers_stack_plans_and_drives(small):
+    """Its kernels differ from those of all other tests by more than numbers; those of the best one:
+    ``tests/learning/test_learned_forecast.py``."""
+    sim = Sim(with_stack(small.config, "paper"), small.N, read_tree(tree_of_stack("paper")))
     every = torch.ones(small.N, dtype=torch.int32)
     sim.reset(every, 5 * every, torch.arange(small.N, dtype=torch.int32))
     for _ in range(100):

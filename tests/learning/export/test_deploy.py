@@ -81,7 +81,6 @@ def exported(found, out, note=lambda _text: None, evaluations=()):
 
 CASES = {
     "plain, held for ten": {"policy.hold_steps": 10},
-    "plain at every step": {},
     "no features, tanh": {
         "world_model.as_features": False,
         "policy.activation": "tanh",
@@ -137,9 +136,14 @@ def test_networks_that_have_seen_nothing_agree_too(tmp_path):
     assert run_policy.of_numpy(driver(found, module), golden_of(module))["agrees"]
 
 
-def test_a_held_action_does_not_follow_the_newest_observation(tmp_path, no_onnx):
-    exported(saved(tmp_path / "run", policy__hold_steps=10), tmp_path / "out")
-    policy = run_policy.load(tmp_path / "out")
+@pytest.fixture(scope="module")
+def held(tmp_path_factory):
+    """(folder of an exported policy that decides at every tenth step, its checkpoint)"""
+    return without_graph(tmp_path_factory.mktemp("held"), policy__hold_steps=10)
+
+
+def test_a_held_action_does_not_follow_the_newest_observation(held):
+    policy = run_policy.load(held[0])
     first, second = policy.act(np.zeros(N_OBS)), policy.act(np.ones(N_OBS))
     np.testing.assert_array_equal(second.action, first.action)
     np.testing.assert_allclose(second.command_si, second.action * [0.6, 0.6, 0.4, 1.0], rtol=1e-6)
@@ -157,10 +161,9 @@ def test_an_observation_of_another_width_is_refused(folder):
 
 
 @pytest.mark.skipif(bool(missing_packages()), reason="needs the extra uuvtai[export]")
-@pytest.mark.parametrize("changes", [{"policy__hold_steps": 10}, {"world_model__as_features": False}])
-def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, capfd):
+def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, capfd):
     pytest.importorskip("onnxruntime")
-    found = exported(saved(tmp_path / "run", **changes), tmp_path / "out")
+    found = exported(saved(tmp_path / "run", policy__hold_steps=10), tmp_path / "out")
     assert [one["engine"] for one in found["engines"]] == ["torch", "NumPy", "ONNX Runtime"]
     assert found["agrees"] and all(0 < one["p50_ms"] <= one["p99_ms"] for one in found["engines"])
     again = deploy.check(tmp_path / "out", print)
@@ -171,10 +174,9 @@ def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, 
     assert set(spec["graph"]["outputs"]) == {"mean_action", "value", "features"}
 
 
-def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
-    found = saved(tmp_path / "run", policy__hold_steps=10)
-    exported(found, tmp_path / "out")
-    spec = run_policy.read_spec(tmp_path / "out")
+def test_the_specification_says_what_every_column_is(held):
+    out, found = held
+    spec = run_policy.read_spec(out)
     columns = spec["observation"]["columns"]
     assert [column["index"] for column in columns] == list(range(N_OBS))
     norm = load_agent(found, 1).policy.observation_norm
@@ -192,7 +194,7 @@ def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
         10,
     )
     assert spec["checkpoint"]["sha256"] == found.sha256
-    listed = {path.name for path in (tmp_path / "out").iterdir()} - {"policy_spec.json"}
+    listed = {path.name for path in out.iterdir()} - {"policy_spec.json"}
     assert (
         set(spec["files"])
         == listed
@@ -321,18 +323,19 @@ def test_evaluations_of_something_else_are_refused(tmp_path):
 # ---------------------------------------------------------------------------------------------------- command
 
 
-def without_graph(root):
-    """An exported folder; ONNX takes seconds."""
+def without_graph(root, **changes):
+    """(exported folder, its checkpoint); ONNX takes seconds."""
+    found = saved(root / "run", **changes)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(deploy, "missing_packages", lambda: ["onnx"])
-        exported(saved(root / "run"), root / "out")
-    return root / "out"
+        exported(found, root / "out")
+    return root / "out", found
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """An exported policy."""
-    return without_graph(tmp_path_factory.mktemp("export"))
+    return without_graph(tmp_path_factory.mktemp("export"))[0]
 
 
 @pytest.fixture
