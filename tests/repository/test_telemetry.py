@@ -1,4 +1,4 @@
-"""ONNX Runtime reports nothing to its makers: off by variable and by call; no file is left outside."""
+"""ONNX Runtime reports nothing to its makers: off by variable and by call (``test_deploy.py`` watches it)."""
 
 import ast
 import os
@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.learning.export import test_deploy as deployed
 from uuvtai.learning.export import graph
 
 ROOT = Path(__file__).parents[2]
@@ -78,32 +77,6 @@ def watched(work, home):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-def test_export_and_check_open_no_socket_and_write_nowhere_else(tmp_path):
-    """The whole command, ONNX graph included; then its check, which holds a session of ONNX Runtime."""
-    for name in ("onnx", "onnxscript", "onnxruntime"):
-        pytest.importorskip(name, reason="needs the extra uuvtai[export]")
-    deployed.saved(tmp_path / "run")
-    home, out = tmp_path / "elsewhere", tmp_path / "out"
-    work = """
-for words in ({export!r}, {check!r}):
-    try:
-        cli.main(words)
-    except SystemExit as left:
-        assert left.code == 0, left.code
-    kept.append(sorted((path.name, path.lstat().st_mtime_ns) for path in pathlib.Path({out!r}).rglob("*")))
-assert kept[0] == kept[1], "the check wrote into the folder"
-"""
-    words = {"export": ["export", str(tmp_path / "run"), "--out", str(out)], "check": ["export", "--check"]}
-    words["check"].append(str(out))
-    answer = watched(
-        "import pathlib\nfrom uuvtai import cli\nkept = []" + work.format(out=str(out), **words), home
-    )
-    assert answer.count("ONNX Runtime") >= 2 and (out / "policy.onnx").exists()
-    assert "sockets: []" in answer and "variable: 1" in answer and "loaded: True" in answer, answer
-    assert [path for path in home.rglob("*") if path.is_file()] == []
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "out", "run"]
 
 
 def test_the_watch_sees_a_socket_and_a_file(tmp_path):

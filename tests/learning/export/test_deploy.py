@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +14,10 @@ import torch
 from safetensors.torch import save
 
 from tests.command import run_cli
+from tests.learning.export import test_set_export
+from tests.learning.export.test_set_export import resigned
+from tests.repository.test_telemetry import watched
+from uuvtai.common.enums import EGO_COLUMNS, OBSTACLE_WIDTH
 from uuvtai.config import ObservationConfig
 from uuvtai.config.loader import ConfigError, load_training
 from uuvtai.kernels.planning.observation import observation_width, placed_columns
@@ -23,7 +26,8 @@ from uuvtai.learning.export import folder as deploy
 from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.card import evaluations_of
 from uuvtai.learning.export.folder import of_torch
-from uuvtai.learning.export.modules import golden_of, missing_packages, module_of, specification, weights_of
+from uuvtai.learning.export.graph import session
+from uuvtai.learning.export.modules import golden_of, module_of, specification, weights_of
 from uuvtai.learning.networks import ActorCritic
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.world_model import WorldModel
@@ -160,18 +164,99 @@ def test_an_observation_of_another_width_is_refused(folder):
 # ----------------------------------------------------------------------------------------------------- folder
 
 
-@pytest.mark.skipif(bool(missing_packages()), reason="needs the extra uuvtai[export]")
-def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, capfd):
-    pytest.importorskip("onnxruntime")
-    found = exported(saved(tmp_path / "run", policy__hold_steps=10), tmp_path / "out")
-    assert [one["engine"] for one in found["engines"]] == ["torch", "NumPy", "ONNX Runtime"]
-    assert found["agrees"] and all(0 < one["p50_ms"] <= one["p99_ms"] for one in found["engines"])
-    again = deploy.check(tmp_path / "out", print)
+IN_ONE_PROCESS = """
+import pathlib, runpy, types, uuvtai
+from uuvtai import cli
+
+def done(*words):
+    try:
+        cli.main(list(words))
+    except SystemExit as left:
+        assert left.code == 0, left.code
+
+def times(folder):
+    return sorted((path.name, path.lstat().st_mtime_ns) for path in pathlib.Path(folder).rglob("*"))
+
+for name in ("plain", "set"):
+    done("export", f"{ROOT}/{name}", "--out", f"{ROOT}/{name}_out")
+    before = times(f"{ROOT}/{name}_out")
+    done("export", "--check", f"{ROOT}/{name}_out")
+    assert times(f"{ROOT}/{name}_out") == before, "the check wrote into the folder"
+uuvtai.make = lambda *_given, **_others: types.SimpleNamespace(num_obs=N_OBS, columns=COLUMNS)
+os.chdir(ROOT)
+runpy.run_path(EXAMPLE, run_name="__main__")
+"""
+EXAMPLE = Path(__file__).parents[3] / "examples/own_onnx.py"
+
+
+def of_an_environment():
+    """(width, columns) of an observation."""
+    found = placed_columns(ObservationConfig())
+    return observation_width(ObservationConfig()), {c.name: slice(at, at + width) for c, at, width in found}
+
+
+@pytest.fixture(scope="module")
+def graphs(tmp_path_factory):
+    """Two exported policies, each checked, and a graph of a user's own, all made by one process that is
+    watched: what PyTorch needs for it takes ten seconds to import. (folder, home of the process, its
+    answer)"""
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(name, reason="needs the extra uuvtai[export]")
+    root = tmp_path_factory.mktemp("graphs")
+    saved(root / "plain", policy__hold_steps=10)
+    test_set_export.saved(root / "set")
+    n_obs, columns = of_an_environment()
+    values = {"ROOT": str(root), "N_OBS": n_obs, "COLUMNS": columns, "EXAMPLE": str(EXAMPLE)}
+    given = "".join(f"{name} = {value!r}\n" for name, value in values.items())
+    home = tmp_path_factory.mktemp("elsewhere")
+    return root, home, watched(given + IN_ONE_PROCESS, home)
+
+
+def test_export_and_check_open_no_socket_and_write_nowhere_else(graphs):
+    """The whole command, ONNX graph included; then its check, which holds a session of ONNX Runtime."""
+    root, home, answer = graphs
+    assert answer.count("ONNX Runtime") >= 4
+    assert "sockets: []" in answer and "variable: 1" in answer and "loaded: True" in answer, answer
+    assert [path for path in home.rglob("*") if path.is_file()] == []
+    assert {path.name for path in root.iterdir()} == {"plain", "plain_out", "set", "set_out", "model.onnx"}
+
+
+def test_onnx_runtime_agrees_and_the_folder_passes_its_check(graphs, capfd):
+    out = graphs[0] / "plain_out"
+    again = deploy.check(out, print)
     assert again["agrees"] and [one["engine"] for one in again["engines"]] == ["NumPy", "ONNX Runtime"]
+    assert all(0 < one["p50_ms"] <= one["p99_ms"] for one in again["engines"])
     assert capfd.readouterr().out == "", "results only on stdout"
-    spec = run_policy.read_spec(tmp_path / "out")
+    spec = run_policy.read_spec(out)
     assert set(spec["graph"]["inputs"]) == {"obs", "last_obs", "last_action", "has_last"}
     assert set(spec["graph"]["outputs"]) == {"mean_action", "value", "features"}
+
+
+def test_the_graph_of_a_policy_over_a_set_says_the_same(graphs):
+    out = graphs[0] / "set_out"
+    spec, policy = run_policy.read_spec(out), run_policy.load(out)
+    assert set(spec["graph"]["inputs"]) == set(policy.inputs)
+    golden = run_policy.read_safetensors(out / "golden.safetensors")
+    said = policy.said({name: golden[f"pair_{name}"] for name in policy.inputs})
+    assert set(spec["graph"]["outputs"]) == set(said)
+    rng = np.random.default_rng(0)
+    few = {"obstacles": rng.normal(size=(3, 2, OBSTACLE_WIDTH)), "own": rng.normal(size=(3, EGO_COLUMNS))}
+    few = {name: array.astype(np.float32) for name, array in few.items()}
+    few["obstacles"][..., 0] = 1.0
+    (wish, *_) = session((out / "policy.onnx").read_bytes()).run(["mean_wish"], few)
+    np.testing.assert_allclose(wish, policy.said(few)["mean_wish"], atol=1e-5)
+
+
+def test_the_example_writes_a_graph_that_is_taken_as_a_policy(graphs, monkeypatch):
+    """``python examples/own_onnx.py``, then ``uuv eval --agent model.onnx``."""
+    monkeypatch.chdir(graphs[0])
+    n_obs, columns = of_an_environment()
+    spec = plugin_spec("model.onnx", "policy")
+    act, hold_steps = onnx_policy(spec, graph_of(spec), n_obs)
+    obs = torch.randn(64, n_obs)
+    own = runpy.run_path(str(EXAMPLE))["Policy"](columns)
+    np.testing.assert_allclose(act(obs.numpy()), own(obs), rtol=1e-5, atol=1e-6)
+    assert hold_steps == 10
 
 
 def test_the_specification_says_what_every_column_is(held):
@@ -364,14 +449,6 @@ def test_a_changed_file_is_exit_3(folder, name, capfd):
     assert f"{name}: has changed" in capfd.readouterr().err
 
 
-def resigned(folder, name, content):
-    """Put other content in a file, with its right sha256 in the specification."""
-    (folder / name).write_bytes(content)
-    spec = json.loads((folder / "policy_spec.json").read_text())
-    spec["files"][name] = run_policy.hashlib.sha256(content).hexdigest()
-    (folder / "policy_spec.json").write_text(json.dumps(spec))
-
-
 def test_other_weights_with_the_right_sha256_are_exit_3(folder, tmp_path, capfd):
     weights = weights_of(module_of(saved(tmp_path / "other", config_of(), metrics={"a": 1.0})))
     weights["actor.4.bias"] += 0.01
@@ -397,22 +474,3 @@ def test_bad_usage(arguments, says, code, capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run_cli(*arguments) == code
     assert says in capfd.readouterr().err
-
-
-# ---------------------------------------------------------------------------------- a policy of the user's
-
-
-def test_the_example_writes_a_graph_that_is_taken_as_a_policy(tmp_path, monkeypatch):
-    """``python examples/own_onnx.py``, then ``uuv eval --agent model.onnx``."""
-    pytest.importorskip("onnxscript", reason="needs the extra uuvtai[export]")
-    columns = {c.name: slice(first, first + width) for c, first, width in placed_columns(ObservationConfig())}
-    n_obs = observation_width(ObservationConfig())
-    env = SimpleNamespace(num_obs=n_obs, columns=columns)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("uuvtai.make", lambda *_given, **_others: env)
-    module = runpy.run_path(str(Path(__file__).parents[3] / "examples/own_onnx.py"), run_name="__main__")
-    spec = plugin_spec("model.onnx", "policy")
-    act, hold_steps = onnx_policy(spec, graph_of(spec), n_obs)
-    obs = torch.randn(64, n_obs)
-    np.testing.assert_allclose(act(obs.numpy()), module["Policy"](columns)(obs), rtol=1e-5, atol=1e-6)
-    assert hold_steps == 10
