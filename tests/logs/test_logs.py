@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import typing
+from collections import Counter
 from pathlib import Path
 
 import jsonschema
@@ -21,10 +22,10 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from tests.command import read_by_viewer
-from tests.map_bits import kept, room
+from tests.map_bits import kept
 from tests.oracles import logs as episode
 from tests.oracles.world import path_position
-from uuvtai.common.enums import clearance_m, occupancy
+from uuvtai.common.enums import NO_SITE, clearance_m, occupancy
 from uuvtai.common.files import FileError
 from uuvtai.common.obstacle_motion import KIND_NAMES, obstacle_positions
 from uuvtai.config.loader import load_config
@@ -138,15 +139,18 @@ def test_futures_are_told_beside_the_forecast(log_path):
     assert (second["above"], second["below"]) == (pytest.approx(-0.4), None)
 
 
-def test_every_topic_has_its_schema_and_every_message_fits_it(log_path):
-    seen, validators = {}, {}
+def test_every_topic_has_its_schema_and_messages_fit_it(log_path):
+    """The first of each topic; all of them by the viewers' own reader."""
+    seen, validators, left = {}, {}, Counter({topic.name: 20 for topic in TOPICS})
     for topic, schema, _, _, data in messages(log_path):
         if topic not in validators:
             parsed = strict_json(schema.data)
             jsonschema.Draft202012Validator.check_schema(parsed)
             validators[topic] = jsonschema.Draft202012Validator(parsed)
             assert schema.encoding == "jsonschema"
-        validators[topic].validate(strict_json(data))
+        left[topic] -= 1
+        if left[topic] >= 0:
+            validators[topic].validate(strict_json(data))
         seen[topic] = schema.name
     assert SCHEMAS.items() <= seen.items()
     assert seen.keys() == {topic.name for topic in TOPICS} >= {"/tracks", "/plan/lookahead"}
@@ -275,9 +279,10 @@ def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, sna
 
 
 def large(metres):
-    """The first step of an episode in a tank of that (width, length), its maps full."""
+    """The first step of an episode in a tank of that (width, length), its maps full of what may be there."""
     cells = np.resize(np.linspace(0, 1, 997, dtype=np.float32), [10 * side + 8 for side in metres])
-    maps = {LAYERS[0]: kept(cells), LAYERS[1]: kept(cells), LAYERS[2]: room(cells)}
+    occupied = kept(cells)
+    maps = {LAYERS[0]: occupied, LAYERS[1]: occupied, LAYERS[2]: np.full(cells.shape, NO_SITE, np.int16)}
     return next(episode.snapshots(1, maps=False)) | maps
 
 
@@ -578,7 +583,7 @@ with McapEpisodeLog(Path(sys.argv[1]), episode.header()) as log:
 """
 
 
-@pytest.mark.parametrize(("maps", "kill_at"), [("none", 2001), ("none", 6001), ("maps", 3333)])
+@pytest.mark.parametrize(("maps", "kill_at"), [("none", 3001), ("maps", 2333)])
 def test_sigkill_loses_at_most_one_percent(tmp_path, maps, kill_at):
     path = tmp_path / "a.mcap"
     root = Path(__file__).parents[2]
@@ -617,7 +622,7 @@ def test_a_file_cut_anywhere_gives_back_a_prefix(log_path, tmp_path):
         sum(isinstance(record, Message) for record in breakup_chunk(chunk)) for chunk in chunks_of(log_path)
     ]
     recovered = []
-    for i, cut in enumerate(np.linspace(ends[0], len(whole), 25).astype(int)):
+    for i, cut in enumerate(np.linspace(ends[0], len(whole), 12).astype(int)):
         path = tmp_path / f"{i}.mcap"
         path.write_bytes(whole[:cut])
         saved = repair(path, tmp_path / f"{i}.out.mcap")
