@@ -11,7 +11,7 @@ PLACES = ("world.spawn_x_m=[2,6]", "world.start_goal_gap_m=3.0")
 
 
 class UsualSteps(Setup):
-    """The sonar takes as long for a step, and sees as far, as in its preset: other tests have those kernels."""
+    """The sonar steps as in its preset, and sees as far (6 m): its kernels are compiled for other tests."""
 
     def rig(self, folder):
         path = super().rig(folder)

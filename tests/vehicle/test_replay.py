@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from tests.command import uuv
 from tests.conftest import estimate_pose
@@ -460,11 +459,3 @@ def test_the_command_fails_where_commands_differ(log, feed, build, monkeypatch, 
 def test_wrong_arguments_are_refused_in_one_line(log, capfd, arguments, said):
     code, out, err = uuv(capfd, "replay", *[str(log) if word == "LOG" else word for word in arguments])
     assert code == 2 and said in err and out == "" and "Traceback" not in err
-
-
-def test_the_simulator_is_its_own_again(small):
-    """After all of the above an episode goes on as ever."""
-    small.sim.sleep()
-    small.begin([1], seed=SEED)
-    small.sim.step()
-    assert torch.isfinite(small.sim.action).all() and small.sim.s.world.pos_w.to_numpy()[0].any()
