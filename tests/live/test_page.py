@@ -399,7 +399,7 @@ def test_a_wall_of_tanks_in_a_browser():
 def test_driving_in_a_browser(tmp_path):
     browser.require()
     folder = tmp_path / "driven"
-    short = ("--set", "episode.horizon_steps=250")
+    short = ("--set", "episode.horizon_steps=125")
     typed = ("drive", "--sensors", "ping360", "-S", 2, "-D", 1, *short, "--run-dir", folder)
     with command(*typed) as (process, address):
         seen = browser.told("live.mjs", "drive", address)

@@ -154,11 +154,10 @@ def test_bombs_take_no_memory(tmp_path):
     for i, (content, _says) in enumerate(SPOILT.values()):
         (tmp_path / f"{i}.bad").write_bytes(content)
     (tmp_path / "a.ok").write_bytes(MAGIC + chunk_of(record_of(0x85, bytes(60 << 20))) * 8 + END)
-    work = "[reader.info(path)['messages'] for path in here.glob('*.ok')]"
-    assert bounded(work, tmp_path) == "accepted [0]"
+    works = ["[reader.info(path)['messages'] for path in here.glob('*.ok')]"]
     for tool in ("reader.info", "export.repair"):
-        work = f"len([pytest.raises(UserError, {tool}, path) for path in here.glob('*.bad')])"
-        assert bounded(work, tmp_path) == f"accepted {len(SPOILT)}"
+        works.append(f"len([pytest.raises(UserError, {tool}, path) for path in here.glob('*.bad')])")
+    assert bounded(", ".join(works), tmp_path) == f"accepted [0] {len(SPOILT)} {len(SPOILT)}"
 
 
 def test_a_message_of_an_undeclared_channel(tmp_path):
@@ -186,7 +185,7 @@ def test_random_damage_is_an_error_or_costs_messages_but_makes_none(log_path, tm
     path, rng, failed = tmp_path / "a.mcap", np.random.default_rng(5), 0
     whole = log_path.read_bytes()
     known = {(m.topic, m.time_s, json.dumps(m.data)) for m in read_messages(log_path)}
-    for trial in range(45):
+    for trial in range(24):
         spoilt, at = bytearray(whole), int(rng.integers(8, 20_000 if trial % 2 else len(whole)))
         if trial % 3 == 0:
             spoilt[at] ^= 1 << int(rng.integers(8))
@@ -204,7 +203,7 @@ def test_random_damage_is_an_error_or_costs_messages_but_makes_none(log_path, tm
                 if tool not in (info, load_recording):
                     kept = [(m.topic, m.time_s, json.dumps(m.data)) for m in read_messages(found.path)]
                     assert len(set(kept)) == len(kept) and set(kept) <= known
-    assert failed > 50
+    assert failed > 25
 
 
 # ----------------------------------------------------------------------------------------------- odd contents

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import typing
+from collections import Counter
 from pathlib import Path
 
 import jsonschema
@@ -21,10 +22,10 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from tests.command import read_by_viewer
-from tests.map_bits import kept, room
+from tests.map_bits import kept
 from tests.oracles import logs as episode
 from tests.oracles.world import path_position
-from uuvtai.common.enums import clearance_m, occupancy
+from uuvtai.common.enums import NO_SITE, clearance_m, occupancy
 from uuvtai.common.files import FileError
 from uuvtai.common.obstacle_motion import KIND_NAMES, obstacle_positions
 from uuvtai.config.loader import load_config
@@ -138,15 +139,18 @@ def test_futures_are_told_beside_the_forecast(log_path):
     assert (second["above"], second["below"]) == (pytest.approx(-0.4), None)
 
 
-def test_every_topic_has_its_schema_and_every_message_fits_it(log_path):
-    seen, validators = {}, {}
+def test_every_topic_has_its_schema_and_messages_fit_it(log_path):
+    """The first of each topic; all of them by the viewers' own reader."""
+    seen, validators, left = {}, {}, Counter({topic.name: 20 for topic in TOPICS})
     for topic, schema, _, _, data in messages(log_path):
         if topic not in validators:
             parsed = strict_json(schema.data)
             jsonschema.Draft202012Validator.check_schema(parsed)
             validators[topic] = jsonschema.Draft202012Validator(parsed)
             assert schema.encoding == "jsonschema"
-        validators[topic].validate(strict_json(data))
+        left[topic] -= 1
+        if left[topic] >= 0:
+            validators[topic].validate(strict_json(data))
         seen[topic] = schema.name
     assert SCHEMAS.items() <= seen.items()
     assert seen.keys() == {topic.name for topic in TOPICS} >= {"/tracks", "/plan/lookahead"}
@@ -160,22 +164,6 @@ def test_how_sure_the_pose_is_stands_beside_how_far_off_it_is(log_path, snaps):
     assert np.diag(matrix) == pytest.approx([cov[0], cov[3], snap["ego.z_var"], 0, 0, cov[5]])
     assert message["sigma"] == pytest.approx(np.sqrt(np.diag(matrix)[[0, 1, 2, 5]]))
     assert message["error"] == pytest.approx([0.01, 0.01, 0.01, 0.0], abs=2e-6)
-
-
-def test_rates(log_path):
-    counts = {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
-    every_step = [
-        "/tf", "/pose", "/pose_estimate", "/pose_covariance", "/sonar/scan", "/sonar/doppler", "/state",
-        "/action", "/policy", "/safety", "/tree",
-    ]  # fmt: skip
-    assert {counts[topic] for topic in every_step} == {N_STEP + 1}
-    assert {counts[topic] for topic in ("/obstacles", "/obstacles/truth", "/goal", "/camera/line")} == {
-        N_STEP // 5 + 1
-    }
-    assert counts["/map/static"] == N_STEP // 25 + 2  # step 0, then 2 Hz, and the last step
-    assert counts["/camera/depth"] == counts["/sonar/image"] == N_STEP // 25 + 1
-    assert counts["/plan"] == counts["/plan/info"] == 2
-    assert counts["/log"] == 3
 
 
 def test_the_final_step_shows_the_obstacles_even_off_their_rate(tmp_path):
@@ -275,9 +263,10 @@ def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, sna
 
 
 def large(metres):
-    """The first step of an episode in a tank of that (width, length), its maps full."""
+    """The first step of an episode in a tank of that (width, length), its maps full of what may be there."""
     cells = np.resize(np.linspace(0, 1, 997, dtype=np.float32), [10 * side + 8 for side in metres])
-    maps = {LAYERS[0]: kept(cells), LAYERS[1]: kept(cells), LAYERS[2]: room(cells)}
+    occupied = kept(cells)
+    maps = {LAYERS[0]: occupied, LAYERS[1]: occupied, LAYERS[2]: np.full(cells.shape, NO_SITE, np.int16)}
     return next(episode.snapshots(1, maps=False)) | maps
 
 
@@ -365,13 +354,6 @@ def test_null_stands_only_where_something_does_not_exist(log_path):
     assert policy[0]["reward"] == pytest.approx(sum(policy[0][name] for name in episode.TERMS))
     assert action[0]["policy"] is None and action[0]["behavior"] == pytest.approx([0.8, 0.0, 0.1, -0.2])
     assert action[75]["leaf"] == "Evade"
-
-
-def test_far_time_to_collision_is_null(tmp_path, snaps):
-    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
-        log.write(snaps[0] | {"termination.ttc_s": 1e6})
-        log.close(episode.result(0))
-    assert by_topic(tmp_path / "a.mcap", "/safety")[0]["ttc_s"] is None
 
 
 def test_replans_say_who_planned_and_why(log_path):
@@ -578,7 +560,7 @@ with McapEpisodeLog(Path(sys.argv[1]), episode.header()) as log:
 """
 
 
-@pytest.mark.parametrize(("maps", "kill_at"), [("none", 2001), ("none", 6001), ("maps", 3333)])
+@pytest.mark.parametrize(("maps", "kill_at"), [("none", 3001), ("maps", 2333)])
 def test_sigkill_loses_at_most_one_percent(tmp_path, maps, kill_at):
     path = tmp_path / "a.mcap"
     root = Path(__file__).parents[2]
@@ -617,13 +599,13 @@ def test_a_file_cut_anywhere_gives_back_a_prefix(log_path, tmp_path):
         sum(isinstance(record, Message) for record in breakup_chunk(chunk)) for chunk in chunks_of(log_path)
     ]
     recovered = []
-    for i, cut in enumerate(np.linspace(ends[0], len(whole), 25).astype(int)):
+    for i, cut in enumerate(np.linspace(ends[0], len(whole), 12).astype(int)):
         path = tmp_path / f"{i}.mcap"
         path.write_bytes(whole[:cut])
         saved = repair(path, tmp_path / f"{i}.out.mcap")
         assert [m[4] for m in messages(saved.path)] == data[: saved.messages]
         assert saved.messages == sum(size for size, end in zip(sizes, ends, strict=True) if end <= cut)
-        assert saved.complete == (cut == len(whole))
+        assert saved.complete == (cut == len(whole)) == ("uuv.repair" not in read_head(saved.path).metadata)
         recovered.append(saved.messages)
     assert recovered == sorted(recovered) and recovered[-1] == len(data)
 
@@ -646,13 +628,6 @@ def test_a_damaged_chunk_costs_only_itself(log_path, tmp_path, number):
     lost = {time for _, time, _ in original - kept}
     assert min(lost) >= index.message_start_time and max(lost) <= index.message_end_time
     assert read_head(saved.path).metadata["uuv.result"]["outcome"] == "success"
-
-
-def test_a_whole_file_is_copied_completely(log_path, tmp_path):
-    saved = repair(log_path, tmp_path / "b.mcap")
-    assert saved.complete and saved.damages == ()
-    assert [m[4] for m in messages(saved.path)] == [m[4] for m in messages(log_path)]
-    assert "uuv.repair" not in read_head(saved.path).metadata
 
 
 def test_repair_never_overwrites(log_path, tmp_path):

@@ -68,6 +68,8 @@ def test_a_video_is_what_its_name_says(folder, logs, capfd, name, container, cod
         assert float(stream.average_rate) == pytest.approx(fps, rel=0.01)
         if codec == "h264":
             assert stream.codec_context.pix_fmt == "yuv420p", "the only one that every player knows"
+            content = out.read_bytes()
+            assert 0 < content.index(b"moov") < content.index(b"mdat"), "it can be played while it loads"
     assert len(frames) == expected and frames[0].shape[1] == 640 and frames[0].shape[0] % 2 == 0
     drawn = cv2.resize(
         FrameArtist(load_recording(logs[0])).frame(0.4),
@@ -78,11 +80,6 @@ def test_a_video_is_what_its_name_says(folder, logs, capfd, name, container, cod
     assert int(np.argmin(errors)) == 2 and errors[2] < 6
 
 
-def test_an_mp4_can_be_played_while_it_loads(folder, logs):
-    content = video(logs[0], folder / "fast.mp4", width_px=320).read_bytes()
-    assert 0 < content.index(b"moov") < content.index(b"mdat")
-
-
 def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
     """15 frames a second are no whole hundredths; rare colours must not melt into frequent ones."""
     with Image.open(video(logs[0], folder / "t.gif", fps=15.0, speed=4.0)) as image:
@@ -90,7 +87,7 @@ def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
         for i in range(image.n_frames):
             image.seek(i)
             durations.append(image.info["duration"])
-            seen |= set(np.unique(np.array(image.convert("RGB")) @ PLACES))
+            seen |= set(np.unique(np.array(image.convert("RGB")) @ PLACES)) if i % 8 == 0 else set()
         assert image.info["loop"] == 0 and image.size[0] == 800
     assert sum(durations) == pytest.approx(1000 * (image.n_frames / 15), abs=40)
     inks = drawing.GOAL, drawing.ROUTE, drawing.agent_inks(["bt"])["bt"]
@@ -181,15 +178,19 @@ def test_every_method_stands_out_from_what_a_map_shows():
 def test_a_video_draws_its_method_in_its_colour(folder, logs):
     recording = load_recording(logs[1])
     own, other = drawing.agent_inks(["straight"])["straight"], drawing.agent_inks(["bt"])["bt"]
-    pixels = set(map(tuple, FrameArtist(recording).frame(1.0).reshape(-1, 3)))
-    assert tuple(own) in pixels and tuple(other) not in pixels
+    image = FrameArtist(recording).frame(1.0)
+    assert has(image, own) and not has(image, other)
+
+
+def has(image, color):
+    return bool((image == np.array(color)).all(axis=2).any())
 
 
 def test_methods_of_a_user_keep_the_colour_that_they_have_beside_each_other(tmp_path):
-    path = episode.record(tmp_path / "b.mcap", N_STEP, episode.header("second"))
+    path = episode.record(tmp_path / "b.mcap", 20, episode.header("second"))
     names = ["bt", "first", "second"]
     image = paint_picture([load_recording(path, PICTURE_TOPICS)], agents=names).image
-    assert tuple(drawing.agent_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))
+    assert has(image, drawing.agent_inks(names)["second"])
 
 
 def test_maps_of_a_harbour_are_kept_packed():

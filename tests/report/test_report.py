@@ -36,6 +36,7 @@ from uuvtai.report.tables import PAGE, Data, Table, pivot
 from uuvtai.report.timing import timing
 from uuvtai.report.training import Training, grouped, training
 
+EVALUATED = samples.evaluation_document()
 READABLE = 4.5
 """contrast of small text, WCAG 2.2 level AA"""
 
@@ -78,15 +79,6 @@ def test_the_papers_grid_has_a_row_for_every_s_and_d_and_no_speed_without_motion
     assert (fast.row, fast.first, fast.n_columns) == (7, 5, 1)
 
 
-def test_any_two_axes_make_a_heat_map():
-    axes = {"world.current_m_s": [0.0, 0.2], "sensors": ["paper", "harsh"]}
-    cells = [
-        {"world.current_m_s": c, "sensors": s, "episodes": 4} for c in (0.2, 0.0) for s in ("harsh", "paper")
-    ]
-    grid = pivot(cells, axes)
-    assert (grid.row_names, grid.column_names) == (["0", "0.2"], ["paper", "harsh"])
-
-
 def test_values_of_an_axis_may_be_lists():
     axes = {"disturbance.current_m_s": [[0.0, 0.1, 0.0], [0.0, 0.2, 0.0]], "D": [3, 6]}
     cells = [
@@ -94,7 +86,8 @@ def test_values_of_an_axis_may_be_lists():
         for c in ((0.0, 0.2, 0.0), (0.0, 0.1, 0.0))
         for d in (3, 6)
     ]
-    assert pivot(cells, axes).row_names == ["[0.0, 0.1, 0.0]", "[0.0, 0.2, 0.0]"]
+    grid = pivot(cells, axes)
+    assert grid.row_names == ["[0.0, 0.1, 0.0]", "[0.0, 0.2, 0.0]"] and grid.column_names == ["3", "6"]
 
 
 def test_a_grid_that_cannot_be_laid_out_says_why():
@@ -193,7 +186,7 @@ def test_names_are_drawn_as_they_are():
 def test_a_figure_on_disk_is_a_picture_with_both_panels():
     import cv2
 
-    document = samples.sweep_document()
+    document = samples.sweep_document(axes={"S": [4, 8], "D": [3], "v_m_s": [0.2, 3.0]})
     grid = pivot(document["cells"], document["axes"])
     one, two = (
         ink.png([heat_map(grid, key, "t") for key in keys])
@@ -467,14 +460,15 @@ TITLES = {
 @pytest.mark.parametrize(("title", "files"), TITLES.items())
 def test_a_page_says_in_its_title_what_it_is_of(title, files, tmp_path):
     samples.write_run(tmp_path / "folder", **files, profile=samples.PROFILE)
-    assert f"<h1>{title}</h1>" in report([tmp_path / "folder"]).page.read_text()
+    assert build._of_run(tmp_path / "folder").title == title
 
 
 def test_the_data_of_a_figure_can_be_had_as_csv(tmp_path):
     data = Data(["name", "value"], [["a, b", 0.1], ['"c"', None]])
     html, _ = render(Page("t", "", [], []))
     assert "<h1>t</h1>" in html
-    samples.write_run(tmp_path, sweep=samples.sweep_document())
+    axes = {"S": [8, 12], "D": [0, 15], "v_m_s": [0.2, 3.0]}
+    samples.write_run(tmp_path, sweep=samples.sweep_document(axes=axes))
     links = [a for a in Reader(report([tmp_path]).page.read_text()).of("a") if "download" in a]
     head, *rows = (
         csv.DictReader(io.StringIO(unquote(links[0]["href"].split(",", 1)[1]))),
@@ -482,7 +476,7 @@ def test_the_data_of_a_figure_can_be_had_as_csv(tmp_path):
     )
     cells = list(head)
     assert rows == ["heat_map_bt.csv"]
-    assert len(cells) == 75
+    assert len(cells) == 6
     assert (cells[-1]["S"], cells[-1]["v_m_s"], cells[-1]["success"], cells[-1]["success_rate"]) == (
         "12", "3.0", "1", "0.0625",
     )  # fmt: skip
@@ -495,31 +489,20 @@ def test_a_page_says_where_its_figures_come_from(evil):
         assert said in text
 
 
-def test_a_run_that_did_not_finish_is_marked(tmp_path):
-    samples.write_run(tmp_path, metrics=samples.metrics())
+def test_a_training_that_was_killed_is_marked_and_shown_without_the_line_that_it_wrote(tmp_path):
+    samples.write_run(tmp_path, metrics=rewards(5))
     record = json.loads((tmp_path / "run.json").read_text())
     (tmp_path / "run.json").write_text(json.dumps(record | {"status": "interrupted"}))
-    assert "marked 'interrupted'" in "".join(Reader(report([tmp_path]).page.read_text()).words)
-
-
-def test_a_training_that_was_killed_while_it_wrote_is_shown_without_its_last_line(tmp_path):
-    samples.write_run(tmp_path / "run", metrics=samples.metrics(5))
-    with (tmp_path / "run/metrics.jsonl").open("a") as file:
+    with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('\n{"iteration": 6, "rollo')
-    assert "<td>5</td>" in report([tmp_path / "run"]).page.read_text()
+    html = report([tmp_path]).page.read_text()
+    assert "<td>5</td>" in html and "marked 'interrupted'" in "".join(Reader(html).words)
 
 
-def test_several_trainings_are_one_page(tmp_path):
-    runs = [
-        samples.write_run(tmp_path / f"ppo_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(5))
-        for i in range(2)
-    ]
-    written = report(runs, tmp_path / "both.html")
-    assert "ppo (2 seeds)" in written.page.read_text()
-    assert written.figures == [tmp_path / "figures/training.png"] and written.figures[0].exists()
-    samples.write_run(tmp_path / "empty")
-    with pytest.raises(ConfigError, match=r"empty: has nothing to report"):
-        report([*runs, tmp_path / "empty"], tmp_path / "x.html")
+def rewards(n):
+    """Records of a training with one figure."""
+    kept = ("iteration", "time/env_steps", "rollout/ep_rew_mean")
+    return [{key: row[key] for key in kept} for row in samples.metrics(n)]
 
 
 def test_a_damaged_cell_of_one_of_several_runs_names_its_folder(tmp_path):
@@ -531,8 +514,12 @@ def test_a_damaged_cell_of_one_of_several_runs_names_its_folder(tmp_path):
 
 
 def test_a_training_and_its_evaluations_are_one_page(tmp_path):
-    """The checkpoint's sha256 tells the training; figures of two folders are kept apart."""
-    trained = samples.write_run(tmp_path / "first", metrics=samples.metrics(5))
+    """The checkpoint's sha256 tells the training; figures of two folders are kept apart. The page is none of
+    theirs."""
+    trained, again = (
+        samples.write_run(tmp_path / name, config=f"train:\n  seed: {i}\n", metrics=rewards(5))
+        for i, name in enumerate(("first", "first_1"))
+    )
     manifest = trained / "checkpoints/step_000005/manifest.json"
     manifest.parent.mkdir(parents=True)
     manifest.write_text('{"step": 5}')
@@ -542,7 +529,8 @@ def test_a_training_and_its_evaluations_are_one_page(tmp_path):
             samples.agent("bt"), samples.agent("mine", checkpoint={"sha256": sha})
         )
         samples.write_run(tmp_path / name, eval__result=document)
-    written = report([trained, *(tmp_path / name for name in shas)], tmp_path / "page.html")
+    runs = [trained, again, *(tmp_path / name for name in shas)]
+    written = report(runs, tmp_path / "page.html")
     page = Reader(written.page.read_text())
     titles = ["Training", "Evaluation: first_eval", "Evaluation: other_eval"]
     assert [word for word in page.words if word in titles] == titles * 2, (
@@ -556,6 +544,13 @@ def test_a_training_and_its_evaluations_are_one_page(tmp_path):
     text = " ".join(page.words)
     assert "mine is checkpoint step_000005 of the training first." in text
     assert "mine (checkpoint 0000000000000000) is none of the checkpoints" in text
+    assert "first (2 seeds)" in text and all(path.exists() for path in written.figures)
+    (trained / "report.html").write_text("its own")
+    with pytest.raises(UserError, match="--force"):
+        report(runs, trained / "report.html")
+    samples.write_run(tmp_path / "empty")
+    with pytest.raises(ConfigError, match=r"empty: has nothing to report"):
+        report([*runs, tmp_path / "empty"], tmp_path / "x.html")
 
 
 def test_pairs_of_methods_are_told_with_p_and_interval():
@@ -659,13 +654,14 @@ def test_a_reproduction_composes_verdicts_tables_and_runs(tmp_path):
         {"kind": "run", "path": "noise"},
         {"kind": "curves", "paths": ["a_0", "a_1"]},
     )
-    samples.write_run(tmp_path / "grid", sweep=samples.sweep_document())
-    samples.write_run(tmp_path / "noise", sweep=samples.noise_sweep())
+    axes = {"S": [4, 8], "D": [3], "v_m_s": [0.2, 0.4]}
+    samples.write_run(tmp_path / "grid", sweep=samples.sweep_document(axes=axes))
+    samples.write_run(tmp_path / "noise", eval__result=EVALUATED)
     for i in range(2):
-        samples.write_run(tmp_path / f"a_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(5))
+        samples.write_run(tmp_path / f"a_{i}", config=f"train:\n  seed: {i}\n", metrics=rewards(5))
     written = report([folder])
     page = Reader(written.page.read_text())
-    assert [path.stem for path in written.figures] == ["grid_heat_map_bt", "noise_sweep_sensors", "training"]
+    assert [path.stem for path in written.figures] == ["grid_heat_map_bt", "noise_agents", "training"]
     assert [item["class"] for item in page.of("li")] == ["holds", "fails"]
     assert "a (2 seeds)" in page.words
 
@@ -711,7 +707,7 @@ def test_a_damaged_file_is_one_clear_error_and_nothing_is_written(tmp_path, file
 
 
 def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path):
-    samples.write_run(tmp_path, sweep=samples.noise_sweep())
+    samples.write_run(tmp_path, eval__result=EVALUATED)
     before = report([tmp_path]).page.read_bytes()
     (tmp_path / "wall").write_text("a file")
     with pytest.raises(RunFolderError, match="--out FILE"):
@@ -723,8 +719,8 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path):
 
 
 def test_the_default_page_may_be_renewed(tmp_path):
-    run = samples.write_run(tmp_path / "run", sweep=samples.noise_sweep())
-    assert report([run]).page == report([run]).page == report([run], run / "report.html").page
+    run = samples.write_run(tmp_path / "run", eval__result=EVALUATED)
+    assert report([run]).page == report([run], run / "report.html").page
 
 
 @pytest.mark.parametrize(
@@ -742,7 +738,7 @@ def test_a_page_never_replaces_a_file_of_the_run(tmp_path, name):
 
 
 def test_a_page_elsewhere_replaces_files_with_force_only(tmp_path):
-    run = samples.write_run(tmp_path / "run", sweep=samples.noise_sweep())
+    run = samples.write_run(tmp_path / "run", eval__result=EVALUATED)
     (tmp_path / "mine.html").write_text("mine")
     with pytest.raises(UserError, match="--force"):
         report([run], tmp_path / "mine.html")
@@ -758,23 +754,16 @@ def test_a_page_elsewhere_replaces_files_with_force_only(tmp_path):
 
 @pytest.mark.parametrize("kind", ["page", "figures", "figure"])
 def test_a_page_is_not_written_through_a_link(tmp_path, kind):
-    run = samples.write_run(tmp_path / "run", sweep=samples.noise_sweep())
+    run = samples.write_run(tmp_path / "run", eval__result=EVALUATED)
     (tmp_path / "outside").mkdir()
-    (tmp_path / "outside" / "sweep_sensors.png").write_text("precious")
-    places = {"page": "page.html", "figures": "figures", "figure": "figures/sweep_sensors.png"}
+    (tmp_path / "outside" / "agents.png").write_text("precious")
+    places = {"page": "page.html", "figures": "figures", "figure": "figures/agents.png"}
     link = tmp_path / places[kind]
     link.parent.mkdir(exist_ok=True)
-    link.symlink_to(tmp_path / "outside" if kind == "figures" else tmp_path / "outside" / "sweep_sensors.png")
+    link.symlink_to(tmp_path / "outside" if kind == "figures" else tmp_path / "outside" / "agents.png")
     with pytest.raises(UserError, match="is a link"):
         report([run], tmp_path / "page.html", force=True)
     assert [path.read_text() for path in (tmp_path / "outside").iterdir()] == ["precious"]
-
-
-def test_a_page_of_several_trainings_is_none_of_theirs(tmp_path):
-    runs = [samples.write_run(tmp_path / name, metrics=samples.metrics(5)) for name in "ab"]
-    report([runs[0]])
-    with pytest.raises(UserError, match="--force"):
-        report(runs, runs[0] / "report.html")
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,13 @@ BAD = """<!DOCTYPE html><title>bad</title><div id="a" style="width: 3000px">wide
 """What the check must find fault with"""
 
 
+AXES = {"S": [4, 8], "D": [0, 15], "v_m_s": [0.2, 0.6, 3.0]}
+REWARDS = [
+    {name: row[name] for name in ("iteration", "time/env_steps", "rollout/ep_rew_mean")}
+    for row in samples.metrics(12)
+]
+
+
 def picture(path):
     path.parent.mkdir(exist_ok=True)
     cv2.imwrite(str(path), np.full((300, 1600, 3), 200, np.uint8))
@@ -36,11 +43,11 @@ def page(tmp_path_factory):
     result = samples.evaluation_document(*agents) | {"paired": paired(agents)}
     samples.write_run(
         folder, ("uuv", "eval", "x" * 300), "key: " + "y" * 500, reproduce=document, eval__result=result,
-        sweep=samples.sweep_document(), profile=samples.PROFILE,
+        sweep=samples.sweep_document(axes=AXES), profile=samples.PROFILE,
     )  # fmt: skip
     samples.write_run(folder / "noise", sweep=samples.noise_sweep())
     for i in range(2):
-        samples.write_run(folder / f"t_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(12))
+        samples.write_run(folder / f"t_{i}", config=f"train:\n  seed: {i}\n", metrics=REWARDS)
     picture(folder / "pictures/seed0_episode0.png")
     (folder / "logs").mkdir()
     record(folder / "logs/bt_seed0_episode7.mcap", 60)
@@ -65,16 +72,14 @@ def test_a_report_is_whole_and_quiet_in_every_view(seen, width, scheme):
     there = found["open"]
     assert there["title"] == "Everything"
     assert [there[name] for name in ("images", "scripts", "doubleIds", "deadLinks")] == [1, 1, [], 0]
-    assert there["svgs"] > 10 and there["hovers"] > 150 and there["downloads"] > 5
+    assert there["svgs"] > 6 and there["hovers"] > 50 and there["downloads"] > 5
 
 
 def test_figures_follow_light_and_dark(seen):
     light, dark = (seen[True, 390, scheme]["open"] for scheme in ("light", "dark"))
     assert brightness(light["background"]) > 700 > 100 > brightness(dark["background"])
     assert brightness(light["ink"]) < 200 < 600 < brightness(dark["ink"])
-    assert light["inkedTexts"] == dark["inkedTexts"] > 100, (
-        "text of the figures has the page's colour in both"
-    )
+    assert light["inkedTexts"] == dark["inkedTexts"] > 50, "text of the figures has the page's colour in both"
 
 
 def test_a_dark_screen_prints_black_on_white(seen):

@@ -103,14 +103,14 @@ def test_it_finds_how_the_dvl_looks_and_where_the_vehicle_is(seed, yaw_deg, off,
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("given", "words", "seconds"),
     [
-        ({"scale": 1.2}, "less than the walls"),
-        ({"tank": {"x_m": (-2.0, 20.0)}}, "the walls in view do not fix it yet"),
+        ({"scale": 1.2}, "less than the walls", 250.0),
+        ({"tank": {"x_m": (-2.0, 20.0)}}, "the walls in view do not fix it yet", 60.0),
     ],
 )
-def test_what_does_not_agree_is_refused_or_said(given, words):
-    calibration = Diver(2, **given).drive()
+def test_what_does_not_agree_is_refused_or_said(given, words, seconds):
+    calibration = Diver(2, **given).drive(seconds)
     assert calibration.found is None and words in (calibration.refusal or calibration.says)
     assert calibration.document(0.0)["rig"] is None and not calibration.document(0.0)["ready"]
 
@@ -140,8 +140,8 @@ def test_a_way_too_short_is_said():
 
 
 def test_it_leads_where_the_walls_stay_in_view():
-    """The head sees 6 m: from 4 m before the end of the pool to the end, from 2.5 m into the pool."""
-    for x, sides in ((16.0, (16.0, 18.0)), (17.5, (15.5, 17.5)), (4.0, (2.0, 4.0)), (2.5, (2.5, 4.5))):
+    """The head sees 6 m: from 4 m before the end of the pool to the end, from 2.5 m into it."""
+    for x, sides in ((16.0, (16.0, 18.0)), (2.5, (2.5, 4.5))):
         diver = Diver(5)
         diver.place = np.array([x, 2.0])
         diver.calibration = Calibration(diver.config, (*diver.place, Z))

@@ -16,7 +16,7 @@ FOUND = (1125,)
 """seeds that once found something"""
 
 
-@pytest.mark.parametrize("seeds", [*(range(first, first + 10) for first in range(0, 30, 10)), FOUND], ids=str)
+@pytest.mark.parametrize("seeds", [*(range(first, first + 5) for first in (0, 5)), FOUND], ids=str)
 def test_whatever_breaks_the_vehicle_is_safe(seeds):
     assert [text for seed in seeds for text in violations(seed)] == []
 
@@ -71,7 +71,7 @@ def test_an_error_of_ours_stops_the_vehicle_and_gives_it_back(tmp_path, monkeypa
     if lasts and stage in NO_MORE:
         pytest.skip("nothing can be said")
     flight = Flight(tmp_path)
-    clock, at = Clock(flight), random.Random(stage).uniform(2.0, 6.0)
+    clock, at = Clock(flight), random.Random(stage).uniform(2.0, 3.0)
     plan = plan_of(flight.endpoint.place, flight.log.path)
     loop = OnboardLoop(
         link_config(), flight.pilot, plan, flight.endpoint, flight.log, clock.now, clock.sleep,

@@ -41,6 +41,8 @@ from uuvtai.vehicle.telemetry import (
 )
 
 DT = 0.02
+COARSE = 0.1
+"""[s] of a step where no step of its own counts"""
 CONFIG = link_config()
 
 
@@ -526,7 +528,7 @@ def test_a_dry_run_moves_nothing_and_logs_what_it_would_say(flight):
 
 def test_where_guided_is_refused_it_drives_by_sticks(flight):
     one = flight(modes=(2, 9))
-    one.run(12, dt=0.1)
+    one.run(12, dt=COARSE)
     assert one.loop.document()["fallback"] and one.sub.mode == 2
     sticks = [message for message in one.sub.told if message.get_type() == "MANUAL_CONTROL"]
     assert sticks and sticks[-1].x > 0 and sticks[-1].get_srcSystem() == 255
@@ -540,10 +542,10 @@ def test_where_guided_is_refused_it_drives_by_sticks(flight):
 @pytest.mark.parametrize(("given", "mode"), [({"modes": (9,)}, 19), ({"obeys": False}, 19)])
 def test_a_vehicle_that_refuses_is_left_alone(flight, given, mode):
     one = flight(**given)
-    assert one.run(16, dt=0.1).action.name == "HAND_BACK" and one.sub.mode == mode
+    assert one.run(16, dt=COARSE).action.name == "HAND_BACK" and one.sub.mode == mode
     before = len(one.sub.moved_by())
     assert 5 <= before <= 11
-    one.run(5)
+    one.run(5, dt=COARSE)
     assert len(one.sub.moved_by()) == before and not one.loop.document()["driven_in"]
 
 
@@ -574,9 +576,9 @@ FAILS = [
 @pytest.mark.parametrize(("fail", "seconds", "action", "mode"), FAILS)
 def test_every_failsafe_on_a_vehicle(flight, fail, seconds, action, mode):
     one = flight()
-    assert one.run(4).action.name == "DRIVE" and one.sub.mode == 4
+    assert one.run(4, dt=COARSE).action.name == "DRIVE" and one.sub.mode == 4
     fail(one)
-    assert one.run(seconds, dt=0.1 if seconds > 5 else DT).action.name == action
+    assert one.run(seconds, dt=COARSE).action.name == action
     assert one.sub.mode == mode
     speeds = [m for m in one.sub.told if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
     if action == "HOLD":
@@ -584,23 +586,23 @@ def test_every_failsafe_on_a_vehicle(flight, fail, seconds, action, mode):
     else:
         before = len(one.sub.moved_by())
         one.sub.silent.clear()
-        one.run(3)
+        one.run(3, dt=COARSE)
         assert len(one.sub.moved_by()) == before, "for good"
     assert_within(one.sub.told)
 
 
 def test_a_silent_autopilot_is_left_alone(flight):
     one = flight()
-    one.run(4)
+    one.run(4, dt=COARSE)
     one.sub.silent.add("HEARTBEAT")
-    assert one.run(4).action.name == "HAND_BACK"
+    assert one.run(4, dt=COARSE).action.name == "HAND_BACK"
     assert "COMMAND_LONG 176" in one.sub.kinds()[-30:] or one.sub.mode == 2
 
 
 def test_messages_that_stand_still_are_old(flight):
     """They come on time, but their time stamps do not: a relay that says the same again and again."""
     one = flight()
-    one.run(4)
+    one.run(4, dt=COARSE)
     one.sub.silent.add("ATTITUDE")
     same = mav.MAVLink_attitude_message(round(1e3 * one.sub.time_s), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert one.run(2, lambda step: one.sub.send(same)).action.name == "HOLD"
@@ -608,7 +610,7 @@ def test_messages_that_stand_still_are_old(flight):
 
 def test_a_stall_of_this_computer_holds_for_a_step(flight):
     one = flight()
-    one.run(4)
+    one.run(4, dt=COARSE)
     one.loop.step(one.now_s + 0.5, stalled_s=0.48)
     assert one.loop.last.action.name == "HOLD"
     one.now_s += 0.5
@@ -617,7 +619,7 @@ def test_a_stall_of_this_computer_holds_for_a_step(flight):
 
 def test_the_goal_ends_the_flight(flight):
     one = flight()
-    one.run(4)
+    one.run(4, dt=COARSE)
     ends = []
     for off_m, one.pilot.place_sigma_m in ((0.9, 0.1), (0.5, 0.1), (0.45, 2.0), (0.45, math.nan), (0.9, 0.0)):
         one.pilot.pos_w = (GOAL[0] - off_m, GOAL[1], GOAL[2])
@@ -728,13 +730,17 @@ def real_packet(payload, number, extra, link):
     return b"\xfd" + head + payload + struct.pack("<H", mav.x25crc(head + payload + bytes([extra])).crc)
 
 
+@pytest.fixture(scope="module")
+def packets():
+    return list(hostile(np.random.default_rng(77001), 1000))
+
+
 @pytest.mark.parametrize("arms", [True, False])
-def test_a_thousand_hostile_packets_send_nothing_outside_the_limits(flight, arms):
+def test_a_thousand_hostile_packets_send_nothing_outside_the_limits(flight, packets, arms):
     one = flight(arms=arms)
     one.pilot.velocity = (5.0, -5.0, 5.0, 50.0)
-    one.run(4)
-    packets = list(hostile(np.random.default_rng(77001), 1000))
-    one.run(5, lambda step: [one.sub.socket.sendto(p, one.sub.to) for p in packets[4 * step : 4 * step + 4]])
+    one.run(4, dt=COARSE)
+    one.run(2, lambda step: [one.sub.socket.sendto(p, one.sub.to) for p in packets[10 * step :][:10]])
     document = one.loop.document()
     assert sum(document["heard"].values()) > 1000 and document["broken"] > 100
     assert_within(one.sub.told)
@@ -750,7 +756,7 @@ def test_a_thousand_hostile_packets_send_nothing_outside_the_limits(flight, arms
 
 def test_a_flood_is_bounded_in_every_step(flight):
     one = flight()
-    one.run(4)
+    one.run(4, dt=COARSE)
     junk = b"\xfe" * 2000
     for _ in range(300):
         one.sub.socket.sendto(junk, one.sub.to)

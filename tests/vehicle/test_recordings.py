@@ -456,7 +456,7 @@ def test_odometry_tells_what_nobody_else_does(tmp_path, capfd):
 
 
 def bomb(path):
-    return bag_ros1(path, "bz2", bytes(70 << 20))
+    return bag_ros1(path, "lz4", bytes(70 << 20))
 
 
 def view(path):
@@ -547,7 +547,7 @@ def test_what_is_typed_wrong(words, why, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("make", [tlog, a50, ping360, bag_ros1, bag_db3, bag_mcap], ids=lambda f: f.__name__)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_damage_anywhere_is_named_or_refused(make, seed, tmp_path, capfd):
     rng, path = np.random.default_rng(seed), make(tmp_path / "a.bin")
     data = bytearray(path.read_bytes())
