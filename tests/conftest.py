@@ -9,9 +9,9 @@ import pytest
 gc.disable()  # until all is imported and collected, which makes millions of objects, few of them garbage
 
 BEGUN_FIRST = """
-docs instruments_chain page native world aboard cuda cli wheel training replay tracking deploy log_alone
-security report set_export sonar examples identify telemetry signals sweep dynamics tuned logs resume_eval
-behavior localization media_formats link explain hostile_logs echoes voronoi
+docs aboard deploy learned_forecast page instruments_chain cli wheel surrogate world examples replay training
+sonar localization report sweep stack tracking security log_alone flights link logs signals resume_eval
+identify telemetry media_formats dynamics explain hostile_logs echoes behavior voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""
