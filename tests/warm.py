@@ -6,6 +6,7 @@ Test processes that run side by side would each compile them. ``bootstrap.py tes
 of the tests are installed, so it needs none of them.
 """
 
+import gc
 import os
 import sys
 
@@ -22,6 +23,7 @@ STEPS = 6
 def main(what: str) -> None:
     """The small simulator with and without sensor errors; or the one vehicle and the small one for a GPU
     (``one``)."""
+    gc.disable()  # building kernels makes millions of objects, few of them garbage
     start_taichi("cpu")
     if what == "one":
         sim, one = sim_with_one_beam(), torch.ones(1, dtype=torch.int32)

@@ -614,7 +614,7 @@ def test_the_trees_of_an_evaluation(here, name, told):
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    return deployed.without_graph(tmp_path_factory.mktemp("export"))
+    return deployed.without_graph(tmp_path_factory.mktemp("export"))[0]
 
 
 @pytest.fixture
