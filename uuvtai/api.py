@@ -176,10 +176,11 @@ def evaluate(
     from uuvtai.evaluation.evaluate import compare
     from uuvtai.evaluation.results import Request
 
-    _check(1, episodes=episodes)
+    named = [*_named(agents), *_named(planners, "planner")]
+    _check(1, episodes=episodes, agents=len(named))
     _check(0, record=record)
     request = Request.typed(
-        _scene(world, sensors, vehicle, overrides), [*_named(agents), *_named(planners, "planner")],
+        _scene(world, sensors, vehicle, overrides), named,
         seeds=_seeds(seeds), episodes=episodes, record=record, explain=explain,
         num_envs=num_envs, device=device, run_dir=_path(run_dir),
     )  # fmt: skip
@@ -207,7 +208,7 @@ def sweep(
     from uuvtai.evaluation import sweep as sweeps
     from uuvtai.evaluation.grid import Grid, SweepRequest, checked, grid_of
 
-    _check(1, episodes=episodes, workers=workers)
+    _check(1, episodes=episodes, workers=workers, agents=len(_several(agents)))
     engine = sweeps.engine_of("local", workers, "")
     own = {} if isinstance(grid, str) else {axis: tuple(_several(values)) for axis, values in grid.items()}
     axes = grid_of([grid]) if isinstance(grid, str) else checked(Grid(own))

@@ -129,13 +129,14 @@ def test_bad_input_is_refused_as_by_the_command():
         ("episodes='8': must be a whole number", {"episodes": "8"}),
         ("record=-1: .* at least 0", {"record": -1}),
         ("seeds=0: .* at least 1", {"seeds": []}),
+        ("agents=0: .* at least 1", {"agents": []}),
         ("negative", {"seeds": -1}),
         ("given twice", {"seeds": [1, 1]}),
         ("did you mean 'pool'", {"world": "poool"}),
         ("n_dynamc", {"overrides": {"world.n_dynamc": 3}}),
     ):
         with pytest.raises(ValueError, match=error):
-            uuvtai.evaluate("straight", **words)
+            uuvtai.evaluate(**{"agents": "straight"} | words)
     for error, grid, words in (
         ("axis", {"nothing": [1]}, {}),
         ("episodes=0", {"D": 3}, {"episodes": 0}),
