@@ -153,7 +153,9 @@ class Canvas:
         self.dot(self.pixels([center])[0], radius_px, color, width)
 
     def star(self, center: Sequence[float], radius_px: float, fill: Color = GOAL, edge: Color = INK) -> None:
-        pixels = self.pixels([center])[0] + star_shape(radius_px)
+        angles = -math.pi / 2 + np.arange(10) * math.pi / 5  # one point up
+        reach = np.where(np.arange(10) % 2 == 0, radius_px, 0.42 * radius_px)
+        pixels = self.pixels([center])[0] + np.column_stack([reach * np.cos(angles), reach * np.sin(angles)])
         self.filled(pixels, fill)
         self.strip(pixels, edge, 1, closed=True)
 
@@ -220,13 +222,6 @@ def _hershey_text(
     corner, font = (round(x), round(place[1])), cv2.FONT_HERSHEY_DUPLEX
     cv2.putText(image, plain, corner, font, scale, color, thickness, cv2.LINE_AA)
     return int(width)
-
-
-def star_shape(radius: float) -> np.ndarray:
-    """(10, 2) corners of a star around the origin, one point up (in pixels)."""
-    angles = -math.pi / 2 + np.arange(10) * math.pi / 5
-    reach = np.where(np.arange(10) % 2 == 0, radius, 0.42 * radius)
-    return np.column_stack([reach * np.cos(angles), reach * np.sin(angles)])
 
 
 def _fixed(pixels: np.ndarray) -> np.ndarray:
