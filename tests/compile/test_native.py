@@ -20,15 +20,6 @@ import torch
 
 import uuvtai
 from uuvtai.compile import cache, codegen
-from uuvtai.compile.cache import (
-    KeyNameError,
-    MachineCode,
-    Store,
-    StoreError,
-    described,
-    digest_of_sources,
-    key_with,
-)
 from uuvtai.compile.codegen import RUNTIME_TYPE, Native, UnfitError, tasks_in
 from uuvtai.compile.launch import native, quick_launch
 from uuvtai.compile.memory import Memory, address_of
@@ -360,7 +351,7 @@ def test_processes_at_once_leave_one_whole_file_also_where_one_was_killed_while_
     assert all(int(made) + int(found) == 1 for made, found, _ in results)
     assert any(made == "1" for made, *_ in results) and len({digest for *_, digest in results}) == 1
     os.utime(part, (0, 0))
-    Store(place).bound()
+    cache.Store(place).bound()
     assert [path.suffix for path in place.iterdir()] == KEPT, "an old unfinished file goes"
     assert forks("launch", 1, place) == ([["0", "1", results[0][2]]], [0])
 
@@ -421,8 +412,8 @@ def test_the_text_in_the_key_is_the_text_that_is_compiled(tmp_path, monkeypatch)
     exec(compile(source.read_text(), str(source), "exec"), space)
     monkeypatch.setattr(cache, "_ROOT", tmp_path)
     monkeypatch.setattr(cache, "_SEEN_BY_KERNELS", ("kernels.py",))
-    digest = digest_of_sources.__wrapped__
-    with pytest.raises(StoreError, match=r"kernels\.py: has changed since this process began"):
+    digest = cache.digest_of_sources.__wrapped__
+    with pytest.raises(cache.StoreError, match=r"kernels\.py: has changed since this process began"):
         digest()
     monkeypatch.setattr(cache, "BEGUN_NS", time.time_ns() + 10**9)
     before = digest()
@@ -442,18 +433,18 @@ def names_of(node):
 def test_a_key_tells_configs_places_and_kinds_apart():
     first, second = Scene(), Scene()
     tree = first.memory.tree
-    told = {described(value, tree) for value in (first.io, first.table, first.out, first.out.double())}
-    assert len(told) == 4 and len(digest_of_sources()) == 64
-    assert described(first.io, tree) == described(second.io, second.memory.tree), (
+    told = {cache.described(value, tree) for value in (first.io, first.table, first.out, first.out.double())}
+    assert len(told) == 4 and len(cache.digest_of_sources()) == 64
+    assert cache.described(first.io, tree) == cache.described(second.io, second.memory.tree), (
         "the same places in another tree"
     )
-    with pytest.raises(KeyNameError, match="a field of tree"):
-        described(second.io, tree)
-    with pytest.raises(KeyNameError):
-        described(object(), tree)
+    with pytest.raises(cache.KeyNameError, match="a field of tree"):
+        cache.described(second.io, tree)
+    with pytest.raises(cache.KeyNameError):
+        cache.described(object(), tree)
     other = dataclasses.replace(first.io, rules=EpisodeConfig(control_dt_s=0.05))
     of_time, of_horizon = (
-        [key_with("k", [name], io) for io in (first.io, other)]
+        [cache.key_with("k", [name], io) for io in (first.io, other)]
         for name in ("rules.control_dt_s", "rules.horizon_steps")
     )
     assert of_time[0] != of_time[1] and of_horizon[0] == of_horizon[1] != of_time[0], (
@@ -466,19 +457,19 @@ def test_a_key_tells_configs_places_and_kinds_apart():
 
 @pytest.fixture
 def store(tmp_path):
-    return Store(tmp_path / "deep" / "native")
+    return cache.Store(tmp_path / "deep" / "native")
 
 
 K = [f"{number:064x}" for number in range(6)]
-CODE = MachineCode(["a_kernel_0_serial"], b"\x7fELF" + bytes(range(256)) * 40)
+CODE = cache.MachineCode(["a_kernel_0_serial"], b"\x7fELF" + bytes(range(256)) * 40)
 
 
 def test_what_is_put_is_got_and_nothing_else(store):
     assert store.get("k1") is None
     store.put("k1", CODE)
     assert store.get("k1") == CODE
-    store.put("k1", MachineCode([], b"new"))
-    assert store.get("k1") == MachineCode([], b"new")
+    store.put("k1", cache.MachineCode([], b"new"))
+    assert store.get("k1") == cache.MachineCode([], b"new")
     assert [p.name for p in store.folder.iterdir()] == ["k1.kernel"]
 
 
@@ -503,18 +494,18 @@ def test_foreign_files_and_folders_are_refused(store, tmp_path):
     store.put("k", CODE)
     path = store.folder / "k.kernel"
     path.chmod(0o666)
-    with pytest.raises(StoreError, match="others could have written it"):
+    with pytest.raises(cache.StoreError, match="others could have written it"):
         store.get("k")
     path.chmod(0o600)
     (store.folder / "link.kernel").symlink_to(path)
-    with pytest.raises(StoreError):
+    with pytest.raises(cache.StoreError):
         store.get("link")
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError):
-        Store(tmp_path / "file")
+    with pytest.raises(cache.StoreError):
+        cache.Store(tmp_path / "file")
     (tmp_path / "way").symlink_to(store.folder)
-    with pytest.raises(StoreError, match="link"):
-        Store(tmp_path / "way")
+    with pytest.raises(cache.StoreError, match="link"):
+        cache.Store(tmp_path / "way")
 
 
 def test_a_full_disk_leaves_nothing_half(store, monkeypatch):
@@ -522,7 +513,7 @@ def test_a_full_disk_leaves_nothing_half(store, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(StoreError, match="No space left"):
+    with pytest.raises(cache.StoreError, match="No space left"):
         store.put("k", CODE)
     assert list(store.folder.iterdir()) == []
 

@@ -397,20 +397,6 @@ def test_tree_is_printed_and_drawn(capfd):
     assert out.startswith("digraph")
 
 
-HEAVY = ("taichi", "torch", "cv2", "ompl", "numpy", "yaml", "matplotlib", "tensorboard", "mcap")
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["eval", "--help"], ["--version"]])
-def test_help_is_quick_because_it_imports_nothing_heavy(arguments):
-    program = (
-        "import sys\nfrom uuvtai.cli import main\n"
-        f"try: main({arguments})\nexcept SystemExit as left: print('left', left.code, [m for m in {HEAVY} if "
-        "m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip().endswith("left 0 []")
-
-
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory):
     """One real evaluation in a process of its own: two controllers, recorded, as JSON."""

@@ -187,7 +187,10 @@ def test_a_folder_that_cannot_be_read_offers_nothing(tmp_path):
 
 @pytest.mark.parametrize(
     "arguments",
-    [["-h"], ["eval", "-h"], ["log", "-h"], ["presets"], ["presets", "show", "sensors/paper", "--json"]],
+    [
+        *(["--version"], ["--help"], ["eval", "-h"], ["log", "-h"]),
+        *(["presets"], ["presets", "show", "sensors/paper", "--json"]),
+    ],
 )
 def test_help_and_presets_import_little(arguments):
     code, modules = modules_after(*arguments)

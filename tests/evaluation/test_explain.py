@@ -16,16 +16,6 @@ from uuvtai.console.views import show_causes
 from uuvtai.evaluation import failure_causes, failure_facts
 from uuvtai.evaluation.episodes import EpisodeResult, jobs_of, run_episodes
 from uuvtai.evaluation.evaluate import Request, compare
-from uuvtai.evaluation.failure_facts import (
-    WINDOW_S,
-    CoarseHistory,
-    History,
-    Obstacles,
-    candidates,
-    escapes,
-    motion,
-    rolled_out,
-)
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 
 CONFIG = Config()
@@ -86,7 +76,7 @@ class Story:
         return self
 
     def obstacles(self):
-        return Obstacles(
+        return failure_facts.Obstacles(
             self.kind, self.size, np.zeros(3), self.speed, self.circle, np.where(self.speed > 0, 8.0, np.inf)
         )
 
@@ -102,7 +92,7 @@ class Story:
         yaw = np.arctan2(toward[:, 1], toward[:, 0]) + self.look
         lead = 0.1 * np.arange(26)
         forecast = self.obstacle[:, TOUCHED, None, :2] + lead[:, None] * self.foreseen_vel[:, None]
-        return History(
+        return failure_facts.History(
             t_s=self.t, pos_w=self.pos, believed_pos_w=self.pos + self.place_error, vel_valid=self.vel_valid,
             quat_wb=np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1), vel_b=self.hull_vel,
             rate_b=np.zeros((self.n, 3)), obstacle_w=self.obstacle, obstacle_vel_w=self.vel,
@@ -112,7 +102,7 @@ class Story:
             forecast_above_w=self.pos[:, 2:] + self.believed_gap,
             forecast_below_w=self.pos[:, 2:] - self.believed_gap, conflict=self.conflict, leaf=self.leaf,
             action=np.zeros((self.n, 4)), map_clearance_m=np.ones(self.n),
-            coarse=self.coarse or CoarseHistory(
+            coarse=self.coarse or failure_facts.CoarseHistory(
                 np.array([0.0, END_S]), np.stack([HERE, HERE]), np.ones(2), np.ones(2, bool), ["", ""]
             ),
         )  # fmt: skip
@@ -354,11 +344,11 @@ def test_a_forgotten_obstacle_and_a_seen_corner_are_told():
     # the turn was at 12.9 s, a lap lasts 8 s: it passed the same corner once before, and the vehicle stood
     # within reach
     assert facts["turns_in_reach_before"] == 1
-    far = CoarseHistory(
+    far = failure_facts.CoarseHistory(
         np.array([0.0, END_S]), np.stack([at(-13.0, 0, 0), HERE]), np.ones(2), np.ones(2, bool), ["", ""]
     )
     assert change(story, coarse=far).explained().facts["turns_in_reach_before"] == 1
-    above = CoarseHistory(
+    above = failure_facts.CoarseHistory(
         np.array([0.0, END_S]), np.stack([at(0, 0, 0.7), at(0, 0, 0.7)]), np.ones(2), np.ones(2, bool),
         ["", ""],
     )  # fmt: skip
@@ -407,7 +397,9 @@ def test_a_scan_is_compared_with_the_moment_of_its_ping():
 def test_timeout_facts_from_the_coarse_history():
     t = np.arange(0.0, 60.1, 0.5)
     pos = np.stack([0.05 * t, 0 * t, 0 * t - 1], -1)
-    coarse = CoarseHistory(t, pos, 8.0 - 0.05 * t, t < 52, ["Hold" if s > 56 else "FollowRoute" for s in t])
+    coarse = failure_facts.CoarseHistory(
+        t, pos, 8.0 - 0.05 * t, t < 52, ["Hold" if s > 56 else "FollowRoute" for s in t]
+    )
     facts = change(Story(), coarse=coarse).explained("timeout").facts
     assert facts["progress_m"] == pytest.approx(0.5)
     assert facts["driven_m"] == pytest.approx(0.5)
@@ -506,7 +498,9 @@ def test_a_held_velocity_is_approached_with_the_lag():
     t = np.linspace(0, 2.0, 2001)
     path, vel = (
         found[0]
-        for found in rolled_out(np.zeros(3), np.array([0.5, 0, 0]), np.array([[0.0, 0.8, -0.2]]), t, 0.35)
+        for found in failure_facts.rolled_out(
+            np.zeros(3), np.array([0.5, 0, 0]), np.array([[0.0, 0.8, -0.2]]), t, 0.35
+        )
     )
     left = np.exp(-t / 0.35)[:, None]
     expected = (1 - left) * [0.0, 0.8, -0.2] + left * [0.5, 0.0, 0.0]
@@ -518,15 +512,15 @@ def test_a_held_velocity_is_approached_with_the_lag():
 def test_everything_escapes_in_free_water_and_nothing_from_a_box():
     free = Story()
     free.kind[TOUCHED] = NONE
-    level, heaving = escapes(free.history(), free.obstacles(), CONFIG, 1.0)
-    assert level == int((candidates(CONFIG, 0.0)[:, 2] == 0).sum()) == 33
+    level, heaving = failure_facts.escapes(free.history(), free.obstacles(), CONFIG, 1.0)
+    assert level == int((failure_facts.candidates(CONFIG, 0.0)[:, 2] == 0).sum()) == 33
     assert heaving == 66  # 0.4 m/s for 1.5 s reaches neither floor nor surface from mid-water
     story = corridor(Story(speed=2.0))
-    assert escapes(story.history(), story.obstacles(), CONFIG, 1.0)[0] == 0
+    assert failure_facts.escapes(story.history(), story.obstacles(), CONFIG, 1.0)[0] == 0
 
 
 def test_candidates_respect_the_limits_of_the_body_axes():
-    command = candidates(CONFIG, 0.7)
+    command = failure_facts.candidates(CONFIG, 0.7)
     along = command[:, 0] * np.cos(0.7) + command[:, 1] * np.sin(0.7)
     across = command[:, 1] * np.cos(0.7) - command[:, 0] * np.sin(0.7)
     assert np.abs(along).max() == pytest.approx(CONFIG.vehicle.max_surge_m_s)
@@ -538,7 +532,7 @@ def test_candidates_respect_the_limits_of_the_body_axes():
 
 def test_obstacles_go_straight_on_after_the_end():
     story = Story(speed=1.0)
-    then, vel = motion(story.history(), np.array([END_S - 0.25, END_S + 0.4]))
+    then, vel = failure_facts.motion(story.history(), np.array([END_S - 0.25, END_S + 0.4]))
     np.testing.assert_allclose(then[:, TOUCHED, 0] - story.obstacle[-1, TOUCHED, 0], [0.25, -0.4], atol=1e-6)
     np.testing.assert_allclose(vel[:, TOUCHED], [[-1.0, 0.0, 0.0]] * 2)
 
@@ -579,7 +573,7 @@ def test_what_is_typical_of_a_label():
     rows[1].explanation.remarks.append("turned lately")
     late, stuck = failure_causes.table_of(rows)
     assert (late["knew_share"], late["evading_median_s"], late["last_chance_median_s"]) == (0.5, 2.0, 1.25)
-    assert late["undetected_median_s"] == pytest.approx((WINDOW_S + 0.1) / 2)
+    assert late["undetected_median_s"] == pytest.approx((failure_facts.WINDOW_S + 0.1) / 2)
     assert late["remarks"] == {"turned lately": 2, "static near": 1}
     assert {
         stuck[name]

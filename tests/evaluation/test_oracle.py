@@ -136,18 +136,15 @@ def test_height_takes_time_and_a_current_carries():
     )
 
 
+DOOR = [obstacle("box", (8, y, -0.8), (0.1, 1.2, 0.8)) for y in (1.2, 4.8)]
+"""what a wall leaves open: 1.2 m in the middle"""
+
+
 def test_a_wall_without_a_gap_cannot_be_passed_and_a_door_can():
     left, right = ((2.0, 3.0, -0.8), (14.0, 3.0, -0.8))
     assert arrival(left, right, obstacle("box", (8, 3, -0.8), (0.1, 3.0, 0.8))) is None
-    door = (
-        obstacle("box", (8, 1.2, -0.8), (0.1, 1.2, 0.8)),
-        obstacle("box", (8, 4.8, -0.8), (0.1, 1.2, 0.8)),
-    )
-    assert arrival(left, right, *door) == pytest.approx(11.0 / TOP_SPEED, abs=2 * STEP_S)
-    slit = (
-        obstacle("box", (8, 1.5, -0.8), (0.1, 1.25, 0.8)),
-        obstacle("box", (8, 4.5, -0.8), (0.1, 1.25, 0.8)),
-    )
+    assert arrival(left, right, *DOOR) == pytest.approx(11.0 / TOP_SPEED, abs=2 * STEP_S)
+    slit = [obstacle("box", (8, y, -0.8), (0.1, 1.25, 0.8)) for y in (1.5, 4.5)]
     assert arrival(left, right, *slit) is None, "0.5 m is less than the hull and its clearances"
 
 
@@ -159,17 +156,13 @@ def test_a_low_wall_is_passed_above():
 def test_the_oracle_waits_for_a_door_that_a_obstacle_blocks():
     """A column creeps out of a 1.2 m door at 2 cm/s and leaves room from 9.5 to 11 s on (by hand)."""
     start, goal = (6.0, 3.0, -0.8), (12.0, 3.0, -0.8)
-    door = (
-        obstacle("box", (8, 1.2, -0.8), (0.1, 1.2, 0.8)),
-        obstacle("box", (8, 4.8, -0.8), (0.1, 1.2, 0.8)),
-    )
-    assert arrival(start, goal, *door) == pytest.approx(5.0 / TOP_SPEED, abs=2 * STEP_S)
+    assert arrival(start, goal, *DOOR) == pytest.approx(5.0 / TOP_SPEED, abs=2 * STEP_S)
     rest_s = 3.0 / TOP_SPEED
-    waited = arrival(start, goal, *door, column(8.0, 3.0, path=line((8.0, 3.0), (8.0, 6.0), 0.02)))
+    waited = arrival(start, goal, *DOOR, column(8.0, 3.0, path=line((8.0, 3.0), (8.0, 6.0), 0.02)))
     assert 9.5 + rest_s - 0.6 <= waited <= 11.0 + rest_s + 0.6
     short = CONFIG.model_copy(update={"episode": CONFIG.episode.model_copy(update={"horizon_steps": 600})})
     assert (
-        arrival(start, goal, *door, column(8.0, 3.0, path=line((8.0, 3.0), (8.0, 6.0), 0.02)), config=short)
+        arrival(start, goal, *DOOR, column(8.0, 3.0, path=line((8.0, 3.0), (8.0, 6.0), 0.02)), config=short)
         is None
     )
 

@@ -28,16 +28,9 @@ from uuvtai.evaluation.episodes import jobs_of, run_episodes
 from uuvtai.kernels.behavior.io import BehaviorIO
 from uuvtai.kernels.behavior.rollout import tuned
 from uuvtai.kernels.core.stage import AnyTensor, Bundle
-from uuvtai.learning import checkpoint
+from uuvtai.learning import checkpoint, parameter_search
 from uuvtai.learning.agents import TunedAgent, load_tuned, tuned_sections
 from uuvtai.learning.checkpoint import CheckpointError
-from uuvtai.learning.parameter_search import (
-    BEND_MEAN,
-    NumberSearch,
-    ParameterSearchTrainer,
-    best_near,
-    fitted,
-)
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.sim.setup import fill_constants
 
@@ -58,7 +51,7 @@ def config():
 @pytest.fixture(scope="module")
 def trainer(config, small):
     """After three iterations: slow obstacles, fast ones, slow ones; ``centres``: before and after each."""
-    made = ParameterSearchTrainer(config, {"pool": small.sim})
+    made = parameter_search.ParameterSearchTrainer(config, {"pool": small.sim})
     made.centres = [made.centre]
     for _ in range(3):
         made.iterate()
@@ -77,25 +70,27 @@ def test_the_surface_finds_what_made_the_scores():
     x, group = place / spread, np.repeat(rng.integers(0, 2, 10000), 2)
     score = 0.6 + 0.1 * group + 0.04 * x[:, 0] - 0.02 * (x[:, 1] - 0.3) ** 2 + rng.normal(0, 0.03, 20000)
     score += np.repeat(rng.normal(0, 0.03, 10000), 2)  # what makes an episode easy, for both of its trials
-    slope, bend = fitted(place, score, group, spread)
+    slope, bend = parameter_search.fitted(place, score, group, spread)
     assert slope == pytest.approx([0.04, 0.012, 0.0], abs=0.004)
     assert bend == pytest.approx([0.0, -0.02, 0.0], abs=0.004)
-    found = best_near(np.zeros(3), slope, bend, spread, -2 * spread, 2 * spread)
+    found = parameter_search.best_near(np.zeros(3), slope, bend, spread, -2 * spread, 2 * spread)
     assert found[0] == pytest.approx(0.25), "a slope: as far as a step goes"
     assert found[1] == pytest.approx(0.3, abs=0.08), "a top within the step"
 
 
 def test_a_step_stays_within_the_bounds():
     one = np.ones(1)
-    assert best_near(0 * one, one, 0 * one, one, -one, 0.2 * one) == pytest.approx(0.2)
-    assert best_near(0 * one, -one, one, one, -0.1 * one, one) == pytest.approx(-0.1)
+    assert parameter_search.best_near(0 * one, one, 0 * one, one, -one, 0.2 * one) == pytest.approx(0.2)
+    assert parameter_search.best_near(0 * one, -one, one, one, -0.1 * one, one) == pytest.approx(-0.1)
 
 
 def test_few_trials_are_not_believed():
     rng = np.random.default_rng(1)
     place = rng.uniform(-1, 1, (200, 2))
-    slope, bend = fitted(place, rng.integers(0, 2, 200).astype(float), np.zeros(200, int), np.ones(2))
-    assert np.abs(slope).max() < 0.03 and np.abs(bend - BEND_MEAN).max() < 0.02
+    slope, bend = parameter_search.fitted(
+        place, rng.integers(0, 2, 200).astype(float), np.zeros(200, int), np.ones(2)
+    )
+    assert np.abs(slope).max() < 0.03 and np.abs(bend - parameter_search.BEND_MEAN).max() < 0.02
 
 
 # ------------------------------------------------------------------------------------------------ the numbers
@@ -184,7 +179,7 @@ def test_a_training_moves_the_numbers_within_their_bounds(trainer):
 
 
 def test_trials_come_in_mirrored_pairs():
-    search = NumberSearch(torch.zeros(len(TUNED)), torch.tensor(log_bounds()), 0.3, 2000, 0)
+    search = parameter_search.NumberSearch(torch.zeros(len(TUNED)), torch.tensor(log_bounds()), 0.3, 2000, 0)
     drawn = search.drawn(2000)
     inside = (drawn > search.low) & (drawn < search.high)
     both = inside[0::2] & inside[1::2]
@@ -202,14 +197,14 @@ def test_trials_of_one_kind_of_obstacles_leave_the_other_s_numbers_alone(trainer
 
 def test_a_search_goes_on_from_the_config_s_numbers(small):
     config = load_training("best", overrides=SMALL | {"slow.hysteresis_s": 2.0, "fast.hysteresis_s": 0.5})
-    made = ParameterSearchTrainer(config, {"pool": small.sim})
+    made = parameter_search.ParameterSearchTrainer(config, {"pool": small.sim})
     assert made.centre[HYSTERESIS].tolist() == pytest.approx([math.log(2.0), math.log(0.5)])
 
 
 def test_a_scene_that_is_neither_slow_nor_fast_is_refused():
     config = load_training("best", overrides=SMALL | {"parameter_search.scenes": [["pool", 8, 6, 1.0]]})
     with pytest.raises(UserError, match=r"1 m/s, in pool, are neither slow \(fast\.from_m_s, 0\.8"):
-        ParameterSearchTrainer(config)
+        parameter_search.ParameterSearchTrainer(config)
 
 
 def test_arrivals_count_and_early_ones_more(trainer):
@@ -233,9 +228,9 @@ def test_an_evaluation_changes_nothing(trainer):
 def test_a_resumed_training_has_the_same_bits(trainer, config, small, tmp_path):
     path = checkpoint.save(tmp_path / "checkpoints", 3, trainer.state(), config, trainer.observation_table)
     found = checkpoint.open_checkpoint(path)
-    other = ParameterSearchTrainer(config, {"pool": small.sim})
+    other = parameter_search.ParameterSearchTrainer(config, {"pool": small.sim})
     other.load_state(found.state(like=other.state()))
-    first = ParameterSearchTrainer(config, {"pool": small.sim})
+    first = parameter_search.ParameterSearchTrainer(config, {"pool": small.sim})
     first.load_state(trainer.state())
     assert first.iterate()["rollout/success_rate"] == other.iterate()["rollout/success_rate"]
     assert torch.equal(first.centre, other.centre)

@@ -7,15 +7,6 @@ import pytest
 from tests.oracles import logs as episode
 from uuvtai.common.obstacle_motion import obstacle_positions
 from uuvtai.logs import drawing as ink
-from uuvtai.logs.drawing import (
-    PICTURE_TOPICS,
-    Canvas,
-    load_recording,
-    map_canvas,
-    paint_truth,
-    paint_walls,
-    paint_water,
-)
 from uuvtai.logs.encode import LogError
 from uuvtai.logs.picture import paint_picture, picture
 from uuvtai.logs.video import FrameArtist, video
@@ -59,14 +50,14 @@ def has(pixels, color, tolerance=12):
 def test_picture_has_what_it_should_where_it_should(folder, bt, straight):
     image = cv2.imread(str(picture([bt, straight], folder / "p.png")))
     assert image.shape[1] == 1600 and image.shape[0] % 2 == 0
-    last = load_recording(bt, PICTURE_TOPICS)["/map/dynamic"].values[-1]
+    last = ink.load_recording(bt, ink.PICTURE_TOPICS)["/map/dynamic"].values[-1]
     row, col = np.unravel_index(last.values.argmax(), last.values.shape)
     assert last.values[row, col] > 0.9
     spot = (last.origin_m[0] + (col + 0.5) * last.cell_m, last.origin_m[1] + (row + 0.5) * last.cell_m)
     assert has(around(image, place(spot)), ink.DYNAMIC, 30)
     assert has(around(image, place(episode.GOAL), 5), ink.GOAL)
     for name, log in (("bt", bt), ("straight", straight)):
-        path = load_recording(log, PICTURE_TOPICS).positions
+        path = ink.load_recording(log, ink.PICTURE_TOPICS).positions
         assert has(around(image, place(path[len(path) // 4]), 2), INKS[name])
     assert has(around(image, place((1.0, 5.0)), 1), ink.WATER, 1)
     assert has(around(image, place((0.0, 3.0)), 2), ink.INK)
@@ -75,7 +66,7 @@ def test_picture_has_what_it_should_where_it_should(folder, bt, straight):
 
 def test_static_occupancy_is_dark_where_the_map_says_so(folder, bt):
     image = cv2.imread(str(picture(bt, folder / "s.png", obstacles=False)))
-    layer = load_recording(bt, PICTURE_TOPICS)["/map/static"].values[-1]
+    layer = ink.load_recording(bt, ink.PICTURE_TOPICS)["/map/static"].values[-1]
     inside = layer.values.copy()
     inside[:4], inside[-4:], inside[:, :6], inside[:, -10:] = 0, 0, 0, 0  # not the walls
     row, col = np.unravel_index(inside.argmax(), inside.shape)
@@ -91,7 +82,7 @@ def test_clearance_is_coloured_from_dark_at_the_wall_to_bright_in_the_open(folde
 
 
 def test_the_end_shows_the_outcome(bt, straight):
-    loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, straight)]
+    loaded = [ink.load_recording(path, ink.PICTURE_TOPICS) for path in (bt, straight)]
     crash, arrival = (
         paint_picture([recording], obstacles=False).image for recording in (loaded[1], loaded[0])
     )
@@ -102,7 +93,7 @@ def test_the_end_shows_the_outcome(bt, straight):
 
 def test_where_methods_go_the_same_way_both_are_seen(folder, bt):
     surrogate = episode.record(folder / "surrogate.mcap", N_STEP, episode.header("surrogate"))
-    loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, surrogate)]
+    loaded = [ink.load_recording(path, ink.PICTURE_TOPICS) for path in (bt, surrogate)]
     image = paint_picture(loaded, obstacles=False).image
     path = loaded[0].positions
     assert has(around(image, place(path[len(path) // 4]), 2), INKS["bt"])
@@ -115,7 +106,7 @@ def test_true_obstacles_are_as_old_as_the_map(folder, bt):
     """The first agent's map is drawn; another agent that took longer does not move the obstacles on."""
     longer = folder / "longer.mcap"
     episode.record(longer, 2 * N_STEP, episode.header("straight"), sway=-0.9)
-    first, second = (load_recording(path, PICTURE_TOPICS) for path in (bt, longer))
+    first, second = (ink.load_recording(path, ink.PICTURE_TOPICS) for path in (bt, longer))
     body = episode.OBSTACLES[4]
     then, later = (
         obstacle_positions(body, np.array([recording.duration_s]))[0] for recording in (first, second)
@@ -128,7 +119,7 @@ def test_true_obstacles_are_as_old_as_the_map(folder, bt):
 
 
 def test_remarks_stand_in_red_beside_the_title(bt):
-    recording = load_recording(bt)
+    recording = ink.load_recording(bt)
     plain = paint_picture([recording]).image
     marked = paint_picture([recording], remark="unseen above").image
     rows, cols = np.nonzero((plain != marked).any(axis=2))
@@ -138,8 +129,10 @@ def test_remarks_stand_in_red_beside_the_title(bt):
 
 def test_obstacles_above_and_below_the_vehicle_are_dashed():
     def ink_used(own_z_m):
-        canvas = map_canvas(episode.scenario()["tank"], 1280, (52, 28, 84, 212))
-        paint_truth(canvas, {"obstacles": [episode.OBSTACLES[0] | {"size": [0.35, 0.35, 0.2]}]}, 0.0, own_z_m)
+        canvas = ink.map_canvas(episode.scenario()["tank"], 1280, (52, 28, 84, 212))
+        ink.paint_truth(
+            canvas, {"obstacles": [episode.OBSTACLES[0] | {"size": [0.35, 0.35, 0.2]}]}, 0.0, own_z_m
+        )
         return int((255 - canvas.image.astype(int)).sum())
 
     level, reaching_up, below, above = (ink_used(z) for z in (-0.8, -1.1, -1.3, -0.3))
@@ -156,10 +149,10 @@ def test_trajectories_of_other_episodes_are_not_overlaid(folder, bt):
 
 def test_a_round_tank_is_round():
     tank = {"shape": "circle", "x_m": [0, 16], "y_m": [0, 16], "radius_m": 8.0}
-    canvas = map_canvas(tank, 1000, (50, 50, 60, 40))
-    paint_water(canvas, tank)
+    canvas = ink.map_canvas(tank, 1000, (50, 50, 60, 40))
+    ink.paint_water(canvas, tank)
     canvas.cells(np.array(ink.STATIC), np.ones((160, 160)), (0.0, 0.0), 0.1)
-    paint_walls(canvas, tank)
+    ink.paint_walls(canvas, tank)
     corner, middle = canvas.pixels([(0.5, 0.5), (8, 8)]).astype(int)
     assert (canvas.image[corner[1], corner[0]] == 255).all()
     assert tuple(canvas.image[middle[1], middle[0]]) == ink.STATIC
@@ -167,7 +160,7 @@ def test_a_round_tank_is_round():
 
 
 def test_cells_lie_where_the_world_says():
-    canvas = Canvas((400, 300), (20.0, 30.0), 35.0, (0.0, 10.0), (0.0, 6.0))
+    canvas = ink.Canvas((400, 300), (20.0, 30.0), 35.0, (0.0, 10.0), (0.0, 6.0))
     opacity = np.zeros((64, 104))
     opacity[2 + 35, 2 + 71] = 1.0  # centre (7.15, 3.55) with two cells of border
     canvas.cells(np.array(ink.DYNAMIC), opacity, (-0.2, -0.2), 0.1)
@@ -188,9 +181,9 @@ def test_text_is_drawn_with_any_opencv(monkeypatch, font):
 
 
 def test_a_frame_shows_the_moment(bt):
-    recording = load_recording(bt)
+    recording = ink.load_recording(bt)
     artist = FrameArtist(recording)
-    canvas = map_canvas(recording.scenario["tank"], 1280, (52, 28, 84, 212))
+    canvas = ink.map_canvas(recording.scenario["tank"], 1280, (52, 28, 84, 212))
     for time_s in (0.3, 1.7):
         frame = artist.frame(time_s)
         hull = canvas.pixels([recording["/pose"].at(time_s)])[0].round().astype(int)
@@ -225,4 +218,4 @@ def test_a_log_without_poses_cannot_be_drawn(tmp_path):
 def test_a_log_without_maps_is_drawn_all_the_same(tmp_path):
     episode.record(tmp_path / "a.mcap", 20, maps=False)
     assert cv2.imread(str(picture(tmp_path / "a.mcap", tmp_path / "a.png", clearance=True))) is not None
-    assert FrameArtist(load_recording(tmp_path / "a.mcap")).frame(0.2).shape[1] == 1280
+    assert FrameArtist(ink.load_recording(tmp_path / "a.mcap")).frame(0.2).shape[1] == 1280

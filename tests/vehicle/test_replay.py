@@ -18,16 +18,8 @@ from uuvtai.logs.encode import LogError
 from uuvtai.logs.reader import records
 from uuvtai.logs.topics.sensors import exact_image
 from uuvtai.logs.writer import EpisodeRecorder
+from uuvtai.vehicle import onboard
 from uuvtai.vehicle import replay as replaying
-from uuvtai.vehicle.onboard import (
-    DepthShot,
-    DvlReading,
-    ImuReading,
-    OnboardPilot,
-    PositionFix,
-    PressureReading,
-    SonarPing,
-)
 from uuvtai.vehicle.replay import Delivery, Faults, Outage, disturbed, outage_of, read_feed, replay
 
 STEPS, SEED = 90, 77001
@@ -67,7 +59,7 @@ def feed(log):
 def build(small, monkeypatch):
     """Makes pilots on the session's simulator, whose sensors are its own again afterwards."""
     monkeypatch.setattr(small.sim, "sensors", small.sim.sensors)
-    return lambda feed: OnboardPilot(small.sim, feed.mission)
+    return lambda feed: onboard.OnboardPilot(small.sim, feed.mission)
 
 
 def commands(feed, build, arrivals=None):
@@ -148,7 +140,7 @@ def test_late_readings_are_carried_to_now(small, build, monkeypatch, tmp_path):
     usual, _ = commands(feed, build)
     late = [
         Delivery(arrival.time_s + (0.1 if arrival.message.time_s < 0.1 else 0.06), arrival.message)
-        if isinstance(arrival.message, PressureReading | ImuReading | DvlReading)
+        if isinstance(arrival.message, onboard.PressureReading | onboard.ImuReading | onboard.DvlReading)
         else arrival
         for arrival in feed.arrivals
     ]
@@ -260,7 +252,7 @@ def test_a_position_that_jumps_is_no_velocity(feed, build, small):
     left = disturbed(feed.arrivals, Faults(outages=(outage_of("dvl:0.2:9"),))).arrivals
     jump = [
         dataclasses.replace(a, message=dataclasses.replace(a.message, pos_w=a.message.pos_w + np.float32(1)))
-        if isinstance(a.message, PositionFix) and a.time_s > 1.79
+        if isinstance(a.message, onboard.PositionFix) and a.time_s > 1.79
         else a
         for a in left
     ]
@@ -275,7 +267,7 @@ def test_nothing_at_all_is_a_stop(feed, build):
 
 
 def test_a_scan_without_an_attitude_is_not_drawn(feed, build, small):
-    left = [arrival for arrival in feed.arrivals if not isinstance(arrival.message, ImuReading)]
+    left = [arrival for arrival in feed.arrivals if not isinstance(arrival.message, onboard.ImuReading)]
     _, pilot = commands(feed, build, left)
     tally = pilot.tallies["sonar"]
     assert tally.used == 0 and tally.unplaced == tally.fed > 0
@@ -288,14 +280,14 @@ def test_nonsense_is_counted_and_forgotten(feed, build):
     for arrival in feed.arrivals:
         message = arrival.message
         spoilt.append(arrival)
-        if isinstance(message, SonarPing):
+        if isinstance(message, onboard.SonarPing):
             wild = message.range_m.copy()
             wild[7] = np.nan
             later = message.time_s + 1e-6
             spoilt.append(Delivery(arrival.time_s, dataclasses.replace(message, time_s=later, range_m=wild)))
-        if isinstance(message, PressureReading):
-            spoilt.append(Delivery(arrival.time_s, PressureReading(message.time_s + 1e-6, 1e30)))
-            spoilt.append(Delivery(arrival.time_s, PressureReading(float("nan"), 1.0)))
+        if isinstance(message, onboard.PressureReading):
+            spoilt.append(Delivery(arrival.time_s, onboard.PressureReading(message.time_s + 1e-6, 1e30)))
+            spoilt.append(Delivery(arrival.time_s, onboard.PressureReading(float("nan"), 1.0)))
     found, pilot = commands(feed, build, spoilt)
     assert all(np.array_equal(one.action, two.action) for one, two in zip(usual, found, strict=True))
     assert pilot.tallies["sonar"].bad == STEPS + 1 and pilot.tallies["pressure"].bad == 2 * (STEPS + 1)
@@ -306,9 +298,9 @@ def test_what_is_no_message_or_has_another_shape_is_refused(feed, build):
     with pytest.raises(TypeError, match="no message of a sensor"):
         pilot.feed("imu")
     with pytest.raises(ValueError, match=r"depth: depth_m must have the shape \(72, 128\)"):
-        pilot.feed(DepthShot(0.0, np.zeros((3, 3))))
+        pilot.feed(onboard.DepthShot(0.0, np.zeros((3, 3))))
     with pytest.raises(ValueError, match="imu: rpy"):
-        pilot.feed(ImuReading(0.0, np.zeros(2), np.zeros(3), np.zeros(3)))
+        pilot.feed(onboard.ImuReading(0.0, np.zeros(2), np.zeros(3), np.zeros(3)))
 
 
 @pytest.mark.parametrize(
@@ -411,7 +403,7 @@ def test_a_gap_is_refused_and_a_tree_can_be_named(log, build, tmp_path):
 
 
 def test_exact_images_keep_every_bit(feed):
-    shots = [a.message for a in feed.arrivals if isinstance(a.message, DepthShot)]
+    shots = [a.message for a in feed.arrivals if isinstance(a.message, onboard.DepthShot)]
     assert len(shots) == STEPS // 5 + 1 and shots[0].depth_m.dtype == np.float32
     assert shots[0].depth_m.std() > 0.1
     with pytest.raises(LogError, match="72 x 128 pixels"):

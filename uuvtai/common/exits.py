@@ -93,7 +93,10 @@ def _ended_by(error: BaseException) -> int:
             if error.code is None
             else reported(str(error.code), FAILED)
         )
-    return _bug(error)
+    # one line, and all that a report needs in a file; with UUV_DEBUG=1 in the terminal
+    what = f"uuv: a bug of ours: {type(error).__name__}: {_one_line(error)}"
+    kept = _kept(error, "uuv-bug")
+    return reported(f"{what}; please report it with {kept}" if _is_file(kept) else f"{what}{kept}", FAILED)
 
 
 def _is_out_of_memory(error: BaseException) -> bool:
@@ -111,13 +114,6 @@ def _interrupted() -> int:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     _settle_output()
     return reported("interrupted", signals.exit_code())
-
-
-def _bug(error: BaseException) -> int:
-    """One line, and all that a report needs in a file; with UUV_DEBUG=1 in the terminal."""
-    what = f"uuv: a bug of ours: {type(error).__name__}: {_one_line(error)}"
-    kept = _kept(error, "uuv-bug")
-    return reported(f"{what}; please report it with {kept}" if _is_file(kept) else f"{what}{kept}", FAILED)
 
 
 def _own_code(error: BaseException) -> int:

@@ -32,17 +32,7 @@ import torch
 from taichi.lang import impl
 
 from uuvtai.common.files import FileError, open_to_append, read_text
-from uuvtai.compile.cache import (
-    KeyNameError,
-    MachineCode,
-    Store,
-    StoreError,
-    default_folder,
-    key_of,
-    key_with,
-    noted,
-    value_of,
-)
+from uuvtai.compile import cache
 from uuvtai.compile.launch import (
     Launch,
     NativeLaunch,
@@ -497,7 +487,7 @@ class Native:
             raise UnfitError("own machine code is for Linux so far")
         if tuple(ti.__version__) != (1, 7, 4):
             raise UnfitError(f"Taichi {'.'.join(map(str, ti.__version__))} is not 1.7.4")
-        self.store = Store(default_folder())
+        self.store = cache.Store(cache.default_folder())
         self.machine = Machine(int(os.environ.get("UUV_NUM_THREADS") or os.cpu_count() or 1))
         program: Any = impl.get_runtime().prog
         told = program.config()
@@ -528,13 +518,15 @@ class Native:
         if owner is None or not all(_is_plain(value) for value in arguments[1:]):
             return None
         try:
-            key = key_of(kernel, arguments, owner.memory.tree, self.surroundings)
-            kept = (self.store.get(key_with(key, names, arguments[0])) for names in self.store.names(key))
+            key = cache.key_of(kernel, arguments, owner.memory.tree, self.surroundings)
+            kept = (
+                self.store.get(cache.key_with(key, names, arguments[0])) for names in self.store.names(key)
+            )
             code = next(filter(None, kept), None)
             if code is None:
                 return self._make(key, kernel, arguments, owner)
             launch = self._launch(code, kernel, arguments, owner)
-        except (UnfitError, KeyNameError, StoreError) as error:
+        except (UnfitError, cache.KeyNameError, cache.StoreError) as error:
             self._tell(kernel, error)
             return None
         launch.again()
@@ -558,7 +550,7 @@ class Native:
         state = Written(arguments, owner.memory)
         taichi.again()
         try:
-            code = MachineCode(tasks, work(), table)
+            code = cache.MachineCode(tasks, work(), table)
             ours = self._launch(code, kernel, arguments, owner)
         except UnfitError as error:
             self._tell(kernel, error)
@@ -568,9 +560,9 @@ class Native:
             return taichi
         self.made += 1
         try:
-            self.store.put(key_with(key, names, arguments[0]), code)
+            self.store.put(cache.key_with(key, names, arguments[0]), code)
             self.store.put_names(key, names)
-        except StoreError as error:
+        except cache.StoreError as error:
             self._tell(kernel, error, "its machine code is not kept")
         return ours
 
@@ -580,11 +572,11 @@ class Native:
         instance = kernel.mapper.lookup(arguments)[0]
         kernel.compiled_kernels.pop((kernel.func, instance, kernel.autodiff_mode), None)  # not read by us
         self._times[kernel.func] += 1
-        with noted(arguments[0], self._times[kernel.func]) as (names, numbers), _uncollected():
+        with cache.noted(arguments[0], self._times[kernel.func]) as (names, numbers), _uncollected():
             made = kernel.compiled_kernels.pop(kernel.ensure_compiled(*arguments))
         return made, sorted(names), numbers.table
 
-    def _launch(self, code: MachineCode, kernel: Any, arguments: tuple, owner: Owner) -> NativeLaunch:
+    def _launch(self, code: cache.MachineCode, kernel: Any, arguments: tuple, owner: Owner) -> NativeLaunch:
         tasks = self.machine.tasks_of(code.machine, code.tasks)
         values = _values(kernel, arguments, code.numbers)
         return NativeLaunch(self.machine, owner.runtime, tasks, arguments, values)
@@ -606,13 +598,13 @@ def adopt(
         if not native:
             native.append(Native())
         native[0].adopt(bundles, memory, recipe, alone)
-    except (UnfitError, StoreError) as error:
+    except (UnfitError, cache.StoreError) as error:
         warnings.warn(f"{error}; Taichi launches all kernels", RuntimeWarning, stacklevel=2)
 
 
 def _values(kernel: Any, arguments: tuple, table: list[Sum]) -> list[tuple[Any, Any]]:
     """What a kernel is told at a launch: its own numbers and tensors, then those of the config."""
-    numbers = (worked_out(told, lambda name: value_of(arguments[0], name)) for told in table)
+    numbers = (worked_out(told, lambda name: cache.value_of(arguments[0], name)) for told in table)
     return given(kernel, arguments) + [(float, number) for number in numbers]
 
 

@@ -20,15 +20,7 @@ from uuvtai.config import Config
 from uuvtai.config.loader import load_config
 from uuvtai.envs.vector_env import NUM_ACTIONS, ObservationColumn, VectorEnv, checked_seed
 from uuvtai.kernels.core.grid import grid_origin
-from uuvtai.logs.drawing import (
-    ROUTE,
-    agent_inks,
-    map_canvas,
-    paint_layers,
-    paint_truth,
-    paint_walls,
-    paint_water,
-)
+from uuvtai.logs import drawing
 from uuvtai.logs.scenario import scenario_document
 from uuvtai.logs.topics.motion import angles_of
 from uuvtai.logs.topics.perception import Layer
@@ -364,14 +356,14 @@ def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
         Layer.of(occupancy(read(layer)), grid_origin(config.world.tank, cell_m), cell_m)
         for layer in ("grid_map.static_occ", "grid_map.dynamic_occ")
     )
-    canvas = map_canvas(scenario["tank"], width_px, _MARGINS)
-    paint_water(canvas, scenario["tank"])
-    paint_layers(canvas, static, dynamic)
-    paint_truth(canvas, scenario, time_s, float(pos_w[2]))
-    paint_walls(canvas, scenario["tank"])
-    canvas.line(read("route.way_w")[: int(read("route.n_way"))], ROUTE, 2)
+    canvas = drawing.map_canvas(scenario["tank"], width_px, _MARGINS)
+    drawing.paint_water(canvas, scenario["tank"])
+    drawing.paint_layers(canvas, static, dynamic)
+    drawing.paint_truth(canvas, scenario, time_s, float(pos_w[2]))
+    drawing.paint_walls(canvas, scenario["tank"])
+    canvas.line(read("route.way_w")[: int(read("route.n_way"))], drawing.ROUTE, 2)
     canvas.star(scenario["goal"], 12)
-    canvas.vehicle([*pos_w, angles_of(*read("vehicle.quat_wb"))[2]], agent_inks(["bt"])["bt"])
+    canvas.vehicle([*pos_w, angles_of(*read("vehicle.quat_wb"))[2]], drawing.agent_inks(["bt"])["bt"])
     return canvas.image[:, :, ::-1].copy()
 
 

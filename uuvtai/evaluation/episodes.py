@@ -296,25 +296,19 @@ def _refill(
 ) -> list[int]:
     """Begin as many jobs as there are free rows; the rows."""
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
-    begun: list[tuple[int, Job]] = []
+    begun: dict[int, Job] = {}
     while waiting and free:
         index, job = waiting.pop()
         row = free.pop()
         running[row] = index
         mask[row], seed[row], number[row] = 1, job.seed, job.episode
-        begun.append((row, job))
-    _set_scenes(sim, begun)
-    stepper.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
-    return [row for row, _job in begun]
-
-
-def _set_scenes(sim: Sim, begun: list[tuple[int, Job]]) -> None:
-    """Give the rows about to be reset the scenes of their jobs; the others have drawn their scenarios
-    already."""
-    scenes = {row: job.scene for row, job in begun if job.scene is not None}
-    if scenes:
+        begun[row] = job
+    scenes = {row: job.scene for row, job in begun.items() if job.scene is not None}
+    if scenes:  # the rows that are not reset have drawn their scenarios already
         any_scene = next(iter(scenes.values()))
         sim.set_scenes([scenes.get(row, any_scene) for row in range(sim.num_envs)])
+    stepper.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
+    return list(begun)
 
 
 def _results(sim: Sim, rows: list[int], jobs: list[Job]) -> list[EpisodeResult]:

@@ -22,17 +22,8 @@ from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError
-from uuvtai.evaluation import failure_causes
+from uuvtai.evaluation import episodes, failure_causes
 from uuvtai.evaluation.agents import TRUTH, AgentSpec, differences, load_agents
-from uuvtai.evaluation.episodes import (
-    EpisodeObserver,
-    EpisodeResult,
-    Job,
-    Recorders,
-    StepClock,
-    jobs_of,
-    run_episodes,
-)
 from uuvtai.evaluation.oracle import earliest_arrival
 from uuvtai.evaluation.results import (
     ORACLE,
@@ -175,7 +166,7 @@ def comparison_of(
 
 def run_agents(comparison: Comparison, folder: RunFolder) -> list[AgentRun]:
     """Run every agent's episodes that are not over yet."""
-    jobs = jobs_of(comparison.request.seeds, comparison.request.episodes)
+    jobs = episodes.jobs_of(comparison.request.seeds, comparison.request.episodes)
     journal = ResultsJournal(folder.path)
     try:
         return [run_agent(comparison, agent, jobs, journal, folder.path) for agent in comparison.agents]
@@ -186,7 +177,7 @@ def run_agents(comparison: Comparison, folder: RunFolder) -> list[AgentRun]:
 def write_results(comparison: Comparison, folder: RunFolder, runs: list[AgentRun]) -> dict[str, Any]:
     """The whole document of what was run, with the oracle's row, and all that is written and drawn of it."""
     request = comparison.request
-    jobs = jobs_of(request.seeds, request.episodes)
+    jobs = episodes.jobs_of(request.seeds, request.episodes)
     entries = [agent_run.entry for agent_run in runs]
     scenarios = scenarios_of(comparison.any_simulator(), jobs)
     if ORACLE in request.agents:
@@ -212,7 +203,7 @@ def _write_results(folder: RunFolder, result: dict[str, Any], runs: list[AgentRu
     folder.write_json("eval/tree.json", {"schema": 1, "use": use})
 
 
-def _draw(comparison: Comparison, folder: Path, logs: list[dict[Job, Path]]) -> None:
+def _draw(comparison: Comparison, folder: Path, logs: list[dict[episodes.Job, Path]]) -> None:
     """One picture per recorded episode with every agent's trajectory."""
     if not logs:
         return
@@ -263,7 +254,7 @@ class Guest:
     """An agent that no name stands for, and who looks on while it drives."""
 
     agent: AgentSpec
-    observer: EpisodeObserver
+    observer: episodes.EpisodeObserver
 
 
 @dataclass(frozen=True)
@@ -300,16 +291,16 @@ class AgentRun:
 
     agent: AgentSpec
     policy: PolicyNote | None
-    results: list[EpisodeResult]
+    results: list[episodes.EpisodeResult]
     entry: dict[str, Any]
     """of ``uuv eval --json``"""
     use: list[dict[str, Any]]
     """of its tree's nodes"""
-    logs: dict[Job, Path]
+    logs: dict[episodes.Job, Path]
 
 
 def run_agent(
-    comparison: Comparison, agent: AgentSpec, jobs: list[Job], journal: ResultsJournal, folder: Path
+    comparison: Comparison, agent: AgentSpec, jobs: list[episodes.Job], journal: ResultsJournal, folder: Path
 ) -> AgentRun:
     """Run one agent's episodes, as far as they are not over; ``folder`` is the run's."""
     policy, watch = comparison.policies[agent.name], comparison.watch
@@ -321,14 +312,14 @@ def run_agent(
     left = [job for job in jobs if job not in over or (job in logs and not logs[job].exists())]
     before = len(jobs) - len(left)
     watch.start(agent.name, len(jobs))
-    writer, clock = JournalWriter(journal, agent.name), StepClock()
+    writer, clock = JournalWriter(journal, agent.name), episodes.StepClock()
     guest = comparison.guest
     looker = guest.observer if guest and guest.agent is agent else None
     try:
-        run_episodes(
+        episodes.run_episodes(
             sim,
             left,
-            Recorders([recorder, writer, looker]),
+            episodes.Recorders([recorder, writer, looker]),
             lambda done, _total, env_steps, to_come: watch.update(
                 before + done, len(jobs), env_steps, to_come
             ),
@@ -352,7 +343,7 @@ def run_agent(
 
 
 def _recorder(
-    request: Request, folder: Path, agent: str, jobs: list[Job], policy: PolicyNote | None
+    request: Request, folder: Path, agent: str, jobs: list[episodes.Job], policy: PolicyNote | None
 ) -> EpisodeRecorder | None:
     if not request.record:
         return None
@@ -377,8 +368,8 @@ def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     try:
         env.sim.sleep()
         env.sim.set_scenes()
-        jobs = jobs_of([config.train.evaluate_seed], config.train.evaluate_episodes)
-        results, env_steps = run_episodes(env.sim, jobs, agent=agent)
+        jobs = episodes.jobs_of([config.train.evaluate_seed], config.train.evaluate_episodes)
+        results, env_steps = episodes.run_episodes(env.sim, jobs, agent=agent)
     finally:
         env.sim.set_scenes(config.train.scenes)
         env.restore(held)
@@ -463,7 +454,7 @@ _UNKNOWN = (
 _UNKNOWN_OF_EPISODE = ("return", "min_clearance_m", "path_length_m", "replans")
 
 
-def scenarios_of(sim: Sim, jobs: list[Job]) -> list[dict[str, Any]]:
+def scenarios_of(sim: Sim, jobs: list[episodes.Job]) -> list[dict[str, Any]]:
     """``describe_scenario``'s document of every job. No row of the simulator runs afterwards."""
     found = [
         scenario
@@ -474,7 +465,7 @@ def scenarios_of(sim: Sim, jobs: list[Job]) -> list[dict[str, Any]]:
     return found
 
 
-def _drawn(sim: Sim, jobs: list[Job]) -> Iterator[dict[str, Any]]:
+def _drawn(sim: Sim, jobs: list[episodes.Job]) -> Iterator[dict[str, Any]]:
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
     for row, job in enumerate(jobs):
         mask[row], seed[row], number[row] = 1, job.seed, job.episode
@@ -491,7 +482,7 @@ def _drawn(sim: Sim, jobs: list[Job]) -> Iterator[dict[str, Any]]:
 
 
 def oracle_entry(
-    config: Config, jobs: list[Job], scenarios: list[dict[str, Any]], watch: EvaluationWatch
+    config: Config, jobs: list[episodes.Job], scenarios: list[dict[str, Any]], watch: EvaluationWatch
 ) -> dict[str, Any]:
     """The oracle's entry of ``uuv eval --json``: success with the earliest arrival, or timeout, which here
     means "not reachable"."""
@@ -508,9 +499,9 @@ def oracle_entry(
     return entry | dict.fromkeys(_UNKNOWN) | {"episodes_detail": details, "privileged": True}
 
 
-def _result(job: Job, time_s: float | None, config: Config) -> EpisodeResult:
+def _result(job: episodes.Job, time_s: float | None, config: Config) -> episodes.EpisodeResult:
     horizon = config.episode.horizon_steps * config.episode.control_dt_s
-    return EpisodeResult(
+    return episodes.EpisodeResult(
         seed=job.seed,
         episode=job.episode,
         outcome="timeout" if time_s is None else "success",

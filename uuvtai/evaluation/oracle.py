@@ -180,9 +180,8 @@ class Termination:
 
     def _forbid(self, out: Array, obstacle: Obstacle, step: int, near: Array | None) -> None:
         box = self._box(obstacle, step)
-        if any(part.start >= part.stop for part in box) or (
-            near is not None and not near[_widened(box)].any()
-        ):
+        wider = tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)
+        if any(part.start >= part.stop for part in box) or (near is not None and not near[wider].any()):
             return
         grid, at, vel = self._grid, obstacle.pos_w[step], obstacle.vel_w[step]
         ox, oy = level_excess(obstacle, grid.x_m[box[2]] - at[0], (grid.y_m[box[1]] - at[1])[:, None])
@@ -213,11 +212,6 @@ class Termination:
             for axis, at, span in low_high
         )
         return z, y, x
-
-
-def _widened(box: tuple[slice, slice, slice]) -> tuple[slice, ...]:
-    """The ranges with one node more on every side."""
-    return tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)
 
 
 Array = np.ndarray

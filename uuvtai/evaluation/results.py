@@ -17,17 +17,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from uuvtai.common import statistics
 from uuvtai.common.enums import COLLIDED, FINAL_OUTCOMES, PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.files import open_to_append, read_bytes, read_text, refuse_links, truncate
 from uuvtai.common.presets import built_in_agents
-from uuvtai.common.statistics import (
-    bootstrap_interval,
-    mcnemar_p,
-    mean,
-    rate,
-    time_to_success_s,
-    wilson_interval,
-)
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError, preset_of, read_preset, validated
 from uuvtai.evaluation.episodes import EpisodeObserver, EpisodeResult, Job
@@ -192,7 +185,7 @@ def _compared(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     ]
     only_a, only_b = arrived.count((True, False)), arrived.count((False, True))
     differences = [one - other for one, other in times]
-    interval = bootstrap_interval(differences)
+    interval = statistics.bootstrap_interval(differences)
     return {
         "a": a["name"],
         "b": b["name"],
@@ -200,10 +193,10 @@ def _compared(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
         "both": len(times),
         "only_a": only_a,
         "only_b": only_b,
-        "mcnemar_p": mcnemar_p(only_a, only_b),
-        "time_a_mean_s": mean([one for one, _other in times]),
-        "time_b_mean_s": mean([other for _one, other in times]),
-        "time_difference_mean_s": mean(differences),
+        "mcnemar_p": statistics.mcnemar_p(only_a, only_b),
+        "time_a_mean_s": statistics.mean([one for one, _other in times]),
+        "time_b_mean_s": statistics.mean([other for _one, other in times]),
+        "time_difference_mean_s": statistics.mean(differences),
         "time_difference_ci95": None if interval is None else list(interval),
     }
 
@@ -233,25 +226,25 @@ def summary(
     n = len(results)
     outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in FINAL_OUTCOMES}
     collided = sum(outcomes[o] for o in COLLIDED)
-    time_mean = mean([r.time_s for r in results])
+    time_mean = statistics.mean([r.time_s for r in results])
     to_goal = [r.time_s for r in results if r.outcome == "success"]
     return {
         "name": name,
         "episodes": n,
         "outcomes": outcomes,
-        "success_rate": rate(outcomes["success"], n),
-        "success_ci95": _as_list(wilson_interval(outcomes["success"], n)),
-        "collision_rate": rate(collided, n),
-        "collision_ci95": _as_list(wilson_interval(collided, n)),
-        "return_mean": mean([r.episode_return for r in results]),
-        "return_ci95": _as_list(bootstrap_interval([r.episode_return for r in results])),
+        "success_rate": statistics.rate(outcomes["success"], n),
+        "success_ci95": _as_list(statistics.wilson_interval(outcomes["success"], n)),
+        "collision_rate": statistics.rate(collided, n),
+        "collision_ci95": _as_list(statistics.wilson_interval(collided, n)),
+        "return_mean": statistics.mean([r.episode_return for r in results]),
+        "return_ci95": _as_list(statistics.bootstrap_interval([r.episode_return for r in results])),
         "time_mean_s": time_mean,
-        "tts_s": time_to_success_s(time_mean, rate(outcomes["success"], n)),
-        "time_to_success_mean_s": mean(to_goal),
-        "time_to_success_ci95": _as_list(bootstrap_interval(to_goal)),
-        "min_clearance_mean_m": mean([r.min_clearance_m for r in results]),
-        "path_length_mean_m": mean([r.path_length_m for r in results]),
-        "replans_per_episode": mean([float(sum(r.replans.values())) for r in results]),
+        "tts_s": statistics.time_to_success_s(time_mean, statistics.rate(outcomes["success"], n)),
+        "time_to_success_mean_s": statistics.mean(to_goal),
+        "time_to_success_ci95": _as_list(statistics.bootstrap_interval(to_goal)),
+        "min_clearance_mean_m": statistics.mean([r.min_clearance_m for r in results]),
+        "path_length_mean_m": statistics.mean([r.path_length_m for r in results]),
+        "replans_per_episode": statistics.mean([float(sum(r.replans.values())) for r in results]),
         "replans_by_trigger": _summed(TRIGGERS, [r.replans for r in results]),
         "planned_by": _summed(PLANNERS, [r.planned_by for r in results]),
         "fallbacks_by_reason": _summed(REASONS, [r.fallbacks for r in results]),

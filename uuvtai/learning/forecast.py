@@ -14,20 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from uuvtai.common.enums import (
-    ANCHOR_S,
-    ANCHORS,
-    COLUMNS,
-    FAR_COLUMNS,
-    N_COLUMN,
-    N_HIDDEN,
-    N_MODE,
-    N_SAID,
-    N_SPREAD,
-    N_TOLD,
-    RUNNING,
-    SIDE_COLUMNS,
-)
+from uuvtai.common import enums
 from uuvtai.common.errors import SettingError
 from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config.learning import LearningConfig
@@ -46,7 +33,7 @@ if TYPE_CHECKING:
 # (Bishop 1994). Each future is a whole way: its places share one weight.
 
 
-TIMES_S = torch.arange(1, ANCHORS + 1) * ANCHOR_S
+TIMES_S = torch.arange(1, enums.ANCHORS + 1) * enums.ANCHOR_S
 """[s] ahead, of the places that it tells"""
 _LEAST_M, _MOST = 0.03, 4.0
 """[m] smallest deviation; largest, as a part of the way that an obstacle can go"""
@@ -70,13 +57,15 @@ class MixtureNet(nn.Module):
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
         gain = math.sqrt(2.0)
-        self.into = linear(N_COLUMN, N_HIDDEN, gain, generator)
-        self.middle = linear(N_HIDDEN, N_HIDDEN, gain, generator)
-        self.said = linear(N_HIDDEN, N_TOLD, 0.1, generator)
-        self.spread = linear(N_HIDDEN, N_SPREAD, 0.1, generator)
+        self.into = linear(enums.N_COLUMN, enums.N_HIDDEN, gain, generator)
+        self.middle = linear(enums.N_HIDDEN, enums.N_HIDDEN, gain, generator)
+        self.said = linear(enums.N_HIDDEN, enums.N_TOLD, 0.1, generator)
+        self.spread = linear(enums.N_HIDDEN, enums.N_SPREAD, 0.1, generator)
         with torch.no_grad():  # the futures begin apart: straight on, slower, back, left and right
             ways = torch.tensor([[1.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [-0.8, 0.0], [0.5, 0.5], [0.5, -0.5]])
-            self.said.bias[N_MODE:] = ways[:N_MODE, None].expand(-1, ANCHORS, -1).reshape(-1)
+            self.said.bias[enums.N_MODE :] = (
+                ways[: enums.N_MODE, None].expand(-1, enums.ANCHORS, -1).reshape(-1)
+            )
             self.spread.bias.fill_(math.log(0.3))
 
     def forward(self, columns: Tensor) -> Mixture:
@@ -84,14 +73,14 @@ class MixtureNet(nn.Module):
         hidden = torch.relu(self.middle(torch.relu(self.into(columns))))
         said = self.said(hidden)
         reach = (columns[:, :1] * TIMES_S)[:, None, :, None]
-        place = said[:, N_MODE:].view(-1, N_MODE, ANCHORS, 2) * reach
-        part = self.spread(hidden).view(-1, N_MODE, ANCHORS, 2).clamp(-6.0, math.log(_MOST)).exp()
-        return Mixture(torch.log_softmax(said[:, :N_MODE], -1), place, _LEAST_M + part * reach)
+        place = said[:, enums.N_MODE :].view(-1, enums.N_MODE, enums.ANCHORS, 2) * reach
+        part = self.spread(hidden).view(-1, enums.N_MODE, enums.ANCHORS, 2).clamp(-6.0, math.log(_MOST)).exp()
+        return Mixture(torch.log_softmax(said[:, : enums.N_MODE], -1), place, _LEAST_M + part * reach)
 
     def weights(self) -> dict[str, np.ndarray]:
         """Arrays of a forecast's file (``mixture_weights``)."""
-        out, bias = torch.zeros(N_HIDDEN, N_SAID), torch.zeros(N_SAID)
-        out[:, :N_TOLD], bias[:N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
+        out, bias = torch.zeros(enums.N_HIDDEN, enums.N_SAID), torch.zeros(enums.N_SAID)
+        out[:, : enums.N_TOLD], bias[: enums.N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
         found = {"weight_out": out, "bias_out": bias}
         layers = {"in": self.into, "mid": self.middle, "spread": self.spread}  # the last one is padded there
         for name, layer in layers.items():
@@ -108,10 +97,10 @@ def negative_log_likelihood(mixture: Mixture, truth: Tensor) -> Tensor:
 
 def mirrored(columns: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     """The same tracks seen in a mirror along their course: left is right."""
-    flip = torch.ones(N_COLUMN)
-    flip[list(SIDE_COLUMNS)] = -1.0
-    order = torch.arange(N_COLUMN)
-    for one, other in FAR_COLUMNS:
+    flip = torch.ones(enums.N_COLUMN)
+    flip[list(enums.SIDE_COLUMNS)] = -1.0
+    order = torch.arange(enums.N_COLUMN)
+    for one, other in enums.FAR_COLUMNS:
         order[one], order[other] = other, one
     return (columns * flip)[:, order], truth * torch.tensor([1.0, -1.0])
 
@@ -172,7 +161,7 @@ def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int
     for step in range(1, steps + 1):
         done += int(running.sum())
         sim.step()
-        running &= sim.rows(sim.s.termination.outcome) == RUNNING
+        running &= sim.rows(sim.s.termination.outcome) == enums.RUNNING
         if not running.any():
             break
         sim.deactivate_ended()
@@ -227,14 +216,14 @@ class ForecastTrainer(EpisodeTrainer):
             raise SettingError("forecast.learned: it is learned beside the analytic forecast; leave it empty")
         forecast = config.forecast.model_copy(update={"keep_columns": True})
         super().__init__(config.model_copy(update={"forecast": forecast}), sims)
-        columns = slice(0, COLUMNS)
+        columns = slice(0, enums.COLUMNS)
         self.observation_table = (ObservationColumn("motion", columns, "mixed", "track", "how tracks move"),)
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.net = MixtureNet(self.generator)
         rate = config.forecast_training.learning_rate
         self.learner = AdamLearner(self.net.parameters(), lr=rate, eps=ADAM_EPS)
-        self._columns = torch.zeros(MEMORY, N_COLUMN, dtype=torch.float16)
+        self._columns = torch.zeros(MEMORY, enums.N_COLUMN, dtype=torch.float16)
         self._truth = torch.zeros(MEMORY, len(TIMES_S), 2)
         self.kept = self.seen = 0
         self._scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (config.world.own_scene,)

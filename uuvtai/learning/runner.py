@@ -260,7 +260,9 @@ class _Run:
             if is_evaluated:
                 self.metrics |= self.evaluate(self.trainer, self.config)
             self.recorder.write(done, self.metrics)
-            self.watch.update(done, self.metrics, self._success_interval())
+            rate, episodes = self.metrics.get("rollout/success_rate"), self.trainer.recent.episodes
+            found = None if rate is None else wilson_interval(round(rate * episodes), round(episodes))
+            self.watch.update(done, self.metrics, found)
             if is_evaluated or done % train.checkpoint_every == 0:
                 self._save()
         if self.saved != self.trainer.iteration:
@@ -312,11 +314,6 @@ class _Run:
             for name, content in trainer.files().items():
                 self.folder.write_bytes(name, content)
         self.saved = trainer.iteration
-
-    def _success_interval(self) -> tuple[float, float] | None:
-        """95 % interval of ``rollout/success_rate`` over the episodes that it is the mean of."""
-        rate, episodes = self.metrics.get("rollout/success_rate"), self.trainer.recent.episodes
-        return None if rate is None else wilson_interval(round(rate * episodes), round(episodes))
 
 
 METRICS, EVENTS = "metrics.jsonl", "tensorboard"

@@ -146,7 +146,10 @@ class PageServer(LiveServer):
                 self._hold("pause" if value else "")
         elif what == "truth" and type(value) is bool:
             if may:
-                self._show_truth(value)
+                self.with_truth = value
+                self.truth_was_seen |= value
+                self._asked |= dict.fromkeys(self._clients, True)
+                self._tell_roles()
         else:
             return False
         return True
@@ -164,12 +167,6 @@ class PageServer(LiveServer):
     def _hold(self, why: str) -> None:
         self._held = why
         self._lock.notify_all()
-        self._tell_roles()
-
-    def _show_truth(self, with_truth: bool) -> None:
-        self.with_truth = with_truth
-        self.truth_was_seen |= with_truth
-        self._asked |= dict.fromkeys(self._clients, True)
         self._tell_roles()
 
     def _tell_roles(self) -> None:

@@ -107,7 +107,8 @@ class Canvas:
     ) -> None:
         """Lay a grid of cells (row, col[, 3]) over the map area; only what lies inside the area is drawn."""
         rows, cols = opacity.shape
-        (left, top), (right, bottom) = self.area_pixels()
+        corners = self.pixels([(self.x_m[0], self.y_m[1]), (self.x_m[1], self.y_m[0])])
+        left, top, right, bottom = corners.round().astype(int).ravel().tolist()
         x = self.x_m[0] + (np.arange(left, right) + 0.5 - self.corner[0]) / self.scale
         y = self.y_m[1] - (np.arange(top, bottom) + 0.5 - self.corner[1]) / self.scale
         col = np.clip(np.floor((x - origin_m[0]) / cell_m).astype(int), 0, cols - 1)
@@ -131,13 +132,6 @@ class Canvas:
 
     # ------------------------------------------------------------------------------------ what is drawn of it
 
-    def area_pixels(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """((left, top), (right, bottom)) of the map area."""
-        (left, top), (right, bottom) = (
-            self.pixels([(self.x_m[0], self.y_m[1]), (self.x_m[1], self.y_m[0])]).round().astype(int)
-        )
-        return (int(left), int(top)), (int(right), int(bottom))
-
     def line(self, points: Any, color: Color, width: int = 2, closed: bool = False) -> None:
         if len(points) > 1:
             self.strip(self.pixels(points), color, width, closed)
@@ -154,16 +148,14 @@ class Canvas:
     def area(self, points: Any, color: Color) -> None:
         self.filled(self.pixels(points), color)
 
-    def area_between(self, outer: Any, inner: Any, color: Color) -> None:
-        """What lies inside one polygon and outside another."""
-        self.filled(self.pixels(outer), color, self.pixels(inner))
-
     def disc(self, center: Sequence[float], radius_px: float, color: Color, width: int = -1) -> None:
         """Circle around a world point; width -1 fills it."""
         self.dot(self.pixels([center])[0], radius_px, color, width)
 
     def star(self, center: Sequence[float], radius_px: float, fill: Color = GOAL, edge: Color = INK) -> None:
-        pixels = self.pixels([center])[0] + star_shape(radius_px)
+        angles = -math.pi / 2 + np.arange(10) * math.pi / 5  # one point up
+        reach = np.where(np.arange(10) % 2 == 0, radius_px, 0.42 * radius_px)
+        pixels = self.pixels([center])[0] + np.column_stack([reach * np.cos(angles), reach * np.sin(angles)])
         self.filled(pixels, fill)
         self.strip(pixels, edge, 1, closed=True)
 
@@ -232,13 +224,6 @@ def _hershey_text(
     return int(width)
 
 
-def star_shape(radius: float) -> np.ndarray:
-    """(10, 2) corners of a star around the origin, one point up (in pixels)."""
-    angles = -math.pi / 2 + np.arange(10) * math.pi / 5
-    reach = np.where(np.arange(10) % 2 == 0, radius, 0.42 * radius)
-    return np.column_stack([reach * np.cos(angles), reach * np.sin(angles)])
-
-
 def _fixed(pixels: np.ndarray) -> np.ndarray:
     return np.round((np.asarray(pixels) - 0.5) * (1 << _SHIFT)).astype(np.int32)
 
@@ -279,7 +264,7 @@ def paint_walls(canvas: Canvas, tank: dict[str, Any]) -> None:
     if tank["shape"] == "circle":
         (x0, x1), (y0, y1) = tank["x_m"], tank["y_m"]
         box = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
-        canvas.area_between(box, tank_outline(tank), PAPER)
+        canvas.filled(canvas.pixels(box), PAPER, canvas.pixels(tank_outline(tank)))
     canvas.line(tank_outline(tank), INK, 3, closed=True)
 
 

@@ -85,32 +85,21 @@ def video(
     out = Path(out)
     suffix = checked_suffix(out, tuple(FORMATS), "video")
     width_px, fps = width_px or FORMATS[suffix][0], fps or FORMATS[suffix][1]
-    _check_video(width_px, fps, speed)
+    given = ("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)
+    for name, value, (least, most) in given:
+        if not least <= value <= most:
+            raise LogError(f"{name} {value:g}: must be from {least:g} to {most:g}")
     recording = load_recording(path)
     times = frame_times(recording, fps, speed)
     with drawing(Path(path)):
         artist = FrameArtist(recording, max(width_px, _DRAWN_PX))
         samples = [_sized(artist.frame(recording.duration_s * share), width_px) for share in (0.0, 0.5, 1.0)]
-    return _encoded(out, _frames(artist, times, width_px, progress), fps, samples, artist.inks)
-
-
-def _encoded(
-    out: Path, frames: Iterator[np.ndarray], fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
-) -> Path:
-    """Write frames as the video that the name of ``out`` asks for, whole or not at all. Raises LogError."""
+    frames = _frames(artist, times, width_px, progress)
     with refusing(LogError, f"{out}: cannot write the video", "choose another place with --out FILE"):
         out.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(out, f".tmp{out.suffix.lower()}") as (_, part):
-            check_whole(part, write_video(part, frames, fps, samples, inks), out)
+            check_whole(part, write_video(part, frames, fps, samples, artist.inks), out)
     return out
-
-
-def _check_video(width_px: int, fps: float, speed: float) -> None:
-    """Raise LogError for a width, a rate or a speed beyond what a video may have."""
-    given = ("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)
-    for name, value, (least, most) in given:
-        if not least <= value <= most:
-            raise LogError(f"{name} {value:g}: must be from {least:g} to {most:g}")
 
 
 def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
@@ -177,7 +166,8 @@ class FrameArtist:
         paint_truth(canvas, recording.scenario, time_s, float(pose[2]))
         self._paint_plan(time_s)
         canvas.line(self._track[: i + 1, :2], self._ink, 2)
-        self._paint_echoes(time_s)
+        for echo in recording.echoes(time_s):
+            canvas.disc(echo, 2.4, ECHO)
         tracks = recording["/tracks"].at(time_s)
         for x, y, radius in () if tracks is None else tracks[:, :3]:
             canvas.disc((x, y), (radius + 0.06) * canvas.scale, DYNAMIC, 2)
@@ -209,10 +199,6 @@ class FrameArtist:
         if ahead is not None:
             canvas.disc(ahead, 7, PAPER)
             canvas.disc(ahead, 5, ROUTE)
-
-    def _paint_echoes(self, time_s: float) -> None:
-        for echo in self.recording.echoes(time_s):
-            self._canvas.disc(echo, 2.4, ECHO)
 
     def _paint_goal(self) -> None:
         canvas, scenario = self._canvas, self.recording.scenario

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import re
 import shlex
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -260,22 +261,13 @@ class PluginError(OwnCodeError):
 
 def failed(error: BaseException, path: Path, what: str) -> PluginError:
     """Of an exception in the user's code: the last line of her file on the way to it."""
-    line = line_in(error.__traceback__, path)
+    lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if _is(frame, path)]
+    line = lines[-1] if lines else None
     if isinstance(error, SyntaxError) and error.filename == str(path):
         line = error.lineno
     place = f"{path}:{line}" if line else str(path)
     reason = " ".join(str(error).split())[:300]
     return PluginError(f"{place}: {type(error).__name__}{f': {reason}' if reason else ''} ({what})")
-
-
-def line_in(trace: TracebackType | None, path: Path) -> int | None:
-    """Line of ``path`` that was reached last on the way to an exception; None = none was."""
-    found = None
-    while trace is not None:
-        if _is(trace.tb_frame, path):
-            found = trace.tb_lineno
-        trace = trace.tb_next
-    return found
 
 
 def line_of_frame(frame: FrameType | None, path: Path) -> int | None:

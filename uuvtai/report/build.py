@@ -207,19 +207,14 @@ def _shown(path: Path, agents: list[dict[str, Any]]) -> _Shown:
     if found is None:
         return _Shown(path, "", None, (), path.stem)
     label, episode = found["label"], (int(found["seed"]), int(found["episode"]))
-    agent = _agent_of(label, agents)
+    names = (m["name"] for m in agents)
+    agent = max((name for name in names if f"_{label}".endswith(f"_{name}")), key=len, default="")
     remark = label.removesuffix(agent).strip("_") if agent else found["rest"].strip("_")
     own = [m for m in agents if not label or m["name"] == agent]
     details = tuple(
         (m["name"], d) for m in own for d in m["episodes_detail"] if (d["seed"], d["episode"]) == episode
     )
     return _Shown(path, agent, episode, details, remark.replace("_", " "))
-
-
-def _agent_of(label: str, agents: list[dict[str, Any]]) -> str:
-    """The agent that a file's label ends with; before it may stand why the episode failed."""
-    names = [m["name"] for m in agents if label == m["name"] or label.endswith(f"_{m['name']}")]
-    return max(names, key=len, default="")
 
 
 def _caption(one: _Shown) -> str:

@@ -50,18 +50,15 @@ class _Drawing:
         """The figure's panels as markup; also draws the PNG."""
         from markupsafe import Markup
 
-        name = self._free_name(figure.name)
+        plain = re.sub(r"[^a-z0-9]+", "_", figure.name.lower()).strip("_") or "figure"
+        names = [plain, *(f"{plain}_{i}" for i in range(2, len(self.pngs) + 3))]
+        name = next(name for name in names if name not in self.pngs)
         self.pngs[name] = figures.png(figure.panels)
         # safe: ElementTree wrote it from matplotlib's own drawing and escaped every text in it
         return [
             Markup(figures.svg(panel, f"{name}-{i}-", figure.caption))
             for i, panel in enumerate(figure.panels)
         ]
-
-    def _free_name(self, wanted: str) -> str:
-        plain = re.sub(r"[^a-z0-9]+", "_", wanted.lower()).strip("_") or "figure"
-        names = [plain, *(f"{plain}_{i}" for i in range(2, len(self.pngs) + 3))]
-        return next(name for name in names if name not in self.pngs)
 
 
 def render(page: Page) -> tuple[str, dict[str, bytes]]:

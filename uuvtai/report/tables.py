@@ -261,7 +261,8 @@ def pivot(cells: Iterable[MapCell], axes: dict[str, list[Any]]) -> HeatMap:
     named = {cell_name(name): list(values) for name, values in axes.items()}
     if not named:
         raise SettingError("this sweep has no axis")
-    across = _across(named)
+    several = varying(named)
+    across = SPEED if SPEED in several else [*named, *several][-1]
     down = tuple(name for name in named if name != across)
     found = list(cells)
     rows = [tuple(cell.get(name) for name in down) for cell in found]
@@ -276,13 +277,6 @@ def pivot(cells: Iterable[MapCell], axes: dict[str, list[Any]]) -> HeatMap:
 def varying(axes: dict[str, list[Any]]) -> list[str]:
     """Axes with more than one value, under the names that cells use."""
     return [cell_name(name) for name, values in axes.items() if len(values) > 1]
-
-
-def _across(axes: dict[str, list[Any]]) -> str:
-    several = varying(axes)
-    if SPEED in several:
-        return SPEED
-    return several[-1] if several else next(reversed(axes))
 
 
 def _order(row: tuple[Any, ...], down: tuple[str, ...], axes: dict[str, list[Any]]) -> list[int]:

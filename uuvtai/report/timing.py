@@ -67,7 +67,9 @@ def timing(document: dict[str, Any], command: str = "") -> list[Block]:
     if rows:
         table = Table(_RATES, rows, "Env-steps per second, resets included")
         blocks += [table, _stages_figure(rows, command)]
-    blocks += _latency(document.get("paper_latency", []))
+    if timed := [row for row in document.get("paper_latency", []) if "mean_ms" in row]:
+        caption = "Beside the paper's table 'Workstation deployability timing' (its machine has an RTX 5090)"
+        blocks.append(latency_table(timed, caption))
     return blocks + _density(document.get("paper_density", []), command)
 
 
@@ -97,14 +99,6 @@ def _stages_figure(rows: list[dict[str, Any]], command: str) -> Figure:
         data,
         command,
     )
-
-
-def _latency(rows: list[dict[str, Any]]) -> list[Block]:
-    timed = [row for row in rows if "mean_ms" in row]
-    if not timed:
-        return []
-    caption = "Beside the paper's table 'Workstation deployability timing' (its machine has an RTX 5090)"
-    return [latency_table(timed, caption)]
 
 
 def _density(rows: list[dict[str, Any]], command: str) -> list[Block]:

@@ -193,7 +193,10 @@ class _Flattener:
         self.rows: list[tuple[str, str, int, int, tuple[float, ...]]] = []
         self.end: list[int] = []
         self.parent: list[int] = []
-        self._check_root(element)
+        if element.tag != "root":
+            self._fail(element, 'the outermost element must be <root BTCPP_format="4">')
+        if element.attributes.get("BTCPP_format") != "4":
+            self._fail(element, f'BTCPP_format must be "4", got {element.attributes.get("BTCPP_format")!r}')
         self.trees = self._collect(element)
         self.main = element.attributes.get("main_tree_to_execute")
         if self.main is None:
@@ -212,12 +215,6 @@ class _Flattener:
         self._add(self.trees[self.main].children[0], -1, (self.main,))  # type: ignore[index,arg-type]
         names, types, kind, leaf, param = (tuple(column) for column in zip(*self.rows, strict=True))
         return FlatTree(names, types, kind, tuple(self.end), tuple(self.parent), leaf, param, self.source)
-
-    def _check_root(self, element: Element) -> None:
-        if element.tag != "root":
-            self._fail(element, 'the outermost element must be <root BTCPP_format="4">')
-        if element.attributes.get("BTCPP_format") != "4":
-            self._fail(element, f'BTCPP_format must be "4", got {element.attributes.get("BTCPP_format")!r}')
 
     def _collect(self, element: Element) -> dict[str, Element]:
         trees: dict[str, Element] = {}

@@ -28,7 +28,11 @@ class Plant:
     """``n_env`` vehicles of one config, moved step by step. Taichi must be running as ``runtime``."""
 
     def __init__(self, config: Config, runtime: Runtime, n_env: int = 1) -> None:
-        check_thruster_index(config)
+        dead, count = config.disturbance.dead_thruster, len(config.vehicle.thrusters)
+        if dead is not None and dead >= count:
+            raise SettingError(
+                f"disturbance.dead_thruster is {dead}, but the vehicle has thrusters 0 to {count - 1}"
+            )
         self.config, self.n_env, self.real = config, n_env, runtime.real
         self._host = HostFields() if runtime.device == "cpu" else None
         self._sizes = {
@@ -104,12 +108,3 @@ class Plant:
     def command(self, action: np.ndarray) -> None:
         """The inner loop alone, on whatever ``ego`` holds."""
         control.command_thrusters(self.actuation_io, np.ascontiguousarray(action, dtype=np.float32))
-
-
-def check_thruster_index(config: Config) -> None:
-    """ValueError where ``disturbance.dead_thruster`` names a thruster that the vehicle does not have."""
-    dead, count = config.disturbance.dead_thruster, len(config.vehicle.thrusters)
-    if dead is not None and dead >= count:
-        raise SettingError(
-            f"disturbance.dead_thruster is {dead}, but the vehicle has thrusters 0 to {count - 1}"
-        )

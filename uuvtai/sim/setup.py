@@ -16,20 +16,7 @@ import taichi as ti
 import torch
 
 from uuvtai import state
-from uuvtai.common.enums import (
-    N_BEND,
-    N_COLUMN,
-    N_FRAME,
-    N_HIDDEN,
-    N_MODE,
-    N_PAST,
-    N_PLANNER,
-    N_REASON,
-    N_SAID,
-    N_TRIGGER,
-    N_WEIGHT,
-    RUNNING,
-)
+from uuvtai.common import enums
 from uuvtai.common.errors import SettingError, SizeError, UserError
 from uuvtai.common.obstacle_motion import KIND_NAMES
 from uuvtai.common.tree_codes import MAX_NODES
@@ -366,7 +353,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_turn_row": 7,
         "n_turn": config.forecast.n_turn,
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
-        "n_future": N_MODE if config.forecast.learned else 1,
+        "n_future": enums.N_MODE if config.forecast.learned else 1,
         **_network_sizes(config.forecast),
         "n_row": n_row,
         "n_col": n_col,
@@ -377,9 +364,9 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_path": 2048,
         "n_ahead": math.ceil(config.route.risk_horizon_m / config.mapping.cell_m) + 2,
         "n_way": config.route.n_way,
-        "n_trigger": N_TRIGGER,
-        "n_planner": N_PLANNER,
-        "n_reason": N_REASON,
+        "n_trigger": enums.N_TRIGGER,
+        "n_planner": enums.N_PLANNER,
+        "n_reason": enums.N_REASON,
         "n_sector": config.observation.n_sector,
         "n_node": MAX_NODES,
         "n_candidate": config.behavior.n_candidate,
@@ -408,13 +395,13 @@ def _network_sizes(forecast_cfg: ForecastConfig) -> dict[str, int]:
             "n_weight": LANES
         }
     return {
-        "n_past": N_PAST,
-        "n_bend": N_BEND,
-        "n_frame": N_FRAME,
-        "n_column": N_COLUMN,
-        "n_hidden": 2 * N_HIDDEN,
-        "n_said": N_SAID,
-        "n_weight": N_WEIGHT,
+        "n_past": enums.N_PAST,
+        "n_bend": enums.N_BEND,
+        "n_frame": enums.N_FRAME,
+        "n_column": enums.N_COLUMN,
+        "n_hidden": 2 * enums.N_HIDDEN,
+        "n_said": enums.N_SAID,
+        "n_weight": enums.N_WEIGHT,
     }
 
 
@@ -520,7 +507,7 @@ class HostCounts:
         """The one number of a field without axes. The wait for it tells ``any_ended``, too."""
         if self._memory.device.type == "cpu":
             return self._memory.number(field)
-        ended = self._memory.tensor(self._outcome)[: self._num_envs].ne(RUNNING).any()
+        ended = self._memory.tensor(self._outcome)[: self._num_envs].ne(enums.RUNNING).any()
         number, self.any_ended = torch.stack((self._memory.tensor(field), ended.to(torch.int32))).tolist()
         return number
 

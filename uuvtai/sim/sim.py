@@ -21,6 +21,7 @@ from uuvtai.compile.launch import Rows
 from uuvtai.compile.memory import Memory, address_of
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config import Config
+from uuvtai.kernels.oracle import true_state
 from uuvtai.kernels.perception import localization, mapping
 from uuvtai.kernels.planning import clearance, observation, route
 from uuvtai.kernels.sensors import proprioception
@@ -104,18 +105,15 @@ class Sim:
             self.action.copy_(action)
         self._launched(self._move)
         if self._speeds is not None and not math.isfinite(np.add.reduce(self._speeds, axis=None)):
-            self._tell_divergence()
+            bad = np.flatnonzero(~np.isfinite(self.rows(self.s.vehicle.vel_b)).all(axis=1))
+            raise DivergenceError(
+                f"the motion of {len(bad)} of {self.num_envs} vehicles diverged, first that of env {bad[0]}: "
+                "inertia, damping and gains of this vehicle do not belong together, or take more "
+                "episode.substeps; look at it alone: uuv simulate --vehicle ..."
+            )
         self.perceive()
         with self._stage("reward"):
             reward.compute_reward(self.io.reward, self.reward, self.terminated, self.truncated)
-
-    def _tell_divergence(self) -> None:
-        bad = np.flatnonzero(~np.isfinite(self.rows(self.s.vehicle.vel_b)).all(axis=1))
-        raise DivergenceError(
-            f"the motion of {len(bad)} of {self.num_envs} vehicles diverged, first that of env {bad[0]}: "
-            "inertia, damping and gains of this vehicle do not belong together, or take more "
-            "episode.substeps; look at it alone: uuv simulate --vehicle ..."
-        )
 
     def _move(self) -> None:
         io, c, rules = self.io, self.config, self.config.episode
@@ -228,7 +226,7 @@ class Sim:
         """As ``draw``, with the route of each vehicle that knows where everything is that does not move."""
         self._draw(self._begin_anew, mask, seed, number)
         self.sensors.sense_motion(self.io)
-        stack.draw_true_map(self.io)
+        true_state.stamp_static(self.io.true_map)
         clearance.compute_clearance(self.io.clearance)
         stack.plan(self.io, self.config, by_voronoi=True)
         self.fallback.serve(self.io, self._plan_seed, self.rows, self.counts.number)

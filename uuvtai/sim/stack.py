@@ -120,11 +120,6 @@ def track(stages: Stages, config: Config, privileged: bool) -> None:
     height.bound_heights(stages.tracking)
 
 
-def draw_true_map(stages: Stages) -> None:
-    """The static layer as it truly is, for routes that are planned beforehand."""
-    true_state.stamp_static(stages.true_map)
-
-
 def plan(stages: Stages, config: Config, by_voronoi: bool) -> None:
     """Which envs want a route; ``by_voronoi``: plan them, else they wait for the host's planner."""
     triggers.fire_triggers(stages.route)

@@ -13,7 +13,6 @@ import torch
 from uuvtai.common.enums import EGO_COLUMNS, N_RAY, OBSTACLE_WIDTH
 from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.compile.runtime import start_taichi
-from uuvtai.config import TankConfig
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.sim.behavior_tree import read_tree
@@ -52,7 +51,11 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
     n_static, n_dynamic = (max(scene[i] for scene in scenes) for i in range(2))
     for world in config.surrogate.worlds:
         own = load_config(world, overrides=[("world.n_static", n_static), ("world.n_dynamic", n_dynamic)])
-        _refuse_other_tank(world, own.world.tank, config.world.tank)
+        if own.world.tank != config.world.tank or own.world.tank.shape != "rectangle":
+            raise ConfigError(
+                f"surrogate.worlds: {world} has another tank than the run's world, or a round one; give "
+                "worlds that share a rectangular one, for example surrogate.worlds=[pool,gauntlet]"
+            )
         if any(len(one.path) > N_CORNER for one in own.world.fixed):
             raise ConfigError(f"surrogate.worlds: {world} has a path of more than {N_CORNER} corners")
         sim = Sim(own, min(BATCH, count), read_tree(TRAINING_TREE))
@@ -65,14 +68,6 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
     arrays = obstacle, _joined(path), _joined(route, "edge"), np.concatenate(mission)
     origin = np.arange(len(names), dtype=np.int32).repeat(count)
     return ScenarioBank(*map(torch.from_numpy, (*arrays, origin)), names=tuple(names))
-
-
-def _refuse_other_tank(world: str, own: TankConfig, wanted: TankConfig) -> None:
-    if own != wanted or own.shape != "rectangle":
-        raise ConfigError(
-            f"surrogate.worlds: {world} has another tank than the run's world, or a round one; give worlds "
-            "that share a rectangular one, for example surrogate.worlds=[pool,gauntlet]"
-        )
 
 
 def _joined(parts: Sequence[np.ndarray], more: Literal["constant", "edge"] = "constant") -> np.ndarray:

@@ -339,7 +339,8 @@ class OnboardLoop:
             self._intake.forget_jump()
         self._find_start(now_s)
         command = self._pilot.tick()
-        self._note_scan()
+        if (used := self._pilot.tallies["sonar"].used) != self._scans:  # a scan was placed in the map
+            self._scans, self._measured_s["sonar"] = used, self._scan_s
         view = self._view(now_s, stalled_s, command)
         decision, memory = safety.decide(view, self._memory, self._plan.limits)
         self._memory = memory if self._handover.has_asked else safety.SafetyMemory(memory.since_s)
@@ -451,11 +452,6 @@ class OnboardLoop:
         else:
             self._measured_s[name] = max(self._measured_s[name], reading.time_s)
 
-    def _note_scan(self) -> None:
-        """A scan that the stack has used was placed in its map."""
-        if (used := self._pilot.tallies["sonar"].used) != self._scans:
-            self._scans, self._measured_s["sonar"] = used, self._scan_s
-
     def _view(self, now_s: float, stalled_s: float, command: PilotCommand) -> safety.VehicleView:
         heard, limits = self._intake.heard, self._plan.limits
         surge, sway, heave, turn = (float(value) for value in command.velocity)
@@ -543,15 +539,11 @@ class OnboardLoop:
         engaged, messages = self._handover.engaged, self.tally.heard.total()
         text = self._notes.look(now_s, decision, engaged, messages, heard)
         if self._calibration is not None and heard.vehicle_s > -math.inf:
-            text = self._guidance(now_s, self._calibration)
+            newest_s = self._measured_s | {"sonar": self._scan_s}
+            missing = (name for name in ("imu", "dvl", "sonar") if now_s - newest_s[name] > DEAF_S)
+            text = next((MISSING[name] for name in missing), self._calibration.says)
         if text and not (self._check is not None and decision.action == safety.SafeAction.DRIVE):
             self.tell(text)
-
-    def _guidance(self, now_s: float, calibration: calibrate.Calibration) -> str:
-        """What the operator of a calibration is to do next."""
-        newest_s = self._measured_s | {"sonar": self._scan_s}
-        missing = (name for name in ("imu", "dvl", "sonar") if now_s - newest_s[name] > DEAF_S)
-        return next((MISSING[name] for name in missing), calibration.says)
 
     def tell(self, text: str) -> None:
         """A sentence for the operator; a terminal that is gone ends nothing."""

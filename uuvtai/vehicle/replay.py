@@ -151,7 +151,8 @@ class _FeedReader:
             self._seen.add(message.topic)
             self._readers[message.topic](message)
         wanted = {"/sensors/imu", "/sensors/dvl", "/sensors/pressure", "/sonar/doppler", "/action"}
-        if uses_camera(self._config):
+        c = self._config
+        if c.camera_tracking.use_camera or c.height.use_camera or c.mapping.depth_hit > 0:
             wanted.add("/camera/exact")
         if self._feed.is_imported:
             wanted = {"/sensors/imu"}  # without it nothing can be placed
@@ -222,11 +223,6 @@ class _FeedReader:
             self._arrives(m, onboard.ThrusterLoss(m.time_s, float(given_up)))
         logged = LoggedStep(_array(m.data["behavior"]), _array(m.data["asked"]), m.data["leaf"], self._pos_w)
         self._feed.steps.append(logged)
-
-
-def uses_camera(config: Config) -> bool:
-    """Whether any stage behind the camera looks at its images."""
-    return config.camera_tracking.use_camera or config.height.use_camera or config.mapping.depth_hit > 0
 
 
 # ---- What goes wrong on the way to the pilot: messages lost or late, a sensor dead for a while.

@@ -20,15 +20,8 @@ from uuvtai.common.errors import SettingError
 from uuvtai.config import Config, VehicleConfig
 from uuvtai.config.sensors import SonarConfig
 from uuvtai.sim.setup import allocation_matrices
+from uuvtai.vehicle import onboard
 from uuvtai.vehicle.mavlink import ARM_DISARM, DO_SET_MODE, LinkError
-from uuvtai.vehicle.onboard import (
-    DvlReading,
-    ImuReading,
-    PositionFix,
-    PressureReading,
-    SensorMessage,
-    SonarPing,
-)
 
 # ---- Distances by sectors, as MAVLink tells them, into the beams of the pilot's sonar_cfg.
 
@@ -49,7 +42,7 @@ def ping_of(
     offset_deg: float,
     min_cm: float,
     max_cm: float,
-) -> SonarPing | str:
+) -> onboard.SonarPing | str:
     """A scan in which each beam has the range of the sector that it lies in, or why there is none.
 
     The pilot takes a beam without a return for free water as far as the sonar sees, so a sector that nobody
@@ -71,7 +64,7 @@ def ping_of(
         return "beams lie in sectors that nobody looked into"
     if (((distance != 0) & (distance < min_cm)) | (distance > max_cm + 1)).any():
         return "distances outside of what the sensor says that it measures"
-    return SonarPing(time_s, distance / 100.0, (distance <= max_cm).astype(float), np.zeros(0))
+    return onboard.SonarPing(time_s, distance / 100.0, (distance <= max_cm).astype(float), np.zeros(0))
 
 
 def sectors_of(
@@ -323,7 +316,7 @@ class Intake:
         """(time, newest position as it was told)"""
         self._volts: dict[str, tuple[float, float]] = {}
         self._rangers = Rangers()
-        self._takers: dict[str, Callable[[Fields, float], list[SensorMessage]]] = {
+        self._takers: dict[str, Callable[[Fields, float], list[onboard.SensorMessage]]] = {
             "ATTITUDE": self._attitude,
             "VISION_POSITION_DELTA": self._vision_delta,
             "VISION_SPEED_ESTIMATE": self._vision_speed,
@@ -339,7 +332,7 @@ class Intake:
 
     def take(
         self, name: str, system: int, component: int, fields: Fields, come_s: float
-    ) -> list[SensorMessage]:
+    ) -> list[onboard.SensorMessage]:
         """What a message that came at ``come_s`` tells the pilot: mostly nothing or one message."""
         if name == "HEARTBEAT":
             self._heartbeat(system, component, fields, come_s)
@@ -399,7 +392,7 @@ class Intake:
         """A position jumped before the vehicle was taken (a new origin): count from the start once more."""
         self.heard.jumped, self._origin = "", None
 
-    def refuse(self, why: str) -> list[SensorMessage]:
+    def refuse(self, why: str) -> list[onboard.SensorMessage]:
         if why in self.heard.refused or len(self.heard.refused) < MOST_KINDS:
             self.heard.refused[why] += 1
         return []
@@ -429,7 +422,7 @@ class Intake:
 
     # ------------------------------------------------------------------------------------------- instruments
 
-    def _attitude(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _attitude(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         heading = self._heading
         if heading is None:
             heading = self._heading = float(fields["yaw"])
@@ -446,15 +439,15 @@ class Intake:
             [-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)]
         )
         force = kept[1] if kept is not None and time_s - kept[0] < _FRESH_S else rest
-        return [ImuReading(time_s, rpy, rate, force)]
+        return [onboard.ImuReading(time_s, rpy, rate, force)]
 
-    def _acceleration(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _acceleration(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         scale = 1.0 if fields["name"] == "HIGHRES_IMU" else _MILLI_G
         x, y, z = (scale * float(fields[axis]) for axis in ("xacc", "yacc", "zacc"))
         self._force_b = time_s, np.array([x, -y, -z])
         return []
 
-    def _vision_delta(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _vision_delta(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         spent_s = float(fields["time_delta_usec"]) / 1e6
         if not 1e-3 <= spent_s <= 1.0 or fields["confidence"] <= 0.0:
             return self.refuse("VISION_POSITION_DELTA: without a time or without confidence")
@@ -463,26 +456,26 @@ class Intake:
             return self.refuse("VISION_POSITION_DELTA: a number that is not finite")
         return self._velocity(time_s, (ahead, -right, -down))
 
-    def _vision_speed(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _vision_speed(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         """The DVL's extension of BlueOS sends body axes, which MAVLink has as north, east, down."""
         ahead, right, down = (float(fields[axis]) for axis in "xyz")
         return self._velocity(time_s, (ahead, -right, -down))
 
-    def _vision_place(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _vision_place(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         return self.refuse(f"{fields['name']}: a place tells no velocity: set the DVL to POSITION_DELTA")
 
-    def _velocity(self, time_s: float, vel_b: tuple[float, float, float]) -> list[SensorMessage]:
-        reading = DvlReading(time_s, np.array(vel_b))
+    def _velocity(self, time_s: float, vel_b: tuple[float, float, float]) -> list[onboard.SensorMessage]:
+        reading = onboard.DvlReading(time_s, np.array(vel_b))
         self.note_velocity(reading)
         return [reading]
 
-    def note_velocity(self, reading: DvlReading) -> None:
+    def note_velocity(self, reading: onboard.DvlReading) -> None:
         """What a DVL says is the vehicle's state too."""
         if reading.time_s >= self.heard.vel_b_s:
             ahead, left, up = (float(value) for value in reading.vel_b)
             self.heard.vel_b, self.heard.vel_b_s = (ahead, left, up), reading.time_s
 
-    def _local_position(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _local_position(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         if self._heading is None or not math.isfinite(self.heard.rpy[2]):
             return []
         turn, yaw = self._heading, self.heard.rpy[2]
@@ -491,12 +484,12 @@ class Intake:
             return self.refuse("LOCAL_POSITION_NED: the position jumped")
         if self._origin is None:
             self._origin = place
-        found: list[SensorMessage] = []
+        found: list[onboard.SensorMessage] = []
         if self._config.sensors.localization != "estimated":
             where = np.array(self._start) + place - self._origin
             if abs(time_s - self._depth[0]) < _FRESH_S:  # the autopilot's own height lags behind a climb
                 where[2] = -self._depth[1]
-            found.append(PositionFix(time_s, where))
+            found.append(onboard.PositionFix(time_s, where))
         newest_s = max(self._newest.get(name, -math.inf) for name in _VELOCITIES)
         if time_s - newest_s > _FRESH_S and "dvl" not in self._replaced:
             east, north, up = _turned(fields["vx"], fields["vy"], fields["vz"], turn)
@@ -515,7 +508,7 @@ class Intake:
             self.heard.jumped = f"the position moved {moved:.1f} m in {spent_s:.2f} s"
         return has_jumped
 
-    def _pressure(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _pressure(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         """ArduSub's second barometer is the one in the water; with one alone it sends the first. The third
         is a thermometer's, without a pressure (ArduSub, ``send_scaled_pressure3``)."""
         name = str(fields["name"])
@@ -525,16 +518,16 @@ class Intake:
         depth = _PASCAL * float(fields["press_abs"]) / (vehicle.water_density_kg_m3 * vehicle.gravity_m_s2)
         zero = self._zero.setdefault(name, depth + self._start[2])
         self._depth = time_s, depth - zero
-        return [PressureReading(time_s, depth - zero)]
+        return [onboard.PressureReading(time_s, depth - zero)]
 
-    def _obstacles(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _obstacles(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         if fields["frame"] != 12:
             return self.refuse("OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_BODY_FRD)")
         increment = float(fields.get("increment_f", 0.0)) or float(fields["increment"])
         distances = np.array(list(fields["distances"])[:SECTORS], dtype=int)
         return self._scan(time_s, distances, increment, float(fields.get("angle_offset", 0.0)), fields)
 
-    def _ranger(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _ranger(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         if time_s - self._newest.get("OBSTACLE_DISTANCE", -math.inf) < _FRESH_S:
             return []
         ring = self._rangers.ring(fields, time_s)
@@ -544,12 +537,12 @@ class Intake:
 
     def _scan(
         self, time_s: float, distances: np.ndarray, increment: float, offset: float, fields: Fields
-    ) -> list[SensorMessage]:
+    ) -> list[onboard.SensorMessage]:
         span = int(fields.get("min_distance", 0)), int(fields["max_distance"])
         found = ping_of(self._config.sensors.sonar, time_s, distances, increment, offset, *span)
-        return [found] if isinstance(found, SonarPing) else self.refuse(f"{fields['name']}: {found}")
+        return [found] if isinstance(found, onboard.SonarPing) else self.refuse(f"{fields['name']}: {found}")
 
-    def _battery(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+    def _battery(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
         if fields["name"] == "SYS_STATUS":
             volts = int(fields["voltage_battery"])
         elif fields["id"] == 0:
