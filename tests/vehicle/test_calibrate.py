@@ -106,7 +106,7 @@ def test_it_finds_how_the_dvl_looks_and_where_the_vehicle_is(seed, yaw_deg, off,
     ("given", "words", "seconds"),
     [
         ({"scale": 1.2}, "less than the walls", 250.0),
-        ({"tank": {"x_m": (-2.0, 20.0)}}, "the walls in view do not fix it yet", 60.0),
+        ({"tank": {"x_m": (-2.0, 20.0)}}, "beams see through the wall at x", 60.0),
     ],
 )
 def test_what_does_not_agree_is_refused_or_said(given, words, seconds):

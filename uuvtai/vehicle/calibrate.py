@@ -10,6 +10,7 @@ DVL's yaw alike.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -39,6 +40,10 @@ WAYS = (
 _SIDE_M, _LEAST_M = 2.0, 1.0  # of a square; from a wall, and from where the sonar no longer sees it
 _SQUARE_M = _SIDE_M * np.array([(1, 0), (1, 1), (0, 1), (0, 0)])
 """where to, one place after the other, from the first one: inwards, or to a wall that would leave the view"""
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"[-+.,\d]+", "", text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +100,9 @@ class Calibration:
             self._track.hear(message)
         if self._fix is not None:
             self._fix.feed(message)
-            if ": turn" in self._fix.waits_for:
-                self.says = (
-                    f"place {self._number}: the walls in view do not fix it yet: turn the vehicle slowly"
-                )
+            waits = self._fix.waits_for
+            if ": turn" in waits and _without_numbers(waits) not in _without_numbers(self.says):
+                self.says = f"place {self._number}: {waits}"  # once, though each scan has other numbers
             if (result := self._fix.result) is not None:
                 self._fix = None
                 self._take(result)
