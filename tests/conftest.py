@@ -117,6 +117,11 @@ def no_onnx(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def forgetful(request):
-    """No test sees what an earlier one left in the session's simulator."""
-    if "small" in request.fixturenames:
-        _built[0].forget()
+    """No test sees what an earlier one left in the session's simulator, nor does a fixture of a whole file,
+    which comes before this one."""
+    small = _built[0] if "small" in request.fixturenames else None
+    if small:
+        small.forget()
+    yield
+    if small:
+        small.forget()
