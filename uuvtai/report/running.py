@@ -74,7 +74,7 @@ class RunningEpisodes:
         self._steps, self._shown_s = 0, -math.inf
 
     def side_by_side(self) -> list[RunningEpisodes]:
-        """This, and one for each other agent, whose episodes are the same: their tanks stand beside its."""
+        """One of these for each agent: all run the same episodes, and their tanks stand side by side."""
         others = [
             RunningEpisodes(self._audience, self._world, self._agents, self._rate, which)
             for which in range(1, len(self._agents))
