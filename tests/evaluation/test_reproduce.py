@@ -3,6 +3,7 @@
 import itertools
 import json
 import random
+import re
 import shutil
 
 import numpy as np
@@ -343,8 +344,12 @@ class Uuv:
             folder = reproduce_steps.Path(place)
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "run.json").write_text(json.dumps({"status": "interrupted" if code else "finished"}))
-            (folder / "metrics.jsonl").write_text("")
+            (folder / "metrics.jsonl").write_text(TRAINED)
         return type("Done", (), {"returncode": code, "stdout": json.dumps(printed(arguments)).encode()})()
+
+
+TRAINED = '{"iteration": 120, "time/env_steps": 61952.0}\n'
+"""metrics of a training of the budget "quick": 120 iterations and the look around before the first"""
 
 
 def printed(arguments):
@@ -382,7 +387,7 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
     assert any(f"--resume {place}" in text for text in watch.answer)
     (made := place / "train/ppo-1").mkdir(parents=True)
     (made / "run.json").write_text('{"status": "finished", "git_sha": "abc"}')
-    (made / "metrics.jsonl").write_text("")
+    (made / "metrics.jsonl").write_text(TRAINED)
     second = Uuv(monkeypatch)
     document, _ = resume(place, Quiet())
     wanted = reproduce_steps.steps_of(reproduce_steps.BUDGETS["quick"], place)
@@ -406,6 +411,17 @@ def test_rows_made_elsewhere_stand_for_their_trainings(tmp_path, monkeypatch):
         reproduce("quick", place := tmp_path / "other", Quiet())
     shutil.copytree(tmp_path / "one/rows", place / "rows")
     (place / "rows/ppo-1.json").unlink()
+    right = (row := place / "rows/paper-0.json").read_text()
+    wrong = {
+        "619,520 env-steps and 100 episodes": right.replace("61952", "619520"),
+        "61,952 env-steps and 99 episodes": re.sub(r'"ends": "\w', '"ends": "', right),
+        "no row of this version": "[1]",
+    }
+    for what, text in wrong.items():
+        row.write_text(text)
+        with pytest.raises(RunFolderError, match=rf"paper-0.json: {what}, but this budget has 61,440 env-st"):
+            resume(place, Quiet())
+    row.write_text(right)
     second = Uuv(monkeypatch)
     again, _ = resume(place, Quiet())
     assert len(interrupted.ran) == 1 and again["table_main"] == document["table_main"]

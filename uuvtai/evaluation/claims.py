@@ -385,7 +385,7 @@ def training_facts(rows: Sequence[dict[str, Any]], limit: float) -> dict[str, An
         curve = [row[key] for row in rows if row.get(key) is not None]
         if (quarter := len(curve) // 4) > 0:
             losses[key] = [fmean(curve[:quarter]), fmean(curve[-quarter:])]
-    scales = [row["distillation/scale"] for row in rows]
+    scales = [row["distillation/scale"] for row in rows if "distillation/scale" in row]
     full = fmean(value >= limit - 1e-9 for value in scales) if scales else 0.0
     late, skill = rows[-max(1, len(rows) // 4) :], {}
     for key in [key for key in (late[-1] if late else {}) if key.startswith(_SKILL)]:

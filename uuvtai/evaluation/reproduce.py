@@ -20,9 +20,11 @@ from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.claims import LEVEL, Claim, of_method, pooled, tts_s
 from uuvtai.evaluation.reproduce_steps import (
     BUDGETS,
+    ENV_STEPS,
     EVALUATION_SEED,
     METHODS,
     RETIRED_SEEDS,
+    Budget,
     Step,
     is_done,
     result_file,
@@ -311,13 +313,20 @@ def _request(root: Path) -> dict[str, Any]:
 
 
 def _run(folder: RunFolder, request: dict[str, Any], watch: EvaluationWatch) -> dict[str, Any]:
-    steps = steps_of(BUDGETS[request["budget"]], folder.path, request["own"])
+    budget = BUDGETS[request["budget"]]
+    steps = steps_of(budget, folder.path, request["own"])
+    rows = {step.row: row_file(folder.path, step.row) for step in steps if step.row}
+    for file in rows.values():
+        if file.exists():
+            _refuse_other_budget(file, read_json(file, folder=folder.path), budget)
     try:
         with folder.recorded():
             for number, step in enumerate(steps, start=1):
                 _step(step, f"{number}/{len(steps)} {step.name}", folder, watch)
-                if step.row and step.command[0] == "eval" and not row_file(folder.path, step.row).exists():
-                    folder.write_json(str(Path("rows") / f"{step.row}.json"), _row(folder.path, step))
+                if step.row and step.command[0] == "eval" and not rows[step.row].exists():
+                    row = _row(folder.path, step)
+                    _refuse_other_budget(folder.path / step.folder, row, budget)
+                    folder.write_json(str(Path("rows") / f"{step.row}.json"), row)
             document = document_of(folder.path, request, steps)
             folder.write_json(RESULT, document)
             folder.write(PAGE, results_page(document))
@@ -402,6 +411,22 @@ def _row(root: Path, step: Step) -> dict[str, Any]:
     limit = load_training(METHODS[0]).uncertainty.max_scale
     facts = claims.training_facts(rows, limit)
     return {"schema": 1, "entry": _entry(agent) | trained, "facts": facts, "commits": commits}
+
+
+def _refuse_other_budget(place: Path, row: Any, budget: Budget) -> None:
+    """RunFolderError for a row, made elsewhere or beforehand, that is not of this budget."""
+    wanted = budget.iterations * ENV_STEPS
+    try:
+        steps, episodes = row["entry"]["trained_steps"], len(row["entry"]["ends"])
+        if wanted <= steps < 1.1 * wanted and episodes == budget.episodes:
+            return
+        found = f"{steps:,} env-steps and {episodes} episodes"
+    except (KeyError, TypeError, ValueError):
+        found = "no row of this version"
+    raise RunFolderError(
+        f"{place}: {found}, but this budget has {wanted:,} env-steps a training and {budget.episodes} "
+        "episodes; move it away and --resume"
+    )
 
 
 def _entry(agent: dict[str, Any]) -> dict[str, Any]:

@@ -19,6 +19,8 @@ METHODS = ("paper", "ppo", "constant_20", "no_risk_scaling", "no_world_model")
 """presets that are trained; in the ablation's table ``paper`` is "Full" and ``ppo`` is "BT distill\""""
 _TEN_HZ, _HOLD_STEPS = "_10hz", 5
 """methods whose decisions last five control steps, on as many env-steps"""
+ENV_STEPS = 512
+"""of an iteration: 8 envs x 64 decisions at 50 Hz"""
 EVALUATION_SEED = 90010
 """never trained or tuned on; for published figures alone: do not look while you change things"""
 RETIRED_SEEDS = range(90001, 90009)  # test seeds of old that tuning has met since (``research/LOG.md``)
@@ -27,7 +29,7 @@ RETIRED_SEEDS = range(90001, 90009)  # test seeds of old that tuning has met sin
 @dataclass(frozen=True)
 class Budget:
     iterations: int
-    """of 8 envs x 64 decisions at 50 Hz: the paper's 1,200 are 614,400 env-steps"""
+    """the paper's 1,200 are 614,400 env-steps"""
     training_seeds: int
     episodes: int  # per agent in Table main
     note: str = ""
