@@ -18,7 +18,7 @@ from uuvtai.console.vehicle_views import show_calibration
 from uuvtai.vehicle import control_loop
 from uuvtai.vehicle.calibrate import WAYS, Calibration, Place, solved
 from uuvtai.vehicle.messages import DvlReading, ImuReading, SonarPing
-from uuvtai.vehicle.start_fix import expected
+from uuvtai.vehicle.start_fix import StartFound, expected
 
 DT, Z = 0.1, -0.8
 
@@ -115,16 +115,51 @@ def test_what_does_not_agree_is_refused_or_said(given, words, seconds):
     assert calibration.document(0.0)["rig"] is None and not calibration.document(0.0)["ready"]
 
 
-def test_a_way_that_nobody_measured_begins_again():
+def test_a_way_that_nobody_measured_is_no_leg():
+    """Pushed by a metre while the DVL is silent: what was found before counts, the way across does not."""
     diver = Diver(3)
     while len({place.number for place in diver.calibration.places}) < 3:
         diver.step()
-    diver.is_silent = True
+    diver.is_silent, kept = True, [*diver.calibration.places]
     for _ in range(40):
+        diver.place += np.array([0.025, 0.0])
         diver.step()
-    assert not diver.calibration.places and "begins again" in diver.calibration.says
+    assert diver.calibration.places == kept and "does not count" in diver.calibration.says
     diver.is_silent = False
-    assert diver.drive().found is not None
+    found = diver.drive().found
+    assert found is not None and found.places == 8, "a leg was lost"
+    assert math.degrees(found.dvl_yaw_rad) == pytest.approx(0.0, abs=1.0) and found.residual_m < 0.1
+
+
+def ends_of(told, place, yaw):
+    """Where somebody ends who drives as told."""
+    metres, way = re.search(r"(\d) m ([a-z ]+?)( by hand|$)", told).group(1, 2)
+    angle = yaw + WAYS.index(way) * math.tau / 8
+    return place + int(metres) * np.array([math.cos(angle), math.sin(angle)])
+
+
+def test_no_way_that_is_told_ends_at_a_wall():
+    rng, diver = np.random.default_rng(6), Diver(6)
+    made = diver.calibration
+    tank = diver.config.world.tank
+    low, high = np.array([tank.x_m, tank.y_m]).T
+    for _ in range(200):
+        first, made._at = rng.uniform(low + 1.0, high - 1.0), rng.uniform(low, high)
+        made.places, made._number = [Place(1, first, np.zeros(2), 0.0)], int(rng.integers(1, 8))
+        made._track.rpy = np.array([0.0, 0.0, rng.uniform(-4.0, 4.0)])
+        end = ends_of(made._next_way(), made._at, made._track.rpy[2])
+        assert (end > low + 0.97).all() and (end < high - 0.97).all(), (made._at, end)
+
+
+def test_where_the_walls_do_not_fit_it_leads_away_from_them():
+    diver = Diver(7)
+    while len(diver.calibration.places) < 3:
+        diver.step()
+    made = diver.calibration
+    made._at = np.array([15.87, 5.99])
+    made._take(StartFound(refusal="the start cannot be checked (x 0 to 20 m): 3 of 9 see through; measure"))
+    assert re.match(r"place 1: 3 of 9 see through: drive \d m [a-z ]+ by hand, then let it rest", made.says)
+    assert 2.0 < ends_of(made.says, made._at, made._track.rpy[2] + made._turn)[1] < 5.0
 
 
 def test_a_way_too_short_is_said():

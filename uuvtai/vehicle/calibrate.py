@@ -9,6 +9,7 @@ DVL's yaw alike.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Mapping
@@ -22,11 +23,11 @@ from uuvtai.common.files import whole_file
 from uuvtai.config import Config
 from uuvtai.config.loader import preset_names
 from uuvtai.vehicle.messages import DvlReading, ImuReading, SensorMessage
-from uuvtai.vehicle.start_fix import FLOOR_M, FLOOR_RAD, StartFix, StartFound, Track
+from uuvtai.vehicle.start_fix import FLOOR_M, FLOOR_RAD, StartFix, StartFound, Track, expected
 
 LONGEST_S = 1200.0  # of a calibration
-PLACES, MOST_PLACES, _FIXES = 7, 12, 3
-"""places at least and at most, and fixes at each"""
+_LEGS, _MOST_LEGS, _FIXES = 6, 11, 3
+"""legs between places at least and at most, and fixes at each place"""
 _LEG_M, _TOLD_M, _DRIFT_M = 1.5, 1.7, 0.5
 """between two places so far by the DVL at least, and so far as the operator is told; less is drift"""
 YAW_RAD, SCALE = math.radians(0.5), 0.05
@@ -37,6 +38,7 @@ WAYS = (
     "ahead to starboard",
 )  # fmt: skip
 """where to drive next, from the hull, counter-clockwise in steps of 45 degrees"""
+_ALL_WAYS_RAD = np.arange(len(WAYS)) * math.tau / len(WAYS)
 _SIDE_M, _LEAST_M = 2.0, 1.0  # of a square; from a wall, and from where the sonar no longer sees it
 _SQUARE_M = _SIDE_M * np.array([(1, 0), (1, 1), (0, 1), (0, 0)])
 """where to, one place after the other, from the first one: inwards, or to a wall that would leave the view"""
@@ -54,6 +56,7 @@ class Place:
     by_walls: np.ndarray  # (2,) [m] world
     by_dvl: np.ndarray  # (2,) [m] from where the calibration began, axes as typed
     turn_rad: float  # to be added to the yaw as typed
+    stretch: int = 0  # by the DVL its way is known to places of the same stretch alone
 
 
 @dataclass(frozen=True)
@@ -85,8 +88,8 @@ class Calibration:
         self._from, self._turn = np.zeros(2), 0.0
         """the way until then; by how much its yaw was wrong"""
         self._fix: StartFix | None = None
-        self._still_s, self._number = math.inf, 1
-        """at rest since; number of this rest"""
+        self._still_s, self._number, self._stretch = math.inf, 1, 0
+        """at rest since; number of this rest, and of the stretch of the way"""
 
     def feed(self, message: SensorMessage) -> None:
         """A message of the pilot's, in any order."""
@@ -94,7 +97,7 @@ class Calibration:
             return
         if isinstance(message, ImuReading):
             if not self._track.go(message) and self.places:
-                self._begin_again()
+                self._interrupt()
             self._rest(message.time_s)
         elif isinstance(message, DvlReading):
             self._track.hear(message)
@@ -107,9 +110,11 @@ class Calibration:
                 self._fix = None
                 self._take(result)
 
-    def _begin_again(self) -> None:
-        self.places, self._fix, self._number = [], None, 1
-        self.says = "attitude or velocity was missing for seconds: it begins again, let the vehicle rest"
+    def _interrupt(self) -> None:
+        """Where it has been meanwhile nobody knows."""
+        self._stretch, self._fix = self._stretch + 1, None
+        self._number += bool(self._of(self._number))
+        self.says = "attitude or velocity was missing for seconds: this way does not count, let it rest"
 
     def _rest(self, now_s: float) -> None:
         """Look for the walls while it rests, far from where it rested before; it may turn meanwhile."""
@@ -127,8 +132,12 @@ class Calibration:
                     self.says = f"that was {way_m:.1f} m of {_LEG_M:g} at least: drive on, then let it rest"
                 return
             self._number += 1
-        x, y = self._at + _turned(self._track.at - self._from, self._turn)
+        x, y = self._now()
         self._fix = StartFix(self._config, (float(x), float(y), self._z_m))
+
+    def _now(self) -> np.ndarray:
+        """(2,) [m] Where it is, by the last fix and the way since."""
+        return self._at + _turned(self._track.at - self._from, self._turn)
 
     def _of(self, number: int) -> list[Place]:
         return [place for place in self.places if place.number == number]
@@ -136,33 +145,48 @@ class Calibration:
     def _take(self, result: StartFound) -> None:
         if result.refusal:
             self.says = result.refusal
+            if self.places:
+                why, way = result.refusal.partition(": ")[2].partition(";")[0], self._way_to(self._middle())
+                self.says = f"place {self._number}: {why}: drive {way} by hand, then let it rest"
             return
         self._at, self._from, self._turn = np.array(result.place), self._track.at, result.turn_rad
-        self.places.append(Place(self._number, self._at, self._from, self._turn))
+        self.places.append(Place(self._number, self._at, self._from, self._turn, self._stretch))
         if (count := len(self._of(self._number))) < _FIXES:
             self.says = f"place {self._number}: fix {count} of {_FIXES}, let it rest"
             return
         self.says = f"place {self._number} is known: drive {self._next_way()} by hand, then let it rest"
-        if self._number >= PLACES:
+        if len(_legs(self.places)[0]) >= _LEGS:
             self._conclude()
 
+    def _middle(self) -> np.ndarray:
+        tank = self._config.world.tank
+        return np.array([sum(tank.x_m), sum(tank.y_m)]) / 2
+
     def _next_way(self) -> str:
-        """The next corner of the square that is a leg away, as seen from the hull."""
+        """To the next corner of the square that is a leg away."""
         tank, first = self._config.world.tank, self.places[0].by_walls
-        off = np.array([sum(tank.x_m), sum(tank.y_m)]) / 2 - first
+        off = self._middle() - first
         wall_m = np.array([np.ptp(tank.x_m), np.ptp(tank.y_m)]) / 2 - np.abs(off)
         sees_m = self._config.sensors.sonar.max_range_m - _LEAST_M
         is_inwards = (wall_m + _SIDE_M <= sees_m) | (wall_m < _SIDE_M + _LEAST_M)
         signs = np.where(is_inwards == (off >= 0), 1.0, -1.0)
         corners = np.roll(first + signs * _SQUARE_M, 1 - self._number, axis=0) - self._at
-        x, y = corners[int(np.argmax(np.hypot(*corners.T) > _TOLD_M))]
-        bearing = math.atan2(y, x) - self._track.rpy[2] - self._turn
-        return f"{math.hypot(x, y):.0f} m {WAYS[round(8 * bearing / math.tau) % 8]}"
+        return self._way_to(self._at + corners[int(np.argmax(np.hypot(*corners.T) > _TOLD_M))])
+
+    def _way_to(self, target: np.ndarray) -> str:
+        """What to drive, as seen from the hull, to end near ``target`` (2,) [m] and away from the walls."""
+        yaw, found = self._track.rpy[2] + self._turn, {}
+        for metres, way in itertools.product((2, 3), range(len(WAYS))):
+            angle = yaw + way * math.tau / len(WAYS)
+            end = self._now() + metres * np.array([math.cos(angle), math.sin(angle)])
+            around = expected(self._config.world.tank, np.tile(end, (len(WAYS), 1)), _ALL_WAYS_RAD)[0]
+            found[f"{metres} m {WAYS[way]}"] = math.dist(end, target) + 100 * max(_LEAST_M - min(around), 0)
+        return min(found, key=lambda told: found[told])
 
     def _conclude(self) -> None:
         found = solved(self.places)
         yaw, off = math.degrees(found.dvl_yaw_sd_rad), found.dvl_scale - 1.0
-        if found.dvl_yaw_sd_rad > YAW_RAD and self._number < MOST_PLACES:
+        if found.dvl_yaw_sd_rad > YAW_RAD and len(_legs(self.places)[0]) < _MOST_LEGS:
             self.says = f"{self.says} (the DVL's yaw is known to {yaw:.1f} degrees, wanted are 0.5)"
         elif found.dvl_yaw_sd_rad > YAW_RAD:
             self.refusal = (
@@ -200,15 +224,10 @@ class Calibration:
 def solved(places: list[Place]) -> Calibrated:
     """The turn and the scale that lay the ways by the DVL on those by the walls, from three rests on: leg by
     leg, for what a DVL misses on one is missing for good."""
-    numbers = sorted({place.number for place in places})
-    rows = [[place for place in places if place.number == number] for number in numbers]
-    walls, way = (
-        np.array([np.mean([getattr(place, name) for place in row], axis=0) for row in rows])
-        for name in ("by_walls", "by_dvl")
-    )
+    legs, way = _legs(places)
     turns = np.array([math.remainder(place.turn_rad, math.tau) for place in places])
     turn = float(np.mean(turns))
-    legs, turned = np.diff(walls, axis=0), _turned(np.diff(way, axis=0), turn)
+    turned = _turned(way, turn)
     along = float((turned * legs).sum())
     across = float((turned[:, 0] * legs[:, 1] - turned[:, 1] * legs[:, 0]).sum())
     size = float((turned**2).sum())
@@ -223,8 +242,19 @@ def solved(places: list[Place]) -> Calibrated:
         max(float(np.std(turns)), FLOOR_RAD),
         (float(places[-1].by_walls[0]), float(places[-1].by_walls[1])),
         math.sqrt(float((off**2).sum()) / (2 * len(legs))),
-        len(rows),
+        len({place.number for place in places}),
     )
+
+
+def _legs(places: list[Place]) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 2) each: ways from place to place by the walls, and by the DVL, which has measured them whole."""
+    rows = [[*row] for _, row in itertools.groupby(places, key=lambda place: place.number)]
+    whole = [one[0].stretch == other[0].stretch for one, other in itertools.pairwise(rows)]
+    walls, way = (
+        np.diff([np.mean([getattr(place, name) for place in row], axis=0) for row in rows], axis=0)[whole]
+        for name in ("by_walls", "by_dvl")
+    )
+    return walls, way
 
 
 def _turned(vectors: np.ndarray, angle: float) -> np.ndarray:
