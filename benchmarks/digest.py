@@ -17,6 +17,7 @@ _BEGINNING = (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
 """tokens that come before a statement"""
 
 
+@functools.cache
 def digest(name: str, root: Path = ROOT) -> str:
     """Of a benchmark and all that it imports of this repository, in turn, at the tops of modules; of the
     presets where they are read; of the whole package where none of it is imported, but run as a command.
@@ -62,14 +63,17 @@ def _imported(node: ast.stmt) -> Iterator[str]:
         yield from ast.literal_eval(node.value)
 
 
-def _places(root: Path, name: str) -> Iterator[Path]:
+@functools.cache
+def _places(root: Path, name: str) -> list[Path]:
     """Files of this repository that an import runs."""
-    place = root
+    place, found = root, []
     for part in name.split("."):
         place /= part
-        yield from (file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file())
+        found += [file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()]
+    return found
 
 
+@functools.cache
 def _preset(path: Path) -> str:
     if path.suffix == ".yaml":
         return str(yaml.safe_load(path.read_text(encoding="utf-8")))
