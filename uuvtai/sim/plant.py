@@ -3,14 +3,17 @@ sensors."""
 
 from __future__ import annotations
 
-from dataclasses import is_dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any, get_type_hints
 
 import numpy as np
+import taichi as ti
+import torch
 
 from uuvtai import state
 from uuvtai.common.errors import SettingError
-from uuvtai.compile.memory import HostFields, numpy_type
+from uuvtai.compile.codegen import adopt
+from uuvtai.compile.memory import HostFields, Memory, address_of, numpy_type
 from uuvtai.compile.runtime import Runtime
 from uuvtai.config import Config
 from uuvtai.kernels.sensors import proprioception
@@ -21,7 +24,20 @@ from uuvtai.kernels.vehicle.thruster_fault import response_size
 from uuvtai.sim.setup import allocation_matrices
 from uuvtai.sim.stages import bind
 
-_T = TypeVar("_T")
+
+@dataclass(frozen=True)
+class Structs:
+    """All that a vehicle alone needs."""
+
+    clock: state.ClockState
+    episode: state.EpisodeState
+    mission: state.MissionState
+    vehicle: state.VehicleState
+    params: state.VehicleParams
+    actuation: state.ActuationState
+    allocation: state.Allocation
+    current: state.CurrentState
+    ego: state.Proprioception
 
 
 class Plant:
@@ -35,33 +51,31 @@ class Plant:
             )
         self.config, self.n_env, self.real = config, n_env, runtime.real
         self._host = HostFields() if runtime.device == "cpu" else None
-        self._sizes = {
+        sizes = {
             "n_env": n_env,
             "n_thruster": len(config.vehicle.thrusters),
             "n_wrench": 6,
             "n_response": response_size(config.vehicle),
             "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
         }
-        self.clock = self._allocated(state.ClockState)
-        self.episode = self._allocated(state.EpisodeState)
-        self.mission = self._allocated(state.MissionState)
-        self.vehicle = self._allocated(state.VehicleState)
-        self.params = self._allocated(state.VehicleParams)
-        self.actuation = self._allocated(state.ActuationState)
-        self.allocation = self._allocated(state.Allocation)
-        self.current = self._allocated(state.CurrentState)
-        self.ego = self._allocated(state.Proprioception)
-        structs = [value for value in vars(self).values() if is_dataclass(value)]
-        self.actuation_io = bind(ActuationIO, config, *structs)
-        self.dynamics_io = bind(DynamicsIO, config, *structs)
-        self.senses_io = bind(ExactProprioceptionIO, config, *structs)
+        ti.sync()  # what others have declared is placed by itself
+        kinds = get_type_hints(Structs)
+        s = Structs(**{name: state.allocate(kind, sizes, self.real) for name, kind in kinds.items()})
+        self.clock, self.episode, self.mission = s.clock, s.episode, s.mission
+        self.vehicle, self.params, self.ego, self.current = s.vehicle, s.params, s.ego, s.current
+        self.actuation, self.allocation = s.actuation, s.allocation
+        self.actuation_io = bind(ActuationIO, config, s)
+        self.dynamics_io = bind(DynamicsIO, config, s)
+        self.senses_io = bind(ExactProprioceptionIO, config, s)
+        if config.runtime.native and runtime.device == "cpu" and runtime.precision == "f32":
+            device = torch.device("cpu")
+            memory = Memory(s, s.clock.running, address_of(s.clock.running, device), device)
+            adopt((self.actuation_io, self.dynamics_io, self.senses_io), memory, alone=n_env == 1)
         wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
         self.write(self.allocation.wrench_of_thrust, wrench_of_thrust)
         self.write(self.allocation.thrust_of_wrench, thrust_of_wrench)
+        self._asked = torch.zeros(n_env, 4, device=runtime.device)
         self.steps = 0
-
-    def _allocated(self, struct: type[_T]) -> _T:
-        return state.allocate(struct, self._sizes, self.real)
 
     def write(self, field: Any, value: Any) -> None:
         """Fill a field from anything that broadcasts to (field shape, vector length)."""
@@ -107,4 +121,5 @@ class Plant:
 
     def command(self, action: np.ndarray) -> None:
         """The inner loop alone, on whatever ``ego`` holds."""
-        control.command_thrusters(self.actuation_io, np.ascontiguousarray(action, dtype=np.float32))
+        self._asked.copy_(torch.as_tensor(action))
+        control.command_thrusters(self.actuation_io, self._asked)
