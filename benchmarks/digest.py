@@ -22,8 +22,7 @@ def digest(name: str, root: Path = ROOT) -> str:
     """Of a benchmark and all that it imports of this repository, in turn, at the tops of modules; of the
     presets where they are read; of the whole package where none of it is imported, but run as a command.
     Comments, docstrings and empty lines do not count."""
-    package, found = root / "uuvtai", dict[Path, str]()
-    left = [root / "benchmarks" / f"{name}.py"]
+    package, found, left = root / "uuvtai", dict[Path, str](), [root / "benchmarks" / f"{name}.py"]
     while left:
         path = left.pop()
         if path not in found:
@@ -66,15 +65,12 @@ def _imported(node: ast.stmt) -> Iterator[str]:
 @functools.cache
 def _places(root: Path, name: str) -> list[Path]:
     """Files of this repository that an import runs."""
-    place, found = root, []
-    for part in name.split("."):
-        place /= part
-        found += [file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()]
-    return found
+    places = (root.joinpath(*name.split(".")[: n + 1]) for n in range(name.count(".") + 1))
+    files = (file for place in places for file in (place.with_suffix(".py"), place / "__init__.py"))
+    return [file for file in files if file.is_file()]
 
 
 @functools.cache
 def _preset(path: Path) -> str:
-    if path.suffix == ".yaml":
-        return str(yaml.safe_load(path.read_text(encoding="utf-8")))
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    content = path.read_bytes()
+    return str(yaml.safe_load(content)) if path.suffix == ".yaml" else hashlib.sha256(content).hexdigest()
