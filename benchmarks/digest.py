@@ -17,12 +17,12 @@ _BEGINNING = (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
 """tokens that come before a statement"""
 
 
+@functools.cache
 def digest(name: str, root: Path = ROOT) -> str:
     """Of a benchmark and all that it imports of this repository, in turn, at the tops of modules; of the
     presets where they are read; of the whole package where none of it is imported, but run as a command.
     Comments, docstrings and empty lines do not count."""
-    package, found = root / "uuvtai", dict[Path, str]()
-    left = [root / "benchmarks" / f"{name}.py"]
+    package, found, left = root / "uuvtai", dict[Path, str](), [root / "benchmarks" / f"{name}.py"]
     while left:
         path = left.pop()
         if path not in found:
@@ -62,15 +62,15 @@ def _imported(node: ast.stmt) -> Iterator[str]:
         yield from ast.literal_eval(node.value)
 
 
-def _places(root: Path, name: str) -> Iterator[Path]:
+@functools.cache
+def _places(root: Path, name: str) -> list[Path]:
     """Files of this repository that an import runs."""
-    place = root
-    for part in name.split("."):
-        place /= part
-        yield from (file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file())
+    places = (root.joinpath(*name.split(".")[: n + 1]) for n in range(name.count(".") + 1))
+    files = (file for place in places for file in (place.with_suffix(".py"), place / "__init__.py"))
+    return [file for file in files if file.is_file()]
 
 
+@functools.cache
 def _preset(path: Path) -> str:
-    if path.suffix == ".yaml":
-        return str(yaml.safe_load(path.read_text(encoding="utf-8")))
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    content = path.read_bytes()
+    return str(yaml.safe_load(content)) if path.suffix == ".yaml" else hashlib.sha256(content).hexdigest()

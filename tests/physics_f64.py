@@ -39,17 +39,17 @@ def run(plant: Plant, cases: list[dict], substeps: int, n_sample: int) -> dict:
     nu = np.array([c.get("nu", [0] * 6) for c in cases], dtype=float)
     plant.write(v.vel_b, nu[:, :3])
     plant.write(v.rate_b, nu[:, 3:])
-    buoyancy = plant.params.buoyancy_n.to_numpy()
-    weight = plant.params.mass_kg.to_numpy() * plant.config.vehicle.gravity_m_s2
+    buoyancy = plant.read(plant.params.buoyancy_n)
+    weight = plant.read(plant.params.mass_kg) * plant.config.vehicle.gravity_m_s2
     plant.write(plant.params.buoyancy_n, np.where([c.get("neutral", False) for c in cases], weight, buoyancy))
     samples = []
     for _ in range(n_sample):
-        q = v.quat_wb.to_numpy()
+        q = plant.read(v.quat_wb)
         samples.append(
             (
-                v.pos_w.to_numpy(),
+                plant.read(v.pos_w),
                 np.degrees([angles_of(*x) for x in q]),
-                np.c_[v.vel_b.to_numpy(), v.rate_b.to_numpy()],
+                np.c_[plant.read(v.vel_b), plant.read(v.rate_b)],
             )
         )
         for _ in range(10):

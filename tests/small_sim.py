@@ -48,6 +48,16 @@ class SmallSim:
             mask[row], seeds[row], numbers[row] = 1, seed, number
         self.sim.reset(mask, seeds, numbers)
 
+    def begin_late(self, patch, steps):
+        """Have every episode begin so many steps before its horizon."""
+        begin, clock = self.sim.reset, self.sim.memory().live(self.sim.s.clock.step)
+
+        def reset(mask, seed, number):
+            begin(mask, seed, number)
+            clock[mask.numpy() == 1] = self.config.episode.horizon_steps - steps
+
+        patch.setattr(self.sim, "reset", reset)
+
     def scenario_bank(self):
         """The scenarios of episodes 0 .. N - 1 of seed 5, for the surrogate."""
         from uuvtai.surrogate.world import ScenarioBank, scenario_rows

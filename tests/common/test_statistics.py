@@ -167,11 +167,11 @@ def test_bootstrap_interval_of_known_samples():
 
 def test_bootstrap_interval_covers_the_mean_as_often_as_it_says():
     rng, covered = np.random.default_rng(1), 0
-    for _ in range(200):
+    for _ in range(100):
         low, high = bootstrap_interval(list(rng.normal(0.0, 1.0, 40)), resamples=300)
         covered += low <= 0.0 <= high
-    assert 0.89 <= covered / 200 <= 0.985, (
-        "95 % nominal, a little less for 40 samples; 200 trials have an error of 1.5 %"
+    assert 0.87 <= covered / 100 <= 0.99, (
+        "95 % nominal, a little less for 40 samples; 100 trials have an error of 2.2 %"
     )
 
 

@@ -59,8 +59,9 @@ def test_the_oracle_alone_is_printed_with_a_dagger(borrowed, capfd, tmp_path):
     assert "oracle †" in out and "† oracle is privileged" in out
 
 
-def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, capfd, tmp_path):
+def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, small, monkeypatch, capfd, tmp_path):
     """The rows of one evaluation do not leak into each other, whatever their order."""
+    small.begin_late(monkeypatch, 400)
     code, out, err = uuv(
         capfd, *COMMAND, "--agent", "bt+truth,bt", "--run-dir", str(tmp_path / "a"), "--json"
     )

@@ -232,7 +232,8 @@ def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
     assert observation_of([str(folder)]) == [("observation", config.observation.model_dump(mode="json"))]
 
 
-def test_the_built_in_policy_arrives(tmp_path, capfd):
+def test_the_built_in_policy_arrives(small, monkeypatch, tmp_path, capfd):
+    monkeypatch.setattr("uuvtai.sim.sim.Sim", lambda *_arguments: small.sim)
     words = (
         "--agent=policy",
         "--episodes=8",

@@ -427,6 +427,6 @@ def test_a_point_learns_to_go_home():
     ppo = Ppo(
         policy, PpoConfig(rollout_steps=32, learning_rate=3e-3, epochs=4, gamma=0.9, entropy_weight=0.0)
     )
-    means = play(policy, ppo, PointTask(generator), generator, 25)
+    means = play(policy, ppo, PointTask(generator), generator, 18)
     assert sum(means[:2]) / 2 < -1.0
     assert sum(means[-5:]) / 5 > -0.4

@@ -82,7 +82,7 @@ def test_log_variance_stays_in_bounds_with_a_gradient_everywhere():
 def test_it_learns_what_follows_and_where_it_is_uncertain():
     """Far below the targets' variance on unseen data, calibrated, and surer where the noise is weak."""
     config = SMALL.model_copy(update={"latent": 48, "hidden": (64, 64)})
-    model, _, metrics = trained(300, config, transitions(steps=256, noisy=1.0))
+    model, _, metrics = trained(200, config, transitions(steps=256, noisy=1.0))
     obs, action, next_obs = (part.flatten(0, 1) for part in transitions(7, steps=64, noisy=1.0))
     with torch.no_grad():
         _, mean, log_var = model.predict(obs, action)

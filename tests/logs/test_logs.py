@@ -555,18 +555,17 @@ def counted(self, *arguments):
     add(self, *arguments)
 container.McapFile.add_message = counted
 with McapEpisodeLog(Path(sys.argv[1]), episode.header()) as log:
-    for snap in episode.snapshots(3000, maps=sys.argv[2] == "maps"):
+    for snap in episode.snapshots(3000, maps=False):
         log.write(snap)
 """
 
 
-@pytest.mark.parametrize(("maps", "kill_at"), [("none", 3001), ("maps", 2333)])
-def test_sigkill_loses_at_most_one_percent(tmp_path, maps, kill_at):
-    path = tmp_path / "a.mcap"
+def test_sigkill_loses_at_most_one_percent(tmp_path):
+    path, kill_at = tmp_path / "a.mcap", 3001
     root = Path(__file__).parents[2]
     environment = {**os.environ, "PYTHONPATH": str(root)}
     with subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(path), maps], cwd=root, env=environment, stdout=subprocess.PIPE
+        [sys.executable, "-c", CHILD, str(path)], cwd=root, env=environment, stdout=subprocess.PIPE
     ) as child:
         for line in child.stdout:
             if int(line) >= kill_at:
@@ -599,7 +598,7 @@ def test_a_file_cut_anywhere_gives_back_a_prefix(log_path, tmp_path):
         sum(isinstance(record, Message) for record in breakup_chunk(chunk)) for chunk in chunks_of(log_path)
     ]
     recovered = []
-    for i, cut in enumerate(np.linspace(ends[0], len(whole), 12).astype(int)):
+    for i, cut in enumerate(np.linspace(ends[0], len(whole), 6).astype(int)):
         path = tmp_path / f"{i}.mcap"
         path.write_bytes(whole[:cut])
         saved = repair(path, tmp_path / f"{i}.out.mcap")

@@ -706,7 +706,14 @@ def test_a_damaged_file_is_one_clear_error_and_nothing_is_written(tmp_path, file
     assert not (tmp_path / "report.html").exists() and not (tmp_path / "figures").exists()
 
 
-def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path):
+@pytest.fixture
+def blank(monkeypatch):
+    """Figures are empty where only files count."""
+    monkeypatch.setattr(ink, "svg", lambda *_panel: "<svg/>")
+    monkeypatch.setattr(ink, "png", lambda _panels: b"png")
+
+
+def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path, blank):
     samples.write_run(tmp_path, eval__result=EVALUATED)
     before = report([tmp_path]).page.read_bytes()
     (tmp_path / "wall").write_text("a file")
@@ -718,7 +725,7 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path):
 # ------------------------------------------------------------------------------------ where it may be written
 
 
-def test_the_default_page_may_be_renewed(tmp_path):
+def test_the_default_page_may_be_renewed(tmp_path, blank):
     run = samples.write_run(tmp_path / "run", eval__result=EVALUATED)
     assert report([run]).page == report([run], run / "report.html").page
 
@@ -737,7 +744,7 @@ def test_a_page_never_replaces_a_file_of_the_run(tmp_path, name):
     assert not (run / "figures").exists()
 
 
-def test_a_page_elsewhere_replaces_files_with_force_only(tmp_path):
+def test_a_page_elsewhere_replaces_files_with_force_only(tmp_path, blank):
     run = samples.write_run(tmp_path / "run", eval__result=EVALUATED)
     (tmp_path / "mine.html").write_text("mine")
     with pytest.raises(UserError, match="--force"):
@@ -753,7 +760,7 @@ def test_a_page_elsewhere_replaces_files_with_force_only(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["page", "figures", "figure"])
-def test_a_page_is_not_written_through_a_link(tmp_path, kind):
+def test_a_page_is_not_written_through_a_link(tmp_path, kind, blank):
     run = samples.write_run(tmp_path / "run", eval__result=EVALUATED)
     (tmp_path / "outside").mkdir()
     (tmp_path / "outside" / "agents.png").write_text("precious")

@@ -10,7 +10,6 @@ import torch
 
 import uuvtai
 from tests.conftest import configure
-from tests.kernels.world.test_world import Drawn
 from uuvtai.compile.runtime import start_taichi
 from uuvtai.config.loader import load_config
 from uuvtai.envs.gymnasium import UuvVectorEnv
@@ -20,6 +19,7 @@ from uuvtai.evaluation.episodes import jobs_of, run_episodes
 from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins.api import plugin_spec
 from uuvtai.plugins.loading import load_plugin, obstacles_of
+from uuvtai.report.world import check
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 N = 8
@@ -46,14 +46,7 @@ def example(monkeypatch):
 def short(small, monkeypatch):
     """The session's simulator with every episode begun shortly before its horizon."""
     small.sim.use_tree(small.trees["bt"])
-    begin = small.sim.reset
-
-    def reset(mask, seed, number):
-        begin(mask, seed, number)
-        for row in mask.nonzero().flatten().tolist():
-            small.sim.s.clock.step[row] = small.config.episode.horizon_steps - SHORT
-
-    monkeypatch.setattr(small.sim, "reset", reset)
+    small.begin_late(monkeypatch, SHORT)
     yield small.sim
     small.sim.use_tree(small.trees["bt"])
 
@@ -157,13 +150,9 @@ def test_custom_world_is_played_and_drawn(short, example, tmp_path):
     assert cv2.imread(str(tmp_path / "new" / "harbour.png")).std() > 1
 
 
-def test_custom_world_can_be_placed(taichi_runtime):
-    world = load_config(str(EXAMPLES / "harbour.yaml")).world
-    drawn = Drawn(world, n_env=64).draw()
-    assert not drawn["faults"].any()
-    assert (drawn["kind"] != 0).sum(axis=1).tolist() == [
-        world.n_static + world.n_dynamic + len(world.fixed)
-    ] * 64
+def test_episodes_can_begin_in_the_custom_world():
+    told, problem, _label = check(load_config(str(EXAMPLES / "harbour.yaml")))
+    assert not problem and not [line for line in told if line.startswith("look at it")]
 
 
 def test_custom_vehicle_follows_its_command(taichi_runtime, example, monkeypatch):

@@ -28,10 +28,12 @@ from uuvtai.evaluation.reproduce import claims_of, results_page
 from uuvtai.evaluation.reproduce_steps import EVALUATION_SEED, RETIRED_SEEDS
 
 
-def test_the_pages_are_those_of_the_results(capsys):
+def test_the_pages_are_those_of_the_results(monkeypatch, capsys):
     found = render_results.differences()
     assert not found, "\n".join(["`python -m docs.render_results` renews the pages:", *found])
-    assert render_results.main(["--check"]) == 0
+    for told, code in ((found, 0), (["a line"], 1)):
+        monkeypatch.setattr(render_results, "differences", lambda told=told: told)
+        assert render_results.main(["--check"]) == code
     for page, wanted in render_results.TABLES.items():
         tables = render_results.TABLE.findall((ROOT / page).read_text())
         assert [name for _head, name, _body, _foot in tables] == list(wanted)

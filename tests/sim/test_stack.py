@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from tests.command import Quiet
-from tests.conftest import configure
 from uuvtai.config.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
 from uuvtai.evaluation.agents import AgentSpec, differences, load_agents
 from uuvtai.evaluation.evaluate import Request, compare
@@ -69,9 +68,7 @@ def test_a_policy_that_meets_another_stack_than_in_training_is_told():
 @pytest.fixture(scope="module")
 def compared(small, tmp_path_factory):
     """The session's simulator stands for both, to compile none: what each row asked for is kept."""
-    asked = []
-    episode = small.config.episode.model_copy(update={"horizon_steps": 100})
-    config = small.config.model_copy(update={"episode": episode})
+    asked, config = [], small.config
     request = Request(
         config=config, world="pool", sensors="paper", agents=["bt", "paper"], seeds=[5],
         episodes=2, num_envs=small.N,
@@ -85,7 +82,7 @@ def compared(small, tmp_path_factory):
         return small.sim
 
     with pytest.MonkeyPatch.context() as patch:
-        configure(patch, small.sim, config)
+        small.begin_late(patch, 100)
         patch.setattr("uuvtai.sim.sim.Sim", made)
         found = compare(request, Quiet())
     small.sim.use_tree(small.trees["bt"])
@@ -116,11 +113,11 @@ def test_the_papers_stack_plans_and_drives(small):
     sim = Sim(with_stack(small.config, "paper"), small.N, read_tree(tree_of_stack("paper")))
     every = torch.ones(small.N, dtype=torch.int32)
     sim.reset(every, 5 * every, torch.arange(small.N, dtype=torch.int32))
-    for _ in range(100):
+    for _ in range(60):
         sim.step()
     assert (sim.rows(sim.s.route.n_way) > 0).all()
     moved = sim.rows(sim.s.vehicle.pos_w) - sim.rows(sim.s.mission.start_w)
-    assert np.hypot(*moved[:, :2].T).min() > 0.3
+    assert np.hypot(*moved[:, :2].T).min() > 0.1
     sim.close()
 
 

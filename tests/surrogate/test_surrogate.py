@@ -324,7 +324,7 @@ def as_small(monkeypatch):
 
 def test_who_goes_straight_on_arrives_more_often_by_the_filter(bank, as_small, monkeypatch):
     """A policy at birth goes along its route whatever comes: with the filter it makes way."""
-    config = load_training("policy", overrides=SMALL | {"train.evaluate_episodes": 64})
+    config = load_training("policy", overrides=SMALL | {"train.evaluate_episodes": 32})
     trainer = Trainer(InSurrogate(config, bank), config)
     filtered = trainer.evaluate()["eval/success_rate"]
     monkeypatch.setattr(safety, "filter_wishes", lambda *_arguments: None)
@@ -570,6 +570,7 @@ def test_a_command_becomes_the_wish_with_its_velocity():
 
 def test_it_learns_what_the_tree_says(small, monkeypatch):
     samples, told = [], []
+    small.begin_late(monkeypatch, 600)
 
     def kept(actor, learner, sample, passes, generator):
         samples.append(sample)
@@ -608,7 +609,8 @@ def test_the_tree_alone_drives_as_without_a_student(small):
 # ------------------------------------------------------------------------------------------ in the simulator
 
 
-def test_it_drives_whatever_the_order_of_the_episodes(small, saved):
+def test_it_drives_whatever_the_order_of_the_episodes(small, saved, monkeypatch):
+    small.begin_late(monkeypatch, 400)
     pilot = load_set_agent(saved(), small.sim)
     jobs = jobs_of([3], 5)
     forth, _ = run_episodes(small.sim, jobs, agent=pilot)

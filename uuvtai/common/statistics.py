@@ -106,8 +106,8 @@ def mcnemar_p(only_a: int, only_b: int) -> float:
     """
     if only_a < 0 or only_b < 0:
         raise ValueError(f"counts must not be negative, got {only_a} and {only_b}")
-    n = only_a + only_b
-    tail = sum(math.comb(n, k) for k in range(min(only_a, only_b) + 1))
+    n, few = only_a + only_b, range(min(only_a, only_b))
+    _, tail = functools.reduce(lambda at, k: (term := at[0] * (n - k) // (k + 1), at[1] + term), few, (1, 1))
     return min(1.0, 2 * tail / 2**n)  # whole numbers: more than a float holds beyond 1,023 pairs
 
 

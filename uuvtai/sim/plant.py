@@ -3,14 +3,17 @@ sensors."""
 
 from __future__ import annotations
 
-from dataclasses import is_dataclass
-from typing import Any, TypeVar
+from dataclasses import make_dataclass
+from typing import Any, get_type_hints
 
 import numpy as np
+import taichi as ti
+import torch
 
 from uuvtai import state
 from uuvtai.common.errors import SettingError
-from uuvtai.compile.memory import HostFields, numpy_type
+from uuvtai.compile.codegen import adopt
+from uuvtai.compile.memory import Memory, address_of, numpy_type
 from uuvtai.compile.runtime import Runtime
 from uuvtai.config import Config
 from uuvtai.kernels.sensors import proprioception
@@ -19,9 +22,9 @@ from uuvtai.kernels.vehicle import control, dynamics
 from uuvtai.kernels.vehicle.io import ActuationIO, DynamicsIO
 from uuvtai.kernels.vehicle.thruster_fault import response_size
 from uuvtai.sim.setup import allocation_matrices
-from uuvtai.sim.stages import bind
+from uuvtai.sim.stages import SimState, bind
 
-_T = TypeVar("_T")
+NOUNS = ["clock", "episode", "mission", "vehicle", "params", "actuation", "allocation", "current", "ego"]
 
 
 class Plant:
@@ -34,40 +37,37 @@ class Plant:
                 f"disturbance.dead_thruster is {dead}, but the vehicle has thrusters 0 to {count - 1}"
             )
         self.config, self.n_env, self.real = config, n_env, runtime.real
-        self._host = HostFields() if runtime.device == "cpu" else None
-        self._sizes = {
+        sizes = {
             "n_env": n_env,
             "n_thruster": len(config.vehicle.thrusters),
             "n_wrench": 6,
             "n_response": response_size(config.vehicle),
             "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
         }
-        self.clock = self._allocated(state.ClockState)
-        self.episode = self._allocated(state.EpisodeState)
-        self.mission = self._allocated(state.MissionState)
-        self.vehicle = self._allocated(state.VehicleState)
-        self.params = self._allocated(state.VehicleParams)
-        self.actuation = self._allocated(state.ActuationState)
-        self.allocation = self._allocated(state.Allocation)
-        self.current = self._allocated(state.CurrentState)
-        self.ego = self._allocated(state.Proprioception)
-        structs = [value for value in vars(self).values() if is_dataclass(value)]
-        self.actuation_io = bind(ActuationIO, config, *structs)
-        self.dynamics_io = bind(DynamicsIO, config, *structs)
-        self.senses_io = bind(ExactProprioceptionIO, config, *structs)
+        ti.sync()  # what others have declared is placed by itself
+        kinds, device = get_type_hints(SimState), torch.device(runtime.device)
+        made = {noun: state.allocate(kinds[noun], sizes, self.real) for noun in NOUNS}
+        structs, anchor = make_dataclass("Structs", made)(**made), made["clock"].running
+        vars(self).update(made)
+        self.actuation_io = bind(ActuationIO, config, structs)
+        self.dynamics_io = bind(DynamicsIO, config, structs)
+        self.senses_io = bind(ExactProprioceptionIO, config, structs)
+        self._memory = Memory(structs, anchor, address_of(anchor, device), device)
+        if config.runtime.native and (runtime.device, runtime.precision) == ("cpu", "f32"):
+            adopt((self.actuation_io, self.dynamics_io, self.senses_io), self._memory, alone=n_env == 1)
         wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
         self.write(self.allocation.wrench_of_thrust, wrench_of_thrust)
         self.write(self.allocation.thrust_of_wrench, thrust_of_wrench)
-        self.steps = 0
+        self.steps, self._asked = 0, torch.zeros(n_env, 4, device=device)
 
-    def _allocated(self, struct: type[_T]) -> _T:
-        return state.allocate(struct, self._sizes, self.real)
+    def __getattr__(self, noun: str) -> Any:
+        """No struct of that noun, for all that there are are attributes."""
+        raise AttributeError(noun)
 
     def write(self, field: Any, value: Any) -> None:
         """Fill a field from anything that broadcasts to (field shape, vector length)."""
-        view = self._host.view(field) if self._host else None
-        if view is not None:  # in memory: Taichi would compile a kernel for every field
-            view[...] = value
+        if self._memory.device.type == "cpu":
+            self._memory.live(field)[...] = value
             return
         shape = (*field.shape, field.n) if hasattr(field, "n") else field.shape
         whole = np.broadcast_to(np.asarray(value, numpy_type(field)), shape)
@@ -75,8 +75,7 @@ class Plant:
 
     def read(self, field: Any) -> np.ndarray:
         """A copy of a field, vectors with a last axis."""
-        view = self._host.view(field) if self._host else None
-        return field.to_numpy() if view is None else view.copy()
+        return self._memory.live(field).copy() if self._memory.device.type == "cpu" else field.to_numpy()
 
     def reset(self, keys: np.ndarray | None = None) -> None:
         """All vehicles at rest at the origin; ``keys`` (n_env) are the episodes' random keys (default: 0, 1,
@@ -107,4 +106,5 @@ class Plant:
 
     def command(self, action: np.ndarray) -> None:
         """The inner loop alone, on whatever ``ego`` holds."""
-        control.command_thrusters(self.actuation_io, np.ascontiguousarray(action, dtype=np.float32))
+        self._asked.copy_(torch.as_tensor(action))
+        control.command_thrusters(self.actuation_io, self._asked)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import Stage, put
 from tests.command import uuv
 from tests.conftest import launch_one_by_one
 from tests.map_bits import room
@@ -15,11 +14,9 @@ from tests.small_sim import SmallSim
 from uuvtai.common.enums import NO_SITE
 from uuvtai.config.planning import ACCELERATION_M_S2
 from uuvtai.kernels.baselines.dwa import plan_dynamic_window
-from uuvtai.kernels.baselines.io import LocalPlannerIO
 from uuvtai.kernels.baselines.mppi import plan_path_integral
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.sim.behavior_tree import read_tree
-from uuvtai.sim.setup import array_sizes
 
 PLANNERS = {"dwa": plan_dynamic_window, "mppi": plan_path_integral}
 HERE = np.array([8.0, 3.0, -0.8])
@@ -175,30 +172,6 @@ def test_mppi_is_the_same_in_any_row_and_beside_any_others(scene):
     last = decide(scene, "mppi")
     np.testing.assert_array_equal(last[:4], other[-1, :4])
     assert (last[4:] != other[-1, 4:]).any()
-
-
-READ = {
-    "clock": ("active", "step"),
-    "ego": ("pos_w", "vel_b", "rpy"),
-    "mission": ("start_w", "goal_w"),
-    "behavior": ("follow_vel_w",),
-    "forecast": ("pos_w", "radius_m", "above_w", "below_w"),
-    "clearance": ("site",),
-}
-"""What MPPI reads."""
-
-
-def test_mppi_is_the_same_in_a_batch_of_another_size(scene):
-    body(scene, 0, 0, near(1.5, 0.1), [-0.5, 0.0])
-    stage = Stage(**array_sizes(scene.config, 64))
-    for noun, names in READ.items():
-        put(getattr(stage, noun), **{name: scene.views[f"{noun}.{name}"][0] for name in names})
-    for step in (0, 5):
-        scene.views["clock.step"][:] = step
-        put(stage.clock, step=step)
-        wanted = decide(scene, "mppi")[0]
-        plan_path_integral(stage.io(LocalPlannerIO, scene.config))
-        np.testing.assert_array_equal(stage.baselines.vel_w.to_numpy(), np.tile(wanted, (64, 1)))
 
 
 # ------------------------------------------------------------------------------------------------------ whole

@@ -260,11 +260,6 @@ def test_doppler_sigma_and_outliers():
     assert wild[wild != 1.0].std() == pytest.approx(2 / np.sqrt(3), rel=0.1)
 
 
-@pytest.mark.parametrize("which", [NOISE, MISSED, FALSE, GRAZING, CUT, DOPPLER])
-def test_every_error_is_absent_at_zero(which):
-    assert np.all(reported(which, CLEAN, 5.0, 0.001) == np.float32([5.0, 1.0, 0.001]))
-
-
 def test_ghost_takes_the_mirrored_path(rig):
     """In an empty tank beam 32 (45 deg) bounces off y = 6, then meets x = 20 (or the range limit)."""
     scene = scenes.one_obstacle_scene(N_ENV, N_OBSTACLE, (15.0, 4.0, -1.0))

@@ -111,7 +111,7 @@ def test_power_is_the_oracles(rig, scene):
 def test_what_is_heard_has_the_scenes_mean_and_rayleighs_speckle(rig, scene):
     rig.start(scene, range(N_ENV))
     heard = []
-    for ping in range(30):
+    for ping in range(12):
         rig.clock.step.fill(5 * ping)
         heard.append(rig.ping()[2][:, :, :N_BIN])
     heard = np.array(heard)

@@ -432,19 +432,6 @@ def test_number_of_static_obstacles_keeps_start_goal_and_the_first_obstacles():
     of.draw()
 
 
-def test_batch_size_changes_nothing():
-    of, drawn = drawn_world("pool")
-    other = Drawn(world_config("pool", static_capacity=8, dynamic_capacity=6), n_env=7)
-    other = other.draw(numbers=[6, 5, 4, 3, 2, 1, 0])
-    first, n = of.slots.first_dynamic, of.cfg.n_dynamic
-    for name in PURE:
-        mine = drawn[name][:7]
-        if mine.ndim > 1 and mine.shape[1] == of.slots.n_obstacle:
-            # the same slots, where capacities are not larger than counts
-            mine = np.concatenate([mine[:, : of.cfg.n_static], mine[:, first : first + n]], axis=1)
-        assert np.array_equal(other[name][::-1], mine), name
-
-
 # ----------------------------------------------------------------------------------------- a user's own world
 
 
