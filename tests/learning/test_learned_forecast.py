@@ -71,9 +71,7 @@ def learned(tmp_path_factory, taichi_runtime):
     path = tmp_path_factory.mktemp("net") / "f.safetensors"
 
     class LearnedSim(SmallSim):
-        # but for two numbers by which tracker and planner would be compiled anew: their own tests have them
         CHANGES = SmallSim.CHANGES | {"stack": "best", "forecast.learned": str(path)}
-        CHANGES |= {"tracking.partial_sigmas": 0.0, "quiet.room_m": 2.0}
 
     net = MixtureNet(torch.Generator().manual_seed(3))
     path.write_bytes(packed_weights(net.weights()))
