@@ -198,9 +198,8 @@ def of_an_environment():
 @pytest.fixture(scope="module")
 def graphs(tmp_path_factory):
     """Two exported policies, each checked, and a graph of a user's own, all made by one process that is
-    watched: what PyTorch needs for it takes ten seconds to import. (folder, home of the process, its
-    answer)"""
-    for name in ("onnx", "onnxscript", "onnxruntime"):
+    watched. (folder, home of the process, its answer)"""
+    for name in ("onnx", "onnxruntime"):
         pytest.importorskip(name, reason="needs the extra uuvtai[export]")
     root = tmp_path_factory.mktemp("graphs")
     saved(root / "plain", policy__hold_steps=10)
