@@ -65,18 +65,12 @@ def built(tmp_path_factory):
         elif source.exists():
             shutil.copy(source, copy / name)
     dist.mkdir()
-    run(
-        sys.executable,
-        "-c",
-        "import sys, setuptools.build_meta as b; b.build_sdist(sys.argv[1])",
-        dist,
-        cwd=copy,
-    )
+    build = "import sys, setuptools.build_meta as b; getattr(b, sys.argv[1])(sys.argv[2])"
+    run(sys.executable, "-c", build, "build_sdist", dist, cwd=copy)
     (sdist,) = dist.glob("*.tar.gz")
-    run(
-        sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index",
-        "-w", dist, sdist, cwd=place,
-    )  # fmt: skip
+    shutil.unpack_archive(sdist, place / "unpacked")
+    (unpacked,) = (place / "unpacked").iterdir()
+    run(sys.executable, "-c", build, "build_wheel", dist, cwd=unpacked)
     (stepper,) = dist.glob("*.whl")
     return sdist, stepper
 
