@@ -352,17 +352,6 @@ def test_presets_are_listed_and_shown(capfd):
     assert "rollout_steps: 64" in out
 
 
-def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    # a killed test may have left its lock in the real one
-    monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))
-    code, out, _ = uuv(capfd, "doctor", "--json")
-    found = json.loads(out)
-    assert code == 0, found
-    assert found["ok"]
-    assert all(check["detail"] for check in found["checks"])
-
-
 def test_doctor_finds_the_lock_of_a_killed_process(tmp_path, monkeypatch):
     """With it Taichi neither reads nor writes its cache: each start takes a minute, with one warning."""
     monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))
@@ -388,15 +377,6 @@ def test_a_start_removes_the_lock_of_a_killed_process_and_no_other(tmp_path):
     )
     assert "Lock" not in done.stdout + done.stderr
     assert not old.exists() and fresh.exists()
-
-
-def test_tree_is_printed_and_drawn(capfd):
-    code, out, _ = uuv(capfd, "presets", "show", "bt")
-    assert code == 0
-    assert "FollowRoute" in out
-    code, out, _ = uuv(capfd, "presets", "show", "straight", "--dot")
-    assert code == 0
-    assert out.startswith("digraph")
 
 
 @pytest.fixture(scope="module")

@@ -144,11 +144,6 @@ def test_the_wheel_holds_the_package_and_the_examples_and_nothing_else(built):
     assert any(name.endswith("licenses/LICENSE") for name in info)
 
 
-def test_presets_of_every_kind_are_among_them():
-    kinds = {name.split("/")[2] for name in PRESETS}
-    assert kinds >= {"worlds", "sensors", "vehicles", "trees", "train", "grids", "layout"}
-
-
 def test_the_source_distribution_can_be_tested_and_carries_no_litter(built):
     with tarfile.open(built[0]) as packed:
         names = {name.partition("/")[2] for name in packed.getnames()}
