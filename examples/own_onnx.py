@@ -1,7 +1,9 @@
 """Writes a policy as ONNX: ``python examples/own_onnx.py``, then ``uuv eval --agent model.onnx``."""
 
+import io
 from pathlib import Path
 
+import onnx
 import torch
 
 import uuvtai
@@ -24,7 +26,9 @@ class Policy(torch.nn.Module):
 
 
 if __name__ == "__main__":
-    env, any_n = uuvtai.make("pool", num_envs=1), {"dynamo": True, "dynamic_shapes": ({0: "rows"},)}
-    model = torch.onnx.export(Policy(env.columns).eval(), (torch.zeros(2, env.num_obs),), **any_n).model_proto
+    env, graph = uuvtai.make("pool", num_envs=1), io.BytesIO()
+    any_n = {"input_names": ["obs"], "dynamic_axes": {"obs": {0: "rows"}}, "dynamo": False}
+    torch.onnx.export(Policy(env.columns).eval(), (torch.zeros(2, env.num_obs),), graph, **any_n)
+    model = onnx.load_from_string(graph.getvalue())
     model.metadata_props.add(key="hold_steps", value="10")  # of 0.02 s each
     Path("model.onnx").write_bytes(model.SerializeToString())

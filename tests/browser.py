@@ -1,5 +1,6 @@
 """Pages from disk in headless Chromium, at two widths, light and dark (``js/look.mjs``), and Node."""
 
+import functools
 import json
 import os
 import platform
@@ -30,12 +31,17 @@ def require():
 def told(script, *arguments):
     """What a script says of pages in a browser. Skips where there is none."""
     require()
-    with tempfile.TemporaryDirectory() as unpacked:
-        done = node(script, *map(str, arguments), TMPDIR=unpacked)
+    done = node(script, *map(str, arguments), TMPDIR=_unpacked().name)
     if done.returncode == 3:
         pytest.skip(f"Chromium does not start here: {done.stderr.strip().splitlines()[0]}")
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
+
+
+@functools.cache
+def _unpacked():
+    """Where Chromium is unpacked to, which takes three seconds: once in a process."""
+    return tempfile.TemporaryDirectory()
 
 
 def node(*arguments, **environment):

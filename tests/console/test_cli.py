@@ -1,7 +1,9 @@
 """The command line as a newcomer meets it: results, exit codes, one clear message for everything wrong."""
 
 import ast
+import contextlib
 import errno
+import io
 import json
 import os
 import re
@@ -20,7 +22,7 @@ from taichi.lang.impl import default_cfg
 
 import uuvtai
 from tests import report_samples as samples
-from tests.command import uuv
+from tests.command import run_cli, uuv
 from tests.small_sim import SmallSim
 from uuvtai.common import exits
 from uuvtai.common.errors import SettingError, SizeError
@@ -222,7 +224,7 @@ def test_a_command_refuses_a_nonsense_thread_count(simulations):
 
 def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluation, simulations):
     """Names of run folder, vehicle and agent that look like markup, in every table."""
-    folder, document, _ = evaluation
+    folder, document = evaluation
     odd = json.loads(json.dumps(document))
     odd["world"] = odd["sensors"] = "[/x]"
     for agent in odd["agents"]:
@@ -285,7 +287,7 @@ def test_results_that_cannot_be_written_are_told_once(tmp_path):
 @pytest.mark.skipif(os.name != "posix", reason="a shell closes them")
 def test_closed_streams_are_like_the_null_device(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])}
-    for closed in (">&-", ">&- 2>&-", "<&- >&- 2>&-"):
+    for closed in (">&-", "<&- >&- 2>&-"):
         command = f"exec {sys.executable} -m uuvtai presets show sensors/clean {closed}"
         done = subprocess.run(
             ["sh", "-c", command], capture_output=True, cwd=tmp_path, env=environment, check=False
@@ -350,17 +352,6 @@ def test_presets_are_listed_and_shown(capfd):
     assert "rollout_steps: 64" in out
 
 
-def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    # a killed test may have left its lock in the real one
-    monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))
-    code, out, _ = uuv(capfd, "doctor", "--json")
-    found = json.loads(out)
-    assert code == 0, found
-    assert found["ok"]
-    assert all(check["detail"] for check in found["checks"])
-
-
 def test_doctor_finds_the_lock_of_a_killed_process(tmp_path, monkeypatch):
     """With it Taichi neither reads nor writes its cache: each start takes a minute, with one warning."""
     monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))
@@ -388,34 +379,21 @@ def test_a_start_removes_the_lock_of_a_killed_process_and_no_other(tmp_path):
     assert not old.exists() and fresh.exists()
 
 
-def test_tree_is_printed_and_drawn(capfd):
-    code, out, _ = uuv(capfd, "presets", "show", "bt")
-    assert code == 0
-    assert "FollowRoute" in out
-    code, out, _ = uuv(capfd, "presets", "show", "straight", "--dot")
-    assert code == 0
-    assert out.startswith("digraph")
-
-
 @pytest.fixture(scope="module")
-def evaluation(tmp_path_factory):
-    """One real evaluation in a process of its own: two controllers, recorded, as JSON."""
-    folder = tmp_path_factory.mktemp("eval") / "run"
-    command = [
-        sys.executable, "-m", "uuvtai", "eval", "--agent", "straight,bt", "--episodes", "4", "--seeds",
-        "3", *SmallSim.OPTIONS,
-        "--record", "1", "--set", "episode.horizon_steps=400", "--run-dir", str(folder),
-        "--report", "--json",
-    ]  # fmt: skip
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, "NO_COLOR": "1"}
-    )
-    assert done.returncode == 0, done.stderr
-    return folder, json.loads(done.stdout), done.stderr
+def evaluation(taichi_runtime, tmp_path_factory):
+    """One real evaluation: two controllers, recorded, as JSON."""
+    folder, out = tmp_path_factory.mktemp("eval") / "run", io.StringIO()
+    with contextlib.redirect_stdout(out):
+        code = run_cli(
+            "eval", "--agent", "straight,bt", "--episodes", "4", "--seeds", "3", *SmallSim.OPTIONS,
+            "--record", "1", "--set", "episode.horizon_steps=400", "--run-dir", folder, "--report", "--json",
+        )  # fmt: skip
+    assert code == 0
+    return folder, json.loads(out.getvalue())
 
 
 def test_eval_prints_one_document_with_every_documented_key(evaluation):
-    _, document, _ = evaluation
+    _, document = evaluation
     assert {"schema", "world", "S", "D", "v_m_s", "sensors", "seeds", "episodes_per_seed", "agents"} <= set(
         document
     )
@@ -443,25 +421,51 @@ def messages_of(log):
         ]
 
 
-def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, tmp_path):
+_THEN_INTERRUPTED = """
+import json, os, sys
+import uuvtai.evaluation.evaluate
+from uuvtai.__main__ import main
+first, second = json.loads(sys.argv[1])
+if child := os.fork():
+    assert os.waitpid(child, 0)[1] == 0
+sys.argv = ["uuv", *(second if child else first)]
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """A process evaluates on one thread, then another begins a long evaluation and is interrupted as soon as
+    a log has messages: (its folder, exit code, stdout, stderr)."""
+    folder = tmp_path_factory.mktemp("alone")
+    usual = [*SmallSim.OPTIONS, "--set", "episode.horizon_steps=400", "--seeds", "3", "--agent", "bt"]
+    told = [
+        ["eval", *usual, "--episodes", count, "--record", recorded, "--json", "--run-dir", str(folder / name)]
+        for name, count, recorded in (("run", "4", "1"), ("cut", "400", "400"))
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _THEN_INTERRUPTED, json.dumps(told)], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env={**os.environ, "UUV_NUM_THREADS": "1"},
+    )  # fmt: skip
+    deadline = time.monotonic() + 600
+    while not _parts_with_messages(folder / "cut") and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=240)
+    return folder, process.returncode, out, err
+
+
+def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, alone):
     """Outcomes of four episodes, and all that one of them wrote down on its way."""
-    folder, document, _ = evaluation
-    command = [
-        sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "4", "--seeds", "3",
-        *SmallSim.OPTIONS,
-        "--record", "1", "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json",
-    ]  # fmt: skip
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=True, env={**os.environ, "UUV_NUM_THREADS": "1"}
-    )
-    assert json.loads(done.stdout)["agents"][0]["episodes_detail"] == document["agents"][1]["episodes_detail"]
-    alone, together = (messages_of(run / "logs/bt_seed3_episode0.mcap") for run in (tmp_path / "run", folder))
-    assert {topic for topic, _, _ in alone} >= {"/sonar/scan", "/map/static", "/map/dynamic"}
-    assert alone == together
+    (folder, document), (place, _, out, _) = evaluation, alone
+    assert json.loads(out)["agents"][0]["episodes_detail"] == document["agents"][1]["episodes_detail"]
+    one, together = (messages_of(run / "logs/bt_seed3_episode0.mcap") for run in (place / "run", folder))
+    assert {topic for topic, _, _ in one} >= {"/sonar/scan", "/map/static", "/map/dynamic"}
+    assert one == together
 
 
 def test_eval_leaves_a_complete_run_folder(evaluation):
-    folder, document, _ = evaluation
+    folder, document = evaluation
     names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     assert {
         "config.yaml", "run.json", "eval/result.json", "eval/tree.json", "eval/trees/bt.xml",
@@ -476,7 +480,7 @@ def test_eval_leaves_a_complete_run_folder(evaluation):
 
 
 def test_tree_shows_the_use_of_every_node(evaluation, capfd):
-    folder, document, _ = evaluation
+    folder, document = evaluation
     code, out, _ = uuv(capfd, "presets", "show", "bt", "--run", str(folder), "--json")
     assert code == 0
     nodes = json.loads(out)["nodes"]
@@ -562,7 +566,7 @@ def test_an_evaluation_leads_on_to_its_report(capfd, compared):
 
 
 def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
-    folder, _, _ = evaluation
+    folder, _ = evaluation
     before = (folder / "run.json").read_text()
     for command in (["eval", "--episodes", "1"], ["train", "smoke"]):
         code, _, err = uuv(capfd, *command, "--run-dir", str(folder))
@@ -612,24 +616,12 @@ def _parts_with_messages(folder: Path) -> list[Path]:
     return [part for part in (folder / "logs").glob("*.part") if part.exists() and CHUNK in _opcodes(part)]
 
 
-def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path, capfd):
-    """The kernels are compiled by ``evaluation``: a compiling process does not listen."""
-    folder = tmp_path / "run"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "uuvtai", "eval", "--agent", "bt", "--episodes", "400", "--seeds", "3",
-        *SmallSim.OPTIONS,
-         "--set", "episode.horizon_steps=400", "--record", "400", "--run-dir", str(folder)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    deadline = time.monotonic() + 600
-    while not _parts_with_messages(folder) and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=240)
-    assert process.returncode == 130, err
+def test_interrupt_leaves_a_marked_run_and_repairable_logs(alone, capfd):
+    folder, code, _, err = alone
+    assert code == 130, err
     assert "interrupted" in err
     assert "Traceback" not in err
-    assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
-    code, out, err = uuv(capfd, "log", "repair", _parts_with_messages(folder)[0])
+    assert json.loads((folder / "cut/run.json").read_text())["status"] == "interrupted"
+    code, out, err = uuv(capfd, "log", "repair", _parts_with_messages(folder / "cut")[0])
     assert code == 0, err
     assert "messages recovered" in out

@@ -1,10 +1,12 @@
 """The command line answers quickly: what help, completion and light commands import, what is offered."""
 
+import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +16,7 @@ from tests.repository.test_docs import fault
 from uuvtai.common.presets import KINDS, preset_names
 from uuvtai.console import parsing
 
+ROOT = Path(commands.__file__).parents[2]
 HEAVY = {"taichi", "torch", "cv2", "ompl", "numpy", "yaml", "matplotlib", "tensorboard", "mcap"}
 """Pydantic is not among them: Typer loads it where it is there."""
 
@@ -31,25 +34,50 @@ def every_command():
 COMMANDS = dict(every_command())
 
 
-def modules_after(*arguments, **environment):
-    """(exit code, modules loaded) of a command in a process of its own."""
-    program = (
-        "import sys\nfrom uuvtai.cli import main\n"
-        f"try: main({list(arguments)})\nexcept SystemExit as left: print('left', left.code, *sys.modules, "
-        "file=sys.stderr)"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    _left, code, *modules = done.stderr.splitlines()[-1].split()
-    return int(code), set(modules)
+_IN_TURN = """
+import json, os, sys
+from uuvtai.cli import main
+for number, (words, environment) in enumerate(json.loads(sys.argv[1])):
+    if child := os.fork():
+        os.waitpid(child, 0)
+        continue
+    for stream, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(f"{sys.argv[2]}/{number}.{name}", os.O_WRONLY | os.O_CREAT), stream)
+    os.environ.update(environment)
+    try:
+        main(*words)
+    except SystemExit as left:
+        print("\\nleft", left.code or 0, *sys.modules, file=sys.stderr)
+    sys.stdout.flush(), sys.stderr.flush()
+    os._exit(0)
+"""
 
 
-@pytest.mark.parametrize(
-    "arguments", [["show", "bt"], ["show", "planner", "--dot"], ["show", "bt", "--json"]]
-)
-def test_a_tree_is_printed_without_torch_and_taichi(arguments):
-    code, modules = modules_after("presets", *arguments)
-    assert code == 0
-    assert not {"torch", "taichi", "cv2"} & modules
+def ended(tmp_path, cases, cwd=None):
+    """(stdout, exit code, modules loaded) of commands, each in a process of its own that has imported the
+    command line and nothing else. ``cases``: (words or, for those of the environment, none; environment)."""
+    told = tmp_path / "told"
+    told.mkdir()
+    command = [sys.executable, "-c", _IN_TURN, json.dumps(cases), str(told)]
+    subprocess.run(command, check=True, cwd=cwd, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    for number, _ in enumerate(cases):
+        err = (told / f"{number}.err").read_text()
+        assert "Traceback" not in err, err
+        _left, code, *modules = err.splitlines()[-1].split()
+        yield (told / f"{number}.out").read_text(), int(code), set(modules)
+
+
+def test_light_commands_import_little(tmp_path):
+    """Help and presets; a tree is printed without torch and Taichi."""
+    trees = [["presets", "show", *line] for line in (["bt"], ["planner", "--dot"], ["bt", "--json"])]
+    helps = [["--version"], ["--help"], ["eval", "-h"], ["log", "-h"]]
+    presets = [["presets"], ["presets", "show", "sensors/paper", "--json"]]
+    heavy = [{"torch", "taichi", "cv2"}] * 3 + [HEAVY] * 4 + [HEAVY - {"yaml"}] * 2
+    words = [*trees, *helps, *presets]
+    found = ended(tmp_path, [([line], {}) for line in words])
+    for line, unwanted, (out, code, modules) in zip(words, heavy, found, strict=True):
+        assert out and code == 0 and not unwanted & modules, line
+        assert ("FollowRoute" in out) == (line in trees) and out.startswith("digraph") == ("--dot" in line)
 
 
 # ------------------------------------------------------------------------------------------------------- help
@@ -111,21 +139,13 @@ def test_a_wrong_word_is_refused_at_once_and_the_right_one_named(
 # ------------------------------------------------------------------------------------------------- completion
 
 
-def completed(words, cwd, shell="bash"):
-    """What the shell is offered after these words, the last half-typed; and the modules that it took."""
-    program = (
-        "import sys\nfrom uuvtai.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)"
-    )
-    environment = os.environ | {
-        "_UUV_COMPLETE": f"complete_{shell}", "COMP_WORDS": "uuv " + " ".join(words),
-        "COMP_CWORD": str(len(words)),
-        "_TYPER_COMPLETE_ARGS": "uuv " + " ".join(words),
+def completion(words, shell="bash"):
+    """What a shell sets to ask what may follow these words, the last half-typed."""
+    typed = "uuv " + " ".join(words)
+    return {
+        "_UUV_COMPLETE": f"complete_{shell}", "COMP_WORDS": typed, "COMP_CWORD": str(len(words)),
+        "_TYPER_COMPLETE_ARGS": typed,
     }  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment, cwd=cwd
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    return done.stdout.split(), set(done.stderr.split())
 
 
 @pytest.fixture
@@ -141,7 +161,7 @@ def runs(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize(("words", "offers"), [
+OFFERED = [
     (["ev"], ["eval"]),
     (["eval", "--world", "ga"], ["gauntlet", "gauntlet_inertial"]),
     (["eval", "--world", "mi"], ["mine.yaml"]),
@@ -157,22 +177,19 @@ def runs(tmp_path):
     (["eval", "--device", ""], ["auto", "cpu", "cuda"]),
     (["presets", "show", "gau"], ["gauntlet", "gauntlet_inertial"]),
     (["presets", "show", "train/p"], ["train/paper", "train/policy", "train/ppo"]),
-], ids=" ".join)  # fmt: skip
-def test_the_shell_is_offered_names_and_folders(words, offers, runs):
-    found, modules = completed(words, runs)
-    assert found == offers
-    assert not HEAVY & modules
+]  # fmt: skip
 
 
-def test_completion_is_shown_for_a_shell():
-    code = (
-        "from typer.completion import get_completion_script as s; print(s(prog_name='uuv', "
-        "complete_var='_UUV_COMPLETE', shell='bash'))"
-    )
-    wanted = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "_UUV_COMPLETE=complete_bash" in wanted
-    for option in ("--show-completion", "--install-completion"):
-        assert option in {name for parameter in COMMANDS[()].params for name in parameter.opts}
+def test_the_shell_is_offered_names_and_folders(runs, tmp_path_factory):
+    cases = [([], completion(words)) for words, _ in OFFERED]
+    found = ended(tmp_path_factory.mktemp("completion"), cases, runs)
+    for (words, offers), (out, _code, modules) in zip(OFFERED, found, strict=True):
+        assert out.split() == offers and not HEAVY & modules, words
+
+
+def test_completion_can_be_asked_for():
+    named = {name for parameter in COMMANDS[()].params for name in parameter.opts}
+    assert {"--show-completion", "--install-completion"} <= named
 
 
 def test_everything_that_can_be_shown_is_offered():
@@ -183,17 +200,3 @@ def test_everything_that_can_be_shown_is_offered():
 
 def test_a_folder_that_cannot_be_read_offers_nothing(tmp_path):
     assert parsing.presets("world")(f"{tmp_path}/no/such/") == []
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        *(["--version"], ["--help"], ["eval", "-h"], ["log", "-h"]),
-        *(["presets"], ["presets", "show", "sensors/paper", "--json"]),
-    ],
-)
-def test_help_and_presets_import_little(arguments):
-    code, modules = modules_after(*arguments)
-    assert code == 0
-    light = {"yaml"} if arguments[0] == "presets" else set()
-    assert not (HEAVY - light) & modules

@@ -44,7 +44,7 @@ class SetEncoder(nn.Module):
         n, rows = obstacles.shape[-2], obstacles.shape[:-2]
         # obstacles first, as pooling wants them; as rows, for which ReLU in place costs nothing
         each = obstacles.reshape(-1, n, obstacles.shape[-1]).transpose(0, 1)
-        said = self.obstacle(each.flatten(0, 1)).unflatten(0, each.shape[:2])
+        said = self.obstacle(each.flatten(0, 1)).reshape(*each.shape[:2], -1)
         highest, total = MaxAndSum.apply(said, mask.reshape(-1, n).t())
         pooled = torch.cat((highest, _SUM_SCALE * total), dim=-1)
         return self.head(torch.cat((pooled.reshape(*rows, -1), self.own(own)), dim=-1))

@@ -22,8 +22,8 @@ import numpy as np
 from uuvtai.common.errors import UserError
 from uuvtai.common.files import whole_folder
 from uuvtai.common.version import __version__
-from uuvtai.compile.codegen import Compiler, Machine, UnfitError, completed, emitted, runtime_layout, tasks_in
-from uuvtai.compile.launch import NativeLaunch, compiling, given
+from uuvtai.compile.codegen import Compiler, UnfitError, completed, emitted, runtime_layout, tasks_in
+from uuvtai.compile.launch import TaichiLaunch, compiling, given
 from uuvtai.config import Config
 from uuvtai.kernels.planning import route
 from uuvtai.kernels.planning.route import keep_route
@@ -100,9 +100,8 @@ class _TapeRecorder:
 
     def __init__(self, tape: Tape, sim: Sim) -> None:
         self.compiler = Compiler()
-        self._tape, self._sim, self._machine = tape, sim, Machine(1)
-        self._runtime = self._machine.runtime(sim.memory().address, alone=True)
-        self._known: dict[tuple[int, ...], tuple[int, NativeLaunch]] = {}
+        self._tape, self._sim = tape, sim
+        self._known: dict[tuple[int, ...], tuple[int, TaichiLaunch]] = {}
         self._kept: list[Any] = []
         self._numbers: dict[int, int] = {}
         self._lines: list[Line] = []
@@ -123,7 +122,7 @@ class _TapeRecorder:
         return 0
 
     def launch(self, kernel: Any, arguments: tuple) -> None:
-        """In place of a kernel: its code, compiled for this processor from the text that is kept."""
+        """In place of a kernel: Taichi launches what it has compiled, and its text is kept."""
         key = (id(kernel), *map(id, arguments))
         if key not in self._known:
             self._known[key] = self._compiled(kernel, arguments)
@@ -132,15 +131,12 @@ class _TapeRecorder:
         self._lines.append({"kernel": number, "arguments": self._described(kernel, arguments)})
         launch.again()
 
-    def _compiled(self, kernel: Any, arguments: tuple) -> tuple[int, NativeLaunch]:
+    def _compiled(self, kernel: Any, arguments: tuple) -> tuple[int, TaichiLaunch]:
         with compiling(kernel, arguments):
             made = kernel.compiled_kernels[kernel.ensure_compiled(*arguments)]
-            _, text = self.compiler.compiled(made)
-        names = tasks_in(text)
-        tasks = self._machine.tasks_of(self._machine.object_of(text), names)
-        self._tape.kernels.append(RecordedKernel(kernel.func.__name__, text, names))
-        launch = NativeLaunch(self._machine, self._runtime, tasks, arguments, given(kernel, arguments))
-        return len(self._tape.kernels) - 1, launch
+            compiled, text = self.compiler.compiled(made)
+        self._tape.kernels.append(RecordedKernel(kernel.func.__name__, text, tasks_in(text)))
+        return len(self._tape.kernels) - 1, TaichiLaunch(kernel, arguments, (made, compiled))
 
     def _described(self, kernel: Any, arguments: tuple) -> list[Any]:
         """[["int", 3], ["float", 0.5], ["array", its number]]"""
@@ -365,6 +361,7 @@ def export_stack(
     linker()
     try:
         tape, sim = record(config, tree, mission)
+        libraries = {name: library_of(tape.kernels, KINDS[name]) for name in machines}
     except UnfitError as error:
         raise StackExportError(f"Taichi's code cannot be exported here: {error}") from None
     steps = min(CHECKED_STEPS, arrivals[-1][0] + 1) if arrivals else 0
@@ -373,7 +370,7 @@ def export_stack(
     sim.fallback = kept  # type: ignore[assignment]
     commands = decided(beside, shown, steps)
     with whole_folder(out) as new:
-        _write(new, tape, beside, machines)
+        _write(new, tape, beside, libraries)
         packed = {**packed_messages(shown), "commands": commands}
         (new / GOLDEN).write_bytes(_npz(packed))
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
@@ -401,7 +398,7 @@ class _KeptRoutes:
         return failed
 
 
-def _write(folder: Path, tape: Tape, pilot: OnboardPilot, machines: Sequence[str]) -> None:
+def _write(folder: Path, tape: Tape, pilot: OnboardPilot, code: dict[str, bytes]) -> None:
     """All but the check."""
     package = folder / PACKAGE
     package.mkdir(parents=True)
@@ -413,10 +410,9 @@ def _write(folder: Path, tape: Tape, pilot: OnboardPilot, machines: Sequence[str
     (package / "__init__.py").write_text('"""The stack of uuvtai without Taichi and torch."""\n')
     main = f"from {PACKAGE}.{Path(runtime.__file__).stem} import main\n\nraise SystemExit(main())\n"
     (package / "__main__.py").write_text(main)
-    libraries = {}
-    for machine in machines:
-        libraries[machine] = f"{machine}.so"
-        (folder / libraries[machine]).write_bytes(library_of(tape.kernels, KINDS[machine]))
+    libraries = {machine: f"{machine}.so" for machine in code}
+    for machine, library in code.items():
+        (folder / libraries[machine]).write_bytes(library)
     (folder / MEMORY).write_bytes(_npz({"memory": tape.memory}))
     spec = {
         "schema": SCHEMA,
