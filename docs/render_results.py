@@ -110,7 +110,7 @@ def local_planners(root: Path) -> str:
     """Every agent beside the tree, planners of the literature and the paper's stack among them."""
     rows = {row["name"]: row for row in _read(root / EVALUATIONS)["rows"]}
     worlds = [rows[name] for name in ("pool_6", "pool_9_fast", "gauntlet_9_fast")]
-    names = ("bt", "best", "policy", "capped", "paper", "mppi", "dwa")
+    names = ("bt", "best", "policy", "capped", "paper", "mppi", "dwa", "bt+truth", "best+truth", "oracle")
     lines = [[f"`{name}`", *(_beside_bt(row, name) for row in worlds)] for name in names]
     return text_table(["", *(row["title"] for row in worlds)], lines)
 
@@ -157,6 +157,7 @@ def grid(root: Path) -> str:
          f"below {100 * claims.FEW_MOVERS_COLLISION:.1f} %", "", ""],
         *_by_agent(few, "`pool`, D <= 3, all S and v"),
         *_by_agent(corner, "the corner S = 12, D = 15, v = 3.0"),
+        *_by_agent([c for c in pool if c["v_m_s"] == claims.CORNER["v_m_s"]], "`pool`, v = 3.0, all S and D"),
         *_by_agent(pool, "`pool`, all cells"),
         *_by_agent(_moderate(gauntlet), f"`gauntlet`, {moderate}", True),
         *_by_agent(gauntlet, "`gauntlet`, all cells"),
