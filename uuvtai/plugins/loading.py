@@ -26,29 +26,7 @@ from uuvtai.kernels.planning.observation import placed_columns
 from uuvtai.learning.export import graph as graph_check
 from uuvtai.learning.export import graph as onnx_session
 from uuvtai.learning.policy_agent import CHUNK
-from uuvtai.plugins import adapters
-from uuvtai.plugins.adapters import (
-    CallMeter,
-    Fixed,
-    Marks,
-    OwnCode,
-    PluginAgent,
-    asking_controller,
-    asking_policy,
-)
-from uuvtai.plugins.api import (
-    CONTROLLER,
-    MOTION,
-    PLANNER,
-    POLICY,
-    REWARD,
-    About,
-    Forecast,
-    PluginError,
-    PluginSpec,
-    failed,
-    plugin,
-)
+from uuvtai.plugins import adapters, api
 from uuvtai.sim.rrt import PlanRequest
 from uuvtai.sim.sim import Sim
 
@@ -74,13 +52,13 @@ class _OwnSource(SourceFileLoader):
         pass
 
 
-def content_of(spec: PluginSpec, limit: int) -> bytes:
+def content_of(spec: api.PluginSpec, limit: int) -> bytes:
     """The plugin's file. Raises PluginError where there is none, FileError for what is no plain file."""
-    with refusing(PluginError, f"{spec.option}: {spec.path} cannot be read"):
+    with refusing(api.PluginError, f"{spec.option}: {spec.path} cannot be read"):
         return read_bytes(spec.path, limit)
 
 
-def object_of(spec: PluginSpec) -> Any:
+def object_of(spec: api.PluginSpec) -> Any:
     """The object that the plugin names, its file imported once per content. Raises PluginError, FileError."""
     module = _module(spec)
     if not hasattr(module, spec.name):
@@ -89,20 +67,20 @@ def object_of(spec: PluginSpec) -> Any:
             for name, value in vars(module).items()
             if callable(value) and getattr(value, "__module__", "") == module.__name__
         ]
-        raise PluginError(
+        raise api.PluginError(
             f"{spec.option}: {spec.path} has no {spec.name!r}; it has {', '.join(there) or 'no function'}"
         )
     return getattr(module, spec.name)
 
 
-def _module(spec: PluginSpec) -> ModuleType:
+def _module(spec: api.PluginSpec) -> ModuleType:
     digest = hashlib.sha256(content_of(spec, MAX_BYTES)).hexdigest()
     key = str(spec.path.resolve()), digest
     if key not in _loaded:
         name = f"uuv_own_{spec.path.stem}_{digest[:8]}"
         if key in _importing:
             below = "move all but imports, functions and classes below 'if __name__ == \"__main__\":'"
-            raise PluginError(f"{spec.path}: runs itself again; {below}")
+            raise api.PluginError(f"{spec.path}: runs itself again; {below}")
         found = importlib.util.spec_from_loader(name, _OwnSource(name, str(spec.path)))
         assert found is not None  # a loader was given
         module = importlib.util.module_from_spec(found)
@@ -115,14 +93,14 @@ def _module(spec: PluginSpec) -> ModuleType:
             _OwnSource(name, str(spec.path)).exec_module(module)
         except (Exception, SystemExit) as error:
             del sys.modules[name]
-            raise failed(error, spec.path, f"while {spec.option} was imported") from error
+            raise api.failed(error, spec.path, f"while {spec.option} was imported") from error
         finally:
             _importing.discard(key)
         _loaded[key] = module
     return _loaded[key]
 
 
-def made(found: Any, spec: PluginSpec, about: About) -> Any:
+def made(found: Any, spec: api.PluginSpec, about: api.About) -> Any:
     """What drives: the object itself, an instance of a class, or what a function named ``load`` returns.
     Raises PluginError."""
     is_class, make = inspect.isclass(found), cast("Callable[..., Any]", found)
@@ -130,13 +108,13 @@ def made(found: Any, spec: PluginSpec, about: About) -> Any:
         return found
     takes, may_take = _parameters(found)
     if takes > 1:
-        raise PluginError(
+        raise api.PluginError(
             f"{place_of(found, spec)}: {spec.name} needs {takes} arguments; it gets one (about) or none"
         )
     try:
         made_one = make(about) if takes or may_take else make()
     except (Exception, SystemExit) as error:
-        raise failed(error, spec.path, f"while {spec.option} was made") from error
+        raise api.failed(error, spec.path, f"while {spec.option} was made") from error
     for name in ("rows", "arrays", "hold_steps"):  # a decorated ``load`` says it for what it returns
         if not is_class and hasattr(found, name) and not hasattr(made_one, name):
             return _Marked(made_one, {n: getattr(found, n) for n in ("rows", "arrays", "hold_steps")})
@@ -168,14 +146,14 @@ def _parameters(found: Any) -> tuple[int, bool]:
 
 
 def agent_of(
-    found: Any, names: tuple[str, ...], spec: PluginSpec, usage: str, count: int
+    found: Any, names: tuple[str, ...], spec: api.PluginSpec, usage: str, count: int
 ) -> Callable[..., Any]:
     """The function to call: the first method of ``names`` that the object has, or the object itself. Raises
     PluginError where there is none, or where it takes other than ``count`` arguments."""
     inner = inner_of(found)
     method = next((getattr(inner, name) for name in names if callable(getattr(inner, name, None))), inner)
     if not callable(method):
-        raise PluginError(
+        raise api.PluginError(
             f"{spec.option}: {spec.name} is {type(inner).__name__}, which cannot be called and has no "
             f"{' or '.join(names)}; {usage}"
         )
@@ -183,13 +161,13 @@ def agent_of(
         taken = inspect.signature(method)
         taken.bind(*range(count), **({"row": 0} if "row" in taken.parameters else {}))
     except TypeError as error:
-        raise PluginError(f"{place_of(method, spec)}: {error}; {usage}") from None
+        raise api.PluginError(f"{place_of(method, spec)}: {error}; {usage}") from None
     except ValueError:  # of compiled code
         pass
     return method
 
 
-def place_of(found: Any, spec: PluginSpec) -> str:
+def place_of(found: Any, spec: api.PluginSpec) -> str:
     """FILE:LINE where a function or a class begins, as far as it is known."""
     code = getattr(inspect.unwrap(found) if inspect.isroutine(found) else found, "__code__", None)
     if code is not None and code.co_filename == str(spec.path):
@@ -209,25 +187,27 @@ _OUTPUTS = ("action", "actions", "mean_action", "mean_actions", "mean")
 MAX_GRAPH_BYTES = graph_check.MAX_BYTES
 
 
-def graph_of(spec: PluginSpec) -> bytes:
+def graph_of(spec: api.PluginSpec) -> bytes:
     """The file, with its weights if they lie beside it, no larger than a graph may be. Raises PluginError,
     FileError."""
     if not onnx_session.is_installed():
-        raise PluginError(f"{spec.option}: needs onnx and onnxruntime: pip install 'uuvtai[export]'")
+        raise api.PluginError(f"{spec.option}: needs onnx and onnxruntime: pip install 'uuvtai[export]'")
     graph = content_of(spec, MAX_GRAPH_BYTES)
 
     def beside(name: str) -> bytes:
         told = f"{spec.path}: its weights are in {name}, which cannot be read"
-        with refusing(PluginError, told, "copy that file too, beside it"):
+        with refusing(api.PluginError, told, "copy that file too, beside it"):
             return read_bytes(spec.path.parent / name, MAX_GRAPH_BYTES, spec.path.parent)
 
     try:
         return graph_check.with_weights(graph, beside)
     except graph_check.GraphError as error:
-        raise PluginError(f"{spec.path}: {error.reason}") from None
+        raise api.PluginError(f"{spec.path}: {error.reason}") from None
 
 
-def onnx_policy(spec: PluginSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
+def onnx_policy(
+    spec: api.PluginSpec, graph: bytes, n_obs: int
+) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
     """(function from observations (n, n_obs) to actions (n, 4), control steps per decision). Raises
     PluginError for a graph that is strange, or made for another observation."""
     try:
@@ -236,18 +216,18 @@ def onnx_policy(spec: PluginSpec, graph: bytes, n_obs: int) -> tuple[Callable[[n
         if len(head.outputs) > 1:
             graph = graph_check.only(graph, output)
         if len(head.inputs) != 1:
-            raise PluginError(
+            raise api.PluginError(
                 f"{spec.path}: takes {', '.join(head.inputs) or 'nothing'}; a policy takes one input, "
                 f"observations (n, {n_obs}), and keeps no state; of 'uuv export' evaluate its run"
             )
         name, (width, rows, dtype) = next(iter(head.inputs.items()))
         if dtype is None or rows == 0 or (rows or 0) > CHUNK:
-            raise PluginError(
+            raise api.PluginError(
                 f"{spec.path}: {name} takes no observations: a float input (n, {n_obs}) does, n "
                 f"open, 1, or up to {CHUNK}"
             )
         if width not in (None, n_obs):
-            raise PluginError(
+            raise api.PluginError(
                 f"{spec.path}: takes observations of {width} columns, here they have {n_obs} "
                 "(docs/extend.md lists them); --set observation.n_track=.. and observation.behavior=true add "
                 "columns"
@@ -256,11 +236,11 @@ def onnx_policy(spec: PluginSpec, graph: bytes, n_obs: int) -> tuple[Callable[[n
         graph_check.refuse_strange(graph, {name: (rows or CHUNK, n_obs)}, calls, rows or 1)
         session = onnx_session.session(graph)
     except graph_check.GraphError as error:
-        raise PluginError(f"{spec.path}: {error.reason}") from None
-    except PluginError:
+        raise api.PluginError(f"{spec.path}: {error.reason}") from None
+    except api.PluginError:
         raise
     except Exception as error:  # ONNX Runtime's own, which share no base class beyond this
-        raise PluginError(
+        raise api.PluginError(
             f"{spec.path}: ONNX Runtime cannot use it ({' '.join(str(error).split())[:200]})"
         ) from None
 
@@ -276,10 +256,10 @@ def onnx_policy(spec: PluginSpec, graph: bytes, n_obs: int) -> tuple[Callable[[n
     return act, _hold(spec, head.metadata)
 
 
-def _hold(spec: PluginSpec, metadata: dict[str, str]) -> int:
+def _hold(spec: api.PluginSpec, metadata: dict[str, str]) -> int:
     text = metadata.get(HOLD, "1")
     if not text.isascii() or not text.isdigit() or not 1 <= int(text[:9]) <= 10_000:
-        raise PluginError(
+        raise api.PluginError(
             f"{spec.path}: metadata {HOLD} = {text[:40]!r}; a whole number of control steps from 1"
         )
     return int(text)
@@ -290,20 +270,20 @@ def _hold(spec: PluginSpec, metadata: dict[str, str]) -> int:
 
 
 _USAGE = {
-    PLANNER: "a planner is called plan(clearance, cell_m, start, goal, forecast)",
-    CONTROLLER: "a controller is called act(view)",
-    POLICY: "a policy is called act(obs)",
-    REWARD: "a reward is called terms(view)",
-    MOTION: "a motion is called paths()",
+    api.PLANNER: "a planner is called plan(clearance, cell_m, start, goal, forecast)",
+    api.CONTROLLER: "a controller is called act(view)",
+    api.POLICY: "a policy is called act(obs)",
+    api.REWARD: "a reward is called terms(view)",
+    api.MOTION: "a motion is called paths()",
 }
 _AGENTS = {
-    PLANNER: ("plan",),
-    CONTROLLER: ("act",),
-    POLICY: ("act", "predict"),
-    REWARD: ("terms",),
-    MOTION: (),
+    api.PLANNER: ("plan",),
+    api.CONTROLLER: ("act",),
+    api.POLICY: ("act", "predict"),
+    api.REWARD: ("terms",),
+    api.MOTION: (),
 }
-_ARGUMENTS = {PLANNER: 5, CONTROLLER: 1, POLICY: 1, REWARD: 1, MOTION: 0}
+_ARGUMENTS = {api.PLANNER: 5, api.CONTROLLER: 1, api.POLICY: 1, api.REWARD: 1, api.MOTION: 0}
 _LIMITS = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
 
 
@@ -315,34 +295,36 @@ def _say(text: str) -> None:
 class LoadedPlugin:
     """A plugin that was found: its file can be read and has what it names."""
 
-    spec: PluginSpec
+    spec: api.PluginSpec
     sha256: str
     """of its file; what that imports is not in it"""
     found: Any
     """the object; an ONNX graph's bytes"""
     note: Callable[[str], None] = _say
     """told of calls that take too long"""
-    meter: CallMeter | None = field(default=None, init=False)
+    meter: adapters.CallMeter | None = field(default=None, init=False)
 
     @property
     def label(self) -> str:
         """What it is called in tables."""
         return self.spec.label
 
-    def agent(self, sim: Sim) -> PluginAgent | None:
+    def agent(self, sim: Sim) -> adapters.PluginAgent | None:
         """Who drives this simulator; None for a planner, where the tree does. Raises PluginError."""
-        if self.spec.kind == PLANNER:
+        if self.spec.kind == api.PLANNER:
             return None
         columns = columns_of(sim)
         about = about_of(sim, self.spec.argument)
         code = self._code(sim, about)
-        if self.spec.kind == CONTROLLER:
-            return PluginAgent(sim, code, asking_controller(sim, code, columns, about.limits))
-        return PluginAgent(sim, code, asking_policy(code, sim.device))
+        if self.spec.kind == api.CONTROLLER:
+            return adapters.PluginAgent(
+                sim, code, adapters.asking_controller(sim, code, columns, about.limits)
+            )
+        return adapters.PluginAgent(sim, code, adapters.asking_policy(code, sim.device))
 
     def planner(self, sim: Sim) -> RouteSource | None:
         """Who plans routes in this simulator; None where its own planner does. Raises PluginError."""
-        if self.spec.kind != PLANNER:
+        if self.spec.kind != api.PLANNER:
             return None
         code = self._code(sim, about_of(sim, self.spec.argument))
         return RouteSource(code, sim.config.mapping.cell_m, sim.config.tracking.forecast_dt_s)
@@ -351,7 +333,7 @@ class LoadedPlugin:
         """Add its terms to the reward of an environment. Raises PluginError, at once or in a step."""
         sim, about = env.sim, about_of(env.sim, self.spec.argument)
         code = self._code(sim, about)
-        fixed, names = Fixed(sim, about.columns, about.limits, code.marks.arrays), []
+        fixed, names = adapters.Fixed(sim, about.columns, about.limits, code.marks.arrays), []
 
         def terms() -> dict[str, torch.Tensor]:
             assert sim.observation is not None
@@ -361,7 +343,9 @@ class LoadedPlugin:
             )
             names[:] = names or [*found]
             if [*found] != names:
-                raise PluginError(f"{code.place}: gave {', '.join(found)}, and {', '.join(names)} at first")
+                raise api.PluginError(
+                    f"{code.place}: gave {', '.join(found)}, and {', '.join(names)} at first"
+                )
             return found
 
         env.add_terms(terms)
@@ -390,24 +374,26 @@ class LoadedPlugin:
         }
         return where | (self.meter.document() if self.meter else {})
 
-    def _code(self, sim: Sim, about: About) -> OwnCode:
+    def _code(self, sim: Sim, about: api.About) -> adapters.OwnCode:
         spec, kind = self.spec, self.spec.kind
         # a route is planned while the vehicle drives on: its time is held against a control step all the same
-        self.meter = CallMeter(spec.option, spec.path, about.dt_s, self.note)
+        self.meter = adapters.CallMeter(spec.option, spec.path, about.dt_s, self.note)
         if not spec.is_code:
             act, hold_steps = onnx_policy(spec, self.found, about.n_obs)
-            return OwnCode(spec, act, None, str(spec.path), Marks(hold_steps=hold_steps), self.meter)
+            return adapters.OwnCode(
+                spec, act, None, str(spec.path), adapters.Marks(hold_steps=hold_steps), self.meter
+            )
         drives = made(self.found, spec, about)
         inner = inner_of(drives)
         act = agent_of(drives, _AGENTS[kind], spec, _USAGE[kind], _ARGUMENTS[kind])
         place = f"{place_of(act, spec)}: {spec.name if act is inner else getattr(act, '__name__', spec.name)}"
         marks = _marks(drives, place)
-        if kind == POLICY and getattr(act, "__name__", "") == "predict":
+        if kind == api.POLICY and getattr(act, "__name__", "") == "predict":
             act = _predicting(act)
-        return OwnCode(spec, act, _reset_of(inner, self.found), place, marks, self.meter)
+        return adapters.OwnCode(spec, act, _reset_of(inner, self.found), place, marks, self.meter)
 
 
-def load_plugin(spec: PluginSpec) -> LoadedPlugin:
+def load_plugin(spec: api.PluginSpec) -> LoadedPlugin:
     """The plugin of a name, refused at once where its file or object is missing. Raises PluginError,
     FileError."""
     if not spec.is_code:
@@ -417,15 +403,15 @@ def load_plugin(spec: PluginSpec) -> LoadedPlugin:
     return LoadedPlugin(spec, hashlib.sha256(content).hexdigest(), object_of(spec))
 
 
-def obstacles_of(spec: PluginSpec) -> list[dict[str, Any]]:
+def obstacles_of(spec: api.PluginSpec) -> list[dict[str, Any]]:
     """Explicit obstacles that a function of the user's gives, as ``world.added`` has them. PluginError,
     FileError."""
     found = object_of(spec)
-    give = agent_of(found, (), spec, _USAGE[MOTION], _ARGUMENTS[MOTION])
+    give = agent_of(found, (), spec, _USAGE[api.MOTION], _ARGUMENTS[api.MOTION])
     try:
         given = [dict(one) for one in give()]
     except (Exception, SystemExit) as error:
-        raise failed(error, spec.path, spec.option) from error
+        raise api.failed(error, spec.path, spec.option) from error
     for i, one in enumerate(given):
         try:
             if (path := np.asarray(one.get("path", ()), float)).size:
@@ -437,7 +423,7 @@ def obstacles_of(spec: PluginSpec) -> list[dict[str, Any]]:
             key, known = ".".join(map(str, first["loc"])), list(FixedObstacle.model_fields)
             like = nearest(key, known) if first.get("type") == "extra_forbidden" else ""
             reason = f"{key}: {first['msg']}{like}".lstrip(": ")
-            raise PluginError(f"{place_of(give, spec)}: obstacle {i}: {reason}") from None
+            raise api.PluginError(f"{place_of(give, spec)}: obstacle {i}: {reason}") from None
     return given
 
 
@@ -446,29 +432,29 @@ def columns_of(sim: Sim) -> dict[str, slice]:
     return {c.name: slice(first, first + width) for c, first, width in placed_columns(sim.config.observation)}
 
 
-def about_of(sim: Sim, argument: str = "") -> About:
+def about_of(sim: Sim, argument: str = "") -> api.About:
     """What a plugin is told before it begins."""
     config, columns = sim.config, columns_of(sim)
     limits = np.array([getattr(config.vehicle, name) for name in _LIMITS], np.float32)
     assert len(limits) == NUM_ACTIONS
-    return About(
+    return api.About(
         num_envs=sim.num_envs, dt_s=config.episode.control_dt_s, limits=limits, columns=columns,
         n_obs=max(place.stop for place in columns.values()), cell_m=config.mapping.cell_m,
         min_clearance_m=config.voronoi.min_clearance_m, device=sim.device.type, argument=argument,
     )  # fmt: skip
 
 
-def _marks(drives: Any, place: str) -> Marks:
+def _marks(drives: Any, place: str) -> adapters.Marks:
     """How it wants to be called; torch for a torch module that says nothing."""
     arrays = "torch" if isinstance(inner_of(drives), torch.nn.Module) else "numpy"
-    found = Marks(
-        *(getattr(drives, name, default) for name, default in Marks(arrays=arrays)._asdict().items())
+    found = adapters.Marks(
+        *(getattr(drives, name, default) for name, default in adapters.Marks(arrays=arrays)._asdict().items())
     )
     given: Any = found
     try:
-        plugin(*given)
+        api.plugin(*given)
     except ValueError as error:
-        raise PluginError(f"{place}: {error}") from None
+        raise api.PluginError(f"{place}: {error}") from None
     return found
 
 
@@ -495,7 +481,7 @@ class RouteSource:
     """Calls ``plan(clearance, cell_m, start, goal, forecast)`` for one env after the other; ``row=`` too
     where it has that parameter."""
 
-    def __init__(self, code: OwnCode, cell_m: float, forecast_dt_s: float) -> None:
+    def __init__(self, code: adapters.OwnCode, cell_m: float, forecast_dt_s: float) -> None:
         self.code, self._cell_m, self._dt_s = code, cell_m, forecast_dt_s
         self._wants_row = "row" in inspect.signature(code.act).parameters
 
@@ -505,7 +491,7 @@ class RouteSource:
 
     def plan(self, asked: PlanRequest) -> np.ndarray | None:
         """Corners (n >= 2, 2) [m] from start to goal; None = no way. PluginError for any other answer."""
-        forecast = Forecast(asked.obstacle, asked.radius_m, self._dt_s)
+        forecast = api.Forecast(asked.obstacle, asked.radius_m, self._dt_s)
         more = {"row": asked.env} if self._wants_row else {}
 
         def called(_given: None) -> object:

@@ -19,25 +19,9 @@ from uuvtai.common.signals import StopEvent
 from uuvtai.config import Config
 from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
-from uuvtai.vehicle import calibrate, safety
+from uuvtai.vehicle import calibrate, mavlink, safety
 from uuvtai.vehicle.handover import Handover
 from uuvtai.vehicle.instruments.rig import Rig
-from uuvtai.vehicle.mavlink import (
-    ALT_HOLD,
-    HARMLESS,
-    MODE_NAMES,
-    Address,
-    Endpoint,
-    FollowedEndpoint,
-    LinkError,
-    LinkPlace,
-    MavCodec,
-    MavMessage,
-    Order,
-    ask_for,
-    heartbeat,
-    place_of,
-)
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage, three
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
 from uuvtai.vehicle.pilot_log import LinkLog
@@ -57,7 +41,7 @@ _DRY = {"fly": "dry run", "check": "check", "calibrate": "calibration"}
 class FlightPlan:
     """What ``uuv pilot`` was told."""
 
-    place: LinkPlace
+    place: mavlink.LinkPlace
     mission: Mission
     limits: safety.SafetyLimits
     log: Path
@@ -79,7 +63,7 @@ class FlightPlan:
     def typed(
         cls,
         config: Config,
-        mavlink: str,
+        link: str,
         start: Sequence[float] | None,
         goal: Sequence[float] | None,
         box: Sequence[float] | None,
@@ -100,20 +84,26 @@ class FlightPlan:
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
         if config.sensors.sonar.doppler:
-            raise LinkError(
+            raise mavlink.LinkError(
                 "the pilot would wait for a sonar with Doppler, which OBSTACLE_DISTANCE does not have: "
                 "--sensors multibeam, or --set sensors.sonar.doppler=false"
             )
         if system == operator:
-            raise LinkError(f"--system {system}: the operator has this id too; give another --operator")
+            raise mavlink.LinkError(
+                f"--system {system}: the operator has this id too; give another --operator"
+            )
         if not 0 < max_speed <= MOST_SPEED_M_S:
-            raise LinkError(f"--max-speed {max_speed:g}: give metres per second up to {MOST_SPEED_M_S:g}")
+            raise mavlink.LinkError(
+                f"--max-speed {max_speed:g}: give metres per second up to {MOST_SPEED_M_S:g}"
+            )
         if not 0 <= battery < 100:
-            raise LinkError(f"--battery {battery:g}: give volts, 0 = never mind")
+            raise mavlink.LinkError(f"--battery {battery:g}: give volts, 0 = never mind")
         if heading_deg is not None and not abs(heading_deg) <= 360:
-            raise LinkError(f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90")
+            raise mavlink.LinkError(
+                f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90"
+            )
         if seconds is not None and not 0 < seconds < math.inf:
-            raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
+            raise mavlink.LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
         heading_deg = config.world.tank.heading_deg if heading_deg is None else heading_deg
         mounted = {"dvl": config.sensors.dvl.at, "sonar": config.sensors.sonar.at}
         heard_at = mounted | {option: place for option, place in (instruments or {}).items() if place}
@@ -121,7 +111,7 @@ class FlightPlan:
         mission = Mission(three(start or ()), three(goal or ()))
         _refuse_places(mission, limits)
         return cls(
-            place_of(mavlink),
+            mavlink.place_of(link),
             mission,
             limits,
             log or Path("runs") / f"pilot_{time.strftime('%Y%m%d-%H%M%S')}.mcap",
@@ -160,13 +150,13 @@ def _limits(
 def _refuse_places(mission: Mission, limits: safety.SafetyLimits) -> None:
     low_x, low_y, high_x, high_y = limits.box_m
     if not (low_x < high_x and low_y < high_y):
-        raise LinkError("--box: give least x, least y, most x, most y, for example --box 0,0,20,6")
+        raise mavlink.LinkError("--box: give least x, least y, most x, most y, for example --box 0,0,20,6")
     if not 0 <= limits.depth_m[0] < limits.depth_m[1]:
-        raise LinkError("--depth: give the least depth, then the most, for example --depth 0.3,1.4")
+        raise mavlink.LinkError("--depth: give the least depth, then the most, for example --depth 0.3,1.4")
     for option, place in (("--start", mission.start), ("--goal", mission.goal)):
         if (out := safety.outside_m(place, limits)) > 0:
             where = ",".join(f"{value:g}" for value in place)
-            raise LinkError(
+            raise mavlink.LinkError(
                 f"{option} {where}: is {out:.2f} m outside the fence; z is up and 0 at the surface, so a "
                 "depth of 0.8 m is -0.8; or widen --box and --depth"
             )
@@ -204,7 +194,7 @@ class OnboardLoop:
         config: Config,
         pilot: OnboardPilot,
         plan: FlightPlan,
-        endpoint: Endpoint,
+        endpoint: mavlink.Endpoint,
         log: LinkLog,
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
@@ -218,7 +208,7 @@ class OnboardLoop:
         self._now, self._sleep, self._note_to = now, sleep, note
         self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}", plan.operator)
         self._rate = plan.rate or 1.0
-        self._codec = MavCodec(plan.system, COMPANION, plan.operator)
+        self._codec = mavlink.MavCodec(plan.system, COMPANION, plan.operator)
         self._intake = Intake(
             config, plan.mission.start, plan.heading_rad, plan.system, plan.operator, plan.senders,
             rig.replaced if rig else (),
@@ -234,8 +224,8 @@ class OnboardLoop:
         """when what the pilot uses was measured; a scan counts when it is placed in the map"""
         self._scan_s, self._scans = -math.inf, 0
         """newest scan heard; scans that were placed"""
-        self._vehicle: Address | None = endpoint.calls
-        self._speaker: Address | None = None
+        self._vehicle: mavlink.Address | None = endpoint.calls
+        self._speaker: mavlink.Address | None = None
         """where the autopilot's heartbeats come from"""
         self._asked_s = self._beat_s = -math.inf
         self._clock_jumps = self._jumps_before = endpoint.clock_jumps
@@ -388,7 +378,7 @@ class OnboardLoop:
                         self._intake.note_velocity(reading)
         self._handover.watch(self._intake.heard, now_s)
 
-    def _take(self, sender: Address, message: MavMessage, come_s: float) -> None:
+    def _take(self, sender: mavlink.Address, message: mavlink.MavMessage, come_s: float) -> None:
         self.tally.heard[message.name] += 1
         refused = self._intake.heard.refused.total()
         if not self._is_another(sender, message, come_s):
@@ -400,7 +390,7 @@ class OnboardLoop:
             self._check.saw(message, come_s, self._intake.heard, was_used)
         self._log.saw(come_s, message)
 
-    def _is_another(self, sender: Address, message: MavMessage, come_s: float) -> bool:
+    def _is_another(self, sender: mavlink.Address, message: mavlink.MavMessage, come_s: float) -> bool:
         """Whether somebody else than the vehicle speaks as its autopilot: what comes from another address
         than its heartbeats, while those come, is not used."""
         if (message.system, message.component) != (self._plan.system, AUTOPILOT):
@@ -501,9 +491,9 @@ class OnboardLoop:
         else:
             self._unanswered_s += self._config.episode.control_dt_s
 
-    def _say(self, now_s: float, order: Order) -> None:
+    def _say(self, now_s: float, order: mavlink.Order) -> None:
         was_sent = False
-        if (self._plan.arms or order.kind in HARMLESS) and self._vehicle is not None:
+        if (self._plan.arms or order.kind in mavlink.HARMLESS) and self._vehicle is not None:
             was_sent = self._endpoint.send(self._codec.encode(order), self._vehicle)
             self._codec.sent(order)
         self.tally.said[order.kind] += 1
@@ -515,17 +505,17 @@ class OnboardLoop:
         if self._vehicle is None or now_s - self._beat_s < 1.0:
             return
         self._beat_s = now_s
-        self._say(now_s, heartbeat())
+        self._say(now_s, mavlink.heartbeat())
         for order in () if self._check is None else self._check.asks():
             self._say(now_s, order)
         if now_s - self._asked_s >= 5.0 and self._intake.heard.vehicle_s > -math.inf:
             self._asked_s = now_s
             if (
                 now_s - min(self._measured_s["imu"], self._measured_s["pressure"]) > 1.0
-                or not self.tally.said[HARMLESS[1]]
+                or not self.tally.said[mavlink.HARMLESS[1]]
             ):
                 for number, rate in _WANTED_HZ.items():
-                    self._say(now_s, ask_for(number, rate, self._plan.system))
+                    self._say(now_s, mavlink.ask_for(number, rate, self._plan.system))
 
     def _note(
         self, now_s: float, command: PilotCommand, decision: safety.SafeDecision, speed: float | None
@@ -591,9 +581,9 @@ class OnboardLoop:
             and not self._start.refusal
             and (not self._handover.engaged or bool(reasons and reasons[0] in _FAREWELLS)),
             "interrupted": _INTERRUPTED in reasons,
-            "mode": MODE_NAMES.get(heard.mode, "none"),
-            "driven_in": MODE_NAMES[self._handover.mode] if self._handover.engaged else "",
-            "fallback": self._handover.mode == ALT_HOLD,
+            "mode": mavlink.MODE_NAMES.get(heard.mode, "none"),
+            "driven_in": mavlink.MODE_NAMES[self._handover.mode] if self._handover.engaged else "",
+            "fallback": self._handover.mode == mavlink.ALT_HOLD,
             "actions": {action.name: tally.actions[action.name] for action in safety.SafeAction},
             "reasons": dict(tally.reasons),
             "heard": dict(tally.heard),
@@ -612,9 +602,9 @@ def fly(
     config: Config, tree: FlatTree, plan: FlightPlan, note: Callable[[str], None]
 ) -> tuple[dict[str, Any], BaseException | None]:
     """The document of a flight, and the error of this program that ended it. Raises LinkError, LogError."""
-    MavCodec(plan.system, COMPANION)  # refused before a minute of compiling
-    followed = FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
-    with followed or Endpoint(plan.place) as endpoint, Rig(config, plan.instruments) as rig:
+    mavlink.MavCodec(plan.system, COMPANION)  # refused before a minute of compiling
+    followed = mavlink.FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
+    with followed or mavlink.Endpoint(plan.place) as endpoint, Rig(config, plan.instruments) as rig:
         pilot = warmed(config, tree, plan.mission)
         about = {"dry_run": str(not plan.arms), "limits": str(plan.limits), "mission": str(plan.mission)}
         with StopEvent(is_last=False) as stop:
