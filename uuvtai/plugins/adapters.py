@@ -67,11 +67,7 @@ class Readings:
         return self._known[name]
 
     def _read(self, name: str) -> list[Array]:
-        found = []
-        for path in FIELDS[name]:
-            struct, _, field = path.partition(".")
-            found.append(self._sim.rows(getattr(getattr(self._sim.s, struct), field), self._chosen))
-        return found
+        return [self._sim.rows(attrgetter(path)(self._sim.s), self._chosen) for path in FIELDS[name]]
 
     def _made(self, name: str) -> Any:
         read, dt_s = self._read(name), self._sim.config.episode.control_dt_s
@@ -307,25 +303,22 @@ def _tensor(found: Any, place: str, wanted: str) -> torch.Tensor:
             f"{place}: gave None; wanted is {wanted}; does it return something on every way?"
         )
     if isinstance(found, torch.Tensor):
-        values = found.detach()
-        kind = "?" if values.dtype == torch.bool else "c" if values.is_complex() else "f"
-        values = values.cpu()
-    else:
-        try:
-            array = np.asarray(found)
-        except (TypeError, ValueError) as error:
+        if found.dtype == torch.bool or found.is_complex():
             raise api.PluginError(
-                f"{place}: gave {type(found).__name__}, no array ({error}); wanted is {wanted}"
-            ) from None
-        kind = array.dtype.kind
-        if kind not in "fiu":
-            raise api.PluginError(
-                f"{place}: gave {type(found).__name__} of {array.dtype}; wanted are real numbers, {wanted}"
+                f"{place}: gave a tensor of {found.dtype}; wanted are real numbers, {wanted}"
             )
-        return torch.from_numpy(array.astype(np.float32))
-    if kind != "f":
-        raise api.PluginError(f"{place}: gave a tensor of {found.dtype}; wanted are real numbers, {wanted}")
-    return values.to(torch.float32)
+        return found.detach().cpu().to(torch.float32)
+    try:
+        array = np.asarray(found)
+    except (TypeError, ValueError) as error:
+        raise api.PluginError(
+            f"{place}: gave {type(found).__name__}, no array ({error}); wanted is {wanted}"
+        ) from None
+    if array.dtype.kind not in "fiu":
+        raise api.PluginError(
+            f"{place}: gave {type(found).__name__} of {array.dtype}; wanted are real numbers, {wanted}"
+        )
+    return torch.from_numpy(array.astype(np.float32))
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -24,7 +24,6 @@ from uuvtai.config.loader import nearest
 from uuvtai.envs.vector_env import NUM_ACTIONS, VectorEnv
 from uuvtai.kernels.planning.observation import placed_columns
 from uuvtai.learning.export import graph as graph_check
-from uuvtai.learning.export import graph as onnx_session
 from uuvtai.learning.policy_agent import CHUNK
 from uuvtai.plugins import adapters, api
 from uuvtai.sim.rrt import PlanRequest
@@ -145,12 +144,10 @@ def _parameters(found: Any) -> tuple[int, bool]:
     return needed, next(iter(given), "") == "about"
 
 
-def agent_of(
-    found: Any, names: tuple[str, ...], spec: api.PluginSpec, usage: str, count: int
-) -> Callable[..., Any]:
-    """The function to call: the first method of ``names`` that the object has, or the object itself. Raises
-    PluginError where there is none, or where it takes other than ``count`` arguments."""
-    inner = inner_of(found)
+def agent_of(found: Any, spec: api.PluginSpec) -> Callable[..., Any]:
+    """The function to call: the first method of its kind that the object has, or the object itself. Raises
+    PluginError where there is none, or where it takes another number of arguments."""
+    inner, (names, count, usage) = inner_of(found), _CALLS[spec.kind]
     method = next((getattr(inner, name) for name in names if callable(getattr(inner, name, None))), inner)
     if not callable(method):
         raise api.PluginError(
@@ -190,7 +187,7 @@ MAX_GRAPH_BYTES = graph_check.MAX_BYTES
 def graph_of(spec: api.PluginSpec) -> bytes:
     """The file, with its weights if they lie beside it, no larger than a graph may be. Raises PluginError,
     FileError."""
-    if not onnx_session.is_installed():
+    if not graph_check.is_installed():
         raise api.PluginError(f"{spec.option}: needs onnx and onnxruntime: pip install 'uuvtai[export]'")
     graph = content_of(spec, MAX_GRAPH_BYTES)
 
@@ -234,7 +231,7 @@ def onnx_policy(
             )
         calls = -(-CHUNK // (rows or CHUNK))
         graph_check.refuse_strange(graph, {name: (rows or CHUNK, n_obs)}, calls, rows or 1)
-        session = onnx_session.session(graph)
+        session = graph_check.session(graph)
     except graph_check.GraphError as error:
         raise api.PluginError(f"{spec.path}: {error.reason}") from None
     except api.PluginError:
@@ -269,21 +266,14 @@ def _hold(spec: api.PluginSpec, metadata: dict[str, str]) -> int:
 # A plugin of the user's from its name to what drives or plans in a simulator.
 
 
-_USAGE = {
-    api.PLANNER: "a planner is called plan(clearance, cell_m, start, goal, forecast)",
-    api.CONTROLLER: "a controller is called act(view)",
-    api.POLICY: "a policy is called act(obs)",
-    api.REWARD: "a reward is called terms(view)",
-    api.MOTION: "a motion is called paths()",
+_CALLS: dict[str, tuple[tuple[str, ...], int, str]] = {
+    api.PLANNER: (("plan",), 5, "a planner is called plan(clearance, cell_m, start, goal, forecast)"),
+    api.CONTROLLER: (("act",), 1, "a controller is called act(view)"),
+    api.POLICY: (("act", "predict"), 1, "a policy is called act(obs)"),
+    api.REWARD: (("terms",), 1, "a reward is called terms(view)"),
+    api.MOTION: ((), 0, "a motion is called paths()"),
 }
-_AGENTS = {
-    api.PLANNER: ("plan",),
-    api.CONTROLLER: ("act",),
-    api.POLICY: ("act", "predict"),
-    api.REWARD: ("terms",),
-    api.MOTION: (),
-}
-_ARGUMENTS = {api.PLANNER: 5, api.CONTROLLER: 1, api.POLICY: 1, api.REWARD: 1, api.MOTION: 0}
+"""of each kind the methods that may be called, the first that there is, their arguments, and both in words"""
 _LIMITS = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
 
 
@@ -313,12 +303,11 @@ class LoadedPlugin:
         """Who drives this simulator; None for a planner, where the tree does. Raises PluginError."""
         if self.spec.kind == api.PLANNER:
             return None
-        columns = columns_of(sim)
         about = about_of(sim, self.spec.argument)
         code = self._code(sim, about)
         if self.spec.kind == api.CONTROLLER:
             return adapters.PluginAgent(
-                sim, code, adapters.asking_controller(sim, code, columns, about.limits)
+                sim, code, adapters.asking_controller(sim, code, about.columns, about.limits)
             )
         return adapters.PluginAgent(sim, code, adapters.asking_policy(code, sim.device))
 
@@ -375,7 +364,7 @@ class LoadedPlugin:
         return where | (self.meter.document() if self.meter else {})
 
     def _code(self, sim: Sim, about: api.About) -> adapters.OwnCode:
-        spec, kind = self.spec, self.spec.kind
+        spec = self.spec
         # a route is planned while the vehicle drives on: its time is held against a control step all the same
         self.meter = adapters.CallMeter(spec.option, spec.path, about.dt_s, self.note)
         if not spec.is_code:
@@ -385,10 +374,10 @@ class LoadedPlugin:
             )
         drives = made(self.found, spec, about)
         inner = inner_of(drives)
-        act = agent_of(drives, _AGENTS[kind], spec, _USAGE[kind], _ARGUMENTS[kind])
+        act = agent_of(drives, spec)
         place = f"{place_of(act, spec)}: {spec.name if act is inner else getattr(act, '__name__', spec.name)}"
         marks = _marks(drives, place)
-        if kind == api.POLICY and getattr(act, "__name__", "") == "predict":
+        if spec.kind == api.POLICY and getattr(act, "__name__", "") == "predict":
             act = _predicting(act)
         return adapters.OwnCode(spec, act, _reset_of(inner, self.found), place, marks, self.meter)
 
@@ -406,8 +395,7 @@ def load_plugin(spec: api.PluginSpec) -> LoadedPlugin:
 def obstacles_of(spec: api.PluginSpec) -> list[dict[str, Any]]:
     """Explicit obstacles that a function of the user's gives, as ``world.added`` has them. PluginError,
     FileError."""
-    found = object_of(spec)
-    give = agent_of(found, (), spec, _USAGE[api.MOTION], _ARGUMENTS[api.MOTION])
+    give = agent_of(object_of(spec), spec)
     try:
         given = [dict(one) for one in give()]
     except (Exception, SystemExit) as error:
@@ -427,14 +415,11 @@ def obstacles_of(spec: api.PluginSpec) -> list[dict[str, Any]]:
     return given
 
 
-def columns_of(sim: Sim) -> dict[str, slice]:
-    """Columns of the observation by name."""
-    return {c.name: slice(first, first + width) for c, first, width in placed_columns(sim.config.observation)}
-
-
 def about_of(sim: Sim, argument: str = "") -> api.About:
     """What a plugin is told before it begins."""
-    config, columns = sim.config, columns_of(sim)
+    config = sim.config
+    placed = placed_columns(config.observation)
+    columns = {column.name: slice(first, first + width) for column, first, width in placed}
     limits = np.array([getattr(config.vehicle, name) for name in _LIMITS], np.float32)
     assert len(limits) == NUM_ACTIONS
     return api.About(
