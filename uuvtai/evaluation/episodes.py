@@ -295,20 +295,27 @@ def _refill(
     sim: Sim, stepper: Stepper, jobs: list[Job], waiting: list, free: list[int], running: dict[int, int]
 ) -> list[int]:
     """Begin as many jobs as there are free rows; the rows."""
-    mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
     begun: dict[int, Job] = {}
     while waiting and free:
         index, job = waiting.pop()
         row = free.pop()
         running[row] = index
-        mask[row], seed[row], number[row] = 1, job.seed, job.episode
         begun[row] = job
     scenes = {row: job.scene for row, job in begun.items() if job.scene is not None}
     if scenes:  # the rows that are not reset have drawn their scenarios already
         any_scene = next(iter(scenes.values()))
         sim.set_scenes([scenes.get(row, any_scene) for row in range(sim.num_envs)])
-    stepper.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
+    stepper.reset(*beginning(sim, begun))
     return list(begun)
+
+
+def beginning(sim: Sim, jobs: dict[int, Job]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(mask, seed, number) (n_env,), by which ``Sim.reset`` and ``Sim.draw`` begin these jobs in their
+    rows."""
+    mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
+    for row, job in jobs.items():
+        mask[row], seed[row], number[row] = 1, job.seed, job.episode
+    return mask.to(sim.device), seed.to(sim.device), number.to(sim.device)
 
 
 def _results(sim: Sim, rows: list[int], jobs: list[Job]) -> list[EpisodeResult]:

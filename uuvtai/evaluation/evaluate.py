@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import time
@@ -13,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import torch
 
 from uuvtai.common.enums import PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.errors import SettingError
@@ -465,20 +465,11 @@ def scenarios_of(sim: Sim, jobs: list[episodes.Job]) -> list[dict[str, Any]]:
     return found
 
 
-def _drawn(sim: Sim, jobs: list[episodes.Job]) -> Iterator[dict[str, Any]]:
-    mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
-    for row, job in enumerate(jobs):
-        mask[row], seed[row], number[row] = 1, job.seed, job.episode
-    sim.draw(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
-    rows, read = list(range(len(jobs))), {}
-    for row in rows:
-
-        def values(name: str, row: int = row) -> np.ndarray:
-            if name not in read:
-                read[name] = sim.rows(attrgetter(name)(sim.s), rows)
-            return read[name][row]
-
-        yield describe_scenario(values)
+def _drawn(sim: Sim, jobs: list[episodes.Job]) -> list[dict[str, Any]]:
+    sim.draw(*episodes.beginning(sim, dict(enumerate(jobs))))
+    rows = list(range(len(jobs)))
+    read = functools.cache(lambda name: sim.rows(attrgetter(name)(sim.s), rows))
+    return [describe_scenario(lambda name, row=row: read(name)[row]) for row in rows]
 
 
 def oracle_entry(
@@ -490,7 +481,7 @@ def oracle_entry(
     watch.start(ORACLE, len(jobs))
     try:
         for job, scenario in zip(jobs, scenarios, strict=True):
-            results.append(_result(job, earliest_arrival(scenario, config).time_s, config))
+            results.append(_result(job, earliest_arrival(scenario, config), config))
             watch.update(len(results), len(jobs), 0, None)
     finally:
         watch.stop()

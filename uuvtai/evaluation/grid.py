@@ -8,9 +8,11 @@ import itertools
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from uuvtai.common.presets import preset_names
 from uuvtai.config import Config
@@ -168,15 +170,8 @@ class Task:
     device: str = "auto"
 
 
-@dataclass
-class _Kept:
-    """The simulator of this process's last task: the next one of the same config does not compile again."""
-
-    key: tuple[str, int, str] | None = None
-    sim: Any = field(default=None)
-
-
-_kept = _Kept()
+_kept: dict[tuple[str, int, str], Sim] = {}
+"""the simulator of this process's last task: the next one of the same config does not compile again"""
 
 
 def run_task(task: Task) -> list[Row]:
@@ -210,11 +205,10 @@ def _sim_of(task: Task, config: Config) -> Sim:
     from uuvtai.sim.sim import Sim
 
     key = (config.model_dump_json(), task.num_envs, task.device)
-    if _kept.key != key:
-        _kept.key, _kept.sim = None, None
-        _kept.sim = Sim(config, task.num_envs, read_tree(TRAINING_TREE), task.device)
-        _kept.key = key
-    return _kept.sim
+    if key not in _kept:
+        _kept.clear()
+        _kept[key] = Sim(config, task.num_envs, read_tree(TRAINING_TREE), task.device)
+    return _kept[key]
 
 
 def row_of(agent: str, label: dict[str, Any], results: list[EpisodeResult]) -> Row:
@@ -245,8 +239,6 @@ def row_of(agent: str, label: dict[str, Any], results: list[EpisodeResult]) -> R
 BATCH = 256  # episodes side by side in one simulator
 TASK_EPISODES = 1024  # about: what a kill costs at most, and enough to make stragglers cheap
 
-Overrides = list[Any]
-
 
 @dataclass(frozen=True)
 class SweepRequest:
@@ -256,7 +248,7 @@ class SweepRequest:
     world: str
     sensors: str | None
     vehicle: str | None
-    overrides: tuple[Any, ...]
+    overrides: tuple[str | tuple[str, Any], ...]
     """of the config, for every cell: ``key=value`` texts and (key, value) pairs"""
     agents: tuple[str, ...]
     seeds: tuple[int, ...]
@@ -282,32 +274,14 @@ class SweepRequest:
 
 
 def request_of(document: dict[str, Any]) -> SweepRequest:
-    """The request of ``document``. KeyError or TypeError for no such document, ConfigError for a grid."""
-    one_at_a_time, axes = document["grid"]["one_at_a_time"], document["grid"]["axes"]
-    grid = checked(Grid({name: tuple(values) for name, values in axes.items()}, _typed(one_at_a_time, bool)))
-    lists = {name: tuple(document[name]) for name in ("agents", "seeds")}
-    overrides = tuple(item if isinstance(item, str) else tuple(item) for item in document["overrides"])
-    rest = {name: _typed(document[name], of) for name, of in _TYPES.items()}
-    for name, values in lists.items():
-        for value in values:
-            _typed(value, int if name == "seeds" else str)
-    return SweepRequest(grid=grid, overrides=overrides, **lists, **rest)
-
-
-_TYPES: dict[str, Any] = {
-    "world": str,
-    "sensors": str | None,
-    "vehicle": str | None,
-    "episodes": int,
-    "num_envs": int | None,
-    "device": str,
-}
-
-
-def _typed(value: Any, of: Any) -> Any:
-    if not isinstance(value, of) or (isinstance(value, bool) and of is not bool):
-        raise TypeError(f"{value!r:.80} is no {of}")
-    return value
+    """The request of ``document``. ValueError for no such document, ConfigError for a grid."""
+    try:
+        request = TypeAdapter(SweepRequest).validate_json(json.dumps(document), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    checked(request.grid)
+    return request
 
 
 def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:

@@ -220,16 +220,9 @@ _DIAGONAL_SHARE = math.sqrt(2.0) - 1.0
 """Share of the time steps that allow diagonal moves, which then are as fast: the reach is an octagon."""
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """What the oracle says of one scenario."""
-
-    time_s: float | None  # earliest arrival; None = not reachable within the horizon
-
-
-def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
-    """Earliest arrival in a scenario (``describe_scenario``'s document) under the rules of ``config``: goal
-    radius, horizon, safety."""
+def earliest_arrival(scenario: dict[str, Any], config: Config) -> float | None:
+    """[s] Earliest arrival in a scenario (``describe_scenario``'s document) under the rules of ``config``:
+    goal radius, horizon, safety. None = the goal cannot be reached within the horizon."""
     rules = config.episode
     grid = lattice_of(np.array(scenario["start"]), config)
     n_step = int(rules.horizon_steps * rules.control_dt_s / grid.dt_s)
@@ -243,13 +236,13 @@ def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
     reached &= ~blocked[0]
     for step in range(n_step + 1):
         if (reached & goal).any():
-            return Arrival(step * grid.dt_s)
+            return step * grid.dt_s
         if step == n_step or not reached.any():
             break
         after = termination.blocked(moving, step + 1, reached)
         reached = _moved(reached, blocked, after, step)
         blocked = after
-    return Arrival(None)
+    return None
 
 
 def _moved(reached: Array, blocked: Array, after: Array, step: int) -> Array:

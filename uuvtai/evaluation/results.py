@@ -378,15 +378,12 @@ class _Document(BaseModel):
 
 def document_of(request: Request, num_envs: int, device: str, digests: dict[str, str]) -> dict[str, Any]:
     """The request with what was chosen for it, as JSON; ``digests``: sha256 of what drives, by agent."""
-    document = {
-        field.name: getattr(request, field.name)
-        for field in dataclasses.fields(request)
-        if field.name not in ("config", "run_dir")
-    }
-    document |= {"num_envs": num_envs, "device": device}
+    given = {name: value for name, value in vars(request).items() if name not in ("config", "run_dir")}
     return {
         "schema": 1,
-        **document,
+        **given,
+        "num_envs": num_envs,
+        "device": device,
         "config": request.config.model_dump(mode="json"),
         "cwd": os.getcwd(),
         "digests": digests,
