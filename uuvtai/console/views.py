@@ -24,6 +24,7 @@ from uuvtai.report.sweep import by_agent, cell_table, grid_table
 from uuvtai.report.tables import (
     Column,
     Table,
+    heads,
     number,
     obstacles,
     percent,
@@ -406,13 +407,7 @@ def show_log(screen: Screen, found: dict[str, Any], file: Path) -> None:
 # A behaviour tree in the terminal, with what its nodes did in an evaluation.
 
 
-_NODES = (
-    Column("node", left=True),
-    Column("episodes"),
-    Column("ticks", 3),
-    Column("acted", 2),
-    Column("acted %", 1),
-)
+_NODES = (*heads("node", "episodes"), Column("ticks", 3), Column("acted", 2), Column("acted %", 1))
 _TREE_LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
 
 
@@ -459,19 +454,11 @@ def show_sweep(screen: Screen, result: dict[str, Any]) -> None:
 
 _ROWS = 12
 _STATE = (
-    Column("t s"),
-    Column("x m"),
-    Column("y m"),
-    Column("z m"),
-    Column("roll deg", 3),
-    Column("pitch deg", 3),
-    Column("yaw deg", 1),
-    Column("u m/s", 1),
-    Column("v m/s", 2),
-    Column("w m/s", 2),
-    Column("p rad/s", 4),
-    Column("q rad/s", 4),
-    Column("r rad/s", 4),
+    *(Column(name) for name in ("t s", "x m", "y m", "z m")),
+    *(Column(name, 3) for name in ("roll deg", "pitch deg")),
+    *(Column(name, 1) for name in ("yaw deg", "u m/s")),
+    *(Column(name, 2) for name in ("v m/s", "w m/s")),
+    *(Column(name, 4) for name in ("p rad/s", "q rad/s", "r rad/s")),
 )
 
 
