@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from uuvtai.common.errors import SettingError
 from uuvtai.common.presets import preset_names
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError, load_config, parsed_yaml, read_preset
@@ -274,12 +275,12 @@ class SweepRequest:
 
 
 def request_of(document: dict[str, Any]) -> SweepRequest:
-    """The request of ``document``. ValueError for no such document, ConfigError for a grid."""
+    """The request of ``document``. SettingError for no such document, ConfigError for a grid."""
     try:
         request = TypeAdapter(SweepRequest).validate_json(json.dumps(document), strict=True)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise SettingError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     checked(request.grid)
     return request
 
