@@ -133,17 +133,14 @@ class Recorders:
         self._parts = [part for part in parts if part is not None]
 
     def begin(self, sim: Sim, row: int, job: Job) -> None:
-        """The episode ``job`` begins in this row."""
         for part in self._parts:
             part.begin(sim, row, job)
 
     def step(self, sim: Sim) -> None:
-        """A control step has been done."""
         for part in self._parts:
             part.step(sim)
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
-        """The episode of this row is over."""
         for part in self._parts:
             part.end(sim, row, result)
 

@@ -153,7 +153,6 @@ class JournalWriter(EpisodeObserver):
         return self.before_s + time.perf_counter() - self._begun
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
-        """Keep the episode."""
         self._journal.add(self._method, Finished(result, self.wall_s))
 
 

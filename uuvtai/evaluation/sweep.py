@@ -74,7 +74,6 @@ class RayEngine:
         self._cpus = min(cpus_per_task, ray.cluster_resources().get("CPU", 1.0))
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
-        """As ``Engine.run``."""
         remote = self._ray.remote(num_cpus=self._cpus, max_retries=ATTEMPTS - 1)(work)
         running = {remote.remote(item): number for number, item in enumerate(items)}
         try:

@@ -119,25 +119,21 @@ class PluginView:
 
     @property
     def rows(self) -> Any:
-        """(n,) numbers of the envs."""
         numbers = self._readings.numbers
         return numbers if self._pick is None else int(numbers[self._pick])
 
     @property
     def time_s(self) -> Any:
-        """(n,) [s] since the episode began."""
         return self._given(self._readings.group("step").astype(np.float32) * np.float32(self.dt_s))
 
     @property
     def obs(self) -> Any:
-        """(n, M) the observation."""
         found = self._readings.obs
         found = found if self._pick is None else found[self._pick]
         return found if self._fixed.torch else found.cpu().numpy()
 
     @property
     def goal(self) -> Any:
-        """(n, 3) [m] world."""
         return self._given(self._readings.group("goal"))
 
     ego = _group_named("ego")
@@ -472,7 +468,6 @@ class PluginAgent:
         self.decision = self._decision()
 
     def reset(self, rows: torch.Tensor) -> None:
-        """New episodes have begun in the rows (n_env,) where this is not 0."""
         begun = rows.cpu().numpy() != 0
         self._age[begun], self._due[begun] = 0, True
         self.code.forget(rows)
@@ -490,7 +485,6 @@ class PluginAgent:
         return self.decision
 
     def advance(self) -> None:
-        """What was decided last has been done."""
         self._age += 1
         self._due |= self._age % self.code.marks.hold_steps == 0
 

@@ -471,7 +471,6 @@ class RouteSource:
         self._wants_row = "row" in inspect.signature(code.act).parameters
 
     def reset(self, mask: torch.Tensor) -> None:
-        """New episodes begin in the rows (n_env,) where this is not 0."""
         self.code.forget(mask)
 
     def plan(self, asked: PlanRequest) -> np.ndarray | None:

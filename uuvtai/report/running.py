@@ -84,7 +84,6 @@ class RunningEpisodes:
         return [self, *others]
 
     def begin(self, sim: Recordable, row: int, job: RecordedJob) -> None:
-        """An episode was just reset in this row."""
         described = describe_scenario(lambda name: _read(sim, name, [row])[0])
         scene, moving = scene_header(
             scenario_document(sim.config, described, self._world, job.seed, job.episode)
@@ -105,7 +104,6 @@ class RunningEpisodes:
         self._wait(at_start=True)
 
     def step(self, sim: Recordable) -> None:
-        """A control step has been done in all rows."""
         self._steps += 1
         running = [tank for tank in self._tanks.values() if tank.sim is sim and tank.end is None]
         self._note_replans(running)

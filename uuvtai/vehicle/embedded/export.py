@@ -394,7 +394,6 @@ class _KeptRoutes:
     count = 0
 
     def serve(self, stages: Stages, _seed_of: Any, _read: Any, count: Callable[[Any], int], *_: Any) -> int:
-        """As ``RouteFallback.serve``."""
         if failed := count(stages.route.route.n_failed):
             keep_route(stages.route, 0)
             self.count += 1

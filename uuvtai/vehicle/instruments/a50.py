@@ -32,7 +32,6 @@ class A50(Instrument):
         self._rest, self._opened = b"", 0
 
     def poll(self, now_s: float) -> list[SensorMessage]:
-        """As in ``Instrument``."""
         pieces = self.channel.read(now_s)
         if self.channel.opened != self._opened:
             self._opened, self._rest, self.clock = self.channel.opened, b"", SourceClock()

@@ -129,7 +129,6 @@ class Ping360(Instrument):
         self._samples = min(MOST_SAMPLES, math.ceil(seconds / (self._period * TICK_S)))
 
     def poll(self, now_s: float) -> list[SensorMessage]:
-        """As in ``Instrument``."""
         pieces, found = self.channel.read(now_s), []
         if self.channel.opened != self._opened:
             self._opened = self.channel.opened

@@ -291,7 +291,6 @@ class _Piece(Channel):
     opened, data = 1, b""
 
     def read(self, now_s: float) -> list[bytes]:
-        """As in ``Channel``."""
         piece, self.data = self.data, b""
         return [piece]
 
