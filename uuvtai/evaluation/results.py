@@ -40,9 +40,9 @@ _SYNC_S = 1.0
 """a kill of the process loses nothing that was flushed; against a failing machine the disk is asked this
 often"""
 
-_COUNTS = ("replans", "planned_by", "fallbacks")
 _PLAIN = (
-    "seed", "episode", "outcome", "time_s", "episode_return", "min_clearance_m", "path_length_m", *_COUNTS,
+    "seed", "episode", "outcome", "time_s", "episode_return", "min_clearance_m", "path_length_m", "replans",
+    "planned_by", "fallbacks",
 )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from uuvtai.evaluation.episodes import (
     Job,
     Recorders,
     Stepper,
+    beginning,
     episodes_in_steps,
     run_in_turn,
 )
@@ -238,8 +239,7 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     sim.planner, sim.privileged = agent.planner_for(sim), agent.privileged
     note = agent.agent_for(sim)
     stepper = Stepper(sim, note.agent if note else None)
-    one, zero = torch.ones(1, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
-    stepper.reset(one, zero, zero)
+    stepper.reset(*beginning(sim, {0: Job(0, 0)}))
     start, goal = (sim.rows(field)[0].astype(float) for field in (sim.s.vehicle.pos_w, sim.s.mission.goal_w))
     samples = [_sample(sim.s.vehicle, sim.rows, 0.0, start)]
     for k in range(1, n_step + 1):
@@ -357,10 +357,7 @@ def _watched(
         for result in results:
             entry = {
                 "agent": agent.name,
-                "seed": result.seed,
-                "episode": result.episode,
-                "outcome": result.outcome,
-                "time_s": result.time_s,
+                **{name: getattr(result, name) for name in ("seed", "episode", "outcome", "time_s")},
                 "min_clearance_m": round(result.min_clearance_m, 4),
                 "real_time_factor": round(clock.real_time_factor, 2),
             }

@@ -25,6 +25,7 @@ from uuvtai.logs.topics.perception import Layer
 
 Color = tuple[int, int, int]  # blue, green, red
 
+_HULL_M, _HULL_RADIUS_M = (0.54, 0.34), 0.17  # of the vehicle from above: length, width; half its height
 _SHIFT = 4  # bits of sub-pixel precision
 
 
@@ -165,12 +166,12 @@ class Canvas:
         """Circle around a world point; width -1 fills it."""
         self.dot(self.pixels([center])[0], radius_px, color, width)
 
-    def star(self, center: Sequence[float], radius_px: float, fill: Color = GOAL, edge: Color = INK) -> None:
+    def star(self, center: Sequence[float], radius_px: float) -> None:
         angles = -math.pi / 2 + np.arange(10) * math.pi / 5  # one point up
         reach = np.where(np.arange(10) % 2 == 0, radius_px, 0.42 * radius_px)
         pixels = self.pixels([center])[0] + reach[:, None] * towards(angles)
-        self.filled(pixels, fill)
-        self.strip(pixels, edge, 1, closed=True)
+        self.filled(pixels, GOAL)
+        self.strip(pixels, INK, 1, closed=True)
 
     def cross(self, center: Sequence[float], radius_px: float, color: Color) -> None:
         """An X with a white rim."""
@@ -179,15 +180,13 @@ class Canvas:
             for sign in (-1, 1):
                 self.strip(at + radius_px * np.array([[-1, -sign], [1, sign]]), ink, width)
 
-    def vehicle(
-        self, pose: Sequence[float], color: Color, length_m: float = 0.54, width_m: float = 0.34
-    ) -> None:
+    def vehicle(self, pose: Sequence[float], color: Color) -> None:
         """The hull from above with its bow: at least 14 pixels long, so that it can be seen."""
-        grow = max(1.0, 14.0 / (length_m * self.scale))
+        grow = max(1.0, 14.0 / (_HULL_M[0] * self.scale))
         outline = np.array(
             [[0.5, 0.0], [0.22, 0.5], [-0.42, 0.5], [-0.5, 0.36], [-0.5, -0.36], [-0.42, -0.5], [0.22, -0.5]]
         )
-        shape = outline * np.array([length_m, width_m]) * grow
+        shape = outline * np.array(_HULL_M) * grow
         c, s = math.cos(pose[3]), math.sin(pose[3])
         world = shape @ np.array([[c, s], [-s, c]]) + np.array(pose[:2])
         self.area(world, color)
@@ -206,7 +205,6 @@ def _fixed(pixels: np.ndarray) -> np.ndarray:
 # ---- What pictures and videos have in common: the tank, maps, true obstacles, ruler, in world coordinates.
 
 _MAX_MAP = 1000  # [px] greatest height of the map
-_HULL_RADIUS_M = 0.17  # half the height of the hull that ``Canvas.vehicle`` draws
 
 
 def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int]) -> Canvas:

@@ -426,11 +426,7 @@ def _write(folder: Path, tape: Tape, pilot: OnboardPilot, machines: Sequence[str
         "numbers": dataclasses.asdict(pilot.numbers),
         "mission": dataclasses.asdict(pilot.mission),
         "kernels": [kernel.name for kernel in tape.kernels],
-        "tensors": tape.tensors,
-        "begin": tape.begin,
-        "step": tape.step,
-        "keep": tape.keep,
-        "arrays": tape.arrays,
+        **{name: getattr(tape, name) for name in ("tensors", "begin", "step", "keep", "arrays")},
         "config": pilot.config.model_dump(mode="json"),
     }
     (folder / SPEC).write_text(json.dumps(spec), encoding="utf-8")
