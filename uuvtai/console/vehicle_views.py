@@ -12,9 +12,7 @@ from typing import Any
 from uuvtai.console.screen import Screen
 from uuvtai.report.tables import Column, Table, heads, number, percent
 
-# ------------------------------------------------------------------------------------------------------------
-# A replayed log in the terminal: what agrees, where it first does not, and what became of the messages.
-
+# ---- A replayed log in the terminal: what agrees, where it first does not, and what became of the messages.
 
 _FATES = ("fed", "used", "lost", "late", "bad", "unplaced")
 """what may become of a message"""
@@ -130,9 +128,7 @@ def _verdict(found: dict[str, Any]) -> str:
     return f"commands differ, {why}; {time}"
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A flight by MAVLink in the terminal: what was done, and why.
-
+# ---- A flight by MAVLink in the terminal: what was done, and why.
 
 _CHECKED = (
     Column("what", left=True),
@@ -239,8 +235,7 @@ def show_sitl(screen: Screen, found: dict[str, Any]) -> None:
     screen.table(Table(_INSTANCES, found["instances"], title))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What was identified, in the terminal: parameters with intervals, errors ahead, warnings.
+# ---- What was identified, in the terminal: parameters with intervals, errors ahead, warnings.
 
 
 def _number(value: float) -> str:

@@ -133,10 +133,8 @@ def _show_agent(screen: Screen, m: dict[str, Any]) -> None:
         screen.line(meaning.append(plain(f" ({remarks})"), style="not bold dim") if remarks else meaning)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A profile in the terminal: time per stage, rates, one bar per batch size, and the paper's timing tables
+# ---- A profile in the terminal: time per stage, rates, one bar per batch size, and the paper's timing tables
 # beside ours.
-
 
 _RATES = {
     "step": "random actions",
@@ -216,10 +214,8 @@ def _show_latency(screen: Screen, result: dict[str, Any]) -> None:
     screen.line(f"{verdict}: {times} ms; {loop['late']} of {loop['steps']} steps late")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The built-in presets in the terminal: a sentence for each, and what one of them states, with its comments,
-# units and sources.
-
+# ---- The built-in presets in the terminal: a sentence for each, and what one of them states, with its
+# comments, units and sources.
 
 _PRESETS = (Column("", left=True), Column("", prose=True))
 _MAX_BYTES = 1 << 20
@@ -325,9 +321,7 @@ def near(name: str) -> str:
     return f"; did you mean '{close[0]}' ({known[close[0]]})?" if close else ""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Watched episodes in the terminal: how each ended.
-
+# ---- Watched episodes in the terminal: how each ended.
 
 _WATCHED = (
     Column("agent", of=lambda entry: entry["agent"]),
@@ -345,8 +339,7 @@ def show_watched(screen: Screen, watched: list[dict[str, Any]]) -> None:
     screen.table(Table(_WATCHED, watched))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What was exported, in the terminal: do a policy's engines agree, and how long does each take.
+# ---- What was exported, in the terminal: do a policy's engines agree, and how long does each take.
 
 
 def _largest(engine: dict[str, Any]) -> str:
@@ -382,9 +375,7 @@ def show_export(screen: Screen, found: dict[str, Any], is_ours: bool = False) ->
         screen.line(f"next: python {shlex.quote(str(Path(found['folder']) / 'run_policy.py'))}")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A recorded episode in the terminal: its topics, how often they come, how it ended.
-
+# ---- A recorded episode in the terminal: its topics, how often they come, how it ended.
 
 _TOPICS = (
     Column("topic", left=True, of=lambda topic: topic["topic"]),
@@ -403,9 +394,7 @@ def show_log(screen: Screen, found: dict[str, Any], file: Path) -> None:
     )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A behaviour tree in the terminal, with what its nodes did in an evaluation.
-
+# ---- A behaviour tree in the terminal, with what its nodes did in an evaluation.
 
 _NODES = (*heads("node", "episodes"), Column("ticks", 3), Column("acted", 2), Column("acted %", 1))
 _TREE_LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
@@ -432,8 +421,7 @@ def show_tree(screen: Screen, text: str, nodes: list[dict[str, Any]]) -> None:
     screen.line(_TREE_LEGEND, "dim")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A sweep in the terminal: a grid for each agent where two axes vary, else one row per cell.
+# ---- A sweep in the terminal: a grid for each agent where two axes vary, else one row per cell.
 
 
 def show_sweep(screen: Screen, result: dict[str, Any]) -> None:
@@ -448,9 +436,7 @@ def show_sweep(screen: Screen, result: dict[str, Any]) -> None:
     screen.table(cell_table(result["cells"], result, title))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Open-loop physics in the terminal: a dozen moments of ``uuv simulate``.
-
+# ---- Open-loop physics in the terminal: a dozen moments of ``uuv simulate``.
 
 _ROWS = 12
 _STATE = (

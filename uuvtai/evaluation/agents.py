@@ -237,8 +237,7 @@ def _label(name: str) -> str:
     return Path(name).stem if name.endswith((".xml", ".yaml", ".yml")) else name
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A run or a checkpoint, found and exported; the stack of a log.
+# ---- A run or a checkpoint, found and exported; the stack of a log.
 
 
 def export_run(

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from uuvtai.learning.policy_agent import AgentDecision
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Time of simulating alone: compiling, recording and drawing are no part of it; and how many steps are still
-# to come.
+# ---- Time of simulating alone: compiling, recording and drawing are no part of it; and how many steps are
+# still to come.
 
 
 class StepClock:
@@ -71,8 +70,7 @@ def env_steps_left(lengths: Iterable[int], ages: Iterable[int], waiting: int) ->
     return round(mean * waiting + sum(max(mean - age, _LEAST_SHARE * mean) for age in running))
 
 
-# ------------------------------------------------------------------------------------------------------------
-
+# ---- Jobs side by side: who watches them, who drives, how each ended.
 
 _REFILL_SHARE = 16
 """Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset

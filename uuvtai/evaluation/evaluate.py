@@ -236,8 +236,7 @@ def _rounded(value: Any) -> Any:
     return round(float(value), _DIGITS) + 0.0 if isinstance(value, float) else value
 
 
-# ------------------------------------------------------------------------------------------------------------
-# One agent of an evaluation runs its episodes on its simulator, as far as they are not over.
+# ---- One agent of an evaluation runs its episodes on its simulator, as far as they are not over.
 
 
 class EvaluationWatch(Protocol):
@@ -351,8 +350,7 @@ def _recorder(
     return EpisodeRecorder(folder / "logs", world, agent, chosen, request.depth_images, policy)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Evaluations in the course of a training: the policy as it is, on the simulator that it is trained with.
+# ---- Evaluations in the course of a training: the policy as it is, on the simulator that it is trained with.
 
 
 def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
@@ -378,8 +376,7 @@ def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     return {f"eval/{name}": results_document[name] for name in names if results_document[name] is not None}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv eval --explain``: the causes of failures in the document, and logs of the worst.
+# ---- ``uuv eval --explain``: the causes of failures in the document, and logs of the worst.
 
 
 def explain(comparison: Comparison, runs: list[AgentRun], result: dict[str, Any], folder: RunFolder) -> None:
@@ -438,9 +435,7 @@ def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
     folder.write_json("eval/explain.json", {"schema": 1, "agents": agents})
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Privileged oracles beside the agents: the oracle's row of the table, and what an agent lacks of it.
-
+# ---- Privileged oracles beside the agents: the oracle's row of the table, and what an agent lacks of it.
 
 _UNKNOWN = (
     "return_mean",

@@ -156,10 +156,8 @@ class JournalWriter(EpisodeObserver):
         self._journal.add(self._method, Finished(result, self.wall_s))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Agents compared on the same episodes: who alone arrives, how sure that is, and the difference in time
+# ---- Agents compared on the same episodes: who alone arrives, how sure that is, and the difference in time
 # where both do.
-
 
 Episode = dict[str, Any]
 """an entry of ``episodes_detail``: seed, episode, outcome, time_s at least"""
@@ -206,8 +204,7 @@ def _pairs(a: list[Episode], b: list[Episode]) -> list[tuple[Episode, Episode]]:
     return [(e, of_b[key]) for e in a if (key := (e["seed"], e["episode"])) in of_b]
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv eval --json`` says of ran episodes: one entry per agent, and the whole document.
+# ---- What ``uuv eval --json`` says of ran episodes: one entry per agent, and the whole document.
 
 
 def summary(
@@ -308,9 +305,7 @@ def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, i
     return {name: sum(c.get(name, 0) for c in counts) for name in names}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv eval`` was asked for, as an object and as the file from which an interrupted evaluation goes on.
-
+# ---- What ``uuv eval`` was asked for: an object, and the file by which an interrupted evaluation goes on.
 
 REQUEST_FILE = "eval/request.json"
 ORACLE = "oracle"

@@ -213,9 +213,7 @@ def _sample(
     }
 
 
-# ------------------------------------------------------------------------------------------------------------
-# One vehicle that an agent drives through open water, from a start to a goal: ``uuv simulate --agent``.
-
+# ---- One vehicle that an agent drives through open water, from a start to a goal: ``uuv simulate --agent``.
 
 _NOT_BESIDE = ("wrench", "command", "initial_rpy_deg", "initial_velocity")
 
@@ -252,10 +250,8 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     return {key: [s[key] for s in samples] for key in samples[0]} | {"goal": (goal - start).tolist()}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv watch``: episodes at the clock's pace, for pages or Foxglove; ``uuv drive``: one in which a person
-# drives.
-
+# ---- ``uuv watch``: episodes at the clock's pace, for pages or Foxglove; ``uuv drive``: one in which a
+# person drives.
 
 LAYOUT = PRESET_DIR / "layout" / "navigation.json"
 """for Foxglove and Lichtblick"""

@@ -90,8 +90,7 @@ class RosMessages:
         return self("geometry_msgs/msg/Twist", linear=self.vector(*linear), angular=self.vector(*angular))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A log's control steps as ROS 2's standard messages; the table of docs/logs.md.
+# ---- A log's control steps as ROS 2's standard messages; the table of docs/logs.md.
 
 Step = dict[str, dict[str, Any]]  # messages of one control step by topic
 

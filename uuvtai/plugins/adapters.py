@@ -21,10 +21,8 @@ from uuvtai.learning.policy_agent import CHUNK, AgentDecision
 from uuvtai.plugins import api
 from uuvtai.sim.sim import Sim
 
-# ------------------------------------------------------------------------------------------------------------
-# What a controller of the user's is shown: rows of what the vehicle senses, remembers and decides, read when
-# it is asked for. ``FIELDS`` is the whole of it; no truth is among them (a test asks).
-
+# ---- What a controller of the user's is shown: rows of what the vehicle senses, remembers and decides, read
+# when it is asked for. ``FIELDS`` is the whole of it; no truth is among them (a test asks).
 
 FIELDS = {
     "goal": ("mission.goal_w",),
@@ -203,9 +201,8 @@ class Fixed:
         self.cell_m, self.origin = sim.config.mapping.cell_m, sim.fallback.origin
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What came back from the user's code, checked: shape, kind of number, NaN; each refusal says what was wanted.
-
+# ---- What came back from the user's code, checked: shape, kind of number, NaN; each refusal says what was
+# wanted.
 
 MAX_WAYPOINTS = 10_000
 _ENDS_M = 1e-4
@@ -317,9 +314,7 @@ def _tensor(found: Any, place: str, wanted: str) -> torch.Tensor:
     return torch.from_numpy(array.astype(np.float32))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Time that the user's code takes, and a voice while a call does not come back.
-
+# ---- Time that the user's code takes, and a voice while a call does not come back.
 
 STALL_S = 10.0
 """a call that takes longer is told while it runs"""
@@ -411,7 +406,7 @@ class CallMeter:
                 )
 
 
-# ------------------------------------------------------------------------------------------------------------
+# ---- The user's code as it is called, and as an agent.
 
 
 class Marks(NamedTuple):

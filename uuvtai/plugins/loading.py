@@ -172,10 +172,8 @@ def place_of(found: Any, spec: api.PluginSpec) -> str:
     return str(spec.path)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A policy as an ONNX graph of whoever's: it holds our operators alone, and its size, memory and work are
+# ---- A policy as an ONNX graph of whoever's: it holds our operators alone, and its size, memory and work are
 # reckoned before ONNX Runtime sees it (``learning.export.graph``).
-
 
 HOLD = "hold_steps"
 """key of the graph's metadata: control steps that a decision is held for"""
@@ -262,9 +260,7 @@ def _hold(spec: api.PluginSpec, metadata: dict[str, str]) -> int:
     return int(text)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A plugin of the user's from its name to what drives or plans in a simulator.
-
+# ---- A plugin of the user's from its name to what drives or plans in a simulator.
 
 _CALLS: dict[str, tuple[tuple[str, ...], int, str]] = {
     api.PLANNER: (("plan",), 5, "a planner is called plan(clearance, cell_m, start, goal, forecast)"),
