@@ -175,7 +175,8 @@ def run_agents(comparison: Comparison, folder: RunFolder) -> list[AgentRun]:
 
 
 def write_results(comparison: Comparison, folder: RunFolder, runs: list[AgentRun]) -> dict[str, Any]:
-    """The whole document of what was run, with the oracle's row, and all that is written and drawn of it."""
+    """The whole document of what was run, with the oracle's row, and all that is written and drawn of it: the
+    trees that drove, too, with the use of their nodes."""
     request = comparison.request
     jobs = episodes.jobs_of(request.seeds, request.episodes)
     entries = [agent_run.entry for agent_run in runs]
@@ -185,22 +186,16 @@ def write_results(comparison: Comparison, folder: RunFolder, runs: list[AgentRun
     named = request.world, request.sensors, request.vehicle
     result = document(request.config, *named, request.seeds, request.episodes, entries)
     result |= {"remainder": remainder_of(entries), "scenarios_sha256": scenarios_sha256(scenarios)}
-    _write_results(folder, result, runs)
+    folder.write_json("eval/result.json", result)
+    driving = [agent_run for agent_run in runs if agent_run.policy is None]
+    for agent_run in driving:
+        folder.write_bytes(f"eval/trees/{agent_run.agent.name}.xml", agent_run.agent.tree.xml)
+    use = {agent_run.agent.name: agent_run.use for agent_run in driving}
+    folder.write_json("eval/tree.json", {"schema": 1, "use": use})
     if request.explain:
         explain(comparison, runs, result, folder)
     _draw(comparison, folder.path, [agent_run.logs for agent_run in runs if agent_run.logs])
     return result
-
-
-def _write_results(folder: RunFolder, result: dict[str, Any], runs: list[AgentRun]) -> None:
-    """The document, and the trees that drove with the use of their nodes."""
-    folder.write_json("eval/result.json", result)
-    driving = [agent_run for agent_run in runs if agent_run.policy is None]
-    for agent_run in driving:
-        agent = agent_run.agent
-        folder.write_bytes(f"eval/trees/{agent.name}.xml", agent.tree.xml)
-    use = {agent_run.agent.name: agent_run.use for agent_run in driving}
-    folder.write_json("eval/tree.json", {"schema": 1, "use": use})
 
 
 def _draw(comparison: Comparison, folder: Path, logs: list[dict[episodes.Job, Path]]) -> None:

@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from uuvtai.common import files
 from uuvtai.common.colours import on_page
-from uuvtai.common.files import FileError, parsed_json
+from uuvtai.common.files import json_object
 from uuvtai.common.version import __version__
 from uuvtai.config.loader import MAX_BYTES as MAX_YAML_BYTES
 from uuvtai.config.loader import ConfigError
@@ -197,15 +197,9 @@ def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
 
 
 def _object(line: bytes) -> dict[str, Any] | None:
-    try:
-        row = parsed_json(line, "a line")
-    except FileError:
-        return None
-    if not isinstance(row, dict):
-        return None
-    return {
-        key: value for key, value in row.items() if not isinstance(value, list | dict)
-    }  # a record of figures
+    """A record of figures."""
+    row = json_object(line)
+    return row and {key: value for key, value in row.items() if not isinstance(value, list | dict)}
 
 
 def read_config(run: Path) -> str | None:
