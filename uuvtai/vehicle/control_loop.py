@@ -209,12 +209,12 @@ class OnboardLoop:
         self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}", plan.operator)
         self._rate = plan.rate or 1.0
         self._codec = mavlink.MavCodec(plan.system, COMPANION, plan.operator)
+        self._rig, self._rate_b = rig or Rig(config, {}), np.zeros(3)
+        """instruments; [rad/s] of the newest gyro"""
         self._intake = Intake(
             config, plan.mission.start, plan.heading_rad, plan.system, plan.operator, plan.senders,
-            rig.replaced if rig else (),
+            self._rig.replaced,
         )  # fmt: skip
-        self._rig, self._rate_b = rig, np.zeros(3)
-        """instruments; [rad/s] of the newest gyro"""
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
         self._memory, self.tally = safety.SafetyMemory(), FlightTally()
         self._needed = [name for name in NAMES.values() if name not in ("depth", "thruster")]
@@ -358,15 +358,14 @@ class OnboardLoop:
         if self._endpoint.clock_jumps != self._clock_jumps:
             self._clock_jumps = self._endpoint.clock_jumps
             self._intake.forget_clocks()
-            if self._rig is not None:
-                self._rig.forget_clocks()
+            self._rig.forget_clocks()
         for sender, datagram in datagrams:
             for message in self._codec.decode(datagram):
                 if self._is_leaving:
                     self._tried(self._take, sender, message, come_s)
                 else:
                     self._take(sender, message, come_s)
-        if self._rig is not None and not self._is_leaving:
+        if not self._is_leaving:
             for instrument, reading in self._rig.poll(come_s, self._rate_b):
                 self._log.read(come_s, reading)
                 try:
@@ -553,16 +552,13 @@ class OnboardLoop:
             return _CALIBRATED if self._calibration.found else self._calibration.refusal
         return "time is up" if now_s >= self._plan.seconds else ""
 
-    def _instruments(self) -> dict[str, dict[str, Any]]:
-        return self._rig.document() if self._rig else {}
-
     def _checked(self) -> dict[str, Any] | None:
         """What a check found (``Preflight.document``); None: it was a flight."""
         if self._check is None:
             return None
         start, jumps = (self._sought, self._start), self._clock_jumps - self._jumps_before
         heard, spent_s = self._intake.heard, self._heard_s
-        return self._check.document(spent_s, heard, self._needed, self._instruments(), start, jumps)
+        return self._check.document(spent_s, heard, self._needed, self._rig.document(), start, jumps)
 
     def document(self) -> dict[str, Any]:
         tally, heard = self.tally, self._intake.heard
@@ -590,7 +586,7 @@ class OnboardLoop:
             "broken": self._codec.broken,
             "refused": dict(heard.refused),
             "said": {kind: {"said": said, "sent": tally.sent[kind]} for kind, said in tally.said.items()},
-            "instruments": self._instruments(),
+            "instruments": self._rig.document(),
             "check": check,
             "calibration": calibrated,
             "ready": (check or calibrated or {"ready": True})["ready"],
