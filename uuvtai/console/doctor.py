@@ -111,11 +111,9 @@ def _mcap() -> str:
 def _cuda() -> str:
     import torch
 
-    return (
-        torch.cuda.get_device_name(0)
-        if torch.cuda.is_available()
-        else "no CUDA device: everything runs on the CPU"
-    )
+    if torch.cuda.is_available():
+        return torch.cuda.get_device_name(0)
+    return "no CUDA device: everything runs on the CPU"
 
 
 def _cache() -> str:

@@ -65,13 +65,8 @@ def show_opened(screen: Screen, found: dict[str, Any]) -> None:
     held = [
         [f"stopped: {name}", str(count), percent(count / steps)] for name, count in found["held_for"].items()
     ]
-    screen.table(
-        Table(
-            heads("node of the tree", "steps", "%"),
-            [*rows, *held],
-            f"{found['log']}: {found['agent']}, {steps} steps",
-        )
-    )
+    title = f"{found['log']}: {found['agent']}, {steps} steps"
+    screen.table(Table(heads("node of the tree", "steps", "%"), [*rows, *held], title))
     heard = {name: row for name, row in found["messages"].items() if row["fed"] or row["lost"]}
     screen.table(_messages(heard))
     screen.line(f"routes planned: {found['replans']}; {_TICK.format_map(found['tick_ms'])}")

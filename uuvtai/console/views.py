@@ -199,11 +199,8 @@ def _show_flame(screen: Screen, row: dict[str, Any]) -> None:
 def _show_latency(screen: Screen, result: dict[str, Any]) -> None:
     rows = [row for row in result["paper_latency"] if row["component"] != "Replanning rate"]
     screen.line("")
-    screen.table(
-        latency_table(
-            rows, "beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)"
-        )
-    )
+    title = "beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)"
+    screen.table(latency_table(rows, title))
     for row in result["paper_latency"]:
         if row["component"] == "Replanning rate":
             ours = f"{row['replans_per_episode']:.1f} replans an episode, {row['hz']:.2f} Hz"

@@ -82,11 +82,9 @@ class AgentSpec:
         if self.own is not None:
             return {"own": self.own.document()}
         if self.checkpoint is None:
-            return (
-                {}
-                if self.stack is None
-                else {"stack": {"preset": self.stack, "tree": tree_of_stack(self.stack)}}
-            )
+            if self.stack is None:
+                return {}
+            return {"stack": {"preset": self.stack, "tree": tree_of_stack(self.stack)}}
         found = self.checkpoint
         return {
             "checkpoint": {

@@ -184,12 +184,8 @@ def run_task(task: Task) -> list[Row]:
     sim = _sim_of(task, agent.config_of(task.config))
     sim.use_tree(agent.tree)
     sim.planner = agent.planner_for(sim)
-    jobs = [
-        Job(seed, episode, scene)
-        for scene in task.scenes
-        for seed in task.seeds
-        for episode in range(task.episodes)
-    ]
+    runs = itertools.product(task.scenes, task.seeds, range(task.episodes))
+    jobs = [Job(seed, episode, scene) for scene, seed, episode in runs]
     note = agent.agent_for(sim)
     results, _env_steps = run_episodes(sim, jobs, agent=note.agent if note else None)
     if agent.own:
@@ -338,24 +334,14 @@ def tasks_of(request: SweepRequest, agents: Sequence[tuple[str, str]], done: set
     per_task = max(1, TASK_EPISODES // each)
     found = []
     for config, cells in _by_config(request):
+        num_envs = request.num_envs or min(BATCH, each * len(cells))
+        run = request.seeds, request.episodes, num_envs, request.device
         for name, agent in agents:
             labels = [label for cell in cells if row_key(label := label_of(cell, config), name) not in done]
             for first in range(0, len(labels), per_task):
                 part = labels[first : first + per_task]
                 scenes = tuple((label["S"], label["D"], label["v_m_s"] or 0.0) for label in part)
-                num_envs = request.num_envs or min(BATCH, each * len(cells))
-                found.append(
-                    Task(
-                        config,
-                        agent,
-                        scenes,
-                        tuple(part),
-                        request.seeds,
-                        request.episodes,
-                        num_envs,
-                        request.device,
-                    )
-                )
+                found.append(Task(config, agent, scenes, tuple(part), *run))
     return found
 
 

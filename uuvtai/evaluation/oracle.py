@@ -189,14 +189,10 @@ class Termination:
         away = np.sqrt(ox**2 + oy**2 + oz**2)
         gap = away - rounding_m(obstacle) - self._hull_m
         # closing speed = -(move - body) . (ox, oy) / away; both sides times ``away``
-        fastest = (
-            np.maximum(gap / self._rules.ttc_s, self._rules.ttc_closing_m_s)
-            if self._rules.ttc_s > 0
-            else np.inf
-        )
-        allowed = np.where(
-            gap < self._rules.collision_clearance_m, -np.inf, fastest * away - (vel[0] * ox + vel[1] * oy)
-        )
+        rules = self._rules
+        fastest = np.maximum(gap / rules.ttc_s, rules.ttc_closing_m_s) if rules.ttc_s > 0 else np.inf
+        allowed = fastest * away - (vel[0] * ox + vel[1] * oy)
+        allowed = np.where(gap < rules.collision_clearance_m, -np.inf, allowed)
         for move, velocity in enumerate(self._velocity):
             out[(move, *box)] |= -(velocity[0] * ox + velocity[1] * oy) > allowed
 

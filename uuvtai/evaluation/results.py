@@ -421,12 +421,9 @@ def _found_again(request: Request, cwd: Path) -> Request:
 def digests_of(agents: list[AgentSpec]) -> dict[str, str]:
     """sha256 of what drives, by agent: of a policy's checkpoint, of a tree as it is run, with its stack,
     of the file of a plugin of the user's."""
+    of_file = {agent.name: agent.own or agent.checkpoint for agent in agents}
     return {
-        agent.name: agent.own.sha256
-        if agent.own
-        else agent.checkpoint.sha256
-        if agent.checkpoint
-        else _tree_sha256(agent)
+        agent.name: source.sha256 if (source := of_file[agent.name]) else _tree_sha256(agent)
         for agent in agents
     }
 

@@ -83,16 +83,9 @@ class Canvas:
         self, pixel: Sequence[float] | np.ndarray, radius_px: float, color: Color, width: int = -1
     ) -> None:
         """Circle in pixels; width -1 fills it."""
-        at = _fixed(np.asarray([pixel]))[0]
-        cv2.circle(
-            self.image,
-            (int(at[0]), int(at[1])),
-            round(radius_px * (1 << _SHIFT)),
-            color,
-            width,
-            cv2.LINE_AA,
-            _SHIFT,
-        )
+        x, y = _fixed(np.asarray([pixel]))[0].tolist()
+        radius = round(radius_px * (1 << _SHIFT))
+        cv2.circle(self.image, (x, y), radius, color, width, cv2.LINE_AA, _SHIFT)
 
     def filled(self, pixels: np.ndarray, color: Color, hole: np.ndarray | None = None) -> None:
         """Filled polygon in pixels, but for the polygon ``hole`` within."""

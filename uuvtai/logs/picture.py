@@ -134,12 +134,8 @@ def _paint_color_bar(canvas: drawing.Canvas, top_m: float) -> None:
         np.array([(x + 26, y0), (x + 44, y0), (x + 44, y1), (x + 26, y1)]), drawing.GREY, 1, closed=True
     )
     for share in (0.0, 0.5, 1.0):
-        canvas.text(
-            (x + 50, y1 - share * (y1 - y0) + (4 if share < 1 else 14)),
-            f"{share * top_m:.1f} m",
-            15,
-            drawing.GREY,
-        )
+        place = x + 50, y1 - share * (y1 - y0) + (4 if share < 1 else 14)
+        canvas.text(place, f"{share * top_m:.1f} m", 15, drawing.GREY)
     canvas.text((x + 26, y0 - 12), "clearance", 15, drawing.GREY)
 
 
