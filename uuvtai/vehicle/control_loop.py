@@ -22,6 +22,7 @@ from uuvtai.sim.sim import Sim
 from uuvtai.vehicle import calibrate, mavlink, safety
 from uuvtai.vehicle.handover import Handover
 from uuvtai.vehicle.instruments.rig import Rig
+from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage, three
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
 from uuvtai.vehicle.pilot_log import LinkLog
@@ -84,26 +85,20 @@ class FlightPlan:
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
         if config.sensors.sonar.doppler:
-            raise mavlink.LinkError(
+            raise LinkError(
                 "the pilot would wait for a sonar with Doppler, which OBSTACLE_DISTANCE does not have: "
                 "--sensors multibeam, or --set sensors.sonar.doppler=false"
             )
         if system == operator:
-            raise mavlink.LinkError(
-                f"--system {system}: the operator has this id too; give another --operator"
-            )
+            raise LinkError(f"--system {system}: the operator has this id too; give another --operator")
         if not 0 < max_speed <= MOST_SPEED_M_S:
-            raise mavlink.LinkError(
-                f"--max-speed {max_speed:g}: give metres per second up to {MOST_SPEED_M_S:g}"
-            )
+            raise LinkError(f"--max-speed {max_speed:g}: give metres per second up to {MOST_SPEED_M_S:g}")
         if not 0 <= battery < 100:
-            raise mavlink.LinkError(f"--battery {battery:g}: give volts, 0 = never mind")
+            raise LinkError(f"--battery {battery:g}: give volts, 0 = never mind")
         if heading_deg is not None and not abs(heading_deg) <= 360:
-            raise mavlink.LinkError(
-                f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90"
-            )
+            raise LinkError(f"--heading {heading_deg:g}: give degrees of a compass, for example --heading 90")
         if seconds is not None and not 0 < seconds < math.inf:
-            raise mavlink.LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
+            raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
         heading_deg = config.world.tank.heading_deg if heading_deg is None else heading_deg
         mounted = {"dvl": config.sensors.dvl.at, "sonar": config.sensors.sonar.at}
         heard_at = mounted | {option: place for option, place in (instruments or {}).items() if place}
@@ -150,13 +145,13 @@ def _limits(
 def _refuse_places(mission: Mission, limits: safety.SafetyLimits) -> None:
     low_x, low_y, high_x, high_y = limits.box_m
     if not (low_x < high_x and low_y < high_y):
-        raise mavlink.LinkError("--box: give least x, least y, most x, most y, for example --box 0,0,20,6")
+        raise LinkError("--box: give least x, least y, most x, most y, for example --box 0,0,20,6")
     if not 0 <= limits.depth_m[0] < limits.depth_m[1]:
-        raise mavlink.LinkError("--depth: give the least depth, then the most, for example --depth 0.3,1.4")
+        raise LinkError("--depth: give the least depth, then the most, for example --depth 0.3,1.4")
     for option, place in (("--start", mission.start), ("--goal", mission.goal)):
         if (out := safety.outside_m(place, limits)) > 0:
             where = ",".join(f"{value:g}" for value in place)
-            raise mavlink.LinkError(
+            raise LinkError(
                 f"{option} {where}: is {out:.2f} m outside the fence; z is up and 0 at the surface, so a "
                 "depth of 0.8 m is -0.8; or widen --box and --depth"
             )
