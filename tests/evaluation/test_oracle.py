@@ -38,7 +38,7 @@ def scenario(start, goal, *obstacles):
 
 
 def arrival(start, goal, *obstacles, config=CONFIG):
-    return oracle.earliest_arrival(scenario(start, goal, *obstacles), config).time_s
+    return oracle.earliest_arrival(scenario(start, goal, *obstacles), config)
 
 
 # -------------------------------------------------------------------------------------------------- obstacles

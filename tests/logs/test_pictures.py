@@ -175,9 +175,9 @@ def test_text_is_drawn_with_any_opencv(monkeypatch, font):
         monkeypatch.delattr(cv2, "FontFace", raising=False)
         monkeypatch.setattr(cv2, "getTextSize", lambda *_: ((40, 20), 5))
         monkeypatch.setattr(cv2, "putText", lambda image, *_: image[10:20, 10:20].fill(0))
-    image = np.full((60, 300, 3), 255, np.uint8)
-    assert ink.draw_text(image, (10, 40), "pool · 3.2 m", 22, ink.INK, True) > 20
-    assert image.min() < 100
+    canvas = ink.Canvas((300, 60), (0, 0), 1.0, (0, 1), (0, 1))
+    assert canvas.text((10, 40), "pool · 3.2 m", 22, ink.INK, True) > 20
+    assert canvas.image.min() < 100
 
 
 def test_a_frame_shows_the_moment(bt):

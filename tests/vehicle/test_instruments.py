@@ -705,4 +705,4 @@ def test_an_instrument_that_cannot_be_had_is_refused_in_a_line():
         FakeRig(config, ("a50", "ping360"), "127.0.0.1", 4)
     fake.close()
     with pytest.raises(LinkError, match="a50 or ping360"):
-        SitlPlan.typed("127.0.0.1", 9002, 1, None, 0.0, None, False, 0, 0, "a50,oculus")
+        SitlPlan.typed(None, None, "a50,oculus")

@@ -131,6 +131,15 @@ def parsed_json(content: bytes | str, where: str) -> Any:
     return value
 
 
+def json_object(content: bytes | str) -> dict[str, Any] | None:
+    """The object of a JSON text that ``parsed_json`` takes; None for anything else."""
+    try:
+        value = parsed_json(content, "")
+    except FileError:
+        return None
+    return value if isinstance(value, dict) else None
+
+
 def read_lines(
     path: Path, limit: int = MAX_BYTES, folder: Path | None = None, longest: int = 1 << 20
 ) -> Iterator[bytes]:

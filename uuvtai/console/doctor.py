@@ -111,11 +111,9 @@ def _mcap() -> str:
 def _cuda() -> str:
     import torch
 
-    return (
-        torch.cuda.get_device_name(0)
-        if torch.cuda.is_available()
-        else "no CUDA device: everything runs on the CPU"
-    )
+    if torch.cuda.is_available():
+        return torch.cuda.get_device_name(0)
+    return "no CUDA device: everything runs on the CPU"
 
 
 def _cache() -> str:
@@ -163,9 +161,7 @@ def _runs() -> str:
     return f"{Path.cwd() / 'runs'} can be written"
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The examples of the documentation, which are installed beside the package, as a folder of one's own.
-
+# ---- The examples of the documentation, which are installed beside the package, as a folder of one's own.
 
 _CHECKOUT = Path(__file__).parents[2] / "examples"
 _SUFFIXES = (".py", ".yaml", ".xml", ".ipynb", ".parm")
@@ -213,9 +209,7 @@ def copy_examples(folder: Path) -> list[Path]:
     return written
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv doctor`` found and ``--compile`` compiled, line by line.
-
+# ---- What ``uuv doctor`` found and ``--compile`` compiled, line by line.
 
 _OK, _BAD = Cell("ok", style="green"), Cell("BAD", style="red")
 _CHECKS = (

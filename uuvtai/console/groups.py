@@ -413,9 +413,7 @@ class PlainOutputGroup(OutputGroup):
     more = "a wider terminal"
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The help of ``uuv`` itself: one line a command.
-
+# ---- The help of ``uuv`` itself: one line a command.
 
 _GROUPS = {
     "Run": ("demo", "eval", "sweep", "watch", "drive"),

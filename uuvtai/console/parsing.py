@@ -210,10 +210,8 @@ def refuse_beside_resume(ctx: typer.Context, kept: tuple[str, ...] = ()) -> None
         )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What may be typed where: values beside an option, names that the shell completes, refusals that say what
-# was meant.
-
+# ---- What may be typed where: values beside an option, names that the shell completes, refusals that say
+# what was meant.
 
 Complete = Callable[[str], list[str]]
 """From what is typed so far to what it may become."""

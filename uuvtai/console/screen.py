@@ -148,10 +148,8 @@ def _text(cell: str | Cell | Text, style: str = "") -> Text:
     return Text(plain(cell), style=style)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# How far a job is: a bar on a terminal, a plain line every few seconds elsewhere, and no guess of the time
-# left too early.
-
+# ---- How far a job is: a bar on a terminal, a plain line every few seconds elsewhere, and no guess of the
+# time left too early.
 
 _PERIOD_S = 5.0
 """between two lines where there is no terminal"""
@@ -296,9 +294,7 @@ def _bar():
     )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A training as it runs: a live dashboard on a terminal, one plain line every few seconds otherwise.
-
+# ---- A training as it runs: a live dashboard on a terminal, one plain line every few seconds otherwise.
 
 _REDRAW_S = 5.0
 

@@ -5,35 +5,23 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from uuvtai.console.screen import Screen
-from uuvtai.report.tables import Column, Table, number, percent
+from uuvtai.report.tables import Column, Table, heads, number, percent
 
-# ------------------------------------------------------------------------------------------------------------
-# A replayed log in the terminal: what agrees, where it first does not, and what became of the messages.
+# ---- A replayed log in the terminal: what agrees, where it first does not, and what became of the messages.
 
-
-_MESSAGES = (
-    Column("sensor", left=True),
-    Column("fed"),
-    Column("used"),
-    Column("lost"),
-    Column("late"),
-    Column("bad", 1),
-    Column("unplaced", 1),
-)
+_FATES = ("fed", "used", "lost", "late", "bad", "unplaced")
+"""what may become of a message"""
 
 
 def show_replay(screen: Screen, found: dict[str, Any]) -> None:
     """A ``uuv replay --json`` document."""
     steps = found["steps"]
-    columns = (
-        Column("per step", left=True),
-        Column("equal"),
-        Column("first difference", left=True, prose=True),
-    )
+    columns = (*heads("per step", "equal"), Column("first difference", left=True, prose=True))
     rows = [
         [row["what"], f"{row['equal_steps']} of {steps}", _place(row["first_difference"])]
         for row in found["agreement"]
@@ -41,9 +29,7 @@ def show_replay(screen: Screen, found: dict[str, Any]) -> None:
     title = f"{found['log']}: {found['agent']} in {found['world']}, {steps} steps"
     screen.table(Table(columns, rows, title))
     if found["faults"]["any"]:
-        screen.table(
-            Table(_MESSAGES, [_counts(name, row) for name, row in found["messages"].items()], "messages")
-        )
+        screen.table(_messages(found["messages"]))
         _show_change(screen, found["change"], steps)
     screen.line(_verdict(found))
 
@@ -61,8 +47,12 @@ def _value(value: Any) -> str:
     return "(" + ", ".join(f"{number:.9g}" for number in value) + ")"
 
 
-def _counts(name: str, row: dict[str, int]) -> list[str]:
-    return [name, *(str(row[key]) for key in ("fed", "used", "lost", "late", "bad", "unplaced"))]
+def _messages(found: dict[str, dict[str, int]], fates: Sequence[str] = _FATES) -> Table:
+    """What became of each sensor's messages."""
+    columns = [*heads("sensor", *fates[:-2]), *(Column(fate, 1) for fate in fates[-2:])]
+    return Table(
+        columns, [[name, *(str(row[fate]) for fate in fates)] for name, row in found.items()], "messages"
+    )
 
 
 _TICK = "{median:.2f} ms a step (99 %: {99th percentile:.2f} ms)"
@@ -75,10 +65,10 @@ def show_opened(screen: Screen, found: dict[str, Any]) -> None:
     held = [
         [f"stopped: {name}", str(count), percent(count / steps)] for name, count in found["held_for"].items()
     ]
-    columns = (Column("node of the tree", left=True), Column("steps"), Column("%"))
-    screen.table(Table(columns, [*rows, *held], f"{found['log']}: {found['agent']}, {steps} steps"))
-    counts = [_counts(name, row) for name, row in found["messages"].items() if row["fed"] or row["lost"]]
-    screen.table(Table(_MESSAGES, counts, "messages"))
+    title = f"{found['log']}: {found['agent']}, {steps} steps"
+    screen.table(Table(heads("node of the tree", "steps", "%"), [*rows, *held], title))
+    heard = {name: row for name, row in found["messages"].items() if row["fed"] or row["lost"]}
+    screen.table(_messages(heard))
     screen.line(f"routes planned: {found['replans']}; {_TICK.format_map(found['tick_ms'])}")
     screen.line(f"log: {found['recorded']}")
     screen.line(f"picture: {found['picture']}")
@@ -133,15 +123,8 @@ def _verdict(found: dict[str, Any]) -> str:
     return f"commands differ, {why}; {time}"
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A flight by MAVLink in the terminal: what was done, and why.
+# ---- A flight by MAVLink in the terminal: what was done, and why.
 
-
-_ACTIONS = (Column("action", left=True), Column("steps"), Column("share"))
-_ORDERS = (Column("order", left=True), Column("said"), Column("sent"))
-_FATES = ("fed", "used", "late", "bad", "unplaced")
-_SENSORS = (Column("sensor", left=True), *(Column(name) for name in _FATES))
-_PLACES = (Column("instrument", left=True), Column("heard"), Column("of others"))
 _CHECKED = (
     Column("what", left=True),
     Column("", left=True),
@@ -162,12 +145,13 @@ def show_flight(screen: Screen, found: dict[str, Any]) -> None:
     steps = max(found["steps"], 1)
     title = "dry run: nothing was sent that moves the vehicle" if found["dry_run"] else "armed"
     rows = [[name, str(count), f"{100 * count / steps:.0f} %"] for name, count in found["actions"].items()]
-    screen.table(Table(_ACTIONS, rows, title))
+    screen.table(Table(heads("action", "steps", "share"), rows, title))
     counts = [[name, str(row["said"]), str(row["sent"])] for name, row in found["said"].items()]
     if counts:
-        screen.table(Table(_ORDERS, counts, f"driven in {found['driven_in'] or 'no mode'}"))
-    sensors = [[name, *(str(row[key]) for key in _FATES)] for name, row in found["sensors"].items()]
-    screen.table(Table(_SENSORS, sensors, "messages"))
+        screen.table(
+            Table(heads("order", "said", "sent"), counts, f"driven in {found['driven_in'] or 'no mode'}")
+        )
+    screen.table(_messages(found["sensors"], [fate for fate in _FATES if fate != "lost"]))
     show_instruments(screen, found["instruments"])
     for name, count in found["refused"].items():
         screen.line(f"not used, {count} times: {name}")
@@ -180,7 +164,7 @@ def show_instruments(screen: Screen, places: dict[str, dict[str, Any]]) -> None:
     """What each instrument told, why something was left out, and which of them nobody heard."""
     if places:
         rows = [[place, str(one["heard"]), str(one["strange"])] for place, one in places.items()]
-        screen.table(Table(_PLACES, rows))
+        screen.table(Table(heads("instrument", "heard", "of others"), rows))
     for place, one in places.items():
         for why, count in one["refused"].items():
             screen.line(f"{place}: not used, {count} times: {why}")
@@ -246,8 +230,7 @@ def show_sitl(screen: Screen, found: dict[str, Any]) -> None:
     screen.table(Table(_INSTANCES, found["instances"], title))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What was identified, in the terminal: parameters with intervals, errors ahead, warnings.
+# ---- What was identified, in the terminal: parameters with intervals, errors ahead, warnings.
 
 
 def _number(value: float) -> str:
@@ -265,14 +248,7 @@ _PARAMETERS = (
     Column("found", of=lambda entry: _number(entry["value"]) if entry["fitted"] else "as given"),
     Column("95 % interval", of=_interval),
 )
-_AHEAD = (
-    Column("steps ahead"),
-    Column("vehicle", left=True),
-    Column("surge m/s"),
-    Column("sway m/s"),
-    Column("heave m/s"),
-    Column("yaw rad/s"),
-)
+_AHEAD = (Column("steps ahead"), *heads("vehicle", "surge m/s", "sway m/s", "heave m/s", "yaw rad/s"))
 
 
 def show_identified(screen: Screen, document: dict[str, Any], known: str) -> None:

@@ -24,6 +24,7 @@ from uuvtai.report.sweep import by_agent, cell_table, grid_table
 from uuvtai.report.tables import (
     Column,
     Table,
+    heads,
     number,
     obstacles,
     percent,
@@ -132,10 +133,8 @@ def _show_agent(screen: Screen, m: dict[str, Any]) -> None:
         screen.line(meaning.append(plain(f" ({remarks})"), style="not bold dim") if remarks else meaning)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A profile in the terminal: time per stage, rates, one bar per batch size, and the paper's timing tables
+# ---- A profile in the terminal: time per stage, rates, one bar per batch size, and the paper's timing tables
 # beside ours.
-
 
 _RATES = {
     "step": "random actions",
@@ -200,11 +199,8 @@ def _show_flame(screen: Screen, row: dict[str, Any]) -> None:
 def _show_latency(screen: Screen, result: dict[str, Any]) -> None:
     rows = [row for row in result["paper_latency"] if row["component"] != "Replanning rate"]
     screen.line("")
-    screen.table(
-        latency_table(
-            rows, "beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)"
-        )
-    )
+    title = "beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)"
+    screen.table(latency_table(rows, title))
     for row in result["paper_latency"]:
         if row["component"] == "Replanning rate":
             ours = f"{row['replans_per_episode']:.1f} replans an episode, {row['hz']:.2f} Hz"
@@ -215,10 +211,8 @@ def _show_latency(screen: Screen, result: dict[str, Any]) -> None:
     screen.line(f"{verdict}: {times} ms; {loop['late']} of {loop['steps']} steps late")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The built-in presets in the terminal: a sentence for each, and what one of them states, with its comments,
-# units and sources.
-
+# ---- The built-in presets in the terminal: a sentence for each, and what one of them states, with its
+# comments, units and sources.
 
 _PRESETS = (Column("", left=True), Column("", prose=True))
 _MAX_BYTES = 1 << 20
@@ -324,9 +318,7 @@ def near(name: str) -> str:
     return f"; did you mean '{close[0]}' ({known[close[0]]})?" if close else ""
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Watched episodes in the terminal: how each ended.
-
+# ---- Watched episodes in the terminal: how each ended.
 
 _WATCHED = (
     Column("agent", of=lambda entry: entry["agent"]),
@@ -344,8 +336,7 @@ def show_watched(screen: Screen, watched: list[dict[str, Any]]) -> None:
     screen.table(Table(_WATCHED, watched))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What was exported, in the terminal: do a policy's engines agree, and how long does each take.
+# ---- What was exported, in the terminal: do a policy's engines agree, and how long does each take.
 
 
 def _largest(engine: dict[str, Any]) -> str:
@@ -381,9 +372,7 @@ def show_export(screen: Screen, found: dict[str, Any], is_ours: bool = False) ->
         screen.line(f"next: python {shlex.quote(str(Path(found['folder']) / 'run_policy.py'))}")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A recorded episode in the terminal: its topics, how often they come, how it ended.
-
+# ---- A recorded episode in the terminal: its topics, how often they come, how it ended.
 
 _TOPICS = (
     Column("topic", left=True, of=lambda topic: topic["topic"]),
@@ -402,17 +391,9 @@ def show_log(screen: Screen, found: dict[str, Any], file: Path) -> None:
     )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A behaviour tree in the terminal, with what its nodes did in an evaluation.
+# ---- A behaviour tree in the terminal, with what its nodes did in an evaluation.
 
-
-_NODES = (
-    Column("node", left=True),
-    Column("episodes"),
-    Column("ticks", 3),
-    Column("acted", 2),
-    Column("acted %", 1),
-)
+_NODES = (*heads("node", "episodes"), Column("ticks", 3), Column("acted", 2), Column("acted %", 1))
 _TREE_LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
 
 
@@ -437,8 +418,7 @@ def show_tree(screen: Screen, text: str, nodes: list[dict[str, Any]]) -> None:
     screen.line(_TREE_LEGEND, "dim")
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A sweep in the terminal: a grid for each agent where two axes vary, else one row per cell.
+# ---- A sweep in the terminal: a grid for each agent where two axes vary, else one row per cell.
 
 
 def show_sweep(screen: Screen, result: dict[str, Any]) -> None:
@@ -453,25 +433,15 @@ def show_sweep(screen: Screen, result: dict[str, Any]) -> None:
     screen.table(cell_table(result["cells"], result, title))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Open-loop physics in the terminal: a dozen moments of ``uuv simulate``.
-
+# ---- Open-loop physics in the terminal: a dozen moments of ``uuv simulate``.
 
 _ROWS = 12
 _STATE = (
-    Column("t s"),
-    Column("x m"),
-    Column("y m"),
-    Column("z m"),
-    Column("roll deg", 3),
-    Column("pitch deg", 3),
-    Column("yaw deg", 1),
-    Column("u m/s", 1),
-    Column("v m/s", 2),
-    Column("w m/s", 2),
-    Column("p rad/s", 4),
-    Column("q rad/s", 4),
-    Column("r rad/s", 4),
+    *(Column(name) for name in ("t s", "x m", "y m", "z m")),
+    *(Column(name, 3) for name in ("roll deg", "pitch deg")),
+    *(Column(name, 1) for name in ("yaw deg", "u m/s")),
+    *(Column(name, 2) for name in ("v m/s", "w m/s")),
+    *(Column(name, 4) for name in ("p rad/s", "q rad/s", "r rad/s")),
 )
 
 

@@ -43,8 +43,7 @@ except ModuleNotFoundError as error:
 __all__ = ["ENV_ID", "UuvEnv", "UuvVectorEnv"]
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Spaces of actions and observations, with bounds where the simulator keeps them.
+# ---- Spaces of actions and observations, with bounds where the simulator keeps them.
 
 
 def action_space() -> spaces.Box:
@@ -77,9 +76,7 @@ def bounds(config: Config) -> dict[str, tuple[float, float]]:
     }
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Seeds as Gymnasium means them, as seeds of our episodes.
-
+# ---- Seeds as Gymnasium means them, as seeds of our episodes.
 
 _SEEDS = 2**31
 
@@ -112,8 +109,7 @@ def _integer(seed: Any) -> int:
         raise TypeError(message) from None
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The simulator behind an env of this package.
+# ---- The simulator behind an env of this package.
 
 
 def simulator(
@@ -132,8 +128,7 @@ def simulator(
     return Sim(config, num_envs, read_tree(teacher), device)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# One decision: an action held for one or several control steps.
+# ---- One decision: an action held for one or several control steps.
 
 
 class Transition(NamedTuple):
@@ -179,10 +174,8 @@ def public_info(info: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return out | {"episode_number": info["episode"], "is_success": info["outcome"] == SUCCESS}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``gymnasium.vector.VectorEnv`` on top of the batched environment: three autoreset modes, results as NumPy
-# arrays or torch tensors.
-
+# ---- ``gymnasium.vector.VectorEnv`` on top of the batched environment: three autoreset modes, results as
+# NumPy arrays or torch tensors.
 
 BACKENDS = ("numpy", "torch")
 
@@ -333,9 +326,7 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
             )
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A picture of one env as it stands: the tank from above, in the colours of the videos.
-
+# ---- A picture of one env as it stands: the tank from above, in the colours of the videos.
 
 _MARGINS = (12, 12, 12, 12)
 """[px] left, right, top, bottom"""
@@ -367,8 +358,7 @@ def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     return canvas.image[:, :, ::-1].copy()
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``gymnasium.Env`` of one vehicle: ``gymnasium.make("uuvtai/Nav-v0")``.
+# ---- ``gymnasium.Env`` of one vehicle: ``gymnasium.make("uuvtai/Nav-v0")``.
 
 
 class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):

@@ -289,7 +289,6 @@ class VectorEnv(AbstractContextManager["VectorEnv"]):
             self.sim.close()
 
     def __exit__(self, *_error: Any) -> None:
-        """Close."""
         self.close()
 
     def _go_on(self, ended: torch.Tensor) -> None:

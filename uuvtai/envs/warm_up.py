@@ -78,10 +78,9 @@ def _counts() -> tuple[int, int]:
     return (native[0].made, native[0].found) if native else (0, 0)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# The second process of a start in which everything has to be compiled: ``python -m uuvtai.envs.warm_up``,
-# which ``compile/runtime.py`` begins. The first one compiles a reset and a step in their order, this one from
-# their end; they meet in the folder of machine code.
+# ---- The second process of a start in which everything has to be compiled: ``python -m
+# uuvtai.envs.warm_up``, which ``compile/runtime.py`` begins. The first one compiles a reset and a step in
+# their order, this one from their end; they meet in the folder of machine code.
 
 
 def main() -> None:

@@ -82,11 +82,9 @@ class AgentSpec:
         if self.own is not None:
             return {"own": self.own.document()}
         if self.checkpoint is None:
-            return (
-                {}
-                if self.stack is None
-                else {"stack": {"preset": self.stack, "tree": tree_of_stack(self.stack)}}
-            )
+            if self.stack is None:
+                return {}
+            return {"stack": {"preset": self.stack, "tree": tree_of_stack(self.stack)}}
         found = self.checkpoint
         return {
             "checkpoint": {
@@ -237,8 +235,7 @@ def _label(name: str) -> str:
     return Path(name).stem if name.endswith((".xml", ".yaml", ".yml")) else name
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A run or a checkpoint, found and exported; the stack of a log.
+# ---- A run or a checkpoint, found and exported; the stack of a log.
 
 
 def export_run(

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from uuvtai.learning.policy_agent import AgentDecision
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Time of simulating alone: compiling, recording and drawing are no part of it; and how many steps are still
-# to come.
+# ---- Time of simulating alone: compiling, recording and drawing are no part of it; and how many steps are
+# still to come.
 
 
 class StepClock:
@@ -71,8 +70,7 @@ def env_steps_left(lengths: Iterable[int], ages: Iterable[int], waiting: int) ->
     return round(mean * waiting + sum(max(mean - age, _LEAST_SHARE * mean) for age in running))
 
 
-# ------------------------------------------------------------------------------------------------------------
-
+# ---- Jobs side by side: who watches them, who drives, how each ended.
 
 _REFILL_SHARE = 16
 """Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset
@@ -133,17 +131,14 @@ class Recorders:
         self._parts = [part for part in parts if part is not None]
 
     def begin(self, sim: Sim, row: int, job: Job) -> None:
-        """The episode ``job`` begins in this row."""
         for part in self._parts:
             part.begin(sim, row, job)
 
     def step(self, sim: Sim) -> None:
-        """A control step has been done."""
         for part in self._parts:
             part.step(sim)
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
-        """The episode of this row is over."""
         for part in self._parts:
             part.end(sim, row, result)
 
@@ -295,20 +290,27 @@ def _refill(
     sim: Sim, stepper: Stepper, jobs: list[Job], waiting: list, free: list[int], running: dict[int, int]
 ) -> list[int]:
     """Begin as many jobs as there are free rows; the rows."""
-    mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
     begun: dict[int, Job] = {}
     while waiting and free:
         index, job = waiting.pop()
         row = free.pop()
         running[row] = index
-        mask[row], seed[row], number[row] = 1, job.seed, job.episode
         begun[row] = job
     scenes = {row: job.scene for row, job in begun.items() if job.scene is not None}
     if scenes:  # the rows that are not reset have drawn their scenarios already
         any_scene = next(iter(scenes.values()))
         sim.set_scenes([scenes.get(row, any_scene) for row in range(sim.num_envs)])
-    stepper.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
+    stepper.reset(*beginning(sim, begun))
     return list(begun)
+
+
+def beginning(sim: Sim, jobs: dict[int, Job]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(mask, seed, number) (n_env,), by which ``Sim.reset`` and ``Sim.draw`` begin these jobs in their
+    rows."""
+    mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
+    for row, job in jobs.items():
+        mask[row], seed[row], number[row] = 1, job.seed, job.episode
+    return mask.to(sim.device), seed.to(sim.device), number.to(sim.device)
 
 
 def _results(sim: Sim, rows: list[int], jobs: list[Job]) -> list[EpisodeResult]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import time
@@ -13,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import torch
 
 from uuvtai.common.enums import PLANNERS, REASONS, TRIGGERS
 from uuvtai.common.errors import SettingError
@@ -175,7 +175,8 @@ def run_agents(comparison: Comparison, folder: RunFolder) -> list[AgentRun]:
 
 
 def write_results(comparison: Comparison, folder: RunFolder, runs: list[AgentRun]) -> dict[str, Any]:
-    """The whole document of what was run, with the oracle's row, and all that is written and drawn of it."""
+    """The whole document of what was run, with the oracle's row, and all that is written and drawn of it: the
+    trees that drove, too, with the use of their nodes."""
     request = comparison.request
     jobs = episodes.jobs_of(request.seeds, request.episodes)
     entries = [agent_run.entry for agent_run in runs]
@@ -185,22 +186,16 @@ def write_results(comparison: Comparison, folder: RunFolder, runs: list[AgentRun
     named = request.world, request.sensors, request.vehicle
     result = document(request.config, *named, request.seeds, request.episodes, entries)
     result |= {"remainder": remainder_of(entries), "scenarios_sha256": scenarios_sha256(scenarios)}
-    _write_results(folder, result, runs)
+    folder.write_json("eval/result.json", result)
+    driving = [agent_run for agent_run in runs if agent_run.policy is None]
+    for agent_run in driving:
+        folder.write_bytes(f"eval/trees/{agent_run.agent.name}.xml", agent_run.agent.tree.xml)
+    use = {agent_run.agent.name: agent_run.use for agent_run in driving}
+    folder.write_json("eval/tree.json", {"schema": 1, "use": use})
     if request.explain:
         explain(comparison, runs, result, folder)
     _draw(comparison, folder.path, [agent_run.logs for agent_run in runs if agent_run.logs])
     return result
-
-
-def _write_results(folder: RunFolder, result: dict[str, Any], runs: list[AgentRun]) -> None:
-    """The document, and the trees that drove with the use of their nodes."""
-    folder.write_json("eval/result.json", result)
-    driving = [agent_run for agent_run in runs if agent_run.policy is None]
-    for agent_run in driving:
-        agent = agent_run.agent
-        folder.write_bytes(f"eval/trees/{agent.name}.xml", agent.tree.xml)
-    use = {agent_run.agent.name: agent_run.use for agent_run in driving}
-    folder.write_json("eval/tree.json", {"schema": 1, "use": use})
 
 
 def _draw(comparison: Comparison, folder: Path, logs: list[dict[episodes.Job, Path]]) -> None:
@@ -236,8 +231,7 @@ def _rounded(value: Any) -> Any:
     return round(float(value), _DIGITS) + 0.0 if isinstance(value, float) else value
 
 
-# ------------------------------------------------------------------------------------------------------------
-# One agent of an evaluation runs its episodes on its simulator, as far as they are not over.
+# ---- One agent of an evaluation runs its episodes on its simulator, as far as they are not over.
 
 
 class EvaluationWatch(Protocol):
@@ -351,8 +345,7 @@ def _recorder(
     return EpisodeRecorder(folder / "logs", world, agent, chosen, request.depth_images, policy)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Evaluations in the course of a training: the policy as it is, on the simulator that it is trained with.
+# ---- Evaluations in the course of a training: the policy as it is, on the simulator that it is trained with.
 
 
 def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
@@ -378,8 +371,7 @@ def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     return {f"eval/{name}": results_document[name] for name in names if results_document[name] is not None}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv eval --explain``: the causes of failures in the document, and logs of the worst.
+# ---- ``uuv eval --explain``: the causes of failures in the document, and logs of the worst.
 
 
 def explain(comparison: Comparison, runs: list[AgentRun], result: dict[str, Any], folder: RunFolder) -> None:
@@ -438,9 +430,7 @@ def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
     folder.write_json("eval/explain.json", {"schema": 1, "agents": agents})
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Privileged oracles beside the agents: the oracle's row of the table, and what an agent lacks of it.
-
+# ---- Privileged oracles beside the agents: the oracle's row of the table, and what an agent lacks of it.
 
 _UNKNOWN = (
     "return_mean",
@@ -465,20 +455,11 @@ def scenarios_of(sim: Sim, jobs: list[episodes.Job]) -> list[dict[str, Any]]:
     return found
 
 
-def _drawn(sim: Sim, jobs: list[episodes.Job]) -> Iterator[dict[str, Any]]:
-    mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
-    for row, job in enumerate(jobs):
-        mask[row], seed[row], number[row] = 1, job.seed, job.episode
-    sim.draw(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
-    rows, read = list(range(len(jobs))), {}
-    for row in rows:
-
-        def values(name: str, row: int = row) -> np.ndarray:
-            if name not in read:
-                read[name] = sim.rows(attrgetter(name)(sim.s), rows)
-            return read[name][row]
-
-        yield describe_scenario(values)
+def _drawn(sim: Sim, jobs: list[episodes.Job]) -> list[dict[str, Any]]:
+    sim.draw(*episodes.beginning(sim, dict(enumerate(jobs))))
+    rows = list(range(len(jobs)))
+    read = functools.cache(lambda name: sim.rows(attrgetter(name)(sim.s), rows))
+    return [describe_scenario(lambda name, row=row: read(name)[row]) for row in rows]
 
 
 def oracle_entry(
@@ -490,7 +471,7 @@ def oracle_entry(
     watch.start(ORACLE, len(jobs))
     try:
         for job, scenario in zip(jobs, scenarios, strict=True):
-            results.append(_result(job, earliest_arrival(scenario, config).time_s, config))
+            results.append(_result(job, earliest_arrival(scenario, config), config))
             watch.update(len(results), len(jobs), 0, None)
     finally:
         watch.stop()

@@ -208,13 +208,9 @@ def _knowledge_label(facts: Fact) -> str | None:
     if _within(facts["turned_ago_s"], TURN_S) and not _within(facts["turn_error_m"], MISS_M):
         return "obstacle_reversed" if facts["turned_deg"] > math.degrees(BACK_RAD) else "obstacle_turned"
     if facts["forecast_error_m"] is None:
-        return (
-            "late_detection"
-            if facts["fan_share"] < 0.5
-            else "occluded"
-            if facts["seen_share"] < 0.5
-            else "untracked"
-        )
+        if facts["fan_share"] < 0.5:
+            return "late_detection"
+        return "occluded" if facts["seen_share"] < 0.5 else "untracked"
     if facts["forecast_error_m"] > MISS_M:
         return "obstacle_on_curve" if facts["circle_m"] else "prediction_error"
     return None
@@ -551,10 +547,6 @@ def record_worst(
     for path, row in zip(paths, rows, strict=True):
         note(f"drawing {path.stem}")
         label = row.explanation.label
-        picture(
-            path,
-            path.with_suffix(".png"),
-            remark=f"{label.replace('_', ' ')}: {CAUSES[label]}",
-            agents=agents,
-        )
+        remark = f"{label.replace('_', ' ')}: {CAUSES[label]}"
+        picture(path, path.with_suffix(".png"), remark=remark, agents=agents)
     return paths

@@ -522,12 +522,8 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
 def _believed_gap(history: History, slot: int, track: int) -> float:
     """Vertical gap [m], as the vehicle believed at the end, to what was touched; 0 = may be level."""
     own, above = history.pos_w[-1, 2], history.obstacle_w[-1, slot, 2] > history.pos_w[-1, 2]
-    return _round(
-        max(
-            0.0,
-            history.forecast_above_w[-1, track] - own if above else own - history.forecast_below_w[-1, track],
-        )
-    )
+    low, high = history.forecast_below_w[-1, track], history.forecast_above_w[-1, track]
+    return _round(max(0.0, high - own if above else own - low))
 
 
 def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
@@ -542,12 +538,12 @@ def _course_facts(history: History, obstacles: Obstacles, slot: int, config: Con
     turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(vel[:, 1], vel[:, 0])))))
     corner = (turn > TURN_RAD) & (obstacles.circle_m[slot] == 0)
     ago = _last_ago(history.t_s[-1] - history.t_s[1:], corner)
+    if ago is None:
+        return dict.fromkeys(("turned_ago_s", "turned_deg", "turns_in_reach_before"))
     return {
         "turned_ago_s": ago,
-        "turned_deg": None if ago is None else _round(np.degrees(turn[corner][-1])),
-        "turns_in_reach_before": None
-        if ago is None
-        else _turns_in_reach(history, obstacles, slot, ago, config),
+        "turned_deg": _round(np.degrees(turn[corner][-1])),
+        "turns_in_reach_before": _turns_in_reach(history, obstacles, slot, ago, config),
     }
 
 
@@ -559,31 +555,20 @@ def _turns_in_reach(history: History, obstacles: Obstacles, slot: int, ago_s: fl
     here = np.stack(
         [np.interp(passes, history.coarse.t_s, history.coarse.pos_w[:, axis]) for axis in range(3)], -1
     )
-    gap = np.abs(
-        vertical_gap(
-            here, int(obstacles.kind[slot]), np.broadcast_to(place, here.shape), obstacles.size[slot]
-        )
-    )
+    there = np.broadcast_to(place, here.shape)
+    gap = np.abs(vertical_gap(here, int(obstacles.kind[slot]), there, obstacles.size[slot]))
     away = np.linalg.norm(here[:, :2] - place[:2], axis=1)
     sonar = config.sensors.sonar
-    return int(
-        (
-            (away <= sonar.max_range_m)
-            & (gap <= away * math.tan(math.radians(sonar.vertical_half_aperture_deg)))
-        ).sum()
-    )
+    slope = math.tan(math.radians(sonar.vertical_half_aperture_deg))
+    return int(((away <= sonar.max_range_m) & (gap <= away * slope)).sum())
 
 
 def touched_facts(history: History, obstacles: Obstacles, slot: int, config: Config) -> dict[str, Any]:
     """What holds where a moving obstacle in this slot was touched."""
     course = _course_facts(history, obstacles, slot, config)
     beliefs = _belief_facts(history, slot, course["turned_ago_s"], config)
-    return (
-        _sight_facts(history, obstacles, slot, config)
-        | course
-        | beliefs
-        | _escape_facts(history, obstacles, config)
-    )
+    sight = _sight_facts(history, obstacles, slot, config)
+    return sight | course | beliefs | _escape_facts(history, obstacles, config)
 
 
 def _escape_facts(history: History, obstacles: Obstacles, config: Config) -> dict[str, Any]:

@@ -8,10 +8,13 @@ import itertools
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import TypeAdapter, ValidationError
+
+from uuvtai.common.errors import SettingError
 from uuvtai.common.presets import preset_names
 from uuvtai.config import Config
 from uuvtai.config.loader import ConfigError, load_config, parsed_yaml, read_preset
@@ -168,15 +171,8 @@ class Task:
     device: str = "auto"
 
 
-@dataclass
-class _Kept:
-    """The simulator of this process's last task: the next one of the same config does not compile again."""
-
-    key: tuple[str, int, str] | None = None
-    sim: Any = field(default=None)
-
-
-_kept = _Kept()
+_kept: dict[tuple[str, int, str], Sim] = {}
+"""the simulator of this process's last task: the next one of the same config does not compile again"""
 
 
 def run_task(task: Task) -> list[Row]:
@@ -188,12 +184,8 @@ def run_task(task: Task) -> list[Row]:
     sim = _sim_of(task, agent.config_of(task.config))
     sim.use_tree(agent.tree)
     sim.planner = agent.planner_for(sim)
-    jobs = [
-        Job(seed, episode, scene)
-        for scene in task.scenes
-        for seed in task.seeds
-        for episode in range(task.episodes)
-    ]
+    runs = itertools.product(task.scenes, task.seeds, range(task.episodes))
+    jobs = [Job(seed, episode, scene) for scene, seed, episode in runs]
     note = agent.agent_for(sim)
     results, _env_steps = run_episodes(sim, jobs, agent=note.agent if note else None)
     if agent.own:
@@ -210,11 +202,10 @@ def _sim_of(task: Task, config: Config) -> Sim:
     from uuvtai.sim.sim import Sim
 
     key = (config.model_dump_json(), task.num_envs, task.device)
-    if _kept.key != key:
-        _kept.key, _kept.sim = None, None
-        _kept.sim = Sim(config, task.num_envs, read_tree(TRAINING_TREE), task.device)
-        _kept.key = key
-    return _kept.sim
+    if key not in _kept:
+        _kept.clear()
+        _kept[key] = Sim(config, task.num_envs, read_tree(TRAINING_TREE), task.device)
+    return _kept[key]
 
 
 def row_of(agent: str, label: dict[str, Any], results: list[EpisodeResult]) -> Row:
@@ -245,8 +236,6 @@ def row_of(agent: str, label: dict[str, Any], results: list[EpisodeResult]) -> R
 BATCH = 256  # episodes side by side in one simulator
 TASK_EPISODES = 1024  # about: what a kill costs at most, and enough to make stragglers cheap
 
-Overrides = list[Any]
-
 
 @dataclass(frozen=True)
 class SweepRequest:
@@ -256,7 +245,7 @@ class SweepRequest:
     world: str
     sensors: str | None
     vehicle: str | None
-    overrides: tuple[Any, ...]
+    overrides: tuple[str | tuple[str, Any], ...]
     """of the config, for every cell: ``key=value`` texts and (key, value) pairs"""
     agents: tuple[str, ...]
     seeds: tuple[int, ...]
@@ -282,32 +271,14 @@ class SweepRequest:
 
 
 def request_of(document: dict[str, Any]) -> SweepRequest:
-    """The request of ``document``. KeyError or TypeError for no such document, ConfigError for a grid."""
-    one_at_a_time, axes = document["grid"]["one_at_a_time"], document["grid"]["axes"]
-    grid = checked(Grid({name: tuple(values) for name, values in axes.items()}, _typed(one_at_a_time, bool)))
-    lists = {name: tuple(document[name]) for name in ("agents", "seeds")}
-    overrides = tuple(item if isinstance(item, str) else tuple(item) for item in document["overrides"])
-    rest = {name: _typed(document[name], of) for name, of in _TYPES.items()}
-    for name, values in lists.items():
-        for value in values:
-            _typed(value, int if name == "seeds" else str)
-    return SweepRequest(grid=grid, overrides=overrides, **lists, **rest)
-
-
-_TYPES: dict[str, Any] = {
-    "world": str,
-    "sensors": str | None,
-    "vehicle": str | None,
-    "episodes": int,
-    "num_envs": int | None,
-    "device": str,
-}
-
-
-def _typed(value: Any, of: Any) -> Any:
-    if not isinstance(value, of) or (isinstance(value, bool) and of is not bool):
-        raise TypeError(f"{value!r:.80} is no {of}")
-    return value
+    """The request of ``document``. SettingError for no such document, ConfigError for a grid."""
+    try:
+        request = TypeAdapter(SweepRequest).validate_json(json.dumps(document), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise SettingError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    checked(request.grid)
+    return request
 
 
 def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:
@@ -363,24 +334,14 @@ def tasks_of(request: SweepRequest, agents: Sequence[tuple[str, str]], done: set
     per_task = max(1, TASK_EPISODES // each)
     found = []
     for config, cells in _by_config(request):
+        num_envs = request.num_envs or min(BATCH, each * len(cells))
+        run = request.seeds, request.episodes, num_envs, request.device
         for name, agent in agents:
             labels = [label for cell in cells if row_key(label := label_of(cell, config), name) not in done]
             for first in range(0, len(labels), per_task):
                 part = labels[first : first + per_task]
                 scenes = tuple((label["S"], label["D"], label["v_m_s"] or 0.0) for label in part)
-                num_envs = request.num_envs or min(BATCH, each * len(cells))
-                found.append(
-                    Task(
-                        config,
-                        agent,
-                        scenes,
-                        tuple(part),
-                        request.seeds,
-                        request.episodes,
-                        num_envs,
-                        request.device,
-                    )
-                )
+                found.append(Task(config, agent, scenes, tuple(part), *run))
     return found
 
 

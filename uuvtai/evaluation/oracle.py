@@ -189,14 +189,10 @@ class Termination:
         away = np.sqrt(ox**2 + oy**2 + oz**2)
         gap = away - rounding_m(obstacle) - self._hull_m
         # closing speed = -(move - body) . (ox, oy) / away; both sides times ``away``
-        fastest = (
-            np.maximum(gap / self._rules.ttc_s, self._rules.ttc_closing_m_s)
-            if self._rules.ttc_s > 0
-            else np.inf
-        )
-        allowed = np.where(
-            gap < self._rules.collision_clearance_m, -np.inf, fastest * away - (vel[0] * ox + vel[1] * oy)
-        )
+        rules = self._rules
+        fastest = np.maximum(gap / rules.ttc_s, rules.ttc_closing_m_s) if rules.ttc_s > 0 else np.inf
+        allowed = fastest * away - (vel[0] * ox + vel[1] * oy)
+        allowed = np.where(gap < rules.collision_clearance_m, -np.inf, allowed)
         for move, velocity in enumerate(self._velocity):
             out[(move, *box)] |= -(velocity[0] * ox + velocity[1] * oy) > allowed
 
@@ -220,16 +216,9 @@ _DIAGONAL_SHARE = math.sqrt(2.0) - 1.0
 """Share of the time steps that allow diagonal moves, which then are as fast: the reach is an octagon."""
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """What the oracle says of one scenario."""
-
-    time_s: float | None  # earliest arrival; None = not reachable within the horizon
-
-
-def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
-    """Earliest arrival in a scenario (``describe_scenario``'s document) under the rules of ``config``: goal
-    radius, horizon, safety."""
+def earliest_arrival(scenario: dict[str, Any], config: Config) -> float | None:
+    """[s] Earliest arrival in a scenario (``describe_scenario``'s document) under the rules of ``config``:
+    goal radius, horizon, safety. None = the goal cannot be reached within the horizon."""
     rules = config.episode
     grid = lattice_of(np.array(scenario["start"]), config)
     n_step = int(rules.horizon_steps * rules.control_dt_s / grid.dt_s)
@@ -243,13 +232,13 @@ def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
     reached &= ~blocked[0]
     for step in range(n_step + 1):
         if (reached & goal).any():
-            return Arrival(step * grid.dt_s)
+            return step * grid.dt_s
         if step == n_step or not reached.any():
             break
         after = termination.blocked(moving, step + 1, reached)
         reached = _moved(reached, blocked, after, step)
         blocked = after
-    return Arrival(None)
+    return None
 
 
 def _moved(reached: Array, blocked: Array, after: Array, step: int) -> Array:

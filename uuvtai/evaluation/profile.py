@@ -179,8 +179,7 @@ def _times_ms(call: Callable[[], Any]) -> list[float]:
     return samples[_WARM_CALLS:]
 
 
-# ------------------------------------------------------------------------------------------------------------
-# A simulator kept busy, for measurements of speed.
+# ---- A simulator kept busy, for measurements of speed.
 
 
 @dataclass
@@ -217,9 +216,7 @@ class SimBatch:
             self.sim.reset(ended, self._seed, self._number)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Time per stage, env-steps per second and memory, warm-up and compile time apart.
-
+# ---- Time per stage, env-steps per second and memory, warm-up and compile time apart.
 
 WARM_STEPS = 60
 """More than every divider's period, so that each stage has run several times before the clock starts."""

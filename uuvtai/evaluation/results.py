@@ -40,9 +40,9 @@ _SYNC_S = 1.0
 """a kill of the process loses nothing that was flushed; against a failing machine the disk is asked this
 often"""
 
-_COUNTS = ("replans", "planned_by", "fallbacks")
 _PLAIN = (
-    "seed", "episode", "outcome", "time_s", "episode_return", "min_clearance_m", "path_length_m", *_COUNTS,
+    "seed", "episode", "outcome", "time_s", "episode_return", "min_clearance_m", "path_length_m", "replans",
+    "planned_by", "fallbacks",
 )  # fmt: skip
 
 
@@ -153,14 +153,11 @@ class JournalWriter(EpisodeObserver):
         return self.before_s + time.perf_counter() - self._begun
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
-        """Keep the episode."""
         self._journal.add(self._method, Finished(result, self.wall_s))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Agents compared on the same episodes: who alone arrives, how sure that is, and the difference in time
+# ---- Agents compared on the same episodes: who alone arrives, how sure that is, and the difference in time
 # where both do.
-
 
 Episode = dict[str, Any]
 """an entry of ``episodes_detail``: seed, episode, outcome, time_s at least"""
@@ -207,8 +204,7 @@ def _pairs(a: list[Episode], b: list[Episode]) -> list[tuple[Episode, Episode]]:
     return [(e, of_b[key]) for e in a if (key := (e["seed"], e["episode"])) in of_b]
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv eval --json`` says of ran episodes: one entry per agent, and the whole document.
+# ---- What ``uuv eval --json`` says of ran episodes: one entry per agent, and the whole document.
 
 
 def summary(
@@ -309,9 +305,7 @@ def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, i
     return {name: sum(c.get(name, 0) for c in counts) for name in names}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What ``uuv eval`` was asked for, as an object and as the file from which an interrupted evaluation goes on.
-
+# ---- What ``uuv eval`` was asked for: an object, and the file by which an interrupted evaluation goes on.
 
 REQUEST_FILE = "eval/request.json"
 ORACLE = "oracle"
@@ -378,15 +372,12 @@ class _Document(BaseModel):
 
 def document_of(request: Request, num_envs: int, device: str, digests: dict[str, str]) -> dict[str, Any]:
     """The request with what was chosen for it, as JSON; ``digests``: sha256 of what drives, by agent."""
-    document = {
-        field.name: getattr(request, field.name)
-        for field in dataclasses.fields(request)
-        if field.name not in ("config", "run_dir")
-    }
-    document |= {"num_envs": num_envs, "device": device}
+    given = {name: value for name, value in vars(request).items() if name not in ("config", "run_dir")}
     return {
         "schema": 1,
-        **document,
+        **given,
+        "num_envs": num_envs,
+        "device": device,
         "config": request.config.model_dump(mode="json"),
         "cwd": os.getcwd(),
         "digests": digests,
@@ -430,12 +421,9 @@ def _found_again(request: Request, cwd: Path) -> Request:
 def digests_of(agents: list[AgentSpec]) -> dict[str, str]:
     """sha256 of what drives, by agent: of a policy's checkpoint, of a tree as it is run, with its stack,
     of the file of a plugin of the user's."""
+    of_file = {agent.name: agent.own or agent.checkpoint for agent in agents}
     return {
-        agent.name: agent.own.sha256
-        if agent.own
-        else agent.checkpoint.sha256
-        if agent.checkpoint
-        else _tree_sha256(agent)
+        agent.name: source.sha256 if (source := of_file[agent.name]) else _tree_sha256(agent)
         for agent in agents
     }
 

@@ -26,6 +26,7 @@ from uuvtai.evaluation.episodes import (
     Job,
     Recorders,
     Stepper,
+    beginning,
     episodes_in_steps,
     run_in_turn,
 )
@@ -212,9 +213,7 @@ def _sample(
     }
 
 
-# ------------------------------------------------------------------------------------------------------------
-# One vehicle that an agent drives through open water, from a start to a goal: ``uuv simulate --agent``.
-
+# ---- One vehicle that an agent drives through open water, from a start to a goal: ``uuv simulate --agent``.
 
 _NOT_BESIDE = ("wrench", "command", "initial_rpy_deg", "initial_velocity")
 
@@ -238,8 +237,7 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     sim.planner, sim.privileged = agent.planner_for(sim), agent.privileged
     note = agent.agent_for(sim)
     stepper = Stepper(sim, note.agent if note else None)
-    one, zero = torch.ones(1, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
-    stepper.reset(one, zero, zero)
+    stepper.reset(*beginning(sim, {0: Job(0, 0)}))
     start, goal = (sim.rows(field)[0].astype(float) for field in (sim.s.vehicle.pos_w, sim.s.mission.goal_w))
     samples = [_sample(sim.s.vehicle, sim.rows, 0.0, start)]
     for k in range(1, n_step + 1):
@@ -252,10 +250,8 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
     return {key: [s[key] for s in samples] for key in samples[0]} | {"goal": (goal - start).tolist()}
 
 
-# ------------------------------------------------------------------------------------------------------------
-# ``uuv watch``: episodes at the clock's pace, for pages or Foxglove; ``uuv drive``: one in which a person
-# drives.
-
+# ---- ``uuv watch``: episodes at the clock's pace, for pages or Foxglove; ``uuv drive``: one in which a
+# person drives.
 
 LAYOUT = PRESET_DIR / "layout" / "navigation.json"
 """for Foxglove and Lichtblick"""
@@ -357,10 +353,7 @@ def _watched(
         for result in results:
             entry = {
                 "agent": agent.name,
-                "seed": result.seed,
-                "episode": result.episode,
-                "outcome": result.outcome,
-                "time_s": result.time_s,
+                **{name: getattr(result, name) for name in ("seed", "episode", "outcome", "time_s")},
                 "min_clearance_m": round(result.min_clearance_m, 4),
                 "real_time_factor": round(clock.real_time_factor, 2),
             }

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.common import signals
-from uuvtai.common.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
+from uuvtai.common.files import FileError, json_object, open_to_append, read_json, read_lines, truncate
 from uuvtai.common.presets import built_in_agents
 from uuvtai.common.processes import ATTEMPTS, EngineError, Item, LocalEngine, Work
 from uuvtai.evaluation.grid import (
@@ -74,7 +74,6 @@ class RayEngine:
         self._cpus = min(cpus_per_task, ray.cluster_resources().get("CPU", 1.0))
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
-        """As ``Engine.run``."""
         remote = self._ray.remote(num_cpus=self._cpus, max_retries=ATTEMPTS - 1)(work)
         running = {remote.remote(item): number for number, item in enumerate(items)}
         try:
@@ -286,17 +285,9 @@ def read_rows(place: Path) -> list[Row]:
     rows: list[Row] = []
     whole, last, row = 0, 0, None
     for line in read_lines(path, folder=place):
-        row = _row(line)
+        row = json_object(line) if line.endswith(b"\n") else None
         rows += [] if row is None else [row]
         whole, last = whole + len(line), len(line)
     if row is None and whole:
         truncate(path, whole - last, place)
     return rows
-
-
-def _row(line: bytes) -> Row | None:
-    try:
-        row = parsed_json(line, ROWS)
-    except FileError:
-        return None
-    return row if line.endswith(b"\n") and isinstance(row, dict) else None

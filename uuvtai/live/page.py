@@ -133,7 +133,7 @@ class PageServer(LiveServer):
 
     def heard(self, client: Client, asked: Any) -> bool:
         """Do what a page asks for, if it may; whether it is a message of ours."""
-        what, value = next(iter(asked.items())) if isinstance(asked, dict) and len(asked) == 1 else ("", None)
+        what, value = next(iter(asked.items())) if asked and len(asked) == 1 else ("", None)
         may = client is self._helm()
         if what == "follow" and type(value) is int and -1 <= value < MOST_TANKS:
             client.tank = value

@@ -19,10 +19,18 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from uuvtai.common.errors import UserError
-from uuvtai.common.files import FileError, parsed_json
-from uuvtai.logs.encode import EpisodeEnd, EpisodeHeader, Topic, Values
+from uuvtai.common.files import json_object
+from uuvtai.logs.encode import EpisodeHeader, Topic, Values
 from uuvtai.logs.schemas import Schema
-from uuvtai.logs.writer import EpisodeReader, PolicyNote, Recordable, RecordedJob, TopicMessage, TopicStream
+from uuvtai.logs.writer import (
+    EpisodeReader,
+    EpisodeSink,
+    PolicyNote,
+    Recordable,
+    RecordedJob,
+    TopicMessage,
+    TopicStream,
+)
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -31,8 +39,8 @@ if TYPE_CHECKING:
 # ---- Running episodes as messages for viewers: the topics of the log, no faster than the clock.
 
 
-class LiveEpisode:
-    """One episode for viewers; an ``EpisodeSink``."""
+class LiveEpisode(EpisodeSink):
+    """One episode for viewers; its last messages have told how it ended."""
 
     def __init__(self, viewers: ViewerServer, header: EpisodeHeader, depth_images: bool) -> None:
         self._viewers, self._stream = viewers, TopicStream(header, depth_images)
@@ -46,12 +54,6 @@ class LiveEpisode:
         self._viewers.tell_time(round(int(values["clock.step"]) * self._dt_s * 1e9))
         for message in self._stream.messages(values):
             self._viewers.send(message)
-
-    def close(self, result: EpisodeEnd) -> None:
-        """Its last messages have told how it ended."""
-
-    def abandon(self) -> None:
-        """Nothing is kept."""
 
 
 class Broadcast(EpisodeReader):
@@ -193,7 +195,8 @@ class LiveServer(contextlib.AbstractContextManager["LiveServer"]):
 
     @abstractmethod
     def heard(self, client: Client, asked: Any) -> bool:
-        """A client says something, read as JSON (None: it is none); whether it may stay. The lock is held."""
+        """A client says something, an object of JSON (None: it is none); whether it may stay. The lock is
+        held."""
 
     def left(self, client: Client) -> None:
         """A client has gone and is in the list no more; the lock is held."""
@@ -249,7 +252,7 @@ class LiveServer(contextlib.AbstractContextManager["LiveServer"]):
             with _ended():
                 async for message in socket:
                     with self._lock:
-                        stays = self.heard(client, _parsed(message))
+                        stays = self.heard(client, json_object(message))
                     if not stays:
                         await socket.close(1008, "no message of ours")
         finally:
@@ -308,13 +311,6 @@ def _ended() -> contextlib.AbstractContextManager[None]:
     from websockets.exceptions import ConnectionClosed
 
     return contextlib.suppress(ConnectionClosed)
-
-
-def _parsed(message: str | bytes) -> Any:
-    try:
-        return parsed_json(message, "a message")
-    except FileError:
-        return None
 
 
 # ---- For Foxglove and Lichtblick.
@@ -409,7 +405,7 @@ class ViewerServer(LiveServer):
 
 
 def _listed(asked: Any, what: str, of: str) -> list[Any]:
-    found = asked.get(of) if isinstance(asked, dict) and asked.get("op") == what else None
+    found = asked.get(of) if asked and asked.get("op") == what else None
     return found if isinstance(found, list) else []
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import functools
 import itertools
 import math
 from collections import defaultdict
@@ -24,6 +25,7 @@ from uuvtai.logs.topics.perception import Layer
 
 Color = tuple[int, int, int]  # blue, green, red
 
+_HULL_M, _HULL_RADIUS_M = (0.54, 0.34), 0.17  # of the vehicle from above: length, width; half its height
 _SHIFT = 4  # bits of sub-pixel precision
 
 
@@ -81,16 +83,9 @@ class Canvas:
         self, pixel: Sequence[float] | np.ndarray, radius_px: float, color: Color, width: int = -1
     ) -> None:
         """Circle in pixels; width -1 fills it."""
-        at = _fixed(np.asarray([pixel]))[0]
-        cv2.circle(
-            self.image,
-            (int(at[0]), int(at[1])),
-            round(radius_px * (1 << _SHIFT)),
-            color,
-            width,
-            cv2.LINE_AA,
-            _SHIFT,
-        )
+        x, y = _fixed(np.asarray([pixel]))[0].tolist()
+        radius = round(radius_px * (1 << _SHIFT))
+        cv2.circle(self.image, (x, y), radius, color, width, cv2.LINE_AA, _SHIFT)
 
     def filled(self, pixels: np.ndarray, color: Color, hole: np.ndarray | None = None) -> None:
         """Filled polygon in pixels, but for the polygon ``hole`` within."""
@@ -128,7 +123,19 @@ class Canvas:
         align: str = "left",
     ) -> int:
         """Text with its baseline at a pixel; gives its width [px]."""
-        return draw_text(self.image, place, text, size, color, bold, align)
+        ink: tuple[Any, ...]
+        if hasattr(cv2, "FontFace"):
+            face, weight = _face(), 650 if bold else 420
+            width = cv2.getTextSize(self.size, text, (0, 0), face, size, weight)[2]
+            ink = (color, face, size, weight)
+        else:  # OpenCV 4 has stroke fonts only, with ASCII only
+            text = text.replace("·", "-").replace("–", "-").encode("ascii", "replace").decode()
+            font, scale, thickness = cv2.FONT_HERSHEY_DUPLEX, size / 28.0, 2 if bold and size >= 20 else 1
+            (width, _), _ = cv2.getTextSize(text, font, scale, thickness)
+            ink = (font, scale, color, thickness, cv2.LINE_AA)
+        x = place[0] - {"left": 0, "center": width / 2, "right": width}[align]
+        cv2.putText(self.image, text, (round(x), round(place[1])), *ink)
+        return int(width)
 
     # ------------------------------------------------------------------------------------ what is drawn of it
 
@@ -152,12 +159,12 @@ class Canvas:
         """Circle around a world point; width -1 fills it."""
         self.dot(self.pixels([center])[0], radius_px, color, width)
 
-    def star(self, center: Sequence[float], radius_px: float, fill: Color = GOAL, edge: Color = INK) -> None:
+    def star(self, center: Sequence[float], radius_px: float) -> None:
         angles = -math.pi / 2 + np.arange(10) * math.pi / 5  # one point up
         reach = np.where(np.arange(10) % 2 == 0, radius_px, 0.42 * radius_px)
-        pixels = self.pixels([center])[0] + np.column_stack([reach * np.cos(angles), reach * np.sin(angles)])
-        self.filled(pixels, fill)
-        self.strip(pixels, edge, 1, closed=True)
+        pixels = self.pixels([center])[0] + reach[:, None] * towards(angles)
+        self.filled(pixels, GOAL)
+        self.strip(pixels, INK, 1, closed=True)
 
     def cross(self, center: Sequence[float], radius_px: float, color: Color) -> None:
         """An X with a white rim."""
@@ -166,62 +173,22 @@ class Canvas:
             for sign in (-1, 1):
                 self.strip(at + radius_px * np.array([[-1, -sign], [1, sign]]), ink, width)
 
-    def vehicle(
-        self, pose: Sequence[float], color: Color, length_m: float = 0.54, width_m: float = 0.34
-    ) -> None:
+    def vehicle(self, pose: Sequence[float], color: Color) -> None:
         """The hull from above with its bow: at least 14 pixels long, so that it can be seen."""
-        grow = max(1.0, 14.0 / (length_m * self.scale))
+        grow = max(1.0, 14.0 / (_HULL_M[0] * self.scale))
         outline = np.array(
             [[0.5, 0.0], [0.22, 0.5], [-0.42, 0.5], [-0.5, 0.36], [-0.5, -0.36], [-0.42, -0.5], [0.22, -0.5]]
         )
-        shape = outline * np.array([length_m, width_m]) * grow
+        shape = outline * np.array(_HULL_M) * grow
         c, s = math.cos(pose[3]), math.sin(pose[3])
         world = shape @ np.array([[c, s], [-s, c]]) + np.array(pose[:2])
         self.area(world, color)
         self.line(world, PAPER, 1, closed=True)
 
 
-def draw_text(
-    image: np.ndarray,
-    place: tuple[float, float],
-    text: str,
-    size: int,
-    color: Color,
-    bold: bool,
-    align: str = "left",
-) -> int:
-    """Text with its baseline at a pixel; gives its width [px]."""
-    if not hasattr(cv2, "FontFace"):
-        return _hershey_text(image, place, text, size, color, bold, align)
-    face, weight = _face(), 650 if bold else 420
-    frame = (image.shape[1], image.shape[0])
-    width = cv2.getTextSize(frame, text, (0, 0), face, size, weight)[2]  # type: ignore[call-overload]
-    x = place[0] - {"left": 0, "center": width / 2, "right": width}[align]
-    corner = (round(x), round(place[1]))
-    cv2.putText(image, text, corner, color, face, size, weight)  # type: ignore[call-overload]
-    return int(width)
-
-
-_faces: list[Any] = []
-
-
+@functools.cache
 def _face() -> Any:
-    if not _faces:
-        _faces.append(cv2.FontFace("sans"))  # type: ignore[attr-defined]
-    return _faces[0]
-
-
-def _hershey_text(
-    image: np.ndarray, place: tuple[float, float], text: str, size: int, color: Color, bold: bool, align: str
-) -> int:
-    """OpenCV 4 has stroke fonts only, with ASCII only."""
-    plain = text.replace("·", "-").replace("–", "-").encode("ascii", "replace").decode()
-    scale, thickness = size / 28.0, 2 if bold and size >= 20 else 1
-    (width, _), _ = cv2.getTextSize(plain, cv2.FONT_HERSHEY_DUPLEX, scale, thickness)
-    x = place[0] - {"left": 0, "center": width / 2, "right": width}[align]
-    corner, font = (round(x), round(place[1])), cv2.FONT_HERSHEY_DUPLEX
-    cv2.putText(image, plain, corner, font, scale, color, thickness, cv2.LINE_AA)
-    return int(width)
+    return cv2.FontFace("sans")  # type: ignore[attr-defined]
 
 
 def _fixed(pixels: np.ndarray) -> np.ndarray:
@@ -231,7 +198,6 @@ def _fixed(pixels: np.ndarray) -> np.ndarray:
 # ---- What pictures and videos have in common: the tank, maps, true obstacles, ruler, in world coordinates.
 
 _MAX_MAP = 1000  # [px] greatest height of the map
-_HULL_RADIUS_M = 0.17  # half the height of the hull that ``Canvas.vehicle`` draws
 
 
 def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int]) -> Canvas:
@@ -249,9 +215,7 @@ def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int
 def tank_outline(tank: dict[str, Any]) -> np.ndarray:
     (x0, x1), (y0, y1) = tank["x_m"], tank["y_m"]
     if tank["shape"] == "circle":
-        angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
-        middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
-        return middle + tank["radius_m"] * np.column_stack([np.cos(angles), np.sin(angles)])
+        return np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)]) + tank["radius_m"] * ring(181)[:-1]
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
 
@@ -308,8 +272,17 @@ def obstacle_outline(obstacle: dict[str, Any], at: np.ndarray) -> np.ndarray:
         a, b, _ = obstacle["size"]
         c, s = math.cos(obstacle["yaw"]), math.sin(obstacle["yaw"])
         return np.array([(a, b), (-a, b), (-a, -b), (a, -b)]) @ np.array([[c, s], [-s, c]]) + at[:2]
-    angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    return at[:2] + obstacle["size"][0] * np.column_stack([np.cos(angles), np.sin(angles)])
+    return at[:2] + obstacle["size"][0] * ring(49)[:-1]
+
+
+def ring(corners: int) -> np.ndarray:
+    """(corners, 2) unit circle, closed."""
+    return towards(np.linspace(0, 2 * np.pi, corners))
+
+
+def towards(angles: np.ndarray) -> np.ndarray:
+    """(n, 2) unit vectors."""
+    return np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 def mixed(color: Color, other: Color, share: float) -> Color:
@@ -403,8 +376,7 @@ class Recording:
         found, beams = [np.empty((0, 2))], 0
         for ranges, away, hit, ping_s in self["/sonar/scan"].until(time_s):
             x, y, _, yaw = self["/pose"].at(ping_s) or self["/pose"].values[0]
-            bearing = yaw + away[hit]
-            found.append((x, y) + ranges[hit, None] * np.column_stack([np.cos(bearing), np.sin(bearing)]))
+            found.append((x, y) + ranges[hit, None] * towards(yaw + away[hit]))
             beams += len(ranges)
             if beams >= _ECHO_BEAMS:
                 break

@@ -82,17 +82,15 @@ class RosMessages:
     def quaternion(self, w: float, x: float, y: float, z: float) -> Any:
         return self("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
 
+    def pose(self, place: Any, turn: Any) -> Any:
+        at, along = self.vector(*place, kind="Point"), self.quaternion(*turn)
+        return self("geometry_msgs/msg/Pose", position=at, orientation=along)
+
     def twist(self, linear: Any, angular: Any) -> Any:
         return self("geometry_msgs/msg/Twist", linear=self.vector(*linear), angular=self.vector(*angular))
 
 
-def zeros(count: int) -> np.ndarray:
-    """A covariance that is unknown."""
-    return np.zeros(count)
-
-
-# ------------------------------------------------------------------------------------------------------------
-# A log's control steps as ROS 2's standard messages; the table of docs/logs.md.
+# ---- A log's control steps as ROS 2's standard messages; the table of docs/logs.md.
 
 Step = dict[str, dict[str, Any]]  # messages of one control step by topic
 
@@ -202,12 +200,12 @@ def _motion(ros: RosMessages, setup: Setup, time_ns: int, step: Step) -> Iterato
     state, measured = step["/state"], step["/state"]["measured"]
     place, turn = state["position"], state["orientation"]
     motion = state["velocity"], state["rates"]
-    yield "/ground_truth/odom", _odometry(ros, time_ns, (place, turn), motion, zeros(36), zeros(36))
+    yield "/ground_truth/odom", _odometry(ros, time_ns, (place, turn), motion, np.zeros(36), np.zeros(36))
     if "/pose_estimate" in step:
         pose = step["/pose_estimate"]["pose"]
         place, turn = _xyz(pose["position"]), _wxyz(pose["orientation"])
-        pose_cov = np.array(step.get("/pose_covariance", {}).get("covariance", zeros(36)), float)
-        twist_cov = zeros(36)
+        pose_cov = np.array(step.get("/pose_covariance", {}).get("covariance", np.zeros(36)), float)
+        twist_cov = np.zeros(36)
         if not measured["velocity_valid"]:
             twist_cov[[0, 7, 14]] = INVALID_VAR
         motion = measured["velocity"], measured["rates"]
@@ -222,15 +220,11 @@ def _motion(ros: RosMessages, setup: Setup, time_ns: int, step: Step) -> Iterato
 def _odometry(
     ros: RosMessages, time_ns: int, pose: Any, motion: Any, pose_cov: np.ndarray, twist_cov: np.ndarray
 ) -> Any:
-    place, turn = pose
-    at = ros(
-        "geometry_msgs/msg/Pose", position=ros.vector(*place, kind="Point"), orientation=ros.quaternion(*turn)
-    )
     return ros(
         "nav_msgs/msg/Odometry",
         header=ros.header(time_ns, "world"),
         child_frame_id=ros.header(0, "base").frame_id,
-        pose=ros("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=pose_cov),
+        pose=ros("geometry_msgs/msg/PoseWithCovariance", pose=ros.pose(*pose), covariance=pose_cov),
         twist=ros("geometry_msgs/msg/TwistWithCovariance", twist=ros.twist(*motion), covariance=twist_cov),
     )
 
@@ -241,9 +235,9 @@ def _imu(ros: RosMessages, time_ns: int, turn: Any, rates: Any) -> Any:
         "sensor_msgs/msg/Imu",
         header=ros.header(time_ns, "base"),
         orientation=ros.quaternion(*turn),
-        orientation_covariance=zeros(9),
+        orientation_covariance=np.zeros(9),
         angular_velocity=ros.vector(*rates),
-        angular_velocity_covariance=zeros(9),
+        angular_velocity_covariance=np.zeros(9),
         linear_acceleration=ros.vector(0, 0, 0),
         linear_acceleration_covariance=np.array([-1.0] + [0.0] * 8),
     )
@@ -304,18 +298,13 @@ def _grid(ros: RosMessages, grid: dict[str, Any]) -> Any:
     if len(base64.b64decode(grid["data"])) % grid["row_stride"]:
         raise ValueError("a grid that is cut off")
     values, pose, head = grid_values(grid), grid["pose"], ros.header(_ns(grid), grid["frame_id"])
-    origin = ros(
-        "geometry_msgs/msg/Pose",
-        position=ros.vector(*_xyz(pose["position"]), kind="Point"),
-        orientation=ros.quaternion(*_wxyz(pose["orientation"])),
-    )
     info = ros(
         "nav_msgs/msg/MapMetaData",
         map_load_time=head.stamp,
         resolution=float(grid["cell_size"]["x"]),
         width=values.shape[1],
         height=values.shape[0],
-        origin=origin,
+        origin=ros.pose(_xyz(pose["position"]), _wxyz(pose["orientation"])),
     )
     data = np.rint(100 * np.clip(values, 0, 1)).astype(np.int8).ravel()
     return ros("nav_msgs/msg/OccupancyGrid", header=head, info=info, data=data)

@@ -65,23 +65,47 @@ DURATION: Schema = {
     "title": "duration",
     "properties": {"sec": {"type": "integer"}, "nsec": _NSEC},
 }
-VECTOR2 = record("foxglove.Vector2", x=NUMBER, y=NUMBER)
-VECTOR3 = record("foxglove.Vector3", x=NUMBER, y=NUMBER, z=NUMBER)
-POINT3 = record("foxglove.Point3", x=NUMBER, y=NUMBER, z=NUMBER)
-QUATERNION = record("foxglove.Quaternion", x=NUMBER, y=NUMBER, z=NUMBER, w=NUMBER)
-COLOR = record("foxglove.Color", r=NUMBER, g=NUMBER, b=NUMBER, a=NUMBER)
-POSE = record("foxglove.Pose", position=VECTOR3, orientation=QUATERNION)
+_TYPES: dict[str, Schema] = {
+    "number": NUMBER,
+    "uint": UINT,
+    "string": STRING,
+    "bool": BOOLEAN,
+    "bytes": BASE64,
+    "time": TIME,
+    "duration": DURATION,
+    "NumericType": _choice(
+        "foxglove.NumericType", "UNKNOWN UINT8 INT8 UINT16 INT16 UINT32 INT32 FLOAT32 FLOAT64"
+    ),
+    "LogLevel": _choice("foxglove.LogLevel", "UNKNOWN DEBUG INFO WARNING ERROR FATAL"),
+    "LineType": _choice("foxglove.LineType", "LINE_STRIP LINE_LOOP LINE_LIST"),
+    "SceneEntityDeletionType": _choice("foxglove.SceneEntityDeletionType", "MATCHING_ID ALL"),
+}
+"""types by their names in Foxglove's schemas; each message that follows is one more"""
 
-FRAME_TRANSFORM = record(
-    "foxglove.FrameTransform",
-    timestamp=TIME,
-    parent_frame_id=STRING,
-    child_frame_id=STRING,
-    translation=VECTOR3,
-    rotation=QUATERNION,
+
+def _foxglove(name: str, fields: str) -> Schema:
+    """The message of this name; ``fields``: ``type name name .., ..``; ``type[]`` is a list of them."""
+    found: dict[str, Schema] = {}
+    for kind, *names in map(str.split, fields.split(",")):
+        of = _TYPES[kind.removesuffix("[]")]
+        found |= dict.fromkeys(names, array_of(of) if kind.endswith("[]") else of)
+    _TYPES[name] = record(f"foxglove.{name}", **found)
+    return _TYPES[name]
+
+
+VECTOR2 = _foxglove("Vector2", "number x y")
+VECTOR3 = _foxglove("Vector3", "number x y z")
+POINT3 = _foxglove("Point3", "number x y z")
+QUATERNION = _foxglove("Quaternion", "number x y z w")
+COLOR = _foxglove("Color", "number r g b a")
+POSE = _foxglove("Pose", "Vector3 position, Quaternion orientation")
+
+_foxglove(
+    "FrameTransform",
+    "time timestamp, string parent_frame_id child_frame_id, Vector3 translation, Quaternion rotation",
 )
-FRAME_TRANSFORMS = record("foxglove.FrameTransforms", transforms=array_of(FRAME_TRANSFORM))
-POSE_IN_FRAME = record("foxglove.PoseInFrame", timestamp=TIME, frame_id=STRING, pose=POSE)
+FRAME_TRANSFORMS = _foxglove("FrameTransforms", "FrameTransform[] transforms")
+POSE_IN_FRAME = _foxglove("PoseInFrame", "time timestamp, string frame_id, Pose pose")
 
 LASER_SCAN = record(
     "foxglove.LaserScan",
@@ -107,12 +131,7 @@ def compressed_image(text: str) -> Schema:
 
 
 UINT8, FLOAT32 = 1, 7  # numeric types of packed fields
-PACKED_FIELD = record(
-    "foxglove.PackedElementField",
-    name=STRING,
-    offset=UINT,
-    type=_choice("foxglove.NumericType", "UNKNOWN UINT8 INT8 UINT16 INT16 UINT32 INT32 FLOAT32 FLOAT64"),
-)
+PACKED_FIELD = _foxglove("PackedElementField", "string name, uint offset, NumericType type")
 GRID = record(
     "foxglove.Grid",
     timestamp=TIME,
@@ -127,95 +146,36 @@ GRID = record(
 )
 
 DEBUG, INFO, WARNING, ERROR = 1, 2, 3, 4  # levels of foxglove.Log
-LOG = record(
-    "foxglove.Log",
-    timestamp=TIME,
-    level=_choice("foxglove.LogLevel", "UNKNOWN DEBUG INFO WARNING ERROR FATAL"),
-    message=STRING,
-    name=STRING,
-    file=STRING,
-    line=UINT,
-)
+LOG = _foxglove("Log", "time timestamp, LogLevel level, string message name file, uint line")
 
 LINE_STRIP, LINE_LOOP = 0, 1  # types of foxglove.LinePrimitive
-_LINE = record(
-    "foxglove.LinePrimitive",
-    type=_choice("foxglove.LineType", "LINE_STRIP LINE_LOOP LINE_LIST"),
-    pose=POSE,
-    thickness=NUMBER,
-    scale_invariant=BOOLEAN,
-    points=array_of(POINT3),
-    color=COLOR,
-    colors=array_of(COLOR),
-    indices=array_of(UINT),
+_foxglove(
+    "LinePrimitive",
+    "LineType type, Pose pose, number thickness, bool scale_invariant, Point3[] points, Color color, "
+    "Color[] colors, uint[] indices",
 )
-_ARROW = record(
-    "foxglove.ArrowPrimitive",
-    pose=POSE,
-    shaft_length=NUMBER,
-    shaft_diameter=NUMBER,
-    head_length=NUMBER,
-    head_diameter=NUMBER,
-    color=COLOR,
+_foxglove(
+    "ArrowPrimitive", "Pose pose, number shaft_length shaft_diameter head_length head_diameter, Color color"
 )
-_CUBE = record("foxglove.CubePrimitive", pose=POSE, size=VECTOR3, color=COLOR)
-_SPHERE = record("foxglove.SpherePrimitive", pose=POSE, size=VECTOR3, color=COLOR)
-_CYLINDER = record(
-    "foxglove.CylinderPrimitive", pose=POSE, size=VECTOR3, bottom_scale=NUMBER, top_scale=NUMBER, color=COLOR
+_foxglove("CubePrimitive", "Pose pose, Vector3 size, Color color")
+_foxglove("SpherePrimitive", "Pose pose, Vector3 size, Color color")
+_foxglove("CylinderPrimitive", "Pose pose, Vector3 size, number bottom_scale top_scale, Color color")
+_foxglove("TriangleListPrimitive", "Pose pose, Point3[] points, Color color, Color[] colors, uint[] indices")
+_foxglove(
+    "TextPrimitive",
+    "Pose pose, bool billboard, number font_size, bool scale_invariant, Color color, string text",
 )
-_TRIANGLES = record(
-    "foxglove.TriangleListPrimitive",
-    pose=POSE,
-    points=array_of(POINT3),
-    color=COLOR,
-    colors=array_of(COLOR),
-    indices=array_of(UINT),
+_foxglove(
+    "ModelPrimitive",
+    "Pose pose, Vector3 scale, Color color, bool override_color, string url media_type, bytes data",
 )
-_TEXT = record(
-    "foxglove.TextPrimitive",
-    pose=POSE,
-    billboard=BOOLEAN,
-    font_size=NUMBER,
-    scale_invariant=BOOLEAN,
-    color=COLOR,
-    text=STRING,
+_foxglove("KeyValuePair", "string key value")
+_foxglove(
+    "SceneEntity",
+    "time timestamp, string frame_id id, duration lifetime, bool frame_locked, KeyValuePair[] metadata, "
+    "ArrowPrimitive[] arrows, CubePrimitive[] cubes, SpherePrimitive[] spheres, "
+    "CylinderPrimitive[] cylinders, LinePrimitive[] lines, TriangleListPrimitive[] triangles, "
+    "TextPrimitive[] texts, ModelPrimitive[] models",
 )
-_MODEL = record(
-    "foxglove.ModelPrimitive",
-    pose=POSE,
-    scale=VECTOR3,
-    color=COLOR,
-    override_color=BOOLEAN,
-    url=STRING,
-    media_type=STRING,
-    data=BASE64,
-)
-SCENE_ENTITY = record(
-    "foxglove.SceneEntity",
-    timestamp=TIME,
-    frame_id=STRING,
-    id=STRING,
-    lifetime=DURATION,
-    frame_locked=BOOLEAN,
-    metadata=array_of(record("foxglove.KeyValuePair", key=STRING, value=STRING)),
-    arrows=array_of(_ARROW),
-    cubes=array_of(_CUBE),
-    spheres=array_of(_SPHERE),
-    cylinders=array_of(_CYLINDER),
-    lines=array_of(_LINE),
-    triangles=array_of(_TRIANGLES),
-    texts=array_of(_TEXT),
-    models=array_of(_MODEL),
-)
-SCENE_UPDATE = record(
-    "foxglove.SceneUpdate",
-    deletions=array_of(
-        record(
-            "foxglove.SceneEntityDeletion",
-            timestamp=TIME,
-            type=_choice("foxglove.SceneEntityDeletionType", "MATCHING_ID ALL"),
-            id=STRING,
-        )
-    ),
-    entities=array_of(SCENE_ENTITY),
-)
+_foxglove("SceneEntityDeletion", "time timestamp, SceneEntityDeletionType type, string id")
+SCENE_UPDATE = _foxglove("SceneUpdate", "SceneEntityDeletion[] deletions, SceneEntity[] entities")

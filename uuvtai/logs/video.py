@@ -15,46 +15,20 @@ from av.error import FFmpegError
 from PIL import Image
 
 from uuvtai.common.files import flush, refusing, whole_file
-from uuvtai.logs.drawing import (
-    DYNAMIC,
-    ECHO,
-    FAILED,
-    FAINT,
-    GOAL,
-    GREY,
-    INK,
-    MOVER,
-    PAPER,
-    ROUTE,
-    STATIC,
-    TRIGGER_COLORS,
-    Color,
-    Recording,
-    agent_inks,
-    bgr,
-    drawing,
-    load_recording,
-    map_canvas,
-    mixed,
-    paint_layers,
-    paint_ruler,
-    paint_truth,
-    paint_walls,
-    paint_water,
-)
+from uuvtai.logs import drawing
 from uuvtai.logs.encode import LogError, checked_suffix
 from uuvtai.logs.topics.perception import Layer
 
 _MARGINS = (52, 28, 84, 212)  # [px] left, right, top, bottom
 _PANEL = 160  # [px] height of the panel below the map
-_GOOD = bgr("#2b8a3e")
+_GOOD = drawing.bgr("#2b8a3e")
 _LEGEND = (
-    (ROUTE, "route"),
-    (ECHO, "sonar"),
-    (STATIC, "mapped"),
-    (DYNAMIC, "tracked"),
-    (MOVER, "true, dynamic"),
-    (GREY, "true, static"),
+    (drawing.ROUTE, "route"),
+    (drawing.ECHO, "sonar"),
+    (drawing.STATIC, "mapped"),
+    (drawing.DYNAMIC, "tracked"),
+    (drawing.MOVER, "true, dynamic"),
+    (drawing.GREY, "true, static"),
 )
 _HOLD_S = 1.0  # The last frame stays this long.
 _DRAWN_PX = 1280  # Narrower frames are drawn this wide and made smaller: the panel below needs the room.
@@ -89,9 +63,9 @@ def video(
     for name, value, (least, most) in given:
         if not least <= value <= most:
             raise LogError(f"{name} {value:g}: must be from {least:g} to {most:g}")
-    recording = load_recording(path)
+    recording = drawing.load_recording(path)
     times = frame_times(recording, fps, speed)
-    with drawing(Path(path)):
+    with drawing.drawing(Path(path)):
         artist = FrameArtist(recording, max(width_px, _DRAWN_PX))
         samples = [_sized(artist.frame(recording.duration_s * share), width_px) for share in (0.0, 0.5, 1.0)]
     frames = _frames(artist, times, width_px, progress)
@@ -102,7 +76,7 @@ def video(
     return out
 
 
-def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
+def frame_times(recording: drawing.Recording, fps: float, speed: float) -> np.ndarray:
     """Moments [s] of the frames; the last stays for a while. Raises LogError for too many frames."""
     n_frames = recording.duration_s * fps / speed
     if n_frames > _MOST_FRAMES:
@@ -124,7 +98,7 @@ def _frames(
     artist: FrameArtist, times: np.ndarray, width_px: int, progress: Progress | None
 ) -> Iterator[np.ndarray]:
     for i, time_s in enumerate(times):
-        with drawing(artist.recording.path):
+        with drawing.drawing(artist.recording.path):
             frame = _sized(artist.frame(float(time_s)), width_px)
         yield frame
         if progress:
@@ -142,10 +116,10 @@ def _sized(frame: np.ndarray, width_px: int) -> np.ndarray:
 class FrameArtist:
     """Draws the frame of any moment of a recording; what stays between two maps is drawn once."""
 
-    def __init__(self, recording: Recording, width_px: int = 1280) -> None:
+    def __init__(self, recording: drawing.Recording, width_px: int = 1280) -> None:
         self.recording = recording
-        self._ink = agent_inks([recording.agent])[recording.agent]
-        self._canvas = map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
+        self._ink = drawing.agent_inks([recording.agent])[recording.agent]
+        self._canvas = drawing.map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
         self._base: np.ndarray | None = None
         self._base_map: Layer | None = None
         self._track = recording.positions
@@ -153,9 +127,16 @@ class FrameArtist:
         self._clearance = np.array([value[0] for value in recording["/safety"].values])
 
     @property
-    def inks(self) -> list[Color]:
+    def inks(self) -> list[drawing.Color]:
         """Colours that mean something."""
-        return [self._ink, GOAL, _GOOD, FAILED, *(color for color, _ in _LEGEND), *TRIGGER_COLORS.values()]
+        return [
+            self._ink,
+            drawing.GOAL,
+            _GOOD,
+            drawing.FAILED,
+            *(color for color, _ in _LEGEND),
+            *drawing.TRIGGER_COLORS.values(),
+        ]
 
     def frame(self, time_s: float) -> np.ndarray:
         """Image (height, width, 3), blue green red."""
@@ -163,14 +144,14 @@ class FrameArtist:
         canvas.image = self._background(time_s).copy()
         i = max(int(np.searchsorted(self._times, time_s + 1e-9)) - 1, 0)
         pose = self._track[i]
-        paint_truth(canvas, recording.scenario, time_s, float(pose[2]))
+        drawing.paint_truth(canvas, recording.scenario, time_s, float(pose[2]))
         self._paint_plan(time_s)
         canvas.line(self._track[: i + 1, :2], self._ink, 2)
         for echo in recording.echoes(time_s):
-            canvas.disc(echo, 2.4, ECHO)
+            canvas.disc(echo, 2.4, drawing.ECHO)
         tracks = recording["/tracks"].at(time_s)
         for x, y, radius in () if tracks is None else tracks[:, :3]:
-            canvas.disc((x, y), (radius + 0.06) * canvas.scale, DYNAMIC, 2)
+            canvas.disc((x, y), (radius + 0.06) * canvas.scale, drawing.DYNAMIC, 2)
         self._paint_goal()
         canvas.vehicle(pose, self._ink)
         self._paint_head(time_s)
@@ -181,12 +162,12 @@ class FrameArtist:
         static, dynamic = (self.recording[f"/map/{name}"].at(time_s) for name in ("static", "dynamic"))
         if self._base is None or static is not self._base_map:
             canvas = self._canvas
-            canvas.image = np.full_like(canvas.image, PAPER)
-            paint_water(canvas, self.recording.scenario["tank"])
+            canvas.image = np.full_like(canvas.image, drawing.PAPER)
+            drawing.paint_water(canvas, self.recording.scenario["tank"])
             if static and dynamic:
-                paint_layers(canvas, static, dynamic)
-            paint_walls(canvas, self.recording.scenario["tank"])
-            paint_ruler(canvas)
+                drawing.paint_layers(canvas, static, dynamic)
+            drawing.paint_walls(canvas, self.recording.scenario["tank"])
+            drawing.paint_ruler(canvas)
             self._base, self._base_map = canvas.image, static
         return self._base
 
@@ -194,35 +175,34 @@ class FrameArtist:
         canvas, plan = self._canvas, self.recording["/plan/info"].at(time_s)
         route, ahead = () if plan is None else plan[0], self.recording["/plan/lookahead"].at(time_s)
         if len(route) > 1:
-            canvas.line(route, PAPER, 5)
-            canvas.line(route, ROUTE, 2)
+            canvas.line(route, drawing.PAPER, 5)
+            canvas.line(route, drawing.ROUTE, 2)
         if ahead is not None:
-            canvas.disc(ahead, 7, PAPER)
-            canvas.disc(ahead, 5, ROUTE)
+            canvas.disc(ahead, 7, drawing.PAPER)
+            canvas.disc(ahead, 5, drawing.ROUTE)
 
     def _paint_goal(self) -> None:
         canvas, scenario = self._canvas, self.recording.scenario
         goal, radius = scenario["goal"], scenario["goal_radius_m"]
-        angles = np.linspace(0, 2 * np.pi, 72)
-        canvas.dashes(np.array(goal[:2]) + radius * np.column_stack([np.cos(angles), np.sin(angles)]), INK, 1)
+        canvas.dashes(np.array(goal[:2]) + radius * drawing.ring(72), drawing.INK, 1)
         canvas.star(goal, 14)
 
     def _paint_head(self, time_s: float) -> None:
         canvas, recording, scenario = self._canvas, self.recording, self.recording.scenario
         width = canvas.image.shape[1]
         which = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
-        canvas.text((24, 34), f"{recording.agent} · {which}", 22, INK, bold=True)
+        canvas.text((24, 34), f"{recording.agent} · {which}", 22, drawing.INK, bold=True)
         moving = f", {scenario['D']} dynamic at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
         canvas.text(
             (24, 60),
             f"{scenario['S']} static obstacles{moving}; dashed while wholly above or below the vehicle",
             16,
-            GREY,
+            drawing.GREY,
         )
-        canvas.text((width - 28, 36), f"{time_s:5.1f} s", 26, INK, bold=True, align="right")
+        canvas.text((width - 28, 36), f"{time_s:5.1f} s", 26, drawing.INK, bold=True, align="right")
         if time_s >= recording.duration_s:
             good = recording.outcome == "success"
-            ink = _GOOD if good else FAILED
+            ink = _GOOD if good else drawing.FAILED
             canvas.text((width - 150, 36), recording.outcome_text, 24, ink, bold=True, align="right")
 
     # -------------------------------------------------------------------------------------------- panel below
@@ -234,17 +214,17 @@ class FrameArtist:
         clearance = None if safety is None else safety[0]
         near = clearance is not None and clearance < 0.3
         said = "-" if clearance is None else f"{clearance:.2f} m"
-        self._figure(24, top, "clearance", said, FAILED if near else INK)
+        self._figure(24, top, "clearance", said, drawing.FAILED if near else drawing.INK)
         said = "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s"
-        self._figure(164, top, "time to collision", said, INK)
-        self._figure(320, top, "speed", "-" if speed is None else f"{speed:.2f} m/s", INK)
-        canvas.text((24, top + 86), "tree", 15, GREY)
-        canvas.text((24, top + 112), leaf or "-", 21, INK, bold=True)
+        self._figure(164, top, "time to collision", said, drawing.INK)
+        self._figure(320, top, "speed", "-" if speed is None else f"{speed:.2f} m/s", drawing.INK)
+        canvas.text((24, top + 86), "tree", 15, drawing.GREY)
+        canvas.text((24, top + 112), leaf or "-", 21, drawing.INK, bold=True)
         self._paint_legend(24, top + 138)
         self._paint_curve(time_s, i, top)
 
-    def _figure(self, x: int, top: int, label: str, value: str, color: Color) -> None:
-        self._canvas.text((x, top + 24), label, 15, GREY)
+    def _figure(self, x: int, top: int, label: str, value: str, color: drawing.Color) -> None:
+        self._canvas.text((x, top + 24), label, 15, drawing.GREY)
         self._canvas.text((x, top + 54), value, 25, color, bold=True)
 
     def _paint_legend(self, x: float, y: float) -> None:
@@ -252,7 +232,7 @@ class FrameArtist:
         for color, label in _LEGEND:
             square = np.array([(0, -9), (9, -9), (9, 0), (0, 0)]) + np.array([x, y])
             canvas.filled(square, color)
-            x += 16 + canvas.text((x + 14, y), label, 14, GREY) + 14
+            x += 16 + canvas.text((x + 14, y), label, 14, drawing.GREY) + 14
 
     def _paint_curve(self, time_s: float, i: int, top: int) -> None:
         """Clearance over the episode; replans as ticks in the colour of their trigger."""
@@ -266,12 +246,12 @@ class FrameArtist:
 
         for value in (0.0, most):
             y = round(float(place(np.zeros(1), np.array([value]))[0, 1]))
-            cv2.line(canvas.image, (left, y), (right, y), FAINT, 1)
-            canvas.text((left - 8, y + 5), f"{value:g}", 13, GREY, align="right")
-        canvas.text((left, top + 12), "clearance [m]", 14, GREY)
+            cv2.line(canvas.image, (left, y), (right, y), drawing.FAINT, 1)
+            canvas.text((left - 8, y + 5), f"{value:g}", 13, drawing.GREY, align="right")
+        canvas.text((left, top + 12), "clearance [m]", 14, drawing.GREY)
         self._paint_replans(place, time_s, low)
         curve = place(np.array(recording["/safety"].times), self._clearance)
-        canvas.strip(curve, mixed(self._ink, PAPER, 0.25), 2)
+        canvas.strip(curve, drawing.mixed(self._ink, drawing.PAPER, 0.25), 2)
         if i > 0:
             canvas.strip(curve[: i + 1], self._ink, 2)
         if len(curve):
@@ -282,15 +262,15 @@ class FrameArtist:
     ) -> None:
         canvas, x, plans = self._canvas, 700.0, self.recording["/plan/info"]
         replans = [(at, trigger) for at, (_, trigger) in zip(plans.times, plans.values, strict=True)]
-        for name, color in TRIGGER_COLORS.items():
+        for name, color in drawing.TRIGGER_COLORS.items():
             count = sum(trigger == name and at <= time_s for at, trigger in replans)
             label = f"{name} {count}"
             x += 14 + canvas.text((x, low + 22), label, 14, color, bold=True) + 10
-        canvas.text((560, low + 22), "replans by trigger:", 14, GREY)
+        canvas.text((560, low + 22), "replans by trigger:", 14, drawing.GREY)
         for at, trigger in replans:
             if at <= time_s:
                 px = round(float(place(np.array([at]), np.zeros(1))[0, 0]))
-                ink = TRIGGER_COLORS.get(trigger, GREY)
+                ink = drawing.TRIGGER_COLORS.get(trigger, drawing.GREY)
                 cv2.line(canvas.image, (px, low), (px, low - 12), ink, 2, cv2.LINE_AA)
 
 
@@ -308,7 +288,7 @@ _GIF_TICKS = 100  # per second: a GIF counts hundredths
 
 
 def write_video(
-    part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
+    part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[drawing.Color]
 ) -> int:
     """Write frames into ``part``, as its name ends; gives their number. Raises OSError.
 
@@ -352,7 +332,7 @@ def _write_video(part: Path, frames: Frames, fps: float) -> int:
 
 
 def _write_gif(
-    part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
+    part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[drawing.Color]
 ) -> int:
     """One palette for all frames, no dithering: what stands still stays the same pixel and costs nothing."""
     known = _palette(samples, inks)
@@ -376,7 +356,7 @@ def _write_gif(
     return _write(part, frames, start, picture, {"final_delay": str(round(_GIF_TICKS / fps))})
 
 
-def _palette(samples: Sequence[np.ndarray], inks: Sequence[Color]) -> np.ndarray:
+def _palette(samples: Sequence[np.ndarray], inks: Sequence[drawing.Color]) -> np.ndarray:
     """(256, 3) red green blue."""
     seen = _image(np.concatenate(samples)).quantize(256 - len(inks), dither=Image.Dither.NONE)
     known = [*(ink[::-1] for ink in inks), *np.reshape(seen.getpalette("RGB") or [], (-1, 3))]

@@ -18,26 +18,11 @@ from uuvtai.common.enums import clearance_m, occupancy
 from uuvtai.config import SonarConfig
 from uuvtai.config.task import TERMS
 from uuvtai.learning.policy_agent import CHUNK, AgentDecision
-from uuvtai.plugins.api import (
-    ACTION,
-    COMMAND,
-    Ego,
-    OccupancyGrid,
-    PluginError,
-    PluginSpec,
-    Scan,
-    Tracks,
-    View,
-    Way,
-    failed,
-    line_of_frame,
-)
+from uuvtai.plugins import api
 from uuvtai.sim.sim import Sim
 
-# ------------------------------------------------------------------------------------------------------------
-# What a controller of the user's is shown: rows of what the vehicle senses, remembers and decides, read when
-# it is asked for. ``FIELDS`` is the whole of it; no truth is among them (a test asks).
-
+# ---- What a controller of the user's is shown: rows of what the vehicle senses, remembers and decides, read
+# when it is asked for. ``FIELDS`` is the whole of it; no truth is among them (a test asks).
 
 FIELDS = {
     "goal": ("mission.goal_w",),
@@ -80,11 +65,7 @@ class Readings:
         return self._known[name]
 
     def _read(self, name: str) -> list[Array]:
-        found = []
-        for path in FIELDS[name]:
-            struct, _, field = path.partition(".")
-            found.append(self._sim.rows(getattr(getattr(self._sim.s, struct), field), self._chosen))
-        return found
+        return [self._sim.rows(attrgetter(path)(self._sim.s), self._chosen) for path in FIELDS[name]]
 
     def _made(self, name: str) -> Any:
         read, dt_s = self._read(name), self._sim.config.episode.control_dt_s
@@ -94,18 +75,18 @@ class Readings:
         if name == "tracks":
             ahead = self._read("forecast")
             moving, state = (read[0] == 1) & (read[1] == 1), read[2]
-            return Tracks(moving, state[..., :2], state[..., 2:], read[3], ahead[0], ahead[1])
+            return api.Tracks(moving, state[..., :2], state[..., 2:], read[3], ahead[0], ahead[1])
         if name == "map":
             read = [*map(occupancy, read[:2]), clearance_m(read[2], self._sim.config)]
-        kinds: dict[str, Callable[..., Any]] = {"ego": Ego, "map": OccupancyGrid, "route": Way}
+        kinds: dict[str, Callable[..., Any]] = {"ego": api.Ego, "map": api.OccupancyGrid, "route": api.Way}
         return kinds[name](*read) if name in kinds else read[0]
 
 
-def _scan(read: list[Array], age_s: Array, sonar_cfg: SonarConfig) -> Scan:
+def _scan(read: list[Array], age_s: Array, sonar_cfg: SonarConfig) -> api.Scan:
     """Of what was read; a speed that is not measured is not a number."""
     range_m, hit, doppler, intensity, yaw, _step = read
     bearing = sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * np.arange(sonar_cfg.n_ray)
-    return Scan(
+    return api.Scan(
         range_m,
         hit == 1,
         doppler if sonar_cfg.doppler else np.full_like(doppler, np.nan),
@@ -136,25 +117,21 @@ class PluginView:
 
     @property
     def rows(self) -> Any:
-        """(n,) numbers of the envs."""
         numbers = self._readings.numbers
         return numbers if self._pick is None else int(numbers[self._pick])
 
     @property
     def time_s(self) -> Any:
-        """(n,) [s] since the episode began."""
         return self._given(self._readings.group("step").astype(np.float32) * np.float32(self.dt_s))
 
     @property
     def obs(self) -> Any:
-        """(n, M) the observation."""
         found = self._readings.obs
         found = found if self._pick is None else found[self._pick]
         return found if self._fixed.torch else found.cpu().numpy()
 
     @property
     def goal(self) -> Any:
-        """(n, 3) [m] world."""
         return self._given(self._readings.group("goal"))
 
     ego = _group_named("ego")
@@ -188,7 +165,7 @@ class PluginView:
         """What there is."""
         return (
             f"View(rows={self.rows}, columns: {', '.join(self.columns)}; obs, goal, time_s, ego, scan, "
-            f"tracks, map, route; a command is {COMMAND})"
+            f"tracks, map, route; a command is {api.COMMAND})"
         )
 
     def _given(self, values: Array) -> Any:
@@ -224,9 +201,8 @@ class Fixed:
         self.cell_m, self.origin = sim.config.mapping.cell_m, sim.fallback.origin
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What came back from the user's code, checked: shape, kind of number, NaN; each refusal says what was wanted.
-
+# ---- What came back from the user's code, checked: shape, kind of number, NaN; each refusal says what was
+# wanted.
 
 MAX_WAYPOINTS = 10_000
 _ENDS_M = 1e-4
@@ -241,11 +217,11 @@ def commands(found: Any, n: int, place: str, meaning: str, device: torch.device)
         wrong = (
             f"{columns} columns" if values.dim() == 2 and len(values) == n else f"shape {tuple(values.shape)}"
         )
-        raise PluginError(f"{place}: gave {wrong}; wanted is shape ({n}, 4): {meaning}")
+        raise api.PluginError(f"{place}: gave {wrong}; wanted is shape ({n}, 4): {meaning}")
     bad = (~torch.isfinite(values)).nonzero()
     if len(bad):
         row, column = bad[0].tolist()
-        raise PluginError(
+        raise api.PluginError(
             f"{place}: gave {float(values[row, column])} in row {row}, column {column} of {n} x 4 ({meaning})"
             f", and {len(bad) - 1} more that are not finite"
         )
@@ -256,19 +232,23 @@ def terms(found: Any, n: int, place: str, device: torch.device) -> dict[str, tor
     """(n,) float32 by name of what a reward answered. Raises PluginError."""
     wanted = f"a dict of arrays ({n},), what each term adds to the reward"
     if not isinstance(found, dict) or not found or not all(str(name).isidentifier() for name in found):
-        raise PluginError(f"{place}: gave {type(found).__name__} {found!r:.60}; wanted is {wanted}, by name")
+        raise api.PluginError(
+            f"{place}: gave {type(found).__name__} {found!r:.60}; wanted is {wanted}, by name"
+        )
     if taken := [name for name in found if name in TERMS]:
-        raise PluginError(
+        raise api.PluginError(
             f"{place}: {taken[0]} is a built-in term; name yours otherwise, or weight that one: "
             f"--set reward.{taken[0]}=0"
         )
     values = {str(name): _tensor(value, f"{place}: {name}", wanted) for name, value in found.items()}
     for name, value in values.items():
         if value.shape != (n,):
-            raise PluginError(f"{place}: {name} has shape {tuple(value.shape)}; wanted is {wanted}")
+            raise api.PluginError(f"{place}: {name} has shape {tuple(value.shape)}; wanted is {wanted}")
         if len(bad := (~torch.isfinite(value)).nonzero()):
             row = int(bad[0])
-            raise PluginError(f"{place}: {name} is {float(value[row])} in env {row}, and {len(bad) - 1} more")
+            raise api.PluginError(
+                f"{place}: {name} is {float(value[row])} in env {row}, and {len(bad) - 1} more"
+            )
     return {name: value.to(device) for name, value in values.items()}
 
 
@@ -276,7 +256,7 @@ def command(found: Any, place: str, meaning: str) -> torch.Tensor:
     """(1, 4) float32 of what a controller answered for one env. Raises PluginError."""
     values = _tensor(found, place, f"(4,): {meaning}")
     if values.shape not in ((4,), (1, 4)):
-        raise PluginError(f"{place}: gave shape {tuple(values.shape)}; wanted is shape (4,): {meaning}")
+        raise api.PluginError(f"{place}: gave shape {tuple(values.shape)}; wanted is shape (4,): {meaning}")
     return values.reshape(1, 4)
 
 
@@ -287,18 +267,18 @@ def waypoints(
     wanted = "waypoints (n, 2) [m] from the grid's corner, or None"
     values = _tensor(found, place, wanted).numpy()
     if values.ndim != 2 or values.shape[1] != 2 or len(values) > MAX_WAYPOINTS:
-        raise PluginError(
+        raise api.PluginError(
             f"{place}: gave shape {values.shape}; wanted are {wanted}, at most {MAX_WAYPOINTS:,}"
         )
     if not np.isfinite(values).all():
         number = int(np.flatnonzero(~np.isfinite(values).all(1))[0])
-        raise PluginError(
+        raise api.PluginError(
             f"{place}: waypoint {number} is {values[number].tolist()}; wanted are finite numbers"
         )
     outside = ((values < 0) | (values > size_m)).any(1)
     if outside.any():
         number = int(np.flatnonzero(outside)[0])
-        raise PluginError(
+        raise api.PluginError(
             f"{place}: waypoint {number} is {np.round(values[number], 3).tolist()}, outside the grid of "
             f"{size_m[0]:g} x {size_m[1]:g} m; places are x = column * cell_m, y = row * cell_m"
         )
@@ -312,32 +292,29 @@ def waypoints(
 
 def _tensor(found: Any, place: str, wanted: str) -> torch.Tensor:
     if found is None:
-        raise PluginError(f"{place}: gave None; wanted is {wanted}; does it return something on every way?")
+        raise api.PluginError(
+            f"{place}: gave None; wanted is {wanted}; does it return something on every way?"
+        )
     if isinstance(found, torch.Tensor):
-        values = found.detach()
-        kind = "?" if values.dtype == torch.bool else "c" if values.is_complex() else "f"
-        values = values.cpu()
-    else:
-        try:
-            array = np.asarray(found)
-        except (TypeError, ValueError) as error:
-            raise PluginError(
-                f"{place}: gave {type(found).__name__}, no array ({error}); wanted is {wanted}"
-            ) from None
-        kind = array.dtype.kind
-        if kind not in "fiu":
-            raise PluginError(
-                f"{place}: gave {type(found).__name__} of {array.dtype}; wanted are real numbers, {wanted}"
+        if found.dtype == torch.bool or found.is_complex():
+            raise api.PluginError(
+                f"{place}: gave a tensor of {found.dtype}; wanted are real numbers, {wanted}"
             )
-        return torch.from_numpy(array.astype(np.float32))
-    if kind != "f":
-        raise PluginError(f"{place}: gave a tensor of {found.dtype}; wanted are real numbers, {wanted}")
-    return values.to(torch.float32)
+        return found.detach().cpu().to(torch.float32)
+    try:
+        array = np.asarray(found)
+    except (TypeError, ValueError) as error:
+        raise api.PluginError(
+            f"{place}: gave {type(found).__name__}, no array ({error}); wanted is {wanted}"
+        ) from None
+    if array.dtype.kind not in "fiu":
+        raise api.PluginError(
+            f"{place}: gave {type(found).__name__} of {array.dtype}; wanted are real numbers, {wanted}"
+        )
+    return torch.from_numpy(array.astype(np.float32))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Time that the user's code takes, and a voice while a call does not come back.
-
+# ---- Time that the user's code takes, and a voice while a call does not come back.
 
 STALL_S = 10.0
 """a call that takes longer is told while it runs"""
@@ -422,14 +399,14 @@ class CallMeter:
             begun = self._begun
             if begun is not None and begun != told and self._now() - begun > self._stall_s:
                 told = begun
-                line = line_of_frame(sys._current_frames().get(self._thread), self._path)
+                line = api.line_of_frame(sys._current_frames().get(self._thread), self._path)
                 place = f"{self._path}:{line}" if line else str(self._path)
                 self._note(
                     f"{place}: a call of {self._what} has not come back for {self._stall_s:g} s; Ctrl-C stops"
                 )
 
 
-# ------------------------------------------------------------------------------------------------------------
+# ---- The user's code as it is called, and as an agent.
 
 
 class Marks(NamedTuple):
@@ -443,7 +420,7 @@ class Marks(NamedTuple):
 class OwnCode(NamedTuple):
     """The user's functions, and where they come from."""
 
-    spec: PluginSpec
+    spec: api.PluginSpec
     act: Callable[..., Any]
     reset: Callable[..., Any] | None
     place: str
@@ -457,7 +434,7 @@ class OwnCode(NamedTuple):
             with self.meter.call(decisions):
                 return function(given)
         except (Exception, SystemExit) as error:
-            raise failed(error, self.spec.path, self.spec.option) from error
+            raise api.failed(error, self.spec.path, self.spec.option) from error
 
     def forget(self, mask: torch.Tensor) -> None:
         """Tell her that new episodes begin in the rows where ``mask`` (n_env,) is not 0."""
@@ -466,7 +443,7 @@ class OwnCode(NamedTuple):
             try:
                 self.reset(rows)
             except (Exception, SystemExit) as error:
-                raise failed(error, self.spec.path, f"in reset of {self.spec.option}") from error
+                raise api.failed(error, self.spec.path, f"in reset of {self.spec.option}") from error
 
 
 Ask = Callable[[list[int], torch.Tensor], torch.Tensor]
@@ -486,7 +463,6 @@ class PluginAgent:
         self.decision = self._decision()
 
     def reset(self, rows: torch.Tensor) -> None:
-        """New episodes have begun in the rows (n_env,) where this is not 0."""
         begun = rows.cpu().numpy() != 0
         self._age[begun], self._due[begun] = 0, True
         self.code.forget(rows)
@@ -504,7 +480,6 @@ class PluginAgent:
         return self.decision
 
     def advance(self) -> None:
-        """What was decided last has been done."""
         self._age += 1
         self._due |= self._age % self.code.marks.hold_steps == 0
 
@@ -519,13 +494,13 @@ def asking_controller(sim: Sim, code: OwnCode, columns: Mapping[str, slice], lim
 
     def ask(rows: list[int], obs: torch.Tensor) -> torch.Tensor:
         readings = Readings(sim, rows, obs)
-        view: View = PluginView(readings, fixed)
+        view: api.View = PluginView(readings, fixed)
         if code.marks.rows == "batch":
             found = code.called(code.act, view, len(rows))
         else:
             each = (code.called(code.act, PluginView(readings, fixed, i), 1) for i in range(len(rows)))
-            found = torch.cat([command(one, code.place, COMMAND) for one in each])
-        return commands(found, len(rows), code.place, COMMAND, sim.device) / top
+            found = torch.cat([command(one, code.place, api.COMMAND) for one in each])
+        return commands(found, len(rows), code.place, api.COMMAND, sim.device) / top
 
     return ask
 
@@ -541,7 +516,7 @@ def asking_policy(code: OwnCode, device: torch.device) -> Ask:
             whole = torch.cat([part, part[:1].expand(CHUNK - len(part), -1)])
             given = whole if code.marks.arrays == "torch" else whole.cpu().numpy()
             found = code.called(code.act, given, len(part))
-            parts.append(commands(found, CHUNK, code.place, ACTION, device)[: len(part)])
+            parts.append(commands(found, CHUNK, code.place, api.ACTION, device)[: len(part)])
         return torch.cat(parts)
 
     return ask

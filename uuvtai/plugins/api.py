@@ -251,8 +251,7 @@ def plugin(
     return marked
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What goes wrong in a plugin of the user's, told by her file and line.
+# ---- What goes wrong in a plugin of the user's, told by her file and line.
 
 
 class PluginError(OwnCodeError):
@@ -281,9 +280,8 @@ def _is(frame: FrameType, path: Path) -> bool:
     return frame.f_code.co_filename == str(path)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Names of the user's plugins on a command line: ``mine.py:plan``, ``mine.py:load=FOLDER``, ``model.onnx``.
-
+# ---- Names of the user's plugins on a command line: ``mine.py:plan``, ``mine.py:load=FOLDER``,
+# ``model.onnx``.
 
 PLANNER, CONTROLLER, POLICY = "planner", "controller", "policy"
 REWARD, MOTION = "reward", "motion"

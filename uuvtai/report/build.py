@@ -66,12 +66,9 @@ class _Shown:
     def severity(self) -> tuple[bool, bool, float]:
         """Sorts the worst first: failures, then what came closest; what is not known comes last."""
         failed = any(detail["outcome"] != _SUCCESS for _, detail in self.details)
-        closest = [
-            detail["min_clearance_m"]
-            for _, detail in self.details
-            if detail.get("min_clearance_m") is not None
-        ]
-        return (not self.details, not failed, min(closest, default=float("inf")))
+        told = (detail.get("min_clearance_m") for _, detail in self.details)
+        closest = min((clearance_m for clearance_m in told if clearance_m is not None), default=float("inf"))
+        return (not self.details, not failed, closest)
 
 
 def media(folder: Path, result: dict[str, Any] | None) -> list[Block]:
@@ -162,11 +159,8 @@ def _gallery(folder: Path, pictures: Iterable[_Shown], budget: int) -> Gallery:
 
 
 def _note(left_out: Sequence[str]) -> str:
-    return (
-        f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}."
-        if left_out
-        else ""
-    )
+    named = f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}."
+    return named if left_out else ""
 
 
 def trimmed(sections: Sequence[PageSection]) -> list[PageSection]:

@@ -321,14 +321,8 @@ def _draw_intervals(axes: Axes, i: int, line: Line, shift: float, joined: bool) 
         label=line.name,
     )
     for k, (x, low, high) in enumerate(zip(places, line.low or line.y, line.high or line.y, strict=True)):
-        axes.plot(
-            [x, x],
-            [100 * low, 100 * high],
-            color=colour,
-            linewidth=2.4,
-            solid_capstyle="butt",
-            gid=f"interval-{i}-{k}",
-        )
+        bar: Any = {"linewidth": 2.4, "solid_capstyle": "butt", "gid": f"interval-{i}-{k}"}
+        axes.plot([x, x], [100 * low, 100 * high], color=colour, **bar)
     return {f"interval-{i}-{k}": text for k, text in enumerate(line.said)}
 
 
@@ -374,15 +368,8 @@ def _stage_bar(axes: Axes, row: int, spent: dict[str, float], longest: float) ->
         gid, ground = f"stage-{row}-{i}", shade(0.1 + 0.85 * (i * _GOLDEN % 1.0))
         axes.barh(row, us, left=left, height=0.7, color=ground)[0].set_gid(gid)
         if us > _ROOM * longest:
-            axes.text(
-                left + us / 2,
-                row,
-                f"{stage}\n{us:.1f}",
-                ha="center",
-                va="center",
-                fontsize=7,
-                color=ink_on(ground),
-            )
+            centred: Any = {"ha": "center", "va": "center", "fontsize": 7}
+            axes.text(left + us / 2, row, f"{stage}\n{us:.1f}", color=ink_on(ground), **centred)
         hover[gid] = f"{stage}: {us:.2f} us per env-step, {percent(us / whole if whole else None)}"
         left += us
     return hover

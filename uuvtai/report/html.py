@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from uuvtai.common import files
 from uuvtai.common.colours import on_page
-from uuvtai.common.files import FileError, parsed_json
+from uuvtai.common.files import json_object
 from uuvtai.common.version import __version__
 from uuvtai.config.loader import MAX_BYTES as MAX_YAML_BYTES
 from uuvtai.config.loader import ConfigError
@@ -163,11 +163,8 @@ def _refuse_many(document: dict[str, Any], path: Path) -> None:
     """Raise ConfigError for a document that would be drawn for hours."""
     axes = document.get("axes")
     lists = [(name, document.get(name), most) for name, most in _MOST.items()]
-    lists += (
-        [(f"axes.{name:.40}", values, _MOST_VALUES) for name, values in axes.items()]
-        if isinstance(axes, dict)
-        else []
-    )
+    if isinstance(axes, dict):
+        lists += [(f"axes.{name:.40}", values, _MOST_VALUES) for name, values in axes.items()]
     for name, entries, most in [*lists, ("axes", axes, _MOST["agents"])]:
         if isinstance(entries, list | dict) and len(entries) > most:
             raise ConfigError(
@@ -182,11 +179,8 @@ def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
     with files.refusing(ConfigError, f"{path}: cannot be read", refused=""), suppress(FileNotFoundError):
         for i, line in enumerate(files.read_lines(path, files.MAX_JSON_BYTES, run), start=1):
             if damaged or i > _MAX_LINES:
-                why = (
-                    "is no JSON object; take that line out to go on without it"
-                    if damaged
-                    else f"is one of more than {_MAX_LINES:,}"
-                )
+                why = "is no JSON object; take that line out to go on without it"
+                why = why if damaged else f"is one of more than {_MAX_LINES:,}"
                 raise ConfigError(f"{path}, line {damaged or i}: {why}")
             row = _object(line)
             if row is None:
@@ -197,15 +191,9 @@ def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
 
 
 def _object(line: bytes) -> dict[str, Any] | None:
-    try:
-        row = parsed_json(line, "a line")
-    except FileError:
-        return None
-    if not isinstance(row, dict):
-        return None
-    return {
-        key: value for key, value in row.items() if not isinstance(value, list | dict)
-    }  # a record of figures
+    """A record of figures."""
+    row = json_object(line)
+    return row and {key: value for key, value in row.items() if not isinstance(value, list | dict)}
 
 
 def read_config(run: Path) -> str | None:

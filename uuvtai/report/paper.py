@@ -115,11 +115,16 @@ def _interval(m: dict[str, Any], key: str) -> str:
     )
 
 
-_AGENTS = (
-    Column("agent", left=True, of=lambda m: m["name"]),
+_RATES = (
     Column("n", of=lambda m: str(m["episodes"])),
     Column("success % [95 %]", of=lambda m: _interval(m, "success")),
     Column("collision % [95 %]", of=lambda m: _interval(m, "collision")),
+)
+"""of an agent or a cell"""
+
+_AGENTS = (
+    Column("agent", left=True, of=lambda m: m["name"]),
+    *_RATES,
     Column("timeout", of=lambda m: str(m["outcomes"]["timeout"])),
     Column(
         "time to goal s [95 %]",
@@ -267,14 +272,7 @@ def _cells(cells: list[dict[str, Any]], document: dict[str, Any]) -> Table:
         where = [Column("changed", left=True, of=lambda cell: change_name(cell, document))]
     else:
         where = [axis_column(name) for name in varying(document["axes"])]
-    columns = [
-        *where,
-        Column("agent", left=True, of=agent_of),
-        Column("n", of=lambda cell: str(cell["episodes"])),
-        Column("success % [95 %]", of=lambda cell: _interval(cell, "success")),
-        Column("collision % [95 %]", of=lambda cell: _interval(cell, "collision")),
-    ]
-    return Table(columns, cells)
+    return Table([*where, Column("agent", left=True, of=agent_of), *_RATES], cells)
 
 
 # ---- LaTeX of tables and floats. Whatever a user can name is text in it, never a command.

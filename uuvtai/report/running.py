@@ -16,7 +16,7 @@ import numpy as np
 from uuvtai.common.colours import PALETTE, agent_colours
 from uuvtai.common.enums import TRIGGERS, clearance_m, occupancy
 from uuvtai.common.obstacle_motion import describe_scenario
-from uuvtai.logs.drawing import OUTCOME_NAMES
+from uuvtai.logs.drawing import OUTCOME_NAMES, towards
 from uuvtai.logs.encode import EpisodeEnd, dumped, numbered
 from uuvtai.logs.scenario import scenario_document
 from uuvtai.logs.topics.perception import map_origin
@@ -84,7 +84,6 @@ class RunningEpisodes:
         return [self, *others]
 
     def begin(self, sim: Recordable, row: int, job: RecordedJob) -> None:
-        """An episode was just reset in this row."""
         described = describe_scenario(lambda name: _read(sim, name, [row])[0])
         scene, moving = scene_header(
             scenario_document(sim.config, described, self._world, job.seed, job.episode)
@@ -105,7 +104,6 @@ class RunningEpisodes:
         self._wait(at_start=True)
 
     def step(self, sim: Recordable) -> None:
-        """A control step has been done in all rows."""
         self._steps += 1
         running = [tank for tank in self._tanks.values() if tank.sim is sim and tank.end is None]
         self._note_replans(running)
@@ -214,8 +212,7 @@ def _detail(tank: _Tank, with_map: bool) -> str:
     n_way, sonar = int(read("route.n_way")), sim.config.sensors.sonar
     hit = np.flatnonzero(read("scan.hit") == 1)
     bearing = float(read("scan.ping_yaw")) + sonar.first_beam_rad + sonar.beam_step_rad * hit
-    towards = np.column_stack([np.cos(bearing), np.sin(bearing)])
-    echoes = read("scan.ping_pos_w")[:2] + read("scan.range_m")[hit, None] * towards
+    echoes = read("scan.ping_pos_w")[:2] + read("scan.range_m")[hit, None] * towards(bearing)
     moving = (read("tracks.alive") == 1) & (read("tracks.moving") == 1)
     state, radius_m, cov = (read(f"tracks.{name}")[moving] for name in ("state", "radius_m", "cov"))
     message = {

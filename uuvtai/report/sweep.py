@@ -232,10 +232,5 @@ def _numbers(cell: MapCell, axes: list[str]) -> list[Any]:
     bounds = [
         bound for key in ("success", "collision") for bound in (cell.get(f"{key}_ci95") or (None, None))
     ]
-    head = [cell.get("agent"), *(cell.get(name) for name in axes), cell["episodes"]]
-    return [
-        *head,
-        *(outcomes.get(name) for name in FINAL_OUTCOMES),
-        *bounds,
-        *(cell.get(name) for name in _NUMBERS),
-    ]
+    head = [cell.get("agent"), *map(cell.get, axes), cell["episodes"]]
+    return [*head, *map(outcomes.get, FINAL_OUTCOMES), *bounds, *map(cell.get, _NUMBERS)]

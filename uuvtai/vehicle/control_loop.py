@@ -19,25 +19,10 @@ from uuvtai.common.signals import StopEvent
 from uuvtai.config import Config
 from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
-from uuvtai.vehicle import calibrate, safety
+from uuvtai.vehicle import calibrate, mavlink, safety
 from uuvtai.vehicle.handover import Handover
 from uuvtai.vehicle.instruments.rig import Rig
-from uuvtai.vehicle.mavlink import (
-    ALT_HOLD,
-    HARMLESS,
-    MODE_NAMES,
-    Address,
-    Endpoint,
-    FollowedEndpoint,
-    LinkError,
-    LinkPlace,
-    MavCodec,
-    MavMessage,
-    Order,
-    ask_for,
-    heartbeat,
-    place_of,
-)
+from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage, three
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
 from uuvtai.vehicle.pilot_log import LinkLog
@@ -57,7 +42,7 @@ _DRY = {"fly": "dry run", "check": "check", "calibrate": "calibration"}
 class FlightPlan:
     """What ``uuv pilot`` was told."""
 
-    place: LinkPlace
+    place: mavlink.LinkPlace
     mission: Mission
     limits: safety.SafetyLimits
     log: Path
@@ -79,7 +64,7 @@ class FlightPlan:
     def typed(
         cls,
         config: Config,
-        mavlink: str,
+        link: str,
         start: Sequence[float] | None,
         goal: Sequence[float] | None,
         box: Sequence[float] | None,
@@ -121,7 +106,7 @@ class FlightPlan:
         mission = Mission(three(start or ()), three(goal or ()))
         _refuse_places(mission, limits)
         return cls(
-            place_of(mavlink),
+            mavlink.place_of(link),
             mission,
             limits,
             log or Path("runs") / f"pilot_{time.strftime('%Y%m%d-%H%M%S')}.mcap",
@@ -204,7 +189,7 @@ class OnboardLoop:
         config: Config,
         pilot: OnboardPilot,
         plan: FlightPlan,
-        endpoint: Endpoint,
+        endpoint: mavlink.Endpoint,
         log: LinkLog,
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
@@ -218,13 +203,13 @@ class OnboardLoop:
         self._now, self._sleep, self._note_to = now, sleep, note
         self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}", plan.operator)
         self._rate = plan.rate or 1.0
-        self._codec = MavCodec(plan.system, COMPANION, plan.operator)
+        self._codec = mavlink.MavCodec(plan.system, COMPANION, plan.operator)
+        self._rig, self._rate_b = rig or Rig(config, {}), np.zeros(3)
+        """instruments; [rad/s] of the newest gyro"""
         self._intake = Intake(
             config, plan.mission.start, plan.heading_rad, plan.system, plan.operator, plan.senders,
-            rig.replaced if rig else (),
+            self._rig.replaced,
         )  # fmt: skip
-        self._rig, self._rate_b = rig, np.zeros(3)
-        """instruments; [rad/s] of the newest gyro"""
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
         self._memory, self.tally = safety.SafetyMemory(), FlightTally()
         self._needed = [name for name in NAMES.values() if name not in ("depth", "thruster")]
@@ -234,8 +219,8 @@ class OnboardLoop:
         """when what the pilot uses was measured; a scan counts when it is placed in the map"""
         self._scan_s, self._scans = -math.inf, 0
         """newest scan heard; scans that were placed"""
-        self._vehicle: Address | None = endpoint.calls
-        self._speaker: Address | None = None
+        self._vehicle: mavlink.Address | None = endpoint.calls
+        self._speaker: mavlink.Address | None = None
         """where the autopilot's heartbeats come from"""
         self._asked_s = self._beat_s = -math.inf
         self._clock_jumps = self._jumps_before = endpoint.clock_jumps
@@ -368,15 +353,14 @@ class OnboardLoop:
         if self._endpoint.clock_jumps != self._clock_jumps:
             self._clock_jumps = self._endpoint.clock_jumps
             self._intake.forget_clocks()
-            if self._rig is not None:
-                self._rig.forget_clocks()
+            self._rig.forget_clocks()
         for sender, datagram in datagrams:
             for message in self._codec.decode(datagram):
                 if self._is_leaving:
                     self._tried(self._take, sender, message, come_s)
                 else:
                     self._take(sender, message, come_s)
-        if self._rig is not None and not self._is_leaving:
+        if not self._is_leaving:
             for instrument, reading in self._rig.poll(come_s, self._rate_b):
                 self._log.read(come_s, reading)
                 try:
@@ -388,7 +372,7 @@ class OnboardLoop:
                         self._intake.note_velocity(reading)
         self._handover.watch(self._intake.heard, now_s)
 
-    def _take(self, sender: Address, message: MavMessage, come_s: float) -> None:
+    def _take(self, sender: mavlink.Address, message: mavlink.MavMessage, come_s: float) -> None:
         self.tally.heard[message.name] += 1
         refused = self._intake.heard.refused.total()
         if not self._is_another(sender, message, come_s):
@@ -400,7 +384,7 @@ class OnboardLoop:
             self._check.saw(message, come_s, self._intake.heard, was_used)
         self._log.saw(come_s, message)
 
-    def _is_another(self, sender: Address, message: MavMessage, come_s: float) -> bool:
+    def _is_another(self, sender: mavlink.Address, message: mavlink.MavMessage, come_s: float) -> bool:
         """Whether somebody else than the vehicle speaks as its autopilot: what comes from another address
         than its heartbeats, while those come, is not used."""
         if (message.system, message.component) != (self._plan.system, AUTOPILOT):
@@ -501,9 +485,9 @@ class OnboardLoop:
         else:
             self._unanswered_s += self._config.episode.control_dt_s
 
-    def _say(self, now_s: float, order: Order) -> None:
+    def _say(self, now_s: float, order: mavlink.Order) -> None:
         was_sent = False
-        if (self._plan.arms or order.kind in HARMLESS) and self._vehicle is not None:
+        if (self._plan.arms or order.kind in mavlink.HARMLESS) and self._vehicle is not None:
             was_sent = self._endpoint.send(self._codec.encode(order), self._vehicle)
             self._codec.sent(order)
         self.tally.said[order.kind] += 1
@@ -515,17 +499,17 @@ class OnboardLoop:
         if self._vehicle is None or now_s - self._beat_s < 1.0:
             return
         self._beat_s = now_s
-        self._say(now_s, heartbeat())
+        self._say(now_s, mavlink.heartbeat())
         for order in () if self._check is None else self._check.asks():
             self._say(now_s, order)
         if now_s - self._asked_s >= 5.0 and self._intake.heard.vehicle_s > -math.inf:
             self._asked_s = now_s
             if (
                 now_s - min(self._measured_s["imu"], self._measured_s["pressure"]) > 1.0
-                or not self.tally.said[HARMLESS[1]]
+                or not self.tally.said[mavlink.HARMLESS[1]]
             ):
                 for number, rate in _WANTED_HZ.items():
-                    self._say(now_s, ask_for(number, rate, self._plan.system))
+                    self._say(now_s, mavlink.ask_for(number, rate, self._plan.system))
 
     def _note(
         self, now_s: float, command: PilotCommand, decision: safety.SafeDecision, speed: float | None
@@ -563,16 +547,13 @@ class OnboardLoop:
             return _CALIBRATED if self._calibration.found else self._calibration.refusal
         return "time is up" if now_s >= self._plan.seconds else ""
 
-    def _instruments(self) -> dict[str, dict[str, Any]]:
-        return self._rig.document() if self._rig else {}
-
     def _checked(self) -> dict[str, Any] | None:
         """What a check found (``Preflight.document``); None: it was a flight."""
         if self._check is None:
             return None
         start, jumps = (self._sought, self._start), self._clock_jumps - self._jumps_before
         heard, spent_s = self._intake.heard, self._heard_s
-        return self._check.document(spent_s, heard, self._needed, self._instruments(), start, jumps)
+        return self._check.document(spent_s, heard, self._needed, self._rig.document(), start, jumps)
 
     def document(self) -> dict[str, Any]:
         tally, heard = self.tally, self._intake.heard
@@ -591,16 +572,16 @@ class OnboardLoop:
             and not self._start.refusal
             and (not self._handover.engaged or bool(reasons and reasons[0] in _FAREWELLS)),
             "interrupted": _INTERRUPTED in reasons,
-            "mode": MODE_NAMES.get(heard.mode, "none"),
-            "driven_in": MODE_NAMES[self._handover.mode] if self._handover.engaged else "",
-            "fallback": self._handover.mode == ALT_HOLD,
+            "mode": mavlink.MODE_NAMES.get(heard.mode, "none"),
+            "driven_in": mavlink.MODE_NAMES[self._handover.mode] if self._handover.engaged else "",
+            "fallback": self._handover.mode == mavlink.ALT_HOLD,
             "actions": {action.name: tally.actions[action.name] for action in safety.SafeAction},
             "reasons": dict(tally.reasons),
             "heard": dict(tally.heard),
             "broken": self._codec.broken,
             "refused": dict(heard.refused),
             "said": {kind: {"said": said, "sent": tally.sent[kind]} for kind, said in tally.said.items()},
-            "instruments": self._instruments(),
+            "instruments": self._rig.document(),
             "check": check,
             "calibration": calibrated,
             "ready": (check or calibrated or {"ready": True})["ready"],
@@ -612,9 +593,9 @@ def fly(
     config: Config, tree: FlatTree, plan: FlightPlan, note: Callable[[str], None]
 ) -> tuple[dict[str, Any], BaseException | None]:
     """The document of a flight, and the error of this program that ended it. Raises LinkError, LogError."""
-    MavCodec(plan.system, COMPANION)  # refused before a minute of compiling
-    followed = FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
-    with followed or Endpoint(plan.place) as endpoint, Rig(config, plan.instruments) as rig:
+    mavlink.MavCodec(plan.system, COMPANION)  # refused before a minute of compiling
+    followed = mavlink.FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
+    with followed or mavlink.Endpoint(plan.place) as endpoint, Rig(config, plan.instruments) as rig:
         pilot = warmed(config, tree, plan.mission)
         about = {"dry_run": str(not plan.arms), "limits": str(plan.limits), "mission": str(plan.mission)}
         with StopEvent(is_last=False) as stop:

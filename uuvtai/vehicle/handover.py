@@ -98,12 +98,10 @@ class Handover:
 
     def last_words(self) -> list[mavlink.Order]:
         """Stop and hand back, for the case that nothing else works any more."""
+        if not self.has_asked or self.lost:
+            return []
         stop = mavlink.set_velocity(STOP, 0.0, self._system, self._limits)
-        return (
-            [stop, mavlink.set_mode(mavlink.ALT_HOLD, self._system)]
-            if self.has_asked and not self.lost
-            else []
-        )
+        return [stop, mavlink.set_mode(mavlink.ALT_HOLD, self._system)]
 
     def _take(self, now_s: float, heard: Heard) -> list[mavlink.Order]:
         if not self.has_asked:

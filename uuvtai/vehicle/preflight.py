@@ -239,12 +239,13 @@ class Preflight:
     ) -> dict[str, Any]:
         """``ready`` and ``rows`` (``CheckRow``). ``needed``: readings that the pilot needs. ``start``: who
         seeks it, and what was found."""
-        lost = Counter({why: count for why, count in heard.refused.items() if why.startswith(_LOST)})
-        for one in instruments.values():
-            lost.update({why: count for why, count in one["refused"].items() if why.startswith(_LOST)})
+        lost: Counter[str] = Counter()
+        for refused in (heard.refused, *(one["refused"] for one in instruments.values())):
+            lost.update({why: count for why, count in refused.items() if why.startswith(_LOST)})
+        foms = [one["fom_m_s"] for one in instruments.values() if one.get("fom_m_s") is not None]
         shown = {*needed, "autopilot", "operator", "battery"}
         rows = [
-            *(self._heard_row(name, now_s, heard, lost, instruments) for name in _LEAST_HZ if name in shown),
+            *(self._heard_row(name, now_s, heard, lost, foms) for name in _LEAST_HZ if name in shown),
             *self._imu_rows(),
             *self._start_rows(*start),
             *self._parameter_rows(heard),
@@ -255,12 +256,7 @@ class Preflight:
         return {"ready": ready, "rows": [asdict(row) for row in rows]}
 
     def _heard_row(
-        self,
-        name: str,
-        now_s: float,
-        heard: Heard,
-        lost: Counter[str],
-        instruments: Mapping[str, Mapping[str, Any]],
+        self, name: str, now_s: float, heard: Heard, lost: Counter[str], foms: list[float]
     ) -> CheckRow:
         come = self._come[name]
         if not come:
@@ -274,7 +270,7 @@ class Preflight:
         most_s = {"autopilot": limits.vehicle_s, "operator": limits.operator_s, "battery": limits.battery_s}
         oldest_s = (most_s | dict(limits.sensor_s))[name]
         state, told = {
-            "dvl": lambda: self._dvl(lost, instruments), "sonar": lambda: self._sonar(instruments),
+            "dvl": lambda: self._dvl(lost, foms), "sonar": self._sonar,
             "pressure": self._depth, "battery": lambda: self._battery(heard),
         }.get(name, lambda: (OK, ""))()  # fmt: skip
         if gap_s > oldest_s or now_s - come[-1] > oldest_s:
@@ -291,9 +287,8 @@ class Preflight:
         sender = self._sources[name].most_common(1)[0][0]
         return CheckRow(name, state, told.rstrip("; "), rate_hz, gap_s, now_s - come[-1], sender)
 
-    def _dvl(self, lost: Counter[str], instruments: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
-        said = (one["fom_m_s"] for one in instruments.values() if one.get("fom_m_s") is not None)
-        fom = "".join(f", figure of merit {value:.3f} m/s" for value in said)
+    def _dvl(self, lost: Counter[str], foms: list[float]) -> tuple[str, str]:
+        fom = "".join(f", figure of merit {value:.3f} m/s" for value in foms)
         share, speed = len(self._speeds) / (len(self._speeds) + lost.total()), float(np.mean(self._speeds))
         told = f"valid {100 * share:.0f} %, {speed:.2f} m/s{fom}; its yaw does not show at rest"
         if share < _VALID[1]:
@@ -302,7 +297,7 @@ class Preflight:
             return NOTE, f"no DVL is heard: this is the autopilot's own estimate; {told}"
         return (NOTE if share < _VALID[0] or speed > _REST_M_S else OK), told
 
-    def _sonar(self, instruments: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
+    def _sonar(self) -> tuple[str, str]:
         sonar, beams = self._config.sensors.sonar, max(self._beams, 1)
         echoes, near = self._echoes / beams, self._near / beams
         told = f"{100 * echoes:.0f} % of {self._beams} beams return"

@@ -157,13 +157,10 @@ class _FeedReader:
         if self._feed.is_imported:
             wanted = {"/sensors/imu"}  # without it nothing can be placed
         if missing := sorted(wanted - self._seen):
+            other = "import a recording that tells it too: uuv log import"
             raise LogError(
                 f"{path}: the log has no {', '.join(missing)}, without which nothing decides the same; "
-                + (
-                    "import a recording that tells it too: uuv log import"
-                    if self._feed.is_imported
-                    else _AGAIN
-                )
+                f"{other if self._feed.is_imported else _AGAIN}"
             )
 
     def _arrives(self, m: LogMessage, message: onboard.SensorMessage) -> None:

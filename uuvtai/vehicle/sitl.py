@@ -278,55 +278,45 @@ def _rotation(quat: tuple[float, float, float, float]) -> np.ndarray:
 SILENT_S = 10.0  # by the clock, without a packet
 
 
-@dataclass
-class _Seen:
-    packets: int = 0
-    bad: int = 0
-    resets: int = 0
-    heard_s: float = 0.0
-    silence_told: bool = False
-    held: bool = True
-    outcome: str = ""
-
-
 class ServingNotes:
     """Of one instance. ``look`` is called often."""
 
     def __init__(self, number: int, port: int, now_s: float) -> None:
         self._name, self._port = f"instance {number}", port
-        self._seen = _Seen(heard_s=now_s)
+        self._seen: Counter[str] = Counter()
+        """packets by turn, as they were told last"""
+        self._heard_s, self._silence_told = now_s, False
+        self._held, self._outcome = True, ""
 
     def look(self, instance: Instance, now_s: float) -> list[str]:
-        seen, counts = self._seen, instance.counts
         found = [*self._packets(instance, now_s), *self._episode(instance)]
-        if counts["bad"] > 0 and seen.bad == 0:
+        if instance.counts["bad"] > 0 and self._seen["bad"] == 0:
             found.append(
                 f"{self._name}: what comes to port {self._port} is no packet of ArduSub's, or a second "
                 "ArduSub's: does it run with --model JSON, and -I counting from 0?"
             )
-        seen.bad = counts["bad"]
+        self._seen = instance.counts.copy()
         return found
 
     def _packets(self, instance: Instance, now_s: float) -> list[str]:
-        seen, counts = self._seen, instance.counts
-        packets = sum(counts[name] for name in ("step", "reset", "again", "ignore"))
-        if packets > seen.packets:
-            was_silent = seen.silence_told or seen.packets == 0
-            first = seen.packets == 0
-            seen.packets, seen.heard_s, seen.silence_told = packets, now_s, False
-            found = [f"{self._name}: ArduSub speaks"] if was_silent else []
-            if counts["reset"] > max(1, seen.resets):
+        counts = instance.counts
+        packets, before = (
+            sum(each[name] for name in ("step", "reset", "again", "ignore")) for each in (counts, self._seen)
+        )
+        if packets > before:
+            found = [f"{self._name}: ArduSub speaks"] if self._silence_told or not before else []
+            self._heard_s, self._silence_told = now_s, False
+            if counts["reset"] > max(1, self._seen["reset"]):
                 found.append(f"{self._name}: ArduSub has begun anew, so has the episode")
-            if first and instance.joined_late:
+            if not before and instance.joined_late:
                 found.append(
                     f"{self._name}: ArduSub is under way already, and takes itself for where it was: nobody "
                     "operates it; restart it, and the pilot"
                 )
-            seen.resets = counts["reset"]
             return found
-        if now_s - seen.heard_s < SILENT_S or seen.silence_told:
+        if now_s - self._heard_s < SILENT_S or self._silence_told:
             return []
-        seen.silence_told = True
+        self._silence_told = True
         if packets == 0:
             return [
                 f"{self._name}: nothing of ArduSub's has come to UDP port {self._port} yet: start it with "
@@ -335,12 +325,12 @@ class ServingNotes:
         return [f"{self._name}: ArduSub has been silent for {SILENT_S:g} s; the physics waits"]
 
     def _episode(self, instance: Instance) -> list[str]:
-        seen, found = self._seen, []
-        if seen.held and not instance.is_held:
+        found = []
+        if self._held and not instance.is_held:
             found.append(f"{self._name}: a thruster turns, the episode begins")
-        if instance.outcome and not seen.outcome:
+        if instance.outcome and not self._outcome:
             found.append(f"{self._name}: {instance.outcome} after {instance.driven_s:.1f} s")
-        seen.held, seen.outcome = instance.is_held, instance.outcome
+        self._held, self._outcome = instance.is_held, instance.outcome
         return found
 
 
@@ -372,28 +362,19 @@ class SitlPlan:
 
     @classmethod
     def typed(
-        cls,
-        host: str,
-        port: int,
-        instances: int,
-        mavlink: Sequence[str] | None,
-        rate: float,
-        seconds: float | None,
-        once: bool,
-        seed: int,
-        episode: int,
-        emulated: str | None = None,
-        operator: bool = False,
+        cls, mavlink: Sequence[str] | None, seconds: float | None, emulated: str | None = None, **rest: Any
     ) -> SitlPlan:
-        """Of what was typed. Raises LinkError."""
+        """Of what was typed; ``rest``: as it is. Raises LinkError."""
         kinds = tuple(emulated.split(",")) if emulated else ()
         if not set(kinds) <= set(KINDS):
             raise LinkError(f"--as {emulated}: give {' or '.join(KINDS)}, or several: --as a50,ping360")
-        places = tuple(place_of(text) for text in mavlink or PLACES)
+        until_s = math.inf if seconds is None else seconds
+        plan = cls(places=tuple(map(place_of, mavlink or PLACES)), seconds=until_s, emulated=kinds, **rest)
+        port, instances = plan.port, plan.instances
         last = NEXT_PORT * (instances - 1)
         if not 1 <= instances <= _MOST_INSTANCES:
             raise LinkError(f"--instances {instances}: give 1 to {_MOST_INSTANCES}")
-        if (highest := max(port, *(place.port for place in places)) + last) > 65535:
+        if (highest := max(port, *(place.port for place in plan.places)) + last) > 65535:
             raise LinkError(
                 f"--port {port}: with --instances {instances} the ports go up to {highest}, beyond 65535"
             )
@@ -404,8 +385,7 @@ class SitlPlan:
             )
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
-        until_s = math.inf if seconds is None else seconds
-        return cls(host, port, instances, places, rate, until_s, once, seed, episode, operator, kinds)
+        return plan
 
 
 @dataclass

@@ -391,7 +391,6 @@ class _KeptRoutes:
     count = 0
 
     def serve(self, stages: Stages, _seed_of: Any, _read: Any, count: Callable[[Any], int], *_: Any) -> int:
-        """As ``RouteFallback.serve``."""
         if failed := count(stages.route.route.n_failed):
             keep_route(stages.route, 0)
             self.count += 1
@@ -423,11 +422,7 @@ def _write(folder: Path, tape: Tape, pilot: OnboardPilot, code: dict[str, bytes]
         "numbers": dataclasses.asdict(pilot.numbers),
         "mission": dataclasses.asdict(pilot.mission),
         "kernels": [kernel.name for kernel in tape.kernels],
-        "tensors": tape.tensors,
-        "begin": tape.begin,
-        "step": tape.step,
-        "keep": tape.keep,
-        "arrays": tape.arrays,
+        **{name: getattr(tape, name) for name in ("tensors", "begin", "step", "keep", "arrays")},
         "config": pilot.config.model_dump(mode="json"),
     }
     (folder / SPEC).write_text(json.dumps(spec), encoding="utf-8")

@@ -347,11 +347,8 @@ def _judged(
 def _worse(axis: int, horizons: dict[str, Any], free: np.ndarray) -> list[tuple[str, list[int]]]:
     """[] where the fit is better on an axis than the vehicle given, or nothing of it is fitted; else how much
     worse it is, and the places of the axis."""
-    places = [
-        place
-        for place in (axis, axis + 4, axis + 8, model.NET)
-        if free[place] and (place != model.NET or axis == 2)
-    ]
+    own = (axis, axis + 4, axis + 8, *([model.NET] if axis == 2 else []))
+    places = [place for place in own if free[place]]
     pairs = [
         (steps, ours[axis], horizons["given"][steps][axis])
         for steps, ours in horizons["identified"].items()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.common.clocks import SourceClock
-from uuvtai.common.files import FileError, parsed_json
+from uuvtai.common.files import json_object
 from uuvtai.vehicle.instruments.channel import Channel, Instrument
 from uuvtai.vehicle.messages import DvlReading, SensorMessage
 
@@ -32,7 +32,6 @@ class A50(Instrument):
         self._rest, self._opened = b"", 0
 
     def poll(self, now_s: float) -> list[SensorMessage]:
-        """As in ``Instrument``."""
         pieces = self.channel.read(now_s)
         if self.channel.opened != self._opened:
             self._opened, self._rest, self.clock = self.channel.opened, b"", SourceClock()
@@ -44,11 +43,8 @@ class A50(Instrument):
         return [reading for reading in found if reading is not None]
 
     def _reading(self, line: bytes, now_s: float) -> DvlReading | None:
-        try:
-            said = parsed_json(line, "a line") if len(line) <= LONGEST else None
-        except FileError:
-            said = None
-        if not isinstance(said, dict):
+        said = json_object(line) if len(line) <= LONGEST else None
+        if said is None:
             return self.refuse("no line of JSON")
         if said.get("type", "velocity") != "velocity":
             return self.refuse(f"{str(said['type'])[:32]}: not used")

@@ -82,7 +82,6 @@ class TcpChannel(Channel):
         self._is_open, self._called_s, self._heard_s = False, -math.inf, -math.inf
 
     def read(self, now_s: float) -> list[bytes]:
-        """As in ``Channel``."""
         if self._socket is not None and now_s - max(self._called_s, self._heard_s) > SILENT_S:
             self.close()
         if self._socket is None:
@@ -108,7 +107,6 @@ class TcpChannel(Channel):
         return found
 
     def close(self) -> None:
-        """As in ``Channel``."""
         if self._socket is not None:
             self._socket.close()
         self._socket, self._is_open = None, False
@@ -148,7 +146,6 @@ class UdpChannel(Channel):
         self.port: int = self._socket.getsockname()[1]
 
     def read(self, now_s: float) -> list[bytes]:
-        """As in ``Channel``."""
         found, size = [], 0
         while size < MOST_BYTES:
             try:
@@ -168,14 +165,12 @@ class UdpChannel(Channel):
         return found
 
     def write(self, data: bytes) -> bool:
-        """As in ``Channel``."""
         try:
             return self._to is not None and self._socket.sendto(data, self._to) == len(data)
         except OSError:
             return False
 
     def close(self) -> None:
-        """As in ``Channel``."""
         self._socket.close()
 
 
@@ -196,7 +191,6 @@ class SerialChannel(Channel):
         self._called_s = -math.inf
 
     def read(self, now_s: float) -> list[bytes]:
-        """As in ``Channel``."""
         try:
             if self._port is None:
                 if now_s - self._called_s < AGAIN_S:
@@ -210,7 +204,6 @@ class SerialChannel(Channel):
         return [data] if data else []
 
     def write(self, data: bytes) -> bool:
-        """As in ``Channel``."""
         try:
             return self._port is not None and self._port.write(data) == len(data)
         except OSError:
@@ -218,7 +211,6 @@ class SerialChannel(Channel):
             return False
 
     def close(self) -> None:
-        """As in ``Channel``."""
         if self._port is not None:
             self._port.close()
         self._port = None

@@ -74,7 +74,6 @@ class FakeA50:
                 self._clients.remove(client)
 
     def close(self) -> None:
-        """Give the port back."""
         for one in (self._server, *self._clients):
             one.close()
 
@@ -159,7 +158,6 @@ class FakePing360:
         return np.clip(level, 0, 255).astype(np.uint8).tobytes()
 
     def close(self) -> None:
-        """Give the port back."""
         self._socket.close()
 
 
@@ -194,7 +192,6 @@ class FakeSonar3D:
             self._socket.sendto(rip2.packet_of(rip2.RangeImage(now_s, met, view, self.RANGE_M)), self._to)
 
     def close(self) -> None:
-        """Give the socket back."""
         self._socket.close()
 
 
@@ -273,7 +270,6 @@ class FakeRig:
             self._image.tell(time_s, value("image.depth_m"))
 
     def close(self) -> None:
-        """Give the ports back."""
         for one in (self._dvl, self._head, self._image):
             if one is not None:
                 one.close()

@@ -129,7 +129,6 @@ class Ping360(Instrument):
         self._samples = min(MOST_SAMPLES, math.ceil(seconds / (self._period * TICK_S)))
 
     def poll(self, now_s: float) -> list[SensorMessage]:
-        """As in ``Instrument``."""
         pieces, found = self.channel.read(now_s), []
         if self.channel.opened != self._opened:
             self._opened = self.channel.opened
@@ -199,13 +198,8 @@ class Ping360(Instrument):
             return self.refuse("a profile neither with an echo nor quiet")
         hit = float(range_m <= self._sonar.max_range_m)
         listened_s = TICK_S * period * len(profile)
-        return SonarPing(
-            now_s - listened_s,
-            np.array([min(range_m, self._sonar.max_range_m)]),
-            np.array([hit]),
-            np.zeros(0),
-            beam,
-        )
+        nearest = np.array([min(range_m, self._sonar.max_range_m)])
+        return SonarPing(now_s - listened_s, nearest, np.array([hit]), np.zeros(0), beam)
 
     def _beam_at(self, gradian: int) -> int | None:
         """The beam that looks there; None for an angle between two, or beside all."""

@@ -117,7 +117,6 @@ class JsonUdp(Instrument):
     """
 
     def poll(self, now_s: float) -> list[SensorMessage]:
-        """As in ``Instrument``."""
         found = []
         for data in self.channel.read(now_s):
             message = self._message(data, now_s)

@@ -158,7 +158,6 @@ class Sonar3D(Instrument):
         self._of: tuple[Any, ...] = ()
 
     def poll(self, now_s: float) -> list[SensorMessage]:
-        """As in ``Instrument``."""
         found: list[SensorMessage] = []
         for packet in self.channel.read(now_s):
             image = image_of(packet)

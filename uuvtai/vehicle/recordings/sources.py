@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.common.errors import ODD, UserError
-from uuvtai.common.files import FileError, open_file, parsed_json, read_lines
+from uuvtai.common.files import json_object, open_file, read_lines
 from uuvtai.config import Config
 from uuvtai.logs.reader import read_messages
 from uuvtai.vehicle.identify.ardusub_log import by_motor, messages
@@ -291,7 +291,6 @@ class _Piece(Channel):
     opened, data = 1, b""
 
     def read(self, now_s: float) -> list[bytes]:
-        """As in ``Channel``."""
         piece, self.data = self.data, b""
         return [piece]
 
@@ -345,11 +344,8 @@ def read_a50(source: Source, config: Config) -> None:
             source.drop("a line", "no JSON object" if at < 0 else "the same line again")
             continue
         last = line
-        try:
-            said = parsed_json(line[at:], "a line")
-        except FileError:
-            said = None
-        if not isinstance(said, dict):
+        said = json_object(line[at:])
+        if said is None:
             source.drop("a line", "no JSON object")
             continue
         found = _TIME.match(line[:at])
