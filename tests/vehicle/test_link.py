@@ -763,6 +763,9 @@ def test_a_flood_is_bounded_in_every_step(flight):
     assert len(one.endpoint.receive()) <= 64
     one.sub.socket.sendto(b"x" * 5000, one.sub.to)
     assert all(len(data) <= LONGEST for _, data in one.endpoint.receive())
+    one.run(1, lambda step: [one.sub.speak() for _ in range(10)])
+    one.log.close()
+    assert "messages: 10 a step are kept" in one.loop.document()["log_trouble"]
 
 
 def test_a_stranger_does_not_get_the_orders(flight):

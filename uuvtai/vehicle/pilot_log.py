@@ -53,7 +53,7 @@ class LinkLog:
     def __init__(self, path: Path, about: dict[str, str]) -> None:
         """Raises LogError."""
         self.path, self.trouble = path, ""
-        self._left, self.unwritten, self._closed = 0, 0, False
+        self._left, self._unwritten, self._closed = 0, 0, False
         with refusing(LogError, f"{path}: cannot write there", "try --log FILE"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = McapFile(path)
@@ -70,7 +70,7 @@ class LinkLog:
 
     def saw(self, time_s: float, heard: MavMessage) -> None:
         if self._left <= 0:
-            self.unwritten += 1
+            self._unwritten += 1
             return
         self._left -= 1
         whose = {"name": heard.name, "system": heard.system, "component": heard.component}
@@ -126,6 +126,8 @@ class LinkLog:
                 self._file.finish()
             except OSError as error:
                 self._give_up(error)
+            if self._unwritten and not self.trouble:
+                self.trouble = f"{self.path}: lacks {self._unwritten} messages: {MOST_SEEN} a step are kept"
 
     def _give_up(self, error: OSError) -> None:
         self.trouble = f"{self.path}: the log ends early ({error.strerror or error})"

@@ -19,7 +19,7 @@ from uuvtai.vehicle.instruments.channel import Channel, Instrument
 from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import DepthShot, SensorMessage, SonarPing
 
-GROUP, PORT = "224.0.0.96", 4747
+PORT = 4747
 LONGEST = 65507  # [bytes] of a datagram
 _MOST_CONTENT = 1 << 20  # [bytes] of what unfolds from one
 _MOST_PIXELS = 1 << 16
