@@ -10,24 +10,12 @@ import torch
 from torch import Tensor
 
 from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
-from uuvtai.common.files import parsed_json, read_bytes
-from uuvtai.common.presets import POLICY, PRESET_DIR
+from uuvtai.common.presets import POLICY
 from uuvtai.config.behavior import FAST, SLOW, TUNED
 from uuvtai.config.learning import LearningConfig
-from uuvtai.config.loader import ConfigError, load_training
-from uuvtai.learning.checkpoint import (
-    LARGEST,
-    MANIFEST,
-    MODEL,
-    Checkpoint,
-    CheckpointError,
-    Note,
-    best,
-    entry_of,
-    open_checkpoint,
-    parsed,
-    refused,
-)
+from uuvtai.config.loader import ConfigError
+from uuvtai.learning import checkpoint as checkpoints
+from uuvtai.learning.checkpoint import MANIFEST, MODEL, Checkpoint, Note
 from uuvtai.learning.policy_agent import AgentDecision, HeldAgent, by_chunk, load_agent
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetActor, actor_of
 
@@ -61,8 +49,9 @@ class TunedAgent(HeldAgent):
 
 def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
     """Agent of a checkpoint that holds numbers of the tree. Raises CheckpointError for impossible ones."""
-    try:
-        found = checkpoint.model()["tree"]["log_factor"]
+    model = checkpoint.model()
+    with checkpoints.refused(checkpoint.path / MODEL, "holds no numbers of the tree"):
+        found = model["tree"]["log_factor"]
         known = len(found)
         if tuple(found.shape) != (known, 2) or not _FEWEST <= known <= len(TUNED):
             raise ValueError(f"log_factor is {tuple(found.shape)} instead of {(len(TUNED), 2)}")
@@ -71,10 +60,6 @@ def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
             for factor in factors:
                 if not number.least * 0.999 <= factor <= number.most * 1.001:
                     raise ValueError(f"{number.name} is multiplied by {factor:g}")
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path / MODEL}: holds no numbers of the tree ({error}); take another one"
-        ) from None
     return TunedAgent(found, sim)
 
 
@@ -152,26 +137,15 @@ def find_policy(name: str, note: Note = lambda _text: None) -> Checkpoint:
     newest). Raises ConfigError for what is none of them, CheckpointError for what cannot be used."""
     path = Path(name)
     if name == POLICY:
-        return _built_in()
+        return checkpoints.built_in()
     if (path / MANIFEST).exists():
-        return open_checkpoint(path)
+        return checkpoints.open_checkpoint(path)
     if (path / "checkpoints").is_dir():
-        return best(path, note)
+        return checkpoints.best(path, note)
     raise ConfigError(
         f"{name!r} is no trained policy: give {POLICY}, which is built in, the run folder of 'uuv train', or "
         "one of its checkpoints/step_N"
     )
-
-
-def _built_in() -> Checkpoint:
-    """The policy of the package: one file, the manifest inside, with today's config of its preset."""
-    path = PRESET_DIR / POLICY
-    with refused(path / MODEL):
-        content = read_bytes(path / MODEL, LARGEST[MODEL], path)
-        header = parsed_json(content[8 : 8 + int.from_bytes(content[:8], "little")], MODEL)
-        manifest = parsed(header["__metadata__"]["manifest"].encode())
-        manifest.files = {MODEL: entry_of(path / MODEL)}
-    return Checkpoint(path, manifest, load_training(POLICY), manifest.files[MODEL].sha256)
 
 
 def load_trained(checkpoint: Checkpoint, sim: Sim) -> HeldAgent:

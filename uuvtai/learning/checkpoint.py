@@ -30,7 +30,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor
 
-from uuvtai.common.errors import UserError
+from uuvtai.common.errors import ODD, UserError
 from uuvtai.common.files import (
     FileError,
     flush,
@@ -44,10 +44,11 @@ from uuvtai.common.files import (
     unfinished,
     whole_folder,
 )
+from uuvtai.common.presets import POLICY, PRESET_DIR
 from uuvtai.common.version import __version__
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
-from uuvtai.config.loader import renamed
+from uuvtai.config.loader import load_training, renamed
 
 
 class CheckpointError(UserError, RuntimeError):
@@ -238,7 +239,7 @@ def _verify(file: Path, entry: FileEntry | None) -> None:
 
 
 @contextlib.contextmanager
-def refused(file: Path) -> Iterator[None]:
+def refused(file: Path, what: str = "cannot be read") -> Iterator[None]:
     """Turn everything that bad content can raise into a CheckpointError that names the file."""
     try:
         yield
@@ -254,8 +255,8 @@ def refused(file: Path) -> Iterator[None]:
         ) from None
     except FileError as error:
         raise CheckpointError(f"{file}: {str(error).removeprefix(f'{file}: ')}") from None
-    except (ValueError, RecursionError, OSError) as error:
-        raise CheckpointError(f"{file}: cannot be read ({error}); take another checkpoint") from None
+    except (*ODD, OSError) as error:
+        raise CheckpointError(f"{file}: {what} ({error}); take another checkpoint") from None
 
 
 def table_rows(table: Sequence[Any]) -> list[dict[str, Any]]:
@@ -448,6 +449,17 @@ def open_checkpoint(path: Path) -> Checkpoint:
     for name in LARGEST:
         _verify(path / name, manifest.files.get(name))
     return Checkpoint(path, manifest, config, hashlib.sha256(content).hexdigest())
+
+
+def built_in() -> Checkpoint:
+    """The policy of the package: one file, the manifest inside, with today's config of its preset."""
+    path = PRESET_DIR / POLICY
+    with refused(path / MODEL):
+        content = read_bytes(path / MODEL, LARGEST[MODEL], path)
+        header = parsed_json(content[8 : 8 + int.from_bytes(content[:8], "little")], MODEL)
+        manifest = parsed(header["__metadata__"]["manifest"].encode())
+        manifest.files = {MODEL: entry_of(path / MODEL)}
+    return Checkpoint(path, manifest, load_training(POLICY), manifest.files[MODEL].sha256)
 
 
 def newest(

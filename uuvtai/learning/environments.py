@@ -13,7 +13,7 @@ from uuvtai.common.enums import DECISION_S, HOLD_STEPS, OUTCOMES, RUNNING, SUCCE
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.distillation import imitate
-from uuvtai.learning.networks import NUM_ACTIONS, OBSERVATION, ActorCritic, Guard, Policy, View, by_part
+from uuvtai.learning.networks import OBSERVATION, ActorCritic, Guard, Policy, View, by_part
 from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.rollout import Environment, Rollout, RolloutSums, Step
 from uuvtai.learning.set_networks import MOST_WISH, SetPolicy
@@ -34,26 +34,14 @@ class Simulated(Environment):
         self.num_envs, self.device = env.num_envs, env.device
         self.outcomes, self.reward_terms, self.node_names = env.outcomes, env.reward_terms, env.node_names
         self.observation_table = env.observation_table
-        n, n_in, device = self.num_envs, env.num_obs + N_FEATURES, self.device
-        self.view: View = {
-            "x": torch.zeros(n, n_in, device=device),
-            "teacher_action": torch.zeros(n, NUM_ACTIONS, device=device),
-            "leaf": torch.zeros(n, dtype=torch.int32, device=device),
-        }
+        self.view: View = {"x": torch.zeros(self.num_envs, env.num_obs + N_FEATURES, device=self.device)}
+        self._no_features = self.view["x"][:, env.num_obs :]
         columns = [(c.name, c.slice) for c in self.observation_table]
-        self.guard = Guard(columns, n, config.train.patience, device)
+        self.guard = Guard(columns, self.num_envs, config.train.patience, self.device)
         self.world_model: WorldModel | None = None
-        self._reward = torch.zeros(n, device=device)
-        self._final = torch.zeros(n, n_in, device=device)
-        self._features = torch.zeros(n, N_FEATURES, device=device)
-        self._bad = torch.zeros(n, dtype=torch.bool, device=device)
-        self.carried = {"x": self.view["x"], "bad": self._bad}
-        """the input too: its world-model columns remember the last step"""
-        self.info: View = {}
-        """what ``VectorEnv.step`` told last beside the observation"""
 
     def make_policy(self, generator: torch.Generator) -> ActorCritic:
-        return ActorCritic(self.view["x"].shape[1], self.config.policy, generator).to(self.device)
+        return ActorCritic(self.env.num_obs + N_FEATURES, self.config.policy, generator).to(self.device)
 
     def agent(self, policy: ActorCritic) -> PolicyAgent:
         """The policy driving by its mean."""
@@ -63,7 +51,7 @@ class Simulated(Environment):
     def begin(self, policy: ActorCritic, world_model: WorldModel | None, generator: torch.Generator) -> None:
         """First episodes. Where ``world_model.as_features`` is false its columns stay zero."""
         self._norm, self.world_model = policy.observation_norm, world_model
-        self._arrive(*self.env.reset(self.config.train.seed))
+        self._arrive(*self.env.reset(self.config.train.seed), self._no_features)
 
     @torch.no_grad()
     def look_around(self, rollout: Rollout) -> bool:
@@ -74,15 +62,6 @@ class Simulated(Environment):
             rollout.note(t, {"ended": self.step(action, None).ended})
         return True
 
-    @torch.no_grad()
-    def fill_model_features(self, rollout: Rollout) -> None:
-        if self.world_model is None or not self.config.world_model.as_features:
-            return
-        x, n = rollout["x"], self.env.num_obs
-        for t in range(1, len(x)):
-            found = self.world_model.features(x[t - 1, :, :n], rollout["action"][t - 1], x[t, :, :n])
-            x[t, :, n:] = torch.where(rollout["ended"][t - 1, :, None], 0.0, found)
-
     @property
     def scenarios(self) -> tuple[Tensor, Tensor]:
         return self.info["seed"], self.info["episode"]
@@ -92,8 +71,8 @@ class Simulated(Environment):
         of the next decision; of the episode in which this one was made: observation that it led to, reward,
         terminated, ended)."""
         obs = final = torch.zeros(self.num_envs, self.env.num_obs, device=self.device)
-        reward = torch.zeros_like(self._reward)
-        terminated = ended = torch.zeros_like(self._reward, dtype=torch.bool)
+        reward = torch.zeros(self.num_envs, device=self.device)
+        terminated = ended = torch.zeros_like(reward, dtype=torch.bool)
         for _ in range(self.steps):
             tree = self.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
             obs, earned, failed, late, self.info = self.env.step(torch.where(ended[:, None], tree, action))
@@ -108,33 +87,32 @@ class Simulated(Environment):
     def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
         """Hold a decision (N, 4); the reward is NaN for samples with anything bad."""
         obs, final, reward, terminated, ended = self._hold(action, sums)
-        self._bad |= self.guard.values("reward", reward, self._reward)
-        self._bad |= self._cleaned(final, self._final, ended)
+        reward, is_odd = self.guard.values("reward", reward)
+        final, is_unknown = self._cleaned(final, ended)
+        features = self._no_features
         if self.world_model is not None:
-            n = self.env.num_obs
-            self._features = self.world_model.features(self.view["x"][:, :n], action, self._final[:, :n])
-            if self.config.world_model.as_features:
-                self._final[:, n:] = self._features
-        self._reward.masked_fill_(self._bad, math.nan)  # PPO leaves such samples out
-        self.view["x"].copy_(self._final).masked_fill_(ended[:, None], 0.0)
-        self._arrive(obs, self.info)
-        told = {"uncertainty": self._features[:, -1]}
-        return Step(self._reward, terminated, ended, {"x": self._final}, told)
+            features = self.world_model.features(self.view["x"][:, : self.env.num_obs], action, final)
+        shown = features if self.config.world_model.as_features else self._no_features
+        reward = reward.masked_fill(self._bad | is_odd | is_unknown, math.nan)  # PPO leaves such samples out
+        self._arrive(obs, self.info, shown.masked_fill(ended[:, None], 0.0))
+        led_to = {"x": torch.cat([final, shown], dim=1)}
+        return Step(reward, terminated, ended, led_to, {"uncertainty": features[:, -1]})
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        self._arrive(*self.env.restore(arrays))
+        self._arrive(*self.env.restore(arrays), self._no_features)
 
-    def _arrive(self, obs: Tensor, info: View) -> None:
-        """The observation of the next decision, and what the tree would do now."""
+    def _arrive(self, obs: Tensor, info: View, features: Tensor) -> None:
+        """What the next decision is made by; ``info``: what ``VectorEnv.step`` tells beside ``obs``."""
         self.info = info
-        self._bad.copy_(self._cleaned(obs, self.view["x"]))
-        self._bad |= self.guard.values("teacher_action", info["teacher_action"], self.view["teacher_action"])
-        self.view["leaf"].copy_(info["leaf"])
+        seen, is_unknown = self._cleaned(obs)
+        teacher_action, is_odd = self.guard.values("teacher_action", info["teacher_action"])
+        x, self._bad = torch.cat([seen, features], dim=1), is_unknown | is_odd
+        self.view = {"x": x, "teacher_action": teacher_action, "leaf": info["leaf"]}
+        self.carried = {"x": x, "bad": self._bad}  # the world model's columns remember the last step
 
-    def _cleaned(self, obs: Tensor, x: Tensor, counted: Tensor | None = None) -> Tensor:
-        """Write the observation into an input, means for what is not finite; which rows were bad."""
-        n = self.env.num_obs
-        return self.guard.values(OBSERVATION, obs, x[:, :n], self._norm.mean[:n].float(), counted)
+    def _cleaned(self, obs: Tensor, counted: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The observation, means for what is not finite, and which rows were bad."""
+        return self.guard.values(OBSERVATION, obs, self._norm.mean[: self.env.num_obs].float(), counted)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -151,11 +129,14 @@ class InSurrogate(Environment):
     device, steps = torch.device("cpu"), HOLD_STEPS
 
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
-        """Draws the scenarios, unless they are given. Raises ConfigError for a world that does not fit."""
+        """Draws the scenarios, unless they are given. Raises SettingError for what does not fit."""
         from uuvtai.surrogate.observation import SET_TABLE
         from uuvtai.surrogate.world import Surrogate, draw_bank
 
-        _refuse_what_the_surrogate_lacks(config)
+        held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
+        if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
+            told = f"the surrogate decides every {DECISION_S} s, after {HOLD_STEPS} control steps"
+            raise SettingError(f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: {told}")
         torch.set_flush_denormal(True)
         self.config, self.observation_table, self.num_envs = config, SET_TABLE, config.train.num_envs
         self.scenes = config.train.scenes or (config.world.own_scene,)
@@ -228,13 +209,6 @@ class InSurrogate(Environment):
         for number, name in enumerate(bank.names):
             metrics[f"eval/success_{name}"] = float(won[bank.origin == number].float().mean())
         return metrics
-
-
-def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
-    held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
-    if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
-        told = f"the surrogate decides every {DECISION_S} s, after {HOLD_STEPS} control steps"
-        raise SettingError(f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: {told}")
 
 
 @torch.no_grad()

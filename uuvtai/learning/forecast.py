@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as fn
 from torch import Tensor, nn
 
 from uuvtai.common import enums
@@ -64,7 +65,7 @@ class MixtureNet(nn.Module):
         with torch.no_grad():  # the futures begin apart: straight on, slower, back, left and right
             ways = torch.tensor([[1.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [-0.8, 0.0], [0.5, 0.5], [0.5, -0.5]])
             self.said.bias[enums.N_MODE :] = (
-                ways[: enums.N_MODE, None].expand(-1, enums.ANCHORS, -1).reshape(-1)
+                ways[: enums.N_MODE].repeat_interleave(enums.ANCHORS, 0).flatten()
             )
             self.spread.bias.fill_(math.log(0.3))
 
@@ -79,13 +80,12 @@ class MixtureNet(nn.Module):
 
     def weights(self) -> dict[str, np.ndarray]:
         """Arrays of a forecast's file (``mixture_weights``)."""
-        out, bias = torch.zeros(enums.N_HIDDEN, enums.N_SAID), torch.zeros(enums.N_SAID)
-        out[:, : enums.N_TOLD], bias[: enums.N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
-        found = {"weight_out": out, "bias_out": bias}
-        layers = {"in": self.into, "mid": self.middle, "spread": self.spread}  # the last one is padded there
+        found, layers = {}, {"in": self.into, "mid": self.middle, "out": self.said, "spread": self.spread}
         for name, layer in layers.items():
-            found |= {f"weight_{name}": layer.weight.T, f"bias_{name}": layer.bias}
-        return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
+            padding = 0, enums.N_SAID - enums.N_TOLD if name == "out" else 0  # that of the spreads: there
+            for kind, values in (("weight", layer.weight.T), ("bias", layer.bias)):
+                found[f"{kind}_{name}"] = fn.pad(values.detach(), padding).contiguous().numpy().copy()
+        return found
 
 
 def negative_log_likelihood(mixture: Mixture, truth: Tensor) -> Tensor:

@@ -264,14 +264,6 @@ class ActorCritic(Policy):
     def observe(self, view: View) -> None:
         self.observation_norm.update(view["x"])
 
-    def distribution(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(mean (..., 4), log_std (4,)) of the action."""
-        return self.mean_of(self.prepared({"x": x})), self.log_std
-
-    def value(self, x: Tensor) -> Tensor:
-        """(...,) expected return, in units of the reward."""
-        return self.value_norm.inverse(self.value_of(self.prepared({"x": x})))
-
 
 @torch.no_grad()
 def by_part(function: Callable[[View], Tensor], inputs: View) -> Tensor:
@@ -438,25 +430,18 @@ class Guard:
         self.bad_in_a_row = 0
 
     def values(
-        self,
-        name: str,
-        values: Tensor,
-        out: Tensor,
-        fill: Tensor | None = None,
-        counted: Tensor | None = None,
-    ) -> Tensor:
-        """Copy ``values`` (N, ...) into ``out`` with ``fill`` (default: 0) in place of what is not finite;
-        which rows (N,) were bad. ``OBSERVATION`` is counted by columns; ``counted`` (N,): rows that count."""
+        self, name: str, values: Tensor, fill: Tensor | float = 0.0, counted: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """``values`` (N, ...) with ``fill`` in place of what is not finite, and which rows (N,) were bad.
+        ``OBSERVATION`` is counted by columns; ``counted`` (N,): rows that count."""
         if values.device.type == "cpu" and math.isfinite(values.sum()):  # elsewhere that is a wait
-            out.copy_(values)
-            return self._none
+            return values, self._none
         bad = ~torch.isfinite(values)
-        torch.where(bad, values.new_zeros(()) if fill is None else fill, values, out=out)
         rows = bad.view(len(bad), -1)
         counting = rows if counted is None else rows & counted[:, None]
         self._counts[name] = counting.sum(dim=0) + self._counts.get(name, 0)
         self._rows |= counting.any(dim=1)
-        return rows.any(dim=1)
+        return torch.where(bad, fill, values), rows.any(dim=1)
 
     def take(self) -> dict[str, float]:
         """Counts above zero since the last call, by name."""
@@ -465,18 +450,20 @@ class Guard:
         self._counts = {}
         return {f"{PREFIX}{name}": float(n) for name, part in found.items() if (n := part.sum())}
 
-    def check(self, iteration: int, complaints: Sequence[str], scenarios: tuple[Tensor, Tensor]) -> None:
-        """Count an iteration; TrainingError after ``patience`` in a row with complaints. ``scenarios``: seed
-        and episode (N,) that the envs are in."""
+    def check(self, iteration: int, metrics: dict[str, float], scenarios: tuple[Tensor, Tensor]) -> None:
+        """Count an iteration; TrainingError after ``patience`` in a row whose metrics tell of something bad.
+        ``scenarios``: seed and episode (N,) that the envs are in."""
+        replaced = {name.removeprefix(PREFIX): n for name, n in metrics.items() if name.startswith(PREFIX)}
+        complaints = [f"{int(n)} values of {name} not finite" for name, n in replaced.items()]
+        if skipped := int(metrics["train/skipped_updates"]):
+            complaints.append(f"{skipped} updates left out because loss or gradient was not finite")
         rows = self._rows.nonzero().flatten().tolist()
         self._rows.zero_()
         self.bad_in_a_row = self.bad_in_a_row + 1 if complaints else 0
         if self.bad_in_a_row < self.patience:
             return
-        seed, episode = scenarios
-        envs = "".join(
-            f"; env {row} (seed {int(seed[row])}, episode {int(episode[row])})" for row in rows[:_ROWS_TOLD]
-        )
+        found = [(row, *(int(number[row]) for number in scenarios)) for row in rows[:_ROWS_TOLD]]
+        envs = "".join(f"; env {row} (seed {seed}, episode {episode})" for row, seed, episode in found)
         raise TrainingError(
             f"iterations {iteration - self.bad_in_a_row + 1} to {iteration} were all bad: "
             f"{'; '.join(complaints)}{envs}. The networks did not learn it. If updates were left out, take "

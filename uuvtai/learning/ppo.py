@@ -4,8 +4,7 @@ distillation term, for any ``Policy``."""
 from __future__ import annotations
 
 import functools
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -96,14 +95,10 @@ class Ppo(AdamLearner):
         """minibatches that changed the policy"""
 
     def update(
-        self,
-        rollout: Rollout,
-        generator: torch.Generator,
-        distillation_weight: float = 0.0,
-        share: float = 0.0,
+        self, rollout: Rollout, generator: torch.Generator, strength: float = 0.0, share: float = 0.0
     ) -> dict[str, float]:
         """Learn from a closed rollout when ``share`` of the run is over; metrics, means over all minibatches.
-        ``distillation_weight`` is lambda_t s_t. Samples that are not finite have no part in it."""
+        ``strength`` of the distillation is lambda_t s_t. Samples that are not finite have no part in it."""
         config = self.config
         samples, metrics = self._prepared(rollout)
         fade = min(1.0, (1.0 - share) / (1.0 - DECAY_FROM)) if config.target_kl > 0 else 1.0
@@ -112,7 +107,7 @@ class Ppo(AdamLearner):
         with torch_threads_rest():
             for _ in range(config.epochs):
                 for index in self._minibatches(len(samples["valid"]), generator):
-                    sums += self._learn(samples, index, distillation_weight)
+                    sums += self._learn(samples, index, strength)
         means = dict(zip(_SUMS[:-1], sums / sums[-1].clamp(min=1.0), strict=False))
         if config.target_kl > 0:
             self.rate.copy_(adapted_rate(self.rate, means["approx_kl"].float(), config.target_kl))
@@ -163,46 +158,37 @@ class Ppo(AdamLearner):
         kept = {n: flat[n] for n in ("action", "log_prob", "teacher_action") if n in flat}
         return kept | self.policy.prepared(flat) | found, metrics
 
-    def _minibatches(self, count: int, generator: torch.Generator) -> Iterator[slice | Tensor]:
-        """Blocks of neighbouring rows (all envs in a span of steps), or random ones."""
-        parts, order = self.config.minibatches, None
+    def _minibatches(self, count: int, generator: torch.Generator) -> Sequence[Tensor]:
+        """Rows of blocks of neighbours (all envs in a span of steps), or random ones."""
+        order, parts = torch.arange(count), self.config.minibatches
         if self.policy.is_shuffled:
-            order = torch.randperm(count, generator=generator).to(self.rate.device)
-        for first, last in itertools.pairwise(count * part // parts for part in range(parts + 1)):
-            yield slice(first, last) if order is None else order[first:last]
+            order = torch.randperm(count, generator=generator)
+        return order.to(self.rate.device).tensor_split([count * part // parts for part in range(1, parts)])
 
-    def _learn(self, samples: View, index: slice | Tensor, distillation_weight: float) -> Tensor:
+    def _learn(self, samples: View, index: Tensor, strength: float) -> Tensor:
         """A step by these samples; their sums. The number of threads changes no bit."""
         self.optimiser.zero_grad(set_to_none=True)
-        count = samples["valid"][index].sum().clamp(min=1.0)
-        together = functools.partial(side_by_side, device=self.rate.device.type)
+        count, device = samples["valid"][index].sum().clamp(min=1.0), self.rate.device.type
+        together = functools.partial(side_by_side, device=device)
 
-        def rows(part: slice | Tensor) -> View:
+        def rows(part: Tensor) -> View:
             return {name: values[part] for name, values in samples.items()}
 
         pieces: list[Callable[[], Piece]] = []
-        for block in together(*(functools.partial(rows, part) for part in self._parts(index))):
-            pieces.append(functools.partial(self._of_actor, block, count, distillation_weight))
+        parts = index.split(CACHE_ROWS) if device == "cpu" else [index]
+        for block in together(*(functools.partial(rows, part) for part in parts)):
+            pieces.append(functools.partial(self._of_actor, block, count, strength))
             pieces.append(functools.partial(self._of_critic, block, count))
         found = together(*pieces)
         for parameters, mine in zip(self._nets, (found[::2], found[1::2]), strict=True):
-            for parameter, *parts in zip(parameters, *(gradients for gradients, _ in mine), strict=True):
-                parameter.grad = functools.reduce(torch.add, parts)
+            for parameter, *found_by in zip(parameters, *(gradients for gradients, _ in mine), strict=True):
+                parameter.grad = functools.reduce(torch.add, found_by)
         if self.step(most=self.config.max_grad_norm):
             self.policy.floor_std()
             self.updates += 1
         return torch.stack([sums for _, sums in found]).sum(dim=0)
 
-    def _parts(self, index: slice | Tensor) -> Sequence[slice | Tensor]:
-        """A minibatch in parts whose activations stay in the cache of a CPU."""
-        if self.rate.device.type != "cpu":
-            return [index]
-        if isinstance(index, Tensor):
-            return index.split(CACHE_ROWS)
-        starts = range(index.start, index.stop, CACHE_ROWS)
-        return [slice(first, min(first + CACHE_ROWS, index.stop)) for first in starts]
-
-    def _of_actor(self, batch: View, count: Tensor, distillation_weight: float) -> Piece:
+    def _of_actor(self, batch: View, count: Tensor, strength: float) -> Piece:
         config, valid, log_std = self.config, batch["valid"], self.policy.log_std
         share, mean = valid / count, self.policy.mean_of(batch)
         log_ratio = log_prob(batch["action"], mean, log_std) - batch["log_prob"]
@@ -212,9 +198,9 @@ class Ppo(AdamLearner):
             clipped = (log_ratio.expm1().abs() > config.clip).float()
             sums = {"count": torch.ones_like(valid), "policy_loss": policy_loss}
             sums |= {"approx_kl": approximate_kl(log_ratio), "clip_fraction": clipped}
-        if distillation_weight:
+        if strength:
             distill = imitation_error(mean, batch["teacher_action"])
-            loss = loss + distillation_weight * (share * distill).sum()
+            loss = loss + strength * (share * distill).sum()
             sums |= {"distill_loss": distill}
         return torch.autograd.grad(loss, self._nets[0]), _summed(sums, valid)
 

@@ -34,7 +34,7 @@ class Environment(ABC):
 
     env: Any
     carried: View
-    """what is kept beside ``env.capture()``: always the same tensors"""
+    """what is kept beside ``env.capture()``"""
     num_envs: int
     device: torch.device
     steps: int
@@ -59,9 +59,6 @@ class Environment(ABC):
     def look_around(self, _rollout: Rollout) -> bool:
         """Fill a rollout with what the statistics of the policy begin with; whether there is any."""
         return False
-
-    def fill_model_features(self, rollout: Rollout) -> None:  # noqa: B027 - most have none
-        """The world model has learned from what ``look_around`` filled: say what it makes of it."""
 
     def warm_start(self, _policy: Any, _note: Callable[[str], None]) -> dict[str, float]:
         """Teach the policy what can be before its first rollout, tell ``note`` how far it is; metrics."""
@@ -129,8 +126,7 @@ class Rollout(dict[str, Tensor]):
         """A copy that is 0 where ``valid`` (T, N) is not."""
         found = Rollout(self.steps)
         for name, part in self.items():
-            rows = valid.view(*valid.shape, *[1] * (part.dim() - 2))
-            found[name] = torch.where(rows, part, torch.zeros_like(part[:1]))
+            found[name] = part.masked_fill(~valid.view(*valid.shape, *[1] * (part.dim() - 2)), 0)
         return found
 
 

@@ -199,24 +199,14 @@ def _trainer(config: LearningConfig, device: str, own: RewardSource | None) -> A
     for section in ("surrogate", "parameter_search", "forecast_training"):
         if device == "cuda" and getattr(config, section).enabled:
             raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
-    return TRAINERS[config.learner](config, device, own)
-
-
-def _policy_trainer(config: LearningConfig, device: str, own: RewardSource | None) -> Trainer:
+    if config.learner != "ppo":
+        return ParameterSearchTrainer(config) if config.learner == "search" else ForecastTrainer(config)
     if config.surrogate.enabled:
         return Trainer(InSurrogate(config), config)
     env = _env(config, device)
     if own:
         own.reward(env)
     return Trainer(Simulated(env, config), config)
-
-
-TRAINERS: dict[str, Callable[[LearningConfig, str, RewardSource | None], AnyTrainer]] = {
-    "ppo": _policy_trainer,
-    "search": lambda config, *_: ParameterSearchTrainer(config),
-    "forecast": lambda config, *_: ForecastTrainer(config),
-}
-"""by ``LearningConfig.learner``"""
 
 
 def _env(config: LearningConfig, device: str) -> VectorEnv:

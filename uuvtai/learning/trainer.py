@@ -14,7 +14,7 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.distillation import Distillation
 from uuvtai.learning.environments import InSurrogate
-from uuvtai.learning.networks import PREFIX, fast_products
+from uuvtai.learning.networks import fast_products
 from uuvtai.learning.policy_agent import network
 from uuvtai.learning.ppo import Ppo
 from uuvtai.learning.rollout import Environment, Recent, Rollout, collect
@@ -71,7 +71,7 @@ class Trainer:
         self.iteration += 1
         self.env_steps += self._samples
         metrics |= self.env.guard.take() | times | self.recent.add(sums)
-        self._judge(metrics)
+        self.env.guard.check(self.iteration, metrics, self.env.scenarios)
         found = {"env_steps": float(self.env_steps), "env_steps_per_s": self._samples / sum(times.values())}
         decisions = {name.replace("env_steps", "decisions"): n / self.env.steps for name, n in found.items()}
         return metrics | {f"time/{name}": n for name, n in (found | decisions).items()}
@@ -108,9 +108,8 @@ class Trainer:
         self.generator.set_state(state["generator"])
         self.recent.rows = [list(row) for row in state["recent"]]
         counters = state["counters"]
-        self.iteration, self.env_steps, self.env.guard.bad_in_a_row = (
-            int(counters[n]) for n in ("iteration", "env_steps", "bad_in_a_row")
-        )
+        self.iteration, self.env_steps = int(counters["iteration"]), int(counters["env_steps"])
+        self.env.guard.bad_in_a_row = int(counters["bad_in_a_row"])
 
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own, by its name in a checkpoint."""
@@ -125,7 +124,8 @@ class Trainer:
         if self.env.look_around(self.rollout):
             self.env_steps += self._samples
             self._learn_world()
-            self.env.fill_model_features(self.rollout)
+            if self.world_model and self.config.world_model.as_features:
+                self.world_model.fill_in(*(self.rollout[name] for name in ("x", "action", "ended")))
             if not self._is_started:
                 self.policy.observe(self.rollout)
         return {} if self._is_started else self.env.warm_start(self.policy, self.note)
@@ -144,19 +144,7 @@ class Trainer:
             return {}
         rollout = self.rollout
         obs, valid = rollout["x"][..., : self.world_learner.model.n_obs], ~rollout["ended"][:-1]
-        return self.world_learner.update(obs[:-1], rollout["action"][:-1], obs[1:], self.generator, valid)
-
-    def _judge(self, metrics: dict[str, float]) -> None:
-        """Tell the guard what was bad in this iteration."""
-        complaints = [
-            f"{int(v)} values of {name.removeprefix(PREFIX)} not finite"
-            for name, v in metrics.items()
-            if name.startswith(PREFIX)
-        ]
-        skipped = metrics["train/skipped_updates"]
-        if skipped:
-            complaints.append(f"{int(skipped)} updates left out because loss or gradient was not finite")
-        self.env.guard.check(self.iteration, complaints, self.env.scenarios)
+        return self.world_learner.update(obs[:-1], rollout["action"][:-1], obs[1:], valid, self.generator)
 
     @property
     def _samples(self) -> int:

@@ -170,13 +170,8 @@ class Surrogate:
 
     def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Carry out a decision (N, 3), filtered: (reward, outcome code), both (N,)."""
-        b, action, horizon_s = (
-            self.bank,
-            action.contiguous().clone(),
-            self.rules.surrogate_cfg.safety_horizon_s,
-        )
-        if horizon_s:
-            view = self.view
+        b, view, action = self.bank, self.view, action.contiguous().clone()
+        if horizon_s := self.rules.surrogate_cfg.safety_horizon_s:
             safety.filter_wishes(self._safe, horizon_s, self._every, view["obstacles"], view["own"], action)
         motion.drive_surrogate(
             self.rules, action, b.obstacle, b.path, b.route, self.scenario, self.ego,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import shutil
@@ -18,19 +19,10 @@ from uuvtai.common.files import unfinished, whole_folder
 from uuvtai.config.loader import ConfigError
 from uuvtai.learning.checkpoint import Checkpoint, Note
 from uuvtai.learning.export import graph as onnx_session
-from uuvtai.learning.export import run_policy
+from uuvtai.learning.export import modules, run_policy
 from uuvtai.learning.export.card import evaluations_of, model_card
-from uuvtai.learning.export.graph import GraphError, refuse_strange
-from uuvtai.learning.export.modules import (
-    ONNX,
-    ExportedModule,
-    golden_of,
-    missing_packages,
-    module_of,
-    onnx_bytes,
-    specification,
-    weights_of,
-)
+from uuvtai.learning.export.graph import GraphError, missing_packages, refuse_strange
+from uuvtai.learning.export.modules import ONNX
 from uuvtai.learning.export.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, Arrays, PolicyError
 from uuvtai.logs.container import sync_folder
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
@@ -50,17 +42,18 @@ def export(
     Returns what ``uuv export --json`` prints. Raises ConfigError for a place that is taken, CheckpointError
     for networks that cannot drive, RunFolderError where the disk refuses."""
     _refuse_place(out, force)
-    module, rows = module_of(checkpoint), evaluations_of(checkpoint, evaluations)
-    golden, missing = golden_of(module), missing_packages()
-    files = {WEIGHTS: safetensors.torch.save(weights_of(module)), GOLDEN: safetensors.numpy.save(golden)}
+    module, rows = modules.module_of(checkpoint), evaluations_of(checkpoint, evaluations)
+    golden, missing = modules.golden_of(module), missing_packages()
+    weights = safetensors.torch.save(modules.weights_of(module))
+    files = {WEIGHTS: weights, GOLDEN: safetensors.numpy.save(golden)}
     if missing:
         note(
             f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', "
             "then export again"
         )
     else:
-        files[ONNX] = onnx_bytes(module)
-    spec = specification(checkpoint, module, name, ONNX in files)
+        files[ONNX] = modules.onnx_bytes(module)
+    spec = modules.specification(checkpoint, module, name, ONNX in files)
     files["README.md"] = model_card(spec, checkpoint, rows).encode()
     files["run_policy.py"] = Path(run_policy.__file__).read_bytes()
     _publish(out, files, spec)
@@ -94,8 +87,10 @@ def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[dict[str, 
     return found
 
 
-def of_torch(module: ExportedModule, golden: Arrays) -> dict[str, Any]:
-    return run_policy.compared("torch", module.said, run_policy.golden_rows(golden, module.inputs), golden)
+def of_torch(module: modules.ExportedModule, golden: Arrays) -> dict[str, Any]:
+    """As ``run_policy.compared``."""
+    said, rows = functools.partial(modules.said, module), run_policy.golden_rows(golden, module.inputs)
+    return run_policy.compared("torch", said, rows, golden)
 
 
 def of_onnx(graph: bytes, golden: Arrays, inputs: Iterable[str]) -> dict[str, Any]:

@@ -225,8 +225,13 @@ VARIABLE = "ORT_DISABLE_TELEMETRY"
 """read by ONNX Runtime when it is loaded, from 1.29 on; before that it had no telemetry outside Windows"""
 
 
+def missing_packages(*names: str) -> list[str]:
+    """Which of these are not installed; of what torch's exporter needs to write a graph, if none is named."""
+    return [name for name in names or ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
+
+
 def is_installed() -> bool:
-    return all(importlib.util.find_spec(name) is not None for name in (NAME, "onnx"))
+    return not missing_packages(NAME, "onnx")
 
 
 def without_telemetry() -> None:

@@ -4,12 +4,10 @@ policy_spec.json, which says what every column is."""
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
 import logging
 import math
 import warnings
-from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
@@ -36,8 +34,6 @@ from uuvtai.learning.world_model import N_FEATURES, N_TARGET
 
 ONNX = "policy.onnx"
 OPSET = 20
-PACKAGES = ("onnx", "onnxscript")
-"""what torch's exporter needs"""
 NO_LIMIT = float(torch.finfo(torch.float32).max)
 """of a normaliser that has seen nothing and therefore cuts nothing off"""
 _ROWS, _SEED = 64, 6
@@ -57,37 +53,11 @@ _WISH = (
 )
 
 
-class ExportedModule(nn.Module, ABC):
-    """Rows of inputs to rows of outputs, by name."""
-
-    kind: str
-    """one of ``run_policy.KINDS``"""
-    inputs: dict[str, str]
-    outputs: dict[str, str]
-    """what each one is, in the order of ``forward``"""
-
-    @abstractmethod
-    def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
-        """Made-up inputs, spread as training had them."""
-
-    @abstractmethod
-    def weights(self) -> dict[str, Tensor]:
-        """Arrays of ``policy.safetensors`` by the names that ``run_policy.py`` knows."""
-
-    @abstractmethod
-    def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
-        """Entries of policy_spec.json that only this kind has."""
-
-    @torch.inference_mode()
-    def said(self, rows: Arrays) -> Arrays:
-        found = self(*(torch.from_numpy(part) for part in rows.values()))
-        return {name: part.numpy() for name, part in zip(self.outputs, found, strict=True)}
-
-
-class OneAction(OneDecision, ExportedModule):
+class OneAction(OneDecision):
     """One decision of a policy on observation vectors; whoever calls it remembers the last one."""
 
     kind = "mlp"
+    """one of ``run_policy.KINDS``; below, what goes in and out, in the order of ``forward``"""
     inputs = {
         "obs": "(N, n_obs) float32: the newest observation, raw SI units",
         "last_obs": "(N, n_obs) float32: that of the last decision; anything where has_last is false",
@@ -101,6 +71,7 @@ class OneAction(OneDecision, ExportedModule):
     }
 
     def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
+        """Made-up inputs, spread as training had them."""
         norm, n_obs = self.policy.observation_norm, self.policy.n_in - N_FEATURES
         mean, std = norm.mean[:n_obs].float(), norm.std()[:n_obs].float()
         last, obs = (mean + std * torch.randn(count, n_obs, generator=rng) for _ in range(2))
@@ -113,6 +84,7 @@ class OneAction(OneDecision, ExportedModule):
         return obs, last, action, torch.arange(count) > 0
 
     def weights(self) -> dict[str, Tensor]:
+        """Arrays of ``policy.safetensors`` by the names that ``run_policy.py`` knows."""
         policy, world = self.policy, self.world_model
         norms = {"norm": policy.observation_norm}
         nets = {"actor": policy.actor, "critic": policy.critic}
@@ -128,6 +100,7 @@ class OneAction(OneDecision, ExportedModule):
         return found
 
     def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
+        """Entries of policy_spec.json that only this kind has."""
         policy, norm = self.policy, self.policy.observation_norm
         pairs = zip(norm.mean.tolist(), norm.std().tolist(), strict=True)
         scales = [{"mean": mean, "std": std} for mean, std in pairs]
@@ -150,7 +123,7 @@ class OneAction(OneDecision, ExportedModule):
         }
 
 
-class OneWish(ExportedModule):
+class OneWish(nn.Module):
     """One decision of a policy over a set of obstacles."""
 
     kind = "set"
@@ -195,6 +168,17 @@ class OneWish(ExportedModule):
         }
 
 
+ExportedModule = OneAction | OneWish
+"""networks without memory: rows of inputs to rows of outputs"""
+
+
+@torch.inference_mode()
+def said(module: ExportedModule, rows: Arrays) -> Arrays:
+    """Outputs by name for rows of inputs by name."""
+    found = module(*(torch.from_numpy(part) for part in rows.values()))
+    return {name: part.numpy() for name, part in zip(module.outputs, found, strict=True)}
+
+
 def module_of(checkpoint: Checkpoint) -> ExportedModule:
     """What of a checkpoint drives. Raises CheckpointError where nothing does."""
     if checkpoint.config.learner == "ppo" and checkpoint.config.encoder == "set":
@@ -213,16 +197,11 @@ def golden_of(module: ExportedModule) -> Arrays:
     """``pair_<input>`` and ``pair_<output>``: made-up inputs and what the module says to them."""
     made_up = module.rows(_ROWS, torch.Generator().manual_seed(_SEED))
     inputs = {name: tensor.numpy() for name, tensor in zip(module.inputs, made_up, strict=True)}
-    return {f"pair_{name}": array for name, array in (inputs | module.said(inputs)).items()}
-
-
-def missing_packages() -> list[str]:
-    """What has to be installed before an ONNX graph can be written; empty = nothing."""
-    return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+    return {f"pair_{name}": array for name, array in (inputs | said(module, inputs)).items()}
 
 
 def onnx_bytes(module: ExportedModule) -> bytes:
-    """The ONNX graph with its weights inside, any number of rows at once. Needs PACKAGES."""
+    """The ONNX graph with its weights inside, any number of rows at once; without ``missing_packages``."""
     without_telemetry()
     rows, obstacles = torch.export.Dim("rows", min=1), torch.export.Dim("obstacles", min=1)
     sizes = {name: {0: rows, 1: obstacles} if name == "obstacles" else {0: rows} for name in module.inputs}
