@@ -79,11 +79,11 @@ class SetAgent(HeldAgent):
     def __init__(self, actor: SetActor, sim: Sim, config: LearningConfig) -> None:
         """``config``: what the policy learnt with, how long it holds a decision and what keeps it safe."""
         from uuvtai.sim.stages import bind
-        from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO, SafetyRules
+        from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO, Rules
 
         super().__init__(sim.num_envs, config.policy.hold_steps, sim.device)
         self.actor, self._limits = actor, config.surrogate
-        self._io, self._safe = bind(ObserverIO, sim.s, sim.config), bind(SafetyRules, sim.config)
+        self._io, self._safe = bind(ObserverIO, sim.s, sim.config), bind(Rules, sim.config, partial=True)
         zeros = self._zeros
         self.ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_OBSTACLE, RAW_WIDTH), zeros(N_RAY)
         self.obstacles, self.own = zeros(N_OBSTACLE, OBSTACLE_WIDTH), zeros(EGO_COLUMNS)
@@ -142,10 +142,10 @@ def find_policy(name: str, note: Note = lambda _text: None) -> Checkpoint:
         return checkpoints.open_checkpoint(path)
     if (path / "checkpoints").is_dir():
         return checkpoints.best(path, note)
-    raise ConfigError(
-        f"{name!r} is no trained policy: give {POLICY}, which is built in, the run folder of 'uuv train', or "
-        "one of its checkpoints/step_N"
+    told = (
+        f"give {POLICY}, which is built in, the run folder of 'uuv train', or one of its checkpoints/step_N"
     )
+    raise ConfigError(f"{name!r} is no trained policy: {told}")
 
 
 def load_trained(checkpoint: Checkpoint, sim: Sim) -> HeldAgent:

@@ -244,15 +244,13 @@ def refused(file: Path, what: str = "cannot be read") -> Iterator[None]:
     try:
         yield
     except SafetensorError as error:
-        raise CheckpointError(
-            f"{file}: is not a safetensors file ({error}); pickles and other formats are never opened"
-        ) from None
+        told = f"is not a safetensors file ({error}); pickles and other formats are never opened"
+        raise CheckpointError(f"{file}: {told}") from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise CheckpointError(
-            f"{file}: {where}: {first['msg']}{renamed(where)}; it was not written by this version of uuvtai"
-        ) from None
+        told = f"{first['msg']}{renamed(where)}; it was not written by this version of uuvtai"
+        raise CheckpointError(f"{file}: {where}: {told}") from None
     except FileError as error:
         raise CheckpointError(f"{file}: {str(error).removeprefix(f'{file}: ')}") from None
     except (*ODD, OSError) as error:
@@ -283,9 +281,6 @@ def finite(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics as JSON can hold them: NaN and infinity become None."""
     bad = {name for name, value in metrics.items() if isinstance(value, float) and not math.isfinite(value)}
     return {name: None if name in bad else value for name, value in metrics.items()}
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 MODEL_PARTS, SIMULATOR_PART = ("policy", "world_model", "forecast", "tree"), "env"
@@ -327,10 +322,8 @@ class Checkpoint:
         plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART)
         own = self.manifest.simulator, self.manifest.simulator_layout
         if own != (plain, layout_of(expected)):
-            raise CheckpointError(
-                f"{self.path}: the simulator's state has other arrays than this simulator; resume with the "
-                "run's own config, number of envs and version of uuvtai"
-            )
+            with_own = "resume with the run's own config, number of envs and version of uuvtai"
+            raise CheckpointError(f"{self.path}: holds other arrays than this simulator; {with_own}")
         with refused(self.path / SIMULATOR):
             simulator = unpack(plain, read_stream(self.path / SIMULATOR, expected))
         training = self._part(TRAINING, self.manifest.training)
@@ -344,10 +337,8 @@ class Checkpoint:
             if own != theirs:
                 different = (pair for pair in zip(own, theirs, strict=False) if pair[0] != pair[1])
                 mine, other = next(different, (f"{len(own)} rows", len(theirs)))
-                raise CheckpointError(
-                    f"{self.path}: made for another {what} table: it expects {mine}, this environment gives "
-                    f"{other}; evaluate it with the config it was trained with"
-                )
+                told = f"it expects {mine}, this environment gives {other}; take the config of its training"
+                raise CheckpointError(f"{self.path}: made for another {what} table: {told}")
 
     def _part(self, name: str, plain: Any) -> dict[str, Any]:
         with refused(self.path / name):
@@ -480,9 +471,7 @@ def newest(
             reasons.append(str(error))
         note(f"left out: {reasons[-1]}")
     why = f" ({reasons[0]})" if reasons else ""
-    raise CheckpointError(
-        f"{checkpoints}: holds no usable checkpoint{why}; give a run with one, or begin anew"
-    )
+    raise CheckpointError(f"{checkpoints}: holds no usable checkpoint{why}; give another run, or begin anew")
 
 
 def best(run: Path, note: Note = lambda _text: None) -> Checkpoint:

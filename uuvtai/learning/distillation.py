@@ -38,8 +38,7 @@ def imitation_error(mean: Tensor, teacher_action: Tensor) -> Tensor:
 
 def leaf_errors(names: Sequence[str], error: Tensor, leaf: Tensor) -> dict[str, float]:
     """``distillation/loss``, the mean of finite imitation errors (n,), and ``distillation/leaf/<name>``, that
-    of the samples in which a node of this name acted. ``names``: of the nodes that ``leaf`` (n,) counts; -1
-    is none."""
+    of samples in which a node of this name acted: ``leaf`` (n,) counts the nodes of ``names``, -1 is none."""
     finite, node = torch.isfinite(error), torch.arange(len(names), device=leaf.device)
     metrics = {}
     for name in sorted(set(names)):
@@ -133,8 +132,7 @@ SEED = 7_000_003
 
 
 def wish_of(command: Tensor, ego: Tensor, vehicle_cfg: VehicleConfig) -> Tensor:
-    """(n, 3) wishes whose velocity is that of commands (n, 4) of vehicles (n, EGO_WIDTH): the inverse of
-    ``motion.wished_velocity``, without the yaw rate."""
+    """(n, 3) wishes for the velocity of commands (n, 4) of vehicles: ``motion.wished_velocity`` backwards."""
     from uuvtai.surrogate.arrays import At
 
     fastest = (vehicle_cfg.max_surge_m_s**2 + vehicle_cfg.max_sway_m_s**2) ** 0.5
@@ -171,14 +169,11 @@ class Student(SetAgent):
 
 
 def imitate(
-    actor: SetActor,
-    config: LearningConfig,
-    scenes: tuple[Scene, ...],
-    note: Callable[[str], None],
-    sims: dict[str, Sim] | None = None,
+    actor: SetActor, config: LearningConfig, scenes: tuple[Scene, ...], note: Callable[[str], None]
 ) -> dict[str, float]:
-    """Waves of DAgger, each told to ``note``; metrics. ``sims``: of worlds that are there already."""
-    began, sims = time.perf_counter(), dict(sims or {})
+    """Waves of DAgger, each told to ``note``; metrics."""
+    sims: dict[str, Sim] = {}
+    began = time.perf_counter()
     waves, rows = config.surrogate.warm_start_waves, min(WAVE_EPISODES, config.train.num_envs)
     few = config.model_copy(update={"train": config.train.model_copy(update={"num_envs": rows})})
     seed = config.train.seed + SEED

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,7 +11,6 @@ from torch import Tensor
 from uuvtai.common.enums import DECISION_S, HOLD_STEPS, OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.distillation import imitate
 from uuvtai.learning.networks import OBSERVATION, ActorCritic, Guard, Policy, View, by_part
 from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.rollout import Environment, Rollout, RolloutSums, Step
@@ -21,7 +19,7 @@ from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import VectorEnv
-    from uuvtai.surrogate.world import ScenarioBank, Surrogate
+    from uuvtai.surrogate.world import ScenarioBank
 
 
 class Simulated(Environment):
@@ -41,6 +39,7 @@ class Simulated(Environment):
         self.world_model: WorldModel | None = None
 
     def make_policy(self, generator: torch.Generator) -> ActorCritic:
+        """One that fits the view."""
         return ActorCritic(self.env.num_obs + N_FEATURES, self.config.policy, generator).to(self.device)
 
     def agent(self, policy: ActorCritic) -> PolicyAgent:
@@ -54,22 +53,22 @@ class Simulated(Environment):
         self._arrive(*self.env.reset(self.config.train.seed), self._no_features)
 
     @torch.no_grad()
-    def look_around(self, rollout: Rollout) -> bool:
+    def look_around(self, rollout: Rollout) -> None:
         """Let the behavior tree drive for T steps; keep inputs, actions and endings."""
+        sums = RolloutSums(len(self.outcomes), len(self.reward_terms), self.device)
         for t in range(rollout.steps):
             action = self.view["teacher_action"].clone()
             rollout.note(t, {"x": self.view["x"], "action": action})
-            rollout.note(t, {"ended": self.step(action, None).ended})
-        return True
+            rollout.note(t, {"ended": self.step(action, sums).ended})
 
     @property
     def scenarios(self) -> tuple[Tensor, Tensor]:
+        """Seed and number, both (N,), of what every env is in."""
         return self.info["seed"], self.info["episode"]
 
-    def _hold(self, action: Tensor, sums: RolloutSums | None) -> tuple[Tensor, ...]:
-        """Hold a decision for ``steps`` control steps; the tree drives what begins on the way. (Observation
-        of the next decision; of the episode in which this one was made: observation that it led to, reward,
-        terminated, ended)."""
+    def _hold(self, action: Tensor, sums: RolloutSums) -> tuple[Tensor, ...]:
+        """Hold a decision for ``steps`` control steps; the tree drives what begins on the way. (Next
+        observation; of the episode in which it was made: last observation, reward, terminated, ended)."""
         obs = final = torch.zeros(self.num_envs, self.env.num_obs, device=self.device)
         reward = torch.zeros(self.num_envs, device=self.device)
         terminated = ended = torch.zeros_like(reward, dtype=torch.bool)
@@ -77,14 +76,13 @@ class Simulated(Environment):
             tree = self.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
             obs, earned, failed, late, self.info = self.env.step(torch.where(ended[:, None], tree, action))
             newly = failed | late
-            if sums is not None:
-                sums.count(newly, self.info)
+            sums.count(newly, self.info)
             final = torch.where(ended[:, None], final, self.info["final_obs"])
             reward += torch.where(ended, 0.0, earned)
             terminated, ended = terminated | (failed & ~ended), ended | newly
         return obs, final, reward, terminated, ended
 
-    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
+    def step(self, action: Tensor, sums: RolloutSums) -> Step:
         """Hold a decision (N, 4); the reward is NaN for samples with anything bad."""
         obs, final, reward, terminated, ended = self._hold(action, sums)
         reward, is_odd = self.guard.values("reward", reward)
@@ -113,9 +111,6 @@ class Simulated(Environment):
     def _cleaned(self, obs: Tensor, counted: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The observation, means for what is not finite, and which rows were bad."""
         return self.guard.values(OBSERVATION, obs, self._norm.mean[: self.env.num_obs].float(), counted)
-
-
-# ------------------------------------------------------------------------------------------------------------
 
 
 BANK_SEED = 4242
@@ -152,6 +147,7 @@ class InSurrogate(Environment):
         return SetPolicy(self.view, self.config, generator)
 
     def begin(self, policy: Policy, world_model: WorldModel | None, generator: torch.Generator) -> None:
+        """First episodes; ``generator`` draws all that follow."""
         self._generator = generator
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
         self.env.look()
@@ -160,16 +156,11 @@ class InSurrogate(Environment):
         found = torch.randint(len(self.env.bank.origin), (self.num_envs,), generator=self._generator)
         self.env.begin(rows, found)
 
-    def warm_start(self, policy: SetPolicy, note: Callable[[str], None]) -> dict[str, float]:
-        waves = self.config.surrogate.warm_start_waves
-        return imitate(policy.actor, self.config, self.scenes, note) if waves else {}
-
     @property
     def scenarios(self) -> tuple[Tensor, Tensor]:
         return torch.full_like(self.env.scenario, BANK_SEED), self.env.scenario
 
-    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
-        assert sums is not None
+    def step(self, action: Tensor, sums: RolloutSums) -> Step:
         surrogate, final = self.env, None
         reward, outcome = surrogate.step(action)
         ended, late = outcome != RUNNING, outcome == TIMEOUT
@@ -196,9 +187,15 @@ class InSurrogate(Environment):
         each = -(-train.evaluate_episodes // (len(self.config.surrogate.worlds) * len(self.scenes)))
         if self._held_out is None:
             self._held_out = draw_bank(self.config, self.scenes, train.evaluate_seed, each)
-        bank = self._held_out
-        surrogate = Surrogate(self.config, bank, len(bank.obstacle), train.evaluate_seed)
-        outcome, time_s = run_once(surrogate, policy)
+        bank, n = self._held_out, len(self._held_out.obstacle)
+        surrogate = Surrogate(self.config, bank, n, train.evaluate_seed)
+        surrogate.begin(torch.ones(n, dtype=torch.bool), torch.arange(n))
+        outcome, time_s = torch.full((n,), RUNNING, dtype=torch.int32), torch.zeros(n)
+        while bool((outcome == RUNNING).any()):
+            wish = by_part(policy.mean_of, policy.prepared(surrogate.look()))
+            _, now = surrogate.step(wish.clamp(-MOST_WISH, MOST_WISH))
+            new = (outcome == RUNNING) & (now != RUNNING)
+            outcome, time_s = torch.where(new, now, outcome), torch.where(new, surrogate.time_s, time_s)
         won, late = outcome == SUCCESS, outcome == TIMEOUT
         metrics = {
             "eval/success_rate": float(won.float().mean()),
@@ -209,17 +206,3 @@ class InSurrogate(Environment):
         for number, name in enumerate(bank.names):
             metrics[f"eval/success_{name}"] = float(won[bank.origin == number].float().mean())
         return metrics
-
-
-@torch.no_grad()
-def run_once(surrogate: Surrogate, policy: Policy) -> tuple[Tensor, Tensor]:
-    """(outcome code, time [s]), both (N,), of scenario i in env i, driven by the mean."""
-    every = torch.ones(surrogate.num_envs, dtype=torch.bool)
-    surrogate.begin(every, torch.arange(surrogate.num_envs))
-    outcome, time_s = torch.zeros(surrogate.num_envs, dtype=torch.int32), torch.zeros(surrogate.num_envs)
-    while bool((outcome == RUNNING).any()):
-        view = surrogate.look()
-        _, now = surrogate.step(by_part(policy.mean_of, policy.prepared(view)).clamp(-MOST_WISH, MOST_WISH))
-        new = (outcome == RUNNING) & (now != RUNNING)
-        outcome, time_s = torch.where(new, now, outcome), torch.where(new, surrogate.time_s, time_s)
-    return outcome, time_s

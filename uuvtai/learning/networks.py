@@ -132,7 +132,7 @@ class RunningNorm(nn.Module):
 
 NUM_ACTIONS = 4
 _MEAN_GAIN = 0.01  # of the last layer: small first actions (Andrychowicz et al. 2021)
-_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 View = dict[str, Tensor]
@@ -153,12 +153,12 @@ class PolicyStep(NamedTuple):
 def log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """(...,) log density [nat] of actions (..., n) under a diagonal Gaussian of log deviation (n,)."""
     scaled = (action - mean) * torch.exp(-log_std)
-    return -0.5 * scaled.square().sum(dim=-1) - (log_std.sum() + log_std.shape[-1] * _HALF_LOG_2PI)
+    return -0.5 * scaled.square().sum(dim=-1) - (log_std.sum() + log_std.shape[-1] * HALF_LOG_2PI)
 
 
 def entropy(log_std: Tensor) -> Tensor:
     """Differential entropy [nat] of such a Gaussian, a scalar."""
-    return log_std.sum() + log_std.shape[-1] * (0.5 + _HALF_LOG_2PI)
+    return log_std.sum() + log_std.shape[-1] * (0.5 + HALF_LOG_2PI)
 
 
 class Policy(nn.Module, ABC):
@@ -207,11 +207,8 @@ class Policy(nn.Module, ABC):
     def act(self, view: View, generator: torch.Generator) -> PolicyStep:
         """Draw actions for N envs with noise from a CPU generator."""
         inputs = self.prepared(view)
-        mean, value = side_by_side(
-            functools.partial(by_part, self.mean_of, inputs),
-            functools.partial(by_part, self.value_of, inputs),
-            device=self.log_std.device.type,
-        )
+        both = (functools.partial(by_part, of, inputs) for of in (self.mean_of, self.value_of))
+        mean, value = side_by_side(*both, device=self.log_std.device.type)
         noise = torch.randn(mean.shape, generator=generator).to(mean.device)
         action = torch.addcmul(mean, noise, self.log_std.exp())
         return PolicyStep(action, log_prob(action, mean, self.log_std), self.value_norm.inverse(value), mean)
@@ -343,9 +340,6 @@ def fastest_precision() -> Literal["medium", "highest"]:
     return "medium" if error < LARGEST_ERROR else "highest"
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 class PlainAdam(torch.optim.Adam):
     """``torch.optim.Adam`` without torch's compiler, which its class imports when one is built and when it
     steps: that takes four seconds, and nothing here compiles by it. Same numbers, same states."""
@@ -359,8 +353,7 @@ class PlainAdam(torch.optim.Adam):
 
 
 def _spare_compiler() -> None:
-    """Tell the methods of optimisers that they are switched off for the compiler already, unless somebody has
-    imported it. A torch that asks in another way imports it as before."""
+    """Tell methods of optimisers that they are off for the compiler already, unless it has been imported."""
     if "torch._dynamo" in sys.modules:
         return
     for method in vars(torch.optim.Optimizer).values():
@@ -379,8 +372,7 @@ class AdamLearner:
         """steps left out because the gradient was not finite, or zero for want of valid samples"""
 
     def step(self, loss: Tensor | None = None, most: float = math.inf) -> bool:
-        """One step on ``loss`` (a scalar; None: by gradients that are there), the norm of every group's
-        gradient cut to ``most``; False where nothing was changed."""
+        """A step on ``loss`` (None: by gradients that are there), norms cut to ``most``; was there any?"""
         if loss is not None:
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()

@@ -169,8 +169,7 @@ def load_agent(checkpoint: Checkpoint, num_envs: int, device: Device = "cpu") ->
     policy = network(checkpoint, "policy", lambda: ActorCritic(n_obs() + N_FEATURES, config.policy, new))
     if world.enabled and world.as_features:
         world_model = network(checkpoint, "world_model", lambda: WorldModel(n_obs(), world, new)).to(device)
-    policy = policy.to(device)
-    return PolicyAgent(policy, world_model, num_envs, device)
+    return PolicyAgent(policy.to(device), world_model, num_envs, device)
 
 
 Net = TypeVar("Net", bound=nn.Module)

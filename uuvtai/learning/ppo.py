@@ -34,18 +34,12 @@ DECAY_FROM, LEAST_RATE = 0.5, 0.1
 
 
 def gae(
-    reward: Tensor,
-    value: Tensor,
-    next_value: Tensor,
-    terminated: Tensor,
-    ended: Tensor,
-    gamma: float,
-    lam: float,
+    reward: Tensor, value: Tensor, next_value: Tensor, ended: Tensor, gamma: float, lam: float
 ) -> tuple[Tensor, Tensor]:
     """(advantage, return), both (T, N) as all inputs, by generalised advantage estimation (Schulman et al.
-    2016, equation 16). ``next_value`` of the true next observation counts after a timeout (ended, not
-    terminated), not after a termination; past an ending nothing is carried back."""
-    delta = reward + gamma * next_value * ~terminated - value
+    2016, equation 16). ``next_value`` is that of the true next observation after a timeout, 0 after a
+    termination; past an ending nothing is carried back."""
+    delta = reward + gamma * next_value - value
     carried = gamma * lam * ~ended
     advantage = torch.empty_like(reward)
     last = torch.zeros_like(reward[0])
@@ -91,8 +85,6 @@ class Ppo(AdamLearner):
             groups = [{"params": actor}, {"params": critic, "lr": policy.critic_rate}]
         super().__init__(groups, lr=self._rate_now, eps=ADAM_EPS, fused=True)
         self._nets = actor, critic
-        self.updates = 0
-        """minibatches that changed the policy"""
 
     def update(
         self, rollout: Rollout, generator: torch.Generator, strength: float = 0.0, share: float = 0.0
@@ -123,13 +115,12 @@ class Ppo(AdamLearner):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"learning_rate": self.rate.clone(), "updates": self.updates}
+        return super().state_dict() | {"learning_rate": self.rate.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.optimiser.param_groups[0]["lr"] = self._rate_now
         self.rate.copy_(state["learning_rate"])
-        self.updates = int(state["updates"])
 
     @torch.no_grad()
     def _prepared(self, rollout: Rollout) -> tuple[View, dict[str, float]]:
@@ -139,9 +130,8 @@ class Ppo(AdamLearner):
         if not bool(valid.all()):
             rollout = rollout.where(valid)
         reward, value, following = rollout["reward"], rollout["value"], rollout["next_value"]
-        terminated, ended = rollout["terminated"], rollout["ended"] | ~valid
         gamma, lam = self.config.gamma, self.config.gae_lambda
-        advantage, returns = gae(reward, value, following, terminated, ended, gamma, lam)
+        advantage, returns = gae(reward, value, following, rollout["ended"] | ~valid, gamma, lam)
         good = returns[valid]
         metrics = {
             "train/explained_variance": _explained_variance(value[valid], good),
@@ -185,7 +175,6 @@ class Ppo(AdamLearner):
                 parameter.grad = functools.reduce(torch.add, found_by)
         if self.step(most=self.config.max_grad_norm):
             self.policy.floor_std()
-            self.updates += 1
         return torch.stack([sums for _, sums in found]).sum(dim=0)
 
     def _of_actor(self, batch: View, count: Tensor, strength: float) -> Piece:

@@ -140,7 +140,7 @@ def _train(
         folder.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
         if request.overrides:
             folder.write(CONFIG, to_yaml(config))
-    run = _Run(trainer, config, folder, watch, evaluate, total, request.reward)
+    run = _Run(trainer, config, folder, watch, evaluate, request)
     with folder.recorded(), contextlib.closing(run), signals.StopEvent() as pressed:
         if not run.go(pressed):
             raise KeyboardInterrupt
@@ -192,10 +192,8 @@ def _check_reward(folder: Path, own: RewardSource | None) -> None:
 def _trainer(config: LearningConfig, device: str, own: RewardSource | None) -> AnyTrainer:
     """What learns. Raises ConfigError for a GPU or a reward where there is no use for it."""
     if own and (config.surrogate.enabled or config.learner != "ppo"):
-        raise ConfigError(
-            f"--reward {own.spec.typed}: needs a preset that trains in the simulator, such as ppo or paper: "
-            f"uuv train ppo --reward {own.spec.typed}"
-        )
+        told = f"such as ppo or paper: uuv train ppo --reward {own.spec.typed}"
+        raise ConfigError(f"--reward {own.spec.typed}: needs a preset that trains in the simulator, {told}")
     for section in ("surrogate", "parameter_search", "forecast_training"):
         if device == "cuda" and getattr(config, section).enabled:
             raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
@@ -228,14 +226,13 @@ class _Run:
     folder: RunFolder
     watch: TrainWatch
     evaluate: Evaluate
-    total: int
-    """iterations in all"""
-    own: RewardSource | None = None
+    request: TrainRequest
     metrics: Metrics = field(default_factory=dict)
     """of the last one"""
 
     def __post_init__(self) -> None:
         self.saved = self.trainer.iteration
+        self.total = self.request.iterations or self.config.train.iterations
         self.recorder = MetricsRecorder(self.folder.path, self.saved)
         self.watch.start(self.folder.path, self.config, self.saved, self.total)
 
@@ -273,7 +270,8 @@ class _Run:
 
     def _again(self, option: str) -> str:
         """The run folder behind an option, and what its config does not keep."""
-        typed = [option, str(self.folder.path)] + (["--reward", self.own.spec.typed] if self.own else [])
+        own = self.request.reward
+        typed = [option, str(self.folder.path)] + (["--reward", own.spec.typed] if own else [])
         if self.total != self.config.train.iterations:
             typed += ["--iterations", str(self.total)]
         return shlex.join(typed)

@@ -12,12 +12,12 @@ import torch
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.distillation import Distillation
-from uuvtai.learning.environments import InSurrogate
+from uuvtai.learning.distillation import Distillation, imitate
+from uuvtai.learning.environments import InSurrogate, Simulated
 from uuvtai.learning.networks import fast_products
 from uuvtai.learning.policy_agent import network
 from uuvtai.learning.ppo import Ppo
-from uuvtai.learning.rollout import Environment, Recent, Rollout, collect
+from uuvtai.learning.rollout import Recent, Rollout, collect
 from uuvtai.learning.world_model import N_TARGET, WorldModel, WorldModelLearner
 
 
@@ -28,14 +28,12 @@ class Trainer:
     note: Callable[[str], None] = print
     """told how far the warm start is"""
 
-    def __init__(self, env: Environment, config: LearningConfig) -> None:
+    def __init__(self, env: Simulated | InSurrogate, config: LearningConfig) -> None:
         """Begins the episodes of ``env``. ValueError for settings that do not fit each other."""
         samples = config.ppo.rollout_steps * env.num_envs
         if config.ppo.minibatches > samples:
-            raise SettingError(
-                f"ppo.minibatches={config.ppo.minibatches}, but a rollout has only {samples} samples: raise "
-                "ppo.rollout_steps or train.num_envs"
-            )
+            told = f"a rollout has only {samples} samples: raise ppo.rollout_steps or train.num_envs"
+            raise SettingError(f"ppo.minibatches={config.ppo.minibatches}, but {told}")
         self.env, self.config, self.observation_table = env, config, env.observation_table
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.policy = env.make_policy(self.generator)
@@ -44,10 +42,7 @@ class Trainer:
         self.ppo = Ppo(self.policy, config.ppo)
         world, self.world_model, self.world_learner = config.world_model, None, None
         if world.enabled and "x" not in env.view:
-            raise SettingError(
-                "world_model.enabled: a policy over a set of obstacles has none, for it predicts observation "
-                "vectors; turn it off"
-            )
+            raise SettingError("world_model.enabled: a policy over a set of obstacles has none; turn it off")
         if world.enabled:
             widths = {c.name: c.slice.stop - c.slice.start for c in env.observation_table}
             names = [f"{name}_{i}" for name, width in widths.items() for i in range(width)]
@@ -121,14 +116,17 @@ class Trainer:
 
     def _begin(self) -> dict[str, float]:
         """Statistics begin with what the behavior tree meets: unscaled networks would learn in vain."""
-        if self.env.look_around(self.rollout):
-            self.env_steps += self._samples
-            self._learn_world()
-            if self.world_model and self.config.world_model.as_features:
-                self.world_model.fill_in(*(self.rollout[name] for name in ("x", "action", "ended")))
-            if not self._is_started:
-                self.policy.observe(self.rollout)
-        return {} if self._is_started else self.env.warm_start(self.policy, self.note)
+        if isinstance(self.env, InSurrogate):
+            is_taught = self.config.surrogate.warm_start_waves > 0 and not self._is_started
+            return imitate(self.policy.actor, self.config, self.env.scenes, self.note) if is_taught else {}
+        self.env.look_around(self.rollout)
+        self.env_steps += self._samples
+        self._learn_world()
+        if self.world_model is not None and self.config.world_model.as_features:
+            self.world_model.fill_in(*(self.rollout[name] for name in ("x", "action", "ended")))
+        if not self._is_started:
+            self.policy.observe(self.rollout)
+        return {}
 
     def _learn(self, share: float) -> dict[str, float]:
         if self.distillation is None:

@@ -11,11 +11,10 @@ from torch import Tensor, nn
 
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import WorldModelConfig
-from uuvtai.learning.networks import AdamLearner, RunningNorm, mlp
+from uuvtai.learning.networks import NUM_ACTIONS, AdamLearner, RunningNorm, mlp
 
 N_TARGET = 24
 """first columns of the observation: goal, heading error, velocity, yaw rate, depth, tilt, 12 sector ranges"""
-N_ACTION = 4
 N_FEATURES = 2
 """residual, uncertainty"""
 
@@ -37,13 +36,11 @@ class WorldModel(nn.Module):
         """SettingError for an observation of fewer columns than targets."""
         super().__init__()
         if n_obs < N_TARGET:
-            raise SettingError(
-                f"the world model predicts the first {N_TARGET} columns of the observation, but it has only "
-                f"{n_obs}"
-            )
+            told = f"the first {N_TARGET} columns of the observation, but it has only {n_obs}"
+            raise SettingError(f"the world model predicts {told}")
         self.n_obs, self.config = n_obs, config
         self.encoder = mlp((n_obs, *config.hidden, config.latent), "elu", generator)
-        self.dynamics = mlp((config.latent + N_ACTION, *config.hidden, config.latent), "elu", generator)
+        self.dynamics = mlp((config.latent + NUM_ACTIONS, *config.hidden, config.latent), "elu", generator)
         self.decoder = mlp((config.latent, *config.hidden, 2 * N_TARGET), "elu", generator, _OUT_GAIN)
         self.observation_norm = RunningNorm(n_obs)
 
@@ -76,8 +73,7 @@ class WorldModel(nn.Module):
         return torch.stack(found, dim=-1).nan_to_num_(0.0, 0.0, 0.0)
 
     def fill_in(self, x: Tensor, action: Tensor, ended: Tensor) -> None:
-        """Write ``features`` into the last columns of inputs x (T, N, n_obs + 2) that were met; 0 where an
-        episode begins."""
+        """Write ``features`` into the last columns of inputs x (T, N, n_obs + 2); 0 where episodes begin."""
         for t in range(1, len(x)):
             found = self.features(x[t - 1, :, : self.n_obs], action[t - 1], x[t, :, : self.n_obs])
             x[t, :, self.n_obs :] = torch.where(ended[t - 1, :, None], 0.0, found)

@@ -21,8 +21,7 @@ CAMERA_RANGE_M, HEIGHT_RANGE_M = 4.0, 3.0
 SPELL = 10
 """decisions for which an obstacle is seen equally badly:"""
 BEST, SPREAD, MISSED, MISSED_HIDDEN = 0.35, 0.325, 0.985, 0.94
-"""the first, and the second over one minus a uniform number; beyond the third, or the fourth out of sight, it
-is not tracked"""
+"""first, and second over one minus a uniform number; no track beyond the third, or the fourth out of sight"""
 BORN_S, SETTLED_S = 0.05, 0.07
 """seen so long, times how badly: a track; its velocity across the line of sight is known"""
 TURN_KNOWN_S = 0.8
@@ -35,8 +34,7 @@ per metre. EC, as are the constants around: by quantiles of the simulator's trac
 CAMERA_ALONE = 12.0
 """times as badly is an obstacle seen that the camera sees and the sonar does not"""
 QUICKEST, SLOWER, LAG_S = 0.6, 1.1, 0.04
-"""share of a change of velocity that is seen at once; less of it beyond the middle uniform number; the place
-is behind by so much of what is not seen yet"""
+"""share of a change of velocity that is seen at once, less beyond the middle uniform number; place lags"""
 HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.04
 """errors of position, and of velocity as a share of it, times how badly, when it goes out of sight"""
 FIRST_NORMAL = 1024
@@ -170,9 +168,8 @@ def how_badly(drawn):
 
 @ti.func
 def updated_track(old, lane, at, bend_m, speed, ego_at, is_visible, knows_height, in_fan, key):
-    """The row of ``track`` after a decision, of an obstacle that is at ``at`` (x, y, vx, vy), in error by
-    what this spell (``key``) has for it; while it is not seen it goes straight on, or on its circle
-    (``bend_m``: signed radius, else 0)."""
+    """The row of ``track`` after a decision, of an obstacle at ``at`` (x, y, vx, vy), in error by the spell's
+    ``key``; while unseen it goes straight on, or on its circle (``bend_m``: signed radius, else 0)."""
     new = old
     drawn = uniform(key, lane)
     first, second = normal_pair_lanes(key, FIRST_NORMAL + 2 * lane, 2)

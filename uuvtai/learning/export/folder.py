@@ -15,7 +15,7 @@ import safetensors.numpy
 import safetensors.torch
 
 from uuvtai.common.errors import UserError
-from uuvtai.common.files import unfinished, whole_folder
+from uuvtai.common.files import refusing, unfinished, whole_folder
 from uuvtai.config.loader import ConfigError
 from uuvtai.learning.checkpoint import Checkpoint, Note
 from uuvtai.learning.export import graph as onnx_session
@@ -47,10 +47,8 @@ def export(
     weights = safetensors.torch.save(modules.weights_of(module))
     files = {WEIGHTS: weights, GOLDEN: safetensors.numpy.save(golden)}
     if missing:
-        note(
-            f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', "
-            "then export again"
-        )
+        told = f"{', '.join(missing)} not installed; pip install '{EXTRA}', then export again"
+        note(f"left out {ONNX}: {told}")
     else:
         files[ONNX] = modules.onnx_bytes(module)
     spec = modules.specification(checkpoint, module, name, ONNX in files)
@@ -126,17 +124,14 @@ def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
     text = json.dumps(spec, indent=1, allow_nan=False) + "\n"
     old = unfinished(out)
     try:
-        with whole_folder(out) as partial:
-            for name, content in {**files, SPEC: text.encode()}.items():
-                write_atomic(partial / name, content)
-            sync_folder(partial)
-            if out.exists():
-                out.rename(old)
-        sync_folder(out.parent)
-    except OSError as error:
-        raise RunFolderError(
-            f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR"
-        ) from None
+        with refusing(RunFolderError, f"{out}: cannot be written", "give a folder that can be: --out DIR"):
+            with whole_folder(out) as partial:
+                for name, content in {**files, SPEC: text.encode()}.items():
+                    write_atomic(partial / name, content)
+                sync_folder(partial)
+                if out.exists():
+                    out.rename(old)
+            sync_folder(out.parent)
     finally:
         if out.exists():
             shutil.rmtree(old, ignore_errors=True)

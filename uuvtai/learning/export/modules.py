@@ -13,15 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from uuvtai.common.enums import (
-    EGO_COLUMNS,
-    LEAST_SPEED_M_S,
-    N_OBSTACLE,
-    N_RAY,
-    OBSTACLE_WIDTH,
-    TURN_GAIN,
-    Safety,
-)
+from uuvtai.common import enums
+from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
 from uuvtai.common.version import __version__
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint, action_rows
@@ -252,8 +245,8 @@ def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
         "fastest_m_s": math.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s),
         "limits_m_s": limits,
         "max_yaw_rate_rad_s": vehicle.max_yaw_rate_rad_s,
-        "turn_gain_1_s": TURN_GAIN,
-        "least_speed_m_s": LEAST_SPEED_M_S,
+        "turn_gain_1_s": enums.TURN_GAIN,
+        "least_speed_m_s": enums.LEAST_SPEED_M_S,
         "z_m": list(config.world.tank.z_m),
         "gap_m": config.surrogate.vertical_gap_m,
     }
@@ -261,7 +254,7 @@ def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
 
 def safety_of(config: LearningConfig) -> dict[str, Any]:
     """Numbers of the safety filter (``run_policy.SetPolicy.kept_safe``)."""
-    known = {name.lower(): value for name, value in vars(Safety).items() if name.isupper()}
+    known = {name.lower(): value for name, value in vars(enums.Safety).items() if name.isupper()}
     return {"horizon_s": config.surrogate.safety_horizon_s, "ttc_s": config.episode.ttc_s, **known}
 
 
@@ -301,7 +294,8 @@ closest_in | s | time of the closest approach on straight lines, clip(v, 0, 3)
 closest_gap | m | distance then, less radius and 0.22, clip(v, -1, 3)
 route_direction.x route_direction.y | 1 | unit vector to the look-ahead point of the route
 """)
-OWN_COLUMNS = _columns("""
+OWN_COLUMNS = _columns(
+    """
 goal.x | 10 m | from the vehicle to the goal, / 10
 goal.y | 4 m | the same, / 4
 goal.z | m | height of the goal above the vehicle
@@ -320,12 +314,10 @@ goal_direction.x goal_direction.y | 1 | unit vector to the goal
 route_distance | m | horizontal, to the look-ahead point, at most 2 m
 route_left | 10 m | length of the route to the goal, / 10
 route_aside | m | place left of the route, times flip.x flip.y, clip(v, -2, 2)
-""") + [
-    {
-        "name": f"ray[{i}]",
-        "unit": "1/m",
-        "meaning": "1 / (0.3 + clip(free - 0.22, 0, 4)) - 0.5, free metres to the nearest wall or occupied "
-        f"cell (at most 4.3) at {360 * i / N_RAY:g} degrees from x towards y",
-    }
-    for i in range(N_RAY)
-]
+"""
+    + "\n".join(
+        f"ray[{i}] | 1/m | 1 / (0.3 + clip(free - 0.22, 0, 4)) - 0.5, free metres to the nearest wall or "
+        f"occupied cell (at most 4.3) at {360 * i / N_RAY:g} degrees from x towards y"
+        for i in range(N_RAY)
+    )
+)

@@ -39,8 +39,7 @@ AT_THERE, AT_DIRECTION = 0, slice(3, 5)
 """columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the look-ahead point"""
 AT_WAYS, AT_WIDTH, AT_WATER = (slice(1, 3), slice(12, 14), slice(14, 16)), 7, slice(8, 10)
 AT_SPEED = slice(6, 8)
-"""of an obstacle: the way to it now, in 1 and in 2 s, its width, free water above and below; of the vehicle's
-own, its speed"""
+"""of an obstacle: way to it now, in 1 and in 2 s, width, free water above and below; the vehicle's speed"""
 N_RAY = 24
 """the last columns of the vehicle's own, the first of them along x"""
 SUM_SCALE = 0.3
@@ -197,8 +196,7 @@ class SetDecision(NamedTuple):
     """What the policy wishes."""
 
     wish: Array
-    """(3,) ahead, left, up in the mirrored world, in parts of the fastest velocity, within +-2: what the
-    safety filter leaves of"""
+    """(3,) ahead, left, up in the mirrored world, parts of the fastest velocity: what the filter leaves of"""
     mean_wish: Array
     """(3,) what the network says, not cut off"""
 
@@ -232,8 +230,7 @@ class SetPolicy(Exported):
         return SetDecision(self.kept_safe(wish, rows["obstacles"][0], rows["own"][0]), mean)
 
     def said(self, given: Arrays) -> Arrays:
-        """``mean_wish`` (N, 3): every obstacle through the same layers, then maximum and sum over those that
-        are there. Raises ValueError as ``act``."""
+        """``mean_wish`` (N, 3): maximum and sum of what the layers say of each obstacle. ValueError."""
         obstacles, own = self._rows(given)
         if not (np.isfinite(obstacles).all() and np.isfinite(own).all()):
             raise ValueError("columns are not finite; leave out obstacles that are not known")
@@ -249,8 +246,7 @@ class SetPolicy(Exported):
 
     def kept_safe(self, wish: Array, obstacles: Array, own: Array) -> Array:
         """(3,) the wish, or the nearest one that leads neither to a contact nor to a stop by time to
-        collision within the horizon, by the columns: the safety filter. Where none is safe it is the one
-        that comes least near; up stays as it is."""
+        collision within the horizon, else the one that comes least near; up stays: the safety filter."""
         rule, mine = self.safety, wish[:2] / max(1.0, math.hypot(*wish[:2]))
         if not rule["horizon_s"] or not self._lacks(mine[None], obstacles, own)[0] > 0.0:
             return wish
@@ -261,8 +257,7 @@ class SetPolicy(Exported):
         return np.append(tried[cost.argmin()], wish[2])
 
     def _lacks(self, wishes: Array, obstacles: Array, own: Array) -> Array:
-        """(k,) metres of clearance that are missing at the worst on the ways of the hull by wishes (k, 2),
-        not below 0; what lies later counts less."""
+        """(k,) [m] of clearance missing at the worst by wishes (k, 2), at least 0; later counts less."""
         rule, dt = self.safety, self.safety["step_s"]
         steps = np.arange(round(rule["horizon_s"] / dt) + 1)[:, None, None]
         target, t = rule["reached"] * self.rule["fastest_m_s"] * wishes[:, None, None], dt * steps[1:]
@@ -293,10 +288,8 @@ class SetPolicy(Exported):
         to goal along x and y (1 where it is 0), ``yaw_rad`` and ``z_m`` heading and height now (0 = surface).
         """
         rule, (x, y, up) = self.rule, (float(part) for part in wish)
-        limit, long = rule["limits_m_s"], max(1.0, math.hypot(x, y))
-        ahead, left = (
-            rule["fastest_m_s"] * sign * part / long for sign, part in zip(flip, (x, y), strict=True)
-        )
+        limit, fastest, long = rule["limits_m_s"], rule["fastest_m_s"], max(1.0, math.hypot(x, y))
+        ahead, left = (fastest * sign * part / long for sign, part in zip(flip, (x, y), strict=True))
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         surge, sway = (c * ahead + s * left) / limit["surge"], (c * left - s * ahead) / limit["sway"]
         over = max(1.0, abs(surge), abs(sway))
