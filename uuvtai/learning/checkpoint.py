@@ -5,8 +5,7 @@ opening one executes nothing.
 every file), ``model.safetensors`` (the networks with their normalisers: all that driving needs),
 ``training.safetensors`` (optimisers, generators, counters) and ``simulator.zst`` (the envs themselves, large,
 so only beside the newest ones). The folder is written under another name, flushed to disk and renamed: a
-process killed at any moment leaves the newest verified one usable.
-"""
+process killed at any moment leaves the newest verified one usable."""
 
 from __future__ import annotations
 
@@ -30,20 +29,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor
 
+from uuvtai.common import files
 from uuvtai.common.errors import ODD, UserError
-from uuvtai.common.files import (
-    FileError,
-    flush,
-    open_file,
-    open_new,
-    parsed_json,
-    read_bytes,
-    refuse_links,
-    refuse_links_in,
-    refusing,
-    unfinished,
-    whole_folder,
-)
+from uuvtai.common.files import FileError, open_file, open_new, parsed_json, read_bytes
 from uuvtai.common.presets import POLICY, PRESET_DIR
 from uuvtai.common.version import __version__
 from uuvtai.config import Config
@@ -279,8 +267,7 @@ def config_sha256(config: dict[str, Any]) -> str:
 
 def finite(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics as JSON can hold them: NaN and infinity become None."""
-    bad = {name for name, value in metrics.items() if isinstance(value, float) and not math.isfinite(value)}
-    return {name: None if name in bad else value for name, value in metrics.items()}
+    return {n: None if isinstance(x, float) and not math.isfinite(x) else x for n, x in metrics.items()}
 
 
 MODEL_PARTS, SIMULATOR_PART = ("policy", "world_model", "forecast", "tree"), "env"
@@ -362,13 +349,13 @@ def save(
     refuses; then nothing half-written is taken for a checkpoint."""
     target, plain = checkpoints / f"{_STEP}{step:06d}", config.model_dump(mode="json")
     mend = "make room or mend the folder; then --resume, or begin anew if this was the first checkpoint"
-    with refusing(CheckpointError, f"{target}: cannot be written", mend, ""):
+    with files.refusing(CheckpointError, f"{target}: cannot be written", mend, ""):
         checkpoints.mkdir(parents=True, exist_ok=True)
-        refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
-        refuse_links_in(checkpoints)
+        files.refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
+        files.refuse_links_in(checkpoints)
         for left in checkpoints.glob(f".{_STEP}*.tmp"):  # by a process that was killed
             shutil.rmtree(left, ignore_errors=True)
-        with whole_folder(target) as partial:
+        with files.whole_folder(target) as partial:
             described = _write_parts(partial, state)
             manifest = Manifest(
                 schema=SCHEMA,
@@ -387,10 +374,10 @@ def save(
             text = json.dumps(manifest.model_dump(mode="json", by_alias=True), indent=1, allow_nan=False)
             (partial / MANIFEST).write_text(text, encoding="utf-8")
             for path in (*partial.iterdir(), partial):
-                flush(path)
+                files.flush(path)
             if target.exists():
                 _remove(target)
-        flush(checkpoints)
+        files.flush(checkpoints)
         _thin(checkpoints, config.train.keep_checkpoints)
     return target
 
@@ -422,7 +409,7 @@ def _thin(checkpoints: Path, keep: int) -> None:
 
 def _remove(folder: Path) -> None:
     """Under another name first: half a folder must never be taken for a checkpoint."""
-    doomed = folder.rename(unfinished(folder))
+    doomed = folder.rename(files.unfinished(folder))
     shutil.rmtree(doomed)
 
 
@@ -462,7 +449,7 @@ def newest(
     for path in sorted(_folders(checkpoints), key=lambda path: path != first):
         try:
             with refused(path):
-                refuse_links(run, path)  # to another folder, which is none of the run's own
+                files.refuse_links(run, path)  # to another folder, which is none of the run's own
             found = open_checkpoint(path)
             if not resumable or found.is_resumable:
                 return found

@@ -1,9 +1,6 @@
 """Distillation: the policy's mean is drawn towards the behavior tree's action, more strongly where the world
-model is unsure (docs/learning.md).
-
-The paper's term, lambda_t s_t E ||mu(x) - a_BT||^2, stands in the PPO loss and again in teacher batches with
-an Adam of their own, which forgets a constant factor: there it scales the learning rate.
-"""
+model is unsure (docs/learning.md). The paper's term, lambda_t s_t E ||mu(x) - a_BT||^2, stands in PPO's loss
+and in teacher batches with an Adam of their own, which forgets a constant factor: it scales their rate."""
 
 from __future__ import annotations
 
@@ -57,14 +54,11 @@ class Uncertainty(nn.Module):
     """Exponential moving average of the uncertainty and the distillation scale s_t: sigma_bar <- (1 - rho)
     sigma_bar + rho sigma_t, s_t = clip(1 + alpha sigma_bar, 1, s_max). It begins at the first value seen."""
 
-    mean: Tensor
-    seen: Tensor
-
     def __init__(self, config: UncertaintyConfig) -> None:
         super().__init__()
         self.config = config
-        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("seen", torch.zeros((), dtype=torch.bool))
+        self.mean = nn.Buffer(torch.zeros((), dtype=torch.float64))
+        self.seen = nn.Buffer(torch.zeros((), dtype=torch.bool))
 
     @torch.no_grad()
     def update(self, sigma: Tensor) -> None:

@@ -47,10 +47,10 @@ class Simulated(Environment):
         model = self.world_model if self.config.world_model.as_features else None
         return PolicyAgent(policy, model, self.num_envs, self.device)
 
-    def begin(self, policy: ActorCritic, world_model: WorldModel | None, generator: torch.Generator) -> None:
+    def begin(self, policy: Any, world_model: WorldModel | None, generator: torch.Generator) -> None:
         """First episodes. Where ``world_model.as_features`` is false its columns stay zero."""
         self._norm, self.world_model = policy.observation_norm, world_model
-        self._arrive(*self.env.reset(self.config.train.seed), self._no_features)
+        self._arrive(self._no_features, *self.env.reset(self.config.train.seed))
 
     @torch.no_grad()
     def look_around(self, rollout: Rollout) -> None:
@@ -92,14 +92,14 @@ class Simulated(Environment):
             features = self.world_model.features(self.view["x"][:, : self.env.num_obs], action, final)
         shown = features if self.config.world_model.as_features else self._no_features
         reward = reward.masked_fill(self._bad | is_odd | is_unknown, math.nan)  # PPO leaves such samples out
-        self._arrive(obs, self.info, shown.masked_fill(ended[:, None], 0.0))
+        self._arrive(shown.masked_fill(ended[:, None], 0.0), obs, self.info)
         led_to = {"x": torch.cat([final, shown], dim=1)}
         return Step(reward, terminated, ended, led_to, {"uncertainty": features[:, -1]})
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        self._arrive(*self.env.restore(arrays), self._no_features)
+        self._arrive(self._no_features, *self.env.restore(arrays))
 
-    def _arrive(self, obs: Tensor, info: View, features: Tensor) -> None:
+    def _arrive(self, features: Tensor, obs: Tensor, info: View) -> None:
         """What the next decision is made by; ``info``: what ``VectorEnv.step`` tells beside ``obs``."""
         self.info = info
         seen, is_unknown = self._cleaned(obs)
@@ -124,7 +124,7 @@ class InSurrogate(Environment):
     device, steps = torch.device("cpu"), HOLD_STEPS
 
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
-        """Draws the scenarios, unless they are given. Raises SettingError for what does not fit."""
+        """Draws scenarios, unless they are given. Raises SettingError, ConfigError for what does not fit."""
         from uuvtai.surrogate.observation import SET_TABLE
         from uuvtai.surrogate.world import Surrogate, draw_bank
 

@@ -104,9 +104,8 @@ def mirrored(columns: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def scores_of(mixture: Mixture, truth: Tensor) -> dict[str, float]:
-    """How good forecasts of n tracks are (``truth`` (n, ANCHORS, 2) [m]): likelihood [nat]; median and 90 %
-    quantile [m] of the distance at the last time, of the likeliest future and of the nearest; how probable
-    the likeliest is said to be, and how often it is the nearest on the whole way."""
+    """How good forecasts of n tracks are: likelihood [nat]; median and 90 % quantile [m] of last distances of
+    the likeliest future and of the nearest; how probable the likeliest is said to be, how often nearest."""
     away, likeliest = (mixture.place - truth[:, None]).norm(dim=-1), mixture.log_weight.argmax(-1)
     last = {"likeliest": away[..., -1].gather(1, likeliest[:, None])[:, 0], "nearest": away[..., -1].amin(-1)}
     found = {f"{name}_median_m": part.median() for name, part in last.items()}

@@ -91,16 +91,13 @@ def combined(a: Moments, b: Moments) -> Moments:
 class RunningNorm(nn.Module):
     """Scales columns to mean 0 and deviation 1 by all samples so far; before the first one not at all."""
 
-    mean: Tensor
-    m2: Tensor
-    count: Tensor
-
     def __init__(self, width: int, clip: float = 10.0) -> None:
         """``clip``: standard deviations beyond which normalised values are cut off."""
         super().__init__()
         self.clip = clip
-        for name, shape in (("mean", (width,)), ("m2", (width,)), ("count", ())):
-            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
+        zeros = functools.partial(torch.zeros, dtype=torch.float64)
+        self.mean, self.m2 = nn.Buffer(zeros(width)), nn.Buffer(zeros(width))
+        self.count = nn.Buffer(zeros(()))
 
     def update(self, x: Tensor) -> None:
         """Add the rows of x (..., width); rows that are not finite are left out."""
@@ -133,8 +130,6 @@ class RunningNorm(nn.Module):
 NUM_ACTIONS = 4
 _MEAN_GAIN = 0.01  # of the last layer: small first actions (Andrychowicz et al. 2021)
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-
-
 View = dict[str, Tensor]
 """what is known of N envs, by name, each (N, ...)"""
 

@@ -16,7 +16,7 @@ from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS
 from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.config.behavior import FAST, SLOW, TUNED, configured_factors, log_bounds
 from uuvtai.config.learning import LearningConfig, SearchScene
-from uuvtai.config.loader import ConfigError
+from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.learning.agents import TunedAgent, tuned_sections
 from uuvtai.learning.rollout import Recent, RolloutSums
 
@@ -117,18 +117,21 @@ def best_near(centre: Array, slope: Array, bend: Array, spread: Array, low: Arra
 def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
     """A simulator of a world with room for every scene, on the run's sensors and stack; what the world says
     is known of its traffic counts. ConfigError."""
-    from uuvtai.config.loader import load_config
-    from uuvtai.sim.behavior_tree import read_tree
-    from uuvtai.sim.sim import Sim
-
     most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
     there = load_config(world, overrides=[*most])
     update: dict[str, Any] = {"world": there.world}
     for name in ("traffic", "tracking"):
         said = getattr(there, name).model_dump(exclude_defaults=True)
         update[name] = getattr(config, name).model_copy(update=said)
-    config = config.model_copy(update=update)
-    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE))
+    return training_simulator(config.model_copy(update=update))
+
+
+def training_simulator(config: LearningConfig, device: str = "cpu") -> Sim:
+    """As many envs as the run has, driven by the tree that teaches."""
+    from uuvtai.sim.behavior_tree import read_tree
+    from uuvtai.sim.sim import Sim
+
+    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE), device)
 
 
 def run_search_episodes(
@@ -225,13 +228,9 @@ class ParameterSearchTrainer(EpisodeTrainer):
     def _search(self, part: int) -> NumberSearch:
         config, n = self.config, len(self._part)
         rounds = sum(self._part[i % n] == part for i in range(config.train.iterations))
-        return NumberSearch(
-            torch.from_numpy(configured_factors(config.slow, config.fast)[:, part]),
-            torch.tensor(log_bounds()),
-            config.parameter_search.spread,
-            rounds * config.train.num_envs,
-            config.train.seed,
-        )
+        centre = torch.from_numpy(configured_factors(config.slow, config.fast)[:, part])
+        spread, size = config.parameter_search.spread, rounds * config.train.num_envs
+        return NumberSearch(centre, torch.tensor(log_bounds()), spread, size, config.train.seed)
 
     def files(self) -> dict[str, bytes]:
         """The stack that drives by the numbers as they are now."""

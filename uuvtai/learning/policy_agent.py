@@ -1,8 +1,6 @@
-"""A trained policy driving: the mean action without exploration noise.
-
-What a row does must not depend on its neighbours, the batch's size or the number of threads. The networks
-therefore always see ``CHUNK`` rows at once: equal shapes take equal paths through the matrix products.
-"""
+"""A trained policy driving: the mean action without exploration noise. What a row does must not depend on its
+neighbours, the batch's size or the number of threads. The networks therefore always see ``CHUNK`` rows at
+once: equal shapes take equal paths through the matrix products."""
 
 from __future__ import annotations
 
@@ -41,14 +39,12 @@ class AgentDecision(NamedTuple):
 class OneDecision(nn.Module):
     """The networks for one decision, without memory."""
 
-    fill: Tensor
-    """(n_obs,) what counts where a value is not finite"""
-
     def __init__(self, policy: ActorCritic, world_model: WorldModel | None) -> None:
         """``world_model``: None where the policy was trained without its features."""
         super().__init__()
         self.policy, self.world_model = policy, world_model
-        self.register_buffer("fill", policy.observation_norm.mean[: policy.n_in - N_FEATURES].float())
+        self.fill = nn.Buffer(policy.observation_norm.mean[: policy.n_in - N_FEATURES].float())
+        """(n_obs,) what counts where a value is not finite"""
 
     def forward(
         self, obs: Tensor, last_obs: Tensor, last_action: Tensor, has_last: Tensor

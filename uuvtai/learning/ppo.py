@@ -11,18 +11,9 @@ import torch
 from torch import Tensor
 
 from uuvtai.config.learning import PpoConfig
+from uuvtai.learning import networks
 from uuvtai.learning.distillation import imitation_error
-from uuvtai.learning.networks import (
-    CACHE_ROWS,
-    AdamLearner,
-    Policy,
-    View,
-    entropy,
-    log_prob,
-    moments_of,
-    side_by_side,
-    torch_threads_rest,
-)
+from uuvtai.learning.networks import CACHE_ROWS, AdamLearner, Policy, View, entropy, log_prob, moments_of
 from uuvtai.learning.rollout import Rollout
 
 ADAM_EPS = 1e-5
@@ -96,7 +87,7 @@ class Ppo(AdamLearner):
         fade = min(1.0, (1.0 - share) / (1.0 - DECAY_FROM)) if config.target_kl > 0 else 1.0
         self._rate_now.copy_(self.rate * max(LEAST_RATE, fade))
         skipped, sums = self.skipped, torch.zeros(len(_SUMS), dtype=torch.float64, device=self.rate.device)
-        with torch_threads_rest():
+        with networks.torch_threads_rest():
             for _ in range(config.epochs):
                 for index in self._minibatches(len(samples["valid"]), generator):
                     sums += self._learn(samples, index, strength)
@@ -132,15 +123,18 @@ class Ppo(AdamLearner):
         reward, value, following = rollout["reward"], rollout["value"], rollout["next_value"]
         gamma, lam = self.config.gamma, self.config.gae_lambda
         advantage, returns = gae(reward, value, following, rollout["ended"] | ~valid, gamma, lam)
-        good = returns[valid]
-        metrics = {
-            "train/explained_variance": _explained_variance(value[valid], good),
-            "train/invalid_samples": float(valid.numel() - len(good)),
-        }
+        good, explained = returns[valid], 0.0
+        if len(good) > 1 and float(good.var()):
+            explained = 1.0 - float((good - value[valid]).var() / good.var())
+        invalid = float(valid.numel() - len(good))
+        metrics = {"train/explained_variance": explained, "train/invalid_samples": invalid}
         if self.config.normalise_values:
             self.policy.learn_returns(good[:, None])
+        moments = moments_of(advantage[valid][:, None])
+        std = (moments.m2 / moments.n.clamp(min=1.0)).sqrt().float()
+        standardised = torch.where(valid, (advantage - moments.mean.float()) / (std + 1e-8), 0.0)
         found = {
-            "advantage": _standardised(advantage, valid).flatten(),
+            "advantage": standardised.flatten(),
             "target": self.policy.value_norm(returns.flatten()),
             "valid": valid.flatten().float(),
         }
@@ -159,7 +153,7 @@ class Ppo(AdamLearner):
         """A step by these samples; their sums. The number of threads changes no bit."""
         self.optimiser.zero_grad(set_to_none=True)
         count, device = samples["valid"][index].sum().clamp(min=1.0), self.rate.device.type
-        together = functools.partial(side_by_side, device=device)
+        together = functools.partial(networks.side_by_side, device=device)
 
         def rows(part: Tensor) -> View:
             return {name: values[part] for name, values in samples.items()}
@@ -205,17 +199,3 @@ def _summed(terms: View, valid: Tensor) -> Tensor:
     """Sums of terms (B,) over the valid rows, in the order of ``_SUMS``; those that are not there are 0."""
     zero = torch.zeros_like(valid)
     return (torch.stack([terms.get(name, zero) for name in _SUMS]) @ valid).double()
-
-
-def _standardised(advantage: Tensor, valid: Tensor) -> Tensor:
-    """Mean 0, deviation 1 by the moments of the valid samples; the others become 0."""
-    moments = moments_of(advantage[valid][:, None])
-    std = (moments.m2 / moments.n.clamp(min=1.0)).sqrt()
-    return torch.where(valid, (advantage - moments.mean.float()) / (std.float() + 1e-8), 0.0)
-
-
-def _explained_variance(value: Tensor, returns: Tensor) -> float:
-    """1 - var(return - value) / var(return); 0 where the returns do not vary."""
-    if len(returns) < 2 or not float(returns.var()):
-        return 0.0
-    return 1.0 - float((returns - value).var() / returns.var())

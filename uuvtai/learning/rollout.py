@@ -35,7 +35,6 @@ class Environment(ABC):
     env: Any
     carried: View
     """what is kept beside ``env.capture()``"""
-    num_envs: int
     device: torch.device
     view: View
     """what is known now; written anew by ``step``"""

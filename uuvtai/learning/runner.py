@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 from uuvtai.common import signals
 from uuvtai.common.errors import OwnCodeError
 from uuvtai.common.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
-from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError, Overrides, load_resolved, to_yaml
@@ -25,7 +24,7 @@ from uuvtai.learning.agents import find_policy
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.environments import InSurrogate, Simulated
 from uuvtai.learning.forecast import ForecastTrainer
-from uuvtai.learning.parameter_search import ParameterSearchTrainer
+from uuvtai.learning.parameter_search import ParameterSearchTrainer, training_simulator
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.set_networks import actor_of
 from uuvtai.learning.trainer import Trainer
@@ -88,11 +87,9 @@ Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 
 
 def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple[dict[str, Any], Path]:
-    """Train or go on training; what ``uuv train --json`` prints, and the run folder.
-
-    Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets
-    the iteration end, saves and raises KeyboardInterrupt; a second one ends at once.
-    """
+    """Train or go on training; what ``uuv train --json`` prints, and the run folder. Everything that can be
+    refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets the iteration end,
+    saves and raises KeyboardInterrupt; a second one ends at once."""
     if request.iterations is not None and request.iterations < 1:
         raise ConfigError(f"--iterations {request.iterations}: at least 1, for example --iterations 100")
     # held before anything is read: what another process writes meanwhile must not count
@@ -209,10 +206,8 @@ def _trainer(config: LearningConfig, device: str, own: RewardSource | None) -> A
 
 def _env(config: LearningConfig, device: str) -> VectorEnv:
     from uuvtai.envs.vector_env import VectorEnv
-    from uuvtai.sim.behavior_tree import read_tree
-    from uuvtai.sim.sim import Sim
 
-    sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE), device)
+    sim = training_simulator(config, device)
     sim.set_scenes(config.train.scenes)
     return VectorEnv(sim, config.train.seed)
 

@@ -31,6 +31,8 @@ class Trainer:
     def __init__(self, env: Simulated | InSurrogate, config: LearningConfig) -> None:
         """Begins the episodes of ``env``. ValueError for settings that do not fit each other."""
         samples = config.ppo.rollout_steps * env.num_envs
+        self._samples = samples * env.steps
+        """env-steps of one rollout"""
         if config.ppo.minibatches > samples:
             told = f"a rollout has only {samples} samples: raise ppo.rollout_steps or train.num_envs"
             raise SettingError(f"ppo.minibatches={config.ppo.minibatches}, but {told}")
@@ -143,8 +145,3 @@ class Trainer:
         rollout = self.rollout
         obs, valid = rollout["x"][..., : self.world_learner.model.n_obs], ~rollout["ended"][:-1]
         return self.world_learner.update(obs[:-1], rollout["action"][:-1], obs[1:], valid, self.generator)
-
-    @property
-    def _samples(self) -> int:
-        """Env-steps of one rollout."""
-        return self.rollout.steps * self.env.steps * self.env.num_envs

@@ -5,16 +5,8 @@ import taichi as ti
 
 from uuvtai.common.enums import HOLD_STEPS, LEAST_SPEED_M_S, RUNNING, SUCCESS, TIMEOUT, TURN_GAIN
 from uuvtai.config import TankConfig, VehicleConfig
-from uuvtai.kernels.core.geometry import (
-    FAR_M,
-    NONE,
-    PI,
-    foot_on,
-    hull_to_side_wall,
-    steady_direction,
-    turned_z,
-    wrapped_angle,
-)
+from uuvtai.kernels.core import geometry
+from uuvtai.kernels.core.geometry import FAR_M, NONE, PI, foot_on, steady_direction, turned_z, wrapped_angle
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
 from uuvtai.kernels.task.episode import threat_of, verdict
 from uuvtai.kernels.vehicle.control import axis_loops, integrated
@@ -77,7 +69,8 @@ def corner_of(number, lane, leg, path: AnyTensor):
 @ti.func
 def leg_of(number, lane, leg, path: AnyTensor):
     """The whole of a leg (x, y) [m]."""
-    return corner_of(number, lane, leg + 1, path) - corner_of(number, lane, leg, path)
+    begin, end = corner_of(number, lane, leg, path), corner_of(number, lane, leg + 1, path)
+    return ti.Vector([end[0] - begin[0], end[1] - begin[1]])
 
 
 @ti.func
@@ -133,8 +126,7 @@ def place_of(number, slot, t_s, obstacle: AnyTensor, path: AnyTensor):
     lane = slot - (obstacle.shape[1] - path.shape[1])
     if lane >= 0:
         place = path_places(number, lane, ti.Vector([t_s]), path)
-        for i in ti.static(range(4)):
-            out[i] = place[0, i]
+        out = ti.Vector([place[0, i] for i in ti.static(range(4))])
     return out
 
 
@@ -158,7 +150,7 @@ def nearest_of(
 ):
     """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the termination
     check sees it; obstacles beyond ``NEAR_M`` are left out."""
-    clearance, ttc = hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg), FAR_M + 0.0
+    clearance, ttc = geometry.hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg), FAR_M + 0.0
     hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
     for slot in range(obstacle.shape[1]):
         kind = ti.cast(obstacle[number, slot, 0], ti.i32)

@@ -44,6 +44,8 @@ RAY_SLACK = 0.01
 """of the angle between two rays, by which an obstacle is looked for wider than it is: rounding"""
 COLUMN_M = 1.6
 """free water above and below is cut off here"""
+RAYS = [[math.cos(angle), math.sin(angle)] for angle in (i * TWO_PI / N_RAY for i in range(N_RAY))]
+"""unit vectors (x, y)"""
 
 
 @ti.func
@@ -67,12 +69,6 @@ def is_hidden(number, slot_count, here, at, obstacle: AnyTensor):
             elif along > 0.0 and along < far and across < 0.9 * wide:
                 out = 1
     return out
-
-
-def rays():
-    """Unit vectors (x, y) of the rays; plain Python, constants of the kernel."""
-    angles = [i * TWO_PI / N_RAY for i in range(N_RAY)]
-    return [[math.cos(angle), math.sin(angle)] for angle in angles]
 
 
 @ti.func
@@ -100,14 +96,6 @@ def free_to_box(dx, dy, to, c, s, wide, deep):
 
 
 @ti.func
-def free_to_circle(dx, dy, to, wide):
-    """[m] in a direction to a circle whose middle is (dx, dy) away."""
-    along = dx * to[0] + dy * to[1]
-    inside = along * along - (dx * dx + dy * dy) + wide * wide
-    return along - ti.sqrt(inside) if inside > 0.0 and along > 0.0 else UNBOUNDED_M
-
-
-@ti.func
 def rays_towards(dx, dy, reach):
     """(first, count) of the rays that can meet an obstacle of this radius whose middle is (dx, dy) away."""
     first, count = 0, N_RAY
@@ -123,7 +111,7 @@ def rays_towards(dx, dy, reach):
 @ti.func
 def write_rays(env, number, slot_count, at, obstacle: AnyTensor, ray: FloatMatrix, io: Bundle[Rules]):
     """[m] from a place (x, y) along each ray to the nearest wall or static obstacle, without the hull."""
-    towards = ti.Matrix(ti.static(rays()))
+    towards = ti.Matrix(ti.static(RAYS))
     for i in ti.static(range(N_RAY)):
         ray[env, i] = free_to_wall(at, ti.Vector([towards[i, 0], towards[i, 1]]), io)
     for slot in range(slot_count):
@@ -137,11 +125,13 @@ def write_rays(env, number, slot_count, at, obstacle: AnyTensor, ray: FloatMatri
             first, count = rays_towards(dx, dy, ti.sqrt(wide * wide + deep * deep))
             for k in range(count):
                 i = (first + k + N_RAY) % N_RAY
-                to, free_m = ti.Vector([towards[i, 0], towards[i, 1]]), 0.0
+                to, free_m = ti.Vector([towards[i, 0], towards[i, 1]]), UNBOUNDED_M + 0.0
+                along = dx * to[0] + dy * to[1]
+                inside = along * along - (dx * dx + dy * dy) + wide * wide
                 if kind == BOX:
                     free_m = free_to_box(dx, dy, to, c, s, wide, deep)
-                else:
-                    free_m = free_to_circle(dx, dy, to, wide)
+                elif inside > 0.0 and along > 0.0:
+                    free_m = along - ti.sqrt(inside)
                 ray[env, i] = ti.min(ray[env, i], free_m)
 
 

@@ -124,9 +124,7 @@ class OneWish(nn.Module):
         "obstacles": f"(N, n, {OBSTACLE_WIDTH}) float32: moving obstacles in any order; zeros = none",
         "own": f"(N, {EGO_COLUMNS}) float32: the vehicle, its goal and the free distances around it",
     }
-    outputs = {
-        "mean_wish": "(N, 3) float32: ahead, left, up in the mirrored world; cut off to [-2, 2], filter"
-    }
+    outputs = {"mean_wish": "(N, 3) float32: ahead, left, up in the mirrored world; cut to [-2, 2], filter"}
 
     def __init__(self, actor: SetActor) -> None:
         super().__init__()

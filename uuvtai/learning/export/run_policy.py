@@ -11,8 +11,7 @@ What it is stands as ``kind`` in policy_spec.json, with every column of its inpu
           policy.command(said.wish, flip, yaw_rad, z_m), the hull rule
 
 ``python run_policy.py [FOLDER]`` replays the golden pairs, prints the differences and the latency, and exits
-3 where they differ. Nothing in the folder can make this file execute code.
-"""
+3 where they differ. Nothing in the folder can make this file execute code."""
 
 from __future__ import annotations
 
@@ -285,8 +284,7 @@ class SetPolicy(Exported):
         """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame: the hull rule. A
         diagonal of the hull turns to the motion, for there surge and sway add up; floor and surface are kept
         clear of. ``wish`` (3,) is held between decisions, ``flip`` (2,) are the signs of the way from start
-        to goal along x and y (1 where it is 0), ``yaw_rad`` and ``z_m`` heading and height now (0 = surface).
-        """
+        to goal along x and y (1 for 0), ``yaw_rad`` and ``z_m`` heading and height now (0 = surface)."""
         rule, (x, y, up) = self.rule, (float(part) for part in wish)
         limit, fastest, long = rule["limits_m_s"], rule["fastest_m_s"], max(1.0, math.hypot(x, y))
         ahead, left = (fastest * sign * part / long for sign, part in zip(flip, (x, y), strict=True))
@@ -380,8 +378,8 @@ def read_spec(folder: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"{file}: is not JSON ({error}); export the policy again") from None
     if not isinstance(spec, dict) or spec.get("schema") != SCHEMA:
-        of = f"a specification of schema {SCHEMA}"
-        raise PolicyError(f"{file}: is not {of}; give a folder of this version's uuv export")
+        told = f"is not the specification of an exported policy of schema {SCHEMA}"
+        raise PolicyError(f"{file}: {told}; give a folder of this version's uuv export")
     return spec
 
 
