@@ -112,8 +112,7 @@ class Distillation(AdamLearner):
 
 # ------------------------------------------------------------------------------------------------------------
 # Warm start of a policy over a set of obstacles by DAgger (Ross, Gordon & Bagnell 2011): whoever drives, the
-# actor's mean is fitted to what the tree would do. The tree drives in the first wave, the student more and
-# more.
+# actor's mean is fitted to what the tree would do. The tree drives first, then the student more and more.
 
 
 WAVE_EPISODES = 256

@@ -36,7 +36,6 @@ class Simulated(Environment):
         self._no_features = self.view["x"][:, env.num_obs :]
         columns = [(c.name, c.slice) for c in self.observation_table]
         self.guard = Guard(columns, self.num_envs, config.train.patience, self.device)
-        self.world_model: WorldModel | None = None
 
     def make_policy(self, generator: torch.Generator) -> ActorCritic:
         """One that fits the view."""

@@ -53,8 +53,7 @@ def is_hidden(number, slot_count, here, at, obstacle: AnyTensor):
     """1 where a static obstacle stands between a place ``here`` and another (x, y)."""
     dx, dy = at[0] - here[0], at[1] - here[1]
     far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
-    to = ti.Vector([dx / far, dy / far])
-    out = 0
+    to, out = ti.Vector([dx / far, dy / far]), 0
     for slot in range(slot_count):
         kind = ti.cast(obstacle[number, slot, 0], ti.i32)
         if out == 0 and kind != NONE:
