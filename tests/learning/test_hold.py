@@ -39,7 +39,8 @@ def held(steps):
     env = Scripted()
     made = trainer_of(env, config_of(policy={"hidden": [4], "hold_steps": steps})).env
     sums = RolloutSums(len(env.outcomes), len(env.reward_terms), env.device)
-    return env, made.view, made.step(torch.full((3, NUM_ACTIONS), 0.5), sums), sums
+    came = made.step(torch.full((3, NUM_ACTIONS), 0.5), sums)
+    return env, made.view, came, sums
 
 
 def test_rewards_add_up_and_an_ending_on_the_way_is_kept():

@@ -21,7 +21,6 @@ from uuvtai.learning.forecast import (
     ForecastTrainer,
     Mixture,
     MixtureNet,
-    TrackMoments,
     negative_log_likelihood,
     scores_of,
     watch,
@@ -45,7 +44,7 @@ def made_up(seed, n=400):
         * torch.where(torch.rand(n, generator=generator) < 0.5, 1.0, -1.0)[:, None]
     )
     truth = torch.stack([way, torch.zeros_like(way)], -1)
-    return TrackMoments(columns, truth)
+    return columns, truth
 
 
 @pytest.fixture
@@ -180,13 +179,13 @@ def test_what_cannot_be_learnt_is_refused(config, tmp_path):
 
 def test_what_is_watched_is_what_came(learned):
     learned.forget()
-    moments, steps = watch(learned.sim, ((8, 6, 0.6),), 7, 0, 300)
+    (columns, truth), steps = watch(learned.sim, ((8, 6, 0.6),), 7, 0, 300)
     assert steps <= 8 * 300
-    assert len(moments.truth) > 50
-    assert moments.columns[:, :COLUMNS].isfinite().all() and (moments.columns[:, COLUMNS:] == 0).all()
-    far = moments.truth[:, -1].norm(dim=-1)
+    assert len(truth) > 50
+    assert columns[:, :COLUMNS].isfinite().all() and (columns[:, COLUMNS:] == 0).all()
+    far = truth[:, -1].norm(dim=-1)
     assert far.max() < 2.5 * 0.6 + 0.5 + 1e-3, "no obstacle is faster than its scene says"
-    ahead = (moments.truth[:, 0] - torch.stack([0.5 * moments.columns[:, 0], 0 * far], -1)).norm(dim=-1)
+    ahead = (truth[:, 0] - torch.stack([0.5 * columns[:, 0], 0 * far], -1)).norm(dim=-1)
     assert ahead.median() < 0.1, "most obstacles go on as they are tracked"
     sim, s = learned.sim, learned.sim.s
     there = sim.rows(s.forecast.radius_m)[..., 0] >= 0

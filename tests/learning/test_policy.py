@@ -36,9 +36,9 @@ def test_densities_are_those_of_torch(x):
 def test_a_step_is_a_draw_from_the_distribution(x):
     policy = make()
     step = policy.act({"x": x}, torch.Generator().manual_seed(9))
-    mean, log_std = policy.distribution(x)
+    mean, log_std = policy.mean_of(policy.prepared({"x": x})), policy.log_std
     assert torch.allclose(step.mean, mean, atol=FLOAT32)
-    assert torch.allclose(step.value, policy.value(x), atol=FLOAT32)
+    assert torch.allclose(step.value, policy.expected({"x": x}), atol=FLOAT32)
     assert torch.allclose(step.log_prob, log_prob(step.action, mean, log_std), atol=FLOAT32)
     assert not any(tensor.requires_grad for tensor in step)
     many = policy.act({"x": x[:1].expand(40_000, -1)}, torch.Generator().manual_seed(3))
@@ -52,8 +52,8 @@ def test_a_step_is_a_draw_from_the_distribution(x):
 
 def test_shapes_follow_the_input(x):
     policy = make()
-    assert policy.distribution(x.view(5, 10, N_IN))[0].shape == (5, 10, 4)
-    assert policy.value(x.view(5, 10, N_IN)).shape == (5, 10)
+    assert policy.mean_of(policy.prepared({"x": x.view(5, 10, N_IN)})).shape == (5, 10, 4)
+    assert policy.expected({"x": x.view(5, 10, N_IN)}).shape == (5, 10)
 
 
 def test_the_floor_of_the_deviation():
@@ -69,11 +69,11 @@ def test_the_floor_of_the_deviation():
 def test_learning_returns_changes_the_statistics_but_no_value(x):
     policy = make()
     policy.observation_norm.update(x)
-    before = policy.value(x)
+    before = policy.expected({"x": x})
     for returns in (torch.linspace(-50.0, 300.0, 40)[:, None], torch.linspace(900.0, 1000.0, 400)[:, None]):
         policy.learn_returns(returns)
         # in parts of returns of 1000 in float32
-        assert torch.allclose(policy.value(x), before, rtol=1e-4, atol=1e-3)
+        assert torch.allclose(policy.expected({"x": x}), before, rtol=1e-4, atol=1e-3)
     assert float(policy.value_norm.mean) > 800
     normalised = policy.critic(policy.observation_norm(x)).squeeze(-1)
     assert torch.allclose(policy.value_norm(before), normalised, atol=1e-4)
@@ -105,8 +105,9 @@ def test_the_state_dict_is_the_whole_policy(x):
     policy.observation_norm.update(x)
     policy.learn_returns(torch.arange(9.0)[:, None])
     other.load_state_dict(policy.state_dict())
-    assert torch.equal(other.distribution(x)[0], policy.distribution(x)[0])
-    assert torch.equal(other.value(x), policy.value(x))
+    x_of_other, x_of_policy = other.prepared({"x": x}), policy.prepared({"x": x})
+    assert torch.equal(other.mean_of(x_of_other), policy.mean_of(x_of_policy))
+    assert torch.equal(other.expected({"x": x}), policy.expected({"x": x}))
 
 
 @pytest.mark.parametrize("activation", ["elu", "tanh", "relu"])

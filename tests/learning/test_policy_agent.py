@@ -16,7 +16,7 @@ from uuvtai.config.loader import load_training
 from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.evaluation.agents import AgentSpec, load_agents, observation_of
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
-from uuvtai.learning import agents, checkpoint
+from uuvtai.learning import checkpoint
 from uuvtai.learning.agents import find_policy
 from uuvtai.learning.checkpoint import CheckpointError
 from uuvtai.learning.networks import ActorCritic
@@ -96,14 +96,14 @@ def test_what_it_thinks_of_the_world_model_is_about_its_own_last_action():
     first, second = 3.0 * torch.randn(2, 3, N_OBS, generator=torch.Generator().manual_seed(4))
     pilot = PolicyAgent(policy, model, 3)
     pilot.act(first)
-    own = policy.distribution(torch.cat([first, torch.zeros(3, 2)], 1))[0].detach()
+    own = policy.mean_of(policy.prepared({"x": torch.cat([first, torch.zeros(3, 2)], 1)})).detach()
     assert own.abs().mean() > 0.1
     decision = pilot.decide(second)
     expected = model.features(first, own, second)
     assert torch.allclose(torch.stack([decision.residual, decision.uncertainty], 1), expected, rtol=1e-4)
     assert not torch.allclose(model.features(first, torch.zeros(3, 4), second), expected, rtol=1e-3)
     x = torch.cat([second, expected], 1)
-    assert torch.allclose(decision.action, policy.distribution(x)[0].clamp(-1, 1), atol=1e-4)
+    assert torch.allclose(decision.action, policy.mean_of(policy.prepared({"x": x})).clamp(-1, 1), atol=1e-4)
 
 
 def test_actions_are_means_within_the_limits_and_nan_does_not_spread():
@@ -118,7 +118,7 @@ def test_actions_are_means_within_the_limits_and_nan_does_not_spread():
     assert (found.abs() <= 1).all()
     x = torch.cat([obs[:1], torch.zeros(1, 2)], 1)
     # other shapes sum in another order
-    assert torch.allclose(found[0], policy.distribution(x)[0][0].clamp(-1, 1), atol=1e-5)
+    assert torch.allclose(found[0], policy.mean_of(policy.prepared({"x": x}))[0].clamp(-1, 1), atol=1e-5)
 
 
 # --------------------------------------------------------------------------------------------- in a simulator
@@ -254,7 +254,7 @@ def test_the_built_in_policy_drives_on_when_keys_are_renamed(tmp_path, monkeypat
     (tmp_path / "policy").mkdir()
     arrays = load_file(PRESET_DIR / "policy" / checkpoint.MODEL)
     save_file(arrays, tmp_path / "policy" / checkpoint.MODEL, {"manifest": json.dumps(manifest)})
-    monkeypatch.setattr(agents, "PRESET_DIR", tmp_path)
+    monkeypatch.setattr(checkpoint, "PRESET_DIR", tmp_path)
     found = find_policy("policy")
     assert found.config == load_training("policy") and "policy" in found.model()
 

@@ -27,6 +27,12 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
+def learn(learner, data, draws, valid=None):
+    """From all of the data, or what is ``valid``."""
+    every = torch.ones(data[1].shape[:2], dtype=torch.bool)
+    return learner.update(*data, every if valid is None else valid, draws)
+
+
 def transitions(seed=0, steps=STEPS, n_env=N_ENV, noisy=0.2):
     """obs, action, next_obs: targets follow the action, with ``noisy`` noise where column 24 is positive."""
     gen = generator(seed)
@@ -44,7 +50,7 @@ def trained(updates, config=SMALL, data=None, seed=0):
     model = WorldModel(N_OBS, config, draws)
     learner, metrics = WorldModelLearner(model, config), {}
     for _ in range(updates):
-        metrics = learner.update(*(data or transitions()), draws)
+        metrics = learn(learner, data or transitions(), draws)
     return model, learner, metrics
 
 
@@ -115,7 +121,7 @@ def test_skill_is_told_by_name_and_only_where_something_changes():
     (obs, action, next_obs), names = transitions(), [f"t{i}" for i in range(N_TARGET)]
     next_obs[..., 3] = obs[..., 3]
     learner = WorldModelLearner(WorldModel(N_OBS, SMALL, generator()), SMALL, names)
-    found = learner.update(obs, action, next_obs, generator()).items()
+    found = learn(learner, (obs, action, next_obs), generator()).items()
     told = {name.split("/")[-1]: value for name, value in found if "/skill/" in name}
     assert told.keys() == {*names} - {"t3"}
     before = (next_obs - obs)[..., :N_TARGET].square().mean((0, 1))
@@ -140,14 +146,14 @@ def test_resume_is_bit_exact():
     model = WorldModel(N_OBS, SMALL, draws)
     learner = WorldModelLearner(model, SMALL)
     for _ in range(2):
-        learner.update(*transitions(), draws)
+        learn(learner, transitions(), draws)
     again = WorldModel(N_OBS, SMALL, generator(9))
     resumed = WorldModelLearner(again, SMALL)
     again.load_state_dict(model.state_dict())
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
     draws_again = generator().set_state(draws.get_state())
     for one, g in ((learner, draws), (resumed, draws_again)):
-        last = [one.update(*transitions(4), g) for _ in range(2)][-1]
+        last = [learn(one, transitions(4), g) for _ in range(2)][-1]
     assert last["world_model/reconstruction_loss"] != 0.0
     for mine, theirs in zip(model.state_dict().values(), again.state_dict().values(), strict=True):
         assert torch.equal(mine, theirs)
@@ -166,7 +172,7 @@ def test_rows_that_are_not_finite_count_like_rows_that_are_not_valid():
     for data, valid in ((with_nan, None), (transitions(), ~bad)):
         draws = generator()
         model = WorldModel(N_OBS, SMALL, draws)
-        WorldModelLearner(model, SMALL).update(*data, draws, valid)
+        learn(WorldModelLearner(model, SMALL), data, draws, valid)
         found.append(parameters(model))
     assert torch.equal(*found) and torch.isfinite(found[0]).all()
     assert not torch.equal(found[0], parameters(trained(1)[0])), "leaving rows out makes a difference"
@@ -175,7 +181,7 @@ def test_rows_that_are_not_finite_count_like_rows_that_are_not_valid():
 def test_nothing_but_nan_changes_nothing():
     model, learner, _ = trained(1)
     before, norm = parameters(model).clone(), model.observation_norm.mean.clone()
-    metrics = learner.update(*(part * math.nan for part in transitions()), generator())
+    metrics = learn(learner, [part * math.nan for part in transitions()], generator())
     assert torch.equal(model.observation_norm.mean, norm)
     assert torch.equal(parameters(model), before)
     assert metrics["world_model/skipped_updates"] == SMALL.steps
@@ -187,7 +193,7 @@ def test_a_loss_that_is_not_finite_is_skipped_and_counted():
     with torch.no_grad():
         model.decoder[-1].bias[0] = math.inf
     before = parameters(model).clone()
-    metrics = learner.update(*transitions(), generator())
+    metrics = learn(learner, transitions(), generator())
     assert metrics["world_model/skipped_updates"] == SMALL.steps == learner.skipped
     assert torch.equal(parameters(model), before)
 

@@ -96,7 +96,7 @@ def gradients(policy, rollout, distilled):
     """Of the actor and of log_std by the textbook; ``distilled`` (T, N) multiplies imitation errors."""
     policy = copy.deepcopy(policy)
     advantage = advantages(rollout)
-    mean, log_std = policy.distribution(rollout["x"])
+    mean, log_std = policy.mean_of(policy.prepared(rollout)), policy.log_std
     normal = torch.distributions.Normal(mean, log_std.exp())
     ratio = (normal.log_prob(rollout["action"]).sum(-1) - rollout["log_prob"]).exp()
     surrogate = -torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
@@ -190,7 +190,7 @@ def test_the_rollout_is_what_happened():
     )
     led_to = torch.cat([joined(moments, "final_obs"), features], -1)
     with torch.no_grad():
-        expected = policy.value(led_to) * ~rollout["terminated"]
+        expected = policy.expected({"x": led_to}) * ~rollout["terminated"]
     assert torch.allclose(rollout["next_value"], expected, atol=1e-4), (
         "a timeout is bootstrapped from the observation it ended in"
     )

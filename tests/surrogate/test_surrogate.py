@@ -301,7 +301,7 @@ def test_an_unsafe_wish_gives_way_and_a_safe_one_does_not(config, obstacle, wall
     own[0, 6:8] = torch.tensor([0.6, 0.0])
     if wall_m:
         own[0, OWN_WIDTH] = 1.0 / (0.3 + wall_m - 0.22) - 0.5
-    found, rules = wish.clone(), bind(arrays.SafetyRules, config)
+    found, rules = wish.clone(), bind(Rules, config)
     safety.filter_wishes(rules, 1.8, torch.zeros(1, dtype=torch.int32), obstacle, own, found)
     assert torch.equal(found, wish), "not due"
     safety.filter_wishes(rules, 1.8, torch.ones(1, dtype=torch.int32), obstacle, own, found)
@@ -583,7 +583,8 @@ def test_it_learns_what_the_tree_says(small, monkeypatch):
     )
     actor = SetActor(config, torch.Generator().manual_seed(1))
     born = copy.deepcopy(actor)
-    found = imitate(actor, config, ((8, 6, 0.6),), told.append, {"pool": small.sim})
+    monkeypatch.setattr(distillation, "simulator_of", lambda *_: small.sim)
+    found = imitate(actor, config, ((8, 6, 0.6),), told.append)
     obstacles, own, wish = samples[1]
     with torch.no_grad():
         errors = [imitation_error(who(obstacles, own), wish).mean() for who in (born, actor)]

@@ -164,7 +164,7 @@ def _networks(config: LearningConfig) -> dict[str, Callable[[], Any]]:
         "WM encoder": lambda: model.encode(obs),
         "WM dynamics": lambda: model.advance(latent, action),
         "WM decoder": lambda: model.decode(latent),
-        "PPO policy": lambda: policy.distribution(x),
+        "PPO policy": lambda: policy.mean_of(policy.prepared({"x": x})),
     }
 
 

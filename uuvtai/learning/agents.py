@@ -10,24 +10,12 @@ import torch
 from torch import Tensor
 
 from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
-from uuvtai.common.files import parsed_json, read_bytes
-from uuvtai.common.presets import POLICY, PRESET_DIR
+from uuvtai.common.presets import POLICY
 from uuvtai.config.behavior import FAST, SLOW, TUNED
 from uuvtai.config.learning import LearningConfig
-from uuvtai.config.loader import ConfigError, load_training
-from uuvtai.learning.checkpoint import (
-    LARGEST,
-    MANIFEST,
-    MODEL,
-    Checkpoint,
-    CheckpointError,
-    Note,
-    best,
-    entry_of,
-    open_checkpoint,
-    parsed,
-    refused,
-)
+from uuvtai.config.loader import ConfigError
+from uuvtai.learning import checkpoint as checkpoints
+from uuvtai.learning.checkpoint import MANIFEST, MODEL, Checkpoint, Note
 from uuvtai.learning.policy_agent import AgentDecision, HeldAgent, by_chunk, load_agent
 from uuvtai.learning.set_networks import MOST_WISH, NUM_WISHES, SetActor, actor_of
 
@@ -61,8 +49,9 @@ class TunedAgent(HeldAgent):
 
 def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
     """Agent of a checkpoint that holds numbers of the tree. Raises CheckpointError for impossible ones."""
-    try:
-        found = checkpoint.model()["tree"]["log_factor"]
+    model = checkpoint.model()
+    with checkpoints.refused(checkpoint.path / MODEL, "holds no numbers of the tree"):
+        found = model["tree"]["log_factor"]
         known = len(found)
         if tuple(found.shape) != (known, 2) or not _FEWEST <= known <= len(TUNED):
             raise ValueError(f"log_factor is {tuple(found.shape)} instead of {(len(TUNED), 2)}")
@@ -71,10 +60,6 @@ def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedAgent:
             for factor in factors:
                 if not number.least * 0.999 <= factor <= number.most * 1.001:
                     raise ValueError(f"{number.name} is multiplied by {factor:g}")
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path / MODEL}: holds no numbers of the tree ({error}); take another one"
-        ) from None
     return TunedAgent(found, sim)
 
 
@@ -94,11 +79,11 @@ class SetAgent(HeldAgent):
     def __init__(self, actor: SetActor, sim: Sim, config: LearningConfig) -> None:
         """``config``: what the policy learnt with, how long it holds a decision and what keeps it safe."""
         from uuvtai.sim.stages import bind
-        from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO, SafetyRules
+        from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO, Rules
 
         super().__init__(sim.num_envs, config.policy.hold_steps, sim.device)
         self.actor, self._limits = actor, config.surrogate
-        self._io, self._safe = bind(ObserverIO, sim.s, sim.config), bind(SafetyRules, sim.config)
+        self._io, self._safe = bind(ObserverIO, sim.s, sim.config), bind(Rules, sim.config, partial=True)
         zeros = self._zeros
         self.ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_OBSTACLE, RAW_WIDTH), zeros(N_RAY)
         self.obstacles, self.own = zeros(N_OBSTACLE, OBSTACLE_WIDTH), zeros(EGO_COLUMNS)
@@ -152,26 +137,15 @@ def find_policy(name: str, note: Note = lambda _text: None) -> Checkpoint:
     newest). Raises ConfigError for what is none of them, CheckpointError for what cannot be used."""
     path = Path(name)
     if name == POLICY:
-        return _built_in()
+        return checkpoints.built_in()
     if (path / MANIFEST).exists():
-        return open_checkpoint(path)
+        return checkpoints.open_checkpoint(path)
     if (path / "checkpoints").is_dir():
-        return best(path, note)
-    raise ConfigError(
-        f"{name!r} is no trained policy: give {POLICY}, which is built in, the run folder of 'uuv train', or "
-        "one of its checkpoints/step_N"
+        return checkpoints.best(path, note)
+    told = (
+        f"give {POLICY}, which is built in, the run folder of 'uuv train', or one of its checkpoints/step_N"
     )
-
-
-def _built_in() -> Checkpoint:
-    """The policy of the package: one file, the manifest inside, with today's config of its preset."""
-    path = PRESET_DIR / POLICY
-    with refused(path / MODEL):
-        content = read_bytes(path / MODEL, LARGEST[MODEL], path)
-        header = parsed_json(content[8 : 8 + int.from_bytes(content[:8], "little")], MODEL)
-        manifest = parsed(header["__metadata__"]["manifest"].encode())
-        manifest.files = {MODEL: entry_of(path / MODEL)}
-    return Checkpoint(path, manifest, load_training(POLICY), manifest.files[MODEL].sha256)
+    raise ConfigError(f"{name!r} is no trained policy: {told}")
 
 
 def load_trained(checkpoint: Checkpoint, sim: Sim) -> HeldAgent:

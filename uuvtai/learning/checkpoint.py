@@ -5,8 +5,7 @@ opening one executes nothing.
 every file), ``model.safetensors`` (the networks with their normalisers: all that driving needs),
 ``training.safetensors`` (optimisers, generators, counters) and ``simulator.zst`` (the envs themselves, large,
 so only beside the newest ones). The folder is written under another name, flushed to disk and renamed: a
-process killed at any moment leaves the newest verified one usable.
-"""
+process killed at any moment leaves the newest verified one usable."""
 
 from __future__ import annotations
 
@@ -30,24 +29,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor
 
-from uuvtai.common.errors import UserError
-from uuvtai.common.files import (
-    FileError,
-    flush,
-    open_file,
-    open_new,
-    parsed_json,
-    read_bytes,
-    refuse_links,
-    refuse_links_in,
-    refusing,
-    unfinished,
-    whole_folder,
-)
+from uuvtai.common import files
+from uuvtai.common.errors import ODD, UserError
+from uuvtai.common.files import FileError, open_file, open_new, parsed_json, read_bytes
+from uuvtai.common.presets import POLICY, PRESET_DIR
 from uuvtai.common.version import __version__
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
-from uuvtai.config.loader import renamed
+from uuvtai.config.loader import load_training, renamed
 
 
 class CheckpointError(UserError, RuntimeError):
@@ -238,24 +227,22 @@ def _verify(file: Path, entry: FileEntry | None) -> None:
 
 
 @contextlib.contextmanager
-def refused(file: Path) -> Iterator[None]:
+def refused(file: Path, what: str = "cannot be read") -> Iterator[None]:
     """Turn everything that bad content can raise into a CheckpointError that names the file."""
     try:
         yield
     except SafetensorError as error:
-        raise CheckpointError(
-            f"{file}: is not a safetensors file ({error}); pickles and other formats are never opened"
-        ) from None
+        told = f"is not a safetensors file ({error}); pickles and other formats are never opened"
+        raise CheckpointError(f"{file}: {told}") from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise CheckpointError(
-            f"{file}: {where}: {first['msg']}{renamed(where)}; it was not written by this version of uuvtai"
-        ) from None
+        told = f"{first['msg']}{renamed(where)}; it was not written by this version of uuvtai"
+        raise CheckpointError(f"{file}: {where}: {told}") from None
     except FileError as error:
         raise CheckpointError(f"{file}: {str(error).removeprefix(f'{file}: ')}") from None
-    except (ValueError, RecursionError, OSError) as error:
-        raise CheckpointError(f"{file}: cannot be read ({error}); take another checkpoint") from None
+    except (*ODD, OSError) as error:
+        raise CheckpointError(f"{file}: {what} ({error}); take another checkpoint") from None
 
 
 def table_rows(table: Sequence[Any]) -> list[dict[str, Any]]:
@@ -280,11 +267,7 @@ def config_sha256(config: dict[str, Any]) -> str:
 
 def finite(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics as JSON can hold them: NaN and infinity become None."""
-    bad = {name for name, value in metrics.items() if isinstance(value, float) and not math.isfinite(value)}
-    return {name: None if name in bad else value for name, value in metrics.items()}
-
-
-# ------------------------------------------------------------------------------------------------------------
+    return {n: None if isinstance(x, float) and not math.isfinite(x) else x for n, x in metrics.items()}
 
 
 MODEL_PARTS, SIMULATOR_PART = ("policy", "world_model", "forecast", "tree"), "env"
@@ -326,10 +309,8 @@ class Checkpoint:
         plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART)
         own = self.manifest.simulator, self.manifest.simulator_layout
         if own != (plain, layout_of(expected)):
-            raise CheckpointError(
-                f"{self.path}: the simulator's state has other arrays than this simulator; resume with the "
-                "run's own config, number of envs and version of uuvtai"
-            )
+            with_own = "resume with the run's own config, number of envs and version of uuvtai"
+            raise CheckpointError(f"{self.path}: holds other arrays than this simulator; {with_own}")
         with refused(self.path / SIMULATOR):
             simulator = unpack(plain, read_stream(self.path / SIMULATOR, expected))
         training = self._part(TRAINING, self.manifest.training)
@@ -343,10 +324,8 @@ class Checkpoint:
             if own != theirs:
                 different = (pair for pair in zip(own, theirs, strict=False) if pair[0] != pair[1])
                 mine, other = next(different, (f"{len(own)} rows", len(theirs)))
-                raise CheckpointError(
-                    f"{self.path}: made for another {what} table: it expects {mine}, this environment gives "
-                    f"{other}; evaluate it with the config it was trained with"
-                )
+                told = f"it expects {mine}, this environment gives {other}; take the config of its training"
+                raise CheckpointError(f"{self.path}: made for another {what} table: {told}")
 
     def _part(self, name: str, plain: Any) -> dict[str, Any]:
         with refused(self.path / name):
@@ -370,13 +349,13 @@ def save(
     refuses; then nothing half-written is taken for a checkpoint."""
     target, plain = checkpoints / f"{_STEP}{step:06d}", config.model_dump(mode="json")
     mend = "make room or mend the folder; then --resume, or begin anew if this was the first checkpoint"
-    with refusing(CheckpointError, f"{target}: cannot be written", mend, ""):
+    with files.refusing(CheckpointError, f"{target}: cannot be written", mend, ""):
         checkpoints.mkdir(parents=True, exist_ok=True)
-        refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
-        refuse_links_in(checkpoints)
+        files.refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
+        files.refuse_links_in(checkpoints)
         for left in checkpoints.glob(f".{_STEP}*.tmp"):  # by a process that was killed
             shutil.rmtree(left, ignore_errors=True)
-        with whole_folder(target) as partial:
+        with files.whole_folder(target) as partial:
             described = _write_parts(partial, state)
             manifest = Manifest(
                 schema=SCHEMA,
@@ -395,10 +374,10 @@ def save(
             text = json.dumps(manifest.model_dump(mode="json", by_alias=True), indent=1, allow_nan=False)
             (partial / MANIFEST).write_text(text, encoding="utf-8")
             for path in (*partial.iterdir(), partial):
-                flush(path)
+                files.flush(path)
             if target.exists():
                 _remove(target)
-        flush(checkpoints)
+        files.flush(checkpoints)
         _thin(checkpoints, config.train.keep_checkpoints)
     return target
 
@@ -430,7 +409,7 @@ def _thin(checkpoints: Path, keep: int) -> None:
 
 def _remove(folder: Path) -> None:
     """Under another name first: half a folder must never be taken for a checkpoint."""
-    doomed = folder.rename(unfinished(folder))
+    doomed = folder.rename(files.unfinished(folder))
     shutil.rmtree(doomed)
 
 
@@ -450,6 +429,17 @@ def open_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(path, manifest, config, hashlib.sha256(content).hexdigest())
 
 
+def built_in() -> Checkpoint:
+    """The policy of the package: one file, the manifest inside, with today's config of its preset."""
+    path = PRESET_DIR / POLICY
+    with refused(path / MODEL):
+        content = read_bytes(path / MODEL, LARGEST[MODEL], path)
+        header = parsed_json(content[8 : 8 + int.from_bytes(content[:8], "little")], MODEL)
+        manifest = parsed(header["__metadata__"]["manifest"].encode())
+        manifest.files = {MODEL: entry_of(path / MODEL)}
+    return Checkpoint(path, manifest, load_training(POLICY), manifest.files[MODEL].sha256)
+
+
 def newest(
     run: Path, note: Note = lambda _text: None, resumable: bool = False, first: Path | None = None
 ) -> Checkpoint:
@@ -459,7 +449,7 @@ def newest(
     for path in sorted(_folders(checkpoints), key=lambda path: path != first):
         try:
             with refused(path):
-                refuse_links(run, path)  # to another folder, which is none of the run's own
+                files.refuse_links(run, path)  # to another folder, which is none of the run's own
             found = open_checkpoint(path)
             if not resumable or found.is_resumable:
                 return found
@@ -468,9 +458,7 @@ def newest(
             reasons.append(str(error))
         note(f"left out: {reasons[-1]}")
     why = f" ({reasons[0]})" if reasons else ""
-    raise CheckpointError(
-        f"{checkpoints}: holds no usable checkpoint{why}; give a run with one, or begin anew"
-    )
+    raise CheckpointError(f"{checkpoints}: holds no usable checkpoint{why}; give another run, or begin anew")
 
 
 def best(run: Path, note: Note = lambda _text: None) -> Checkpoint:

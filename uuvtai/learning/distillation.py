@@ -1,9 +1,6 @@
 """Distillation: the policy's mean is drawn towards the behavior tree's action, more strongly where the world
-model is unsure (docs/learning.md).
-
-The paper's term, lambda_t s_t E ||mu(x) - a_BT||^2, stands in the PPO loss and again in teacher batches with
-an Adam of their own, which forgets a constant factor: there it scales the learning rate.
-"""
+model is unsure (docs/learning.md). The paper's term, lambda_t s_t E ||mu(x) - a_BT||^2, stands in PPO's loss
+and in teacher batches with an Adam of their own, which forgets a constant factor: it scales their rate."""
 
 from __future__ import annotations
 
@@ -38,8 +35,7 @@ def imitation_error(mean: Tensor, teacher_action: Tensor) -> Tensor:
 
 def leaf_errors(names: Sequence[str], error: Tensor, leaf: Tensor) -> dict[str, float]:
     """``distillation/loss``, the mean of finite imitation errors (n,), and ``distillation/leaf/<name>``, that
-    of the samples in which a node of this name acted. ``names``: of the nodes that ``leaf`` (n,) counts; -1
-    is none."""
+    of samples in which a node of this name acted: ``leaf`` (n,) counts the nodes of ``names``, -1 is none."""
     finite, node = torch.isfinite(error), torch.arange(len(names), device=leaf.device)
     metrics = {}
     for name in sorted(set(names)):
@@ -58,14 +54,11 @@ class Uncertainty(nn.Module):
     """Exponential moving average of the uncertainty and the distillation scale s_t: sigma_bar <- (1 - rho)
     sigma_bar + rho sigma_t, s_t = clip(1 + alpha sigma_bar, 1, s_max). It begins at the first value seen."""
 
-    mean: Tensor
-    seen: Tensor
-
     def __init__(self, config: UncertaintyConfig) -> None:
         super().__init__()
         self.config = config
-        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("seen", torch.zeros((), dtype=torch.bool))
+        self.mean = nn.Buffer(torch.zeros((), dtype=torch.float64))
+        self.seen = nn.Buffer(torch.zeros((), dtype=torch.bool))
 
     @torch.no_grad()
     def update(self, sigma: Tensor) -> None:
@@ -119,8 +112,7 @@ class Distillation(AdamLearner):
 
 # ------------------------------------------------------------------------------------------------------------
 # Warm start of a policy over a set of obstacles by DAgger (Ross, Gordon & Bagnell 2011): whoever drives, the
-# actor's mean is fitted to what the tree would do. The tree drives in the first wave, the student more and
-# more.
+# actor's mean is fitted to what the tree would do. The tree drives first, then the student more and more.
 
 
 WAVE_EPISODES = 256
@@ -133,8 +125,7 @@ SEED = 7_000_003
 
 
 def wish_of(command: Tensor, ego: Tensor, vehicle_cfg: VehicleConfig) -> Tensor:
-    """(n, 3) wishes whose velocity is that of commands (n, 4) of vehicles (n, EGO_WIDTH): the inverse of
-    ``motion.wished_velocity``, without the yaw rate."""
+    """(n, 3) wishes for the velocity of commands (n, 4) of vehicles: ``motion.wished_velocity`` backwards."""
     from uuvtai.surrogate.arrays import At
 
     fastest = (vehicle_cfg.max_surge_m_s**2 + vehicle_cfg.max_sway_m_s**2) ** 0.5
@@ -171,14 +162,11 @@ class Student(SetAgent):
 
 
 def imitate(
-    actor: SetActor,
-    config: LearningConfig,
-    scenes: tuple[Scene, ...],
-    note: Callable[[str], None],
-    sims: dict[str, Sim] | None = None,
+    actor: SetActor, config: LearningConfig, scenes: tuple[Scene, ...], note: Callable[[str], None]
 ) -> dict[str, float]:
-    """Waves of DAgger, each told to ``note``; metrics. ``sims``: of worlds that are there already."""
-    began, sims = time.perf_counter(), dict(sims or {})
+    """Waves of DAgger, each told to ``note``; metrics."""
+    sims: dict[str, Sim] = {}
+    began = time.perf_counter()
     waves, rows = config.surrogate.warm_start_waves, min(WAVE_EPISODES, config.train.num_envs)
     few = config.model_copy(update={"train": config.train.model_copy(update={"num_envs": rows})})
     seed = config.train.seed + SEED

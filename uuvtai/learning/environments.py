@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,8 +11,7 @@ from torch import Tensor
 from uuvtai.common.enums import DECISION_S, HOLD_STEPS, OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.distillation import imitate
-from uuvtai.learning.networks import NUM_ACTIONS, OBSERVATION, ActorCritic, Guard, Policy, View, by_part
+from uuvtai.learning.networks import OBSERVATION, ActorCritic, Guard, Policy, View, by_part
 from uuvtai.learning.policy_agent import PolicyAgent
 from uuvtai.learning.rollout import Environment, Rollout, RolloutSums, Step
 from uuvtai.learning.set_networks import MOST_WISH, SetPolicy
@@ -21,7 +19,7 @@ from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
 if TYPE_CHECKING:
     from uuvtai.envs.vector_env import VectorEnv
-    from uuvtai.surrogate.world import ScenarioBank, Surrogate
+    from uuvtai.surrogate.world import ScenarioBank
 
 
 class Simulated(Environment):
@@ -34,110 +32,84 @@ class Simulated(Environment):
         self.num_envs, self.device = env.num_envs, env.device
         self.outcomes, self.reward_terms, self.node_names = env.outcomes, env.reward_terms, env.node_names
         self.observation_table = env.observation_table
-        n, n_in, device = self.num_envs, env.num_obs + N_FEATURES, self.device
-        self.view: View = {
-            "x": torch.zeros(n, n_in, device=device),
-            "teacher_action": torch.zeros(n, NUM_ACTIONS, device=device),
-            "leaf": torch.zeros(n, dtype=torch.int32, device=device),
-        }
+        self.view: View = {"x": torch.zeros(self.num_envs, env.num_obs + N_FEATURES, device=self.device)}
+        self._no_features = self.view["x"][:, env.num_obs :]
         columns = [(c.name, c.slice) for c in self.observation_table]
-        self.guard = Guard(columns, n, config.train.patience, device)
-        self.world_model: WorldModel | None = None
-        self._reward = torch.zeros(n, device=device)
-        self._final = torch.zeros(n, n_in, device=device)
-        self._features = torch.zeros(n, N_FEATURES, device=device)
-        self._bad = torch.zeros(n, dtype=torch.bool, device=device)
-        self.carried = {"x": self.view["x"], "bad": self._bad}
-        """the input too: its world-model columns remember the last step"""
-        self.info: View = {}
-        """what ``VectorEnv.step`` told last beside the observation"""
+        self.guard = Guard(columns, self.num_envs, config.train.patience, self.device)
 
     def make_policy(self, generator: torch.Generator) -> ActorCritic:
-        return ActorCritic(self.view["x"].shape[1], self.config.policy, generator).to(self.device)
+        """One that fits the view."""
+        return ActorCritic(self.env.num_obs + N_FEATURES, self.config.policy, generator).to(self.device)
 
     def agent(self, policy: ActorCritic) -> PolicyAgent:
         """The policy driving by its mean."""
         model = self.world_model if self.config.world_model.as_features else None
         return PolicyAgent(policy, model, self.num_envs, self.device)
 
-    def begin(self, policy: ActorCritic, world_model: WorldModel | None, generator: torch.Generator) -> None:
+    def begin(self, policy: Any, world_model: WorldModel | None, generator: torch.Generator) -> None:
         """First episodes. Where ``world_model.as_features`` is false its columns stay zero."""
         self._norm, self.world_model = policy.observation_norm, world_model
-        self._arrive(*self.env.reset(self.config.train.seed))
+        self._arrive(self._no_features, *self.env.reset(self.config.train.seed))
 
     @torch.no_grad()
-    def look_around(self, rollout: Rollout) -> bool:
+    def look_around(self, rollout: Rollout) -> None:
         """Let the behavior tree drive for T steps; keep inputs, actions and endings."""
+        sums = RolloutSums(len(self.outcomes), len(self.reward_terms), self.device)
         for t in range(rollout.steps):
             action = self.view["teacher_action"].clone()
             rollout.note(t, {"x": self.view["x"], "action": action})
-            rollout.note(t, {"ended": self.step(action, None).ended})
-        return True
-
-    @torch.no_grad()
-    def fill_model_features(self, rollout: Rollout) -> None:
-        if self.world_model is None or not self.config.world_model.as_features:
-            return
-        x, n = rollout["x"], self.env.num_obs
-        for t in range(1, len(x)):
-            found = self.world_model.features(x[t - 1, :, :n], rollout["action"][t - 1], x[t, :, :n])
-            x[t, :, n:] = torch.where(rollout["ended"][t - 1, :, None], 0.0, found)
+            rollout.note(t, {"ended": self.step(action, sums).ended})
 
     @property
     def scenarios(self) -> tuple[Tensor, Tensor]:
+        """Seed and number, both (N,), of what every env is in."""
         return self.info["seed"], self.info["episode"]
 
-    def _hold(self, action: Tensor, sums: RolloutSums | None) -> tuple[Tensor, ...]:
-        """Hold a decision for ``steps`` control steps; the tree drives what begins on the way. (Observation
-        of the next decision; of the episode in which this one was made: observation that it led to, reward,
-        terminated, ended)."""
+    def _hold(self, action: Tensor, sums: RolloutSums) -> tuple[Tensor, ...]:
+        """Hold a decision for ``steps`` control steps; the tree drives what begins on the way. (Next
+        observation; of the episode in which it was made: last observation, reward, terminated, ended)."""
         obs = final = torch.zeros(self.num_envs, self.env.num_obs, device=self.device)
-        reward = torch.zeros_like(self._reward)
-        terminated = ended = torch.zeros_like(self._reward, dtype=torch.bool)
+        reward = torch.zeros(self.num_envs, device=self.device)
+        terminated = ended = torch.zeros_like(reward, dtype=torch.bool)
         for _ in range(self.steps):
             tree = self.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
             obs, earned, failed, late, self.info = self.env.step(torch.where(ended[:, None], tree, action))
             newly = failed | late
-            if sums is not None:
-                sums.count(newly, self.info)
+            sums.count(newly, self.info)
             final = torch.where(ended[:, None], final, self.info["final_obs"])
             reward += torch.where(ended, 0.0, earned)
             terminated, ended = terminated | (failed & ~ended), ended | newly
         return obs, final, reward, terminated, ended
 
-    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
+    def step(self, action: Tensor, sums: RolloutSums) -> Step:
         """Hold a decision (N, 4); the reward is NaN for samples with anything bad."""
         obs, final, reward, terminated, ended = self._hold(action, sums)
-        self._bad |= self.guard.values("reward", reward, self._reward)
-        self._bad |= self._cleaned(final, self._final, ended)
+        reward, is_odd = self.guard.values("reward", reward)
+        final, is_unknown = self._cleaned(final, ended)
+        features = self._no_features
         if self.world_model is not None:
-            n = self.env.num_obs
-            self._features = self.world_model.features(self.view["x"][:, :n], action, self._final[:, :n])
-            if self.config.world_model.as_features:
-                self._final[:, n:] = self._features
-        self._reward.masked_fill_(self._bad, math.nan)  # PPO leaves such samples out
-        self.view["x"].copy_(self._final).masked_fill_(ended[:, None], 0.0)
-        self._arrive(obs, self.info)
-        told = {"uncertainty": self._features[:, -1]}
-        return Step(self._reward, terminated, ended, {"x": self._final}, told)
+            features = self.world_model.features(self.view["x"][:, : self.env.num_obs], action, final)
+        shown = features if self.config.world_model.as_features else self._no_features
+        reward = reward.masked_fill(self._bad | is_odd | is_unknown, math.nan)  # PPO leaves such samples out
+        self._arrive(shown.masked_fill(ended[:, None], 0.0), obs, self.info)
+        led_to = {"x": torch.cat([final, shown], dim=1)}
+        return Step(reward, terminated, ended, led_to, {"uncertainty": features[:, -1]})
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        self._arrive(*self.env.restore(arrays))
+        self._arrive(self._no_features, *self.env.restore(arrays))
 
-    def _arrive(self, obs: Tensor, info: View) -> None:
-        """The observation of the next decision, and what the tree would do now."""
+    def _arrive(self, features: Tensor, obs: Tensor, info: View) -> None:
+        """What the next decision is made by; ``info``: what ``VectorEnv.step`` tells beside ``obs``."""
         self.info = info
-        self._bad.copy_(self._cleaned(obs, self.view["x"]))
-        self._bad |= self.guard.values("teacher_action", info["teacher_action"], self.view["teacher_action"])
-        self.view["leaf"].copy_(info["leaf"])
+        seen, is_unknown = self._cleaned(obs)
+        teacher_action, is_odd = self.guard.values("teacher_action", info["teacher_action"])
+        x, self._bad = torch.cat([seen, features], dim=1), is_unknown | is_odd
+        self.view = {"x": x, "teacher_action": teacher_action, "leaf": info["leaf"]}
+        self.carried = {"x": x, "bad": self._bad}  # the world model's columns remember the last step
 
-    def _cleaned(self, obs: Tensor, x: Tensor, counted: Tensor | None = None) -> Tensor:
-        """Write the observation into an input, means for what is not finite; which rows were bad."""
-        n = self.env.num_obs
-        return self.guard.values(OBSERVATION, obs, x[:, :n], self._norm.mean[:n].float(), counted)
-
-
-# ------------------------------------------------------------------------------------------------------------
+    def _cleaned(self, obs: Tensor, counted: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The observation, means for what is not finite, and which rows were bad."""
+        return self.guard.values(OBSERVATION, obs, self._norm.mean[: self.env.num_obs].float(), counted)
 
 
 BANK_SEED = 4242
@@ -151,11 +123,14 @@ class InSurrogate(Environment):
     device, steps = torch.device("cpu"), HOLD_STEPS
 
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
-        """Draws the scenarios, unless they are given. Raises ConfigError for a world that does not fit."""
+        """Draws scenarios, unless they are given. Raises SettingError, ConfigError for what does not fit."""
         from uuvtai.surrogate.observation import SET_TABLE
         from uuvtai.surrogate.world import Surrogate, draw_bank
 
-        _refuse_what_the_surrogate_lacks(config)
+        held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
+        if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
+            told = f"the surrogate decides every {DECISION_S} s, after {HOLD_STEPS} control steps"
+            raise SettingError(f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: {told}")
         torch.set_flush_denormal(True)
         self.config, self.observation_table, self.num_envs = config, SET_TABLE, config.train.num_envs
         self.scenes = config.train.scenes or (config.world.own_scene,)
@@ -171,6 +146,7 @@ class InSurrogate(Environment):
         return SetPolicy(self.view, self.config, generator)
 
     def begin(self, policy: Policy, world_model: WorldModel | None, generator: torch.Generator) -> None:
+        """First episodes; ``generator`` draws all that follow."""
         self._generator = generator
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
         self.env.look()
@@ -179,16 +155,11 @@ class InSurrogate(Environment):
         found = torch.randint(len(self.env.bank.origin), (self.num_envs,), generator=self._generator)
         self.env.begin(rows, found)
 
-    def warm_start(self, policy: SetPolicy, note: Callable[[str], None]) -> dict[str, float]:
-        waves = self.config.surrogate.warm_start_waves
-        return imitate(policy.actor, self.config, self.scenes, note) if waves else {}
-
     @property
     def scenarios(self) -> tuple[Tensor, Tensor]:
         return torch.full_like(self.env.scenario, BANK_SEED), self.env.scenario
 
-    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
-        assert sums is not None
+    def step(self, action: Tensor, sums: RolloutSums) -> Step:
         surrogate, final = self.env, None
         reward, outcome = surrogate.step(action)
         ended, late = outcome != RUNNING, outcome == TIMEOUT
@@ -215,9 +186,15 @@ class InSurrogate(Environment):
         each = -(-train.evaluate_episodes // (len(self.config.surrogate.worlds) * len(self.scenes)))
         if self._held_out is None:
             self._held_out = draw_bank(self.config, self.scenes, train.evaluate_seed, each)
-        bank = self._held_out
-        surrogate = Surrogate(self.config, bank, len(bank.obstacle), train.evaluate_seed)
-        outcome, time_s = run_once(surrogate, policy)
+        bank, n = self._held_out, len(self._held_out.obstacle)
+        surrogate = Surrogate(self.config, bank, n, train.evaluate_seed)
+        surrogate.begin(torch.ones(n, dtype=torch.bool), torch.arange(n))
+        outcome, time_s = torch.full((n,), RUNNING, dtype=torch.int32), torch.zeros(n)
+        while bool((outcome == RUNNING).any()):
+            wish = by_part(policy.mean_of, policy.prepared(surrogate.look()))
+            _, now = surrogate.step(wish.clamp(-MOST_WISH, MOST_WISH))
+            new = (outcome == RUNNING) & (now != RUNNING)
+            outcome, time_s = torch.where(new, now, outcome), torch.where(new, surrogate.time_s, time_s)
         won, late = outcome == SUCCESS, outcome == TIMEOUT
         metrics = {
             "eval/success_rate": float(won.float().mean()),
@@ -228,24 +205,3 @@ class InSurrogate(Environment):
         for number, name in enumerate(bank.names):
             metrics[f"eval/success_{name}"] = float(won[bank.origin == number].float().mean())
         return metrics
-
-
-def _refuse_what_the_surrogate_lacks(config: LearningConfig) -> None:
-    held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
-    if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
-        told = f"the surrogate decides every {DECISION_S} s, after {HOLD_STEPS} control steps"
-        raise SettingError(f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: {told}")
-
-
-@torch.no_grad()
-def run_once(surrogate: Surrogate, policy: Policy) -> tuple[Tensor, Tensor]:
-    """(outcome code, time [s]), both (N,), of scenario i in env i, driven by the mean."""
-    every = torch.ones(surrogate.num_envs, dtype=torch.bool)
-    surrogate.begin(every, torch.arange(surrogate.num_envs))
-    outcome, time_s = torch.zeros(surrogate.num_envs, dtype=torch.int32), torch.zeros(surrogate.num_envs)
-    while bool((outcome == RUNNING).any()):
-        view = surrogate.look()
-        _, now = surrogate.step(by_part(policy.mean_of, policy.prepared(view)).clamp(-MOST_WISH, MOST_WISH))
-        new = (outcome == RUNNING) & (now != RUNNING)
-        outcome, time_s = torch.where(new, now, outcome), torch.where(new, surrogate.time_s, time_s)
-    return outcome, time_s

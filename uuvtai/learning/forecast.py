@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as fn
 from torch import Tensor, nn
 
 from uuvtai.common import enums
 from uuvtai.common.errors import SettingError
 from uuvtai.common.obstacle_motion import describe_scenario, path_positions
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learning.networks import AdamLearner, linear
+from uuvtai.learning.networks import HALF_LOG_2PI, AdamLearner, linear
 from uuvtai.learning.parameter_search import EpisodeTrainer
 from uuvtai.learning.ppo import ADAM_EPS
 from uuvtai.sim.forecast_weights import WEIGHTS, packed_weights
@@ -37,7 +38,6 @@ TIMES_S = torch.arange(1, enums.ANCHORS + 1) * enums.ANCHOR_S
 """[s] ahead, of the places that it tells"""
 _LEAST_M, _MOST = 0.03, 4.0
 """[m] smallest deviation; largest, as a part of the way that an obstacle can go"""
-_HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 
 
 class Mixture(NamedTuple):
@@ -63,9 +63,8 @@ class MixtureNet(nn.Module):
         self.spread = linear(enums.N_HIDDEN, enums.N_SPREAD, 0.1, generator)
         with torch.no_grad():  # the futures begin apart: straight on, slower, back, left and right
             ways = torch.tensor([[1.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [-0.8, 0.0], [0.5, 0.5], [0.5, -0.5]])
-            self.said.bias[enums.N_MODE :] = (
-                ways[: enums.N_MODE, None].expand(-1, enums.ANCHORS, -1).reshape(-1)
-            )
+            places = ways[: enums.N_MODE].repeat_interleave(enums.ANCHORS, 0)
+            self.said.bias[enums.N_MODE :] = places.flatten()
             self.spread.bias.fill_(math.log(0.3))
 
     def forward(self, columns: Tensor) -> Mixture:
@@ -79,19 +78,18 @@ class MixtureNet(nn.Module):
 
     def weights(self) -> dict[str, np.ndarray]:
         """Arrays of a forecast's file (``mixture_weights``)."""
-        out, bias = torch.zeros(enums.N_HIDDEN, enums.N_SAID), torch.zeros(enums.N_SAID)
-        out[:, : enums.N_TOLD], bias[: enums.N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
-        found = {"weight_out": out, "bias_out": bias}
-        layers = {"in": self.into, "mid": self.middle, "spread": self.spread}  # the last one is padded there
+        found, layers = {}, {"in": self.into, "mid": self.middle, "out": self.said, "spread": self.spread}
         for name, layer in layers.items():
-            found |= {f"weight_{name}": layer.weight.T, f"bias_{name}": layer.bias}
-        return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
+            padding = 0, enums.N_SAID - enums.N_TOLD if name == "out" else 0  # that of the spreads: there
+            for kind, values in (("weight", layer.weight.T), ("bias", layer.bias)):
+                found[f"{kind}_{name}"] = fn.pad(values.detach(), padding).contiguous().numpy().copy()
+        return found
 
 
 def negative_log_likelihood(mixture: Mixture, truth: Tensor) -> Tensor:
     """(n,) [nat] of the true places (n, ANCHORS, 2) [m] in the tracks' frames."""
     off = (truth[:, None] - mixture.place) / mixture.sigma
-    log_density = -(0.5 * off * off + mixture.sigma.log() + _HALF_LOG_TAU).sum((-1, -2))
+    log_density = -(0.5 * off * off + mixture.sigma.log() + HALF_LOG_2PI).sum((-1, -2))
     return -torch.logsumexp(mixture.log_weight + log_density, -1)
 
 
@@ -106,9 +104,8 @@ def mirrored(columns: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def scores_of(mixture: Mixture, truth: Tensor) -> dict[str, float]:
-    """How good forecasts of n tracks are (``truth`` (n, ANCHORS, 2) [m]): likelihood [nat]; median and 90 %
-    quantile [m] of the distance at the last time, of the likeliest future and of the nearest; how probable
-    the likeliest is said to be, and how often it is the nearest on the whole way."""
+    """How good forecasts of n tracks are: likelihood [nat]; median and 90 % quantile [m] of last distances of
+    the likeliest future and of the nearest; how probable the likeliest is said to be, how often nearest."""
     away, likeliest = (mixture.place - truth[:, None]).norm(dim=-1), mixture.log_weight.argmax(-1)
     last = {"likeliest": away[..., -1].gather(1, likeliest[:, None])[:, 0], "nearest": away[..., -1].amin(-1)}
     found = {f"{name}_median_m": part.median() for name, part in last.items()}
@@ -135,13 +132,9 @@ _SPEED_S = 0.3
 _STEP_S = 0.02
 
 
-class TrackMoments(NamedTuple):
-    """n moments of tracks that an obstacle is behind."""
-
-    columns: Tensor
-    """(n, N_COLUMN) what a network is told"""
-    truth: Tensor
-    """(n, ANCHORS, 2) [m] where the obstacle then was, in the track's frame"""
+TrackMoments = tuple[Tensor, Tensor]
+"""of n moments of tracks that an obstacle is behind: columns (n, N_COLUMN) that a network is told; where the
+obstacle then was (n, ANCHORS, 2) [m], in the track's frame"""
 
 
 def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int) -> tuple[TrackMoments, int]:
@@ -167,7 +160,8 @@ def watch(sim: Sim, scenes: tuple[Scene, ...], seed: int, first: int, steps: int
         sim.deactivate_ended()
         if step % EVERY_STEPS == 0:
             found.append(_moments(sim, np.flatnonzero(running).tolist(), paths, step * _STEP_S))
-    return TrackMoments(*(torch.cat(parts) for parts in zip(*found, strict=True))), done
+    columns, truth = zip(*found, strict=True)
+    return (torch.cat(columns), torch.cat(truth)), done
 
 
 def _moments(sim: Sim, envs: list[int], paths: list[list[dict[str, Any]]], now_s: float) -> TrackMoments:
@@ -190,11 +184,8 @@ def _moments(sim: Sim, envs: list[int], paths: list[list[dict[str, Any]]], now_s
     chosen = frame[row, track]
     x, y = np.moveaxis(obstacles[row, body[row, track], 3:] - chosen[:, None, :2], -1, 0)
     c, s = chosen[:, 2, None], chosen[:, 3, None]
-    parts = sim.rows(sim.s.mixture.column, envs)[row, track], np.stack([c * x + s * y, c * y - s * x], -1)
-    return TrackMoments(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in parts))
-
-
-# ------------------------------------------------------------------------------------------------------------
+    truth = np.stack([c * x + s * y, c * y - s * x], -1, dtype=np.float32, casting="same_kind")
+    return torch.from_numpy(sim.rows(sim.s.mixture.column, envs)[row, track]), torch.from_numpy(truth)
 
 
 MEMORY, MINIBATCH = 2**21, 512
@@ -233,7 +224,7 @@ class ForecastTrainer(EpisodeTrainer):
         began, config = time.perf_counter(), self.config
         worlds, first = config.forecast_training.worlds, self.iteration * config.train.num_envs
         found, steps = self._watched(worlds[self.iteration % len(worlds)], config.train.seed, first)
-        self._keep(found)
+        self._keep(*found)
         between = time.perf_counter()
         losses = [self._fit() for _ in range(config.forecast_training.minibatches)]
         return {
@@ -247,8 +238,8 @@ class ForecastTrainer(EpisodeTrainer):
         """``eval/*`` on episodes that it never learned from, world by world."""
         train, metrics = self.config.train, {}
         for world in self.config.forecast_training.worlds:
-            found, _ = self._watched(world, train.evaluate_seed, 0)
-            scores = scores_of(self.net(found.columns), found.truth)
+            (columns, truth), _ = self._watched(world, train.evaluate_seed, 0)
+            scores = scores_of(self.net(columns), truth)
             metrics |= {f"eval/{name}_{world}": value for name, value in scores.items()}
         return metrics
 
@@ -260,12 +251,12 @@ class ForecastTrainer(EpisodeTrainer):
         sim = self.simulator(world, self._scenes)
         return watch(sim, self._scenes, seed, first, self.config.forecast_training.episode_steps)
 
-    def _keep(self, seen: TrackMoments) -> None:
+    def _keep(self, columns: Tensor, truth: Tensor) -> None:
         """Remember moments, the newest in the place of the oldest."""
         size = len(self._columns)
-        at = torch.arange(self.seen, self.seen + len(seen.columns)) % size
-        self._columns[at], self._truth[at] = seen.columns.half(), seen.truth
-        self.seen += len(seen.columns)
+        at = torch.arange(self.seen, self.seen + len(columns)) % size
+        self._columns[at], self._truth[at] = columns.half(), truth
+        self.seen += len(columns)
         self.kept = min(self.seen, size)
 
     def _fit(self) -> float:

@@ -91,16 +91,13 @@ def combined(a: Moments, b: Moments) -> Moments:
 class RunningNorm(nn.Module):
     """Scales columns to mean 0 and deviation 1 by all samples so far; before the first one not at all."""
 
-    mean: Tensor
-    m2: Tensor
-    count: Tensor
-
     def __init__(self, width: int, clip: float = 10.0) -> None:
         """``clip``: standard deviations beyond which normalised values are cut off."""
         super().__init__()
         self.clip = clip
-        for name, shape in (("mean", (width,)), ("m2", (width,)), ("count", ())):
-            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
+        zeros = functools.partial(torch.zeros, dtype=torch.float64)
+        self.mean, self.m2 = nn.Buffer(zeros(width)), nn.Buffer(zeros(width))
+        self.count = nn.Buffer(zeros(()))
 
     def update(self, x: Tensor) -> None:
         """Add the rows of x (..., width); rows that are not finite are left out."""
@@ -132,9 +129,7 @@ class RunningNorm(nn.Module):
 
 NUM_ACTIONS = 4
 _MEAN_GAIN = 0.01  # of the last layer: small first actions (Andrychowicz et al. 2021)
-_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-
-
+HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 View = dict[str, Tensor]
 """what is known of N envs, by name, each (N, ...)"""
 
@@ -153,12 +148,12 @@ class PolicyStep(NamedTuple):
 def log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """(...,) log density [nat] of actions (..., n) under a diagonal Gaussian of log deviation (n,)."""
     scaled = (action - mean) * torch.exp(-log_std)
-    return -0.5 * scaled.square().sum(dim=-1) - (log_std.sum() + log_std.shape[-1] * _HALF_LOG_2PI)
+    return -0.5 * scaled.square().sum(dim=-1) - (log_std.sum() + log_std.shape[-1] * HALF_LOG_2PI)
 
 
 def entropy(log_std: Tensor) -> Tensor:
     """Differential entropy [nat] of such a Gaussian, a scalar."""
-    return log_std.sum() + log_std.shape[-1] * (0.5 + _HALF_LOG_2PI)
+    return log_std.sum() + log_std.shape[-1] * (0.5 + HALF_LOG_2PI)
 
 
 class Policy(nn.Module, ABC):
@@ -207,11 +202,8 @@ class Policy(nn.Module, ABC):
     def act(self, view: View, generator: torch.Generator) -> PolicyStep:
         """Draw actions for N envs with noise from a CPU generator."""
         inputs = self.prepared(view)
-        mean, value = side_by_side(
-            functools.partial(by_part, self.mean_of, inputs),
-            functools.partial(by_part, self.value_of, inputs),
-            device=self.log_std.device.type,
-        )
+        both = (functools.partial(by_part, of, inputs) for of in (self.mean_of, self.value_of))
+        mean, value = side_by_side(*both, device=self.log_std.device.type)
         noise = torch.randn(mean.shape, generator=generator).to(mean.device)
         action = torch.addcmul(mean, noise, self.log_std.exp())
         return PolicyStep(action, log_prob(action, mean, self.log_std), self.value_norm.inverse(value), mean)
@@ -263,14 +255,6 @@ class ActorCritic(Policy):
 
     def observe(self, view: View) -> None:
         self.observation_norm.update(view["x"])
-
-    def distribution(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(mean (..., 4), log_std (4,)) of the action."""
-        return self.mean_of(self.prepared({"x": x})), self.log_std
-
-    def value(self, x: Tensor) -> Tensor:
-        """(...,) expected return, in units of the reward."""
-        return self.value_norm.inverse(self.value_of(self.prepared({"x": x})))
 
 
 @torch.no_grad()
@@ -351,9 +335,6 @@ def fastest_precision() -> Literal["medium", "highest"]:
     return "medium" if error < LARGEST_ERROR else "highest"
 
 
-# ------------------------------------------------------------------------------------------------------------
-
-
 class PlainAdam(torch.optim.Adam):
     """``torch.optim.Adam`` without torch's compiler, which its class imports when one is built and when it
     steps: that takes four seconds, and nothing here compiles by it. Same numbers, same states."""
@@ -367,8 +348,7 @@ class PlainAdam(torch.optim.Adam):
 
 
 def _spare_compiler() -> None:
-    """Tell the methods of optimisers that they are switched off for the compiler already, unless somebody has
-    imported it. A torch that asks in another way imports it as before."""
+    """Tell methods of optimisers that they are off for the compiler already, unless it has been imported."""
     if "torch._dynamo" in sys.modules:
         return
     for method in vars(torch.optim.Optimizer).values():
@@ -387,8 +367,7 @@ class AdamLearner:
         """steps left out because the gradient was not finite, or zero for want of valid samples"""
 
     def step(self, loss: Tensor | None = None, most: float = math.inf) -> bool:
-        """One step on ``loss`` (a scalar; None: by gradients that are there), the norm of every group's
-        gradient cut to ``most``; False where nothing was changed."""
+        """A step on ``loss`` (None: by gradients that are there), norms cut to ``most``; was there any?"""
         if loss is not None:
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -438,25 +417,18 @@ class Guard:
         self.bad_in_a_row = 0
 
     def values(
-        self,
-        name: str,
-        values: Tensor,
-        out: Tensor,
-        fill: Tensor | None = None,
-        counted: Tensor | None = None,
-    ) -> Tensor:
-        """Copy ``values`` (N, ...) into ``out`` with ``fill`` (default: 0) in place of what is not finite;
-        which rows (N,) were bad. ``OBSERVATION`` is counted by columns; ``counted`` (N,): rows that count."""
+        self, name: str, values: Tensor, fill: Tensor | float = 0.0, counted: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """``values`` (N, ...) with ``fill`` in place of what is not finite, and which rows (N,) were bad.
+        ``OBSERVATION`` is counted by columns; ``counted`` (N,): rows that count."""
         if values.device.type == "cpu" and math.isfinite(values.sum()):  # elsewhere that is a wait
-            out.copy_(values)
-            return self._none
+            return values, self._none
         bad = ~torch.isfinite(values)
-        torch.where(bad, values.new_zeros(()) if fill is None else fill, values, out=out)
         rows = bad.view(len(bad), -1)
         counting = rows if counted is None else rows & counted[:, None]
         self._counts[name] = counting.sum(dim=0) + self._counts.get(name, 0)
         self._rows |= counting.any(dim=1)
-        return rows.any(dim=1)
+        return torch.where(bad, fill, values), rows.any(dim=1)
 
     def take(self) -> dict[str, float]:
         """Counts above zero since the last call, by name."""
@@ -465,18 +437,20 @@ class Guard:
         self._counts = {}
         return {f"{PREFIX}{name}": float(n) for name, part in found.items() if (n := part.sum())}
 
-    def check(self, iteration: int, complaints: Sequence[str], scenarios: tuple[Tensor, Tensor]) -> None:
-        """Count an iteration; TrainingError after ``patience`` in a row with complaints. ``scenarios``: seed
-        and episode (N,) that the envs are in."""
+    def check(self, iteration: int, metrics: dict[str, float], scenarios: tuple[Tensor, Tensor]) -> None:
+        """Count an iteration; TrainingError after ``patience`` in a row whose metrics tell of something bad.
+        ``scenarios``: seed and episode (N,) that the envs are in."""
+        replaced = {name.removeprefix(PREFIX): n for name, n in metrics.items() if name.startswith(PREFIX)}
+        complaints = [f"{int(n)} values of {name} not finite" for name, n in replaced.items()]
+        if skipped := int(metrics["train/skipped_updates"]):
+            complaints.append(f"{skipped} updates left out because loss or gradient was not finite")
         rows = self._rows.nonzero().flatten().tolist()
         self._rows.zero_()
         self.bad_in_a_row = self.bad_in_a_row + 1 if complaints else 0
         if self.bad_in_a_row < self.patience:
             return
-        seed, episode = scenarios
-        envs = "".join(
-            f"; env {row} (seed {int(seed[row])}, episode {int(episode[row])})" for row in rows[:_ROWS_TOLD]
-        )
+        found = [(row, *(int(number[row]) for number in scenarios)) for row in rows[:_ROWS_TOLD]]
+        envs = "".join(f"; env {row} (seed {seed}, episode {episode})" for row, seed, episode in found)
         raise TrainingError(
             f"iterations {iteration - self.bad_in_a_row + 1} to {iteration} were all bad: "
             f"{'; '.join(complaints)}{envs}. The networks did not learn it. If updates were left out, take "

@@ -14,10 +14,9 @@ from torch import Tensor
 
 from uuvtai.common.enums import OUTCOMES, RUNNING, SUCCESS
 from uuvtai.common.presets import TRAINING_TREE
-from uuvtai.config import Config
 from uuvtai.config.behavior import FAST, SLOW, TUNED, configured_factors, log_bounds
 from uuvtai.config.learning import LearningConfig, SearchScene
-from uuvtai.config.loader import ConfigError
+from uuvtai.config.loader import ConfigError, load_config
 from uuvtai.learning.agents import TunedAgent, tuned_sections
 from uuvtai.learning.rollout import Recent, RolloutSums
 
@@ -39,8 +38,8 @@ class NumberSearch:
         self.spread = spread * (self.high - self.low)
         self.size, self.trials = size, 0
         self._generator = torch.Generator().manual_seed(seed)
-        self._place, self._score = torch.zeros(size, len(centre)), torch.zeros(size)
-        self._group = torch.zeros(size, dtype=torch.int64)
+        self.memory = {"place": torch.zeros(size, len(centre)), "score": torch.zeros(size)}
+        self.memory["group"] = torch.zeros(size, dtype=torch.int64)
 
     def drawn(self, count: int) -> Tensor:
         """(count, n) numbers to try: within ``spread``, the second of a pair as far the other way."""
@@ -52,29 +51,27 @@ class NumberSearch:
     def take(self, place: Tensor, score: Tensor, group: int) -> None:
         """Remember trials at ``place`` (count, n) with scores (count,), all of one ``group``."""
         rows = slice(self.trials, self.trials + len(place))
-        self._place[rows], self._score[rows], self._group[rows] = place, score, group
+        self.memory["place"][rows], self.memory["score"][rows] = place, score
+        self.memory["group"][rows] = group
         self.trials += len(place)
 
     def move(self) -> None:
         """One step along the surface of all trials."""
-        n = slice(self.trials)
-        place, spread = self._place[n].double().numpy(), self.spread.double().numpy()
-        slope, bend = fitted(place, self._score[n].double().numpy(), self._group[n].numpy(), spread)
-        centre, low, high = (part.double().numpy() for part in (self.centre, self.low, self.high))
+        place, score, group = (part[: self.trials].numpy() for part in self.memory.values())
+        own = self.spread, self.centre, self.low, self.high
+        spread, centre, low, high = (part.double().numpy() for part in own)
+        slope, bend = fitted(place.astype(float), score.astype(float), group, spread)
         self.centre = torch.from_numpy(best_near(centre, slope, bend, spread, low, high)).float()
 
     def state(self) -> dict[str, Any]:
         """But for ``memory``."""
         return {"centre": self.centre, "generator": self._generator.get_state(), "trials": self.trials}
 
-    def memory(self) -> dict[str, Tensor]:
-        return {"place": self._place, "score": self._score, "group": self._group}
-
     def load_state(self, state: Mapping[str, Any], memory: Mapping[str, Tensor]) -> None:
         self.centre = state["centre"].clone()
         self._generator.set_state(state["generator"])
         self.trials = int(state["trials"])
-        for name, own in self.memory().items():
+        for name, own in self.memory.items():
             own.copy_(memory[name])
 
 
@@ -120,20 +117,21 @@ def best_near(centre: Array, slope: Array, bend: Array, spread: Array, low: Arra
 def simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
     """A simulator of a world with room for every scene, on the run's sensors and stack; what the world says
     is known of its traffic counts. ConfigError."""
-    from uuvtai.config.loader import load_config
+    most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
+    there = load_config(world, overrides=[*most])
+    update: dict[str, Any] = {"world": there.world}
+    for name in ("traffic", "tracking"):
+        said = getattr(there, name).model_dump(exclude_defaults=True)
+        update[name] = getattr(config, name).model_copy(update=said)
+    return training_simulator(config.model_copy(update=update))
+
+
+def training_simulator(config: LearningConfig, device: str = "cpu") -> Sim:
+    """As many envs as the run has, driven by the tree that teaches."""
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.sim.sim import Sim
 
-    most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
-    there, usual = load_config(world, overrides=[*most]), Config()
-    update: dict[str, Any] = {"world": there.world}
-    for name in ("traffic", "tracking"):
-        said = {
-            key: value for key, value in getattr(there, name) if value != getattr(getattr(usual, name), key)
-        }
-        update[name] = getattr(config, name).model_copy(update=said)
-    config = config.model_copy(update=update)
-    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE))
+    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE), device)
 
 
 def run_search_episodes(
@@ -230,13 +228,9 @@ class ParameterSearchTrainer(EpisodeTrainer):
     def _search(self, part: int) -> NumberSearch:
         config, n = self.config, len(self._part)
         rounds = sum(self._part[i % n] == part for i in range(config.train.iterations))
-        return NumberSearch(
-            torch.from_numpy(configured_factors(config.slow, config.fast)[:, part]),
-            torch.tensor(log_bounds()),
-            config.parameter_search.spread,
-            rounds * config.train.num_envs,
-            config.train.seed,
-        )
+        centre = torch.from_numpy(configured_factors(config.slow, config.fast)[:, part])
+        spread, size = config.parameter_search.spread, rounds * config.train.num_envs
+        return NumberSearch(centre, torch.tensor(log_bounds()), spread, size, config.train.seed)
 
     def files(self) -> dict[str, bytes]:
         """The stack that drives by the numbers as they are now."""
@@ -264,9 +258,12 @@ class ParameterSearchTrainer(EpisodeTrainer):
         search.take(place[:, :, part], self._scored(outcome, steps, part), nth)
         if search.trials >= self.config.parameter_search.warm_up * search.size:
             search.move()
-        env_steps = int(steps.sum())
+        env_steps, sums = int(steps.sum()), RolloutSums(len(OUTCOMES), 0, torch.device("cpu"))
+        sums.outcomes += torch.bincount(outcome, minlength=len(OUTCOMES)).double()
+        sums.episode_steps += env_steps
+        sums.samples += env_steps
         times = self._done(env_steps, began, between)
-        return self._counted(outcome, env_steps) | self.factors() | times
+        return self.recent.add(sums) | self.factors() | times
 
     def factors(self) -> dict[str, float]:
         """The best so far, as metrics."""
@@ -293,13 +290,6 @@ class ParameterSearchTrainer(EpisodeTrainer):
         late = steps * self.config.episode.control_dt_s * cost
         return (outcome == SUCCESS).float() * (1.0 - late)
 
-    def _counted(self, outcome: Tensor, steps: int) -> dict[str, float]:
-        sums = RolloutSums(len(OUTCOMES), 0, torch.device("cpu"))
-        sums.outcomes += torch.bincount(outcome, minlength=len(OUTCOMES)).double()
-        sums.episode_steps += steps
-        sums.samples += steps
-        return self.recent.add(sums)
-
     def evaluate(self) -> dict[str, float]:
         """``eval/*`` of the best so far, on episodes that no trial met, as many of each scene."""
         train, scenes = self.config.train, list(dict.fromkeys(self._scenes))
@@ -321,7 +311,7 @@ class ParameterSearchTrainer(EpisodeTrainer):
             "tree": {"log_factor": self.centre},
             "recent": list(self.recent.rows),
             "searches": [search.state() for search in self.searches],
-            "env": [search.memory() for search in self.searches],
+            "env": [search.memory for search in self.searches],
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:

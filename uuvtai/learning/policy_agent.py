@@ -1,8 +1,6 @@
-"""A trained policy driving: the mean action without exploration noise.
-
-What a row does must not depend on its neighbours, the batch's size or the number of threads. The networks
-therefore always see ``CHUNK`` rows at once: equal shapes take equal paths through the matrix products.
-"""
+"""A trained policy driving: the mean action without exploration noise. What a row does must not depend on its
+neighbours, the batch's size or the number of threads. The networks therefore always see ``CHUNK`` rows at
+once: equal shapes take equal paths through the matrix products."""
 
 from __future__ import annotations
 
@@ -13,7 +11,8 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
-from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError
+from uuvtai.common.files import FileError
+from uuvtai.learning.checkpoint import MODEL, Checkpoint, CheckpointError, refused
 from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic
 from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
@@ -40,14 +39,12 @@ class AgentDecision(NamedTuple):
 class OneDecision(nn.Module):
     """The networks for one decision, without memory."""
 
-    fill: Tensor
-    """(n_obs,) what counts where a value is not finite"""
-
     def __init__(self, policy: ActorCritic, world_model: WorldModel | None) -> None:
         """``world_model``: None where the policy was trained without its features."""
         super().__init__()
         self.policy, self.world_model = policy, world_model
-        self.register_buffer("fill", policy.observation_norm.mean[: policy.n_in - N_FEATURES].float())
+        self.fill = nn.Buffer(policy.observation_norm.mean[: policy.n_in - N_FEATURES].float())
+        """(n_obs,) what counts where a value is not finite"""
 
     def forward(
         self, obs: Tensor, last_obs: Tensor, last_action: Tensor, has_last: Tensor
@@ -59,8 +56,9 @@ class OneDecision(nn.Module):
         if self.world_model is not None:
             found = self.world_model.features(last_obs, last_action, obs)
             features = torch.where(has_last[:, None], found, features)
-        x = torch.cat([obs, features], dim=1)
-        return self.policy.distribution(x)[0], self.policy.value(x), features
+        inputs = self.policy.prepared({"x": torch.cat([obs, features], dim=1)})
+        value = self.policy.value_norm.inverse(self.policy.value_of(inputs))
+        return self.policy.mean_of(inputs), value, features
 
 
 class HeldAgent(ABC):
@@ -119,22 +117,17 @@ class PolicyAgent(HeldAgent):
 
     @torch.no_grad()
     def decide(self, obs: Tensor) -> AgentDecision:
-        """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on. What is
-        not finite counts as its mean in training."""
         self._obs[:] = obs
         due = self._due()
         if len(due):
             row = self._obs[due], self._last_obs[due], self._last_action[due], self._age[due] > 0
             for held, found in zip(self._said, by_chunk(self._one, *row), strict=True):
                 held[due] = found
-        mean, value, features = self._said
-        self.decision = AgentDecision(
-            mean.clamp(-1.0, 1.0), value.clone(), self.policy.log_std.exp(), *features.clone().T
-        )
+        mean, value, features = (part.clone() for part in self._said)
+        self.decision = AgentDecision(mean.clamp(-1.0, 1.0), value, self.policy.log_std.exp(), *features.T)
         return self.decision
 
     def advance(self) -> None:
-        """The last decision has been carried out."""
         due = self._due()
         self._last_obs[due], self._last_action[due] = self._obs[due], self._said[0][due]
         super().advance()
@@ -172,8 +165,7 @@ def load_agent(checkpoint: Checkpoint, num_envs: int, device: Device = "cpu") ->
     policy = network(checkpoint, "policy", lambda: ActorCritic(n_obs() + N_FEATURES, config.policy, new))
     if world.enabled and world.as_features:
         world_model = network(checkpoint, "world_model", lambda: WorldModel(n_obs(), world, new)).to(device)
-    policy = policy.to(device)
-    return PolicyAgent(policy, world_model, num_envs, device)
+    return PolicyAgent(policy.to(device), world_model, num_envs, device)
 
 
 Net = TypeVar("Net", bound=nn.Module)
@@ -182,23 +174,18 @@ Net = TypeVar("Net", bound=nn.Module)
 def network(checkpoint: Checkpoint, name: str, make: Callable[[], Net]) -> Net:
     """What ``make`` gives, with the weights that a checkpoint holds under this name. Raises CheckpointError
     where they are of another shape, before anything is made so wide, or not finite."""
-    file, model = checkpoint.path / MODEL, checkpoint.model()
-    try:
+    model = checkpoint.model()
+    with refused(checkpoint.path / MODEL, "its networks are not those of its config"):
         part = model[name]
         with torch.device("meta"):  # shapes alone
             expected = make().state_dict()
+        if part.keys() != expected.keys():
+            raise ValueError(f"{name} holds other tensors: {min(part.keys() ^ expected.keys())}")
         for key, like in expected.items():
             if part[key].shape != like.shape:
                 raise ValueError(f"{name}.{key} is {tuple(part[key].shape)} instead of {tuple(like.shape)}")
+            if not bool(torch.isfinite(part[key]).all()):
+                raise FileError(f"{key} is not finite: the training failed; take an older checkpoint")
         net = make()
         net.load_state_dict(part)
-    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"{file}: its networks are not those of its config ({error}); take another one"
-        ) from None
-    for key, tensor in net.state_dict().items():
-        if not bool(torch.isfinite(tensor).all()):
-            raise CheckpointError(
-                f"{file}: {key} is not finite: the training failed; take an older checkpoint"
-            )
     return net.eval()

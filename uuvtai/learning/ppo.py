@@ -4,26 +4,16 @@ distillation term, for any ``Policy``."""
 from __future__ import annotations
 
 import functools
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from uuvtai.config.learning import PpoConfig
+from uuvtai.learning import networks
 from uuvtai.learning.distillation import imitation_error
-from uuvtai.learning.networks import (
-    CACHE_ROWS,
-    AdamLearner,
-    Policy,
-    View,
-    entropy,
-    log_prob,
-    moments_of,
-    side_by_side,
-    torch_threads_rest,
-)
+from uuvtai.learning.networks import CACHE_ROWS, AdamLearner, Policy, View, entropy, log_prob, moments_of
 from uuvtai.learning.rollout import Rollout
 
 ADAM_EPS = 1e-5
@@ -35,18 +25,12 @@ DECAY_FROM, LEAST_RATE = 0.5, 0.1
 
 
 def gae(
-    reward: Tensor,
-    value: Tensor,
-    next_value: Tensor,
-    terminated: Tensor,
-    ended: Tensor,
-    gamma: float,
-    lam: float,
+    reward: Tensor, value: Tensor, next_value: Tensor, ended: Tensor, gamma: float, lam: float
 ) -> tuple[Tensor, Tensor]:
     """(advantage, return), both (T, N) as all inputs, by generalised advantage estimation (Schulman et al.
-    2016, equation 16). ``next_value`` of the true next observation counts after a timeout (ended, not
-    terminated), not after a termination; past an ending nothing is carried back."""
-    delta = reward + gamma * next_value * ~terminated - value
+    2016, equation 16). ``next_value`` is that of the true next observation after a timeout, 0 after a
+    termination; past an ending nothing is carried back."""
+    delta = reward + gamma * next_value - value
     carried = gamma * lam * ~ended
     advantage = torch.empty_like(reward)
     last = torch.zeros_like(reward[0])
@@ -92,27 +76,21 @@ class Ppo(AdamLearner):
             groups = [{"params": actor}, {"params": critic, "lr": policy.critic_rate}]
         super().__init__(groups, lr=self._rate_now, eps=ADAM_EPS, fused=True)
         self._nets = actor, critic
-        self.updates = 0
-        """minibatches that changed the policy"""
 
     def update(
-        self,
-        rollout: Rollout,
-        generator: torch.Generator,
-        distillation_weight: float = 0.0,
-        share: float = 0.0,
+        self, rollout: Rollout, generator: torch.Generator, strength: float = 0.0, share: float = 0.0
     ) -> dict[str, float]:
         """Learn from a closed rollout when ``share`` of the run is over; metrics, means over all minibatches.
-        ``distillation_weight`` is lambda_t s_t. Samples that are not finite have no part in it."""
+        ``strength`` of the distillation is lambda_t s_t. Samples that are not finite have no part in it."""
         config = self.config
         samples, metrics = self._prepared(rollout)
         fade = min(1.0, (1.0 - share) / (1.0 - DECAY_FROM)) if config.target_kl > 0 else 1.0
         self._rate_now.copy_(self.rate * max(LEAST_RATE, fade))
         skipped, sums = self.skipped, torch.zeros(len(_SUMS), dtype=torch.float64, device=self.rate.device)
-        with torch_threads_rest():
+        with networks.torch_threads_rest():
             for _ in range(config.epochs):
                 for index in self._minibatches(len(samples["valid"]), generator):
-                    sums += self._learn(samples, index, distillation_weight)
+                    sums += self._learn(samples, index, strength)
         means = dict(zip(_SUMS[:-1], sums / sums[-1].clamp(min=1.0), strict=False))
         if config.target_kl > 0:
             self.rate.copy_(adapted_rate(self.rate, means["approx_kl"].float(), config.target_kl))
@@ -128,13 +106,12 @@ class Ppo(AdamLearner):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"learning_rate": self.rate.clone(), "updates": self.updates}
+        return super().state_dict() | {"learning_rate": self.rate.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.optimiser.param_groups[0]["lr"] = self._rate_now
         self.rate.copy_(state["learning_rate"])
-        self.updates = int(state["updates"])
 
     @torch.no_grad()
     def _prepared(self, rollout: Rollout) -> tuple[View, dict[str, float]]:
@@ -144,18 +121,20 @@ class Ppo(AdamLearner):
         if not bool(valid.all()):
             rollout = rollout.where(valid)
         reward, value, following = rollout["reward"], rollout["value"], rollout["next_value"]
-        terminated, ended = rollout["terminated"], rollout["ended"] | ~valid
         gamma, lam = self.config.gamma, self.config.gae_lambda
-        advantage, returns = gae(reward, value, following, terminated, ended, gamma, lam)
-        good = returns[valid]
-        metrics = {
-            "train/explained_variance": _explained_variance(value[valid], good),
-            "train/invalid_samples": float(valid.numel() - len(good)),
-        }
+        advantage, returns = gae(reward, value, following, rollout["ended"] | ~valid, gamma, lam)
+        good, explained = returns[valid], 0.0
+        if len(good) > 1 and float(good.var()):
+            explained = 1.0 - float((good - value[valid]).var() / good.var())
+        invalid = float(valid.numel() - len(good))
+        metrics = {"train/explained_variance": explained, "train/invalid_samples": invalid}
         if self.config.normalise_values:
             self.policy.learn_returns(good[:, None])
+        moments = moments_of(advantage[valid][:, None])
+        std = (moments.m2 / moments.n.clamp(min=1.0)).sqrt().float()
+        standardised = torch.where(valid, (advantage - moments.mean.float()) / (std + 1e-8), 0.0)
         found = {
-            "advantage": _standardised(advantage, valid).flatten(),
+            "advantage": standardised.flatten(),
             "target": self.policy.value_norm(returns.flatten()),
             "valid": valid.flatten().float(),
         }
@@ -163,46 +142,36 @@ class Ppo(AdamLearner):
         kept = {n: flat[n] for n in ("action", "log_prob", "teacher_action") if n in flat}
         return kept | self.policy.prepared(flat) | found, metrics
 
-    def _minibatches(self, count: int, generator: torch.Generator) -> Iterator[slice | Tensor]:
-        """Blocks of neighbouring rows (all envs in a span of steps), or random ones."""
-        parts, order = self.config.minibatches, None
+    def _minibatches(self, count: int, generator: torch.Generator) -> Sequence[Tensor]:
+        """Rows of blocks of neighbours (all envs in a span of steps), or random ones."""
+        order, parts = torch.arange(count), self.config.minibatches
         if self.policy.is_shuffled:
-            order = torch.randperm(count, generator=generator).to(self.rate.device)
-        for first, last in itertools.pairwise(count * part // parts for part in range(parts + 1)):
-            yield slice(first, last) if order is None else order[first:last]
+            order = torch.randperm(count, generator=generator)
+        return order.to(self.rate.device).tensor_split([count * part // parts for part in range(1, parts)])
 
-    def _learn(self, samples: View, index: slice | Tensor, distillation_weight: float) -> Tensor:
+    def _learn(self, samples: View, index: Tensor, strength: float) -> Tensor:
         """A step by these samples; their sums. The number of threads changes no bit."""
         self.optimiser.zero_grad(set_to_none=True)
-        count = samples["valid"][index].sum().clamp(min=1.0)
-        together = functools.partial(side_by_side, device=self.rate.device.type)
+        count, device = samples["valid"][index].sum().clamp(min=1.0), self.rate.device.type
+        together = functools.partial(networks.side_by_side, device=device)
 
-        def rows(part: slice | Tensor) -> View:
+        def rows(part: Tensor) -> View:
             return {name: values[part] for name, values in samples.items()}
 
         pieces: list[Callable[[], Piece]] = []
-        for block in together(*(functools.partial(rows, part) for part in self._parts(index))):
-            pieces.append(functools.partial(self._of_actor, block, count, distillation_weight))
+        parts = index.split(CACHE_ROWS) if device == "cpu" else [index]
+        for block in together(*(functools.partial(rows, part) for part in parts)):
+            pieces.append(functools.partial(self._of_actor, block, count, strength))
             pieces.append(functools.partial(self._of_critic, block, count))
         found = together(*pieces)
         for parameters, mine in zip(self._nets, (found[::2], found[1::2]), strict=True):
-            for parameter, *parts in zip(parameters, *(gradients for gradients, _ in mine), strict=True):
-                parameter.grad = functools.reduce(torch.add, parts)
+            for parameter, *found_by in zip(parameters, *(gradients for gradients, _ in mine), strict=True):
+                parameter.grad = functools.reduce(torch.add, found_by)
         if self.step(most=self.config.max_grad_norm):
             self.policy.floor_std()
-            self.updates += 1
         return torch.stack([sums for _, sums in found]).sum(dim=0)
 
-    def _parts(self, index: slice | Tensor) -> Sequence[slice | Tensor]:
-        """A minibatch in parts whose activations stay in the cache of a CPU."""
-        if self.rate.device.type != "cpu":
-            return [index]
-        if isinstance(index, Tensor):
-            return index.split(CACHE_ROWS)
-        starts = range(index.start, index.stop, CACHE_ROWS)
-        return [slice(first, min(first + CACHE_ROWS, index.stop)) for first in starts]
-
-    def _of_actor(self, batch: View, count: Tensor, distillation_weight: float) -> Piece:
+    def _of_actor(self, batch: View, count: Tensor, strength: float) -> Piece:
         config, valid, log_std = self.config, batch["valid"], self.policy.log_std
         share, mean = valid / count, self.policy.mean_of(batch)
         log_ratio = log_prob(batch["action"], mean, log_std) - batch["log_prob"]
@@ -212,9 +181,9 @@ class Ppo(AdamLearner):
             clipped = (log_ratio.expm1().abs() > config.clip).float()
             sums = {"count": torch.ones_like(valid), "policy_loss": policy_loss}
             sums |= {"approx_kl": approximate_kl(log_ratio), "clip_fraction": clipped}
-        if distillation_weight:
+        if strength:
             distill = imitation_error(mean, batch["teacher_action"])
-            loss = loss + distillation_weight * (share * distill).sum()
+            loss = loss + strength * (share * distill).sum()
             sums |= {"distill_loss": distill}
         return torch.autograd.grad(loss, self._nets[0]), _summed(sums, valid)
 
@@ -230,17 +199,3 @@ def _summed(terms: View, valid: Tensor) -> Tensor:
     """Sums of terms (B,) over the valid rows, in the order of ``_SUMS``; those that are not there are 0."""
     zero = torch.zeros_like(valid)
     return (torch.stack([terms.get(name, zero) for name in _SUMS]) @ valid).double()
-
-
-def _standardised(advantage: Tensor, valid: Tensor) -> Tensor:
-    """Mean 0, deviation 1 by the moments of the valid samples; the others become 0."""
-    moments = moments_of(advantage[valid][:, None])
-    std = (moments.m2 / moments.n.clamp(min=1.0)).sqrt()
-    return torch.where(valid, (advantage - moments.mean.float()) / (std.float() + 1e-8), 0.0)
-
-
-def _explained_variance(value: Tensor, returns: Tensor) -> float:
-    """1 - var(return - value) / var(return); 0 where the returns do not vary."""
-    if len(returns) < 2 or not float(returns.var()):
-        return 0.0
-    return 1.0 - float((returns - value).var() / returns.var())

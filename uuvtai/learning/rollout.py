@@ -5,14 +5,14 @@ from __future__ import annotations
 import functools
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from uuvtai.common.enums import COLLIDED, OUTCOMES
-from uuvtai.learning.networks import Guard, Policy, View
+from uuvtai.learning.networks import Policy, View
 
 
 class Step(NamedTuple):
@@ -30,50 +30,21 @@ class Step(NamedTuple):
 
 
 class Environment(ABC):
-    """Where a policy learns: the simulator or its surrogate (``environments.py``). ``begin`` comes first."""
+    """What a rollout needs of the places where a policy learns (``environments.py``)."""
 
     env: Any
     carried: View
-    """what is kept beside ``env.capture()``: always the same tensors"""
-    num_envs: int
+    """what is kept beside ``env.capture()``"""
     device: torch.device
-    steps: int
-    """of control that a decision counts as"""
     view: View
     """what is known now; written anew by ``step``"""
     node_names: Sequence[str] = ()
     """of the tree that teaches: ``teacher_action`` and ``leaf`` are then in the view"""
     outcomes: Sequence[str] = OUTCOMES
     reward_terms: Sequence[str] = ()
-    observation_table: Sequence[Any]
-    guard: Guard
 
     @abstractmethod
-    def make_policy(self, generator: torch.Generator) -> Policy:
-        """One that fits the view."""
-
-    @abstractmethod
-    def begin(self, policy: Any, world_model: Any, generator: torch.Generator) -> None:
-        """First episodes, for the policy that was made; ``generator`` draws all that follow."""
-
-    def look_around(self, _rollout: Rollout) -> bool:
-        """Fill a rollout with what the statistics of the policy begin with; whether there is any."""
-        return False
-
-    def fill_model_features(self, rollout: Rollout) -> None:  # noqa: B027 - most have none
-        """The world model has learned from what ``look_around`` filled: say what it makes of it."""
-
-    def warm_start(self, _policy: Any, _note: Callable[[str], None]) -> dict[str, float]:
-        """Teach the policy what can be before its first rollout, tell ``note`` how far it is; metrics."""
-        return {}
-
-    @property
-    @abstractmethod
-    def scenarios(self) -> tuple[Tensor, Tensor]:
-        """Seed and number, both (N,), of what every env is in."""
-
-    @abstractmethod
-    def step(self, action: Tensor, sums: RolloutSums | None) -> Step:
+    def step(self, action: Tensor, sums: RolloutSums) -> Step:
         """Carry out a decision (N, n_action), and count it."""
 
     def state_dict(self) -> View:
@@ -129,8 +100,7 @@ class Rollout(dict[str, Tensor]):
         """A copy that is 0 where ``valid`` (T, N) is not."""
         found = Rollout(self.steps)
         for name, part in self.items():
-            rows = valid.view(*valid.shape, *[1] * (part.dim() - 2))
-            found[name] = torch.where(rows, part, torch.zeros_like(part[:1]))
+            found[name] = part.masked_fill(~valid.view(*valid.shape, *[1] * (part.dim() - 2)), 0)
         return found
 
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 from uuvtai.common import signals
 from uuvtai.common.errors import OwnCodeError
 from uuvtai.common.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
-from uuvtai.common.presets import TRAINING_TREE
 from uuvtai.common.statistics import wilson_interval
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.loader import ConfigError, Overrides, load_resolved, to_yaml
@@ -25,7 +24,7 @@ from uuvtai.learning.agents import find_policy
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.environments import InSurrogate, Simulated
 from uuvtai.learning.forecast import ForecastTrainer
-from uuvtai.learning.parameter_search import ParameterSearchTrainer
+from uuvtai.learning.parameter_search import ParameterSearchTrainer, training_simulator
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.set_networks import actor_of
 from uuvtai.learning.trainer import Trainer
@@ -88,11 +87,9 @@ Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 
 
 def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple[dict[str, Any], Path]:
-    """Train or go on training; what ``uuv train --json`` prints, and the run folder.
-
-    Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets
-    the iteration end, saves and raises KeyboardInterrupt; a second one ends at once.
-    """
+    """Train or go on training; what ``uuv train --json`` prints, and the run folder. Everything that can be
+    refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets the iteration end,
+    saves and raises KeyboardInterrupt; a second one ends at once."""
     if request.iterations is not None and request.iterations < 1:
         raise ConfigError(f"--iterations {request.iterations}: at least 1, for example --iterations 100")
     # held before anything is read: what another process writes meanwhile must not count
@@ -140,7 +137,7 @@ def _train(
         folder.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
         if request.overrides:
             folder.write(CONFIG, to_yaml(config))
-    run = _Run(trainer, config, folder, watch, evaluate, total, request.reward)
+    run = _Run(trainer, config, folder, watch, evaluate, request)
     with folder.recorded(), contextlib.closing(run), signals.StopEvent() as pressed:
         if not run.go(pressed):
             raise KeyboardInterrupt
@@ -192,17 +189,13 @@ def _check_reward(folder: Path, own: RewardSource | None) -> None:
 def _trainer(config: LearningConfig, device: str, own: RewardSource | None) -> AnyTrainer:
     """What learns. Raises ConfigError for a GPU or a reward where there is no use for it."""
     if own and (config.surrogate.enabled or config.learner != "ppo"):
-        raise ConfigError(
-            f"--reward {own.spec.typed}: needs a preset that trains in the simulator, such as ppo or paper: "
-            f"uuv train ppo --reward {own.spec.typed}"
-        )
+        told = f"such as ppo or paper: uuv train ppo --reward {own.spec.typed}"
+        raise ConfigError(f"--reward {own.spec.typed}: needs a preset that trains in the simulator, {told}")
     for section in ("surrogate", "parameter_search", "forecast_training"):
         if device == "cuda" and getattr(config, section).enabled:
             raise ConfigError(f"{section}.enabled: it learns on the CPU; leave out --device cuda")
-    return TRAINERS[config.learner](config, device, own)
-
-
-def _policy_trainer(config: LearningConfig, device: str, own: RewardSource | None) -> Trainer:
+    if config.learner != "ppo":
+        return ParameterSearchTrainer(config) if config.learner == "search" else ForecastTrainer(config)
     if config.surrogate.enabled:
         return Trainer(InSurrogate(config), config)
     env = _env(config, device)
@@ -211,20 +204,10 @@ def _policy_trainer(config: LearningConfig, device: str, own: RewardSource | Non
     return Trainer(Simulated(env, config), config)
 
 
-TRAINERS: dict[str, Callable[[LearningConfig, str, RewardSource | None], AnyTrainer]] = {
-    "ppo": _policy_trainer,
-    "search": lambda config, *_: ParameterSearchTrainer(config),
-    "forecast": lambda config, *_: ForecastTrainer(config),
-}
-"""by ``LearningConfig.learner``"""
-
-
 def _env(config: LearningConfig, device: str) -> VectorEnv:
     from uuvtai.envs.vector_env import VectorEnv
-    from uuvtai.sim.behavior_tree import read_tree
-    from uuvtai.sim.sim import Sim
 
-    sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE), device)
+    sim = training_simulator(config, device)
     sim.set_scenes(config.train.scenes)
     return VectorEnv(sim, config.train.seed)
 
@@ -238,14 +221,13 @@ class _Run:
     folder: RunFolder
     watch: TrainWatch
     evaluate: Evaluate
-    total: int
-    """iterations in all"""
-    own: RewardSource | None = None
+    request: TrainRequest
     metrics: Metrics = field(default_factory=dict)
     """of the last one"""
 
     def __post_init__(self) -> None:
         self.saved = self.trainer.iteration
+        self.total = self.request.iterations or self.config.train.iterations
         self.recorder = MetricsRecorder(self.folder.path, self.saved)
         self.watch.start(self.folder.path, self.config, self.saved, self.total)
 
@@ -283,7 +265,8 @@ class _Run:
 
     def _again(self, option: str) -> str:
         """The run folder behind an option, and what its config does not keep."""
-        typed = [option, str(self.folder.path)] + (["--reward", self.own.spec.typed] if self.own else [])
+        own = self.request.reward
+        typed = [option, str(self.folder.path)] + (["--reward", own.spec.typed] if own else [])
         if self.total != self.config.train.iterations:
             typed += ["--iterations", str(self.total)]
         return shlex.join(typed)

@@ -26,8 +26,7 @@ _SUM_SCALE = 0.3
 
 
 class SetEncoder(nn.Module):
-    """Obstacles (..., n, n_obstacle) of which ``mask`` (..., n, 1) are there, and the vehicle's own columns
-    (..., n_own), to ``n_out`` numbers."""
+    """Obstacles (..., n, n_obstacle), of which ``mask`` (..., n, 1) are there, and own columns to numbers."""
 
     def __init__(
         self, sizes: tuple[int, int, int], config: LearningConfig, gain: float, generator: torch.Generator

@@ -12,12 +12,12 @@ import torch
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint
-from uuvtai.learning.distillation import Distillation
-from uuvtai.learning.environments import InSurrogate
-from uuvtai.learning.networks import PREFIX, fast_products
+from uuvtai.learning.distillation import Distillation, imitate
+from uuvtai.learning.environments import InSurrogate, Simulated
+from uuvtai.learning.networks import fast_products
 from uuvtai.learning.policy_agent import network
 from uuvtai.learning.ppo import Ppo
-from uuvtai.learning.rollout import Environment, Recent, Rollout, collect
+from uuvtai.learning.rollout import Recent, Rollout, collect
 from uuvtai.learning.world_model import N_TARGET, WorldModel, WorldModelLearner
 
 
@@ -28,14 +28,14 @@ class Trainer:
     note: Callable[[str], None] = print
     """told how far the warm start is"""
 
-    def __init__(self, env: Environment, config: LearningConfig) -> None:
+    def __init__(self, env: Simulated | InSurrogate, config: LearningConfig) -> None:
         """Begins the episodes of ``env``. ValueError for settings that do not fit each other."""
         samples = config.ppo.rollout_steps * env.num_envs
+        self._samples = samples * env.steps
+        """env-steps of one rollout"""
         if config.ppo.minibatches > samples:
-            raise SettingError(
-                f"ppo.minibatches={config.ppo.minibatches}, but a rollout has only {samples} samples: raise "
-                "ppo.rollout_steps or train.num_envs"
-            )
+            told = f"a rollout has only {samples} samples: raise ppo.rollout_steps or train.num_envs"
+            raise SettingError(f"ppo.minibatches={config.ppo.minibatches}, but {told}")
         self.env, self.config, self.observation_table = env, config, env.observation_table
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.policy = env.make_policy(self.generator)
@@ -44,10 +44,7 @@ class Trainer:
         self.ppo = Ppo(self.policy, config.ppo)
         world, self.world_model, self.world_learner = config.world_model, None, None
         if world.enabled and "x" not in env.view:
-            raise SettingError(
-                "world_model.enabled: a policy over a set of obstacles has none, for it predicts observation "
-                "vectors; turn it off"
-            )
+            raise SettingError("world_model.enabled: a policy over a set of obstacles has none; turn it off")
         if world.enabled:
             widths = {c.name: c.slice.stop - c.slice.start for c in env.observation_table}
             names = [f"{name}_{i}" for name, width in widths.items() for i in range(width)]
@@ -71,7 +68,7 @@ class Trainer:
         self.iteration += 1
         self.env_steps += self._samples
         metrics |= self.env.guard.take() | times | self.recent.add(sums)
-        self._judge(metrics)
+        self.env.guard.check(self.iteration, metrics, self.env.scenarios)
         found = {"env_steps": float(self.env_steps), "env_steps_per_s": self._samples / sum(times.values())}
         decisions = {name.replace("env_steps", "decisions"): n / self.env.steps for name, n in found.items()}
         return metrics | {f"time/{name}": n for name, n in (found | decisions).items()}
@@ -108,9 +105,8 @@ class Trainer:
         self.generator.set_state(state["generator"])
         self.recent.rows = [list(row) for row in state["recent"]]
         counters = state["counters"]
-        self.iteration, self.env_steps, self.env.guard.bad_in_a_row = (
-            int(counters[n]) for n in ("iteration", "env_steps", "bad_in_a_row")
-        )
+        self.iteration, self.env_steps = int(counters["iteration"]), int(counters["env_steps"])
+        self.env.guard.bad_in_a_row = int(counters["bad_in_a_row"])
 
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own, by its name in a checkpoint."""
@@ -122,13 +118,17 @@ class Trainer:
 
     def _begin(self) -> dict[str, float]:
         """Statistics begin with what the behavior tree meets: unscaled networks would learn in vain."""
-        if self.env.look_around(self.rollout):
-            self.env_steps += self._samples
-            self._learn_world()
-            self.env.fill_model_features(self.rollout)
-            if not self._is_started:
-                self.policy.observe(self.rollout)
-        return {} if self._is_started else self.env.warm_start(self.policy, self.note)
+        if isinstance(self.env, InSurrogate):
+            is_taught = self.config.surrogate.warm_start_waves > 0 and not self._is_started
+            return imitate(self.policy.actor, self.config, self.env.scenes, self.note) if is_taught else {}
+        self.env.look_around(self.rollout)
+        self.env_steps += self._samples
+        self._learn_world()
+        if self.world_model is not None and self.config.world_model.as_features:
+            self.world_model.fill_in(*(self.rollout[name] for name in ("x", "action", "ended")))
+        if not self._is_started:
+            self.policy.observe(self.rollout)
+        return {}
 
     def _learn(self, share: float) -> dict[str, float]:
         if self.distillation is None:
@@ -144,21 +144,4 @@ class Trainer:
             return {}
         rollout = self.rollout
         obs, valid = rollout["x"][..., : self.world_learner.model.n_obs], ~rollout["ended"][:-1]
-        return self.world_learner.update(obs[:-1], rollout["action"][:-1], obs[1:], self.generator, valid)
-
-    def _judge(self, metrics: dict[str, float]) -> None:
-        """Tell the guard what was bad in this iteration."""
-        complaints = [
-            f"{int(v)} values of {name.removeprefix(PREFIX)} not finite"
-            for name, v in metrics.items()
-            if name.startswith(PREFIX)
-        ]
-        skipped = metrics["train/skipped_updates"]
-        if skipped:
-            complaints.append(f"{int(skipped)} updates left out because loss or gradient was not finite")
-        self.env.guard.check(self.iteration, complaints, self.env.scenarios)
-
-    @property
-    def _samples(self) -> int:
-        """Env-steps of one rollout."""
-        return self.rollout.steps * self.env.steps * self.env.num_envs
+        return self.world_learner.update(obs[:-1], rollout["action"][:-1], obs[1:], valid, self.generator)

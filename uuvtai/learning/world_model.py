@@ -11,11 +11,10 @@ from torch import Tensor, nn
 
 from uuvtai.common.errors import SettingError
 from uuvtai.config.learning import WorldModelConfig
-from uuvtai.learning.networks import AdamLearner, RunningNorm, mlp
+from uuvtai.learning.networks import NUM_ACTIONS, AdamLearner, RunningNorm, mlp
 
 N_TARGET = 24
 """first columns of the observation: goal, heading error, velocity, yaw rate, depth, tilt, 12 sector ranges"""
-N_ACTION = 4
 N_FEATURES = 2
 """residual, uncertainty"""
 
@@ -37,13 +36,11 @@ class WorldModel(nn.Module):
         """SettingError for an observation of fewer columns than targets."""
         super().__init__()
         if n_obs < N_TARGET:
-            raise SettingError(
-                f"the world model predicts the first {N_TARGET} columns of the observation, but it has only "
-                f"{n_obs}"
-            )
+            told = f"the first {N_TARGET} columns of the observation, but it has only {n_obs}"
+            raise SettingError(f"the world model predicts {told}")
         self.n_obs, self.config = n_obs, config
         self.encoder = mlp((n_obs, *config.hidden, config.latent), "elu", generator)
-        self.dynamics = mlp((config.latent + N_ACTION, *config.hidden, config.latent), "elu", generator)
+        self.dynamics = mlp((config.latent + NUM_ACTIONS, *config.hidden, config.latent), "elu", generator)
         self.decoder = mlp((config.latent, *config.hidden, 2 * N_TARGET), "elu", generator, _OUT_GAIN)
         self.observation_norm = RunningNorm(n_obs)
 
@@ -75,6 +72,12 @@ class WorldModel(nn.Module):
         found = error.square().mean(dim=-1).sqrt(), log_var.exp().mean(dim=-1)
         return torch.stack(found, dim=-1).nan_to_num_(0.0, 0.0, 0.0)
 
+    def fill_in(self, x: Tensor, action: Tensor, ended: Tensor) -> None:
+        """Write ``features`` into the last columns of inputs x (T, N, n_obs + 2); 0 where episodes begin."""
+        for t in range(1, len(x)):
+            found = self.features(x[t - 1, :, : self.n_obs], action[t - 1], x[t, :, : self.n_obs])
+            x[t, :, self.n_obs :] = torch.where(ended[t - 1, :, None], 0.0, found)
+
     def loss(
         self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -99,12 +102,7 @@ class WorldModelLearner(AdamLearner):
         self._names = names or [str(i) for i in range(N_TARGET)]
 
     def update(
-        self,
-        obs: Tensor,
-        action: Tensor,
-        next_obs: Tensor,
-        generator: torch.Generator,
-        valid: Tensor | None = None,
+        self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor, generator: torch.Generator
     ) -> dict[str, float]:
         """``config.steps`` gradient steps on the ``valid`` (T, N) and finite samples of a rollout: obs,
         next_obs (T, N, n_obs), action (T, N, 4). Metrics; calibration and skill (1 - mean squared error /
@@ -126,16 +124,14 @@ class WorldModelLearner(AdamLearner):
         }
 
     def _drawn(
-        self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor | None, generator: torch.Generator
+        self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Random samples and whether they are valid; rows that are not finite are zero and not valid."""
         steps, num_envs = action.shape[:2]
         drawn = torch.randint(steps * num_envs, (self.config.batch,), generator=generator).to(obs.device)
         t, env = drawn // num_envs, drawn % num_envs
         rows = obs[t, env], action[t, env], next_obs[t, env]
-        good = torch.isfinite(torch.cat(rows, dim=1)).all(dim=1)
-        if valid is not None:
-            good &= valid[t, env]
+        good = torch.isfinite(torch.cat(rows, dim=1)).all(dim=1) & valid[t, env]
         kept = [torch.where(good[:, None], row, 0.0) for row in rows]
         return kept[0], kept[1], kept[2], good
 

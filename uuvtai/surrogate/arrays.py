@@ -48,7 +48,7 @@ TRUTH_WIDTH = 10
 
 @dataclass(frozen=True, eq=False)
 class Rules:
-    """What the surrogate's kernels are compiled for."""
+    """What the kernels are compiled for; the safety filter reads the first and ``episode_cfg`` alone."""
 
     vehicle_cfg: Const[VehicleConfig]
     actuation_cfg: Const[ActuationConfig]
@@ -56,14 +56,6 @@ class Rules:
     episode_cfg: Const[EpisodeConfig]
     route_cfg: Const[RouteConfig]
     surrogate_cfg: Const[SurrogateConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class SafetyRules:
-    """What the safety filter is compiled for."""
-
-    vehicle_cfg: Const[VehicleConfig]
-    episode_cfg: Const[EpisodeConfig]
 
 
 @dataclass(frozen=True, eq=False)

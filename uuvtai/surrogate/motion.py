@@ -5,16 +5,8 @@ import taichi as ti
 
 from uuvtai.common.enums import HOLD_STEPS, LEAST_SPEED_M_S, RUNNING, SUCCESS, TIMEOUT, TURN_GAIN
 from uuvtai.config import TankConfig, VehicleConfig
-from uuvtai.kernels.core.geometry import (
-    FAR_M,
-    NONE,
-    PI,
-    foot_on,
-    hull_to_side_wall,
-    steady_direction,
-    turned_z,
-    wrapped_angle,
-)
+from uuvtai.kernels.core import geometry
+from uuvtai.kernels.core.geometry import FAR_M, NONE, PI, foot_on, steady_direction, turned_z, wrapped_angle
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
 from uuvtai.kernels.task.episode import threat_of, verdict
 from uuvtai.kernels.vehicle.control import axis_loops, integrated
@@ -30,9 +22,8 @@ def part(rows: FloatMatrix, env, first, count: Const[int]):
 
 @ti.func
 def hull_command(wish, yaw, z_m, gap_m, vehicle_cfg: Const[VehicleConfig], tank_cfg: Const[TankConfig]):
-    """(surge, sway, heave, yaw rate) in parts of the vehicle's limits for a wished velocity [m/s] in the
-    world: a diagonal of the hull turns to the motion, for there surge and sway add up; the centre stays
-    ``gap_m`` from floor and surface."""
+    """(surge, sway, heave, yaw rate) in parts of the limits for a wished velocity [m/s] in the world: the
+    hull's diagonal turns to the motion, for there surge and sway add up; ``gap_m`` from floor and surface."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     surge = (c * wish[0] + s * wish[1]) / vehicle_cfg.max_surge_m_s
     sway = (c * wish[1] - s * wish[0]) / vehicle_cfg.max_sway_m_s
@@ -57,13 +48,11 @@ def carried_out(action):
 
 @ti.func
 def wished_velocity(action, flip, vehicle_cfg: Const[VehicleConfig]):
-    """Velocity [m/s] in the world of a policy's action in the frame in which the goal lies ahead and to the
-    left; ``flip``: signs of the way to the goal (x, y)."""
+    """Velocity [m/s] in the world of a policy's action; ``flip``: signs of the way to the goal (x, y)."""
     fastest = ti.sqrt(vehicle_cfg.max_surge_m_s**2 + vehicle_cfg.max_sway_m_s**2)
     out = carried_out(action)
-    return ti.Vector(
-        [flip[0] * out[0] * fastest, flip[1] * out[1] * fastest, out[2] * vehicle_cfg.max_heave_m_s]
-    )
+    ahead, left = flip[0] * out[0] * fastest, flip[1] * out[1] * fastest
+    return ti.Vector([ahead, left, out[2] * vehicle_cfg.max_heave_m_s])
 
 
 NEAR_M = 1.5
@@ -137,29 +126,21 @@ def place_of(number, slot, t_s, obstacle: AnyTensor, path: AnyTensor):
     lane = slot - (obstacle.shape[1] - path.shape[1])
     if lane >= 0:
         place = path_places(number, lane, ti.Vector([t_s]), path)
-        for i in ti.static(range(4)):
-            out[i] = place[0, i]
+        out = ti.Vector([place[0, i] for i in ti.static(range(4))])
     return out
-
-
-def axis_drag(cfg, axis):
-    """(inertia with added mass, linear, quadratic damping) of an axis; constants of the kernel."""
-    at = axis if axis < 3 else 5
-    inertia = cfg.mass_kg if axis < 3 else cfg.inertia_kg_m2[2]
-    return inertia + cfg.added_mass[at], cfg.linear_damping[at], cfg.quadratic_damping[at]
 
 
 @ti.func
 def axis_step(vel, integral, command, axis: Const[int], io: Bundle[Rules]):
-    """(velocity, integral) of one of surge, sway, heave, yaw rate after a control step: the simulator's
-    velocity loop against inertia and drag of this axis alone."""
-    loops = ti.static(axis_loops(io.actuation_cfg))
-    inertia, linear, quadratic = ti.static(axis_drag(io.vehicle_cfg, axis))
+    """(velocity, integral) of an axis after a control step: the velocity loop against inertia and drag."""
+    loop, at = ti.static(axis_loops(io.actuation_cfg)[axis], axis if axis < 3 else 5)
+    own = ti.static(io.vehicle_cfg.mass_kg if axis < 3 else io.vehicle_cfg.inertia_kg_m2[2])
+    inertia = ti.static(own + io.vehicle_cfg.added_mass[at])
     error = command - vel
-    force = loops[axis].gain * error + integral + linear * error
-    force += quadratic * (ti.abs(command) * command - ti.abs(vel) * vel)
-    per_step = loops[axis].integral_gain * io.episode_cfg.control_dt_s
-    after = integrated(integral, error, False, per_step, loops[axis].band, loops[axis].bound)
+    force = loop.gain * error + integral + io.vehicle_cfg.linear_damping[at] * error
+    force += io.vehicle_cfg.quadratic_damping[at] * (ti.abs(command) * command - ti.abs(vel) * vel)
+    per_step = loop.integral_gain * io.episode_cfg.control_dt_s
+    after = integrated(integral, error, False, per_step, loop.band, loop.bound)
     return ti.Vector([vel + io.episode_cfg.control_dt_s * force / inertia, after])
 
 
@@ -169,7 +150,7 @@ def nearest_of(
 ):
     """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the termination
     check sees it; obstacles beyond ``NEAR_M`` are left out."""
-    clearance, ttc = hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg), FAR_M + 0.0
+    clearance, ttc = geometry.hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg), FAR_M + 0.0
     hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
     for slot in range(obstacle.shape[1]):
         kind = ti.cast(obstacle[number, slot, 0], ti.i32)
@@ -191,13 +172,11 @@ def nearest_of(
 
 @ti.func
 def earned(nearer_m, nearest_m, ended, io: Bundle[Rules]):
-    """Reward of a decision that brought the vehicle ``nearer_m`` to its goal along the route and, at the
-    worst, within ``nearest_m`` of anything."""
+    """Reward of a decision that went ``nearer_m`` to the goal, and within ``nearest_m`` of something."""
     held_s = ti.static(HOLD_STEPS * io.episode_cfg.control_dt_s)
     close = ti.math.clamp(1.0 - nearest_m / io.surrogate_cfg.soft_clearance_m, 0.0, 1.0)
-    out = io.surrogate_cfg.progress * nearer_m - held_s * (
-        io.surrogate_cfg.time_cost + io.surrogate_cfg.closeness_cost * close
-    )
+    per_s = io.surrogate_cfg.time_cost + io.surrogate_cfg.closeness_cost * close
+    out = io.surrogate_cfg.progress * nearer_m - held_s * per_s
     if ended == SUCCESS:
         out += 1.0
     elif ended != RUNNING:
@@ -278,7 +257,7 @@ def drive_surrogate(
     scenario: IntVector, ego: FloatMatrix, reward: FloatVector, outcome: IntVector,
 ):  # fmt: skip
     """``action`` (n, 3) of every env, held for ``HOLD_STEPS`` control steps or until the episode ends."""
-    dt_s = ti.static(io.episode_cfg.control_dt_s)
+    dt_s, gap_m = ti.static(io.episode_cfg.control_dt_s, io.surrogate_cfg.vertical_gap_m)
     for env in range(ego.shape[0]):
         number, goal_w, pos_w = scenario[env], part(ego, env, At.GOAL, 3), part(ego, env, At.POS, 3)
         vel = ti.Vector([ego[env, At.VEL], ego[env, At.VEL + 1], ego[env, At.VEL + 2], ego[env, At.RATE]])
@@ -291,9 +270,7 @@ def drive_surrogate(
         nearest, ended = 9.0, RUNNING
         for _ in range(HOLD_STEPS):
             if ended == RUNNING:
-                asked = hull_command(
-                    wish, yaw, pos_w[2], io.surrogate_cfg.vertical_gap_m, io.vehicle_cfg, io.tank_cfg
-                )
+                asked = hull_command(wish, yaw, pos_w[2], gap_m, io.vehicle_cfg, io.tank_cfg)
                 for axis in ti.static(range(4)):
                     wanted = fastest[axis] * asked[axis]
                     after = axis_step(vel[axis], ego[env, At.INTEGRAL + axis], wanted, axis, io)

@@ -81,11 +81,8 @@ def next_track(env, after, slot, io: Bundle[ObserverIO]):
 @ti.func
 def flip_of(env, io: Bundle[ObserverIO]):
     """Signs (1 or -1) of the way from the start to the goal in x and y."""
-    out = ti.Vector([1.0, 1.0])
-    for i in ti.static(range(2)):
-        if io.mission.goal_w[env][i] < io.mission.start_w[env][i]:
-            out[i] = -1.0
-    return out
+    goal_w, start_w = io.mission.goal_w[env], io.mission.start_w[env]
+    return ti.Vector([ti.select(goal_w[i] < start_w[i], -1.0, 1.0) for i in ti.static(range(2))])
 
 
 @ti.kernel

@@ -9,14 +9,13 @@ import taichi as ti
 from uuvtai.common.enums import N_RAY, OWN_WIDTH, Safety
 from uuvtai.kernels.core.geometry import TWO_PI
 from uuvtai.kernels.core.stage import AnyTensor, Bundle, FloatMatrix, IntVector
-from uuvtai.surrogate.arrays import SafetyRules
+from uuvtai.surrogate.arrays import Rules
 from uuvtai.surrogate.motion import carried_out, part
 
 
 @ti.func
 def lack_of(clearance_m, way, vel, spare_m, spare_s):
-    """[m] of clearance that is missing to something ``clearance_m`` away in the direction ``way`` (x, y),
-    which comes nearer by ``vel``."""
+    """[m] of clearance that is missing to what lies ``clearance_m`` away on ``way`` and comes by ``vel``."""
     closing = vel.dot(way) / ti.max(way.norm(), 1e-3)
     return spare_m + ti.max(closing, 0.0) * spare_s - clearance_m
 
@@ -29,9 +28,8 @@ def moved(pos, vel, target):
 
 
 @ti.func
-def lack_to_obstacle(env, lane, vel, target, horizon_s, obstacles: AnyTensor, io: Bundle[SafetyRules]):
-    """[m] of clearance that is missing at the worst to one obstacle, which goes on as forecast; what is later
-    counts less."""
+def lack_to_obstacle(env, lane, vel, target, horizon_s, obstacles: AnyTensor, io: Bundle[Rules]):
+    """[m] of clearance that is missing at the worst to an obstacle as forecast; what is later counts less."""
     place = 4.0 * ti.Vector([obstacles[env, lane, 1], obstacles[env, lane, 2]])
     one = 4.0 * ti.Vector([obstacles[env, lane, 12], obstacles[env, lane, 13]]) - place
     two = 4.0 * ti.Vector([obstacles[env, lane, 14], obstacles[env, lane, 15]]) - place
@@ -53,7 +51,7 @@ def lack_to_obstacle(env, lane, vel, target, horizon_s, obstacles: AnyTensor, io
 
 
 @ti.func
-def worst_lack(env, wish, horizon_s, obstacles: AnyTensor, own: FloatMatrix, io: Bundle[SafetyRules]):
+def worst_lack(env, wish, horizon_s, obstacles: AnyTensor, own: FloatMatrix, io: Bundle[Rules]):
     """[m] of clearance that is missing at the worst on the way of the hull by a wish (x, y), not below 0."""
     fastest = ti.sqrt(io.vehicle_cfg.max_surge_m_s**2 + io.vehicle_cfg.max_sway_m_s**2)
     target, vel, out = Safety.REACHED * fastest * wish, ti.Vector([own[env, 6], own[env, 7]]), 0.0
@@ -68,9 +66,8 @@ def worst_lack(env, wish, horizon_s, obstacles: AnyTensor, own: FloatMatrix, io:
             end, pos, now = free * ti.Vector([ti.cos(angle), ti.sin(angle)]), ti.Vector([0.0, 0.0]), vel
             for k in range(ti.cast(soon_s / Safety.STEP_S + 0.5, ti.i32)):  # type: ignore[arg-type]
                 pos, now = moved(pos, now, target)
-                lack = lack_of(
-                    (end - pos).norm() - Safety.HULL_M, end - pos, now, Safety.WALL_M, Safety.WALL_S
-                )
+                way = end - pos
+                lack = lack_of(way.norm() - Safety.HULL_M, way, now, Safety.WALL_M, Safety.WALL_S)
                 out = ti.max(out, lack * (1.0 - 0.5 * (k + 1) * Safety.STEP_S / horizon_s))
     return out
 
@@ -78,21 +75,17 @@ def worst_lack(env, wish, horizon_s, obstacles: AnyTensor, own: FloatMatrix, io:
 @ti.func
 def tried_wish(number):
     """(x, y) of one of the wishes that are tried: the last one stops."""
-    angle, speed = number * (TWO_PI / Safety.DIRECTIONS), 1.0
-    if number >= Safety.DIRECTIONS:
-        speed = 0.5
-    if number == 2 * Safety.DIRECTIONS:
-        speed = 0.0
+    angle = number * (TWO_PI / Safety.DIRECTIONS)
+    speed = 1.0 - 0.5 * (number // Safety.DIRECTIONS)
     return speed * ti.Vector([ti.cos(angle), ti.sin(angle)])
 
 
 @ti.kernel
 def filter_wishes(
-    io: Bundle[SafetyRules], horizon_s: float, due: IntVector,
+    io: Bundle[Rules], horizon_s: float, due: IntVector,
     obstacles: AnyTensor, own: FloatMatrix, wish: FloatMatrix,
 ):  # fmt: skip
-    """Wishes (n, 3) of policies that are told ``obstacles`` and ``own``, where ``due`` is 1: what is ahead
-    and to the left of an unsafe one is replaced."""
+    """Replace, where ``due`` is 1, wishes (n, 3) that are unsafe by ``obstacles`` and ``own``, but for up."""
     for env in range(wish.shape[0]):
         if due[env] == 1:
             said = carried_out(part(wish, env, 0, 3))

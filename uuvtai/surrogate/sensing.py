@@ -21,8 +21,7 @@ CAMERA_RANGE_M, HEIGHT_RANGE_M = 4.0, 3.0
 SPELL = 10
 """decisions for which an obstacle is seen equally badly:"""
 BEST, SPREAD, MISSED, MISSED_HIDDEN = 0.35, 0.325, 0.985, 0.94
-"""the first, and the second over one minus a uniform number; beyond the third, or the fourth out of sight, it
-is not tracked"""
+"""first, and second over one minus a uniform number; no track beyond the third, or the fourth out of sight"""
 BORN_S, SETTLED_S = 0.05, 0.07
 """seen so long, times how badly: a track; its velocity across the line of sight is known"""
 TURN_KNOWN_S = 0.8
@@ -35,8 +34,7 @@ per metre. EC, as are the constants around: by quantiles of the simulator's trac
 CAMERA_ALONE = 12.0
 """times as badly is an obstacle seen that the camera sees and the sonar does not"""
 QUICKEST, SLOWER, LAG_S = 0.6, 1.1, 0.04
-"""share of a change of velocity that is seen at once; less of it beyond the middle uniform number; the place
-is behind by so much of what is not seen yet"""
+"""share of a change of velocity that is seen at once, less beyond the middle uniform number; place lags"""
 HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.04
 """errors of position, and of velocity as a share of it, times how badly, when it goes out of sight"""
 FIRST_NORMAL = 1024
@@ -46,6 +44,8 @@ RAY_SLACK = 0.01
 """of the angle between two rays, by which an obstacle is looked for wider than it is: rounding"""
 COLUMN_M = 1.6
 """free water above and below is cut off here"""
+RAYS = [[math.cos(angle), math.sin(angle)] for angle in (i * TWO_PI / N_RAY for i in range(N_RAY))]
+"""unit vectors (x, y)"""
 
 
 @ti.func
@@ -53,8 +53,7 @@ def is_hidden(number, slot_count, here, at, obstacle: AnyTensor):
     """1 where a static obstacle stands between a place ``here`` and another (x, y)."""
     dx, dy = at[0] - here[0], at[1] - here[1]
     far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
-    to = ti.Vector([dx / far, dy / far])
-    out = 0
+    to, out = ti.Vector([dx / far, dy / far]), 0
     for slot in range(slot_count):
         kind = ti.cast(obstacle[number, slot, 0], ti.i32)
         if out == 0 and kind != NONE:
@@ -69,12 +68,6 @@ def is_hidden(number, slot_count, here, at, obstacle: AnyTensor):
             elif along > 0.0 and along < far and across < 0.9 * wide:
                 out = 1
     return out
-
-
-def rays():
-    """Unit vectors (x, y) of the rays; plain Python, constants of the kernel."""
-    angles = [i * TWO_PI / N_RAY for i in range(N_RAY)]
-    return [[math.cos(angle), math.sin(angle)] for angle in angles]
 
 
 @ti.func
@@ -102,14 +95,6 @@ def free_to_box(dx, dy, to, c, s, wide, deep):
 
 
 @ti.func
-def free_to_circle(dx, dy, to, wide):
-    """[m] in a direction to a circle whose middle is (dx, dy) away."""
-    along = dx * to[0] + dy * to[1]
-    inside = along * along - (dx * dx + dy * dy) + wide * wide
-    return along - ti.sqrt(inside) if inside > 0.0 and along > 0.0 else UNBOUNDED_M
-
-
-@ti.func
 def rays_towards(dx, dy, reach):
     """(first, count) of the rays that can meet an obstacle of this radius whose middle is (dx, dy) away."""
     first, count = 0, N_RAY
@@ -125,7 +110,7 @@ def rays_towards(dx, dy, reach):
 @ti.func
 def write_rays(env, number, slot_count, at, obstacle: AnyTensor, ray: FloatMatrix, io: Bundle[Rules]):
     """[m] from a place (x, y) along each ray to the nearest wall or static obstacle, without the hull."""
-    towards = ti.Matrix(ti.static(rays()))
+    towards = ti.Matrix(ti.static(RAYS))
     for i in ti.static(range(N_RAY)):
         ray[env, i] = free_to_wall(at, ti.Vector([towards[i, 0], towards[i, 1]]), io)
     for slot in range(slot_count):
@@ -139,11 +124,13 @@ def write_rays(env, number, slot_count, at, obstacle: AnyTensor, ray: FloatMatri
             first, count = rays_towards(dx, dy, ti.sqrt(wide * wide + deep * deep))
             for k in range(count):
                 i = (first + k + N_RAY) % N_RAY
-                to, free_m = ti.Vector([towards[i, 0], towards[i, 1]]), 0.0
+                to, free_m = ti.Vector([towards[i, 0], towards[i, 1]]), UNBOUNDED_M + 0.0
+                along = dx * to[0] + dy * to[1]
+                inside = along * along - (dx * dx + dy * dy) + wide * wide
                 if kind == BOX:
                     free_m = free_to_box(dx, dy, to, c, s, wide, deep)
-                else:
-                    free_m = free_to_circle(dx, dy, to, wide)
+                elif inside > 0.0 and along > 0.0:
+                    free_m = along - ti.sqrt(inside)
                 ray[env, i] = ti.min(ray[env, i], free_m)
 
 
@@ -170,9 +157,8 @@ def how_badly(drawn):
 
 @ti.func
 def updated_track(old, lane, at, bend_m, speed, ego_at, is_visible, knows_height, in_fan, key):
-    """The row of ``track`` after a decision, of an obstacle that is at ``at`` (x, y, vx, vy), in error by
-    what this spell (``key``) has for it; while it is not seen it goes straight on, or on its circle
-    (``bend_m``: signed radius, else 0)."""
+    """The row of ``track`` after a decision, of an obstacle at ``at`` (x, y, vx, vy), in error by the spell's
+    ``key``; while unseen it goes straight on, or on its circle (``bend_m``: signed radius, else 0)."""
     new = old
     drawn = uniform(key, lane)
     first, second = normal_pair_lanes(key, FIRST_NORMAL + 2 * lane, 2)

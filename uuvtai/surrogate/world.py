@@ -20,7 +20,7 @@ from uuvtai.sim.setup import N_CORNER, Scene
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stages import bind
 from uuvtai.surrogate import motion, safety, sensing
-from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules, SafetyRules
+from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules
 
 BATCH = 256
 """envs of the simulator that draws"""
@@ -52,10 +52,8 @@ def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, coun
     for world in config.surrogate.worlds:
         own = load_config(world, overrides=[("world.n_static", n_static), ("world.n_dynamic", n_dynamic)])
         if own.world.tank != config.world.tank or own.world.tank.shape != "rectangle":
-            raise ConfigError(
-                f"surrogate.worlds: {world} has another tank than the run's world, or a round one; give "
-                "worlds that share a rectangular one, for example surrogate.worlds=[pool,gauntlet]"
-            )
+            told = "give worlds that share a rectangular one, for example surrogate.worlds=[pool,gauntlet]"
+            raise ConfigError(f"surrogate.worlds: {world} has another tank, or a round one; {told}")
         if any(len(one.path) > N_CORNER for one in own.world.fixed):
             raise ConfigError(f"surrogate.worlds: {world} has a path of more than {N_CORNER} corners")
         sim = Sim(own, min(BATCH, count), read_tree(TRAINING_TREE))
@@ -126,7 +124,7 @@ class Surrogate:
         """``seed`` opens the noise of the tracks."""
         start_taichi("cpu")
         self.bank, self.num_envs, self.seed = bank, num_envs, seed
-        self.rules, self._safe, lanes = bind(Rules, config), bind(SafetyRules, config), bank.path.shape[1]
+        self.rules, lanes = bind(Rules, config), bank.path.shape[1]
         self.ego, self.track = torch.zeros(num_envs, EGO_WIDTH), torch.zeros(num_envs, lanes, TRACK_WIDTH)
         self.scenario, self.outcome = (torch.zeros(num_envs, dtype=torch.int32) for _ in range(2))
         self.reward, self.count = torch.zeros(num_envs), torch.zeros(1, dtype=torch.int64)
@@ -170,14 +168,9 @@ class Surrogate:
 
     def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Carry out a decision (N, 3), filtered: (reward, outcome code), both (N,)."""
-        b, action, horizon_s = (
-            self.bank,
-            action.contiguous().clone(),
-            self.rules.surrogate_cfg.safety_horizon_s,
-        )
-        if horizon_s:
-            view = self.view
-            safety.filter_wishes(self._safe, horizon_s, self._every, view["obstacles"], view["own"], action)
+        b, view, action = self.bank, self.view, action.contiguous().clone()
+        if horizon_s := self.rules.surrogate_cfg.safety_horizon_s:
+            safety.filter_wishes(self.rules, horizon_s, self._every, view["obstacles"], view["own"], action)
         motion.drive_surrogate(
             self.rules, action, b.obstacle, b.path, b.route, self.scenario, self.ego,
             self.reward, self.outcome,

@@ -28,7 +28,7 @@ from uuvtai.learning.export.card import evaluations_of
 from uuvtai.learning.export.folder import of_torch
 from uuvtai.learning.export.graph import session
 from uuvtai.learning.export.modules import golden_of, module_of, specification, weights_of
-from uuvtai.learning.networks import ActorCritic
+from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic
 from uuvtai.learning.policy_agent import load_agent
 from uuvtai.learning.world_model import WorldModel
 from uuvtai.plugins.api import plugin_spec
@@ -322,7 +322,7 @@ def test_the_folder_drives_where_there_is_numpy_alone(folder):
 
 
 def test_constants_that_the_driver_repeats_are_those_of_the_package():
-    assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, world_model.N_ACTION)
+    assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, NUM_ACTIONS)
     assert (run_policy._LOG_VAR, run_policy._LARGEST_ERROR) == (
         world_model.LOG_VAR_BOUNDS,
         world_model.LARGEST_ERROR,

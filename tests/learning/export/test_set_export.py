@@ -23,7 +23,7 @@ from uuvtai.learning.export import run_policy
 from uuvtai.learning.export.modules import OBSTACLE_COLUMNS, OWN_COLUMNS, hull_rule_of, module_of, safety_of
 from uuvtai.learning.set_networks import SetActor, SetCritic
 from uuvtai.sim.stages import bind
-from uuvtai.surrogate.arrays import TRUTH_WIDTH, SafetyRules
+from uuvtai.surrogate.arrays import TRUTH_WIDTH, Rules
 from uuvtai.surrogate.observation import SET_TABLE
 from uuvtai.surrogate.safety import filter_wishes
 
@@ -201,7 +201,7 @@ def test_the_safety_filter_is_that_of_the_vehicle():
     wish = rng.uniform(-2, 2, (n, 3)).astype(np.float32)
     found, policy = torch.from_numpy(wish.copy()), module_policy()
     filter_wishes(
-        bind(SafetyRules, config), config.surrogate.safety_horizon_s, torch.ones(n, dtype=torch.int32),
+        bind(Rules, config), config.surrogate.safety_horizon_s, torch.ones(n, dtype=torch.int32),
         torch.from_numpy(obstacles), torch.from_numpy(own), found,
     )  # fmt: skip
     wanted = [policy.kept_safe(*row) for row in zip(wish, obstacles, own, strict=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import shutil
@@ -14,23 +15,14 @@ import safetensors.numpy
 import safetensors.torch
 
 from uuvtai.common.errors import UserError
-from uuvtai.common.files import unfinished, whole_folder
+from uuvtai.common.files import refusing, unfinished, whole_folder
 from uuvtai.config.loader import ConfigError
 from uuvtai.learning.checkpoint import Checkpoint, Note
 from uuvtai.learning.export import graph as onnx_session
-from uuvtai.learning.export import run_policy
+from uuvtai.learning.export import modules, run_policy
 from uuvtai.learning.export.card import evaluations_of, model_card
-from uuvtai.learning.export.graph import GraphError, refuse_strange
-from uuvtai.learning.export.modules import (
-    ONNX,
-    ExportedModule,
-    golden_of,
-    missing_packages,
-    module_of,
-    onnx_bytes,
-    specification,
-    weights_of,
-)
+from uuvtai.learning.export.graph import GraphError, missing_packages, refuse_strange
+from uuvtai.learning.export.modules import ONNX
 from uuvtai.learning.export.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, Arrays, PolicyError
 from uuvtai.logs.container import sync_folder
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
@@ -50,17 +42,16 @@ def export(
     Returns what ``uuv export --json`` prints. Raises ConfigError for a place that is taken, CheckpointError
     for networks that cannot drive, RunFolderError where the disk refuses."""
     _refuse_place(out, force)
-    module, rows = module_of(checkpoint), evaluations_of(checkpoint, evaluations)
-    golden, missing = golden_of(module), missing_packages()
-    files = {WEIGHTS: safetensors.torch.save(weights_of(module)), GOLDEN: safetensors.numpy.save(golden)}
+    module, rows = modules.module_of(checkpoint), evaluations_of(checkpoint, evaluations)
+    golden, missing = modules.golden_of(module), missing_packages()
+    weights = safetensors.torch.save(modules.weights_of(module))
+    files = {WEIGHTS: weights, GOLDEN: safetensors.numpy.save(golden)}
     if missing:
-        note(
-            f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', "
-            "then export again"
-        )
+        told = f"{', '.join(missing)} not installed; pip install '{EXTRA}', then export again"
+        note(f"left out {ONNX}: {told}")
     else:
-        files[ONNX] = onnx_bytes(module)
-    spec = specification(checkpoint, module, name, ONNX in files)
+        files[ONNX] = modules.onnx_bytes(module)
+    spec = modules.specification(checkpoint, module, name, ONNX in files)
     files["README.md"] = model_card(spec, checkpoint, rows).encode()
     files["run_policy.py"] = Path(run_policy.__file__).read_bytes()
     _publish(out, files, spec)
@@ -94,8 +85,10 @@ def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[dict[str, 
     return found
 
 
-def of_torch(module: ExportedModule, golden: Arrays) -> dict[str, Any]:
-    return run_policy.compared("torch", module.said, run_policy.golden_rows(golden, module.inputs), golden)
+def of_torch(module: modules.ExportedModule, golden: Arrays) -> dict[str, Any]:
+    """As ``run_policy.compared``."""
+    said, rows = functools.partial(modules.said, module), run_policy.golden_rows(golden, module.inputs)
+    return run_policy.compared("torch", said, rows, golden)
 
 
 def of_onnx(graph: bytes, golden: Arrays, inputs: Iterable[str]) -> dict[str, Any]:
@@ -131,17 +124,14 @@ def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
     text = json.dumps(spec, indent=1, allow_nan=False) + "\n"
     old = unfinished(out)
     try:
-        with whole_folder(out) as partial:
-            for name, content in {**files, SPEC: text.encode()}.items():
-                write_atomic(partial / name, content)
-            sync_folder(partial)
-            if out.exists():
-                out.rename(old)
-        sync_folder(out.parent)
-    except OSError as error:
-        raise RunFolderError(
-            f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR"
-        ) from None
+        with refusing(RunFolderError, f"{out}: cannot be written", "give a folder that can be: --out DIR"):
+            with whole_folder(out) as partial:
+                for name, content in {**files, SPEC: text.encode()}.items():
+                    write_atomic(partial / name, content)
+                sync_folder(partial)
+                if out.exists():
+                    out.rename(old)
+            sync_folder(out.parent)
     finally:
         if out.exists():
             shutil.rmtree(old, ignore_errors=True)

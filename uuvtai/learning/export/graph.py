@@ -118,9 +118,8 @@ def only(graph: bytes, output: str) -> bytes:
 def refuse_strange(
     graph: bytes, inputs: dict[str, tuple[int, ...]], single_calls: int, rows_of_one: int = 1
 ) -> None:
-    """Raise GraphError for a graph that reaches beyond itself or may take more memory or time than a policy
-    does. It will run once with ``inputs`` of these shapes (rows, ...), and ``single_calls`` times with
-    ``rows_of_one``."""
+    """Raise GraphError for a graph that reaches beyond itself or may take more memory or time than ours.
+    It will run once with ``inputs`` of these shapes, and ``single_calls`` times with ``rows_of_one``."""
     model = _parsed(graph)
     _refuse_parts(model)
     found = {value.name for value in model.graph.input} - {tensor.name for tensor in model.graph.initializer}
@@ -177,9 +176,8 @@ def _tensors(graph: Any) -> Iterator[Any]:
 
 
 def _work(model: Any, inputs: dict[str, tuple[int, ...]]) -> int:
-    """Multiplications of the matrix products, and values of everything, of a call with inputs of these
-    shapes; what the file itself says of shapes is taken out of ``model`` first. GraphError where one is
-    unknown, or where all values together take too much memory."""
+    """Multiplications of the matrix products, and values of everything, of a call with these inputs; what the
+    file says of shapes is taken out of ``model``. GraphError for unknown ones, and for too much memory."""
     from onnx import shape_inference
 
     graph = model.graph
@@ -225,8 +223,13 @@ VARIABLE = "ORT_DISABLE_TELEMETRY"
 """read by ONNX Runtime when it is loaded, from 1.29 on; before that it had no telemetry outside Windows"""
 
 
+def missing_packages(*names: str) -> list[str]:
+    """Which of these are not installed; of what torch's exporter needs to write a graph, if none is named."""
+    return [name for name in names or ("onnx",) if importlib.util.find_spec(name) is None]
+
+
 def is_installed() -> bool:
-    return all(importlib.util.find_spec(name) is not None for name in (NAME, "onnx"))
+    return not missing_packages(NAME, "onnx")
 
 
 def without_telemetry() -> None:

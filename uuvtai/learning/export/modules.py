@@ -3,25 +3,16 @@ policy_spec.json, which says what every column is."""
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import math
 import warnings
-from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from uuvtai.common.enums import (
-    EGO_COLUMNS,
-    LEAST_SPEED_M_S,
-    N_OBSTACLE,
-    N_RAY,
-    OBSTACLE_WIDTH,
-    TURN_GAIN,
-    Safety,
-)
+from uuvtai.common import enums
+from uuvtai.common.enums import EGO_COLUMNS, N_OBSTACLE, N_RAY, OBSTACLE_WIDTH
 from uuvtai.common.version import __version__
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learning.checkpoint import Checkpoint, action_rows
@@ -34,8 +25,6 @@ from uuvtai.learning.world_model import N_FEATURES, N_TARGET
 
 ONNX = "policy.onnx"
 OPSET = 20
-PACKAGES = ("onnx",)
-"""what torch's exporter needs"""
 NO_LIMIT = float(torch.finfo(torch.float32).max)
 """of a normaliser that has seen nothing and therefore cuts nothing off"""
 _ROWS, _SEED = 64, 6
@@ -55,37 +44,11 @@ _WISH = (
 )
 
 
-class ExportedModule(nn.Module, ABC):
-    """Rows of inputs to rows of outputs, by name."""
-
-    kind: str
-    """one of ``run_policy.KINDS``"""
-    inputs: dict[str, str]
-    outputs: dict[str, str]
-    """what each one is, in the order of ``forward``"""
-
-    @abstractmethod
-    def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
-        """Made-up inputs, spread as training had them."""
-
-    @abstractmethod
-    def weights(self) -> dict[str, Tensor]:
-        """Arrays of ``policy.safetensors`` by the names that ``run_policy.py`` knows."""
-
-    @abstractmethod
-    def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
-        """Entries of policy_spec.json that only this kind has."""
-
-    @torch.inference_mode()
-    def said(self, rows: Arrays) -> Arrays:
-        found = self(*(torch.from_numpy(part) for part in rows.values()))
-        return {name: part.numpy() for name, part in zip(self.outputs, found, strict=True)}
-
-
-class OneAction(OneDecision, ExportedModule):
+class OneAction(OneDecision):
     """One decision of a policy on observation vectors; whoever calls it remembers the last one."""
 
     kind = "mlp"
+    """one of ``run_policy.KINDS``; below, what goes in and out, in the order of ``forward``"""
     inputs = {
         "obs": "(N, n_obs) float32: the newest observation, raw SI units",
         "last_obs": "(N, n_obs) float32: that of the last decision; anything where has_last is false",
@@ -99,6 +62,7 @@ class OneAction(OneDecision, ExportedModule):
     }
 
     def rows(self, count: int, rng: torch.Generator) -> tuple[Tensor, ...]:
+        """Made-up inputs, spread as training had them."""
         norm, n_obs = self.policy.observation_norm, self.policy.n_in - N_FEATURES
         mean, std = norm.mean[:n_obs].float(), norm.std()[:n_obs].float()
         last, obs = (mean + std * torch.randn(count, n_obs, generator=rng) for _ in range(2))
@@ -111,6 +75,7 @@ class OneAction(OneDecision, ExportedModule):
         return obs, last, action, torch.arange(count) > 0
 
     def weights(self) -> dict[str, Tensor]:
+        """Arrays of ``policy.safetensors`` by the names that ``run_policy.py`` knows."""
         policy, world = self.policy, self.world_model
         norms = {"norm": policy.observation_norm}
         nets = {"actor": policy.actor, "critic": policy.critic}
@@ -126,6 +91,7 @@ class OneAction(OneDecision, ExportedModule):
         return found
 
     def about(self, checkpoint: Checkpoint) -> dict[str, Any]:
+        """Entries of policy_spec.json that only this kind has."""
         policy, norm = self.policy, self.policy.observation_norm
         pairs = zip(norm.mean.tolist(), norm.std().tolist(), strict=True)
         scales = [{"mean": mean, "std": std} for mean, std in pairs]
@@ -148,7 +114,7 @@ class OneAction(OneDecision, ExportedModule):
         }
 
 
-class OneWish(ExportedModule):
+class OneWish(nn.Module):
     """One decision of a policy over a set of obstacles."""
 
     kind = "set"
@@ -156,9 +122,7 @@ class OneWish(ExportedModule):
         "obstacles": f"(N, n, {OBSTACLE_WIDTH}) float32: moving obstacles in any order; zeros = none",
         "own": f"(N, {EGO_COLUMNS}) float32: the vehicle, its goal and the free distances around it",
     }
-    outputs = {
-        "mean_wish": "(N, 3) float32: ahead, left, up in the mirrored world; cut off to [-2, 2], filter"
-    }
+    outputs = {"mean_wish": "(N, 3) float32: ahead, left, up in the mirrored world; cut to [-2, 2], filter"}
 
     def __init__(self, actor: SetActor) -> None:
         super().__init__()
@@ -193,6 +157,17 @@ class OneWish(ExportedModule):
         }
 
 
+ExportedModule = OneAction | OneWish
+"""networks without memory: rows of inputs to rows of outputs"""
+
+
+@torch.inference_mode()
+def said(module: ExportedModule, rows: Arrays) -> Arrays:
+    """Outputs by name for rows of inputs by name."""
+    found = module(*(torch.from_numpy(part) for part in rows.values()))
+    return {name: part.numpy() for name, part in zip(module.outputs, found, strict=True)}
+
+
 def module_of(checkpoint: Checkpoint) -> ExportedModule:
     """What of a checkpoint drives. Raises CheckpointError where nothing does."""
     if checkpoint.config.learner == "ppo" and checkpoint.config.encoder == "set":
@@ -211,16 +186,11 @@ def golden_of(module: ExportedModule) -> Arrays:
     """``pair_<input>`` and ``pair_<output>``: made-up inputs and what the module says to them."""
     made_up = module.rows(_ROWS, torch.Generator().manual_seed(_SEED))
     inputs = {name: tensor.numpy() for name, tensor in zip(module.inputs, made_up, strict=True)}
-    return {f"pair_{name}": array for name, array in (inputs | module.said(inputs)).items()}
-
-
-def missing_packages() -> list[str]:
-    """What has to be installed before an ONNX graph can be written; empty = nothing."""
-    return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+    return {f"pair_{name}": array for name, array in (inputs | said(module, inputs)).items()}
 
 
 def onnx_bytes(module: ExportedModule) -> bytes:
-    """The ONNX graph with its weights inside, any number of rows at once. Needs PACKAGES."""
+    """The ONNX graph with its weights inside, any number of rows at once; without ``missing_packages``."""
     without_telemetry()
     names = [*module.inputs, *module.outputs]
     sizes = {name: {0: "rows"} | ({1: "obstacles"} if name == "obstacles" else {}) for name in names}
@@ -268,8 +238,8 @@ def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
         "fastest_m_s": math.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s),
         "limits_m_s": limits,
         "max_yaw_rate_rad_s": vehicle.max_yaw_rate_rad_s,
-        "turn_gain_1_s": TURN_GAIN,
-        "least_speed_m_s": LEAST_SPEED_M_S,
+        "turn_gain_1_s": enums.TURN_GAIN,
+        "least_speed_m_s": enums.LEAST_SPEED_M_S,
         "z_m": list(config.world.tank.z_m),
         "gap_m": config.surrogate.vertical_gap_m,
     }
@@ -277,7 +247,7 @@ def hull_rule_of(config: LearningConfig) -> dict[str, Any]:
 
 def safety_of(config: LearningConfig) -> dict[str, Any]:
     """Numbers of the safety filter (``run_policy.SetPolicy.kept_safe``)."""
-    known = {name.lower(): value for name, value in vars(Safety).items() if name.isupper()}
+    known = {name.lower(): value for name, value in vars(enums.Safety).items() if name.isupper()}
     return {"horizon_s": config.surrogate.safety_horizon_s, "ttc_s": config.episode.ttc_s, **known}
 
 
@@ -317,7 +287,8 @@ closest_in | s | time of the closest approach on straight lines, clip(v, 0, 3)
 closest_gap | m | distance then, less radius and 0.22, clip(v, -1, 3)
 route_direction.x route_direction.y | 1 | unit vector to the look-ahead point of the route
 """)
-OWN_COLUMNS = _columns("""
+OWN_COLUMNS = _columns(
+    """
 goal.x | 10 m | from the vehicle to the goal, / 10
 goal.y | 4 m | the same, / 4
 goal.z | m | height of the goal above the vehicle
@@ -336,12 +307,10 @@ goal_direction.x goal_direction.y | 1 | unit vector to the goal
 route_distance | m | horizontal, to the look-ahead point, at most 2 m
 route_left | 10 m | length of the route to the goal, / 10
 route_aside | m | place left of the route, times flip.x flip.y, clip(v, -2, 2)
-""") + [
-    {
-        "name": f"ray[{i}]",
-        "unit": "1/m",
-        "meaning": "1 / (0.3 + clip(free - 0.22, 0, 4)) - 0.5, free metres to the nearest wall or occupied "
-        f"cell (at most 4.3) at {360 * i / N_RAY:g} degrees from x towards y",
-    }
-    for i in range(N_RAY)
-]
+"""
+    + "\n".join(
+        f"ray[{i}] | 1/m | 1 / (0.3 + clip(free - 0.22, 0, 4)) - 0.5, free metres to the nearest wall or "
+        f"occupied cell (at most 4.3) at {360 * i / N_RAY:g} degrees from x towards y"
+        for i in range(N_RAY)
+    )
+)

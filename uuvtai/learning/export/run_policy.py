@@ -11,8 +11,7 @@ What it is stands as ``kind`` in policy_spec.json, with every column of its inpu
           policy.command(said.wish, flip, yaw_rad, z_m), the hull rule
 
 ``python run_policy.py [FOLDER]`` replays the golden pairs, prints the differences and the latency, and exits
-3 where they differ. Nothing in the folder can make this file execute code.
-"""
+3 where they differ. Nothing in the folder can make this file execute code."""
 
 from __future__ import annotations
 
@@ -37,14 +36,9 @@ FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py")
 N_TARGET, N_ACTION = 24, 4
 AT_THERE, AT_DIRECTION = 0, slice(3, 5)
 """columns: of an obstacle, 1 = there; of the vehicle's own, the unit vector to the look-ahead point"""
-AT_WAYS, AT_WIDTH, AT_WATER, AT_SPEED = (
-    (slice(1, 3), slice(12, 14), slice(14, 16)),
-    7,
-    slice(8, 10),
-    slice(6, 8),
-)
-"""of an obstacle: the way to it now, in 1 and in 2 s, its width, free water above and below; of the vehicle's
-own, its speed"""
+AT_WAYS, AT_WIDTH, AT_WATER = (slice(1, 3), slice(12, 14), slice(14, 16)), 7, slice(8, 10)
+AT_SPEED = slice(6, 8)
+"""of an obstacle: way to it now, in 1 and in 2 s, width, free water above and below; the vehicle's speed"""
 N_RAY = 24
 """the last columns of the vehicle's own, the first of them along x"""
 SUM_SCALE = 0.3
@@ -69,9 +63,10 @@ _NOTHING = np.empty(0)
 _MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
 """what content of another form may raise"""
 
-Arrays = dict[str, np.ndarray]
-Layers = list[tuple[np.ndarray, np.ndarray]]
-Activation = Callable[[np.ndarray], np.ndarray]
+Array = np.ndarray
+Arrays = dict[str, Array]
+Layers = list[tuple[Array, Array]]
+Activation = Callable[[Array], Array]
 
 
 class PolicyError(RuntimeError):
@@ -85,7 +80,6 @@ class Exported(ABC):
     shapes: tuple[tuple[int | None, ...], ...]
     """of the inputs behind the rows; None = any size but 0"""
 
-    @abstractmethod
     def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
         """``spec`` is policy_spec.json, ``arrays`` policy.safetensors."""
         self.work = sum(array.size for array in arrays.values())
@@ -95,7 +89,7 @@ class Exported(ABC):
     def said(self, given: Arrays) -> Arrays:
         """Outputs by name, one row each for rows of inputs. Raises ValueError for inputs of other shapes."""
 
-    def _rows(self, given: Arrays) -> list[np.ndarray]:
+    def _rows(self, given: Arrays) -> list[Array]:
         found = [np.asarray(given[name], np.float32) for name in self.inputs]
         for name, rows, shape in zip(self.inputs, found, self.shapes, strict=True):
             fits = rows.ndim == 1 + len(shape) and len(rows) == len(found[0])
@@ -109,9 +103,9 @@ class Exported(ABC):
 class Decision(NamedTuple):
     """What the policy chooses, and what it thinks of the state."""
 
-    action: np.ndarray
+    action: Array
     """(4,) surge, sway, heave, yaw rate in parts of the limits, within [-1, 1]"""
-    command_si: np.ndarray
+    command_si: Array
     """(4,) the same in m/s, m/s, m/s, rad/s, body frame"""
     value: float
     """expected return"""
@@ -180,7 +174,7 @@ class Policy(Exported):
             "features": features,
         }
 
-    def _features(self, obs: np.ndarray, last: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def _features(self, obs: Array, last: Array, action: Array) -> Array:
         """(N, 2) residual and uncertainty of the world model's prediction from the last decision."""
         lowest, highest = map(np.float32, _LOG_VAR)
         latent = _through(self._nets["encoder"], self._scaled(last, "world_norm"), _elu)
@@ -192,7 +186,7 @@ class Policy(Exported):
         residual, uncertainty = np.sqrt(np.mean(error**2, axis=1)), np.mean(np.exp(log_var), axis=1)
         return np.nan_to_num(np.stack([residual, uncertainty], 1), nan=0.0, posinf=0.0, neginf=0.0)
 
-    def _scaled(self, x: np.ndarray, name: str) -> np.ndarray:
+    def _scaled(self, x: Array, name: str) -> Array:
         limit = self._a[f"{name}.limit"][0]
         return np.clip((x - self._a[f"{name}.mean"]) * self._a[f"{name}.scale"], -limit, limit)
 
@@ -200,10 +194,9 @@ class Policy(Exported):
 class SetDecision(NamedTuple):
     """What the policy wishes."""
 
-    wish: np.ndarray
-    """(3,) ahead, left, up in the mirrored world, in parts of the fastest velocity, within +-2: what the
-    safety filter leaves of"""
-    mean_wish: np.ndarray
+    wish: Array
+    """(3,) ahead, left, up in the mirrored world, parts of the fastest velocity: what the filter leaves of"""
+    mean_wish: Array
     """(3,) what the network says, not cut off"""
 
 
@@ -218,10 +211,8 @@ class SetPolicy(Exported):
         self.safety = {name: float(value) for name, value in spec["safety"].items()}
         n_obstacle, n_own = (len(spec["observation"][name]["columns"]) for name in self.inputs)
         self.shapes = (None, n_obstacle), (n_own,)
-        steps, directions = self.safety["horizon_s"] / self.safety["step_s"], self.safety["directions"]
-        if not (
-            0.0 <= steps <= MOST_TRIED and 1.0 <= directions <= MOST_TRIED and self.safety["lag_s"] > 0.0
-        ):
+        steps, tried = self.safety["horizon_s"] / self.safety["step_s"], self.safety["directions"]
+        if not (0.0 <= steps <= MOST_TRIED and 1.0 <= tried <= MOST_TRIED and self.safety["lag_s"] > 0.0):
             raise ValueError("safety")
         self.kept_safe(np.zeros(3), np.ones((1, n_obstacle)), np.zeros(n_own))
         self._gain = np.float32(spec["network"]["goal_gain"])
@@ -238,8 +229,7 @@ class SetPolicy(Exported):
         return SetDecision(self.kept_safe(wish, rows["obstacles"][0], rows["own"][0]), mean)
 
     def said(self, given: Arrays) -> Arrays:
-        """``mean_wish`` (N, 3): every obstacle through the same layers, then maximum and sum over those that
-        are there. Raises ValueError as ``act``."""
+        """``mean_wish`` (N, 3): maximum and sum of what the layers say of each obstacle. ValueError."""
         obstacles, own = self._rows(given)
         if not (np.isfinite(obstacles).all() and np.isfinite(own).all()):
             raise ValueError("columns are not finite; leave out obstacles that are not known")
@@ -253,10 +243,9 @@ class SetPolicy(Exported):
         mean[:, :2] += self._gain * own[:, AT_DIRECTION]
         return {"mean_wish": mean}
 
-    def kept_safe(self, wish: np.ndarray, obstacles: np.ndarray, own: np.ndarray) -> np.ndarray:
+    def kept_safe(self, wish: Array, obstacles: Array, own: Array) -> Array:
         """(3,) the wish, or the nearest one that leads neither to a contact nor to a stop by time to
-        collision within the horizon, by the columns: the safety filter. Where none is safe it is the one
-        that comes least near; up stays as it is."""
+        collision within the horizon, else the one that comes least near; up stays: the safety filter."""
         rule, mine = self.safety, wish[:2] / max(1.0, math.hypot(*wish[:2]))
         if not rule["horizon_s"] or not self._lacks(mine[None], obstacles, own)[0] > 0.0:
             return wish
@@ -266,19 +255,12 @@ class SetPolicy(Exported):
         cost = rule["lack_cost"] * self._lacks(tried, obstacles, own) + ((tried - mine) ** 2).sum(1)
         return np.append(tried[cost.argmin()], wish[2])
 
-    def _lacks(self, wishes: np.ndarray, obstacles: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """(k,) metres of clearance that are missing at the worst on the ways of the hull by wishes (k, 2),
-        not below 0; what lies later counts less."""
+    def _lacks(self, wishes: Array, obstacles: Array, own: Array) -> Array:
+        """(k,) [m] of clearance missing at the worst by wishes (k, 2), at least 0; later counts less."""
         rule, dt = self.safety, self.safety["step_s"]
-        n = round(rule["horizon_s"] / dt)
-        target, t = (
-            rule["reached"] * self.rule["fastest_m_s"] * wishes[:, None, None],
-            dt * np.arange(1, n + 1)[:, None, None],
-        )
-        vel = (
-            target
-            + (own[AT_SPEED] - target) * math.exp(-dt / rule["lag_s"]) ** np.arange(n + 1)[:, None, None]
-        )
+        steps = np.arange(round(rule["horizon_s"] / dt) + 1)[:, None, None]
+        target, t = rule["reached"] * self.rule["fastest_m_s"] * wishes[:, None, None], dt * steps[1:]
+        vel = target + (own[AT_SPEED] - target) * math.exp(-dt / rule["lag_s"]) ** steps
         pos, vel = np.cumsum(0.5 * dt * (vel[:, 1:] + vel[:, :-1]), 1), vel[:, 1:]
         later, there = (1.0 - 0.5 * t / rule["horizon_s"])[..., 0], obstacles[obstacles[:, AT_THERE] > 0.5]
         place, one, two = (4.0 * there[:, at] for at in AT_WAYS)
@@ -286,13 +268,10 @@ class SetPolicy(Exported):
         straight, over = one - place - bend, there[:, AT_WATER].min(1, initial=math.inf)
         way, coming = place + straight * t + bend * t**2 - pos, vel - straight - 2.0 * t * bend
         level = np.linalg.norm(way, axis=-1) - 0.5 * there[:, AT_WIDTH]
-        clear = np.maximum(level, 0.0)
+        clear, spare_s = np.maximum(level, 0.0), rule["ttc_s"] + rule["spare_s"]
         apart = np.where(over > 0.0, np.hypot(clear, over), level)
         coming = coming * np.where(over > 0.0, clear / np.maximum(apart, 1e-9), 1.0)[..., None]
-        lacks = (
-            _lack(apart - rule["hull_m"], way, coming, rule["spare_m"], rule["ttc_s"] + rule["spare_s"])
-            * later
-        )
+        lacks = _lack(apart - rule["hull_m"], way, coming, rule["spare_m"], spare_s) * later
         free = 1.0 / (own[-N_RAY:] + 0.5) - 0.08
         angles, seen = 2.0 * math.pi / N_RAY * np.arange(N_RAY), free < rule["sight_m"]
         ends = (free * np.stack([np.cos(angles), np.sin(angles)])).T[seen]
@@ -301,17 +280,14 @@ class SetPolicy(Exported):
         walls = _lack(apart - rule["hull_m"], way, vel[:, soon], rule["wall_m"], rule["wall_s"]) * later[soon]
         return np.maximum(lacks.max((1, 2), initial=0.0), walls.max((1, 2), initial=0.0))
 
-    def command(self, wish: Any, flip: Any, yaw_rad: float, z_m: float) -> np.ndarray:
+    def command(self, wish: Any, flip: Any, yaw_rad: float, z_m: float) -> Array:
         """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame: the hull rule. A
         diagonal of the hull turns to the motion, for there surge and sway add up; floor and surface are kept
         clear of. ``wish`` (3,) is held between decisions, ``flip`` (2,) are the signs of the way from start
-        to goal along x and y (1 where it is 0), ``yaw_rad`` and ``z_m`` heading and height now (0 = surface).
-        """
+        to goal along x and y (1 for 0), ``yaw_rad`` and ``z_m`` heading and height now (0 = surface)."""
         rule, (x, y, up) = self.rule, (float(part) for part in wish)
-        limit, long = rule["limits_m_s"], max(1.0, math.hypot(x, y))
-        ahead, left = (
-            rule["fastest_m_s"] * sign * part / long for sign, part in zip(flip, (x, y), strict=True)
-        )
+        limit, fastest, long = rule["limits_m_s"], rule["fastest_m_s"], max(1.0, math.hypot(x, y))
+        ahead, left = (fastest * sign * part / long for sign, part in zip(flip, (x, y), strict=True))
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         surge, sway = (c * ahead + s * left) / limit["surge"], (c * left - s * ahead) / limit["sway"]
         over = max(1.0, abs(surge), abs(sway))
@@ -330,24 +306,22 @@ KINDS: dict[str, type[Exported]] = {"mlp": Policy, "set": SetPolicy}
 """by ``kind`` of policy_spec.json"""
 
 
-def _lack(
-    apart: np.ndarray, way: np.ndarray, coming: np.ndarray, spare_m: float, spare_s: float
-) -> np.ndarray:
+def _lack(apart: Array, way: Array, coming: Array, spare_m: float, spare_s: float) -> Array:
     """[m] that are missing to what is ``apart`` in the direction ``way`` (..., 2) and comes by ``coming``."""
     closing = (coming * way).sum(-1) / np.maximum(np.linalg.norm(way, axis=-1), 1e-3)
     return spare_m + np.maximum(closing, 0.0) * spare_s - apart
 
 
-def _elu(x: np.ndarray) -> np.ndarray:
-    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
-
-
-def _relu(x: np.ndarray) -> np.ndarray:
+def _relu(x: Array) -> Array:
     return np.maximum(x, 0)
 
 
-def _softplus(x: np.ndarray) -> np.ndarray:
-    return np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
+def _elu(x: Array) -> Array:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+
+
+def _softplus(x: Array) -> Array:
+    return _relu(x) + np.log1p(np.exp(-np.abs(x)))
 
 
 _ACTIVATIONS: dict[str, Activation] = {"elu": _elu, "tanh": np.tanh, "relu": _relu}
@@ -367,7 +341,7 @@ def _layers(arrays: Arrays, name: str, first: int, last: int | None = None) -> L
     return layers
 
 
-def _through(layers: Layers, x: np.ndarray, act: Activation) -> np.ndarray:
+def _through(layers: Layers, x: Array, act: Activation) -> Array:
     """Output (..., n_out) of a network for x (..., n_in), ``act`` after every layer but the last."""
     for weight, bias in layers[:-1]:
         x = act(x @ weight.T + bias)
@@ -392,9 +366,8 @@ def made(spec: dict[str, Any], arrays: Arrays) -> Exported:
     try:
         return KINDS[kind](spec, arrays)
     except _MISFITS as error:
-        raise PolicyError(
-            f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again"
-        ) from None
+        told = f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again"
+        raise PolicyError(told) from None
 
 
 def read_spec(folder: Path) -> dict[str, Any]:
@@ -405,10 +378,8 @@ def read_spec(folder: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"{file}: is not JSON ({error}); export the policy again") from None
     if not isinstance(spec, dict) or spec.get("schema") != SCHEMA:
-        raise PolicyError(
-            f"{file}: is not the specification of an exported policy of schema {SCHEMA}; give a folder of "
-            "this version's uuv export"
-        )
+        told = f"is not the specification of an exported policy of schema {SCHEMA}"
+        raise PolicyError(f"{file}: {told}; give a folder of this version's uuv export")
     return spec
 
 
@@ -416,18 +387,14 @@ def changed_files(folder: Path, spec: dict[str, Any]) -> list[str]:
     """What is not as the spec says, in words. Raises PolicyError."""
     listed = spec.get("files")
     if not isinstance(listed, dict) or not {WEIGHTS, GOLDEN} <= listed.keys() <= set(FILES):
-        raise PolicyError(
-            f"{folder / SPEC}: lists other files than an exported policy has ({', '.join(FILES)})"
-        )
+        raise PolicyError(f"{folder / SPEC}: lists other files than a policy has ({', '.join(FILES)})")
     found = []
     for name, sha256 in listed.items():
         try:
-            digest = hashlib.sha256(content_of(folder / name)).hexdigest()
+            if hashlib.sha256(content_of(folder / name)).hexdigest() != sha256:
+                found.append(f"{name}: has changed, its sha256 is not that of {SPEC}")
         except PolicyError as error:
             found.append(str(error))
-        else:
-            if digest != sha256:
-                found.append(f"{name}: has changed, its sha256 is not that of {SPEC}")
     return found
 
 
@@ -523,7 +490,7 @@ def compared(
     }
 
 
-def difference(found: np.ndarray, expected: np.ndarray) -> float:
+def difference(found: Array, expected: Array) -> float:
     """Largest difference, as ``TOLERANCE`` counts; infinite for other shapes or NaN."""
     if found.shape != expected.shape or not (np.isfinite(found).all() and np.isfinite(expected).all()):
         return math.inf
