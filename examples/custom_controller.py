@@ -10,8 +10,7 @@ import numpy as np
 from judge import judge
 
 import uuvtai
-from uuvtai.envs.vector_env import VectorEnv
-from uuvtai.sim.sim import Sim
+from uuvtai import Sim, VectorEnv
 
 MAX_HEAVE_M = 0.4
 """height error [m] at which heave is full"""

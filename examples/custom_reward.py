@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 
 import uuvtai
-from uuvtai.envs.vector_env import VectorEnv
+from uuvtai import VectorEnv
 
 CAREFUL = {"reward.clearance": 0.5, "reward.ttc": 0.5, "reward.effort": 0.02, "reward.success": 10.0}
 """Nearness costs five times, effort four times as much; arriving pays half. `uuv presets show pool` lists

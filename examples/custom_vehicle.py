@@ -8,28 +8,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from uuvtai.compile.runtime import Runtime
-from uuvtai.config.loader import load_config
-from uuvtai.evaluation.simulate import Trial, simulate
+import torch
+
+import uuvtai
 
 VEHICLES = ("bluerov2", str(Path(__file__).with_name("heavy_pack.yaml")))
 TIMES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
 
 
-def surge_m_s(vehicle: str, runtime: Runtime | None) -> list[float]:
-    """Forward speed at ``TIMES_S`` after the command of 0.6 m/s, through the inner loop and the thrusters."""
-    trial = Trial(seconds=TIMES_S[-1], command=(0.6, 0, 0, 0), neutral=True)
-    found = simulate(load_config("open", vehicle=vehicle), trial, runtime)
-    return [found["nu"][round(time_s / found["t"][1])][0] for time_s in TIMES_S]
+def surge_m_s(vehicle: str) -> list[float]:
+    """Forward speed at ``TIMES_S`` after the command of full surge, through inner loop and thrusters."""
+    with uuvtai.make("open", num_envs=1, vehicle=vehicle, sensors="clean") as env:
+        env.reset(seed=1)
+        ahead, speeds = env.columns["velocity"].start, []
+        for _ in range(round(TIMES_S[-1] / env.config.episode.control_dt_s)):
+            obs, *_rest = env.step(torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
+            speeds.append(float(obs[0, ahead]))
+        return [speeds[round(time_s / env.config.episode.control_dt_s) - 1] for time_s in TIMES_S]
 
 
-def main(runtime: Runtime | None = None) -> str:
+def main() -> str:
     """The table: surge [m/s] over time of both."""
     lines = [f"{'surge [m/s] after':20}" + "".join(f"{time_s:7.1f} s" for time_s in TIMES_S)]
     for vehicle in VEHICLES:
-        lines.append(
-            f"{Path(vehicle).stem:20}" + "".join(f"{speed:9.3f}" for speed in surge_m_s(vehicle, runtime))
-        )
+        lines.append(f"{Path(vehicle).stem:20}" + "".join(f"{speed:9.3f}" for speed in surge_m_s(vehicle)))
     return "\n".join(lines)
 
 

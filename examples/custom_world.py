@@ -9,9 +9,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from uuvtai.envs.gymnasium import UuvEnv
-from uuvtai.logs.picture import save_image
-from uuvtai.sim.sim import Sim
+import matplotlib.pyplot as plt
+
+from uuvtai import Sim, UuvEnv
 
 WORLD = Path(__file__).with_name("harbour.yaml")
 
@@ -24,7 +24,8 @@ def main(picture: Path, sim: Sim | None = None, most_steps: int = 3000) -> str:
         _obs, _reward, terminated, truncated, info = env.step(info["teacher_action"])
         if terminated or truncated:
             break
-    save_image(env.render()[:, :, ::-1], picture)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plt.imsave(picture, env.render())
     env.close()
     seconds = info["episode_steps"] * env.native.config.episode.control_dt_s
     return (

@@ -19,10 +19,7 @@ from typing import Any
 import numpy as np
 
 import uuvtai
-from uuvtai.common.statistics import wilson_interval
-from uuvtai.envs.gymnasium import UuvVectorEnv
-from uuvtai.logs.run_folder import default_run_dir, refuse_place
-from uuvtai.sim.sim import Sim
+from uuvtai import Sim, UuvVectorEnv
 
 HOLD_STEPS = 10
 """control steps per decision: noise drawn anew every 0.02 s would average out before the vehicle has moved"""
@@ -107,13 +104,10 @@ def main(
         "--play", type=Path, metavar="FOLDER", help="train nothing: play what was saved there"
     )
     given = parser.parse_args(arguments)
-    out = (
-        given.play
-        or given.out
-        or default_run_dir(train.__module__ if train.__module__ != "__main__" else Path(sys.argv[0]).stem)
-    )
-    if not given.play:
-        refuse_place(out)
+    name = Path(sys.argv[0]).stem if train.__module__ == "__main__" else train.__module__
+    out = given.play or given.out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}_{name}"
+    if out.exists() and not given.play:
+        parser.error(f"--out {out}: is there already; give a new folder, or --play {out}")
     sim = sim or uuvtai.make(given.world, num_envs=given.num_envs).sim
     if not given.play:
         print(f"before {told(sim, train(sim, 0, None))}", flush=True)
@@ -130,13 +124,15 @@ def main(
 
 
 def told(sim: Sim, act: Act) -> str:
-    """Mean return and success of one episode per env."""
+    """Mean return and success of one episode per env, with standard error and Wilson's interval (95 %)."""
     returns, won = judge(sim, act)
-    low, high = wilson_interval(won, len(returns)) or (0.0, 1.0)
-    error = returns.std(ddof=1) / np.sqrt(len(returns))
+    n, z = len(returns), 1.96
+    error = returns.std(ddof=1) / np.sqrt(n)
+    middle = (won + z**2 / 2) / (n + z**2)
+    off = z * np.sqrt(won * (n - won) / n + z**2 / 4) / (n + z**2)
     return (
-        f"return {returns.mean():6.1f} +- {error:.1f}, success {won}/{len(returns)} ({100 * low:.0f} .. "
-        f"{100 * high:.0f} %)"
+        f"return {returns.mean():6.1f} +- {error:.1f}, success {won}/{n} ({100 * (middle - off):.0f} .. "
+        f"{100 * (middle + off):.0f} %)"
     )
 
 

@@ -9,7 +9,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from train_rsl_rl import CONFIG
 
-from uuvtai.plugins import About, plugin
+from uuvtai import About, plugin
 
 
 @plugin(arrays="torch", hold_steps=HOLD_STEPS)

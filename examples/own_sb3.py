@@ -7,7 +7,7 @@ from pathlib import Path
 from judge import HOLD_STEPS
 from stable_baselines3 import PPO
 
-from uuvtai.plugins import About, plugin
+from uuvtai import About, plugin
 
 
 @plugin(hold_steps=HOLD_STEPS)

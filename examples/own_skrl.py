@@ -10,7 +10,7 @@ from judge import HOLD_STEPS
 from skrl.resources.preprocessors.torch import RunningStandardScaler
 from train_skrl import Policy
 
-from uuvtai.plugins import About, plugin
+from uuvtai import About, plugin
 
 
 @plugin(arrays="torch", hold_steps=HOLD_STEPS)

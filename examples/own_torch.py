@@ -2,7 +2,7 @@
 
 import torch
 
-from uuvtai.plugins import View, plugin
+from uuvtai import View, plugin
 
 
 @plugin(arrays="torch")

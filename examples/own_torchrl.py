@@ -7,7 +7,7 @@ import torch
 from judge import HOLD_STEPS
 from train_torchrl import policy
 
-from uuvtai.plugins import About, plugin
+from uuvtai import About, plugin
 
 
 @plugin(arrays="torch", hold_steps=HOLD_STEPS)

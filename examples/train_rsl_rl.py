@@ -13,8 +13,7 @@ from judge import HOLD_STEPS, Act, Watched, main
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
-from uuvtai.envs.rsl_rl import RslRlVecEnv
-from uuvtai.sim.sim import Sim
+from uuvtai import RslRlVecEnv, Sim
 
 NETWORK = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "tanh", "obs_normalization": True}
 CONFIG = {

@@ -9,8 +9,7 @@ from judge import HOLD_STEPS, Act, Watched, main
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from uuvtai.envs.sb3 import Sb3VecEnv
-from uuvtai.sim.sim import Sim
+from uuvtai import Sb3VecEnv, Sim
 
 ROLLOUT_STEPS = 64
 

@@ -16,7 +16,7 @@ from skrl.trainers.torch import SequentialTrainer
 from skrl.utils import set_seed
 from torch import nn
 
-from uuvtai.sim.sim import Sim
+from uuvtai import Sim
 
 ROLLOUT_STEPS = 64
 

@@ -16,7 +16,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from uuvtai.sim.sim import Sim
+from uuvtai import Sim
 
 ROLLOUT_STEPS, EPOCHS, MINIBATCHES = 64, 5, 4
 

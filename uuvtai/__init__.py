@@ -17,7 +17,17 @@ if TYPE_CHECKING:
     from uuvtai.api import show as show
     from uuvtai.api import sweep as sweep
     from uuvtai.api import train as train
-    from uuvtai.envs.vector_env import VectorEnv
+    from uuvtai.envs.gymnasium import UuvEnv as UuvEnv
+    from uuvtai.envs.gymnasium import UuvVectorEnv as UuvVectorEnv
+    from uuvtai.envs.gymnasium import draw_frame as draw_frame
+    from uuvtai.envs.rsl_rl import RslRlVecEnv as RslRlVecEnv
+    from uuvtai.envs.sb3 import Sb3VecEnv as Sb3VecEnv
+    from uuvtai.envs.vector_env import VectorEnv as VectorEnv
+    from uuvtai.plugins import About as About
+    from uuvtai.plugins import Forecast as Forecast
+    from uuvtai.plugins import View as View
+    from uuvtai.plugins import plugin as plugin
+    from uuvtai.sim.sim import Sim as Sim
 
 # Taichi prints a banner to stdout when it is imported; stdout belongs to results
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -59,16 +69,32 @@ def make(
 
 
 _OF_API = ("evaluate", "load_log", "show", "sweep", "train")
+_OF_PLUGINS = ("About", "Forecast", "View", "plugin")
+_OF_GYMNASIUM = ("UuvEnv", "UuvVectorEnv", "draw_frame")
+_LATE = (*_OF_API, *_OF_PLUGINS, *_OF_GYMNASIUM, "RslRlVecEnv", "Sb3VecEnv", "Sim", "VectorEnv")
 
 
 def __getattr__(name: str) -> Any:
-    """The commands as functions, imported when one is asked for: they take a second or two."""
-    if name not in _OF_API:
+    """The commands as functions, what plugins need, and the environments, imported when one is asked for:
+    they take a second or two, and some need an extra."""
+    if name in _OF_API:
+        from uuvtai import api as found
+    elif name in _OF_PLUGINS:
+        from uuvtai import plugins as found
+    elif name in _OF_GYMNASIUM:
+        from uuvtai.envs import gymnasium as found
+    elif name == "RslRlVecEnv":
+        from uuvtai.envs import rsl_rl as found
+    elif name == "Sb3VecEnv":
+        from uuvtai.envs import sb3 as found
+    elif name == "VectorEnv":
+        from uuvtai.envs import vector_env as found
+    elif name == "Sim":
+        from uuvtai.sim import sim as found
+    else:
         raise AttributeError(f"module 'uuvtai' has no attribute {name!r}")
-    from uuvtai import api
-
-    return getattr(api, name)
+    return getattr(found, name)
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_OF_API]
+    return [*globals(), *_LATE]

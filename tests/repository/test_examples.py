@@ -1,6 +1,7 @@
 """The examples: every script runs on the session's simulator and gives what it promises."""
 
 import importlib
+import re
 from pathlib import Path
 
 import cv2
@@ -10,13 +11,11 @@ import torch
 
 import uuvtai
 from tests.conftest import configure
-from uuvtai.compile.runtime import start_taichi
 from uuvtai.config.loader import load_config
 from uuvtai.envs.gymnasium import UuvVectorEnv
 from uuvtai.envs.vector_env import VectorEnv
 from uuvtai.evaluation.agents import load_agents
 from uuvtai.evaluation.episodes import jobs_of, run_episodes
-from uuvtai.logs.run_folder import RunFolderError
 from uuvtai.plugins.api import plugin_spec
 from uuvtai.plugins.loading import load_plugin, obstacles_of
 from uuvtai.report.world import check
@@ -79,8 +78,9 @@ def test_a_trainer_learns_and_what_it_learnt_is_played_again(
     assert any(out.iterdir()) and (tmp_path / "curve.csv").read_text().startswith("decisions,return")
     judge.main(module.train, module.play, 1, ["--play", str(out)], short)
     assert capsys.readouterr().out.splitlines() == [played]
-    with pytest.raises(RunFolderError, match="already there and not empty"):
+    with pytest.raises(SystemExit):
         judge.main(module.train, module.play, 1, ["--out", str(out)], short)
+    assert "is there already; give a new folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
@@ -155,13 +155,13 @@ def test_episodes_can_begin_in_the_custom_world():
     assert not problem and not [line for line in told if line.startswith("look at it")]
 
 
-def test_custom_vehicle_follows_its_command(taichi_runtime, example, monkeypatch):
+def test_custom_vehicle_follows_its_command(example, monkeypatch):
     """The one beside it: ``tests/evaluation/test_simulate.py``."""
     module = example("custom_vehicle")
     theirs, ours = (load_config("open", vehicle=name).vehicle for name in module.VEHICLES)
     assert ours.mass_kg > theirs.mass_kg and len(ours.thrusters) == len(theirs.thrusters)
     monkeypatch.setattr(module, "VEHICLES", module.VEHICLES[1:])
-    head, row = module.main(start_taichi("cpu")).splitlines()
+    head, row = module.main().splitlines()
     name, *speeds = row.split()
     assert head.split()[-2:] == ["4.0", "s"] and name == "heavy_pack"
     assert abs(float(speeds[-1]) - 0.6) < 0.02 and float(speeds[0]) < 0.4
@@ -191,6 +191,12 @@ def test_custom_tree_stands_beside_the_shipped_ones(example, monkeypatch):
     (((trees, world), words),) = asked
     assert [agent.name for agent in load_agents(list(map(str, trees)))] == ["patient", "bt", "planner"]
     assert world == "pool" and words == {"episodes": 128, "seeds": 3}
+
+
+def test_examples_import_nothing_deeper_than_the_package():
+    for path in (*EXAMPLES.glob("*.py"), EXAMPLES / "tutorial.ipynb"):
+        assert not re.search(r"(from|import) uuvtai\.", path.read_text()), path.name
+    assert all(hasattr(uuvtai, name) for name in dir(uuvtai)) and "Sb3VecEnv" in dir(uuvtai)
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*_*.py")), ids=lambda path: path.stem)
