@@ -1,15 +1,14 @@
 """Sweeps: cells, tasks, engines that lose workers, and folders that survive a kill at any moment."""
 
 import json
-import os
-import signal
+import subprocess
 import sys
 import time
 
 import pytest
 
 from tests import worker_work
-from tests.command import Quiet, run_cli, uuv
+from tests.command import Quiet, uuv
 from tests.report_samples import robustness_sweep
 from tests.small_sim import SmallSim
 from uuvtai.common.processes import EngineError
@@ -291,19 +290,16 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path, capfd):
     """To the last digit, also after SIGKILL."""
     place = tmp_path / "sweep"
     command = ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--agent", "bt", *OPTIONS]
-    child = os.fork()
-    if child == 0:
-        for stream in (1, 2):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-        try:
-            run_cli(*command, "--run-dir", place)
-        finally:
-            os._exit(0)
+    child = subprocess.Popen(
+        [sys.executable, "-m", "uuvtai", *command, "--run-dir", str(place)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     while not (place / sweep_run.REQUEST).exists():
-        assert os.waitpid(child, os.WNOHANG) == (0, 0), "ended before it had begun"
+        assert child.poll() is None, "ended before it had begun"
         time.sleep(0.02)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
+    child.kill()
+    child.wait()
     code, out, err = uuv(capfd, "sweep", "--resume", place, "--json")
     assert code == 0, err
     cells = json.loads(out)["cells"]
