@@ -1,5 +1,4 @@
-"""Your own vehicle: how ``heavy_pack.yaml`` answers to full surge, beside the BlueROV2 that it extends: a
-table.
+"""Your own vehicle: how ``heavy_pack.yaml`` answers to a speed command, beside the BlueROV2: a table.
 
 ``python examples/custom_vehicle.py``
 """
@@ -8,8 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 import uuvtai
 
 VEHICLES = ("bluerov2", str(Path(__file__).with_name("heavy_pack.yaml")))
@@ -17,14 +14,10 @@ TIMES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
 
 
 def surge_m_s(vehicle: str) -> list[float]:
-    """Forward speed at ``TIMES_S`` after the command of full surge, through inner loop and thrusters."""
-    with uuvtai.make("open", num_envs=1, vehicle=vehicle, sensors="clean") as env:
-        env.reset(seed=1)
-        ahead, speeds = env.columns["velocity"].start, []
-        for _ in range(round(TIMES_S[-1] / env.config.episode.control_dt_s)):
-            obs, *_rest = env.step(torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
-            speeds.append(float(obs[0, ahead]))
-        return [speeds[round(time_s / env.config.episode.control_dt_s) - 1] for time_s in TIMES_S]
+    """Forward speed at ``TIMES_S`` after the command of 0.6 m/s, through the inner loop and the thrusters."""
+    trial = uuvtai.Trial(seconds=TIMES_S[-1], command=(0.6, 0, 0, 0), neutral=True)
+    found = uuvtai.simulate(uuvtai.load_config("open", vehicle=vehicle), trial)
+    return [found["nu"][round(time_s / found["t"][1])][0] for time_s in TIMES_S]
 
 
 def main() -> str:

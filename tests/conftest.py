@@ -9,9 +9,9 @@ import pytest
 gc.disable()  # until all is imported and collected, which makes millions of objects, few of them garbage
 
 BEGUN_FIRST = """
-docs aboard deploy learned_forecast page instruments_chain cli wheel surrogate world examples replay training
-sonar localization report sweep stack tracking security log_alone flights link logs signals resume_eval
-identify telemetry media_formats dynamics explain hostile_logs echoes behavior voronoi
+docs aboard deploy learned_forecast page cuda instruments_chain cli wheel surrogate world examples replay
+training sonar localization report sweep stack tracking security log_alone flights link logs signals
+resume_eval identify telemetry media_formats dynamics explain hostile_logs echoes behavior voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""

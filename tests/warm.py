@@ -1,19 +1,16 @@
 """Compile the kernels of the tests' small simulator once, for every process that will need them:
-``python -m tests.warm``; and those of one vehicle with a mechanical sonar, and of the small simulator in the
-shape for a GPU: ``python -m tests.warm one``.
+``python -m tests.warm``; and those of one vehicle with a mechanical sonar: ``python -m tests.warm one``.
 
 Test processes that run side by side would each compile them. ``bootstrap.py test`` runs this while packages
 of the tests are installed, so it needs none of them.
 """
 
 import gc
-import os
 import sys
 
 import torch
 
 from tests.small_sim import SmallSim, sim_with_one_beam
-from uuvtai.compile.launch import VARIABLE, asked_shape
 from uuvtai.compile.runtime import start_taichi
 
 STEPS = 6
@@ -21,17 +18,15 @@ STEPS = 6
 
 
 def main(what: str) -> None:
-    """The small simulator with and without sensor errors; or the one vehicle and the small one for a GPU
-    (``one``)."""
+    """The small simulator with and without sensor errors; or the one vehicle (``one``)."""
     gc.disable()  # building kernels makes millions of objects, few of them garbage
     start_taichi("cpu")
     if what == "one":
         sim, one = sim_with_one_beam(), torch.ones(1, dtype=torch.int32)
         sim.reset(one, one, one)
         step(sim)
-        os.execve(sys.executable, [sys.executable, "-m", "tests.warm"], os.environ | {VARIABLE: "gpu"})
-    play(SmallSim())
-    if asked_shape() == "cpu":
+    else:
+        play(SmallSim())
         play(SmallSim("clean"))
 
 

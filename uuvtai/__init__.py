@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from uuvtai.api import show as show
     from uuvtai.api import sweep as sweep
     from uuvtai.api import train as train
+    from uuvtai.config.loader import load_config as load_config
     from uuvtai.envs.gymnasium import UuvEnv as UuvEnv
     from uuvtai.envs.gymnasium import UuvVectorEnv as UuvVectorEnv
     from uuvtai.envs.gymnasium import draw_frame as draw_frame
     from uuvtai.envs.rsl_rl import RslRlVecEnv as RslRlVecEnv
     from uuvtai.envs.sb3 import Sb3VecEnv as Sb3VecEnv
     from uuvtai.envs.vector_env import VectorEnv as VectorEnv
+    from uuvtai.evaluation.simulate import Trial as Trial
+    from uuvtai.evaluation.simulate import simulate as simulate
     from uuvtai.plugins import About as About
     from uuvtai.plugins import Forecast as Forecast
     from uuvtai.plugins import View as View
@@ -71,7 +74,9 @@ def make(
 _OF_API = ("evaluate", "load_log", "show", "sweep", "train")
 _OF_PLUGINS = ("About", "Forecast", "View", "plugin")
 _OF_GYMNASIUM = ("UuvEnv", "UuvVectorEnv", "draw_frame")
-_LATE = (*_OF_API, *_OF_PLUGINS, *_OF_GYMNASIUM, "RslRlVecEnv", "Sb3VecEnv", "Sim", "VectorEnv")
+_OF_SIMULATE = ("Trial", "simulate")
+_SINGLE = ("RslRlVecEnv", "Sb3VecEnv", "Sim", "VectorEnv", "load_config")
+_LATE = (*_OF_API, *_OF_PLUGINS, *_OF_GYMNASIUM, *_OF_SIMULATE, *_SINGLE)
 
 
 def __getattr__(name: str) -> Any:
@@ -83,6 +88,10 @@ def __getattr__(name: str) -> Any:
         from uuvtai import plugins as found
     elif name in _OF_GYMNASIUM:
         from uuvtai.envs import gymnasium as found
+    elif name in _OF_SIMULATE:
+        from uuvtai.evaluation import simulate as found
+    elif name == "load_config":
+        from uuvtai.config import loader as found
     elif name == "RslRlVecEnv":
         from uuvtai.envs import rsl_rl as found
     elif name == "Sb3VecEnv":

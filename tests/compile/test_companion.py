@@ -61,8 +61,8 @@ def test_its_keys_are_those_that_the_first_process_looks_for(small, another):
     looked_for = {"generate_scenarios", "update_map", "follow_obstacles", "plan_evasion", "compute_reward"}
     for kernel, arguments in calls_of(another):
         if kernel.func.__name__ in looked_for:
-            key = key_of(kernel, arguments, another.memory().tree, native[0].surroundings)
-            assert any(store.get(key_with(key, names, arguments[0])) for names in store.names(key))
+            key, tree = key_of(kernel, arguments, native[0].surroundings), another.memory().tree
+            assert any(store.get(key_with(key, names, arguments[0], tree)) for names in store.names(key))
             looked_for.remove(kernel.func.__name__)
     assert not looked_for
 

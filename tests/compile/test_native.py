@@ -21,7 +21,7 @@ import torch
 import uuvtai
 from uuvtai.compile import cache, codegen
 from uuvtai.compile.codegen import RUNTIME_TYPE, Native, UnfitError, tasks_in
-from uuvtai.compile.launch import native, quick_launch
+from uuvtai.compile.launch import VARIABLE, is_gpu_shaped, native, quick_launch
 from uuvtai.compile.memory import Memory, address_of
 from uuvtai.config import EpisodeConfig
 from uuvtai.kernels.core.stage import Bundle, Const, FloatMatrix, FloatVector, In, Out
@@ -30,7 +30,7 @@ from uuvtai.state.arrays import allocate, array
 ROOT = Path(__file__).resolve().parents[2]
 
 KEPT = [".kernel", ".kernel"]
-"""of one kernel: its code, and what of the config it depends on"""
+"""of one kernel: its code, and what of its bundle it depends on"""
 N = 3000
 """more items than one block of a loop has, so that threads share them"""
 
@@ -71,17 +71,34 @@ def add_up(io: Bundle[SumsIO], table: FloatMatrix, weight: float, count: int, ou
 
 
 @dataclasses.dataclass
-class Both:
+class Unread:
+    """What no kernel asks for."""
+
+    other: ti.Field = array("n_unread")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LargerIO(SumsIO):
+    unread: "In[Unread]"
+
+
+@dataclasses.dataclass
+class Structs:
     sums: Sums
     source: Source
+    unread: Unread
 
 
 class Scene:
-    """Arrays, a bundle over them, and tensors."""
+    """Arrays, in this order and with so many that nobody reads; a bundle over them, and tensors."""
 
-    def __init__(self):
-        self.structs = Both(allocate(Sums, {"n_env": N}), allocate(Source, {"n_env": N}))
-        self.io = SumsIO(self.structs.sums, self.structs.source, EpisodeConfig())
+    def __init__(self, order=(Sums, Source, Unread), n_unread=4):
+        sizes = {"n_env": N, "n_unread": n_unread}
+        built = {kind: allocate(kind, sizes) for kind in order}
+        self.structs = Structs(*(built[kind] for kind in (Sums, Source, Unread)))
+        self.io = LargerIO(
+            self.structs.sums, self.structs.source, EpisodeConfig(), unread=self.structs.unread
+        )
         anchor = self.structs.sums.total
         anchor.fill(0.0)
         self.structs.source.value.from_numpy(np.linspace(0, 3, N, dtype=np.float32))
@@ -430,7 +447,37 @@ def names_of(node):
     return [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
 
 
-def test_a_key_tells_configs_places_and_kinds_apart():
+def test_arrays_that_a_kernel_does_not_read_compile_nothing(place, expected):
+    first = Scene()
+    ours = started(first, place)
+    first.launch()
+    for order, n_unread, made in (
+        ((Sums, Source, Unread), 500, 1), ((Sums, Source, Unread), N, 1), ((Unread, Sums, Source), 500, 2),
+        ((Source, Sums, Unread), 4, 3),
+    ):  # fmt: skip
+        other = Scene(order, n_unread)
+        ours.adopt([other.io], other.memory)
+        np.testing.assert_array_equal(other.launch(), expected[0])
+        assert (ours.made, ours.refused) == (made, 0)
+
+
+def test_what_is_read_of_arrays_is_noted():
+    io = Scene().io
+    assert [(place, type(struct)) for place, struct in cache.structs_in(io)] == [
+        ("sums", Sums), ("source", Source), ("unread", Unread),
+    ]  # fmt: skip
+    with cache.noted(io) as (names, _):
+        assert io.source.value.shape == (N,) and not hasattr(io.unread, "nothing")
+    assert names == {"@source.value"}
+    with cache.noted(io) as (names, _):
+        assert len(vars(io.sums)) == 3
+    assert names == {"@sums.total", "@sums.pair", "@sums.rest"}
+    with cache.noted(io) as (names, _):
+        pass
+    assert io.unread.other.shape == (4,) and names == set(), "nothing is noted any more"
+
+
+def test_a_key_tells_configs_places_and_kinds_apart(monkeypatch):
     first, second = Scene(), Scene()
     tree = first.memory.tree
     told = {cache.described(value, tree) for value in (first.io, first.table, first.out, first.out.double())}
@@ -442,14 +489,21 @@ def test_a_key_tells_configs_places_and_kinds_apart():
         cache.described(second.io, tree)
     with pytest.raises(cache.KeyNameError):
         cache.described(object(), tree)
+    assert cache.described(first.io) == cache.described(Scene((Source, Sums, Unread)).io), "without places"
     other = dataclasses.replace(first.io, rules=EpisodeConfig(control_dt_s=0.05))
     of_time, of_horizon = (
-        [cache.key_with("k", [name], io) for io in (first.io, other)]
+        [cache.key_with("k", [name], io, tree) for io in (first.io, other)]
         for name in ("rules.control_dt_s", "rules.horizon_steps")
     )
     assert of_time[0] != of_time[1] and of_horizon[0] == of_horizon[1] != of_time[0], (
         "what a kernel does not read is not in its key"
     )
+    with cache.noted(first.io) as (names, _):
+        assert not is_gpu_shaped()
+    plain = cache.key_with("k", names, first.io, tree)
+    monkeypatch.setenv(VARIABLE, "gpu")
+    assert cache.key_with("k", names, first.io, tree) != plain, "it asks for the shape"
+    assert cache.key_with("k", ["rules.control_dt_s"], first.io, tree) == of_time[0], "it does not"
 
 
 # ------------------------------------------------------------------------------------------------ store

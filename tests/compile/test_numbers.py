@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.compile.test_native import N, Scene, Source, Sums, place, started  # noqa: F401
 from uuvtai.compile import launch as module
-from uuvtai.compile.cache import ALL, key_of, noted, sections_in, value_of, values_of
+from uuvtai.compile.cache import ALL, key_of, key_with, noted, sections_in, value_of, values_of
 from uuvtai.compile.launch import Number, Numbers, native, quick_launch, worked_out
 from uuvtai.config import BehaviorConfig, Config, EpisodeConfig, SonarConfig
 from uuvtai.envs.warm_up import calls_of
@@ -203,7 +203,7 @@ def test_what_is_read_is_noted_in_all_its_places_and_by_code_of_the_section_too(
     with noted(io) as (names, _):
         io.behavior_cfg.model_dump()
     assert f"behavior_cfg.{ALL}" in names
-    assert values_of([f"behavior_cfg.{ALL}"], io) == [(f"behavior_cfg.{ALL}", repr(io.behavior_cfg))]
+    assert values_of([f"behavior_cfg.{ALL}"], io, 0) == [(f"behavior_cfg.{ALL}", repr(io.behavior_cfg))]
     with noted(io) as (names, _):
         pass
     assert io.behavior_cfg.n_heading == 24 and names == set(), "nothing is noted any more"
@@ -212,11 +212,11 @@ def test_what_is_read_is_noted_in_all_its_places_and_by_code_of_the_section_too(
 def test_what_another_config_lacks_is_told_apart():
     io = parts()
     assert value_of(io, "sonar_cfg.nothing.at.all") is None
-    assert values_of(['["/", 1.0, ["-", "sonar_cfg.max_range_m", 12.0]]', '["<", "no.such", 1]'], io) == [
+    assert values_of(['["/", 1.0, ["-", "sonar_cfg.max_range_m", 12.0]]', '["<", "no.such", 1]'], io, 0) == [
         ('["/", 1.0, ["-", "sonar_cfg.max_range_m", 12.0]]', ""),
         ('["<", "no.such", 1]', ""),
     ]
-    assert values_of(["all_cfg.behavior"], io) == [("all_cfg.behavior", "BehaviorConfig")]
+    assert values_of(["all_cfg.behavior"], io, 0) == [("all_cfg.behavior", "BehaviorConfig")]
 
 
 # ------------------------------------------------------------------------------------- the whole simulator
@@ -239,8 +239,10 @@ def test_another_number_of_the_tree_the_reward_the_forecast_or_the_noise_compile
     tried, wrong = set(), set()
     other = Sim(small.config, small.N, small.trees["bt"])  # nothing of it was launched
     for kernel, arguments in calls_of(other):
-        key, io = key_of(kernel, arguments, other.memory().tree, native[0].surroundings), arguments[0]
-        kept = native[0].store.names(key)
+        key, io = key_of(kernel, arguments, native[0].surroundings), arguments[0]
+        store, tree = native[0].store, other.memory().tree
+        ways = store.names(key)
+        kept = [names for names in ways if store.get(key_with(key, names, io, tree))]
         assert kept, kernel.func.__name__
         for at, section in sections_in(io):
             for name in type(section).model_fields if at in OFTEN else ():

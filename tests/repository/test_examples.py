@@ -2,6 +2,7 @@
 
 import importlib
 import re
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import torch
 
 import uuvtai
 from tests.conftest import configure
+from uuvtai.compile.runtime import start_taichi
 from uuvtai.config.loader import load_config
 from uuvtai.envs.gymnasium import UuvVectorEnv
 from uuvtai.envs.vector_env import VectorEnv
@@ -155,8 +157,9 @@ def test_episodes_can_begin_in_the_custom_world():
     assert not problem and not [line for line in told if line.startswith("look at it")]
 
 
-def test_custom_vehicle_follows_its_command(example, monkeypatch):
+def test_custom_vehicle_follows_its_command(taichi_runtime, example, monkeypatch):
     """The one beside it: ``tests/evaluation/test_simulate.py``."""
+    monkeypatch.setattr(uuvtai, "simulate", partial(uuvtai.simulate, runtime=start_taichi("cpu")))
     module = example("custom_vehicle")
     theirs, ours = (load_config("open", vehicle=name).vehicle for name in module.VEHICLES)
     assert ours.mass_kg > theirs.mass_kg and len(ours.thrusters) == len(theirs.thrusters)

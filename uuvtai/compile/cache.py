@@ -1,5 +1,5 @@
-"""What a kernel's machine code depends on, as one key: the sources that kernels see, the arrays' places, the
-processor, and the values of the config that the kernel reads. Nothing of it asks Taichi to read a kernel."""
+"""What a kernel's machine code depends on, as one key: the sources that kernels see, the processor, and of
+arrays and config what the kernel reads. Nothing of it asks Taichi to read a kernel."""
 
 from __future__ import annotations
 
@@ -24,22 +24,26 @@ import taichi as ti
 
 from uuvtai.common.files import FileError, open_file, open_new, parsed_json, unfinished
 from uuvtai.common.version import BEGUN_NS
-from uuvtai.compile.launch import Number, Numbers, as_arguments, worked_out
+from uuvtai.compile.launch import VARIABLE, Number, Numbers, as_arguments, asked_shape, worked_out
 from uuvtai.config import Section
 
 # ------------------------------------------------------------------------------------------------------------
-# What of the config a kernel's code depends on: what was read and decided while Taichi compiled it, and
-# nothing else. So another horizon compiles the termination check anew, and not the sonar.
+# What of a bundle a kernel's code depends on: what was read and decided while Taichi compiled it, and nothing
+# else. So another horizon compiles the termination check anew, and not the sonar; a longer forecast moves
+# arrays, and compiles nothing that does not touch them.
 
 
 ALL = "*"
 """a whole section: something was done with it that cannot be followed"""
+_ARRAY = "@"
+"""before the name of an array, whose place is told ('@tracks.pos_w')"""
 
 
 @contextlib.contextmanager
 def noted(bundle: Any, spare: int = 0) -> Iterator[tuple[set[str], Numbers]]:
-    """Names of the values of this bundle's sections that code depends on which Taichi compiles meanwhile
-    ('behavior_cfg.n_heading'), and the numbers that are its arguments."""
+    """Names of the values of this bundle's sections ('behavior_cfg.n_heading') and of its arrays
+    ('@tracks.pos_w') that code depends on which Taichi compiles meanwhile, and the numbers that are its
+    arguments."""
     names: set[str] = set()
     numbers = Numbers(names.add, spare)
     places: dict[int, list[str]] = {}
@@ -55,12 +59,39 @@ def noted(bundle: Any, spare: int = 0) -> Iterator[tuple[set[str], Numbers]]:
             names.update(f"{place}.{leaf}" for place in found)
         return value
 
+    structs: dict[int, list[str]] = {}
+    kinds = set()
+    for place, struct in structs_in(bundle):
+        structs.setdefault(id(struct), []).append(place)
+        kinds.add(type(struct))
+
+    def noting_arrays(struct: Any, name: str) -> Any:
+        value = object.__getattribute__(struct, name)
+        read = list(value) if name == "__dict__" else [name] if isinstance(value, ti.Field) else []
+        for place in structs.get(id(struct), []):
+            names.update(f"{_ARRAY}{place}.{array}" for array in read)
+        return value
+
     Section.__getattribute__ = noting  # type: ignore[method-assign]
+    for kind in kinds:
+        kind.__getattribute__ = noting_arrays
     try:
         with as_arguments(numbers):
             yield names, numbers
     finally:
         del Section.__getattribute__
+        for kind in kinds:
+            del kind.__getattribute__
+
+
+def structs_in(value: Any, place: str = "") -> list[tuple[str, Any]]:
+    """Every dataclass of a bundle that has arrays, with its place there."""
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return []
+    members = {member.name: getattr(value, member.name) for member in dataclasses.fields(value)}
+    own = [(place, value)] if any(isinstance(member, ti.Field) for member in members.values()) else []
+    inner = [structs_in(member, f"{place}.{name}".lstrip(".")) for name, member in members.items()]
+    return sum(inner, own)
 
 
 def sections_in(value: Any, place: str = "") -> list[tuple[str, Section]]:
@@ -76,9 +107,10 @@ def sections_in(value: Any, place: str = "") -> list[tuple[str, Section]]:
     return sum(inner, own)
 
 
-def values_of(names: Iterable[str], bundle: Any) -> list[tuple[str, str]]:
-    """(name, value) in the order of the names; a section that has parts of its own is told by its kind."""
-    return [(name, _value(bundle, name)) for name in sorted(names)]
+def values_of(names: Iterable[str], bundle: Any, tree: int) -> list[tuple[str, str]]:
+    """(name, value) in the order of the names; a section that has parts of its own is told by its kind, an
+    array, which must belong to ``tree``, by its place. Raises KeyNameError."""
+    return [(name, _value(bundle, name, tree)) for name in sorted(names)]
 
 
 def value_of(bundle: Any, name: str) -> Any:
@@ -88,7 +120,11 @@ def value_of(bundle: Any, name: str) -> Any:
     return bundle
 
 
-def _value(bundle: Any, name: str) -> str:
+def _value(bundle: Any, name: str, tree: int) -> str:
+    if name.startswith(_ARRAY):
+        return described(value_of(bundle, name.removeprefix(_ARRAY)), tree)
+    if name == json.dumps(VARIABLE):
+        return asked_shape()
     if name.startswith("["):
         # of another config, which goes another way before
         with contextlib.suppress(ArithmeticError, TypeError):
@@ -292,33 +328,34 @@ def digest_of_sources() -> str:
     return digest.hexdigest()
 
 
-def key_of(kernel: Any, arguments: tuple, tree: int, surroundings: list) -> str:
-    """64 hexadecimal digits that name ``kernel`` for these arguments whatever their config says;
-    ``surroundings`` say which processor, compilers and runtime it is for. Raises KeyNameError."""
+def key_of(kernel: Any, arguments: tuple, surroundings: list) -> str:
+    """64 hexadecimal digits that name ``kernel`` for these arguments whatever their config says and wherever
+    their arrays lie; ``surroundings`` say which processor, compilers and runtime it is for. Raises
+    KeyNameError."""
     function = kernel.func
     given = [
-        "" if declared.annotation in (int, float) else described(value, tree)
+        "" if declared.annotation in (int, float) else described(value)
         for declared, value in zip(kernel.arguments, arguments, strict=True)
     ]
     parts = [digest_of_sources(), surroundings, function.__module__, function.__qualname__, given]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def key_with(key: str, names: Iterable[str], bundle: Any) -> str:
-    """64 hexadecimal digits that name a kernel's machine code: its ``key_of``, and what of its bundle's
-    config it depends on (``reads.noted``)."""
-    return hashlib.sha256(json.dumps([key, values_of(names, bundle)]).encode()).hexdigest()
+def key_with(key: str, names: Iterable[str], bundle: Any, tree: int) -> str:
+    """64 hexadecimal digits that name a kernel's machine code: its ``key_of``, and what of its bundle it
+    depends on (``noted``), whose arrays belong to ``tree``. Raises KeyNameError."""
+    return hashlib.sha256(json.dumps([key, values_of(names, bundle, tree)]).encode()).hexdigest()
 
 
-def described(value: Any, tree: int) -> str:
-    """All of an argument that its kernel's code can depend on, but for values of the config; fields must
-    belong to ``tree``. Raises KeyNameError."""
+def described(value: Any, tree: int | None = None) -> str:
+    """All of an argument that its kernel's code can depend on, but for values of the config; where arrays lie
+    in ``tree``, if it is given. Raises KeyNameError."""
     if isinstance(value, Section):
         return type(value).__name__
     if isinstance(value, bool | int | str | None):
         return f"{type(value).__name__} {value!r}"
     if isinstance(value, ti.Field):
-        return _place(value, tree)
+        return "array" if tree is None else _place(value, tree)
     if hasattr(value, "data_ptr"):
         return f"tensor {value.dtype} {value.ndim} {value.device.type} {value.is_contiguous()}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

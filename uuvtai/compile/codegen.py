@@ -33,17 +33,7 @@ from taichi.lang import impl
 
 from uuvtai.common.files import FileError, open_to_append, read_text
 from uuvtai.compile import cache
-from uuvtai.compile.launch import (
-    Launch,
-    NativeLaunch,
-    Sum,
-    TaichiLaunch,
-    asked_shape,
-    given,
-    native,
-    worked_out,
-    written,
-)
+from uuvtai.compile.launch import Launch, NativeLaunch, Sum, TaichiLaunch, given, native, worked_out, written
 from uuvtai.compile.memory import Memory
 from uuvtai.compile.runtime import Companion
 
@@ -492,7 +482,7 @@ class Native:
         program: Any = impl.get_runtime().prog
         told = program.config()
         passes = f"{told.advanced_optimization} {told.cfg_optimization} {told.fast_math}"
-        self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__), asked_shape(), passes]
+        self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__), passes]
         self.adopted: weakref.WeakKeyDictionary[Any, Owner] = weakref.WeakKeyDictionary()
         self.compiler: Compiler | None = None
         self.companion = Companion()
@@ -518,9 +508,10 @@ class Native:
         if owner is None or not all(_is_plain(value) for value in arguments[1:]):
             return None
         try:
-            key = cache.key_of(kernel, arguments, owner.memory.tree, self.surroundings)
+            key, tree = cache.key_of(kernel, arguments, self.surroundings), owner.memory.tree
             kept = (
-                self.store.get(cache.key_with(key, names, arguments[0])) for names in self.store.names(key)
+                self.store.get(cache.key_with(key, names, arguments[0], tree))
+                for names in self.store.names(key)
             )
             code = next(filter(None, kept), None)
             if code is None:
@@ -560,7 +551,7 @@ class Native:
             return taichi
         self.made += 1
         try:
-            self.store.put(cache.key_with(key, names, arguments[0]), code)
+            self.store.put(cache.key_with(key, names, arguments[0], owner.memory.tree), code)
             self.store.put_names(key, names)
         except cache.StoreError as error:
             self._tell(kernel, error, "its machine code is not kept")

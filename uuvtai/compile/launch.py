@@ -319,6 +319,10 @@ VARIABLE = "UUV_KERNELS"
 """names the shape where there is no GPU, to compare the two: 'cpu' or 'gpu'"""
 
 
+_reading: list[Numbers] = []
+"""of the kernel that Taichi reads now: its code depends on the shape where it asks for that"""
+
+
 def asked_shape() -> str:
     """'cpu' or 'gpu': what kernels on a CPU are to be like. Raises SettingError."""
     shape = os.environ.get(VARIABLE) or "cpu"
@@ -330,6 +334,8 @@ def asked_shape() -> str:
 def is_gpu_shaped() -> bool:
     """Whether the kernels of this process are made for a GPU. Plain Python, for the time when a kernel is
     compiled or a size chosen; sizes are also asked for before Taichi has been started."""
+    for numbers in _reading:
+        numbers.fix(VARIABLE)
     return (ti.cfg is not None and ti.cfg.arch == ti.cuda) or asked_shape() == "gpu"
 
 
@@ -497,9 +503,11 @@ def as_arguments(numbers: Numbers) -> Iterator[None]:
     ]
     for module, name, ours, _ in parts:
         setattr(module, name, ours)
+    _reading.append(numbers)
     try:
         yield
     finally:
+        _reading.pop()
         for module, name, _, theirs in parts:
             setattr(module, name, theirs)
 
