@@ -501,6 +501,7 @@ def test_a_key_tells_configs_places_and_kinds_apart(monkeypatch):
     with cache.noted(first.io) as (names, _):
         assert not is_gpu_shaped()
     plain = cache.key_with("k", names, first.io, tree)
+    assert Native().surroundings[-1].split()[-1] == "f32", "what numbers are that no array tells"
     monkeypatch.setenv(VARIABLE, "gpu")
     assert cache.key_with("k", names, first.io, tree) != plain, "it asks for the shape"
     assert cache.key_with("k", ["rules.control_dt_s"], first.io, tree) == of_time[0], "it does not"

@@ -481,7 +481,7 @@ class Native:
         self.machine = Machine(int(os.environ.get("UUV_NUM_THREADS") or os.cpu_count() or 1))
         program: Any = impl.get_runtime().prog
         told = program.config()
-        passes = f"{told.advanced_optimization} {told.cfg_optimization} {told.fast_math}"
+        passes = f"{told.advanced_optimization} {told.cfg_optimization} {told.fast_math} {told.default_fp}"
         self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__), passes]
         self.adopted: weakref.WeakKeyDictionary[Any, Owner] = weakref.WeakKeyDictionary()
         self.compiler: Compiler | None = None
