@@ -34,9 +34,10 @@ import yaml
 
 from benchmarks.common import Job, Row
 from benchmarks.peers.stand_in_autopilot import RATE_HZ, StandIn
-from uuvtai.common.enums import OUTCOMES, RUNNING
+from uuvtai.common.enums import LETTERS, OUTCOMES, RUNNING
 from uuvtai.common.statistics import bootstrap_interval, wilson_interval
 from uuvtai.config.loader import load_config
+from uuvtai.logs.run_folder import git_sha
 from uuvtai.sim.behavior_tree import read_tree
 from uuvtai.sim.sim import Sim
 from uuvtai.vehicle.calibrate import WAYS
@@ -49,9 +50,12 @@ from uuvtai.vehicle.instruments.rip2 import LONGEST, Sonar3D
 
 THREADS = 1
 LONGEST_S = 86400
-EPISODES, CALIBRATIONS, SEED = 600, 20, 77001
+SETS = ("a50,ping360", "a50,3d15", "a50,nominal")
+EPISODES, CALIBRATIONS, SEED = 600, 20, 90011
+FLIGHTS = Path(__file__).with_name("flights.json")
+_LETTERS = LETTERS | {"not ended": "-"}
+_WORDS = {letter: word for word, letter in _LETTERS.items()}
 _PILOTS = 3  # at once; one is getting ready while others drive
-
 _ROOT = Path(__file__).resolve().parent.parent
 _PATIENCE_S = 20.0  # by our clock, that the pilot is waited for
 _SAYS_START = re.compile(r"instance (\d+): uuv pilot needs --start (\S+) --goal (\S+) --heading (\S+)")
@@ -62,29 +66,34 @@ def measure(job: Job) -> list[Row]:
     """CPU of each adapter; arrivals beside the simulator's own loop; errors of calibrations."""
     count = 2 if job.quick else EPISODES
     rows = [_adapter(name, job) for name in ADAPTERS]
-    for kinds in ("a50,ping360", "a50,3d15", "a50,nominal"):
-        for dynamic in (0, 6):
-            rows += _driven(Setup(kinds, dynamic), count, job)
+    for setup in (Setup(kinds, dynamic) for dynamic in (6, 0) for kinds in SETS):
+        rows += _driven(setup, count, job)
     return [*rows, *_calibrations(2 if job.quick else CALIBRATIONS, job)]
 
 
 def _driven(setup: Setup, count: int, job: Job) -> list[Row]:
-    """By the instruments, in the simulator's own loop, and the difference by episode."""
-    what = f"{setup.kinds.replace(',', ' + ')}, D = {setup.dynamic}"
-    with tempfile.TemporaryDirectory() as name:
-        folder, ends = Path(name), []
-        with ExitStack() as open_ones, ThreadPoolExecutor(_PILOTS) as threads:
-            pilots: SimpleQueue[Process] = SimpleQueue()
-            for _ in range(_PILOTS):
-                pilots.put(open_ones.enter_context(Process(folder)))
-            for first in range(0, count, MOST_AT_ONCE):
-                some = min(MOST_AT_ONCE, count - first)
-                with Process(folder) as process:
-                    waters = Waters(process, setup, folder, first, some)
-                    ends += threads.map(partial(flown, waters, pilots, job.say), range(some))
+    """By the instruments, in the simulator's own loop, and the difference by episode. What has been flown is
+    kept (``FLIGHTS``) and not flown again, for all of it takes hours."""
+    what, known = f"{setup.kinds.replace(',', ' + ')}, D = {setup.dynamic}", json.loads(FLIGHTS.read_text())
+    kept = known.setdefault(what, {"processes": "", "loop": "", "commits": []})
+    ends, own = ([_WORDS[letter] for letter in kept[side] if not job.quick] for side in ("processes", "loop"))
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(_PILOTS) as threads, ExitStack() as opened:
+        folder, pilots = Path(name), SimpleQueue[Process]()
         config = load_config("pool", str(setup.rig(folder)), "bluerov2_16v", overrides=list(setup.overrides))
         sim = Sim(config, 1, read_tree("bt"))
-        own = [simulated(sim, number) for number in range(count)]
+        for _ in range(_PILOTS if len(ends) < count else 0):
+            pilots.put(opened.enter_context(Process(folder)))
+        for first in range(len(ends), count, MOST_AT_ONCE):
+            some = min(MOST_AT_ONCE, count - first)
+            with Process(folder) as process:
+                waters = Waters(process, setup, folder, first, some)
+                ends += threads.map(partial(flown, waters, pilots, job.say), range(some))
+            own += [simulated(sim, number) for number in range(first, first + some)]
+            if not job.quick:
+                for side, found in (("processes", ends), ("loop", own)):
+                    kept[side] = "".join(_LETTERS[end] for end in found)
+                kept["commits"] = sorted({*kept["commits"], str(git_sha())})
+                FLIGHTS.write_text(json.dumps(known, indent=1) + "\n")
     off = [100.0 * ((one == "success") - (other == "success")) for one, other in zip(ends, own, strict=True)]
     low, high = bootstrap_interval(off) or (math.nan, math.nan)
     note = f"[{low:.1f}, {high:.1f}]; {off.count(100)} arrive so alone, {off.count(-100)} not"
@@ -140,17 +149,15 @@ def _calibrations(count: int, job: Job) -> list[Row]:
 
 # ---- CPU of an adapter at its device's full rate, its step of the pilot's loop alone.
 
-_FULL_SHARE = 5.0  # [%] of one core
 
-
-def _a50() -> tuple[Callable[[float], None], Instrument]:
+def _a50() -> tuple[Callable[[float], object], Instrument]:
     fake = FakeA50("127.0.0.1", 0)
     fake.PERIOD_S = 1 / 15
     instrument = A50(TcpChannel("127.0.0.1", fake.port), 0.0, 0.1, 0.05)
     return lambda now_s: fake.tell(now_s, np.array([0.3, 0.0, 0.1]), 1.0), instrument
 
 
-def _ping360() -> tuple[Callable[[float], None], Instrument]:
+def _ping360() -> tuple[Callable[[float], object], Instrument]:
     sonar, fake = load_config("pool", "ping360").sensors.sonar, FakePing360("127.0.0.1", 0)
     fake._step_s = lambda listening: sonar.step_us / 1e6
     channel = UdpChannel(InstrumentPlace("ping360", "127.0.0.1", fake.port), True, 2048)
@@ -158,7 +165,7 @@ def _ping360() -> tuple[Callable[[float], None], Instrument]:
     return lambda now_s: fake.step(now_s, lambda bearing: 3.0 + bearing), instrument
 
 
-def _3d15() -> tuple[Callable[[float], None], Instrument]:
+def _3d15() -> tuple[Callable[[float], object], Instrument]:
     config = load_config("pool", "3d15")
     camera = emulated(config, ("3d15",)).sensors.depth
     fake, depth_m = FakeSonar3D("127.0.0.1", _IMAGES, camera), np.full((camera.rows, camera.cols), 4.0)
@@ -166,15 +173,11 @@ def _3d15() -> tuple[Callable[[float], None], Instrument]:
     return lambda now_s: fake.tell(now_s, depth_m), Sonar3D(channel, config)
 
 
-def _json() -> tuple[Callable[[float], None], Instrument]:
+def _json() -> tuple[Callable[[float], object], Instrument]:
     channel = UdpChannel(InstrumentPlace("json", "127.0.0.1", _IMAGES + 1), False, 65507)
     other = UdpChannel(InstrumentPlace("json", "127.0.0.1", _IMAGES + 1), True, 65507)
     said = {"kind": "sonar", "range_m": [4.123] * 256, "hit": [1] * 256, "doppler_m_s": []}
-
-    def tell(_: float) -> None:
-        other.write(json.dumps(said).encode())
-
-    return tell, JsonUdp(channel)
+    return lambda _: other.write(json.dumps(said).encode()), JsonUdp(channel)
 
 
 _IMAGES = 24747  # UDP port
@@ -195,11 +198,8 @@ def _adapter(name: str, job: Job) -> Row:
     instrument.close()
     return Row(
         f"adapter: {name}", 100.0 * spent_s / seconds, "% of a core", less_is_better=True,
-        floor=_FULL_SHARE, note=f"{found / seconds:.1f} readings a second",
+        floor=5.0, note=f"{found / seconds:.1f} readings a second",
     )  # fmt: skip
-
-
-# ---- Processes.
 
 
 _WORK = """
@@ -222,8 +222,7 @@ class Process(AbstractContextManager["Process"]):
     def __init__(self, folder: Path) -> None:
         environment = os.environ | {"PYTHONPATH": str(_ROOT), "UUV_NUM_THREADS": "1", "COLUMNS": "400"}
         self.lines: list[str] = []
-        self.out = folder / f"{id(self)}.json"
-        """what it says on its output"""
+        self.out = folder / f"{id(self)}.json"  # what it says on its output
         self._running = subprocess.Popen(
             [sys.executable, "-c", _WORK], cwd=folder, env=environment, text=True,
             stdin=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -301,10 +300,8 @@ class Link(AbstractContextManager["Link"]):
         self.autopilot.close()
 
 
-# ---- One water for several pilots.
-
-MOST_AT_ONCE = 20
-_PHYSICS, _PILOT = 21002, 23000  # ports of the first instance, counted on by ten
+MOST_AT_ONCE = 20  # pilots of one water
+PORTS = {"physics": 21002, "pilot": 23000, "a50": 16171, "ping360": 9092, "3d15": 4747}  # counted on by ten
 _HORIZON = 6000  # twice the usual: the pilot first turns until the walls have told where it is
 _RIG = """extends: {preset}
 sensors:
@@ -349,13 +346,20 @@ class Setup:
 class Waters:
     """``uuv sitl`` with the emulators of a setup, for a few episodes."""
 
-    def __init__(self, process: Process, setup: Setup, folder: Path, first: int, count: int) -> None:
-        self.setup, self.folder, self.rig = setup, folder, setup.rig(folder)
+    def __init__(
+        self, process: Process, setup: Setup, folder: Path, first: int, count: int, **ports: int
+    ) -> None:
+        self.setup, self.folder, self.rig, self._ports = setup, folder, setup.rig(folder), PORTS | ports
         words = ["sitl", "--world", "pool", "--sensors", str(self.rig), "--vehicle", "bluerov2_16v"]
         words += [f"--set={text}" for text in setup.overrides]
         words += ["--seed", str(SEED), "--episode", str(first), "--instances", str(count)]
-        words += ["--as", ",".join(setup.emulated), "--port", str(_PHYSICS)]
-        words += ["--mavlink", f"udpout:127.0.0.1:{_PILOT}", "--json"]
+        words += ["--as", ",".join(f"{kind}:{self._ports[kind]}" for kind in setup.emulated), "--json"]
+        words += [
+            "--port",
+            str(self._ports["physics"]),
+            "--mavlink",
+            f"udpout:127.0.0.1:{self._ports['pilot']}",
+        ]
         self.process = process
         process.begin(words)
         found = self.process.until(_SAYS_START, count)
@@ -363,11 +367,10 @@ class Waters:
 
     def pilot(self, process: Process, number: int, *more: str) -> None:
         """``uuv pilot`` for an instance, until it listens."""
-        own = 10 * number
-        ports = {"a50": 16171 + own, "ping360": 9092 + own, "3d15": 4747 + own}
+        ports = {name: port + 10 * number for name, port in self._ports.items()}
         instruments = [f"{kind}:127.0.0.1:{ports[kind]}" for kind in self.setup.emulated]
         start, goal = self.places[number]
-        words = ["pilot", "--mavlink", f"udp:127.0.0.1:{_PILOT + own}", "--rate", "0", "--world", "pool"]
+        words = ["pilot", "--mavlink", f"udp:127.0.0.1:{ports['pilot']}", "--rate", "0", "--world", "pool"]
         words += ["--sensors", str(self.rig), "--vehicle", "bluerov2_16v"]
         words += [word for pair in zip(("--dvl", "--sonar"), instruments, strict=False) for word in pair]
         words += ["--start", start, "--goal", goal, "--heading", "0", "--battery", "0", "--json"]
@@ -377,7 +380,7 @@ class Waters:
 
     def link(self, number: int, pilot: Process) -> Link:
         """The autopilot of an instance."""
-        return Link(_PHYSICS + 10 * number, _PILOT + 10 * number, pilot)
+        return Link(self._ports["physics"] + 10 * number, self._ports["pilot"] + 10 * number, pilot)
 
     def ended(self, number: int) -> str:
         """How an instance's episode ended; '' = it has not."""
@@ -398,20 +401,18 @@ def flown(waters: Waters, pilots: SimpleQueue[Process], say: Callable[[str], Non
 
 
 def _flown(waters: Waters, pilot: Process, say: Callable[[str], None], number: int) -> str:
-    begun_s = time.monotonic()
     waters.pilot(pilot, number, "--arm", "--depth", "0.05,1.55", "--max-speed", "1")
     with waters.link(number, pilot) as link:
-        ready_s, left_s = time.monotonic(), _LONGEST_EPISODE_S
+        left_s = _LONGEST_EPISODE_S
         while not (end := waters.ended(number)) and link.autopilot.time_s < left_s:
             link.advance()
             if pilot.has_ended:
                 left_s = min(left_s, link.autopilot.time_s + _AFTER_S)
-        driven_s = time.monotonic()
         while not pilot.has_ended:  # it gives the vehicle back
             link.advance()
     last = [line for line in pilot.lines if not line.startswith("ended")][-1:]
-    spent = f"{ready_s - begun_s:.1f} + {driven_s - ready_s:.1f} s, {link.hurried} times not waited for"
-    say(f"{number}: {end or 'not ended'}, {link.autopilot.time_s:.1f} s in {spent}; {last}")
+    time_s = f"{link.autopilot.time_s:.1f} s, {link.hurried} times not waited for"
+    say(f"{number}: {end or 'not ended'}, {time_s}; {last}")
     return end or "not ended"
 
 
@@ -435,7 +436,7 @@ def calibrated(
     more = ("--start", typed, "--heading", f"{_HEADING_DEG:g}", "--set", "sensors.dvl.yaw_deg=0")
     waters.pilot(pilot, number, *more, "--calibrate", str(out))
     with waters.link(number, pilot) as link:
-        begun_s, left_m, way, told = time.monotonic(), 0.0, np.zeros(4), ""
+        left_m, way, told = 0.0, np.zeros(4), ""
         while not pilot.has_ended and link.autopilot.time_s < _LONGEST_S_BY_HAND:
             last = pilot.lines[-1] if pilot.lines else ""
             if last != told and (said := _SAYS_DRIVE.search(last)):
@@ -448,8 +449,7 @@ def calibrated(
             link.autopilot.by_hand = way if left_m > 0 else np.array([0.0, 0.0, 0.0, turns])
             left_m -= _SPEED_M_S / 50
             link.advance()
-        time_s, spent_s = link.autopilot.time_s, time.monotonic() - begun_s
-        say(f"{number}: {time_s:.0f} s in {spent_s:.0f} s, {link.hurried} hurried; {pilot.lines[-1:]}")
+        say(f"{number}: {link.autopilot.time_s:.0f} s, {link.hurried} hurried; {pilot.lines[-1:]}")
     if not pilot.has_ended or not out.exists():
         return None
     found = json.loads(pilot.out.read_text())["calibration"]["found"]

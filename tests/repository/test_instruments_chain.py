@@ -5,7 +5,8 @@ from queue import SimpleQueue
 
 import pytest
 
-from benchmarks.instruments import Process, Setup, Waters, flown
+from benchmarks.instruments import PORTS, Process, Setup, Waters, flown
+from tests.mavlink_vehicle import free_port
 
 PLACES = ("world.spawn_x_m=[2,6]", "world.start_goal_gap_m=3.0")
 
@@ -24,6 +25,7 @@ def test_a_pilot_arrives_by_what_emulated_instruments_tell(tmp_path):
     said, pilots = [], SimpleQueue()
     with Process(tmp_path) as process, Process(tmp_path) as pilot:
         pilots.put(pilot)
-        waters = Waters(process, UsualSteps(static=0, range_m=6.0, changes=PLACES), tmp_path, 0, 1)
+        setup = UsualSteps(static=0, range_m=6.0, changes=PLACES)
+        waters = Waters(process, setup, tmp_path, 0, 1, **{name: free_port() for name in PORTS})
         assert flown(waters, pilots, said.append, 0) == "success", (said, pilot.lines)
         assert pilot.lines[-1] == "ended 0" and "goal reached" in pilot.lines[-2]

@@ -12,7 +12,7 @@ from brping import PingMessage, definitions
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.mavlink_vehicle import Flight, link_config, plan_of
+from tests.mavlink_vehicle import Flight, free_port, link_config, plan_of
 from tests.vehicle.test_sitl import StillWater, packet
 from uuvtai.config.loader import load_config
 from uuvtai.logs.reader import read_messages
@@ -20,11 +20,11 @@ from uuvtai.vehicle.control_loop import OnboardLoop
 from uuvtai.vehicle.instruments import ping, rip2
 from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Channel, InstrumentPlace, TcpChannel, UdpChannel, place_of
-from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeRig, FakeSonar3D, emulated
+from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeRig, FakeSonar3D, emulated, ports_of
 from uuvtai.vehicle.instruments.rig import PORTS, JsonUdp, Rig
 from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import MOST_WAITING, DepthShot, DvlReading, Inbox, SonarPing
-from uuvtai.vehicle.sitl import Instance, SitlPlan
+from uuvtai.vehicle.sitl import Instance
 
 
 class Played(Channel):
@@ -341,7 +341,8 @@ def test_datagrams_of_others_are_not_heard():
 
 def test_while_one_speaks_nobody_else_is_heard():
     """Where no host is named, and of a multicast group."""
-    channel = UdpChannel(InstrumentPlace("json", "", 45990), calls=False, longest=64)
+    port = free_port()
+    channel = UdpChannel(InstrumentPlace("json", "", port), calls=False, longest=64)
     senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
     for one, host in zip(senders, ("127.0.0.1", "127.0.0.2"), strict=True):
         one.bind((host, 0))
@@ -349,7 +350,7 @@ def test_while_one_speaks_nobody_else_is_heard():
     def heard(now_s, *numbers):
         before, found = channel.strange, []
         for number in numbers:
-            senders[number].sendto(str(number).encode(), ("127.0.0.1", 45990))
+            senders[number].sendto(str(number).encode(), ("127.0.0.1", port))
         for _ in range(1000):
             found += channel.read(now_s)
             if len(found) + channel.strange - before == len(numbers):
@@ -566,38 +567,41 @@ def rig_config():
 
 
 def test_a_rig_gives_velocities_about_the_centre_and_only_what_was_asked_for(rig_config):
-    with Rig(rig_config, {"dvl": "json:127.0.0.1:45991"}) as rig:
-        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", 45991), calls=True, longest=2048)
+    port = free_port()
+    with Rig(rig_config, {"dvl": f"json:127.0.0.1:{port}"}) as rig:
+        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", port), calls=True, longest=2048)
         said = {"kind": "dvl", "vel_b": [0.5, 0.0, 0.0]}, {"kind": "pressure", "depth_m": 0.5}
         for one in said:
             other.write(json.dumps(one).encode())
         found = []
         for _ in range(200):
             found += list(rig.poll(1.0, np.array([0.0, 0.5, 0.0])))
-            if found and rig.document()["json:127.0.0.1:45991"]["heard"] == 2:
+            if found and rig.document()[f"json:127.0.0.1:{port}"]["heard"] == 2:
                 break
         ((_, reading),) = found
         assert np.allclose(reading.vel_b, [0.6, 0.0, 0.0])  # less rate x lever
-        assert rig.document()["json:127.0.0.1:45991"]["refused"] == {"pressure: not asked for": 1}
+        assert rig.document()[f"json:127.0.0.1:{port}"]["refused"] == {"pressure: not asked for": 1}
         other.close()
     assert rig.replaced == {"dvl"}
 
 
 @pytest.mark.parametrize("vel_b", [[1e6, 0, 0], [1e300, 0, 0], [0, 0]])
 def test_a_velocity_that_cannot_be_is_no_reading(vel_b):
-    with Rig(link_config(), {"dvl": "json:127.0.0.1:45989"}) as rig:
-        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", 45989), calls=True, longest=2048)
+    port = free_port()
+    with Rig(link_config(), {"dvl": f"json:127.0.0.1:{port}"}) as rig:
+        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", port), calls=True, longest=2048)
         other.write(json.dumps({"kind": "dvl", "vel_b": vel_b}).encode())
         for _ in range(1000):
             assert list(rig.poll(1.0, np.zeros(3))) == []
-            if rig.document()["json:127.0.0.1:45989"]["refused"]:
+            if rig.document()[f"json:127.0.0.1:{port}"]["refused"]:
                 break
-        assert rig.document()["json:127.0.0.1:45989"]["refused"]
+        assert rig.document()[f"json:127.0.0.1:{port}"]["refused"]
         other.close()
 
 
 def test_what_an_instrument_tells_mavlink_tells_no_more(tmp_path):
-    with Rig(link_config(), {"dvl": "json::45992"}) as rig:
+    port = free_port()
+    with Rig(link_config(), {"dvl": f"json::{port}"}) as rig:
         flight = Flight(tmp_path)
         flight.loop = OnboardLoop(
             link_config(), flight.pilot, plan_of(flight.endpoint.place, flight.log.path), flight.endpoint,
@@ -607,12 +611,12 @@ def test_what_an_instrument_tells_mavlink_tells_no_more(tmp_path):
         assert flight.loop.last.action.name == "HOLD" and flight.sub.moved_by() == []
         refused = flight.loop.document()["refused"]
         assert any("--dvl names an instrument" in why for why in refused)
-        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", 45992), calls=True, longest=2048)
+        other = UdpChannel(InstrumentPlace("json", "127.0.0.1", port), calls=True, longest=2048)
         good = json.dumps({"kind": "dvl", "vel_b": [0.3, 0.0, 0.0]}).encode()
         bad = json.dumps({"kind": "dvl", "vel_b": [0.0, 0.0]}).encode()
         flight.run(5, before=lambda step: (other.write(good), other.write(bad)))
         assert flight.loop.last.action.name == "DRIVE" and flight.sub.moved_by()
-        told = flight.loop.document()["instruments"]["json::45992"]
+        told = flight.loop.document()["instruments"][f"json::{port}"]
         assert told["heard"] > 100 and told["refused"]["dvl: a velocity has three numbers"] > 100
         flight.run(5)  # the instrument is silent: it holds, whatever the autopilot says of its velocity
         assert flight.loop.last.action.name in ("HOLD", "HAND_BACK")
@@ -639,8 +643,9 @@ def test_when_our_clock_has_jumped_a_dvl_is_dated_anew():
 
 
 def test_a_place_that_somebody_holds_is_refused_in_a_line(rig_config):
-    with Rig(rig_config, {"dvl": "json::45993"}), pytest.raises(LinkError, match="45993"):
-        Rig(rig_config, {"dvl": "json::45993"})
+    port = free_port()
+    with Rig(rig_config, {"dvl": f"json::{port}"}), pytest.raises(LinkError, match=str(port)):
+        Rig(rig_config, {"dvl": f"json::{port}"})
 
 
 def test_what_a_sitl_instrument_says_the_pilot_hears():
@@ -656,9 +661,13 @@ def test_what_a_sitl_instrument_says_the_pilot_hears():
         return ring[name] if name in ring else told(name, row)
 
     water.value = value
-    places = {"dvl": f"a50:127.0.0.1:{16171 + 30}", "sonar": f"ping360:127.0.0.1:{9092 + 30}"}
+    ports = {"a50": free_port(), "ping360": free_port()}
+    places = {
+        "dvl": f"a50:127.0.0.1:{ports['a50'] + 30}",
+        "sonar": f"ping360:127.0.0.1:{ports['ping360'] + 30}",
+    }
     with Rig(config, places) as rig:
-        fake = FakeRig(wide, ("a50", "ping360"), "127.0.0.1", 3)
+        fake = FakeRig(wide, ports, "127.0.0.1", 3)
         one, found = Instance(wide, water, 0, fake), []
         kinds = {order.kind for count in range(3) for order in one.answer(packet(count), 0.0)[1]}
         assert kinds == {"DISTANCE_SENSOR"}
@@ -675,13 +684,14 @@ def test_what_a_sitl_instrument_says_the_pilot_hears():
 
 def test_a_sitl_3d15_shows_what_its_camera_sees():
     """A wall across at 4 m, and a bar above to port that only some rows see."""
+    port = free_port()
     config = emulated(FAN, ("3d15",))
     camera, told_s = config.sensors.depth, (0.0, 0.1, 0.2, 0.4)
     depth_m = np.full((camera.rows, camera.cols), 4.0)
     depth_m[: camera.rows // 5, : camera.cols // 4] = 2.0
     depth_m[:, -camera.cols // 5 :] = camera.max_range_m
-    with Rig(FAN, {"sonar": "3d15:127.0.0.1:45994"}) as rig:
-        fake, found = FakeSonar3D("127.0.0.1", 45994, camera), []
+    with Rig(FAN, {"sonar": f"3d15:127.0.0.1:{port}"}) as rig:
+        fake, found = FakeSonar3D("127.0.0.1", port, camera), []
         for now_s in told_s:
             fake.tell(now_s, depth_m)
             found += [reading for _, reading in rig.poll(now_s, np.zeros(3))]
@@ -700,9 +710,12 @@ def test_a_sitl_3d15_shows_what_its_camera_sees():
 
 def test_an_instrument_that_cannot_be_had_is_refused_in_a_line():
     config = load_config("pool", "ping360")
-    fake = FakeRig(config, ("a50",), "127.0.0.1", 4)
-    with pytest.raises(LinkError, match="--as: cannot listen at port 16211"):
-        FakeRig(config, ("a50", "ping360"), "127.0.0.1", 4)
+    ports = {"a50": free_port(), "ping360": free_port()}
+    fake = FakeRig(config, {"a50": ports["a50"]}, "127.0.0.1", 4)
+    with pytest.raises(LinkError, match=f"--as: cannot listen at port {ports['a50'] + 40}"):
+        FakeRig(config, ports, "127.0.0.1", 4)
     fake.close()
-    with pytest.raises(LinkError, match="a50 or ping360"):
-        SitlPlan.typed(None, None, "a50,oculus")
+    for text in ("a50,oculus", "a50:", "a50:70000", "a50:x", "a50:-1", "", "a50,"):
+        with pytest.raises(LinkError, match="a50 or ping360"):
+            ports_of(text)
+    assert ports_of("a50:16200,3d15") == {"a50": 16200, "3d15": 4747}

@@ -25,8 +25,7 @@ from uuvtai.kernels.world import scenario
 from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
-from uuvtai.vehicle.instruments import ping
-from uuvtai.vehicle.instruments.emulate import KINDS, NEXT_PORT, FakeRig, emulated
+from uuvtai.vehicle.instruments.emulate import NEXT_PORT, FakeRig, emulated, ports_of
 from uuvtai.vehicle.instruments.rig import PORTS
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
 from uuvtai.vehicle.messages import three
@@ -358,30 +357,29 @@ class SitlPlan:
     seed: int = 0
     episode: int = 0
     operator: bool = False  # be the ground station too
-    emulated: tuple[str, ...] = ()  # instruments in place of MAVLink's DVL and sonar
+    emulated: dict[str, int] = field(default_factory=dict)
+    """ports of the instruments in place of MAVLink's DVL and sonar, by kind"""
 
     @classmethod
     def typed(
         cls, mavlink: Sequence[str] | None, seconds: float | None, emulated: str | None = None, **rest: Any
     ) -> SitlPlan:
         """Of what was typed; ``rest``: as it is. Raises LinkError."""
-        kinds = tuple(emulated.split(",")) if emulated else ()
-        if not set(kinds) <= set(KINDS):
-            raise LinkError(f"--as {emulated}: give {' or '.join(KINDS)}, or several: --as a50,ping360")
+        own = {} if emulated is None else ports_of(emulated)
         until_s = math.inf if seconds is None else seconds
-        plan = cls(places=tuple(map(place_of, mavlink or PLACES)), seconds=until_s, emulated=kinds, **rest)
+        plan = cls(places=tuple(map(place_of, mavlink or PLACES)), seconds=until_s, emulated=own, **rest)
         port, instances = plan.port, plan.instances
         last = NEXT_PORT * (instances - 1)
         if not 1 <= instances <= _MOST_INSTANCES:
             raise LinkError(f"--instances {instances}: give 1 to {_MOST_INSTANCES}")
-        if (highest := max(port, *(place.port for place in plan.places)) + last) > 65535:
+        if (highest := max(port, *own.values(), *(place.port for place in plan.places)) + last) > 65535:
             raise LinkError(
                 f"--port {port}: with --instances {instances} the ports go up to {highest}, beyond 65535"
             )
-        if "ping360" in kinds and abs(port - ping.PORT) in range(0, last + 1, NEXT_PORT):
+        if (head := own.get("ping360")) and abs(port - head) in range(0, last + 1, NEXT_PORT):
             raise LinkError(
                 f"--port {port}: with --instances {instances} an ArduSub has the port of a Ping360, from "
-                f"{ping.PORT} up; --port {port + 1}"
+                f"{head} up; --port {port + 1}"
             )
         if seconds is not None and not 0 < seconds < math.inf:
             raise LinkError(f"--seconds {seconds:g}: give a number above 0, or leave it out")
@@ -514,10 +512,10 @@ def serve_water(
 def _heard(plan: SitlPlan, number: int) -> str:
     """The pilot's options that hear the instruments of an instance."""
     return "".join(
-        f" --{option} {kind}:{plan.host}:{ports[kind] + NEXT_PORT * number}"
-        for option, ports in PORTS.items()
-        for kind in plan.emulated
-        if kind in ports
+        f" --{option} {kind}:{plan.host}:{port + NEXT_PORT * number}"
+        for option, kinds in PORTS.items()
+        for kind, port in plan.emulated.items()
+        if kind in kinds
     )
 
 

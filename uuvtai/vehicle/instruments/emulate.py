@@ -6,9 +6,10 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import re
 import socket
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -195,8 +196,8 @@ class FakeSonar3D:
         self._socket.close()
 
 
-KINDS = ("a50", "ping360", "3d15")
-"""what ``uuv sitl --as`` can be"""
+KINDS = {"a50": a50.PORT, "ping360": ping.PORT, "3d15": rip2.PORT}
+"""what ``uuv sitl --as`` can be, and its usual port"""
 RING = {
     "mechanical": False,
     "horizontal_aperture_deg": 360.0,
@@ -217,9 +218,21 @@ CAMERA = {
 }
 """of a simulated camera behind a 3D-15: wider and higher than it sees"""
 NEXT_PORT = 10  # from one instance's port to the next one's, as ArduPilot counts
+_IS_PORT = re.compile("[0-9]{1,5}")
 
 
-def emulated(config: Config, kinds: tuple[str, ...]) -> Config:
+def ports_of(text: str) -> dict[str, int]:
+    """'a50,ping360:9100' -> port by kind. Raises LinkError."""
+    found = {}
+    for word in text.split(","):
+        kind, other, port = word.partition(":")
+        found[kind] = KINDS.get(kind, 0) if not other else int(port) if _IS_PORT.fullmatch(port) else 0
+    if not found.keys() <= KINDS.keys() or not all(0 < port < 65536 for port in found.values()):
+        raise LinkError(f"--as {text}: give {' or '.join(KINDS)}, or several: --as a50,ping360:9100")
+    return found
+
+
+def emulated(config: Config, kinds: Iterable[str]) -> Config:
     """The config of the water behind these instruments."""
     changed = {}
     if "ping360" in kinds:
@@ -232,10 +245,10 @@ def emulated(config: Config, kinds: tuple[str, ...]) -> Config:
 class FakeRig:
     """The instruments of one vehicle: ``step`` in every control step."""
 
-    def __init__(self, config: Config, kinds: tuple[str, ...], host: str, number: int) -> None:
-        """``number``: of the vehicle; ports count on with it. Raises LinkError."""
+    def __init__(self, config: Config, ports: dict[str, int], host: str, number: int) -> None:
+        """``ports``: by kind; they count on with the ``number`` of the vehicle. Raises LinkError."""
         self._sonar, dvl = config.sensors.sonar, config.sensors.dvl
-        self.speaks = {"dvl" if kind == "a50" else "sonar" for kind in kinds}
+        self.speaks = {"dvl" if kind == "a50" else "sonar" for kind in ports}
         """what MAVLink need not tell"""
         self._lever, self._yaw = np.array(dvl.position_b_m), math.radians(dvl.yaw_deg)
         self._dvl: FakeA50 | None = None
@@ -243,17 +256,18 @@ class FakeRig:
         self._image: FakeSonar3D | None = None
         port, next_port = 0, NEXT_PORT * number
         try:
-            if "a50" in kinds:
-                self._dvl = FakeA50(host, port := a50.PORT + next_port, number)
-            if "ping360" in kinds:
+            if "a50" in ports:
+                self._dvl = FakeA50(host, port := ports["a50"] + next_port, number)
+            if "ping360" in ports:
                 zero = round(self._sonar.zero_gradian)
-                self._head = FakePing360(host, port := ping.PORT + next_port, number, zero)
-            if "3d15" in kinds:
-                self._image = FakeSonar3D(host, rip2.PORT + next_port, config.sensors.depth)
+                self._head = FakePing360(host, port := ports["ping360"] + next_port, number, zero)
+            if "3d15" in ports:
+                self._image = FakeSonar3D(host, ports["3d15"] + next_port, config.sensors.depth)
         except OSError as error:
             self.close()
             raise LinkError(
-                f"--as: cannot listen at port {port} ({error.strerror or error}); another uuv sitl may run"
+                f"--as: cannot listen at port {port} ({error.strerror or error}); another uuv sitl may run: "
+                "--as KIND:PORT takes another"
             ) from None
 
     def step(self, time_s: float, altitude_m: float, value: Callable[[str], np.ndarray]) -> None:
