@@ -28,10 +28,12 @@ class Fix(SimpleNamespace):
         pass
 
 
-def test_until_the_start_is_known_it_only_turns(tmp_path):
+@pytest.mark.parametrize("look_s", [0.0, 2.0])
+def test_until_the_start_is_known_it_only_turns(tmp_path, look_s):
     flight = Flight(tmp_path)
     flight.loop._fix = Fix(result=None, waits_for="no wall is seen", first_s=0.0)
-    flight.run(4)
+    flight.loop._look_s = look_s
+    flight.run(4 + look_s)
     assert flight.sub.moved_by() == [] and flight.loop.last.action.name == "HOLD"
     flight.run(6)
     told = [m for m in flight.sub.told if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]

@@ -5,6 +5,7 @@ import math
 import socket
 import struct
 import zlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -289,21 +290,25 @@ def test_a_device_that_lost_its_power_is_called_again():
 
 
 @pytest.mark.parametrize("own", [True, False])
-def test_a_head_scans_there_and_back(own):
+def test_a_head_scans_there_and_back_and_all_around_when_asked_to(own):
     fake, found = FakePing360("127.0.0.1", 0, own=own), []
     channel = UdpChannel(InstrumentPlace("ping360", "127.0.0.1", fake.port), calls=True, longest=2048)
     sonar = ping.Ping360(channel, SONAR, 200.0, 0.3, 1500.0)
 
-    def step(now_s):
-        fake.step(now_s, lambda bearing: 2.0 + bearing)
-        found.extend(sonar.poll(now_s))
+    def step(now_s, begun_s):
+        fake.step(begun_s + now_s, lambda bearing: 3.0 + 0.5 * bearing)
+        found.extend(sonar.poll(begun_s + now_s))
 
-    spent_s = until(step, found, lambda them: len(them) >= 2 * SONAR.n_ray)
-    assert spent_s > 2 * SONAR.n_ray * 0.035  # a step of the head takes its time
-    for one in found:
-        bearing = SONAR.first_beam_rad + one.first_beam * SONAR.beam_step_rad
-        assert one.hit[0] == 1.0 and one.range_m[0] == pytest.approx(2.0 + bearing, abs=0.03)
-    assert {one.first_beam for one in found} == set(range(SONAR.n_ray))
+    for begun_s, whole, beams in ((0.0, False, SONAR.n_ray), (60.0, True, 200), (120.0, False, SONAR.n_ray)):
+        assert sonar.look_around(whole) == pytest.approx(200 * SONAR.step_us / 1e6)
+        found.clear()
+        spent_s = until(partial(step, begun_s=begun_s), found, lambda them: len(them) >= 400)
+        assert spent_s > 400 * 0.035  # a step of the head takes its time
+        assert {one.first_beam for one in found} == set(range(beams))
+        for one in found:
+            bearing = SONAR.first_beam_rad + one.first_beam * SONAR.beam_step_rad
+            expected = 3.0 + 0.5 * math.remainder(bearing, math.tau)
+            assert one.hit[0] == 1.0 and one.range_m[0] == pytest.approx(expected, abs=0.03)
     sonar.close()
     fake.close()
 

@@ -104,6 +104,24 @@ def test_what_cannot_be_checked_is_refused(true, typed, rate, why):
     assert why in fix.result.refusal and "--start" in fix.result.refusal
 
 
+@pytest.mark.parametrize(("beams", "is_found"), [(200, True), (64, False)])
+def test_a_head_that_looks_all_around_finds_the_start_at_rest(beams, is_found):
+    config, true, still = load_config("pool", "ping360"), (4.0, 2.2, 0.4), np.zeros(3)
+    sonar, rng, fix = config.sensors.sonar, np.random.default_rng(1), StartFix(config, (4.3, 2.5, -0.8))
+    fans = [(*true[:2], true[2] + sonar.turn_rad(sonar.n_ray) * number) for number in range(4)]
+    r, hit = np.concatenate([np.array(ranges(config, fan, rng)) for fan in fans], axis=1)
+    for k in range(2 * beams):
+        time_s, beam = k * sonar.step_us / 1e6, k % beams
+        fix.feed(ImuReading(time_s, np.array([0.0, 0.0, 0.3]), still, still))
+        fix.feed(DvlReading(time_s, still))
+        fix.feed(SonarPing(time_s, r[[beam]], hit[[beam]], np.zeros(0), beam))
+    assert (fix.result is not None) == is_found
+    if is_found:
+        assert not fix.result.refusal
+        far, degrees = off(fix.result, true, -0.1)
+        assert far < 0.1 and degrees < 2.0
+
+
 def watched(config, true, believed, obstacles=OBSTACLES):
     """What the watch says after 4 s at ``true`` (x, y, yaw), which is taken for ``believed``."""
     watch, rng, n = WallWatch(config), np.random.default_rng(3), config.sensors.sonar.n_ray

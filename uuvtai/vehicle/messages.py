@@ -56,7 +56,9 @@ class SonarPing:
     doppler_m_s: np.ndarray
     """(n_ray,) [m/s] rate of change of the distance to what returned, own motion included; empty where the
     sonar measures none (``sensors.sonar.doppler``)"""
-    first_beam: int = 0  # number of the first of these beams; 0 unless the beam is a mechanical one
+    first_beam: int = 0
+    """number of the first of these beams; 0 unless the beam is a mechanical one. That may look beside its fan
+    (beams counted on around the circle): the start is checked by those, the stack does not see them"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +245,7 @@ class PilotNumbers:
     estimated: bool  # the pilot estimates its own position, nobody gives it
     dvl_steps: int  # control steps from one expected reading to the next
     beams: int
-    beam_limit: int  # beams [0, limit) may follow each other in a ping of a mechanical sonar, as in a ring
+    circle: int  # beams that fill a whole circle; of a ring those that it has
     mechanical: bool
     doppler: bool
     sonar_latency_steps: int  # control steps from a ping to its scan, always

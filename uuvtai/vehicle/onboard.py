@@ -103,7 +103,7 @@ def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:
         estimated=sensors.localization == "estimated",
         dvl_steps=sensors.dvl.period_steps,
         beams=sonar.n_ray,
-        beam_limit=2 * sonar.n_ray if sonar.is_ring else sonar.n_ray,
+        circle=sonar.circle_beams,
         mechanical=sonar.mechanical,
         doppler=sonar.doppler,
         sonar_latency_steps=sonar.latency_steps,

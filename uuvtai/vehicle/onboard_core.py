@@ -88,9 +88,8 @@ class FedPilot:
 
     def feed(self, message: SensorMessage) -> None:
         """Take a message, at any time before the ``tick`` that is to use it. TypeError, ValueError."""
-        if isinstance(message, SonarPing):
-            _check_beams(message, self.numbers)
-        self._inbox.feed(message)
+        if not isinstance(message, SonarPing) or _is_seen(message, self.numbers):
+            self._inbox.feed(message)
 
     def tick(self) -> PilotCommand:
         """One control step, the first one at time 0."""
@@ -148,10 +147,11 @@ def _shapes(numbers: PilotNumbers) -> dict[str, tuple[int, ...]]:
     }
 
 
-def _check_beams(ping: SonarPing, numbers: PilotNumbers) -> None:
-    """ValueError for beams that the sonar does not have."""
-    n, last = len(ping.range_m), numbers.beam_limit
-    there = 0 <= ping.first_beam < numbers.beams and n <= numbers.beams and ping.first_beam + n <= last
+def _is_seen(ping: SonarPing, numbers: PilotNumbers) -> bool:
+    """Whether beams do not lie beside the fan. ValueError for those that the sonar does not have."""
+    n, is_ring = len(ping.range_m), numbers.circle == numbers.beams
+    there = 0 <= ping.first_beam < numbers.circle and n <= numbers.beams
+    there = there and (is_ring or ping.first_beam + n <= numbers.circle)
     if numbers.mechanical and not (there and n == len(ping.hit) > 0):
         raise ValueError(
             f"sonar: {n} ranges and {len(ping.hit)} hits from beam {ping.first_beam} on are no neighbouring "
@@ -159,3 +159,4 @@ def _check_beams(ping: SonarPing, numbers: PilotNumbers) -> None:
         )
     if not numbers.mechanical and ping.first_beam != 0:
         raise ValueError("sonar: first_beam is for a mechanical beam (sensors.sonar.mechanical)")
+    return is_ring or ping.first_beam + n <= numbers.beams

@@ -49,7 +49,7 @@ _RINGS_M, _RINGS, _ECHOES = 0.5, 0.3, 0.05
 """so many echoes nearer than this are a ring-down; so few echoes at all are noted"""
 _WALL_M, _TURN_DEG = 0.3, 8.0
 """a wall that is off by more is another tank's; a start that is so far off is noted, and corrected"""
-_WARM_S, _HELD = 5.0, 0.02  # at the beginning nothing counts; share of steps without decision that is bad
+_WARM_S, _HELD = 5.0, 0.02  # at first nothing counts; share of steps without decision that is bad
 _MOST_ASKED, _KEPT = 5, 100_000  # requests for a parameter; arrivals of a kind that are remembered
 _LOST = ("velocity not valid", "figure of merit", "VISION_POSITION_DELTA: without")
 _OUT_OF_RANGE = "is the bottom out of its range, or something in its beams"
@@ -135,6 +135,8 @@ class Preflight:
         self._speeds: deque[float] = deque(maxlen=_KEPT)
         self._beams, self._echoes, self._near, self._looked = 0, 0, 0, set[int]()
         self._steps, self._undecided, self._held, self._broken = 0, 0, Counter[str](), Counter[str]()
+        self._from_s = _WARM_S
+        """they count from then on"""
         self._now: Collection[str] = ()
         """rules that are broken in the last step"""
 
@@ -197,9 +199,11 @@ class Preflight:
             self._near += int((hit & (ranges < _RINGS_M)).sum())
             self._looked.update(range(reading.first_beam, reading.first_beam + len(hit)))
 
-    def turned(self) -> None:
-        """The walls have corrected the heading: the next attitude is no motion."""
-        self._imu = None
+    def begun(self, now_s: float) -> None:
+        """The walls have told the start: the stack runs freely from now on, and the heading that they have
+        corrected is no motion."""
+        self._imu, self._from_s = None, max(self._from_s, now_s + 1.0)
+        self._steps, self._undecided, self._held, self._broken = 0, 0, Counter(), Counter()
 
     def _feel(self, imu: ImuReading) -> None:
         """A gyro's error is what its rates turn and the attitude does not, so the vehicle may be turned."""
@@ -219,7 +223,7 @@ class Preflight:
     def stepped(self, now_s: float, most_s: float, held: Collection[str], broken: Collection[str]) -> None:
         """A step of a check of ``most_s``: why the stack held, and the rules that are broken."""
         self._now = broken
-        if now_s < min(_WARM_S, 0.5 * most_s):
+        if now_s < min(self._from_s, 0.5 * most_s):
             return
         self._steps += 1
         self._held.update(reason.partition(":")[0] for reason in held)
@@ -306,7 +310,7 @@ class Preflight:
                 f"{told}, {100 * near:.0f} % nearer than {_RINGS_M:g} m: ring-down, raise "
                 "sensors.sonar.min_range_m; or something is that near"
             )
-        unseen = sonar.n_ray - len(self._looked)
+        unseen = sonar.n_ray - len(self._looked & {*range(sonar.n_ray)})
         if sonar.mechanical and unseen > 0:
             return NOTE, f"{told}; {unseen} bearings were never looked at: --seconds"
         return (OK if echoes >= _ECHOES else NOTE), told

@@ -120,6 +120,8 @@ class Ping360(Instrument):
                 f"sensors.sonar: {sonar_cfg.n_ray} beams in {sonar_cfg.horizontal_aperture_deg:g} degrees "
                 "are no steps of 1 to 10 gradians of one turned beam; take --sensors ping360"
             )
+        self._whole, self._circle = sonar_cfg.is_ring, sonar_cfg.circle_beams
+        """whether it turns all around; beams of a turn"""
         self._asked_s = self._heard_s = -math.inf
         self._by_itself, self._beam, self._way = True, 0, 1
         self._turns = 0
@@ -142,6 +144,11 @@ class Ping360(Instrument):
         self._ask(now_s)
         return found
 
+    def look_around(self, whole: bool) -> float:
+        if self._whole != (whole or self._sonar.is_ring):
+            self._whole, self._asked_s = not self._whole, -math.inf
+        return self._circle * self._sonar.step_us / 1e6
+
     def close(self) -> None:
         """Stop the motor, give the place back."""
         self.channel.write(frame(MOTOR_OFF))
@@ -152,10 +159,10 @@ class Ping360(Instrument):
         is_silent = now_s - max(self._heard_s, self._asked_s) > self._SILENT_S
         if is_silent and self._asked_s > -math.inf:
             self._by_itself, self._turns = not self._by_itself, self._turns + 1
-        if self._by_itself and is_silent:
+        if self._by_itself and (is_silent or self._asked_s == -math.inf):
             first, last = (self._gradian(beam) for beam in (self._sonar.n_ray - 1, 0))
-            if self._sonar.is_ring:
-                first, last = 0, 399
+            if self._whole:
+                first, last = first % self._step, 399
             self._send(AUTO_TRANSMIT, struct.pack("<HH", first, last) + bytes([self._step, 0]), now_s)
         elif not self._by_itself and (is_silent or self._heard_s >= self._asked_s):
             self._send(TRANSDUCER, struct.pack("<BB", 1, 0), now_s, self._gradian(self._beam))
@@ -202,20 +209,20 @@ class Ping360(Instrument):
         return SonarPing(now_s - listened_s, nearest, np.array([hit]), np.zeros(0), beam)
 
     def _beam_at(self, gradian: int) -> int | None:
-        """The beam that looks there; None for an angle between two, or beside all."""
+        """The beam that looks there; None for an angle between two, or beside all that are asked for."""
         off = (self._zero - gradian - math.degrees(self._sonar.first_beam_rad) / 0.9) % 400
         beam = off / self._step
         near = round(beam)
         if abs(beam - near) * self._step > 0.5:
             return None
-        near = near % self._sonar.n_ray if self._sonar.is_ring else near
-        return near if near < self._sonar.n_ray else None
+        near %= self._circle
+        return near if self._whole or near < self._sonar.n_ray else None
 
     def _next(self, beam: int) -> None:
         """Of a fan there and back, of a ring round and round."""
         last = self._sonar.n_ray - 1
-        if self._sonar.is_ring:
-            self._beam = (beam + 1) % (last + 1)
+        if self._whole:
+            self._beam = (beam + 1) % self._circle
             return
         self._way = -1 if beam >= last else 1 if beam <= 0 else self._way
         self._beam = beam + self._way
