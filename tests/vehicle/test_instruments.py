@@ -313,6 +313,23 @@ def test_a_head_scans_there_and_back_and_all_around_when_asked_to(own):
     fake.close()
 
 
+def test_a_head_that_misses_a_request_while_it_scans_is_asked_again():
+    fake, found = FakePing360("127.0.0.1", 0), []
+    channel = UdpChannel(InstrumentPlace("ping360", "127.0.0.1", fake.port), calls=True, longest=2048)
+    sonar = ping.Ping360(channel, SONAR, 200.0, 0.3, 1500.0)
+    sonar.look_around(True)
+    take, missed = fake._take, []
+    for number in range(1500):
+        if number == 400:
+            sonar.look_around(False)
+            fake._take = lambda *told: missed.append(told) if len(missed) < 3 else take(*told)
+        fake.step(0.02 * number, lambda _bearing: 3.0)
+        found += sonar.poll(0.02 * number)
+    assert len(missed) == 3 and {one.first_beam for one in found[-150:]} == set(range(SONAR.n_ray))
+    sonar.close()
+    fake.close()
+
+
 @pytest.mark.parametrize("own", [True, False])
 def test_a_head_that_was_off_is_asked_the_quicker_way_again(own):
     fake, found = FakePing360("127.0.0.1", 0, own=own), []

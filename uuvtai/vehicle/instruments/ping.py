@@ -104,6 +104,7 @@ class Ping360(Instrument):
     that does not is asked beam by beam (2601)."""
 
     _SILENT_S = 1.0  # without an answer it is asked anew, in turns in both ways
+    _MOST_ASTRAY = 20  # so many beams, and it is asked anew: while it scans, a request may be lost
 
     def __init__(
         self, channel: Channel, sonar_cfg: SonarConfig, zero_gradian: float, blind_m: float, sound_m_s: float
@@ -124,8 +125,8 @@ class Ping360(Instrument):
         """whether it turns all around; beams of a turn"""
         self._asked_s = self._heard_s = -math.inf
         self._by_itself, self._beam, self._way = True, 0, 1
-        self._turns = 0
-        """changes of the way of asking since it answered last"""
+        self._turns = self._astray = 0
+        """changes of the way of asking since it answered last; beams beside those asked for since then"""
         seconds = 2.0 * sonar_cfg.max_range_m / sound_m_s
         self._period = max(80, math.ceil(seconds / (MOST_SAMPLES * TICK_S)))
         self._samples = min(MOST_SAMPLES, math.ceil(seconds / (self._period * TICK_S)))
@@ -159,7 +160,8 @@ class Ping360(Instrument):
         is_silent = now_s - max(self._heard_s, self._asked_s) > self._SILENT_S
         if is_silent and self._asked_s > -math.inf:
             self._by_itself, self._turns = not self._by_itself, self._turns + 1
-        if self._by_itself and (is_silent or self._asked_s == -math.inf):
+        is_new = self._asked_s == -math.inf or self._astray >= self._MOST_ASTRAY
+        if self._by_itself and (is_silent or is_new):
             first, last = (self._gradian(beam) for beam in (self._sonar.n_ray - 1, 0))
             if self._whole:
                 first, last = first % self._step, 399
@@ -174,7 +176,7 @@ class Ping360(Instrument):
         pulse_us = min(max(round(8000.0 * self._sonar.max_range_m / self._sound), 5), 500)
         listening = struct.pack("<HHHH", pulse_us, self._period, 740, self._samples)
         if self.channel.write(frame(number, mode_gain + angle + listening + rest)):
-            self._asked_s = now_s
+            self._asked_s, self._astray = now_s, 0
 
     def _gradian(self, beam: int) -> int:
         """The device's angle of a beam."""
@@ -197,6 +199,7 @@ class Ping360(Instrument):
             return self.refuse("a profile shorter or coarser than was asked for: another program's request?")
         beam = self._beam_at(angle)
         if beam is None:
+            self._astray += 1
             return self.refuse("an angle between the beams")
         if not self._by_itself:
             self._next(beam)
