@@ -198,7 +198,7 @@ class Calibration:
                 f"the DVL tells {more} than the walls: its speed of sound, or the sizes of the tank"
             )
         else:
-            self.found = found
+            self.found, self.says = found, f"place {self._number} is known: nothing more to drive"
 
     def document(self, heading_rad: float | None) -> dict[str, Any]:
         """What was found (null: it was not) in SI units, as sections of a sensors file, and why not.
