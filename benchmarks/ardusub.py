@@ -20,7 +20,7 @@ import numpy as np
 from pymavlink import mavutil
 
 from benchmarks.common import Job, Row
-from benchmarks.instruments import SEED, ends_row, simulated
+from benchmarks.instruments import SEED, ends_row, in_the_loop
 from uuvtai.config import Config
 from uuvtai.config.loader import load_config
 from uuvtai.sim.behavior_tree import read_tree
@@ -37,6 +37,7 @@ BINARY = "UUV_ARDUSUB"
 RATE_HZ = 400
 ALT_HOLD, GUIDED = 2, 4
 PORT, SENSORS, OPERATOR = 29002, 24660, 24560
+_SCENE = {"world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6}
 PARAMETERS = Path(__file__).resolve().parent.parent / "examples/ardusub.parm"
 """beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm)"""
 
@@ -51,9 +52,7 @@ def measure(job: Job) -> list[Row]:
     alone = Sim(still, 1, tree)
     rows = _alone(alone, binary, job)
     rows.append(_three(Sim(still, 3, tree), binary, job))
-    pool = load_config(
-        "pool", "multibeam", "bluerov2_16v", overrides={"world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6}
-    )
+    pool = load_config("pool", "multibeam", "bluerov2_16v", overrides=_SCENE)
     count = 1 if job.quick else int(os.environ.get(f"{BINARY}_EPISODES", "20"))
     return rows + _driven(pool, Sim(pool, 1, tree), Sim(pool, 1, tree), count, binary, job)
 
@@ -316,7 +315,7 @@ def _driven(config: Config, sim: Sim, flown: Sim, count: int, binary: str, job: 
         except RuntimeError as error:
             found.append(f"failed: {error}")
             job.say(f"episode {number}: {error}")
-    ours = [simulated(sim, number) for number in range(count)]
+    ours = in_the_loop("multibeam", _SCENE, count)
     what = "pool (8, 6, 0.6), "
     return [
         ends_row(f"{what}driven by the stack through ArduSub", found),

@@ -20,26 +20,25 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 import numpy as np
-import torch
 import yaml
 
 from benchmarks.common import Job, Row
 from benchmarks.peers.stand_in_autopilot import RATE_HZ, StandIn
-from uuvtai.common.enums import LETTERS, OUTCOMES, RUNNING
+from uuvtai.api import evaluate
+from uuvtai.common.enums import LETTERS
 from uuvtai.common.statistics import bootstrap_interval, wilson_interval
 from uuvtai.config.loader import load_config
 from uuvtai.logs.run_folder import git_sha
-from uuvtai.sim.behavior_tree import read_tree
-from uuvtai.sim.sim import Sim
 from uuvtai.vehicle.calibrate import WAYS
 from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Instrument, InstrumentPlace, TcpChannel, UdpChannel
@@ -77,10 +76,15 @@ def _driven(setup: Setup, count: int, job: Job) -> list[Row]:
     what, known = f"{setup.kinds.replace(',', ' + ')}, D = {setup.dynamic}", json.loads(FLIGHTS.read_text())
     kept = known.setdefault(what, {"processes": "", "loop": "", "commits": []})
     ends, own = ([_WORDS[letter] for letter in kept[side] if not job.quick] for side in ("processes", "loop"))
+
+    def keep(side: str, found: list[str]) -> None:
+        if not job.quick:
+            kept[side] = "".join(_LETTERS[end] for end in found)
+            kept["commits"] = sorted({*kept["commits"], str(git_sha())})
+            FLIGHTS.write_text(json.dumps(known, indent=1) + "\n")
+
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(_PILOTS) as threads, ExitStack() as opened:
         folder, pilots = Path(name), SimpleQueue[Process]()
-        config = load_config("pool", str(setup.rig(folder)), "bluerov2_16v", overrides=list(setup.overrides))
-        sim = Sim(config, 1, read_tree("bt"))
         for _ in range(_PILOTS if len(ends) < count else 0):
             pilots.put(opened.enter_context(Process(folder)))
         for first in range(len(ends), count, MOST_AT_ONCE):
@@ -88,12 +92,10 @@ def _driven(setup: Setup, count: int, job: Job) -> list[Row]:
             with Process(folder) as process:
                 waters = Waters(process, setup, folder, first, some)
                 ends += threads.map(partial(flown, waters, pilots, job.say), range(some))
-            own += [simulated(sim, number) for number in range(first, first + some)]
-            if not job.quick:
-                for side, found in (("processes", ends), ("loop", own)):
-                    kept[side] = "".join(_LETTERS[end] for end in found)
-                kept["commits"] = sorted({*kept["commits"], str(git_sha())})
-                FLIGHTS.write_text(json.dumps(known, indent=1) + "\n")
+            keep("processes", ends)
+        if len(own) < count:
+            own = in_the_loop(str(setup.rig(folder)), setup.overrides, count)
+            keep("loop", own)
     off = [100.0 * ((one == "success") - (other == "success")) for one, other in zip(ends, own, strict=True)]
     low, high = bootstrap_interval(off) or (math.nan, math.nan)
     note = f"[{low:.1f}, {high:.1f}]; {off.count(100)} arrive so alone, {off.count(-100)} not"
@@ -118,14 +120,12 @@ def ends_row(what: str, found: list[str]) -> Row:
     )
 
 
-def simulated(sim: Sim, number: int) -> str:
-    """How the same episode ends where the stack drives by the simulator's own velocity loop."""
-    one, seeds, numbers = (torch.ones(sim.num_envs, dtype=torch.int32) for _ in range(3))
-    sim.sleep()
-    sim.reset(one, SEED * seeds, number * numbers)
-    while (outcome := int(sim.rows(sim.s.termination.outcome, [0])[0])) == RUNNING:
-        sim.step()
-    return OUTCOMES[outcome]
+def in_the_loop(sensors: str, overrides: Mapping[str, Any], count: int) -> list[str]:
+    """How the same episodes end in ``uuv eval``, by the simulator's own velocity loop."""
+    given: Any = {"sensors": sensors, "vehicle": "bluerov2_16v", "overrides": dict(overrides)}
+    with tempfile.TemporaryDirectory() as folder:
+        found = evaluate("bt", "pool", episodes=count, seeds=SEED, run_dir=Path(folder) / "loop", **given)
+    return [episode["outcome"] for episode in found.document["agents"][0]["episodes_detail"]]
 
 
 def _calibrations(count: int, job: Job) -> list[Row]:
@@ -272,7 +272,8 @@ class Link(AbstractContextManager["Link"]):
     def __init__(self, physics: int, pilot_port: int, pilot: Process) -> None:
         """``physics``, ``pilot_port``: UDP ports on this computer."""
         self.autopilot, self.pilot = StandIn(("127.0.0.1", pilot_port)), pilot
-        self._to, self._port = ("127.0.0.1", physics), f":{pilot_port:04X}"
+        self._to = "127.0.0.1", physics
+        self._queued = re.compile(rf":{pilot_port:04X} \S+ \w+ \w+:(\w+)")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(600.0)
         self.hurried = 0
@@ -292,8 +293,7 @@ class Link(AbstractContextManager["Link"]):
 
     def _waits(self) -> bool:
         """Whether something is in the queue of the pilot's port."""
-        rows = (line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:])
-        return any(row[1].endswith(self._port) and int(row[4].partition(":")[2], 16) for row in rows)
+        return any(int(waits, 16) for waits in self._queued.findall(Path("/proc/net/udp").read_text()))
 
     def __exit__(self, *_: object) -> None:
         self._socket.close()
@@ -322,7 +322,7 @@ class Setup:
     yaw_deg: float = 0.0
     range_m: float = 12.0
     """of the sonar: from anywhere in the pool an end wall is in view"""
-    changes: tuple[str, ...] = ()
+    changes: Mapping[str, Any] = field(default_factory=dict)
 
     def rig(self, folder: Path) -> Path:
         """Its file for ``--sensors``."""
@@ -336,11 +336,11 @@ class Setup:
         return [kind for kind in self.kinds.split(",") if kind in KINDS]
 
     @property
-    def overrides(self) -> list[str]:
-        """Of the config, as ``--set`` takes them."""
+    def overrides(self) -> dict[str, Any]:
+        """Of the config."""
         scene = {"n_static": self.static, "n_dynamic": self.dynamic, "dynamic_speed_m_s": 0.6}
-        long = f"episode.horizon_steps={_HORIZON}"
-        return [*(f"world.{name}={value}" for name, value in scene.items()), long, *self.changes]
+        long = {"episode.horizon_steps": _HORIZON}
+        return {f"world.{name}": value for name, value in scene.items()} | long | dict(self.changes)
 
 
 class Waters:
@@ -351,7 +351,7 @@ class Waters:
     ) -> None:
         self.setup, self.folder, self.rig, self._ports = setup, folder, setup.rig(folder), PORTS | ports
         words = ["sitl", "--world", "pool", "--sensors", str(self.rig), "--vehicle", "bluerov2_16v"]
-        words += [f"--set={text}" for text in setup.overrides]
+        words += [f"--set={name}={value}" for name, value in setup.overrides.items()]
         words += ["--seed", str(SEED), "--episode", str(first), "--instances", str(count)]
         words += ["--as", ",".join(f"{kind}:{self._ports[kind]}" for kind in setup.emulated), "--json"]
         words += [
@@ -418,8 +418,8 @@ def _flown(waters: Waters, pilot: Process, say: Callable[[str], None], number: i
 
 # ---- A vehicle that is driven by hand where ``uuv pilot --calibrate`` says.
 
-_BY_THE_WALL = ("world.spawn_x_m=[15.6,17.0]", "world.spawn_y_m=[2,4]", "world.start_goal_gap_m=0.5",
-                "episode.horizon_steps=30000")  # fmt: skip
+_BY_THE_WALL = {"world.spawn_x_m": [15.6, 17.0], "world.spawn_y_m": [2, 4], "world.start_goal_gap_m": 0.5,
+                "episode.horizon_steps": 30000}  # fmt: skip
 _OFF, _HEADING_DEG, _SPEED_M_S, _TURN_RAD_S = (0.2, -0.2), 6.0, 0.35, 0.25
 """errors of what is typed [m], [deg]; how the operator drives and turns"""
 _SAYS_DRIVE = re.compile(r"drive (\d) m ([a-z ]+) by hand")

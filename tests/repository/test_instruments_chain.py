@@ -8,7 +8,7 @@ import pytest
 from benchmarks.instruments import PORTS, Process, Setup, Waters, flown
 from tests.mavlink_vehicle import free_port
 
-PLACES = ("world.spawn_x_m=[2,6]", "world.start_goal_gap_m=3.0")
+PLACES = {"world.spawn_x_m": [2, 6], "world.start_goal_gap_m": 3.0}
 
 
 class UsualSteps(Setup):
