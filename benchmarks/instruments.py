@@ -111,13 +111,9 @@ def ends_row(what: str, found: list[str]) -> Row:
     count, ends = len(found), Counter(found)
     low, high = wilson_interval(ends["success"], count) or (0.0, 1.0)
     others = ", ".join(f"{end} {n}" for end, n in sorted(ends.items()) if end != "success") or "none"
-    return Row(
-        what,
-        100.0 * ends["success"] / count,
-        "% of the episodes a success",
-        note=f"{ends['success']} of {count} [{100 * low:.1f}, {100 * high:.1f}]; others: {others}",
-        details={"endings": found, "seed": SEED},
-    )
+    note = f"{ends['success']} of {count} [{100 * low:.1f}, {100 * high:.1f}]; others: {others}"
+    share, details = 100.0 * ends["success"] / count, {"endings": found, "seed": SEED}
+    return Row(what, share, "% of the episodes a success", note=note, details=details)
 
 
 def in_the_loop(sensors: str, overrides: Mapping[str, Any], count: int) -> list[str]:
@@ -308,6 +304,9 @@ sensors:
   localization: estimated
   sonar: {{max_range_m: {range_m}, step_overhead_s: 0.03, doppler: false}}  # a step of a Ping360 as recorded
   dvl: {{yaw_deg: {yaw_deg}, sigma_m_s: 0.005, period_steps: 6}}
+camera_tracking: {{use_camera: {images}}}
+height: {{use_camera: {images}}}
+mapping: {{depth_hit: {depth_hit}}}
 """
 
 
@@ -327,7 +326,8 @@ class Setup:
     def rig(self, folder: Path) -> Path:
         """Its file for ``--sensors``."""
         path, preset = folder / "rig.yaml", self.kinds.partition(",")[2]
-        path.write_text(_RIG.format(preset=preset, yaw_deg=self.yaw_deg, range_m=self.range_m))
+        images = preset == "3d15"  # no other camera is emulated
+        path.write_text(_RIG.format(**vars(self), preset=preset, images=images, depth_hit=0.1 * images))
         return path
 
     @property

@@ -28,14 +28,17 @@ class Fix(SimpleNamespace):
         pass
 
 
-@pytest.mark.parametrize("look_s", [0.0, 2.0])
-def test_until_the_start_is_known_it_only_turns(tmp_path, look_s):
+@pytest.mark.parametrize("sees_around", [True, False])
+def test_until_the_start_is_known_it_only_turns(tmp_path, sees_around):
     flight = Flight(tmp_path)
     flight.loop._fix = Fix(result=None, waits_for="no wall is seen", first_s=0.0)
-    flight.loop._look_s = look_s
-    flight.run(4 + look_s)
+    flight.loop._sees_around = sees_around
+    flight.run(4)
     assert flight.sub.moved_by() == [] and flight.loop.last.action.name == "HOLD"
     flight.run(6)
+    if sees_around:
+        assert flight.sub.moved_by() == [] and flight.loop.last.action.name == "HOLD"
+        return flight.close()
     told = [m for m in flight.sub.told if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
     assert told and {(m.vx, m.vy, m.vz) for m in told} == {(0.0, 0.0, 0.0)}
     assert told[-1].yaw_rate == pytest.approx(-0.3)

@@ -164,8 +164,7 @@ FEEDBACK_AGE_S = 0.5  # a velocity that is older is not fed back to the sticks
 _LEAST_ASKED_M_S, _ANSWER = 0.15, 0.2
 """a vehicle that is asked for so much, and has less than this share of it, does not answer"""
 _REST_S, _LOOK_RAD_S = 5.0, 0.3
-"""where the walls seen at rest, once all around by a head that turns, do not tell the start for so long, the
-vehicle turns on the spot"""
+"""where the walls that are seen at rest do not tell the start for so long, the vehicle turns on the spot"""
 _UNKNOWN = (math.nan, math.nan, math.nan)
 _REACHED, _INTERRUPTED, _CALIBRATED = "goal reached", "interrupted", "calibrated"
 _T = TypeVar("_T")
@@ -234,8 +233,8 @@ class OnboardLoop:
         self.last = safety.SafeDecision(safety.SafeAction.HOLD, safety.STOP, ("nothing was decided yet",))
         self._is_leaving, self._told = False, ""
         self._fix, self._start, self._walls = fix, StartFound(), WallWatch(config) if fix else None
-        self._look_s = self._rig.look_around(fix is not None or plan.purpose == "calibrate")
-        """of a turn of a sonar's head, by which the start is sought"""
+        self._sees_around = self._rig.look_around(fix is not None or plan.purpose == "calibrate")
+        """whether the start is sought by a sonar's head that turns all around"""
         self._sought, self._check = fix, None
         """who seeks the start, also when it is found; what a check gathers"""
         if plan.purpose == "check":
@@ -448,8 +447,8 @@ class OnboardLoop:
         if stalled_s > safety.STALL_S:
             self._stalls.append((now_s, stalled_s))
         is_fresh = now_s - heard.vel_b_s <= limits.sensor_s["dvl"]
-        rested = self._fix is not None and now_s - self._fix.first_s >= _REST_S + self._look_s
-        looks_around = rested and self._plan.arms
+        rests = self._fix is None or self._sees_around or now_s - self._fix.first_s < _REST_S
+        looks_around = not rests and self._plan.arms
         return safety.VehicleView(
             now_s=now_s,
             wanted=(0.0, 0.0, 0.0, _LOOK_RAD_S) if looks_around else (surge, sway, heave, turn),

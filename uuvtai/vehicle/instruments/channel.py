@@ -234,9 +234,9 @@ class Instrument(ABC):
     def poll(self, now_s: float) -> list[SensorMessage]:
         """What has come, in body axes about the instrument's own place; ``now_s`` by the pilot's clock."""
 
-    def look_around(self, whole: bool) -> float:
-        """See all around, or again what is configured: [s] of a turn, 0 where nothing turns by itself."""
-        return 0.0
+    def look_around(self, whole: bool) -> bool:
+        """See all around, or again what is configured; False where nothing turns by itself."""
+        return False
 
     def close(self) -> None:
         """Give the place back."""

@@ -145,10 +145,10 @@ class Ping360(Instrument):
         self._ask(now_s)
         return found
 
-    def look_around(self, whole: bool) -> float:
+    def look_around(self, whole: bool) -> bool:
         if self._whole != (whole or self._sonar.is_ring):
             self._whole, self._asked_s = not self._whole, -math.inf
-        return self._circle * self._sonar.step_us / 1e6
+        return True
 
     def close(self) -> None:
         """Stop the motor, give the place back."""

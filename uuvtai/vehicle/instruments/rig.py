@@ -69,9 +69,10 @@ class Rig(AbstractContextManager["Rig"]):
                     moved = np.cross(rate_b, self._lever)
                     yield instrument, dataclasses.replace(message, vel_b=message.vel_b - moved)
 
-    def look_around(self, whole: bool) -> float:
-        """As ``Instrument.look_around``, of the slowest one."""
-        return max((one.look_around(whole) for one, _ in self._sources.values()), default=0.0)
+    def look_around(self, whole: bool) -> bool:
+        """As ``Instrument.look_around``, of any of them."""
+        answers = [one.look_around(whole) for one, _ in self._sources.values()]
+        return any(answers)
 
     def forget_clocks(self) -> None:
         """Date what comes anew: our clock has run on without those of the instruments."""
