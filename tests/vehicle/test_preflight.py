@@ -281,6 +281,17 @@ def heard_itself(check, lost=0.0, echo=echo, minimum_m=0.3, mute=(), seconds=6.0
     return rows, one.loop.document()
 
 
+def test_the_free_run_of_a_check_begins_once_the_start_is_found(check):
+    preflight = check().loop._check
+    for now_s, steps in ((4.0, 0), (6.0, 1), (7.0, 2)):
+        preflight.stepped(now_s, 30.0, ("sonar: 2 s old",), ("sonar lost",))
+        assert preflight._steps == preflight._undecided == steps
+    preflight.begun(20.0)
+    for now_s, steps in ((20.5, 0), (21.5, 1)):
+        preflight.stepped(now_s, 30.0, (), ())
+        assert preflight._steps == steps and preflight._undecided == 0
+
+
 def test_instruments_that_are_well_may_drive(check):
     rows, found = heard_itself(check, seconds=14.0)
     assert found["check"]["ready"], rows

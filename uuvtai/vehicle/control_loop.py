@@ -447,8 +447,8 @@ class OnboardLoop:
         if stalled_s > safety.STALL_S:
             self._stalls.append((now_s, stalled_s))
         is_fresh = now_s - heard.vel_b_s <= limits.sensor_s["dvl"]
-        rests = self._fix is None or self._sees_around or now_s - self._fix.first_s < _REST_S
-        looks_around = not rests and self._plan.arms
+        turns = self._plan.arms and not self._sees_around
+        looks_around = self._fix is not None and turns and now_s - self._fix.first_s >= _REST_S
         return safety.VehicleView(
             now_s=now_s,
             wanted=(0.0, 0.0, 0.0, _LOOK_RAD_S) if looks_around else (surge, sway, heave, turn),

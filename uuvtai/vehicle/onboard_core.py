@@ -159,4 +159,4 @@ def _is_seen(ping: SonarPing, numbers: PilotNumbers) -> bool:
         )
     if not numbers.mechanical and ping.first_beam != 0:
         raise ValueError("sonar: first_beam is for a mechanical beam (sensors.sonar.mechanical)")
-    return is_ring or ping.first_beam + n <= numbers.beams
+    return not numbers.mechanical or is_ring or ping.first_beam + n <= numbers.beams

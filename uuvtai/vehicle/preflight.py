@@ -135,8 +135,8 @@ class Preflight:
         self._speeds: deque[float] = deque(maxlen=_KEPT)
         self._beams, self._echoes, self._near, self._looked = 0, 0, 0, set[int]()
         self._steps, self._undecided, self._held, self._broken = 0, 0, Counter[str](), Counter[str]()
-        self._from_s = _WARM_S
-        """they count from then on"""
+        self._from_s = 0.0
+        """they count from then on, and not while it warms up"""
         self._now: Collection[str] = ()
         """rules that are broken in the last step"""
 
@@ -202,7 +202,7 @@ class Preflight:
     def begun(self, now_s: float) -> None:
         """The walls have told the start: the stack runs freely from now on, and the heading that they have
         corrected is no motion."""
-        self._imu, self._from_s = None, max(self._from_s, now_s + 1.0)
+        self._imu, self._from_s = None, now_s + 1.0
         self._steps, self._undecided, self._held, self._broken = 0, 0, Counter(), Counter()
 
     def _feel(self, imu: ImuReading) -> None:
@@ -223,7 +223,7 @@ class Preflight:
     def stepped(self, now_s: float, most_s: float, held: Collection[str], broken: Collection[str]) -> None:
         """A step of a check of ``most_s``: why the stack held, and the rules that are broken."""
         self._now = broken
-        if now_s < min(self._from_s, 0.5 * most_s):
+        if now_s < max(self._from_s, min(_WARM_S, 0.5 * most_s)):
             return
         self._steps += 1
         self._held.update(reason.partition(":")[0] for reason in held)

@@ -1,6 +1,7 @@
 """A vehicle with one mechanical beam: what it does, logs and decides again from its log."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +17,10 @@ from uuvtai.logs.encode import EpisodeHeader, Moment
 from uuvtai.logs.topics.sensors import SONAR_ROWS
 from uuvtai.logs.video import FrameArtist
 from uuvtai.logs.writer import EpisodeRecorder
-from uuvtai.vehicle.onboard import Mission, OnboardPilot, SonarPing
+from uuvtai.sim.behavior_tree import read_tree
+from uuvtai.vehicle.messages import Inbox
+from uuvtai.vehicle.onboard import Mission, OnboardPilot, SonarPing, numbers_of
+from uuvtai.vehicle.onboard_core import FedPilot, _shapes
 from uuvtai.vehicle.replay import replay
 
 STEPS, SEED, EPISODE = 200, 77001, 3
@@ -118,3 +122,11 @@ def test_a_pilot_refuses_beams_that_the_sonar_does_not_have(alone, monkeypatch, 
     for beam in (63, 64, 199):  # the last two lie beside the fan
         pilot.feed(SonarPing(0.0, np.ones(1), np.ones(1), np.zeros(0), beam))
     assert pilot.tallies["sonar"].fed == fed + 1 and pilot.tallies["sonar"].bad == 0
+
+
+@pytest.mark.parametrize("mechanical", [True, False])
+def test_a_scan_of_too_many_beams_is_refused(mechanical):
+    numbers = replace(numbers_of(CONFIG, read_tree("bt")), mechanical=mechanical)
+    pilot = SimpleNamespace(numbers=numbers, _inbox=Inbox(_shapes(numbers)))
+    with pytest.raises(ValueError, match="sonar"):
+        FedPilot.feed(pilot, SonarPing(0.0, np.ones(65), np.ones(65), np.zeros(0)))

@@ -222,7 +222,7 @@ class Ping360(Instrument):
         return near if self._whole or near < self._sonar.n_ray else None
 
     def _next(self, beam: int) -> None:
-        """Of a fan there and back, of a ring round and round."""
+        """Of a fan there and back, else round and round."""
         last = self._sonar.n_ray - 1
         if self._whole:
             self._beam = (beam + 1) % self._circle
