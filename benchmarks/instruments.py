@@ -1,6 +1,6 @@
 """Instruments by their own protocols (pool, S = 8, D = 6 and 0, v = 0.6 m/s): CPU of the adapters; ``uuv sitl
---as``, ``uuv pilot --rate 0`` that hears an A50 and a Ping360, a 3D-15 or a ring as MAVLink tells it, and
-between them the autopilot of a hundred lines, every part a process of its own. Beside it the same episodes in
+--as``, ``uuv pilot --rate 0`` that hears an A50 and a Ping360, a 3D-15 or a ring as JSON, and between them
+the stand-in autopilot, every part a process of its own. Beside it the same episodes in
 ``uuv eval``'s loop.
 
 All of them go by the water's clock: the autopilot waits for the water's answer and for the pilot, so a busy
@@ -33,7 +33,6 @@ import numpy as np
 import yaml
 
 from benchmarks.common import Job, Row
-from benchmarks.peers.stand_in_autopilot import RATE_HZ, StandIn
 from uuvtai.api import evaluate
 from uuvtai.common.enums import LETTERS
 from uuvtai.common.statistics import bootstrap_interval, wilson_interval
@@ -42,14 +41,15 @@ from uuvtai.logs.run_folder import git_sha
 from uuvtai.vehicle.calibrate import WAYS
 from uuvtai.vehicle.instruments.a50 import A50
 from uuvtai.vehicle.instruments.channel import Instrument, InstrumentPlace, TcpChannel, UdpChannel
-from uuvtai.vehicle.instruments.emulate import KINDS, FakeA50, FakePing360, FakeSonar3D, emulated
+from uuvtai.vehicle.instruments.emulate import FakeA50, FakePing360, FakeSonar3D, emulated
 from uuvtai.vehicle.instruments.ping import Ping360
 from uuvtai.vehicle.instruments.rig import JsonUdp
 from uuvtai.vehicle.instruments.rip2 import LONGEST, Sonar3D
+from uuvtai.vehicle.stand_in import LOOP_HZ, RATE_HZ, StandIn
 
 THREADS = 1
 LONGEST_S = 86400
-SETS = ("a50,ping360", "a50,3d15", "a50,nominal")
+SETS = ("a50,ping360", "a50,3d15", "a50,json")  # the last: a ring
 EPISODES, CALIBRATIONS, SEED = 600, 20, 90011
 FLIGHTS = Path(__file__).with_name("flights.json")
 _LETTERS = LETTERS | {"not ended": "-"}
@@ -265,9 +265,9 @@ class Process(AbstractContextManager["Process"]):
 class Link(AbstractContextManager["Link"]):
     """The autopilot between one instance of the water and one pilot."""
 
-    def __init__(self, physics: int, pilot_port: int, pilot: Process) -> None:
-        """``physics``, ``pilot_port``: UDP ports on this computer."""
-        self.autopilot, self.pilot = StandIn(("127.0.0.1", pilot_port)), pilot
+    def __init__(self, physics: int, pilot_port: int, pilot: Process, system: int) -> None:
+        """``physics``, ``pilot_port``: UDP ports on this computer; ``system``: the vehicle's id."""
+        self.autopilot, self.pilot = StandIn(("127.0.0.1", pilot_port), system), pilot
         self._to = "127.0.0.1", physics
         self._queued = re.compile(rf":{pilot_port:04X} \S+ \w+ \w+:(\w+)")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -277,7 +277,7 @@ class Link(AbstractContextManager["Link"]):
 
     def advance(self) -> None:
         """A control step of the water, once the pilot has heard the last one."""
-        for _ in range(RATE_HZ // 50):
+        for _ in range(RATE_HZ // LOOP_HZ):
             self._socket.sendto(self.autopilot.frame(), self._to)
             self.autopilot.take(self._socket.recv(65536))
         end_s = time.monotonic() + _PATIENCE_S
@@ -297,7 +297,14 @@ class Link(AbstractContextManager["Link"]):
 
 
 MOST_AT_ONCE = 20  # pilots of one water
-PORTS = {"physics": 21002, "pilot": 23000, "a50": 16171, "ping360": 9092, "3d15": 4747}  # counted on by ten
+PORTS = {
+    "physics": 21002,
+    "pilot": 23000,
+    "a50": 16171,
+    "ping360": 9092,
+    "3d15": 4747,
+    "json": 14700,
+}  # counted on by ten
 _HORIZON = 6000  # twice the usual: the pilot first turns until the walls have told where it is
 _RIG = """extends: {preset}
 sensors:
@@ -315,7 +322,7 @@ class Setup:
     """A scene with a rig."""
 
     kinds: str = "a50,ping360"
-    """a DVL, and a preset of a sonar: what ``--as`` can be is, the rest is told by MAVLink"""
+    """a DVL and a sonar, as for ``--as``"""
     dynamic: int = 0
     static: int = 8
     yaw_deg: float = 0.0
@@ -325,15 +332,10 @@ class Setup:
 
     def rig(self, folder: Path) -> Path:
         """Its file for ``--sensors``."""
-        path, preset = folder / "rig.yaml", self.kinds.partition(",")[2]
-        images = preset == "3d15"  # no other camera is emulated
+        path, kind = folder / "rig.yaml", self.kinds.partition(",")[2]
+        preset, images = "nominal" if kind == "json" else kind, kind == "3d15"  # no other camera is emulated
         path.write_text(_RIG.format(**vars(self), preset=preset, images=images, depth_hit=0.1 * images))
         return path
-
-    @property
-    def emulated(self) -> list[str]:
-        """What ``--as`` names."""
-        return [kind for kind in self.kinds.split(",") if kind in KINDS]
 
     @property
     def overrides(self) -> dict[str, Any]:
@@ -352,8 +354,12 @@ class Waters:
         self.setup, self.folder, self.rig, self._ports = setup, folder, setup.rig(folder), PORTS | ports
         words = ["sitl", "--world", "pool", "--sensors", str(self.rig), "--vehicle", "bluerov2_16v"]
         words += [f"--set={name}={value}" for name, value in setup.overrides.items()]
-        words += ["--seed", str(SEED), "--episode", str(first), "--instances", str(count)]
-        words += ["--as", ",".join(f"{kind}:{self._ports[kind]}" for kind in setup.emulated), "--json"]
+        words += ["--seed", str(SEED), "--episode", str(first), "--instances", str(count), "--operator"]
+        words += [
+            "--as",
+            ",".join(f"{kind}:{self._ports[kind]}" for kind in setup.kinds.split(",")),
+            "--json",
+        ]
         words += [
             "--port",
             str(self._ports["physics"]),
@@ -368,19 +374,21 @@ class Waters:
     def pilot(self, process: Process, number: int, *more: str) -> None:
         """``uuv pilot`` for an instance, until it listens."""
         ports = {name: port + 10 * number for name, port in self._ports.items()}
-        instruments = [f"{kind}:127.0.0.1:{ports[kind]}" for kind in self.setup.emulated]
+        instruments = [f"{kind}:127.0.0.1:{ports[kind]}" for kind in self.setup.kinds.split(",")]
         start, goal = self.places[number]
         words = ["pilot", "--mavlink", f"udp:127.0.0.1:{ports['pilot']}", "--rate", "0", "--world", "pool"]
         words += ["--sensors", str(self.rig), "--vehicle", "bluerov2_16v"]
         words += [word for pair in zip(("--dvl", "--sonar"), instruments, strict=False) for word in pair]
         words += ["--start", start, "--goal", goal, "--heading", "0", "--battery", "0", "--json"]
+        words += ["--system", str(number + 1)]
         words += ["--log", str(self.folder / f"pilot{number}.mcap"), "--force", *more]
         process.begin(words)
         process.until(re.compile("listens at"))
 
     def link(self, number: int, pilot: Process) -> Link:
         """The autopilot of an instance."""
-        return Link(self._ports["physics"] + 10 * number, self._ports["pilot"] + 10 * number, pilot)
+        physics, pilot_port = (self._ports[name] + 10 * number for name in ("physics", "pilot"))
+        return Link(physics, pilot_port, pilot, number + 1)
 
     def ended(self, number: int) -> str:
         """How an instance's episode ended; '' = it has not."""
@@ -401,7 +409,7 @@ def flown(waters: Waters, pilots: SimpleQueue[Process], say: Callable[[str], Non
 
 
 def _flown(waters: Waters, pilot: Process, say: Callable[[str], None], number: int) -> str:
-    waters.pilot(pilot, number, "--arm", "--depth", "0.05,1.55", "--max-speed", "1")
+    waters.pilot(pilot, number, "--arm", "--max-speed", "1")
     with waters.link(number, pilot) as link:
         left_s = _LONGEST_EPISODE_S
         while not (end := waters.ended(number)) and link.autopilot.time_s < left_s:
@@ -441,12 +449,12 @@ def calibrated(
             last = pilot.lines[-1] if pilot.lines else ""
             if last != told and (said := _SAYS_DRIVE.search(last)):
                 angle = WAYS.index(said[2]) * math.tau / len(WAYS)
-                way = _SPEED_M_S * np.array([math.cos(angle), -math.sin(angle), 0.0, 0.0])
+                way = _SPEED_M_S * np.array([0.0, math.cos(angle), -math.sin(angle), 0.0])
                 left_m = int(said[1]) + 0.2
             told = last
             turns = _TURN_RAD_S if "turn the vehicle" in told else 0.0
             link.autopilot.is_armed = True
-            link.autopilot.by_hand = way if left_m > 0 else np.array([0.0, 0.0, 0.0, turns])
+            link.autopilot.by_hand = way if left_m > 0 else np.array([turns, 0.0, 0.0, 0.0])
             left_m -= _SPEED_M_S / 50
             link.advance()
         say(f"{number}: {link.autopilot.time_s:.0f} s, {link.hurried} hurried; {pilot.lines[-1:]}")

@@ -4,13 +4,11 @@ while something is missing."""
 
 import dataclasses
 import math
-import socket
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks.peers.stand_in_autopilot import StandIn
 from tests.mavlink_vehicle import FakeSub, WishfulPilot, link_config
 from uuvtai.vehicle.control_loop import DEAF_S, FlightNotes, FlightPlan, OnboardLoop
 from uuvtai.vehicle.mavlink import SILENT_S, Endpoint, FollowedEndpoint, LinkError, LinkPlace
@@ -18,6 +16,7 @@ from uuvtai.vehicle.onboard import ImuReading, Mission, PositionFix
 from uuvtai.vehicle.pilot_log import LinkLog
 from uuvtai.vehicle.safety import STOP, SafeAction, SafeDecision, SafetyLimits
 from uuvtai.vehicle.sitl import Instance, ServingNotes, SimulatedOperator, SitlPlan, SitlPort, WaterRows
+from uuvtai.vehicle.stand_in import StandIn
 from uuvtai.vehicle.telemetry import Heard, Intake
 
 HERE = LinkPlace("127.0.0.1", 0, False)
@@ -184,13 +183,9 @@ class Three:
         with Endpoint(HERE) as free:
             number = free.port
         places = (LinkPlace("127.0.0.1", self.endpoint.port, True),)
-        plan = SitlPlan(port=number, places=places, operator=operator)
+        own = {"autopilot": self.endpoint.port}
+        plan = SitlPlan(port=number, places=places, operator=operator, emulated=own)
         self.port = SitlPort(plan, Instance(config, self.water, ROW), 0)
-        self.autopilot = StandIn(("127.0.0.1", self.endpoint.port), operates=False)
-        self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.wire.bind(("127.0.0.1", 0))
-        self.wire.settimeout(5)
-        self.physics = ("127.0.0.1", number)
         self.water.begin(ROW)
         self.start = tuple(self.water.value("mission.start_w", ROW).tolist())
         self.goal = (self.start[0] + 2.5, self.start[1] + 0.6, self.start[2] - 0.1)
@@ -208,16 +203,12 @@ class Three:
         """A frame of the autopilot's; by our clock it takes twice as long as by its own."""
         self.wall.now_s += 0.01
         self.now_s += 1.0
-        self.wire.sendto(self.autopilot.frame(), self.physics)
-        self.port.serve(self.now_s)
-        self.autopilot.take(self.wire.recv(4096))
+        self.port.drive(self.now_s)
 
     def close(self):
         self.log.close()
         self.endpoint.close()
         self.port.close()
-        self.autopilot.close()
-        self.wire.close()
 
 
 @pytest.fixture
@@ -269,8 +260,8 @@ def test_water_that_begins_anew_under_a_vehicle_on_its_way_is_noticed(three):
     found = one.loop.document()
     assert not found["reached"] and not found["safe"] and "position jumped" in found["ended"], one.said
     assert found["mode"] == "ALT_HOLD" and one.port.instance.joined_late
-    one.autopilot.close()
-    one.autopilot = StandIn(("127.0.0.1", one.endpoint.port), operates=False)
+    one.port.autopilot.close()
+    one.port.autopilot = StandIn(("127.0.0.1", one.endpoint.port))
     begin_anew()
     assert not one.port.instance.joined_late, "ArduSub has begun anew too"
 

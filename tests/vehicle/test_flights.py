@@ -1,15 +1,16 @@
 """Flights with faults: no order beyond limits, none while held or by old data, the operator obeyed."""
 
+import dataclasses
 import random
 from types import SimpleNamespace
 
 import pytest
 
 from tests.flights import DT, moves, orders, violations
-from tests.mavlink_vehicle import Flight, link_config, plan_of
+from tests.mavlink_vehicle import LIMITS, Flight, link_config, plan_of
 from uuvtai.logs.reader import read_messages
 from uuvtai.vehicle import control_loop
-from uuvtai.vehicle.control_loop import OnboardLoop
+from uuvtai.vehicle.control_loop import OnboardLoop, fenced
 from uuvtai.vehicle.instruments.rig import Rig
 
 FOUND = (1125,)
@@ -27,6 +28,9 @@ class Fix(SimpleNamespace):
     def feed(self, message):
         pass
 
+    def way_round(self):
+        return -1.0
+
 
 @pytest.mark.parametrize("sees_around", [True, False])
 def test_until_the_start_is_known_it_only_turns(tmp_path, sees_around):
@@ -41,8 +45,14 @@ def test_until_the_start_is_known_it_only_turns(tmp_path, sees_around):
         return flight.close()
     told = [m for m in flight.sub.told if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
     assert told and {(m.vx, m.vy, m.vz) for m in told} == {(0.0, 0.0, 0.0)}
-    assert told[-1].yaw_rate == pytest.approx(-0.3)
+    assert told[-1].yaw_rate == pytest.approx(0.5), "clockwise is positive for ArduSub"
     flight.close()
+
+
+@pytest.mark.parametrize(("depth_m", "gap_m"), [((0.2, 1.4), 0.25), ((0.05, 1.55), 0.25), ((0.4, 1.3), 0.35)])
+def test_the_stack_plans_within_the_fence(depth_m, gap_m):
+    found = fenced(link_config(), dataclasses.replace(LIMITS, depth_m=depth_m))
+    assert found.behavior.edge_gap_m == pytest.approx(gap_m)
 
 
 class Clock:

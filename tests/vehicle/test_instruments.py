@@ -730,6 +730,25 @@ def test_a_sitl_3d15_shows_what_its_camera_sees():
     assert seen[0, -1] == FAN.sensors.depth.max_range_m
 
 
+def test_a_sitl_ring_is_told_as_json():
+    config, port = load_config("pool", "nominal", overrides={"sensors.sonar.doppler": False}), free_port()
+    n_ray = config.sensors.sonar.n_ray
+    seen = {
+        "scan.fresh": 1,
+        "scan.range_m": np.linspace(1.0, 5.0, n_ray + 8),
+        "scan.hit": np.arange(n_ray + 8) % 3,
+    }
+    with Rig(config, {"sonar": f"json:127.0.0.1:{port}"}) as rig:
+        fake = FakeRig(config, {"json": port - 20, "autopilot": 1}, "127.0.0.1", 2)
+        assert fake.speaks == {"sonar"}
+        fake.step(0.0, 1.0, seen.__getitem__)
+        fake.step(0.02, 1.0, (seen | {"scan.fresh": 0}).__getitem__)
+        ((_, scan),) = rig.poll(0.5, np.zeros(3))
+        fake.close()
+    assert np.allclose(scan.range_m, seen["scan.range_m"][:n_ray], atol=1e-3)
+    assert (scan.hit == (seen["scan.hit"][:n_ray] > 0)).all() and scan.time_s == 0.5
+
+
 def test_an_instrument_that_cannot_be_had_is_refused_in_a_line():
     config = load_config("pool", "ping360")
     ports = {"a50": free_port(), "ping360": free_port()}

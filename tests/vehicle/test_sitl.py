@@ -1,5 +1,6 @@
 """Our water behind ArduSub's JSON interface: bytes, lockstep, restarts, axes, sensors the pilot knows."""
 
+import dataclasses
 import json
 import math
 import re
@@ -16,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from scipy.spatial.transform import Rotation
 
 from tests.command import uuv
-from tests.mavlink_vehicle import START, free_port, link_config
+from tests.mavlink_vehicle import LIMITS, START, free_port, link_config
 from tests.oracles.actuation import thrust_of_rpm
 from uuvtai.common import signals
 from uuvtai.common.errors import SettingError
@@ -25,10 +26,20 @@ from uuvtai.config.loader import load_config
 from uuvtai.kernels.vehicle import dynamics
 from uuvtai.sim.setup import allocation_matrices
 from uuvtai.vehicle import sitl
-from uuvtai.vehicle.mavlink import LinkError, LinkPlace, MavCodec
+from uuvtai.vehicle.mavlink import (
+    ALT_HOLD,
+    GUIDED,
+    LinkError,
+    LinkPlace,
+    MavCodec,
+    arm,
+    set_mode,
+    set_velocity,
+)
 from uuvtai.vehicle.onboard import DvlReading, SonarPing
 from uuvtai.vehicle.sitl import Instance, SitlPlan, SitlPort, WaterRows, frame_of, turn_of
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
+from uuvtai.vehicle.stand_in import StandIn
 from uuvtai.vehicle.telemetry import Intake, Motors
 
 NEUTRAL = (1500,) * 16
@@ -586,6 +597,53 @@ def test_the_command_serves_and_tells(capfd, monkeypatch, small, words):
         assert json.loads(out)["instances"][0]["outcome"] == "waiting"
     else:
         assert "waiting" in out
+
+
+def test_an_autopilot_of_ours_stands_in(capfd, monkeypatch, small):
+    monkeypatch.setattr(sitl, "Sim", lambda config, rows, tree: small.sim)
+    stranger, number = client(), free_port()
+    stranger.sendto(packet(0, TURNING), ("127.0.0.1", number))
+    heard = client()
+    pilot = heard.getsockname()[1]
+    words = ["--port", str(number), "--seconds", "0.5", "--operator", "--as", f"autopilot:{pilot}", "--json"]
+    code, out, err = uuv(capfd, "sitl", *words)
+    assert code == 0 and "a small autopilot drives" in err
+    assert f"--heading 0 --mavlink udp:127.0.0.1:{pilot} --system 1\n" in err
+    (found,) = json.loads(out)["instances"]
+    assert found["packets"]["bad"] == 0 and found["packets"]["reset"] == 1, "nobody else drives"
+    assert 0.2 < found["seconds"] < 0.7 and found["outcome"] == "waiting", "by the clock"
+    names = {mav.MAVLink(None).parse_buffer(heard.recv(4096))[0].get_type() for _ in range(20)}
+    assert names >= {"ATTITUDE", "RAW_IMU", "LOCAL_POSITION_NED", "SCALED_PRESSURE2", "OBSTACLE_DISTANCE"}
+    for one in (heard, stranger):
+        one.close()
+
+
+@pytest.mark.parametrize("thrusters", [6, 8])
+def test_the_stand_in_drives_as_guided_asks_and_forgets_it(thrusters):
+    pilot = client()
+    one = StandIn(pilot.getsockname(), thrusters=thrusters)
+    codec, there = MavCodec(1, 191), one._endpoint.port
+
+    def lived(seconds, *orders):
+        for order in orders:
+            pilot.sendto(codec.encode(order), ("127.0.0.1", there))
+        for _ in range(round(200 * seconds)):
+            pulses = frame_of(one.frame()).pwm[:thrusters]
+            rest = (0.0, 0.0, 0.0)
+            still = Motion(one.time_s + 0.02, rest, rest, (1.0, 0.0, 0.0, 0.0), rest, (0.0, 0.0, 9.8), 1.0)
+            one.take(reply_of(still))
+        return pulses
+
+    ahead = set_velocity((0.3, 0.0, 0.0, 0.0), 0.0, 1, LIMITS)
+    assert set(lived(0.1, ahead)) == {1500}, "neither armed nor in GUIDED"
+    assert set(lived(0.1, set_mode(GUIDED, 1))) == {1500}
+    driven = max(lived(2.8, arm(1)))
+    assert driven > 1700 and max(lived(0.4)) < driven, "what was asked for 3 s ago is asked no more"
+    broken = dataclasses.replace(ahead, fields=ahead.fields | {"vx": math.nan})
+    assert max(lived(0.1, ahead)) >= driven and max(lived(0.1, broken, set_mode(77, 1))) >= driven
+    assert max(lived(0.1, set_mode(ALT_HOLD, 1))) < driven
+    pilot.close()
+    one.close()
 
 
 def test_a_port_that_is_taken_is_told():

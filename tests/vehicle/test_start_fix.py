@@ -104,6 +104,22 @@ def test_what_cannot_be_checked_is_refused(true, typed, rate, why):
     assert why in fix.result.refusal and "--start" in fix.result.refusal
 
 
+@pytest.mark.parametrize(
+    ("at", "yaw_deg", "way"),
+    [
+        ((2.0, 3.5), 0, 1),
+        ((2.0, 3.5), -130, -1),
+        ((18.0, 5.0), 90, -1),
+        ((18.0, 1.0), 20, -1),
+        ((18.0, 1.0), -90, 1),
+    ],
+)
+def test_it_turns_to_the_nearest_corner(at, yaw_deg, way):
+    fix = StartFix(load_config("pool", "multibeam"), (*at, -0.8))
+    fix.feed(ImuReading(0.0, np.array([0.0, 0.0, math.radians(yaw_deg)]), np.zeros(3), np.zeros(3)))
+    assert fix.way_round() == way
+
+
 @pytest.mark.parametrize(("beams", "is_found"), [(200, True), (64, False)])
 def test_a_head_that_looks_all_around_finds_the_start_at_rest(beams, is_found):
     config, true, still = load_config("pool", "ping360"), (4.0, 2.2, 0.4), np.zeros(3)

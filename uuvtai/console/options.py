@@ -429,8 +429,8 @@ Emulated = Annotated[
     Option(
         "--as",
         metavar="a50,ping360",
-        help="Be these instruments (a50, ping360, 3d15; KIND:PORT), by their own protocols, in place of "
-        "MAVLink's DVL and sonar.",
+        help="Be these instruments (a50, ping360, 3d15, json; KIND:PORT), by their own protocols, in place "
+        "of MAVLink's DVL and sonar; autopilot: a small one in ArduSub's place.",
     ),
 ]
 PlayOperator = Annotated[

@@ -163,8 +163,9 @@ _GIVE_BACK_S = 6.0
 FEEDBACK_AGE_S = 0.5  # a velocity that is older is not fed back to the sticks
 _LEAST_ASKED_M_S, _ANSWER = 0.15, 0.2
 """a vehicle that is asked for so much, and has less than this share of it, does not answer"""
-_REST_S, _LOOK_RAD_S = 5.0, 0.3
-"""where the walls that are seen at rest do not tell the start for so long, the vehicle turns on the spot"""
+_REST_S, _LOOK_RAD_S, _SWEEP_RAD_S = 5.0, 0.5, 0.3
+"""where the walls that are seen at rest do not tell the start for so long, the vehicle turns on the spot; the
+last: where a head turns, too"""
 _UNKNOWN = (math.nan, math.nan, math.nan)
 _REACHED, _INTERRUPTED, _CALIBRATED = "goal reached", "interrupted", "calibrated"
 _T = TypeVar("_T")
@@ -224,8 +225,7 @@ class OnboardLoop:
         """where the autopilot's heartbeats come from"""
         self._asked_s = self._beat_s = -math.inf
         self._clock_jumps = self._jumps_before = endpoint.clock_jumps
-        self._heard_s = 0.0
-        """time of the newest step"""
+        self._heard_s = 0.0  # time of the newest step
         self._begun_s: float | None = None
         self._lag_s = self._unanswered_s = 0.0
         """pilot's clock behind ours: what was lost in stalls; how long the vehicle did not move as asked"""
@@ -235,6 +235,7 @@ class OnboardLoop:
         self._fix, self._start, self._walls = fix, StartFound(), WallWatch(config) if fix else None
         self._sees_around = self._rig.look_around(fix is not None or plan.purpose == "calibrate")
         """whether the start is sought by a sonar's head that turns all around"""
+        self._look_rad_s = 0.0  # at which the vehicle turns until the start is found
         self._sought, self._check = fix, None
         """who seeks the start, also when it is found; what a check gathers"""
         if plan.purpose == "check":
@@ -449,9 +450,12 @@ class OnboardLoop:
         is_fresh = now_s - heard.vel_b_s <= limits.sensor_s["dvl"]
         turns = self._plan.arms and not self._sees_around
         looks_around = self._fix is not None and turns and now_s - self._fix.first_s >= _REST_S
+        if self._fix is not None and looks_around and not self._look_rad_s:
+            most_rad_s = _SWEEP_RAD_S if self._config.sensors.sonar.mechanical else _LOOK_RAD_S
+            self._look_rad_s = most_rad_s * self._fix.way_round()
         return safety.VehicleView(
             now_s=now_s,
-            wanted=(0.0, 0.0, 0.0, _LOOK_RAD_S) if looks_around else (surge, sway, heave, turn),
+            wanted=(0.0, 0.0, 0.0, self._look_rad_s) if looks_around else (surge, sway, heave, turn),
             held=command.held,
             vehicle_age_s=now_s - heard.vehicle_s,
             operator_age_s=now_s - heard.operator_s,
@@ -598,6 +602,7 @@ def fly(
 ) -> tuple[dict[str, Any], BaseException | None]:
     """The document of a flight, and the error of this program that ended it. Raises LinkError, LogError."""
     mavlink.MavCodec(plan.system, COMPANION)  # refused before a minute of compiling
+    config = fenced(config, plan.limits)
     followed = mavlink.FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
     with followed or mavlink.Endpoint(plan.place) as endpoint, Rig(config, plan.instruments) as rig:
         pilot = warmed(config, tree, plan.mission)
@@ -620,6 +625,15 @@ def fly(
             finally:
                 log.close()
         return loop.document(), loop.failure
+
+
+def fenced(config: Config, limits: safety.SafetyLimits) -> Config:
+    """The stack plans for depths that the fence allows, and farther from floor and surface than in the
+    simulator: an autopilot follows late."""
+    low, high = config.world.tank.z_m
+    room = min(high + limits.depth_m[0], -limits.depth_m[1] - low)
+    update = {"edge_gap_m": max(config.behavior.edge_gap_m, room) + safety.FENCE_ROOM_M}
+    return config.model_copy(update={"behavior": config.behavior.model_copy(update=update)})
 
 
 def warmed(config: Config, tree: FlatTree, mission: Mission) -> OnboardPilot:

@@ -235,12 +235,14 @@ def decide(
 
 # ------------------------------------------------------------------------------------------------- the limits
 
-FENCE_RATE_HZ = 0.5  # towards the fence no faster than this times the distance to it
+FENCE_RATE_HZ, FENCE_ROOM_M = 0.5, 0.05
+"""towards the fence no faster than this times the distance to a line so far within it, which a vehicle that
+follows late, or errors of its place, may overrun"""
 
 
 def allowed(wanted: Velocity, view: VehicleView, limits: SafetyLimits) -> Velocity:
     """``wanted`` within the speed limits, and towards a side of the fence no faster than the room left there
-    allows; outside, only inward. Not finite: zero."""
+    allows; beyond, only inward. Not finite: zero."""
     surge, sway, heave, turn = bounded(wanted, limits)
     yaw = view.rpy[2]
     if not all(map(math.isfinite, (*view.pos_w, yaw))):
@@ -278,8 +280,8 @@ def outside_m(pos_w: tuple[float, float, float], limits: SafetyLimits) -> float:
 
 
 def _within(speed: float, room_below: float, room_above: float) -> float:
-    most, least = FENCE_RATE_HZ * max(room_above, 0.0), -FENCE_RATE_HZ * max(room_below, 0.0)
-    return max(least, min(most, speed))
+    least, most = (FENCE_RATE_HZ * max(room - FENCE_ROOM_M, 0.0) for room in (room_below, room_above))
+    return max(-least, min(most, speed))
 
 
 def _old(who: str, age_s: float, limit_s: float) -> str:

@@ -26,10 +26,10 @@ from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
 from uuvtai.sim.stack import forget_readings
 from uuvtai.vehicle.instruments.emulate import NEXT_PORT, FakeRig, emulated, ports_of
-from uuvtai.vehicle.instruments.rig import PORTS
 from uuvtai.vehicle.mavlink import Address, Endpoint, LinkError, LinkPlace, MavCodec, Order, place_of
 from uuvtai.vehicle.messages import three
 from uuvtai.vehicle.sitl_protocol import Motion, ReportedSensors, reply_of
+from uuvtai.vehicle.stand_in import StandIn
 from uuvtai.vehicle.telemetry import Motors
 
 # ---- One ArduSub's water: a packet in, an answer out, and what the sensors say meanwhile. No sockets here. A
@@ -41,6 +41,7 @@ _CHANNELS = {18458: 16, 29569: 32}  # magic -> channels
 RATES_HZ = (50, 4000)  # physics steps in a second that are believed; ArduSub has told 16959 after a stall
 DOUBLED_S = 0.5  # ArduSub repeats a packet after a second without answer; sooner it was doubled
 
+_AWAY_M = 1e4  # where nothing senses them
 Turn = Literal["reset", "step", "again", "ignore"]
 
 
@@ -78,13 +79,13 @@ def turn_of(count: int, last: int | None, waited_s: float) -> Turn:
 
 
 class Instance:
-    """Until a thruster turns for the first time the vehicle is held at its start and the obstacles stand
-    still: an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
+    """Until a thruster turns for the first time the vehicle is held at its start, and no moving obstacles are
+    there: an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
 
     def __init__(self, config: Config, water: WaterRows, row: int, rig: FakeRig | None = None) -> None:
         """``rig``: its DVL and sonar, where they speak their own protocols."""
         self._config, self._water, self._row, self._rig = config, water, row, rig
-        self._dt = config.episode.control_dt_s
+        self._dt, self.thrusters = config.episode.control_dt_s, len(config.vehicle.thrusters)
         self._count: int | None = None
         self._answered_s, self._answer, self._rate_hz = 0.0, b"", 0
         self._forget()
@@ -181,6 +182,7 @@ class WaterRows:
         self._rpm = views["actuation.rpm_command"]
         names = ("pos_w", "vel_b", "quat_wb", "rate_b", "acc_b")
         self._vehicle = {name: views[f"vehicle.{name}"] for name in names}
+        self._moving = views["world.pos_w"][:, -views["path.n_way"].shape[1] :, :2]
         self._read = views
         self._sim.sleep()
 
@@ -200,6 +202,7 @@ class WaterRows:
         control.reset_actuation(io.actuation)
         forget_readings(io)
         episode.reset_termination(io.episode)
+        self._moving[row] = _AWAY_M  # until the first control step
         self.sense(row)
 
     def push(self, row: int, pwm: tuple[int, ...], dt_s: float) -> None:
@@ -280,15 +283,17 @@ SILENT_S = 10.0  # by the clock, without a packet
 class ServingNotes:
     """Of one instance. ``look`` is called often."""
 
-    def __init__(self, number: int, port: int, now_s: float) -> None:
-        self._name, self._port = f"instance {number}", port
+    def __init__(self, number: int, port: int, now_s: float, stands_in: bool = False) -> None:
+        """``stands_in``: no packets come, its autopilot is our own."""
+        self._name, self._port, self._stands_in = f"instance {number}", port, stands_in
         self._seen: Counter[str] = Counter()
         """packets by turn, as they were told last"""
         self._heard_s, self._silence_told = now_s, False
         self._held, self._outcome = True, ""
 
     def look(self, instance: Instance, now_s: float) -> list[str]:
-        found = [*self._packets(instance, now_s), *self._episode(instance)]
+        packets = [] if self._stands_in else self._packets(instance, now_s)
+        found = [*packets, *self._episode(instance)]
         if instance.counts["bad"] > 0 and self._seen["bad"] == 0:
             found.append(
                 f"{self._name}: what comes to port {self._port} is no packet of ArduSub's, or a second "
@@ -367,6 +372,9 @@ class SitlPlan:
         """Of what was typed; ``rest``: as it is. Raises LinkError."""
         own = {} if emulated is None else ports_of(emulated)
         until_s = math.inf if seconds is None else seconds
+        if "autopilot" in own:  # it asks for no pace, and its own sensors speak to the pilot alone
+            mavlink = mavlink or [f"udpout:127.0.0.1:{own['autopilot']}"]
+            rest["rate"] = rest.get("rate") or 1.0
         plan = cls(places=tuple(map(place_of, mavlink or PLACES)), seconds=until_s, emulated=own, **rest)
         port, instances = plan.port, plan.instances
         last = NEXT_PORT * (instances - 1)
@@ -418,9 +426,14 @@ class SitlPort:
         self._heard_s = float("-inf")
         self.paced_from_s = 0.0
         """by the clock, when the water's time was 0"""
-        port = plan.port + NEXT_PORT * number
-        self.notes = ServingNotes(number, port, time.monotonic())
+        port, pilot = plan.port + NEXT_PORT * number, plan.emulated.get("autopilot")
+        self.notes = ServingNotes(number, port, time.monotonic(), pilot is not None)
+        self.autopilot: StandIn | None = None
+        """in ArduSub's place"""
         try:
+            if pilot is not None:
+                at = plan.host, pilot + NEXT_PORT * number
+                self.autopilot = StandIn(at, self._system, instance.thrusters)
             self.socket.bind((plan.host, port))
             self.socket.setblocking(False)
             for place in plan.places:
@@ -445,16 +458,25 @@ class SitlPort:
         if self._peer not in (None, sender) and now_s - self._heard_s < _SILENT_S:
             self.instance.counts["bad"] += 1
             return
-        reply, said = self.instance.answer(packet, now_s)
-        if reply:
+        if reply := self._answer(packet, now_s):
             self._peer, self._heard_s = sender, now_s
             try:
                 self.socket.sendto(reply, sender)
             except OSError:
                 self.instance.counts["unsent"] += 1
+
+    def drive(self, now_s: float) -> None:
+        """A packet of the autopilot's that stands in, if there is one."""
+        if self.autopilot is not None:
+            self.autopilot.take(self._answer(self.autopilot.frame(), now_s))
+
+    def _answer(self, packet: bytes, now_s: float) -> bytes:
+        """What the physics says to a packet; the sensors tell what they sense."""
+        reply, said = self.instance.answer(packet, now_s)
         if reply and self._operator is not None and not self.instance.joined_late:
             said = [*said, *self._operator.report(self.instance.time_s)]
         self._report(said)
+        return reply
 
     def _report(self, said: list[Order]) -> None:
         for link in self.links if said else []:
@@ -469,6 +491,8 @@ class SitlPort:
         self.socket.close()
         for link in self.links:
             link.endpoint.close()
+        if self.autopilot is not None:
+            self.autopilot.close()
 
 
 def serve_water(
@@ -491,8 +515,8 @@ def serve_water(
         begun = time.monotonic()
         signals.engage()  # there is a document to print
         shown = ", ".join(f"{plan.host}:{plan.port + NEXT_PORT * number}" for number in range(plan.instances))
-        begin = f"start it with: ardusub --model JSON:{plan.host}"
-        note(f"physics for ArduSub at UDP {shown}; {begin}; Ctrl-C ends")
+        begin = f"physics for ArduSub at UDP {shown}; start it with: ardusub --model JSON:{plan.host}"
+        note(f"{'a small autopilot drives' if 'autopilot' in plan.emulated else begin}; Ctrl-C ends")
         for number in range(plan.instances):
             water.begin(number)
             start, goal = (_written(water.value(f"mission.{name}_w", number)) for name in ("start", "goal"))
@@ -510,12 +534,11 @@ def serve_water(
 
 
 def _heard(plan: SitlPlan, number: int) -> str:
-    """The pilot's options that hear the instruments of an instance."""
-    return "".join(
-        f" --{option} {kind}:{plan.host}:{port + NEXT_PORT * number}"
-        for option, kinds in PORTS.items()
-        for kind, port in plan.emulated.items()
-        if kind in kinds
+    """The pilot's options that hear the instruments of an instance, and its autopilot."""
+    at = {kind: f"{plan.host}:{port + NEXT_PORT * number}" for kind, port in plan.emulated.items()}
+    pilot = at.pop("autopilot", "")
+    return (f" --mavlink udp:{pilot} --system {number + 1}" if pilot else "") + "".join(
+        f" --{'dvl' if kind == 'a50' else 'sonar'} {kind}:{place}" for kind, place in at.items()
     )
 
 
@@ -524,14 +547,15 @@ def _written(place: np.ndarray) -> str:
 
 
 def _serve(ports: list[SitlPort], plan: SitlPlan, begun: float, note: Callable[[str], None]) -> None:
+    driven = ports if "autopilot" in plan.emulated else []
     with selectors.DefaultSelector() as waiting:
-        for port in ports:
+        for port in ports if not driven else []:
             waiting.register(port.socket, selectors.EVENT_READ, port)
         while time.monotonic() - begun < plan.seconds:
-            for key, _ in waiting.select(timeout=0.2):
-                port: SitlPort = key.data
+            for port in driven or [key.data for key, _ in waiting.select(timeout=0.2)]:
                 _pace(port, plan.rate)
-                port.serve(time.monotonic())
+                serve = port.drive if driven else port.serve
+                serve(time.monotonic())
             for port in ports:
                 for text in port.notes.look(port.instance, time.monotonic()):
                     note(text)

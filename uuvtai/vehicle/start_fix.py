@@ -312,6 +312,13 @@ class StartFix:
             found.append((_side(self._config.world.tank, wall), middle if is_wall else math.nan, len(off)))
         return found
 
+    def way_round(self) -> float:
+        """1 or -1 (clockwise): by which turn the nearest corner of the tank comes into view sooner."""
+        tank, yaw = self._config.world.tank, float(self._track.rpy[2])
+        sides = np.array([tank.x_m, tank.y_m]) - self._typed[:, None]
+        x, y = np.where(np.abs(sides[:, 0]) < np.abs(sides[:, 1]), *sides.T)
+        return math.copysign(1.0, math.remainder(math.atan2(y, x) - yaw, math.tau))
+
     def _see(self, ping: SonarPing) -> None:
         if (then := self._track.then(ping.time_s)) is None:
             return

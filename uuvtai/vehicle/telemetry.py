@@ -128,7 +128,7 @@ _SPEED_OF_PULSE = np.array(
 )  # fmt: skip
 """[us beyond neutral, rpm] of a T200 at 16 V (the maker's table, docs/data/t200.csv)"""
 _LEVEL = ((0, 0, 1, 0, -1, 1), (0, 0, -1, 0, -1, -1), (0, 0, -1, 0, 1, 1), (0, 0, 1, 0, 1, -1))
-_FRAMES = {
+FRAMES = {
     6: (*_LEVEL, (1, 0, 0, -1, 0, 0), (-1, 0, 0, -1, 0, 0)),
     8: (*_LEVEL, (1, -1, 0, -1, 0, 0), (-1, -1, 0, -1, 0, 0), (1, 1, 0, -1, 0, 0), (-1, 1, 0, -1, 0, 0)),
 }
@@ -144,7 +144,7 @@ class Motors:
         force_moment, _ = allocation_matrices(vehicle_cfg)
         signs = np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
         ours = force_moment[[3, 4, 5, 2, 0, 1]].T * signs  # in ArduSub's axes and order
-        frame = _FRAMES.get(len(ours))
+        frame = FRAMES.get(len(ours))
         if frame is None:
             raise SettingError(
                 f"the vehicle has {len(ours)} thrusters; ArduSub's frames here have 6 (VECTORED) or 8 "

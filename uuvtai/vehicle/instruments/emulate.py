@@ -1,5 +1,5 @@
 """Devices that are not there, from their specifications: what the simulator's vehicle senses, told as an A50,
-a Ping360 or a 3D-15 tells it."""
+a Ping360 or a 3D-15 tells it, or as the JSON of any other sonar."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from uuvtai.config import Config, DepthConfig, SonarConfig
 from uuvtai.vehicle.instruments import a50, ping, rip2
+from uuvtai.vehicle.instruments.rig import JSON_PORT
 from uuvtai.vehicle.mavlink import LinkError
 
 Echo = Callable[[float], float]
@@ -196,8 +197,25 @@ class FakeSonar3D:
         self._socket.close()
 
 
-KINDS = {"a50": a50.PORT, "ping360": ping.PORT, "3d15": rip2.PORT}
-"""what ``uuv sitl --as`` can be, and its usual port"""
+class FakeJson:
+    """A sonar that is told as JSON (``rig.JsonUdp``), without errors of its own."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket, self._to = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), (host, port)
+
+    def tell(self, range_m: np.ndarray, hit: np.ndarray) -> None:
+        """A scan (n_ray,) that was taken just now."""
+        ranges = np.round(range_m.astype(float), 3).tolist()
+        said = {"kind": "sonar", "range_m": ranges, "hit": (hit > 0).astype(int).tolist(), "doppler_m_s": []}
+        with contextlib.suppress(OSError):  # nobody listens
+            self._socket.sendto(json.dumps(said).encode(), self._to)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+KINDS = {"a50": a50.PORT, "ping360": ping.PORT, "3d15": rip2.PORT, "json": JSON_PORT, "autopilot": 14550}
+"""what ``uuv sitl --as`` can be, and its usual port; 3d15, json and autopilot speak to it"""
 RING = {
     "mechanical": False,
     "horizontal_aperture_deg": 360.0,
@@ -248,12 +266,13 @@ class FakeRig:
     def __init__(self, config: Config, ports: dict[str, int], host: str, number: int) -> None:
         """``ports``: by kind; they count on with the ``number`` of the vehicle. Raises LinkError."""
         self._sonar, dvl = config.sensors.sonar, config.sensors.dvl
-        self.speaks = {"dvl" if kind == "a50" else "sonar" for kind in ports}
+        self.speaks = {"dvl" if kind == "a50" else "sonar" for kind in ports if kind != "autopilot"}
         """what MAVLink need not tell"""
         self._lever, self._yaw = np.array(dvl.position_b_m), math.radians(dvl.yaw_deg)
         self._dvl: FakeA50 | None = None
         self._head: FakePing360 | None = None
         self._image: FakeSonar3D | None = None
+        self._scan: FakeJson | None = None
         port, next_port = 0, NEXT_PORT * number
         try:
             if "a50" in ports:
@@ -263,6 +282,8 @@ class FakeRig:
                 self._head = FakePing360(host, port := ports["ping360"] + next_port, number, zero)
             if "3d15" in ports:
                 self._image = FakeSonar3D(host, ports["3d15"] + next_port, config.sensors.depth)
+            if "json" in ports:
+                self._scan = FakeJson(host, ports["json"] + next_port)
         except OSError as error:
             self.close()
             raise LinkError(
@@ -282,9 +303,11 @@ class FakeRig:
             self._head.step(time_s, lambda bearing: _met(self._sonar, range_m, hit, bearing))
         if self._image is not None and value("image.fresh"):
             self._image.tell(time_s, value("image.depth_m"))
+        if self._scan is not None and value("scan.fresh"):
+            self._scan.tell(*(value(f"scan.{name}")[: self._sonar.n_ray] for name in ("range_m", "hit")))
 
     def close(self) -> None:
-        for one in (self._dvl, self._head, self._image):
+        for one in (self._dvl, self._head, self._image, self._scan):
             if one is not None:
                 one.close()
 
