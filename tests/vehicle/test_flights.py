@@ -10,7 +10,7 @@ from tests.flights import DT, moves, orders, violations
 from tests.mavlink_vehicle import LIMITS, Flight, link_config, plan_of
 from uuvtai.logs.reader import read_messages
 from uuvtai.vehicle import control_loop
-from uuvtai.vehicle.control_loop import OnboardLoop, fenced
+from uuvtai.vehicle.control_loop import OnboardLoop, as_driven
 from uuvtai.vehicle.instruments.rig import Rig
 
 FOUND = (1125,)
@@ -50,9 +50,21 @@ def test_until_the_start_is_known_it_only_turns(tmp_path, sees_around):
 
 
 @pytest.mark.parametrize(("depth_m", "gap_m"), [((0.2, 1.4), 0.25), ((0.05, 1.55), 0.25), ((0.4, 1.3), 0.35)])
-def test_the_stack_plans_within_the_fence(depth_m, gap_m):
-    found = fenced(link_config(), dataclasses.replace(LIMITS, depth_m=depth_m))
-    assert found.behavior.edge_gap_m == pytest.approx(gap_m)
+def test_the_stack_plans_within_the_fence(tmp_path, depth_m, gap_m):
+    plan = dataclasses.replace(
+        plan_of(None, tmp_path / "a.mcap"), limits=dataclasses.replace(LIMITS, depth_m=depth_m)
+    )
+    assert as_driven(link_config(), plan).behavior.edge_gap_m == pytest.approx(gap_m)
+
+
+@pytest.mark.parametrize(
+    ("sonar", "has"), [({}, False), ({"sonar": "ping360:h"}, False), ({"sonar": "3d15:h"}, True)]
+)
+def test_the_stack_believes_in_no_camera_that_is_not_there(tmp_path, sonar, has):
+    found = as_driven(
+        link_config(), dataclasses.replace(plan_of(None, tmp_path / "a.mcap"), instruments=sonar)
+    )
+    assert found.camera_tracking.use_camera == found.height.use_camera == (found.mapping.depth_hit > 0) == has
 
 
 class Clock:

@@ -21,7 +21,7 @@ from uuvtai.sim.behavior_tree import FlatTree
 from uuvtai.sim.sim import Sim
 from uuvtai.vehicle import calibrate, mavlink, safety
 from uuvtai.vehicle.handover import Handover
-from uuvtai.vehicle.instruments.rig import Rig
+from uuvtai.vehicle.instruments.rig import HAVE_IMAGES, Rig
 from uuvtai.vehicle.mavlink import LinkError
 from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage, three
 from uuvtai.vehicle.onboard import Mission, OnboardPilot, PilotCommand
@@ -602,7 +602,7 @@ def fly(
 ) -> tuple[dict[str, Any], BaseException | None]:
     """The document of a flight, and the error of this program that ended it. Raises LinkError, LogError."""
     mavlink.MavCodec(plan.system, COMPANION)  # refused before a minute of compiling
-    config = fenced(config, plan.limits)
+    config = as_driven(config, plan)
     followed = mavlink.FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
     with followed or mavlink.Endpoint(plan.place) as endpoint, Rig(config, plan.instruments) as rig:
         pilot = warmed(config, tree, plan.mission)
@@ -627,13 +627,18 @@ def fly(
         return loop.document(), loop.failure
 
 
-def fenced(config: Config, limits: safety.SafetyLimits) -> Config:
+def as_driven(config: Config, plan: FlightPlan) -> Config:
     """The stack plans for depths that the fence allows, and farther from floor and surface than in the
-    simulator: an autopilot follows late."""
-    low, high = config.world.tank.z_m
+    simulator, for an autopilot follows late; it believes in no camera where no instrument has one."""
+    (low, high), limits = config.world.tank.z_m, plan.limits
     room = min(high + limits.depth_m[0], -limits.depth_m[1] - low)
-    update = {"edge_gap_m": max(config.behavior.edge_gap_m, room) + safety.FENCE_ROOM_M}
-    return config.model_copy(update={"behavior": config.behavior.model_copy(update=update)})
+    gap = max(config.behavior.edge_gap_m, room) + safety.FENCE_ROOM_M
+    keys: dict[str, dict[str, object]] = {"behavior": {"edge_gap_m": gap}}
+    if not plan.instruments.get("sonar", "").startswith(HAVE_IMAGES):
+        keys |= {"camera_tracking": {"use_camera": False}, "height": {"use_camera": False}}
+        keys["mapping"] = {"depth_hit": 0.0}
+    update = {name: getattr(config, name).model_copy(update=own) for name, own in keys.items()}
+    return config.model_copy(update=update)
 
 
 def warmed(config: Config, tree: FlatTree, mission: Mission) -> OnboardPilot:

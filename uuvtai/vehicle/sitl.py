@@ -41,7 +41,6 @@ _CHANNELS = {18458: 16, 29569: 32}  # magic -> channels
 RATES_HZ = (50, 4000)  # physics steps in a second that are believed; ArduSub has told 16959 after a stall
 DOUBLED_S = 0.5  # ArduSub repeats a packet after a second without answer; sooner it was doubled
 
-_AWAY_M = 1e4  # where nothing senses them
 Turn = Literal["reset", "step", "again", "ignore"]
 
 
@@ -79,8 +78,8 @@ def turn_of(count: int, last: int | None, waited_s: float) -> Turn:
 
 
 class Instance:
-    """Until a thruster turns for the first time the vehicle is held at its start, and no moving obstacles are
-    there: an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
+    """Until a thruster turns for the first time the vehicle is held at its start and the obstacles stand
+    still: an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
 
     def __init__(self, config: Config, water: WaterRows, row: int, rig: FakeRig | None = None) -> None:
         """``rig``: its DVL and sonar, where they speak their own protocols."""
@@ -182,7 +181,6 @@ class WaterRows:
         self._rpm = views["actuation.rpm_command"]
         names = ("pos_w", "vel_b", "quat_wb", "rate_b", "acc_b")
         self._vehicle = {name: views[f"vehicle.{name}"] for name in names}
-        self._moving = views["world.pos_w"][:, -views["path.n_way"].shape[1] :, :2]
         self._read = views
         self._sim.sleep()
 
@@ -202,7 +200,6 @@ class WaterRows:
         control.reset_actuation(io.actuation)
         forget_readings(io)
         episode.reset_termination(io.episode)
-        self._moving[row] = _AWAY_M  # until the first control step
         self.sense(row)
 
     def push(self, row: int, pwm: tuple[int, ...], dt_s: float) -> None:
