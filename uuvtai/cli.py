@@ -586,14 +586,14 @@ def pilot_vehicle(
         raise typer.Exit(GATE)
 
 
-@app.command("sitl", epilog="Example: uuv sitl --world pool -S 8 -D 6 --speed 0.6 --instances 3")
+@app.command("sitl", epilog="Example: uuv sitl --sensors ping360 --as a50,ping360,autopilot --operator")
 @groups.grouped
 def serve_sitl(
     scene: groups.SitlSceneGroup, served: groups.ServedGroup, output: groups.PlainOutputGroup
 ) -> None:
-    """Run our physics as the ArduSub SITL backend.
+    """Be ArduSub's water, or a whole vehicle for uuv pilot.
 
-    ArduSub connects by its JSON interface (docs/on_a_vehicle.md)."""
+    ArduSub connects by its JSON interface; --as autopilot stands in for it (docs/on_a_vehicle.md)."""
     from uuvtai.console.vehicle_views import show_sitl
     from uuvtai.sim.behavior_tree import read_tree
     from uuvtai.vehicle.sitl import serve_water
