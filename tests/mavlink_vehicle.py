@@ -1,6 +1,8 @@
 """A submarine of pymavlink on UDP that obeys modes and arming; a ground station; an obedient pilot."""
 
+import contextlib
 import math
+import random
 import socket
 from functools import cache
 from types import SimpleNamespace
@@ -28,9 +30,13 @@ def link_config(**changes):
 
 
 def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
+    """A port that nobody holds by UDP or TCP, below those that systems hand out by themselves."""
+    for port in random.SystemRandom().sample(range(20_000, 32_000), 200):
+        with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+            for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
+                stack.enter_context(socket.socket(socket.AF_INET, kind)).bind(("127.0.0.1", port))
+            return port
+    raise OSError("no port is free")
 
 
 class WishfulPilot:

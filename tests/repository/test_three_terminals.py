@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.mavlink_vehicle import FakeSub, WishfulPilot, link_config
+from tests.mavlink_vehicle import FakeSub, WishfulPilot, free_port, link_config
 from uuvtai.vehicle.control_loop import DEAF_S, FlightNotes, FlightPlan, OnboardLoop
-from uuvtai.vehicle.mavlink import SILENT_S, Endpoint, FollowedEndpoint, LinkError, LinkPlace
+from uuvtai.vehicle.mavlink import SILENT_S, FollowedEndpoint, LinkError, LinkPlace
 from uuvtai.vehicle.onboard import ImuReading, Mission, PositionFix
 from uuvtai.vehicle.pilot_log import LinkLog
 from uuvtai.vehicle.safety import STOP, SafeAction, SafeDecision, SafetyLimits
@@ -125,8 +125,7 @@ def test_others_do_not_set_its_clock(followed):
 
 def test_sleep_waits_for_the_vehicle():
     wall = Wall()
-    with Endpoint(HERE) as free:
-        port = free.port
+    port = free_port()
     sub = FakeSub(port)
 
     def pause():
@@ -180,11 +179,9 @@ class Three:
         config = small.sim.config
         self.water = WaterRows(small.sim, seed=77001, first=3)
         self.endpoint = FollowedEndpoint(HERE, 1, self.wall, self.step)
-        with Endpoint(HERE) as free:
-            number = free.port
         places = (LinkPlace("127.0.0.1", self.endpoint.port, True),)
         own = {"autopilot": self.endpoint.port}
-        plan = SitlPlan(port=number, places=places, operator=operator, emulated=own)
+        plan = SitlPlan(port=free_port(), places=places, operator=operator, emulated=own)
         self.port = SitlPort(plan, Instance(config, self.water, ROW), 0)
         self.water.begin(ROW)
         self.start = tuple(self.water.value("mission.start_w", ROW).tolist())

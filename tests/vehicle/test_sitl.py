@@ -454,10 +454,7 @@ class Served:
     """A port with still water on a thread of its own."""
 
     def __init__(self, places=()):
-        free = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        free.bind(("127.0.0.1", 0))
-        self.number = free.getsockname()[1]
-        free.close()
+        self.number = free_port()
         plan = SitlPlan(port=self.number, places=places)
         self.port = SitlPort(plan, Instance(CONFIG, StillWater(), 0), 0)
         self.port.socket.setblocking(True)
@@ -516,9 +513,7 @@ def test_packets_by_socket_and_a_second_client_is_not_answered(served):
 
 def test_who_speaks_to_the_sensors_port_is_told(served):
     listener = client()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        sensors = free.getsockname()[1]
+    sensors = free_port()
     one = served(
         places=(
             LinkPlace("127.0.0.1", sensors, False),
