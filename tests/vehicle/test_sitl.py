@@ -602,7 +602,7 @@ def test_an_autopilot_of_ours_stands_in(capfd, monkeypatch, small):
     pilot = heard.getsockname()[1]
     words = ["--port", str(number), "--seconds", "0.5", "--operator", "--as", f"autopilot:{pilot}", "--json"]
     code, out, err = uuv(capfd, "sitl", *words)
-    assert code == 0 and "a small autopilot drives" in err
+    assert code == 0 and "a small autopilot waits for uuv pilot" in err
     assert f"--heading 0 --mavlink udp:127.0.0.1:{pilot} --system 1\n" in err
     (found,) = json.loads(out)["instances"]
     assert found["packets"]["bad"] == 0 and found["packets"]["reset"] == 1, "nobody else drives"

@@ -370,7 +370,7 @@ class SitlPlan:
         own = {} if emulated is None else ports_of(emulated)
         until_s = math.inf if seconds is None else seconds
         if "autopilot" in own:  # it asks for no pace, and its own sensors speak to the pilot alone
-            mavlink = mavlink or [f"udpout:127.0.0.1:{own['autopilot']}"]
+            mavlink = mavlink or [f"udpout:{rest.get('host', cls.host)}:{own['autopilot']}"]
             rest["rate"] = rest.get("rate") or 1.0
         plan = cls(places=tuple(map(place_of, mavlink or PLACES)), seconds=until_s, emulated=own, **rest)
         port, instances = plan.port, plan.instances
@@ -513,7 +513,9 @@ def serve_water(
         signals.engage()  # there is a document to print
         shown = ", ".join(f"{plan.host}:{plan.port + NEXT_PORT * number}" for number in range(plan.instances))
         begin = f"physics for ArduSub at UDP {shown}; start it with: ardusub --model JSON:{plan.host}"
-        note(f"{'a small autopilot drives' if 'autopilot' in plan.emulated else begin}; Ctrl-C ends")
+        if "autopilot" in plan.emulated:
+            begin = "a small autopilot waits for uuv pilot"
+        note(f"{begin}; Ctrl-C ends")
         for number in range(plan.instances):
             water.begin(number)
             start, goal = (_written(water.value(f"mission.{name}_w", number)) for name in ("start", "goal"))

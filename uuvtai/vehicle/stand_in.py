@@ -15,7 +15,8 @@ from uuvtai.vehicle.telemetry import AUTOPILOT, FRAMES, NEUTRAL_US, SPAN_US
 
 RATE_HZ, LOOP_HZ = 200, 50
 """packets to the physics; steps of its own"""
-_MANUAL, _ARMED = 19, 128  # mode at the beginning; flag of a heartbeat
+_MAGIC, _MANUAL, _ARMED = 18458, 19, 128  # of a packet with 16 channels; first mode; flag of a heartbeat
+_AIR_HPA, _WATER_HPA_M = 1013.25, 97.8057  # by metre of depth: 997 kg/m^3
 _PUSH, _PUSH_SUM = np.array([0.35, 1.2, 1.2, 1.5]), np.array([0.3, 0.5, 0.5, 0.8])
 """round, ahead, right, down: parts of a full push for an error of 1 rad/s or 1 m/s, and for its sum in 1 s"""
 _FORGETS_S = 3.0  # a velocity asked for so long ago; as ArduSub's GUIDED does
@@ -39,7 +40,7 @@ class StandIn:
 
     def frame(self) -> bytes:
         """The next packet."""
-        packet = struct.pack("<HHI16H", 18458, RATE_HZ, self._count, *self._pulses)
+        packet = struct.pack("<HHI16H", _MAGIC, RATE_HZ, self._count, *self._pulses)
         self._count += 1
         return packet
 
@@ -87,7 +88,11 @@ class StandIn:
 
     def _speak(self, told: dict) -> None:
         time_s, imu, position = told["timestamp"], told["imu"], told["position"]
-        rpy, boot_ms, hpa = _euler(told["quaternion"]), round(1e3 * time_s), 1013.25 + 97.8057 * position[2]
+        rpy, boot_ms, hpa = (
+            _euler(told["quaternion"]),
+            round(1e3 * time_s),
+            _AIR_HPA + _WATER_HPA_M * position[2],
+        )
         accel = [round(1e3 * value / 9.80665) for value in imu["accel_body"]]
         boot = {"time_boot_ms": boot_ms}
         turn = _named("rollspeed pitchspeed yawspeed", imu["gyro"])

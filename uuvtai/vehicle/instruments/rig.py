@@ -30,7 +30,7 @@ PORTS = {
     "sonar": {"ping360": ping.PORT, "3d15": rip2.PORT, "json": JSON_PORT},
 }
 """what is given by which option: kind -> usual port"""
-HAVE_IMAGES = ("3d15", "json")
+HAVE_IMAGES = ("3d15", "json")  # sonars that may tell depth images
 _TELLS = {"dvl": ("dvl",), "sonar": ("sonar", "depth")}
 
 
