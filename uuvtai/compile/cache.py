@@ -35,8 +35,7 @@ from uuvtai.config import Section
 
 ALL = "*"
 """a whole section: something was done with it that cannot be followed"""
-_ARRAY = "@"
-"""before the name of an array, whose place is told ('@tracks.pos_w')"""
+_ARRAY = "@"  # before the name of an array, whose place is told ('@tracks.pos_w')
 
 
 @contextlib.contextmanager
@@ -158,8 +157,7 @@ _OWN = re.compile(r"[0-9a-f]{64}\.kernel|\.[0-9a-f]{64}\.kernel\.[0-9a-f]{8}\.tm
 """names that are given here: whole, unfinished, and unfinished as they were called before"""
 _MOST_NAMES = 16
 """ways through a kernel's source that are remembered: each depends on something else of the config"""
-_STALE_S = 3600.0
-"""age of an unfinished file whose writer is dead for sure [s]"""
+_STALE_S = 3600.0  # age of an unfinished file whose writer is dead for sure [s]
 
 
 class StoreError(Exception):

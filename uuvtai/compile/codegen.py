@@ -340,13 +340,11 @@ def _openmp() -> ctypes.CDLL:
 # LLVM's text of a kernel, as Taichi compiles it.
 
 
-_CLONE_FS = 0x200
-"""of Linux's ``unshare``: a thread's current folder is its own"""
+_CLONE_FS = 0x200  # of Linux's ``unshare``: a thread's current folder is its own
 
 
 _PREFIX, _LOCK = "uuvtai-native-", "lock"
-_NEW_S = 60.0
-"""a folder of this age may be about to get its lock [s]"""
+_NEW_S = 60.0  # a folder of this age may be about to get its lock [s]
 
 
 class Compiler:

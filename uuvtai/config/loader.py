@@ -456,8 +456,7 @@ def renamed(dotted: str) -> str:
 
 
 _WITHIN = re.compile(r"Value error, ([a-z_]+(?:\.[a-z_0-9]+)*): (.+)", re.DOTALL)
-_MOST_GOT = 200
-"""characters of a value that are shown"""
+_MOST_GOT = 200  # characters of a value that are shown
 
 
 def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseModel]) -> str:

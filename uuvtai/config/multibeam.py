@@ -18,8 +18,7 @@ NOISE_DB = -40.0
 """noise below the return of a wall that fills the beam at maximum range (EC)"""
 SHOWN_DB = 50.0
 """of the picture, from black to white"""
-_PAD_DEG = 15.0
-"""A fan hears so far beyond its edge by its side lobes."""
+_PAD_DEG = 15.0  # A fan hears so far beyond its edge by its side lobes.
 STEEPEST_RAD, STEP_RAD = math.radians(45.0), math.radians(0.75)
 """elevations of rays: up to the first, up and down, the second apart"""
 HALF_POWER = 0.4429

@@ -19,10 +19,8 @@ MAX_CORNERS = 500
 """of an outline with its holes"""
 _MAX_IMAGE_BYTES, _MAX_PIXELS = 16 << 20, 4_000_000
 _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
-_MOST_CELLS = 400
-"""along a side of the raster in which an outline is filled"""
-_HOLLOW_M = 0.4
-"""half the width of what may stay empty inside an outline: neither start nor goal fits in"""
+_MOST_CELLS = 400  # along a side of the raster in which an outline is filled
+_HOLLOW_M = 0.4  # half the width of what may stay empty inside an outline: neither start nor goal fits in
 
 Box = tuple[float, float, float, float, float]
 """x, y of the centre, half extents along and across [m], yaw [deg]"""

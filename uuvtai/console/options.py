@@ -72,8 +72,7 @@ Motion = Annotated[
     str | None,
     _more("--motion", metavar="FILE.py:NAME", help="Moving obstacles that a function of yours gives."),
 ]
-_MEANT = {"gpu": "cuda", "nvidia": "cuda"}
-"""what people type for a device, and what they mean by it"""
+_MEANT = {"gpu": "cuda", "nvidia": "cuda"}  # what people type for a device, and what they mean by it
 _WHERE = "Where to compute; auto takes a GPU if there is one."
 Device = Annotated[str, parsing.choice("--device", ("auto", "cpu", "cuda"), _WHERE, _MEANT, **_PANEL)]
 OpenPage = Annotated[bool, Option("--open", help="Open the page in the browser.")]

@@ -21,10 +21,8 @@ from rich.text import Text
 from uuvtai.common.exits import plain, say
 from uuvtai.report.tables import TERMINAL, Cell, Column, Table, number, obstacles, percent
 
-_PIPE_WIDTH = 160
-"""[columns] of text that goes into a file: nobody's terminal limits it"""
-_WRAPPED_MIN = 16
-"""[columns] a column of prose gets at least before others are left out for it"""
+_PIPE_WIDTH = 160  # [columns] of text that goes into a file: nobody's terminal limits it
+_WRAPPED_MIN = 16  # [columns] a column of prose gets at least before others are left out for it
 _ENDLESS = 100_000
 
 
@@ -151,12 +149,9 @@ def _text(cell: str | Cell | Text, style: str = "") -> Text:
 # ---- How far a job is: a bar on a terminal, a plain line every few seconds elsewhere, and no guess of the
 # time left too early.
 
-_PERIOD_S = 5.0
-"""between two lines where there is no terminal"""
-_WORTH_S = 20.0
-"""after so long at work the speed so far says something"""
-_WORTH_SHARE = 0.1
-"""or after this part of the work"""
+_PERIOD_S = 5.0  # between two lines where there is no terminal
+_WORTH_S = 20.0  # after so long at work the speed so far says something
+_WORTH_SHARE = 0.1  # or after this part of the work
 
 
 class Pace:
@@ -306,8 +301,7 @@ class TrainingProgress(_Told):
     def __init__(self) -> None:
         self._last = 0.0
         self._pace: Pace | None = None
-        self._evaluated: dict[str, float] = {}
-        """newest figures of an evaluation"""
+        self._evaluated: dict[str, float] = {}  # newest figures of an evaluation
 
     def start(self, folder: Path, config: Any, done: int, total: int) -> None:
         """``done`` of ``total`` iterations are over as the run begins in ``folder``."""

@@ -14,8 +14,7 @@ from uuvtai.report.tables import Column, Table, heads, number, percent
 
 # ---- A replayed log in the terminal: what agrees, where it first does not, and what became of the messages.
 
-_FATES = ("fed", "used", "lost", "late", "bad", "unplaced")
-"""what may become of a message"""
+_FATES = ("fed", "used", "lost", "late", "bad", "unplaced")  # what may become of a message
 
 
 def show_replay(screen: Screen, found: dict[str, Any]) -> None:

@@ -99,8 +99,7 @@ def _privilege(name: str) -> str:
     return "it is told where every moving obstacle is and how it moves; what stands still it senses"
 
 
-_REMARKABLE_SHARE = 0.2
-"""Remarks on fewer of a cause's episodes are left to the JSON."""
+_REMARKABLE_SHARE = 0.2  # Remarks on fewer of a cause's episodes are left to the JSON.
 
 _LEGEND = (
     "knew: share whose forecast of the obstacle, made 1 s before the end, was right. Medians before the end: "

@@ -328,8 +328,7 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
 
 # ---- A picture of one env as it stands: the tank from above, in the colours of the videos.
 
-_MARGINS = (12, 12, 12, 12)
-"""[px] left, right, top, bottom"""
+_MARGINS = (12, 12, 12, 12)  # [px] left, right, top, bottom
 
 
 def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:

@@ -23,8 +23,7 @@ from uuvtai.sim.scene import SceneOptions
 from uuvtai.sim.setup import check_size
 from uuvtai.sim.sim import Sim
 
-_STEPS = 6
-"""one depth image and one decision of the tree are among them"""
+_STEPS = 6  # one depth image and one decision of the tree are among them
 
 
 @dataclass(frozen=True)

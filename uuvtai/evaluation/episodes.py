@@ -52,8 +52,7 @@ class StepClock:
         return self.env_steps / self.seconds if self.env_steps and self.seconds > 0 else None
 
 
-_WORTH_SHARE = 0.1
-"""of the episodes must be over before their length says something of the others'"""
+_WORTH_SHARE = 0.1  # of the episodes must be over before their length says something of the others'
 _LEAST_SHARE = 0.25
 """of the mean length lies before an episode that is longer than that already: it may end at any time, but the
 last ones take long"""
@@ -77,8 +76,7 @@ _REFILL_SHARE = 16
 passes, same results."""
 
 
-_PROGRESS_EVERY = 50
-"""passes between two calls of ``progress`` while no episode ends"""
+_PROGRESS_EVERY = 50  # passes between two calls of ``progress`` while no episode ends
 
 
 @dataclass(frozen=True)

@@ -212,8 +212,7 @@ def _draw(comparison: Comparison, folder: Path, logs: list[dict[episodes.Job, Pa
         picture(files, folder / "pictures" / f"{end}_clearance.png", clearance=True, agents=names)
 
 
-_DIGITS = 3
-"""of a number: millimetres"""
+_DIGITS = 3  # of a number: millimetres
 
 
 def scenarios_sha256(scenarios: list[dict[str, Any]]) -> str:

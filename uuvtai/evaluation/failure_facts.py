@@ -26,8 +26,7 @@ from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 
 Array = np.ndarray
 
-_AXIS_SAMPLES = 9
-"""Points along the hull's axis, 25 mm apart: the clearance is less than 1 mm too large."""
+_AXIS_SAMPLES = 9  # Points along the hull's axis, 25 mm apart: the clearance is less than 1 mm too large.
 
 
 def rotation(quat_wb: Array) -> Array:

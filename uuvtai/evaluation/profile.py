@@ -38,8 +38,7 @@ PAPER_REPLANS = {"paper_hz": 6.21, "paper_replans_per_episode": 52.1}
 _CALLS, _WARM_CALLS = 2000, 200
 EVERY_STEP, NO_NETWORKS = "Planner stage, every step", "Loop without networks"
 _STAGES = {"Mapping update": ("mapping", "clearance"), EVERY_STEP: ("planning",)}
-_LEAST_STEPS = 4
-"""a loop of fewer steps has no quantiles to speak of"""
+_LEAST_STEPS = 4  # a loop of fewer steps has no quantiles to speak of
 _ENOUGH_PLANS = 20
 
 

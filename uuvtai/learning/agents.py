@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from uuvtai.sim.sim import Sim
 
 
-_FEWEST = 25
-"""numbers that a checkpoint holds; later ones, which it may lack, are not changed"""
+_FEWEST = 25  # numbers that a checkpoint holds; later ones, which it may lack, are not changed
 
 
 class TunedAgent(HeldAgent):

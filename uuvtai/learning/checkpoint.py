@@ -140,8 +140,7 @@ MANIFEST = "manifest.json"
 MODEL, TRAINING, SIMULATOR = "model.safetensors", "training.safetensors", "simulator.zst"
 LARGEST = {MODEL: 256 << 20, TRAINING: 512 << 20, SIMULATOR: 8 << 30}
 """[bytes] of a file; a policy drives by the first one alone"""
-_MAX_BYTES, _CHUNK_BYTES = 8 << 20, 1 << 20
-"""of a manifest; of a file at once"""
+_MAX_BYTES, _CHUNK_BYTES = 8 << 20, 1 << 20  # of a manifest; of a file at once
 
 
 class FileEntry(BaseModel):

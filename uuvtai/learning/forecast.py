@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 
 TIMES_S = torch.arange(1, enums.ANCHORS + 1) * enums.ANCHOR_S
 """[s] ahead, of the places that it tells"""
-_LEAST_M, _MOST = 0.03, 4.0
-"""[m] smallest deviation; largest, as a part of the way that an obstacle can go"""
+_LEAST_M, _MOST = 0.03, 4.0  # [m] smallest deviation; largest, as a part of the way that an obstacle can go
 
 
 class Mixture(NamedTuple):
@@ -125,10 +124,8 @@ def scores_of(mixture: Mixture, truth: Tensor) -> dict[str, float]:
 
 EVERY_STEPS = 25
 """a track is looked at so often, in control steps"""
-_OBSTACLE_M = 0.5
-"""a track belongs to a moving obstacle this close to where it is forecast now,"""
-_SPEED_S = 0.3
-"""the nearest of them, a m/s of difference in velocity counting as so many metres"""
+_OBSTACLE_M = 0.5  # a track belongs to a moving obstacle this close to where it is forecast now,
+_SPEED_S = 0.3  # the nearest of them, a m/s of difference in velocity counting as so many metres
 _STEP_S = 0.02
 
 
@@ -190,8 +187,7 @@ def _moments(sim: Sim, envs: list[int], paths: list[list[dict[str, Any]]], now_s
 
 MEMORY, MINIBATCH = 2**21, 512
 """moments of tracks that are kept to learn from, and of one step"""
-_LEAST_RATE = 0.02
-"""part of the learning rate that is left at the end"""
+_LEAST_RATE = 0.02  # part of the learning rate that is left at the end
 
 
 class ForecastTrainer(EpisodeTrainer):

@@ -412,8 +412,7 @@ class Guard:
         self.columns, self.patience = tuple(columns), patience
         self._rows = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._none = torch.zeros_like(self._rows)
-        self._counts: dict[str, Tensor] = {}
-        """of what was replaced, column by column"""
+        self._counts: dict[str, Tensor] = {}  # of what was replaced, column by column
         self.bad_in_a_row = 0
 
     def values(

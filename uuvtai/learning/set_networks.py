@@ -21,8 +21,7 @@ MOST_WISH = 2.0
 """wishes beyond it are cut off before they are carried out"""
 AT_DIRECTION = slice(3, 5)
 """columns of ``own`` with the unit vector to the look-ahead point of the route"""
-_SUM_SCALE = 0.3
-"""sums over the obstacles are a few times as large as a maximum"""
+_SUM_SCALE = 0.3  # sums over the obstacles are a few times as large as a maximum
 
 
 class SetEncoder(nn.Module):

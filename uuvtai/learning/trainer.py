@@ -31,8 +31,7 @@ class Trainer:
     def __init__(self, env: Simulated | InSurrogate, config: LearningConfig) -> None:
         """Begins the episodes of ``env``. ValueError for settings that do not fit each other."""
         samples = config.ppo.rollout_steps * env.num_envs
-        self._samples = samples * env.steps
-        """env-steps of one rollout"""
+        self._samples = samples * env.steps  # env-steps of one rollout
         if config.ppo.minibatches > samples:
             told = f"a rollout has only {samples} samples: raise ppo.rollout_steps or train.num_envs"
             raise SettingError(f"ppo.minibatches={config.ppo.minibatches}, but {told}")

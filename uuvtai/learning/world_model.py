@@ -24,8 +24,7 @@ SKILL = "world_model/skill/"
 """before the name of a target in metrics.jsonl"""
 LARGEST_ERROR = 100.0
 """of a target, in SI units: one that is further off counts as so far"""
-_OUT_GAIN = 0.01
-"""of the decoder: at birth it says 0 with variance one"""
+_OUT_GAIN = 0.01  # of the decoder: at birth it says 0 with variance one
 
 
 class WorldModel(nn.Module):

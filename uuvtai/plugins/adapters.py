@@ -205,8 +205,7 @@ class Fixed:
 # wanted.
 
 MAX_WAYPOINTS = 10_000
-_ENDS_M = 1e-4
-"""a route begins and ends within this of start and goal, or they are added"""
+_ENDS_M = 1e-4  # a route begins and ends within this of start and goal, or they are added
 
 
 def commands(found: Any, n: int, place: str, meaning: str, device: torch.device) -> torch.Tensor:

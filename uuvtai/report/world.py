@@ -16,8 +16,7 @@ from uuvtai.logs.encode import checked_suffix
 from uuvtai.logs.picture import save_image
 from uuvtai.logs.scenario import tank_document
 
-_CELL_M = 0.2
-"""of the grid on which scenarios look for a way (``kernels.world.scenario``)"""
+_CELL_M = 0.2  # of the grid on which scenarios look for a way (``kernels.world.scenario``)
 _LEAST_SHARE, _ROUGH_M, _MOST_TOLD = 0.01, 0.05, 5
 """of the spawn area that is told; that an obstacle may reach through a wall; obstacles that are told"""
 _CLEAR = drawing.mixed(drawing.GOAL, drawing.WATER, 0.35)

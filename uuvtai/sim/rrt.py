@@ -30,15 +30,13 @@ Point = tuple[float, float]
 
 RANGE_M = 1.0
 """longest edge of the tree"""
-_STEP_CELLS = 0.5
-"""States along a motion are checked this often [cells]."""
+_STEP_CELLS = 0.5  # States along a motion are checked this often [cells].
 
 _PAD = 0.51 * _STEP_CELLS
 """A state is valid when all cells within this [cells] are: so no cell between two checked states is
 missed."""
 
-_GOAL_M = 1e-3
-"""The goal counts as reached within this."""
+_GOAL_M = 1e-3  # The goal counts as reached within this.
 
 _MAX_SEED = 0x7FFFFFFF
 

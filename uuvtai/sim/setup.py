@@ -311,8 +311,7 @@ def arrays_for(config: Config, sizes: dict[str, int], device: torch.device) -> A
 
 
 _MAX_ENVS = 1 << 20
-_ROWS = (1, 8, 64, 256)
-"""sizes of a batch that are allocated; beyond them powers of two"""
+_ROWS = (1, 8, 64, 256)  # sizes of a batch that are allocated; beyond them powers of two
 _PLAN_SLOTS = 64
 """Plans under way at once: far more than a CPU has cores, and the planner's scratch stays small."""
 _GPU_PLAN_SLOTS, _ENVS_PER_PLAN = 16, 16

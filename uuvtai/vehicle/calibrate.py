@@ -26,8 +26,7 @@ from uuvtai.vehicle.messages import DvlReading, ImuReading, SensorMessage
 from uuvtai.vehicle.start_fix import FLOOR_M, FLOOR_RAD, StartFix, StartFound, Track, expected
 
 LONGEST_S = 1200.0  # of a calibration
-_LEGS, _MOST_LEGS, _FIXES = 6, 11, 3
-"""legs between places at least and at most, and fixes at each place"""
+_LEGS, _MOST_LEGS, _FIXES = 6, 11, 3  # legs between places at least and at most, and fixes at each place
 _LEG_M, _TOLD_M, _DRIFT_M = 1.5, 1.7, 0.5
 """between two places so far by the DVL at least, and so far as the operator is told; less is drift"""
 YAW_RAD, SCALE = math.radians(0.5), 0.05
@@ -85,8 +84,7 @@ class Calibration:
         self._config, self._z_m = config, typed[2]
         self._track, self._at = Track(), np.array(typed[:2])
         """way by attitude and DVL; where the last fix was [m]"""
-        self._from, self._turn = np.zeros(2), 0.0
-        """the way until then; by how much its yaw was wrong"""
+        self._from, self._turn = np.zeros(2), 0.0  # the way until then; by how much its yaw was wrong
         self._fix: StartFix | None = None
         self._still_s, self._number, self._stretch = math.inf, 1, 0
         """at rest since; number of this rest, and of the stretch of the way"""

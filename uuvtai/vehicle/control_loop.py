@@ -218,11 +218,9 @@ class OnboardLoop:
             self._needed.remove("position")
         self._measured_s = dict.fromkeys(NAMES.values(), -math.inf)
         """when what the pilot uses was measured; a scan counts when it is placed in the map"""
-        self._scan_s, self._scans = -math.inf, 0
-        """newest scan heard; scans that were placed"""
+        self._scan_s, self._scans = -math.inf, 0  # newest scan heard; scans that were placed
         self._vehicle: mavlink.Address | None = endpoint.calls
-        self._speaker: mavlink.Address | None = None
-        """where the autopilot's heartbeats come from"""
+        self._speaker: mavlink.Address | None = None  # where the autopilot's heartbeats come from
         self._asked_s = self._beat_s = -math.inf
         self._clock_jumps = self._jumps_before = endpoint.clock_jumps
         self._heard_s = 0.0  # time of the newest step

@@ -34,14 +34,10 @@ class Handover:
         """in which it is driven"""
         self._system, self._limits, self._pretended = system, limits, pretended
         self._leaving = False
-        self._asked: dict[str, tuple[float, int]] = {}
-        """request -> (when it was asked for last, how often)"""
-        self._modes: set[int] = set()
-        """asked for"""
-        self._before = -1
-        """mode at the first order"""
-        self._took = self._was_armed = False
-        """whether it was ever in a mode that was asked for; armed"""
+        self._asked: dict[str, tuple[float, int]] = {}  # request -> (when it was asked for last, how often)
+        self._modes: set[int] = set()  # asked for
+        self._before = -1  # mode at the first order
+        self._took = self._was_armed = False  # whether it was ever in a mode that was asked for; armed
         self._spoke_s = -math.inf
 
     @property

@@ -160,8 +160,7 @@ class FollowedEndpoint(Endpoint):
         self._pause = pause or (lambda: self.wait(0.005))
         self._waiting: list[tuple[Address, bytes]] = []
         self._told_s: float | None = None
-        self._before_s = math.inf
-        """what was told before a time that fell"""
+        self._before_s = math.inf  # what was told before a time that fell
         self._time_s, self._heard_s = 0.0, wall()
 
     def receive(self) -> list[tuple[Address, bytes]]:

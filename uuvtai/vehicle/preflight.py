@@ -135,10 +135,8 @@ class Preflight:
         self._speeds: deque[float] = deque(maxlen=_KEPT)
         self._beams, self._echoes, self._near, self._looked = 0, 0, 0, set[int]()
         self._steps, self._undecided, self._held, self._broken = 0, 0, Counter[str](), Counter[str]()
-        self._from_s = 0.0
-        """they count from then on, and not while it warms up"""
-        self._now: Collection[str] = ()
-        """rules that are broken in the last step"""
+        self._from_s = 0.0  # they count from then on, and not while it warms up
+        self._now: Collection[str] = ()  # rules that are broken in the last step
 
     def asks(self) -> Iterator[Order]:
         """Once a second: requests for the parameters that were not told yet."""

@@ -283,8 +283,7 @@ class ServingNotes:
     def __init__(self, number: int, port: int, now_s: float, stands_in: bool = False) -> None:
         """``stands_in``: no packets come, its autopilot is our own."""
         self._name, self._port, self._stands_in = f"instance {number}", port, stands_in
-        self._seen: Counter[str] = Counter()
-        """packets by turn, as they were told last"""
+        self._seen: Counter[str] = Counter()  # packets by turn, as they were told last
         self._heard_s, self._silence_told = now_s, False
         self._held, self._outcome = True, ""
 

@@ -309,11 +309,9 @@ class Intake:
         self._newest: dict[str, float] = {}
         self._force_b: tuple[float, np.ndarray] | None = None
         self._zero: dict[str, float] = {}
-        self._depth = -math.inf, 0.0
-        """(time, newest depth [m] of the pressure sensor)"""
+        self._depth = -math.inf, 0.0  # (time, newest depth [m] of the pressure sensor)
         self._origin: np.ndarray | None = None
-        self._place = -math.inf, np.zeros(3)
-        """(time, newest position as it was told)"""
+        self._place = -math.inf, np.zeros(3)  # (time, newest position as it was told)
         self._volts: dict[str, tuple[float, float]] = {}
         self._rangers = Rangers()
         self._takers: dict[str, Callable[[Fields, float], list[onboard.SensorMessage]]] = {

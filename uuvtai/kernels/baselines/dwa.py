@@ -23,10 +23,8 @@ from uuvtai.kernels.baselines.local_planner import (
 from uuvtai.kernels.core.geometry import FAR_M, PI, turned_z3
 from uuvtai.kernels.core.stage import Bundle, loop_end
 
-_CLEAR_M = 0.6
-"""Clearance beyond the margin from which on more is worth nothing."""
-_FORBIDDEN = -100.0
-"""Score below that of every admissible velocity."""
+_CLEAR_M = 0.6  # Clearance beyond the margin from which on more is worth nothing.
+_FORBIDDEN = -100.0  # Score below that of every admissible velocity.
 
 
 @quick_launch

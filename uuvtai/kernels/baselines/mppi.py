@@ -29,18 +29,13 @@ from uuvtai.kernels.core.geometry import turned_z3
 from uuvtai.kernels.core.noise import STREAM_MPPI, episode_key, normal, stream_key
 from uuvtai.kernels.core.stage import Bundle, loop_end
 
-_HEAVE_SIGMA_M_S = 0.2
-"""Standard deviation of the noise on heave."""
-_NOISE_TAU_S = 1.0
-"""Correlation time of the noise."""
-_PLAIN = 3
-"""Trials without noise: the plan, the wanted velocity, a stop."""
+_HEAVE_SIGMA_M_S = 0.2  # Standard deviation of the noise on heave.
+_NOISE_TAU_S = 1.0  # Correlation time of the noise.
+_PLAIN = 3  # Trials without noise: the plan, the wanted velocity, a stop.
 
-_FRESH = 8
-"""One in so many samples spreads around the wanted velocity."""
+_FRESH = 8  # One in so many samples spreads around the wanted velocity.
 
-_NEGLIGIBLE = 16.0
-"""A sample whose exponent is lower than the best one's by more has no part in the mean."""
+_NEGLIGIBLE = 16.0  # A sample whose exponent is lower than the best one's by more has no part in the mean.
 
 
 @quick_launch

@@ -16,8 +16,7 @@ from uuvtai.kernels.core.grid import clearance_of, grid_origin
 from uuvtai.kernels.core.simd import filled, filled_int
 from uuvtai.kernels.core.stage import Bundle, Const, Out
 
-_SLACK_S = 1.0e-3
-"""the last sample is within the horizon, however times are rounded"""
+_SLACK_S = 1.0e-3  # the last sample is within the horizon, however times are rounded
 UNSTICK_M_S = 0.3
 """of creeping away from the nearest mapped obstacle, unless the leaf's port says (EC)"""
 

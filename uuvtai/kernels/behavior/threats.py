@@ -86,8 +86,7 @@ def kept_in_sight(turn, way, io: Bundle[BehaviorIO]):
 # still be reached in time; with a dead vertical thruster at the goal's.
 
 
-_BLUR_M = 0.1
-"""An obstacle's edge is known to this, vertically."""
+_BLUR_M = 0.1  # An obstacle's edge is known to this, vertically.
 
 
 @ti.func
@@ -141,8 +140,7 @@ _PATH_SAMPLES = 8
 
 _NEARER = 3
 """Points of the route before the look-ahead point that are tried where the straight way to it is narrow,"""
-_NEARER_M = 0.2
-"""[m] so far apart, from the foot of the route on."""
+_NEARER_M = 0.2  # [m] so far apart, from the foot of the route on.
 
 
 @quick_launch

@@ -90,8 +90,7 @@ def turned_z3(v, yaw):
 # in most cases, else to 2^-16 of the axis's length.
 
 
-_BISECTIONS = 16
-"""0.2 m of axis / 2^16 = 3 micrometres"""
+_BISECTIONS = 16  # 0.2 m of axis / 2^16 = 3 micrometres
 
 _TINY = 1e-9
 

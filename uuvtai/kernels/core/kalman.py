@@ -17,8 +17,7 @@ from uuvtai.kernels.core.geometry import turned_z
 AT = ((0, 1, 2, 3), (1, 4, 5, 6), (2, 5, 7, 8), (3, 6, 8, 9))
 """Place of element [i][j] in the stored triangle."""
 
-_FLOOR = 1.0e-7
-"""Smallest variance [m^2, m^2/s^2]."""
+_FLOOR = 1.0e-7  # Smallest variance [m^2, m^2/s^2].
 
 
 @ti.func

@@ -30,8 +30,7 @@ STREAM_SONAR_SPECKLE = 18
 STREAM_SONAR_HISS = 19
 
 _GOLDEN = 0x9E3779B9
-_TO_UNIT = 1.0 / 16777216.0
-"""24 random bits fill a float32 mantissa exactly: [0, 1) on the grid of 2^-24."""
+_TO_UNIT = 1.0 / 16777216.0  # 24 random bits fill a float32 mantissa exactly: [0, 1) on the grid of 2^-24.
 
 _SINE = (0.999999246, -0.166656827, 0.00831325872, -0.000185243574)
 _COSINE = (0.9999933, -0.49991244, 0.04148775, -0.00127121)

@@ -31,8 +31,7 @@ _COLUMNS = 8
 """Columns on a CPU: LLVM prefers vectors of 256 bits even where there are longer ones, and every element
 costs compile time."""
 
-_WARP = 32
-"""Threads of a GPU that go in step."""
+_WARP = 32  # Threads of a GPU that go in step.
 
 
 def n_column() -> int:

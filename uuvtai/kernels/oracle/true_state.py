@@ -67,8 +67,7 @@ _VARIANCE = 1.0e-6
 _NAMED_M = 0.15
 """A return so close to an obstacle's outline is its own (EC: 3 sigma of the harsh sonar's range)."""
 
-_COLUMN_SHARE = 0.9
-"""An obstacle that takes up so much of the water's depth goes through all of it."""
+_COLUMN_SHARE = 0.9  # An obstacle that takes up so much of the water's depth goes through all of it.
 
 
 def take_true_tracks(io: TrueTracksIO) -> None:

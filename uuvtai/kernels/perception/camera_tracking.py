@@ -25,14 +25,11 @@ _ROW_STRIDE = 2
 """Rows of the image that are looked at: every second one; an obstacle fills several within the range that
 matters."""
 
-_ROUNDING_M = 1.0e-3
-"""Far more than float32 rounds a distance by."""
+_ROUNDING_M = 1.0e-3  # Far more than float32 rounds a distance by.
 
-_PRESENT = 0.95
-"""Probability of an obstacle that has just been seen to be where it is expected."""
+_PRESENT = 0.95  # Probability of an obstacle that has just been seen to be where it is expected.
 
-_NEWLY_SEEN_S = 0.15
-"""[s] a track that the sonar saw this lately needs no image."""
+_NEWLY_SEEN_S = 0.15  # [s] a track that the sonar saw this lately needs no image.
 
 BAND_M, WALL_MARGIN_M = 0.9, 0.25
 """Nothing farther above or below the camera is looked at, nor what is nearer to a known wall (EC)."""
@@ -336,15 +333,13 @@ def begin_spotted(env, at, along, radius, late, height, io: Bundle[TrackingIO]):
 _DEPTH_SLACK_M = 0.25
 """A pixel this close to the obstacle's expected distance shows the obstacle (track errors and the size's)."""
 
-_TRUNCATED_M = 0.4
-"""[m] farthest that the middle of an obstacle may be from its one visible end."""
+_TRUNCATED_M = 0.4  # [m] farthest that the middle of an obstacle may be from its one visible end.
 
 _EDGE_M = 0.1
 """[m] a column through the full water column must reach this close to floor and surface, and a middle is
 known this well."""
 
-_LEAST = 0.05
-"""Likelihood of a height that the image contradicts."""
+_LEAST = 0.05  # Likelihood of a height that the image contradicts.
 
 # what a pixel of the column shows: something nearer than the obstacle (or the image's edge), the obstacle,
 # something beyond it

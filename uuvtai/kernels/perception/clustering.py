@@ -21,11 +21,9 @@ ARC = 0.25 * math.pi
 """Mean over the beams of a far circle's visible arc of sqrt(1 - x^2): how many radii its mean range lies
 before the centre."""
 
-_CANDIDATE = 1 << 20
-"""Label of a beam that may belong to an obstacle and is in no cluster yet."""
+_CANDIDATE = 1 << 20  # Label of a beam that may belong to an obstacle and is in no cluster yet.
 
-_BRIDGE = 3
-"""A run may step this many beams at once: over one beam of any kind, or over two without return."""
+_BRIDGE = 3  # A run may step this many beams at once: over one beam of any kind, or over two without return.
 
 SPLIT_M, SPLIT_SLOPE = 0.18, 0.03
 """Jump of range [m], and more per metre of it, that ends an obstacle (EC, tuned)."""

@@ -26,15 +26,13 @@ COLUMN = LANES - 1
 """Lane of the hypothesis "through the full water column"; the others are centre heights from floor to
 surface."""
 
-_LEAST = 0.01
-"""Likelihood of what cannot be, for one scan may be wrong."""
+_LEAST = 0.01  # Likelihood of what cannot be, for one scan may be wrong.
 
 _LEAST_SHARE = 1.0e-3
 """Share that every hypothesis keeps: many scans may be wrong (two obstacles that cross swap their tracks),
 and nothing comes back from 0."""
 
-_WELL_THERE = 0.95
-"""Probability of an obstacle that has just been matched to be where it is expected."""
+_WELL_THERE = 0.95  # Probability of an obstacle that has just been matched to be where it is expected.
 
 EDGE_M = 0.06
 """Half width of the soft edge of the fan (EC)."""

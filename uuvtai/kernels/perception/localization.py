@@ -39,11 +39,9 @@ from uuvtai.kernels.perception.sensor_model import is_new
 # say. A sonar without Doppler says nothing of the velocity.
 
 
-_BESIDE = 2
-"""Beams on either side that are looked at together with one: most obstacles are wider."""
+_BESIDE = 2  # Beams on either side that are looked at together with one: most obstacles are wider.
 
-_MOST_WRONG = 0.5
-"""No sonar is taken to be worse."""
+_MOST_WRONG = 0.5  # No sonar is taken to be worse.
 
 NEWEST_SHARE, JUMP_SHARE = 0.8, 0.12
 """Share of a step's mean acceleration that its newest reading tells, for rotors follow their command within a
@@ -268,10 +266,8 @@ def form3(cov, a, b, c):
 # ------------------------------------------------------------------------------------------------------------
 
 
-_N = 9
-"""Numbers of the horizontal filter,"""
-_D = 4
-"""and of the depth's."""
+_N = 9  # Numbers of the horizontal filter,
+_D = 4  # and of the depth's.
 
 _START_SPEED_M_S = 0.1
 """Standard deviation of the velocity before the first reading: vehicles start at rest, or nearly (EC)."""

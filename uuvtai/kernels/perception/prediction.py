@@ -36,29 +36,22 @@ _STRAIGHT_SIGMA = 0.4
 """[rad/s] an obstacle is on a straight leg where its turn rate is known to this and less than its standard
 deviation."""
 
-_SETTLED = 0.05
-"""... and where its velocity's variance is below this share of its square."""
+_SETTLED = 0.05  # ... and where its velocity's variance is below this share of its square.
 
-_TURNED_COS = 0.9
-"""Cosine of the change of course that makes a turn: 26 deg."""
+_TURNED_COS = 0.9  # Cosine of the change of course that makes a turn: 26 deg.
 
-_ALIKE_COS = 0.94
-"""Cosine within which two courses are the same: 20 deg."""
+_ALIKE_COS = 0.94  # Cosine within which two courses are the same: 20 deg.
 
 BEGIN_SEEN, CORNER_SEEN = 2, 3
 """``run_kind`` of a way that began with a turn that was seen: back, or a corner."""
 
-_LONGEST_S = 4.0
-"""Two legs farther apart in time than this do not make one turn."""
+_LONGEST_S = 4.0  # Two legs farther apart in time than this do not make one turn.
 
-_MISFIT_M = 0.3
-"""Two legs whose lines and way do not meet within this had more than one turn between them."""
+_MISFIT_M = 0.3  # Two legs whose lines and way do not meet within this had more than one turn between them.
 
-_SAME_M = 0.4
-"""Turns closer than this, on the same courses, are one."""
+_SAME_M = 0.4  # Turns closer than this, on the same courses, are one.
 
-_MOST_WEIGHT = 4.0
-"""A remembered turn moves by at least a quarter of what is seen anew."""
+_MOST_WEIGHT = 4.0  # A remembered turn moves by at least a quarter of what is seen anew.
 
 ACROSS_M, ACROSS_SLOPE = 0.25, 0.1
 """A course leads to a remembered turn that it passes within this, and within so much more per metre ahead

@@ -135,12 +135,9 @@ def _place_at(env, track, future, ahead_s, io: Bundle[TrackingIO]):
 
 
 _SLOWEST_M_S = 0.1
-_NEW_BEND_M = 0.3
-"""a turn this far from the newest one is another"""
-_FAST_LEGS = 3
-"""of the legs between remembered places: over so many a speed is measured"""
-_BACK_COS = -0.9
-"""cosine of the change of course that makes a turn back"""
+_NEW_BEND_M = 0.3  # a turn this far from the newest one is another
+_FAST_LEGS = 3  # of the legs between remembered places: over so many a speed is measured
+_BACK_COS = -0.9  # cosine of the change of course that makes a turn back
 
 
 @quick_launch

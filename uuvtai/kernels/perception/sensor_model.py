@@ -221,8 +221,7 @@ def mark_sectors(env, slot, io: Bundle[MappingIO]):
 NEVER = -(1 << 20)
 """Step of a bearing along which no beam has looked."""
 
-_SAME_M = 0.3
-"""A new return replaces a remembered one of its bearing up to so far behind it (EC)."""
+_SAME_M = 0.3  # A new return replaces a remembered one of its bearing up to so far behind it (EC).
 
 
 @ti.func

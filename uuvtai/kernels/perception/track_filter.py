@@ -22,8 +22,7 @@ from uuvtai.kernels.perception.prediction import BEGIN_SEEN, STRAIGHT_ODDS, next
 # track (part of tracking).
 
 
-_CROSS_SIGMA_M = 0.02
-"""Error of a centre across the beam beside that of its edges (EC)."""
+_CROSS_SIGMA_M = 0.02  # Error of a centre across the beam beside that of its edges (EC).
 
 _EDGE_SIGMA = 0.25
 """Error of the middle of two edges, in beam spacings: each is uniform within one spacing, sqrt(1 / 24) = 0.2,
@@ -136,14 +135,11 @@ _RADIUS_DRIFT = 4.0e-4
 DOPPLER_SIGMAS = 4.0
 """A mean Doppler of this many standard deviations is motion."""
 
-_SETTLED = 0.2
-"""A turn rate is estimated where the velocity's variance is below this share of its square."""
+_SETTLED = 0.2  # A turn rate is estimated where the velocity's variance is below this share of its square.
 
-_CORNER = 0.5
-"""[rad] a larger change of course within one scan is a corner"""
+_CORNER = 0.5  # [rad] a larger change of course within one scan is a corner
 
-_FASTEST_TURN = 4.0
-"""[rad/s] bound of the turn rate"""
+_FASTEST_TURN = 4.0  # [rad/s] bound of the turn rate
 
 
 @ti.func
@@ -328,14 +324,11 @@ def update_turn_rate(env, track, before, io: Bundle[TrackingIO]):
 # way, its root the speed.
 
 
-_SLOWEST_M_S = 0.1
-"""A slower body is where it is, whichever way it turns."""
+_SLOWEST_M_S = 0.1  # A slower body is where it is, whichever way it turns.
 
-_LEAST_SHARE = 1.0e-3
-"""Share of ways at least that an obstacle may still be on."""
+_LEAST_SHARE = 1.0e-3  # Share of ways at least that an obstacle may still be on.
 
-_ODD_SHARE = 0.05
-"""Share of ways that are longer than any expected: their length is exponential."""
+_ODD_SHARE = 0.05  # Share of ways that are longer than any expected: their length is exponential.
 
 
 @ti.func

@@ -396,8 +396,7 @@ def carry_over(env, io: Bundle[TrackingIO]):
 # Which cluster of a scan is which track's body (part of the tracking stage).
 
 
-_REACH_M = 2.0
-"""No match is looked for beyond this; saves the arithmetic."""
+_REACH_M = 2.0  # No match is looked for beyond this; saves the arithmetic.
 
 
 @ti.func

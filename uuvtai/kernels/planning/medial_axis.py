@@ -44,8 +44,7 @@ up (cost at most + 2 %)."""
 _BETTER = 1.0 - 1.0e-6
 """A way must be cheaper by more than rounding to replace another: equal ways would fill the heap."""
 
-_FLAT_M = 1.0e-4
-"""Clearances within this of clearance.max_m are saturated."""
+_FLAT_M = 1.0e-4  # Clearances within this of clearance.max_m are saturated.
 
 
 def widest_m(clearance, quiet, voronoi):
@@ -264,8 +263,7 @@ def is_traversable(env, row, col, room, io: Bundle[RouteIO]):
 # geometry never changes.
 
 
-_ROUNDING = 1.0e-4
-"""A segment longer than the spacing by less than this share is not cut in two."""
+_ROUNDING = 1.0e-4  # A segment longer than the spacing by less than this share is not cut in two.
 
 WIDENING = 1.25
 """Where a route does not fit into n_way waypoints, its spacing grows by this factor until it does."""
@@ -316,8 +314,7 @@ STRIDE = 4
 _CORNER = 0.01
 """[cells] a line that passes a corner of the grid this closely must find both cells beside it traversable."""
 
-_NEVER = 2.0
-"""Beyond the end of a line, whose parameter runs from 0 to 1."""
+_NEVER = 2.0  # Beyond the end of a line, whose parameter runs from 0 to 1.
 
 _GAIN = 1.0e-4
 """A chord must not cost more than the cells it replaces, up to this share (rounding on a straight run)."""

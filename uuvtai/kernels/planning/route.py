@@ -22,8 +22,7 @@ from uuvtai.state import RouteState
 # Where things are along a route: the vehicle's foot, and points ahead of it. Lengths are measured back from
 # the goal (way_left_m).
 
-_WINDOW_M = 1.5
-"""How far ahead of the last foot the new one is looked for."""
+_WINDOW_M = 1.5  # How far ahead of the last foot the new one is looked for.
 
 
 @ti.func
@@ -131,8 +130,7 @@ def risk_at(env, cell, room, io: Bundle[RouteIO]):
 # ------------------------------------------------------------------------------------------------------------
 
 
-_LONG_AGO = -(1 << 20)
-"""Step at which no trigger has been served yet."""
+_LONG_AGO = -(1 << 20)  # Step at which no trigger has been served yet.
 
 
 @quick_launch

@@ -19,21 +19,17 @@ from uuvtai.kernels.core.stage import Bundle, loop_end, n_envs, shares
 from uuvtai.kernels.sensors.io import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
 
-_BLOCK = 36
-"""Image rows per loop item on a CPU: obstacles are projected once per item."""
+_BLOCK = 36  # Image rows per loop item on a CPU: obstacles are projected once per item.
 
-_BLOCK_GPU = 4
-"""Rows per loop item where items are threads and thousands of them must be there."""
+_BLOCK_GPU = 4  # Rows per loop item where items are threads and thousands of them must be there.
 
 _NEAR_M = 0.02
 """A bounding corner nearer than this to the camera's plane is not projected: the obstacle is then tested in
 the whole image."""
 
-_MARGIN = 0.01
-"""[pixel] added around the bounding rectangle against rounding."""
+_MARGIN = 0.01  # [pixel] added around the bounding rectangle against rounding.
 
-_POKED_M = 1.0e-6
-"""A camera nearer to a wall than this pokes through it."""
+_POKED_M = 1.0e-6  # A camera nearer to a wall than this pokes through it.
 
 CameraPose = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
 """Truth of the camera as float32: world position [m], body to world."""

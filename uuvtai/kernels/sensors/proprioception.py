@@ -28,8 +28,7 @@ from uuvtai.kernels.core.noise import (
 from uuvtai.kernels.core.stage import Bundle, n_envs
 from uuvtai.kernels.sensors.io import ExactProprioceptionIO, ProprioceptionIO, VelocityIO
 
-_EPISODE_DRAW = 1000
-"""Index of draws made once per episode, apart from those of step 0."""
+_EPISODE_DRAW = 1000  # Index of draws made once per episode, apart from those of step 0.
 _RISE_RATE = 4.0
 """[rad/s] of the critically damped filter that finds the heave by pressure: it lags by half a second, and
 2 cm of noise in each reading become 1.6 cm/s (EC)"""

@@ -15,8 +15,7 @@ from uuvtai.kernels.core.simd import LANES, f16x, filled, lane_bits
 from uuvtai.kernels.core.stage import Bundle, Const
 from uuvtai.kernels.sensors.io import SonarIO
 
-_TINY = 1.0e-9
-"""Below this a direction component counts as parallel."""
+_TINY = 1.0e-9  # Below this a direction component counts as parallel.
 
 _SKIN_M = 1.0e-4
 """A ray that starts on a surface (after a bounce) does not meet that surface again within this."""

@@ -42,8 +42,7 @@ from uuvtai.kernels.sensors.raycast import nearest_echo, place_obstacles
 CLOUD_BRIGHTNESS = 0.5
 """Stands for the cosine of incidence of a bubble cloud (EC)."""
 
-_CLOUD_NEAREST_M = 0.5
-"""Bubble clouds form between this and the maximum range (EC)."""
+_CLOUD_NEAREST_M = 0.5  # Bubble clouds form between this and the maximum range (EC).
 
 
 @ti.func
@@ -229,11 +228,9 @@ _FALLOFF = 0.9
 """Intensity = cosine of incidence x (1 - 0.9 r / maximum range): Lambert's law and what gain control leaves
 of the range loss (EC)."""
 
-_DIMMEST = 0.01
-"""Floor of the cosine in the intensity, so that a return is never 0."""
+_DIMMEST = 0.01  # Floor of the cosine in the intensity, so that a return is never 0.
 
-_BEAMS_GPU = 8
-"""Beams of one thread of a GPU"""
+_BEAMS_GPU = 8  # Beams of one thread of a GPU
 
 Mount = ti.types.struct(pos=ti.math.vec3, vel=ti.math.vec2, heading=ti.math.vec2)
 """Truth of the sensor as float32: world position [m], horizontal velocity [m/s], unit vector ahead."""

@@ -29,8 +29,7 @@ from uuvtai.kernels.sensors.io import SonarIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, obstacles_in_wedge, slab_span, wall_echo
 from uuvtai.kernels.sensors.sonar import place_sonar, sonar_mount
 
-_WALL, _FLOOR, _SURFACE = -1, -2, -3
-"""surfaces that are no obstacle"""
+_WALL, _FLOOR, _SURFACE = -1, -2, -3  # surfaces that are no obstacle
 
 
 @quick_launch

@@ -16,8 +16,7 @@ from uuvtai.kernels.vehicle.dynamics import rpm_of_thrust, thrust_limits, thrust
 from uuvtai.kernels.vehicle.io import ActuationIO
 from uuvtai.kernels.vehicle.thruster_fault import vertical_pair
 
-_LARGEST = 3.4028234663852886e38
-"""of float32"""
+_LARGEST = 3.4028234663852886e38  # of float32
 BAND_M_S, BAND_RAD_S = 0.3, 0.5
 """errors beyond do not build up the integral: they are a step under way or a blocked vehicle, and both would
 overshoot later (EC)"""

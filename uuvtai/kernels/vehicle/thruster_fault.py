@@ -32,8 +32,7 @@ from uuvtai.kernels.vehicle.io import ThrusterWatchIO
 _OFFSET_NOISE_N2_S = 2.5
 """How much squared residual tells as much of the offset as the accelerometer's data sheet."""
 
-_SMOOTH_S = 0.1
-"""Time constant of felt and asked thrusts."""
+_SMOOTH_S = 0.1  # Time constant of felt and asked thrusts.
 
 RATIO, DOUBT_N2_S = 0.3, 1.0
 """A death must leave less than this share of what any other explanation leaves of the felt thrust, which
@@ -43,8 +42,7 @@ evidence (EC)."""
 _SUSPECT, _SUSPECT_RATIO = 0.3, 0.4
 """Share of ``DOUBT_N2_S``, and what stands for ``RATIO``, where one is only suspected."""
 
-_UPRIGHT = 0.99
-"""Vertical share of a thruster's direction, at least."""
+_UPRIGHT = 0.99  # Vertical share of a thruster's direction, at least.
 
 
 def vertical_group(vehicle_cfg):

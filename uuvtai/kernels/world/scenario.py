@@ -52,16 +52,13 @@ FAULT_ENDPOINTS = 1
 FAULT_STATIC = 2
 FAULT_JOINED = 4
 
-_LAYOUTS = 16
-"""Static layouts drawn for one pair of start and goal."""
+_LAYOUTS = 16  # Static layouts drawn for one pair of start and goal.
 _PAIRS = 32
 """Pairs of start and goal that are tried: where a wall parts the water, half of them cannot be joined."""
 _PAIR_DRAWS = 64
 _PLACE_DRAWS = 64
-_SWEEPS = 64
-"""Pairs of raster sweeps of the flood; what needs more counts as not joined."""
-_PAIR_STEP = 1 << 20
-"""Keeps the keys of start and goal apart from those of layouts."""
+_SWEEPS = 64  # Pairs of raster sweeps of the flood; what needs more counts as not joined.
+_PAIR_STEP = 1 << 20  # Keeps the keys of start and goal apart from those of layouts.
 
 
 @ti.func

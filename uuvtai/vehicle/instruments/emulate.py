@@ -94,8 +94,7 @@ class FakePing360:
         self._rng, self._zero, self._own = np.random.default_rng(seed), zero_gradian, own
         self._frames, self._client = ping.Frames(), ("", 0)
         self._scan: tuple[bytes, int, int, int] | None = None
-        self._single: tuple[bytes, int] | None = None
-        """how to listen, and the angle that was asked for"""
+        self._single: tuple[bytes, int] | None = None  # how to listen, and the angle that was asked for
         self._at, self._way, self._due_s = 0, 1, -math.inf
 
     def step(self, now_s: float, echo: Echo, sound_m_s: float = 1500.0) -> None:

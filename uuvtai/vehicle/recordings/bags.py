@@ -177,8 +177,7 @@ class _Bag:
     def __init__(self, source: Source, config: Config, start: tuple[float, ...]) -> None:
         self.source, self._config, self.stores = source, config, RosMessages(DECLARED)
         self.telemetry = Telemetry(source, config, start)
-        self._chosen: dict[str, str] = {}
-        """what is told -> topic that tells it"""
+        self._chosen: dict[str, str] = {}  # what is told -> topic that tells it
         self.telemetry.only_places = True
         self._head = sources.ping360(source, config) if config.sensors.sonar.mechanical else None
 
