@@ -68,6 +68,12 @@ def test_a_line_of_the_makers_page_is_a_velocity_in_our_axes():
     assert reading.time_s == pytest.approx(20.0 - 0.189319)  # transmission less validity
 
 
+def test_what_a_relay_says_again_is_not_believed_again():
+    assert len(a50(line(), line(vx=0.1), line(vx=0.1)).poll(1.0)) == 2
+    device = sonar3d(GOLDEN, GOLDEN)
+    assert len(device.poll(1.0)) == 2 and device.refused == {"the same again": 1}
+
+
 def test_a_device_mounted_at_an_angle_is_turned_back():
     (reading,) = a50(line(vx=0.3, vy=0.0, vz=0.0), yaw_rad=math.pi / 2).poll(1.0)
     assert np.allclose(reading.vel_b, [0.0, 0.3, 0.0])
@@ -186,6 +192,21 @@ def test_a_quiet_profile_is_free_water_and_a_loud_one_is_unknown():
                  data=bytearray(np.linspace(255, 20, 1200).astype(np.uint8).tobytes()))  # fmt: skip
     sonar = ping360(noisy)
     assert sonar.poll(1.0) == [] and any("neither" in why for why in sonar.refused)
+
+
+@pytest.mark.parametrize("level", [0, 200, 255])
+def test_a_transducer_that_is_dead_or_deaf_tells_of_no_free_water(level):
+    assert math.isnan(ping.first_echo(np.full(1200, level, np.uint8), BIN_M, 0.3))
+
+
+def test_profiles_that_come_together_were_taken_one_after_the_other():
+    shapes = {"range_m": (1,), "hit": (1,), "doppler_m_s": (0,), "first_beam": ()}
+    inbox, found = Inbox({f"sonar.{name}": shape for name, shape in shapes.items()}), []
+    for each in ping360(*(device_data(201 + 2 * k, 3.0) for k in range(3))).poll(5.0):
+        inbox.feed(each)
+    while each := inbox.newest("sonar", 5.0, in_turn=True):
+        found.append(each.first_beam)
+    assert found == [31, 30, 29] and inbox.tallies["sonar"].late == 0
 
 
 def test_an_echo_within_the_ring_down_is_none():
@@ -516,7 +537,7 @@ def test_another_view_than_the_first_is_not_used(monkeypatch):
     assert len(device.poll(1.0)) == 2
     image = rip2.image_of(GOLDEN)
     monkeypatch.setattr(rip2, "image_of", lambda _packet: image._replace(fov_rad=(0.1, 0.1)))
-    device.channel.pieces = [GOLDEN]
+    device.channel.pieces = [GOLDEN + b"2"]
     assert device.poll(2.0) == [] and any("than the first" in why for why in device.refused)
 
 

@@ -259,6 +259,20 @@ def test_a_position_that_jumps_is_no_velocity(feed, build, small):
     assert small.arrays("ego")["ego.vel_valid"][0] == 0
 
 
+def test_a_velocity_that_no_thrust_explains_moves_nothing(small, build, monkeypatch, tmp_path):
+    """A DVL's single reading of 6 m/s had moved the own place for good."""
+    estimate_pose(monkeypatch, small)
+    feed = read_feed(recorded(small, tmp_path))
+    usual, _ = commands(feed, build)
+    told, spike = list(feed.arrivals), np.array([6.0, 0.0, 0.0])
+    at = [n for n, each in enumerate(told) if isinstance(each.message, onboard.DvlReading)][8]
+    message = dataclasses.replace(told[at].message, vel_b=told[at].message.vel_b + spike)
+    told[at] = dataclasses.replace(told[at], message=message)
+    found, pilot = commands(feed, build, told)
+    assert pilot.tallies["dvl"].unplaced == 1
+    assert max(math.dist(a.pos_w, b.pos_w) for a, b in zip(usual, found, strict=True)) < 0.03
+
+
 def test_nothing_at_all_is_a_stop(feed, build):
     found, _ = commands(feed, build, [])
     assert all(not command.action.any() and command.leaf is not None for command in found)

@@ -363,12 +363,12 @@ class OnboardLoop:
                     self._take(sender, message, come_s)
         if not self._is_leaving:
             for instrument, reading in self._rig.poll(come_s, self._rate_b):
-                self._log.read(come_s, reading)
                 try:
                     self._feed(reading, self._plan.instruments.get(NAMES[type(reading)], ""), come_s)
                 except ValueError as error:  # arrays of another vehicle's shape
                     instrument.refuse(str(error))
                 else:
+                    self._log.read(come_s, reading)
                     if isinstance(reading, DvlReading):
                         self._intake.note_velocity(reading)
         self._handover.watch(self._intake.heard, now_s)

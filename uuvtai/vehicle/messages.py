@@ -94,7 +94,7 @@ LIMITS = {
     "rpy": 100.0,
     "rate_b": 50.0,
     "specific_force_b": 500.0,
-    "vel_b": 50.0,
+    "vel_b": 10.0,
     "pos_w": 1e5,
     "depth_m": 1e5,
     "range_m": 1e5,
@@ -119,7 +119,8 @@ class Tally:
     used: int = 0
     late: int = 0  # as old as one that was used already, or superseded before a step could use it
     bad: int = 0  # with a number that is not finite, or larger than anything believed
-    unplaced: int = 0  # scans and images taken when the own attitude or position was not known
+    unplaced: int = 0
+    """scans and images taken when the own attitude or position was not known; velocities that cannot be"""
 
 
 class Inbox:
@@ -170,7 +171,7 @@ class Inbox:
             self._waiting[name] = [message for message in self._waiting[name] if message.time_s > best.time_s]
             ready = [message for message in ready if message.time_s <= best.time_s]
         else:
-            best = max(ready, key=lambda message: message.time_s)
+            best = max(reversed(ready), key=lambda message: message.time_s)
             self._waiting[name] = [message for message in self._waiting[name] if message.time_s > now_s]
         tally = self.tallies[name]
         if best.time_s <= self._newest[name]:

@@ -149,12 +149,12 @@ def _shapes(numbers: PilotNumbers) -> dict[str, tuple[int, ...]]:
 
 def _is_seen(ping: SonarPing, numbers: PilotNumbers) -> bool:
     """Whether beams do not lie beside the fan. ValueError for those that the sonar does not have."""
-    n, is_ring = len(ping.range_m), numbers.circle == numbers.beams
+    n, is_ring = np.size(ping.range_m), numbers.circle == numbers.beams
     there = 0 <= ping.first_beam < numbers.circle and n <= numbers.beams
     there = there and (is_ring or ping.first_beam + n <= numbers.circle)
-    if numbers.mechanical and not (there and n == len(ping.hit) > 0):
+    if numbers.mechanical and not (there and n == np.size(ping.hit) > 0):
         raise ValueError(
-            f"sonar: {n} ranges and {len(ping.hit)} hits from beam {ping.first_beam} on are no neighbouring "
+            f"sonar: {n} ranges and {np.size(ping.hit)} hits from beam {ping.first_beam} on are no "
             f"beams of {numbers.beams}"
         )
     if not numbers.mechanical and ping.first_beam != 0:

@@ -150,7 +150,8 @@ class MotionWatch:
         self._views, self._estimated = views, numbers.estimated
         self._dt, self._gravity = numbers.dt_s, numbers.gravity_m_s2
         self.sums = MotionSums()
-        self._before = self._expected = self._own()
+        self._before = self.expected = self._own()
+        """after the last step; now, by the accelerometer"""
 
     def note_walls(self, step: int) -> None:
         """Before ``step``: what the last one's scan has corrected."""
@@ -166,7 +167,7 @@ class MotionWatch:
         attitude = np.array([rpy[0], rpy[1], rpy[2] + corrected], np.float64)
         accel_b = acceleration_b(imu, before.vel_b, self._gravity) - before.bias_b
         vel_w = to_world(before.vel_b + 0.5 * dt * accel_b, attitude)
-        self._expected = OwnPose(
+        self.expected = OwnPose(
             before.pos_w + dt * vel_w, attitude, before.vel_b + dt * accel_b, before.bias_b
         )
         self.sums.feel(accel_b, vel_w, dt)
@@ -175,7 +176,7 @@ class MotionWatch:
         """After the prediction: what a DVL's reading has corrected in it; other steps have none."""
         now = self._own()
         if self._estimated and step > 0 and self._views["ego.dvl_fresh"][0]:
-            self.sums.correct(self._expected, now, self._dt * step)
+            self.sums.correct(self.expected, now, self._dt * step)
         self._before = now
 
     def _own(self) -> OwnPose:
@@ -197,6 +198,7 @@ FIX_AGE_S = 0.3
 at the wrong place of the map. A velocity or depth later than this is not carried forward, and a velocity by
 positions is no older"""
 FASTEST_M_S = 3.0  # a position that changes faster was corrected, not driven
+JUMP_M_S, JUMP_M_S2 = 1.0, 2.0  # a velocity may be off by so much, and more after a silence (EC)
 
 
 class FedSensors:
@@ -266,17 +268,21 @@ class FedSensors:
 
     def _take_velocity(self) -> None:
         """Valid where the DVL has said anything since its last turn; else it holds the last reading. A late
-        one changes by what the accelerometer has felt since."""
+        one changes by what the accelerometer has felt since; one that no thrust explains is none."""
         reading, ego = self._inbox.newest("dvl", self.now_s), self._ego
-        ego["vel_valid"][0] = ego["dvl_fresh"][0] = isinstance(reading, DvlReading)
+        is_valid = isinstance(reading, DvlReading)
         if isinstance(reading, DvlReading):
             velocity = np.asarray(reading.vel_b)
             if self._steps_since(reading.time_s):
                 then = self._motion_at(reading.time_s, self._dvl_period)
-                ego["vel_valid"][0] = ego["dvl_fresh"][0] = then is not None
+                is_valid = then is not None
                 velocity = velocity + self._watch.sums.won_b - then["won_b"] if then else ego["vel_b"][0]
+            silent_s = (self.step - self._dvl_step) * self._dt
+            if np.linalg.norm(velocity - self._watch.expected.vel_b) > JUMP_M_S + JUMP_M_S2 * silent_s:
+                self._inbox.reject("dvl")
+                is_valid, velocity = False, ego["vel_b"][0]
             ego["vel_b"][0] = ego["dvl_b"][0] = velocity
-        self._dvl_valid = ego["vel_valid"][0]
+        self._dvl_valid = ego["vel_valid"][0] = ego["dvl_fresh"][0] = is_valid
         self._dvl_step = self.step if self._dvl_valid else self._dvl_step
 
     def _offer_change(self) -> None:

@@ -107,9 +107,10 @@ def test_a_log_tells_the_beams_of_this_step_alone():
     ("ping", "message"),
     [
         (SonarPing(0.0, np.ones(2), np.ones(1), np.zeros(0), 3), "2 ranges and 1 hits from beam 3"),
-        (SonarPing(0.0, np.ones(2), np.ones(2), np.zeros(0), 199), "are no neighbouring beams of 64"),
+        (SonarPing(0.0, np.ones(2), np.ones(2), np.zeros(0), 199), "are no beams of 64"),
         (SonarPing(0.0, np.ones(1), np.ones(1), np.zeros(0), -1), "from beam -1"),
         (SonarPing(0.0, np.ones(0), np.ones(0), np.zeros(0), 0), "0 ranges"),
+        (SonarPing(0.0, 1.0, 1.0, np.zeros(0)), r"range_m must have the shape"),
         (SonarPing(0.0, np.ones(1), np.ones(1), np.zeros(1), 0), r"doppler_m_s must have the shape \(0,\)"),
     ],
 )

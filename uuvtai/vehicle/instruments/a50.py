@@ -44,8 +44,9 @@ class A50(Instrument):
 
     def _reading(self, line: bytes, now_s: float) -> DvlReading | None:
         said = json_object(line) if len(line) <= LONGEST else None
-        if said is None:
-            return self.refuse("no line of JSON")
+        is_again, self._last = line == self._last, line
+        if said is None or is_again:
+            return self.refuse("the same line again" if is_again else "no line of JSON")
         if said.get("type", "velocity") != "velocity":
             return self.refuse(f"{str(said['type'])[:32]}: not used")
         numbers = [_number(said, name) for name in ("vx", "vy", "vz", "fom")]

@@ -220,7 +220,7 @@ class Instrument(ABC):
     """One device: ``poll`` in every step gives what it has told."""
 
     def __init__(self, channel: Channel) -> None:
-        self.channel = channel
+        self.channel, self._last = channel, b""  # of what stamps: a relay without it may say one for ever
         self.heard = 0
         """messages that were understood"""
         self.refused: Counter[str] = Counter()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 
 import numpy as np
 
@@ -67,6 +68,7 @@ class Frames:
 _SMOOTH_M, _GUARD_M, _AROUND_M = 0.02, 0.06, 0.30
 _FACTOR, _ABOVE = 1.5, 12.0  # an echo is so many times its surroundings, and so much of 255 above them
 _RINGS_M = 0.5  # a transducer may ring so far; a profile that is loud beyond, without an echo, tells nothing
+_ALIVE, _DEAF = 50, 80  # nor does one that does not ring so loud, or in whose noise an echo may not stand out
 
 
 def first_echo(profile: np.ndarray, bin_m: float, blind_m: float) -> float:
@@ -96,6 +98,7 @@ def first_echo(profile: np.ndarray, bin_m: float, blind_m: float) -> float:
         return math.nan
     loud = np.flatnonzero(beyond > np.median(beyond) + _ABOVE)
     is_quiet = blind_m + bin_m * (loud.max(initial=-1) + 1) <= max(_RINGS_M, 2.0 * blind_m)
+    is_quiet &= profile[: round(_RINGS_M / bin_m)].max() >= _ALIVE and np.median(beyond) <= _DEAF
     return math.inf if is_quiet else math.nan
 
 
@@ -130,6 +133,7 @@ class Ping360(Instrument):
         seconds = 2.0 * sonar_cfg.max_range_m / sound_m_s
         self._period = max(80, math.ceil(seconds / (MOST_SAMPLES * TICK_S)))
         self._samples = min(MOST_SAMPLES, math.ceil(seconds / (self._period * TICK_S)))
+        self._listens_s = TICK_S * self._period * self._samples
 
     def poll(self, now_s: float) -> list[SensorMessage]:
         pieces, found = self.channel.read(now_s), []
@@ -140,6 +144,8 @@ class Ping360(Instrument):
             for number, payload in self._frames.take(piece):
                 if (ping := self._ping(number, payload, now_s)) is not None:
                     found.append(ping)
+        for back, ping in enumerate(reversed(found)):  # of several the first were taken before the last
+            found[-1 - back] = replace(ping, time_s=ping.time_s - back * self._listens_s)
         if self._frames.broken:
             self.refused["a wrong sum, or a length that no frame has"] = self._frames.broken
         self._ask(now_s)

@@ -64,7 +64,7 @@ class Rig(AbstractContextManager["Rig"]):
                     instrument.refuse(f"{name}: numbers that cannot be")
                 elif not isinstance(message, DvlReading):
                     yield instrument, message
-                elif message.vel_b.shape != (3,):
+                elif np.shape(message.vel_b) != (3,):
                     instrument.refuse("dvl: a velocity has three numbers")
                 else:
                     moved = np.cross(rate_b, self._lever)

@@ -160,7 +160,8 @@ class Sonar3D(Instrument):
     def poll(self, now_s: float) -> list[SensorMessage]:
         found: list[SensorMessage] = []
         for packet in self.channel.read(now_s):
-            image = image_of(packet)
+            image = "the same again" if packet == self._last else image_of(packet)
+            self._last = packet
             if isinstance(image, str):
                 self.refuse(image)
                 continue

@@ -333,18 +333,14 @@ def read_a50(source: Source, config: Config) -> None:
     """Lines of JSON, each perhaps behind the time when it came: seconds, ISO 8601, or a clock's."""
     dvl = config.sensors.dvl
     device = A50(_Piece(), math.radians(dvl.yaw_deg), dvl.fom_most_m_s, dvl.latency_s)
-    played, come_s, last = Played(source, device, "a line"), 0.0, b""
+    played, come_s = Played(source, device, "a line"), 0.0
     for row in read_lines(source.path, MOST_BYTES, longest=4 * LONGEST):
         line = row.strip()
         if not line:
             continue
         source.heard()
         at = line.find(b"{", 0, _LONGEST_PREFIX)
-        if at < 0 or line == last:
-            source.drop("a line", "no JSON object" if at < 0 else "the same line again")
-            continue
-        last = line
-        said = json_object(line[at:])
+        said = json_object(line[at:]) if at >= 0 else None
         if said is None:
             source.drop("a line", "no JSON object")
             continue
