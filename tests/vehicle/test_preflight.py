@@ -41,8 +41,8 @@ class RestingSub(FakeSub):
         self.parameters, self.config, self.steps = dict(GOOD), link_config(), 0
         self.every = {}
         """name -> every so many steps it comes"""
-        self.changed = {}
-        """name -> fields of it as they are told"""
+        self.changed, self.stuck = {}, set()
+        """name -> fields of it as they are told; names that are told without noise"""
 
     def speak(self, dt=DT):
         self.steps += 1
@@ -56,6 +56,11 @@ class RestingSub(FakeSub):
         fields = {"position_delta": [0.0] * 3} if name == "VISION_POSITION_DELTA" else {}
         for field, value in (fields | self.changed.get(name, {})).items():
             setattr(message, field, value)
+        noise = 1e-6 * (self.steps % 7) * (name not in self.stuck)
+        if name == "VISION_POSITION_DELTA":
+            message.position_delta = [value + noise for value in message.position_delta]
+        elif name == "ATTITUDE":
+            message.roll += noise
         super().emit(name, message, link)
 
     def scan(self):
@@ -172,6 +177,26 @@ def parameter(name, value):
     return lambda one: one.sub.parameters.update({name: value})
 
 
+def often(*given, link=None):
+    """A message that comes in every step."""
+
+    def plant(one):
+        sender = mav.MAVLink(None, srcSystem=link[0], srcComponent=link[1]) if link else None
+        return lambda step: one.sub.send(given[0](*given[1:]), sender)
+
+    return plant
+
+
+def by_the_hull(one):
+    """The depth sensor is not found: the hull's barometer alone."""
+    one.sub.silent.add("SCALED_PRESSURE2")
+    return often(mav.MAVLink_scaled_pressure_message, 0, 1013.25, 0.0, 2000)(one)
+
+
+def swings(one):
+    return lambda step: setattr(one.sub, "depth", 0.8 + 0.35 * math.sin(step))
+
+
 def jumps(one):
     """The vehicle's clock is set an hour ahead."""
     return lambda step: setattr(one.sub, "time_s", one.sub.time_s + 3600.0 * (step == 80))
@@ -205,6 +230,21 @@ PLANTED = {
     "attitude at 4 Hz": (lambda one: one.sub.every.update(ATTITUDE=5), "imu", "bad", "slower than 10 Hz"),
     "attitude in gaps": (lambda one: one.sub.every.update(ATTITUDE=14), "imu", "bad", "longer than 0.5 s"),
     "clock jumps": (jumps, "clock jumps", "bad", "ATTITUDE 1 times"),
+    "DVL stuck": (lambda one: one.sub.stuck.add("VISION_POSITION_DELTA"), "dvl", "bad", "it is stuck"),
+    "attitude stuck": (lambda one: one.sub.stuck.add("ATTITUDE"), "imu", "bad", "it is stuck"),
+    "hull's barometer": (by_the_hull, "pressure", "bad", "is the depth sensor connected"),
+    "depth swings": (swings, "pressure", "bad", "at rest"),
+    "leak": (often(mav.MAVLink_statustext_message, 2, b"Leak Detected"), "autopilot says", "bad", "Leak"),
+    "emergency": (told("HEARTBEAT", system_status=6), "autopilot says", "bad", "emergency"),
+    "checks fail": (
+        told("SYS_STATUS", onboard_control_sensors_enabled=1 << 28), "autopilot says", "bad", "before arming"),
+    "stick at its end": (
+        often(mav.MAVLink_manual_control_message, 1, 0, 0, 0, 0, 0, link=(255, 190)), "sticks", "bad", "let go"),
+    "joystick without GUIDED": (parameter("VISO_TYPE", 0), "VISO_TYPE", "bad", "joystick off"),
+    "second pilot": (
+        often(mav.MAVLink_heartbeat_message, 18, 8, 0, 0, 4, 3, link=(1, 191)), "left out", "bad", "second uuv"),
+    "leak failsafe warns": (parameter("FS_LEAK_ENABLE", 1), "FS_LEAK_ENABLE", "note", "only warns: set 2"),
+    "GCS failsafe disarms": (parameter("FS_GCS_ENABLE", 2), "FS_GCS_ENABLE", "note", "only disarms"),
     "armed": (lambda one: setattr(one.sub, "armed", True), "armed", "bad", "disarm"),
     "stack undecided": (lambda one: setattr(one.pilot, "held", ("dvl: old",)), "free run", "bad", "dvl"),
 }  # fmt: skip
@@ -218,6 +258,8 @@ TOGETHER = [
     "DVL invalid, attitude in gaps, stack undecided", "two autopilots",
     "vehicle of another type, no vehicle of that type",
     "vehicle upside down, no answer", "clock jumps", "armed",
+    "DVL stuck, attitude stuck, hull's barometer, leak, leak failsafe warns, GCS failsafe disarms",
+    "emergency", "checks fail, second pilot, depth swings", "stick at its end, joystick without GUIDED",
 ]  # fmt: skip
 """what one vehicle can have at once"""
 
@@ -268,7 +310,7 @@ def heard_itself(check, lost=0.0, echo=echo, minimum_m=0.3, mute=(), seconds=6.0
 
     def step(number):
         if "dvl" not in mute:
-            dvl.tell(number * DT, np.zeros(3), 1.0)
+            dvl.tell(number * DT, np.full(3, 1e-3 * (number % 7)), 1.0)
         if "sonar" not in mute:
             sonar.step(number * DT, echo)
 

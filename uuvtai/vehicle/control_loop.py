@@ -32,6 +32,7 @@ from uuvtai.vehicle.telemetry import AUTOPILOT, COMPANION, Heard, Intake, Sender
 
 # ---- What ``uuv pilot`` was told, checked before anything is opened or compiled.
 
+_ECHOES = 3  # more of our own heartbeats than we sent are another's
 EDGE_M = 0.2  # the fence's depths keep so far from surface and floor of the tank where none are typed
 MOST_SPEED_M_S = 2.0
 _USUAL_S = {"fly": math.inf, "check": CHECK_S, "calibrate": calibrate.LONGEST_S}
@@ -273,6 +274,7 @@ class OnboardLoop:
             stalled_s = max(0.0, now_s - due_s)
             if stalled_s > safety.STALL_S:
                 self._lag_s, due_s = self._lag_s + stalled_s, now_s
+                self._rig.forget(now_s)  # what came meanwhile would count as told now
             command = self.step(now_s, stalled_s)
             if self._start.refusal:
                 return (f"start refused: {self._start.refusal}",)
@@ -361,6 +363,8 @@ class OnboardLoop:
                     self._tried(self._take, sender, message, come_s)
                 else:
                     self._take(sender, message, come_s)
+        if self._codec.echoes > self.tally.sent["HEARTBEAT"] + _ECHOES:
+            self._intake.refuse("another program speaks as we do: does a second uuv pilot run")
         if not self._is_leaving:
             for instrument, reading in self._rig.poll(come_s, self._rate_b):
                 try:
@@ -611,6 +615,7 @@ def fly(
             if followed:
                 now, sleep = followed.now, partial(followed.sleep, stop=stop)
             endpoint.forget()  # what came while kernels were compiled
+            rig.forget(0.0)
             fix = None if plan.purpose == "calibrate" else StartFix(config, plan.mission.start)
             loop = OnboardLoop(config, pilot, plan, endpoint, log, now, sleep, note, fix, rig)
             dry = f"{_DRY[plan.purpose]}: no order that moves the vehicle is sent"

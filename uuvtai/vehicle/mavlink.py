@@ -338,8 +338,8 @@ class MavCodec:
         self._as_operator = self._dialect.MAVLink(None, srcSystem=operator, srcComponent=component)
         self.senders = {(system, component), (operator, component)}
         """ours: what comes back from there is an echo"""
-        self.broken = 0
-        """pieces of datagrams that were no message"""
+        self.broken = self.echoes = 0
+        """pieces of datagrams that were no message; heartbeats by our own id"""
 
     def decode(self, datagram: bytes) -> list[MavMessage]:
         """Messages of one datagram; nothing is carried over to the next one."""
@@ -356,7 +356,9 @@ class MavCodec:
                 self.broken += 1
                 continue
             sender = message.get_srcSystem(), message.get_srcComponent()
-            if sender not in self.senders:
+            if sender in self.senders:
+                self.echoes += message.get_type() == "HEARTBEAT"
+            else:
                 fields = {name: getattr(message, name) for name in message.get_fieldnames()}
                 found.append(MavMessage(message.get_type(), *sender, fields))
         return found

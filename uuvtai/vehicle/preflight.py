@@ -16,8 +16,17 @@ import numpy as np
 
 from uuvtai.common.clocks import JUMP_S, stamp_of
 from uuvtai.config import Config
+from uuvtai.vehicle.handover import STICKS_S
 from uuvtai.vehicle.mavlink import MavMessage, Order, ask_parameter
-from uuvtai.vehicle.messages import NAMES, DvlReading, ImuReading, SensorMessage, SonarPing
+from uuvtai.vehicle.messages import (
+    NAMES,
+    DvlReading,
+    ImuReading,
+    PositionFix,
+    PressureReading,
+    SensorMessage,
+    SonarPing,
+)
 from uuvtai.vehicle.safety import SafetyLimits
 from uuvtai.vehicle.start_fix import StartFix, StartFound
 from uuvtai.vehicle.telemetry import AUTOPILOT, KIND_OF, KINDS, Heard
@@ -53,7 +62,9 @@ _WARM_S, _HELD = 5.0, 0.02  # at first nothing counts; share of steps without de
 _MOST_ASKED, _KEPT = 5, 100_000  # requests for a parameter; arrivals of a kind that are remembered
 _LOST = ("velocity not valid", "figure of merit", "VISION_POSITION_DELTA: without")
 _OUT_OF_RANGE = "is the bottom out of its range, or something in its beams"
-_STRANGERS = ("a second sender speaks as", "the vehicle is no submarine")
+_STRANGERS = ("a second sender speaks as", "the vehicle is no submarine", "another program speaks as we do")
+_FROZEN, _STILL_M = 50, 0.5  # the same reading so often is a stuck one; what rests tells places within this
+_EMERGENCY, _CRITICAL, _ARMABLE = 5, 2, 1 << 28  # MAV_STATE, MAV_SEVERITY, MAV_SYS_STATUS_PREARM_CHECK
 
 
 @dataclass(frozen=True)
@@ -87,10 +98,12 @@ _FRAMES = {6: 1, 8: 2}  # thrusters -> FRAME_CONFIG: VECTORED, VECTORED_6DOF
 def judged(name: str, value: float, config: Config, operator: int, has_sticks: bool) -> tuple[str, str]:
     """(state, what is wrong and what to do) of one of ``PARAMETERS``. ``has_sticks``: the operator's came."""
     guided = "GUIDED needs a position; without it the pilot drives by sticks in ALT_HOLD"
-    if name == "FS_GCS_ENABLE" and value == 1:
-        return NOTE, "only warns of a lost ground station: set 3 (depth hold) or 4 (surface)"
     if name in ("FS_GCS_ENABLE", "FS_LEAK_ENABLE"):
-        return _failsafe(value, "set 3 (depth hold)" if name == "FS_GCS_ENABLE" else "set 2 (surface)")
+        is_gcs = name == "FS_GCS_ENABLE"
+        mend = "set 3 (depth hold) or 4 (surface)" if is_gcs else "set 2 (surface)"
+        if value == 1 or (is_gcs and value == 2):
+            return NOTE, f"only {'warns' if value == 1 else 'disarms'}: {mend}"
+        return _failsafe(value, mend)
     if name in ("FS_EKF_ACTION", "FS_PRESS_ENABLE"):
         return _failsafe(value, "set 1 (warn)", NOTE)
     if name == "FS_PILOT_INPUT" and value >= 2 and not has_sticks:
@@ -102,7 +115,8 @@ def judged(name: str, value: float, config: Config, operator: int, has_sticks: b
         return BAD, f"the ground station that it obeys is not {operator}: --operator {value:g}"
     wanted = {"VISO_TYPE": 1, "EK3_SRC1_VELXY": 6}.get(name, value)
     if value != wanted:
-        return NOTE, f"not {wanted}: {guided}"
+        joystick = ", and the operator's hand it back: switch the joystick off" if has_sticks else ""
+        return BAD if has_sticks else NOTE, f"not {wanted}: {guided}{joystick}"
     return OK, ""
 
 
@@ -133,6 +147,9 @@ class Preflight:
         """[s], [rad] by the rates, [rad] by the attitude"""
         self._force_off, self._upright = np.zeros(3), 0.0
         self._speeds: deque[float] = deque(maxlen=_KEPT)
+        self._last, self._same = dict[str, bytes](), Counter[str]()  # reading; how often it came again
+        self._span: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # smallest and largest place, or depth
+        self._says: Counter[str] = Counter()  # what the autopilot complains of
         self._beams, self._echoes, self._near, self._looked = 0, 0, 0, set[int]()
         self._steps, self._undecided, self._held, self._broken = 0, 0, Counter[str](), Counter[str]()
         self._from_s = 0.0  # they count from then on, and not while it warms up
@@ -156,11 +173,19 @@ class Preflight:
             if math.isfinite(value := float(fields["param_value"])):
                 self.parameters[fields["param_id"]] = value
         if name == "HEARTBEAT":
+            if is_autopilot and fields["system_status"] >= _EMERGENCY:
+                self._says["its state is an emergency (MAV_STATE)"] += 1
             for row, last_s in (("autopilot", heard.vehicle_s), ("operator", heard.operator_s)):
                 if last_s == come_s and (row == "autopilot") == is_autopilot:
                     self._note(row, who, come_s)
+        elif name == "STATUSTEXT" and is_autopilot:
+            text = str(fields["text"])
+            self._says.update([text] if fields["severity"] <= _CRITICAL or text.startswith("PreArm") else [])
         elif name in KINDS["battery"] and heard.battery_s > -math.inf:
             self._note("battery", f"{name} {who}", come_s)
+            asked = int(fields.get("onboard_control_sensors_enabled", 0)) & _ARMABLE
+            if is_autopilot and asked & ~int(fields.get("onboard_control_sensors_health", 0)):
+                self._says["its checks before arming fail: see QGroundControl"] += 1
         elif name in KINDS["imu"]:
             self._force_s = come_s
         elif name in KINDS["pressure"] and fields["press_abs"] > 0:
@@ -187,9 +212,16 @@ class Preflight:
         """A reading that the pilot was fed, and of whom."""
         if (row := NAMES[type(reading)]) in self._come:
             self._note(row, source, come_s)
+        if isinstance(reading, ImuReading | DvlReading):
+            told = np.concatenate([v for name, v in vars(reading).items() if name != "time_s"]).tobytes()
+            self._same[row], self._last[row] = (told == self._last.get(row)) * (self._same[row] + 1), told
+        if isinstance(reading, PositionFix | PressureReading):
+            place = np.atleast_1d(reading.pos_w if isinstance(reading, PositionFix) else reading.depth_m)
+            low, high = self._span.get(row, (place, place))
+            self._span[row] = np.minimum(low, place), np.maximum(high, place)
         if isinstance(reading, ImuReading):
             self._feel(reading)
-        elif isinstance(reading, DvlReading):
+        elif isinstance(reading, DvlReading) and not source.startswith("LOCAL_POSITION_NED"):
             self._speeds.append(float(np.linalg.norm(reading.vel_b)))
         elif isinstance(reading, SonarPing):
             hit, ranges = np.asarray(reading.hit) > 0, np.asarray(reading.range_m)
@@ -201,6 +233,7 @@ class Preflight:
         """The walls have told the start: the stack runs freely from now on, and the heading that they have
         corrected is no motion."""
         self._imu, self._from_s = None, now_s + 1.0
+        self._span.clear()
         self._steps, self._undecided, self._held, self._broken = 0, 0, Counter(), Counter()
 
     def _feel(self, imu: ImuReading) -> None:
@@ -252,7 +285,7 @@ class Preflight:
             *self._start_rows(*start),
             *self._parameter_rows(heard),
             *self._strange_rows(heard, clock_jumps),
-            *self._run_rows(heard),
+            *self._run_rows(heard, now_s),
         ]
         ready = self._steps > 0 and all(row.state != BAD for row in rows)
         return {"ready": ready, "rows": [asdict(row) for row in rows]}
@@ -279,6 +312,10 @@ class Preflight:
             state, told = BAD, f"it stops for longer than {oldest_s:g} s, which holds the vehicle; {told}"
         elif rate_hz < _LEAST_HZ[name]:
             state, told = BAD, f"slower than {_LEAST_HZ[name]:g} Hz: raise its rate (BlueOS, SR0_..); {told}"
+        elif self._same[name] >= _FROZEN:
+            state, told = BAD, f"the same reading came {self._same[name]} times: it is stuck; {told}"
+        elif name in self._span and (moved_m := float(np.ptp(self._span[name], axis=0).max())) > _STILL_M:
+            state, told = BAD, f"moves by {moved_m:.2f} m at rest; {told}"
         elif gaps.max() > oldest_s and state == OK:
             state, told = NOTE, f"once it stopped for {gaps.max():.1f} s; {told}"
         several = [one for one in self._sources[name] if not one.startswith("LOCAL_POSITION_NED")]
@@ -291,12 +328,13 @@ class Preflight:
 
     def _dvl(self, lost: Counter[str], foms: list[float]) -> tuple[str, str]:
         fom = "".join(f", figure of merit {value:.3f} m/s" for value in foms)
+        if not self._speeds:
+            told = "no DVL is heard: this is the autopilot's own estimate"
+            return (BAD, f"{told}; {_OUT_OF_RANGE}") if lost else (NOTE, told)
         share, speed = len(self._speeds) / (len(self._speeds) + lost.total()), float(np.mean(self._speeds))
         told = f"valid {100 * share:.0f} %, {speed:.2f} m/s{fom}; its yaw does not show at rest"
         if share < _VALID[1]:
             return BAD, f"{told}; {_OUT_OF_RANGE}: {lost.most_common(1)[0][0]}"
-        if all(one.startswith("LOCAL_POSITION_NED") for one in self._sources["dvl"]):
-            return NOTE, f"no DVL is heard: this is the autopilot's own estimate; {told}"
         return (NOTE if share < _VALID[0] or speed > _REST_M_S else OK), told
 
     def _sonar(self) -> tuple[str, str]:
@@ -317,9 +355,11 @@ class Preflight:
         depth_m = self._depths_m.get("SCALED_PRESSURE2", next(iter(self._depths_m.values()), math.nan))
         off_m, floor_m = abs(depth_m + self._start_z_m), -self._config.world.tank.z_m[0]
         told = f"{depth_m:.2f} m deep if the air has 1013 hPa, --start says {-self._start_z_m:.2f}"
-        if not off_m <= _DEPTH_M[1]:
+        if is_alone := "SCALED_PRESSURE2" not in self._depths_m:
+            told = f"{told}; SCALED_PRESSURE alone may be the hull's own: is the depth sensor connected"
+        if not off_m <= _DEPTH_M[not is_alone]:
             return BAD, f"{told} in a tank of {floor_m:g} m: measure again, or another sensor speaks"
-        return (NOTE if off_m > _DEPTH_M[0] else OK), told
+        return (NOTE if off_m > _DEPTH_M[0] or is_alone else OK), told
 
     def _battery(self, heard: Heard) -> tuple[str, str]:
         volts, share, limits = heard.battery_v, heard.battery_share, self._limits
@@ -390,7 +430,11 @@ class Preflight:
             told = f"{names or f'{clock_jumps} times'}: does it restart, is its time set, is the link stuck?"
             yield CheckRow("clock jumps", BAD, told)
 
-    def _run_rows(self, heard: Heard) -> Iterator[CheckRow]:
+    def _run_rows(self, heard: Heard, now_s: float) -> Iterator[CheckRow]:
+        for text, count in self._says.most_common(4):
+            yield CheckRow("autopilot says", BAD, f"{count} times: {text}")
+        if now_s - heard.sticks_moved_s <= STICKS_S:
+            yield CheckRow("sticks", BAD, "they are off their middle, which hands it back: let go of them")
         if heard.is_armed:
             yield CheckRow("armed", BAD, "the vehicle is armed: disarm it, a check is of one at rest")
         steps, held = max(self._steps, 1), self._undecided

@@ -413,6 +413,8 @@ class Intake:
 
     def _sticks(self, fields: Fields, come_s: float) -> None:
         """Sticks of the operator, which reach the vehicle as ours do."""
+        if int(fields.get("target", self._system)) != self._system:
+            return
         off = max(*(abs(int(fields[axis])) for axis in ("x", "y", "r")), abs(2 * int(fields["z"]) - 1000))
         self.heard.sticks_s = come_s
         if off > _STICK_MOVED:

@@ -75,6 +75,11 @@ class Rig(AbstractContextManager["Rig"]):
         answers = [one.look_around(whole) for one, _ in self._sources.values()]
         return any(answers)
 
+    def forget(self, now_s: float) -> None:
+        """Take what waits to be read, and use nothing of it."""
+        for instrument, _ in self._sources.values():
+            instrument.channel.read(now_s)
+
     def forget_clocks(self) -> None:
         """Date what comes anew: our clock has run on without those of the instruments."""
         for instrument, _ in self._sources.values():
