@@ -237,12 +237,12 @@ PLANTED = {
     "leak": (often(mav.MAVLink_statustext_message, 2, b"Leak Detected"), "autopilot says", "bad", "Leak"),
     "emergency": (told("HEARTBEAT", system_status=6), "autopilot says", "bad", "emergency"),
     "checks fail": (
-        told("SYS_STATUS", onboard_control_sensors_enabled=1 << 28), "autopilot says", "bad", "before arming"),
+        told("SYS_STATUS", onboard_control_sensors_enabled=1 << 28), "autopilot says", "bad", "checks"),
     "stick at its end": (
-        often(mav.MAVLink_manual_control_message, 1, 0, 0, 0, 0, 0, link=(255, 190)), "sticks", "bad", "let go"),
+        often(mav.MAVLink_manual_control_message, 1, 0, 0, 0, 0, 0, link=(255, 190)), "sticks", "bad", "off"),
     "joystick without GUIDED": (parameter("VISO_TYPE", 0), "VISO_TYPE", "bad", "joystick off"),
     "second pilot": (
-        often(mav.MAVLink_heartbeat_message, 18, 8, 0, 0, 4, 3, link=(1, 191)), "left out", "bad", "second uuv"),
+        often(mav.MAVLink_heartbeat_message, 18, 8, 0, 0, 4, 3, link=(1, 191)), "left out", "bad", "second"),
     "leak failsafe warns": (parameter("FS_LEAK_ENABLE", 1), "FS_LEAK_ENABLE", "note", "only warns: set 2"),
     "GCS failsafe disarms": (parameter("FS_GCS_ENABLE", 2), "FS_GCS_ENABLE", "note", "only disarms"),
     "armed": (lambda one: setattr(one.sub, "armed", True), "armed", "bad", "disarm"),

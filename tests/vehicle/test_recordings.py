@@ -203,6 +203,32 @@ def test_odd_lines_and_times_are_named(tmp_path, capfd):
     assert found["readings"] == {"dvl": 13} and found["duration_s"] < 2.0
 
 
+def test_lines_of_a_clock_go_on_after_midnight(tmp_path, capfd):
+    path = a50(
+        tmp_path / "a.txt", lambda t: f"{(23, 0)[t >= 2]:02}:{(59, 0)[t >= 2]:02}:{(58 + t) % 60:04.1f} ", 4
+    )
+    found = imported(capfd, path)
+    assert found["duration_s"] == pytest.approx(3.9, abs=0.01) and found["readings"] == {"dvl": 40}
+
+
+def test_a_file_that_is_silent_leaves_the_time_to_another(tmp_path, capfd):
+    first, second = a50(tmp_path / "a.txt"), a50(tmp_path / "b.txt")
+    lines = first.read_text().splitlines()
+    first.write_text("\n".join(lines[:20] + lines[80:]) + "\n")
+    found = imported(capfd, first, second)
+    assert [row["readings"] for row in found["files"]] == [60, 60]
+    assert dropped(found, 1) == {"readings: dvl": (60, "a.txt tells it")}
+
+
+def test_damage_in_a_dataflash_log_is_counted_and_floods_no_terminal(tmp_path, capfd):
+    data = dataflash(drive(), FORMATS)
+    (tmp_path / "a.bin").write_bytes(data[:9000] + bytes(5000) + data[9000:])
+    code, out, err = uuv(capfd, "log", "import", tmp_path / "a.bin", "--json")
+    assert code == 0 and len(err) < 2000
+    count, why = dropped(json.loads(out))["bytes"]
+    assert 5000 <= count < 5100 and why == "no message of a DataFlash log"
+
+
 def test_a_dataflash_log_says_what_mavlink_says(tmp_path, capfd):
     formats = FORMATS | {"BARO": (8, "QBf", "TimeUS,I,Press"), "MAG": (9, "Qf", "TimeUS,X")}
     rows = [*drive(), *(("BARO", (200_000 * k, 1, 1e5 + 980.0 * k)) for k in range(20)), ("MAG", (0, 1.0))]
@@ -235,6 +261,10 @@ def pilots(path, seconds=SECONDS):
     made.saw(now_s, MavMessage("ATTITUDE", 3, 1, {"roll": None}))
     made._write("/instruments/read", now_s, {"kind": "gps", "fields": {"time_s": 0.0}})
     made._write("/instruments/read", now_s, {"kind": "dvl", "fields": {"time_s": 0.0}})
+    made.read(now_s, SonarPing(now_s, np.ones(2), np.ones(1), np.zeros(0)))
+    made.read(now_s, SonarPing(now_s, np.ones(()), np.ones(()), np.zeros(0)))
+    made.read(now_s, DvlReading(now_s, np.zeros(2)))
+    made._write("/instruments/read", now_s, {"kind": "depth", "fields": {"time_s": 0.0, "depth_m": [[1.0]]}})
     made.close()
     return path
 
@@ -246,7 +276,8 @@ def test_a_log_of_the_pilot_is_what_it_heard(tmp_path, capfd):
     found = imported(capfd, path, *MATCHED, "--out", tmp_path / "one.mcap")
     assert [row["kind"] for row in found["files"]] == ["uuv pilot"] and found["localization"] == "truth"
     assert found["readings"] == {"imu": 120, "pressure": 120, "position": 120, "dvl": 120, "sonar": 120}
-    assert set(dropped(found)) == {"ATTITUDE", "gps", "dvl"}
+    odd = {what: count for what, (count, _) in dropped(found).items()}
+    assert odd == {"ATTITUDE": 1, "gps": 1, "dvl": 2, "sonar": 2, "depth": 1}
     (time_s, velocity), (_, scan) = told(found, "/sensors/dvl")[5], told(found, "/sonar/scan")[5]
     assert time_s == pytest.approx(0.5) and velocity["velocity"] == [SPEED, 0, 0] and scan["ranges"] == [2.0]
 
@@ -450,6 +481,28 @@ def test_odometry_tells_what_nobody_else_does(tmp_path, capfd):
     found = read_kind("nav_msgs/msg/Odometry", "/odom", tmp_path, capfd, header=head, pose=whole)
     assert found["localization"] == "truth" and found["readings"]["position"] == 3
     assert found["readings"]["dvl"] == 20, "its velocity is not used beside a DVL's"
+
+
+def test_odd_rows_and_an_imu_without_orientation_leave_the_others_alone(tmp_path, capfd):
+    kind = "sensor_msgs/msg/Imu"
+    bare = bytes(STORES[False].serialize_cdr(made(False, kind), kind))
+    path = bag_db3(tmp_path / "a.db3", [("/bare", kind, T0 + 0.05 * k, bare) for k in range(40)])
+    base = sqlite3.connect(path)
+    for odd in ((T0, 2**40), (T0, "text"), (None, b"x"), ("now", b"x")):
+        base.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", odd)
+    base.commit()
+    base.close()
+    found = imported(capfd, path, "--out", tmp_path / "x.log")
+    assert found["readings"] == {"imu": 20, "pressure": 20, "dvl": 20, "sonar": 20, "motors": 20}
+    assert dropped(found)["/bare (sensor_msgs/msg/Imu)"] == (40, "/imu tells it")
+    assert dropped(found)["/imu (no message of ROS)"] == (4, "not used")
+
+
+def test_a_pressure_in_another_unit_is_named(tmp_path):
+    bag = bags._Bag(sources.Source(tmp_path, "bag"), load_config("open", "multibeam"), START)
+    message = made(False, "sensor_msgs/msg/FluidPressure", fluid_pressure=1093.0)
+    with pytest.raises(ValueError, match="pascals"):
+        bag.pressure(message, 1.0, set(), "/depth")
 
 
 # -------------------------------------------------------------------------------------------------- bad input

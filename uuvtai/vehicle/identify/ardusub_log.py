@@ -12,6 +12,7 @@ import contextlib
 import importlib.util
 import io
 import math
+import os
 import struct
 from array import array
 from collections import Counter
@@ -399,7 +400,14 @@ def messages(path: Path, is_bin: bool, names: list[str] | None = None) -> Iterat
     """Messages of these types, or all, in the order of the file."""
     from pymavlink import DFReader, mavutil
 
-    log: Any = DFReader.DFReader_binary(str(path)) if is_bin else mavutil.mavlogfile(str(path))
+    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)  # its indexer in C tells of each byte that is no message
+    try:
+        log: Any = DFReader.DFReader_binary(str(path)) if is_bin else mavutil.mavlogfile(str(path))
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(null)
     try:
         while (message := log.recv_match(type=names)) is not None:
             yield message

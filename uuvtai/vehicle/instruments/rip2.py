@@ -104,6 +104,8 @@ def image_of(packet: bytes) -> RangeImage | str:
     if not (sound and min(image.width, image.height) > 1 and size == count <= _MOST_PIXELS):
         return "an image of an impossible size"
     pixels = np.array(image.image_pixel_data, np.float64).reshape(image.height, image.width)
+    if pixels.max() * image.image_pixel_scale > 1.1 * image.range:
+        return "pixels beyond the range that it tells"
     stamp = image.header.timestamp
     return RangeImage(
         stamp.seconds + 1e-9 * stamp.nanos,

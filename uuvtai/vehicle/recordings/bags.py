@@ -7,6 +7,8 @@ definitions are never parsed. Axes by REP 103: x ahead, y left, z up; east, nort
 from __future__ import annotations
 
 import bz2
+import contextlib
+import functools
 import math
 import re
 import sqlite3
@@ -131,7 +133,9 @@ def _of_sqlite(path: Path) -> Iterator[Row]:
             asked = f"SELECT topic_id, timestamp, {small} FROM messages ORDER BY rowid"
             for number, time_ns, data in base.execute(asked):
                 topic, kind = topics.get(number, ("?", ""))
-                yield Row(str(topic), str(kind), float(time_ns) / 1e9, bytes(data or b""), False)
+                is_odd = not (isinstance(time_ns, int) and isinstance(data, bytes))
+                told = ("", 0.0, b"") if is_odd else (str(kind), time_ns / 1e9, data)
+                yield Row(str(topic), *told, False)
         finally:
             base.close()
     except (sqlite3.Error, *ODD) as error:
@@ -157,8 +161,9 @@ def _of_ros1(path: Path) -> Iterator[Row]:
         raise RecordingError(f"{path}: is cut off or damaged ({why}); first: rosbag reindex") from None
 
 
+@functools.lru_cache(maxsize=4)
 def _unpacked(data: bytes) -> bytes:
-    """A chunk, never more than any may have."""
+    """A chunk, never more than any may have; messages of several may lie in turns."""
     if data.startswith(b"BZh"):
         data = bz2.BZ2Decompressor().decompress(data, max_length=MAX_RECORD + 1)
     elif data.startswith(b"\x04\x22\x4d\x18"):
@@ -181,13 +186,18 @@ class _Bag:
         self.telemetry.only_places = True
         self._head = sources.ping360(source, config) if config.sensors.sonar.mechanical else None
 
-    def choose(self, counts: Counter[tuple[str, str]]) -> None:
-        """Of several topics that tell the same: the kind named first in ``TOLD``, then most messages."""
-        ranks = list(TOLD)
-        best = sorted(
-            (each for each in counts if each[1] in TOLD), key=lambda e: (ranks.index(e[1]), -counts[e], e[0])
-        )
-        for topic, kind in best:
+    def choose(self, files: list[Path]) -> None:
+        """Of several topics that tell the same: the kind named first in ``TOLD``, then most messages; an IMU
+        whose first message has no orientation comes last."""
+        counts, bare, ranks = Counter[tuple[str, str]](), set[tuple[str, str]](), list(TOLD)
+        for row in (row for file in files for row in rows(file) if row.kind in TOLD):
+            each = row.topic, row.kind
+            if row.kind == ranks[0] and each not in counts:
+                with contextlib.suppress(*ODD):
+                    turn = self.stores.unpacked(row.data, row.kind, row.is_ros1).orientation
+                    bare |= set() if any((turn.w, turn.x, turn.y, turn.z)) else {each}
+            counts[each] += 1
+        for topic, kind in sorted(counts, key=lambda e: (e in bare, ranks.index(e[1]), -counts[e], e[0])):
             for told in TOLD[kind][0]:
                 if told != "position" or self._config.sensors.localization != "estimated":
                     self._chosen.setdefault(told, topic)
@@ -259,6 +269,8 @@ class _Bag:
         self.velocity(m.velocity.x, m.velocity.y, m.velocity.z, come_s, what)
 
     def pressure(self, m: Any, come_s: float, _: set[str], what: str) -> None:
+        if m.fluid_pressure < _LEAST_PA:
+            raise ValueError("no pressure of water in pascals, as REP 103 has it")
         self.telemetry.take("SCALED_PRESSURE", {"press_abs": m.fluid_pressure / 100.0}, come_s, what)
 
     def echo(self, m: Any, come_s: float, _: set[str], what: str) -> None:
@@ -317,6 +329,7 @@ class _Bag:
 
 
 _BODY = 3  # velocity_frame of PX4
+_LEAST_PA = 3e4  # of the air, anywhere
 
 
 def _flipped(turn: Any, rates: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -364,10 +377,8 @@ def read_bag(source: Source, config: Config, start: tuple[float, ...]) -> None:
     """All files of a bag. Raises RecordingError, LogError, FileError, OSError."""
     path = source.path
     files = parts_of(path) if path.is_dir() else [path]
-    bag, counts = _Bag(source, config, start), Counter[tuple[str, str]]()
-    for file in files:
-        counts.update((row.topic, row.kind) for row in rows(file))
-    bag.choose(counts)
+    bag = _Bag(source, config, start)
+    bag.choose(files)
     for file in files:
         for row in rows(file):
             bag.take(row)

@@ -39,6 +39,7 @@ PULSES = record(
     "uuv.Pulses",
     us=described(array_of(NUMBER), "pulse widths of ArduSub's motors 1 to 8, none reversed, 0 = off; armed"),
 )
+_GAP_S = 2.0  # a file that is silent for longer leaves the time to others
 _FAR_S = 86_400.0  # a time so far from the middle one of its file is none
 _AHEAD_M, _EDGE_M = 5.0, 0.5
 """the goal where none is typed: so far ahead of the start, so far from a wall at least"""
@@ -211,8 +212,9 @@ class _Import:
                     source.drop(f"readings: {kind}", f"{other[2].name} tells it")
             source.readings = kept
             for kind in {_kind(reading) for reading in kept}:
-                times = [reading.time_s for reading in kept if _kind(reading) == kind]
-                spans.setdefault(kind, []).append((min(times), max(times), source.path))
+                times = np.sort([reading.time_s for reading in kept if _kind(reading) == kind])
+                for part in np.split(times, np.flatnonzero(np.diff(times) > _GAP_S) + 1):
+                    spans.setdefault(kind, []).append((part[0], part[-1], source.path))
 
     def _note_ranges(self, begin_s: float) -> None:
         """Files that lie apart from the first, and from those that do not, are named with the offset that has

@@ -29,7 +29,7 @@ from uuvtai.vehicle.instruments.a50 import A50, LONGEST
 from uuvtai.vehicle.instruments.channel import Channel, Instrument
 from uuvtai.vehicle.instruments.ping import AUTO_DEVICE_DATA, DEVICE_DATA, TICK_S, Frames, Ping360
 from uuvtai.vehicle.instruments.rig import as_fields
-from uuvtai.vehicle.messages import KINDS, DvlReading, SensorMessage, is_believed
+from uuvtai.vehicle.messages import ANY, KINDS, DvlReading, Inbox, SensorMessage, SonarPing, is_believed
 from uuvtai.vehicle.pilot_log import SEEN
 from uuvtai.vehicle.telemetry import AUTOPILOT, KIND_OF, Intake, Senders
 
@@ -185,10 +185,12 @@ def read_ardusub(source: Source, config: Config, start: tuple[float, ...]) -> No
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             system = 1 if is_bin else _system(path)
             telemetry, gyro = Telemetry(source, config, start, system), [0.0, 0.0, 0.0]
+            rest = path.stat().st_size if is_bin else 0
             for m in messages(path, is_bin):
                 source.heard()
                 name = m.get_type()
                 if is_bin:
+                    rest -= m.fmt.len
                     _take_bin(telemetry, source, m, gyro)
                 elif name == "BAD_DATA" or name.startswith("UNKNOWN"):
                     source.drop("bytes", "no message of MAVLink's")
@@ -196,6 +198,8 @@ def read_ardusub(source: Source, config: Config, start: tuple[float, ...]) -> No
                     fields = {each: getattr(m, each) for each in m.get_fieldnames()}
                     sender = m.get_srcSystem(), m.get_srcComponent()
                     telemetry.take(name, fields, m._timestamp, name, sender)
+            if rest > 0:
+                source.drop("bytes", "no message of a DataFlash log", rest)
     except (UserError, MemoryError):
         raise
     except Exception as error:  # pymavlink raises this very class for a format that it does not know
@@ -222,12 +226,21 @@ def read_pilot(source: Source, config: Config, start: tuple[float, ...]) -> None
         is_it = (m.data.get("name"), m.data.get("component")) == ("ATTITUDE", AUTOPILOT)
         told.update([m.data.get("system", 1)] if is_it else [])
     telemetry = Telemetry(source, config, start, told.most_common(1)[0][0] if told else 1, own)
+    beams = (ANY if config.sensors.sonar.mechanical else config.sensors.sonar.n_ray,)
+    shapes = {"range_m": beams, "hit": beams, "doppler_m_s": (ANY,), "first_beam": ()}
+    inbox = Inbox({f"sonar.{name}": shape for name, shape in shapes.items()})
     for m in read_messages(source.path, SEEN):
         source.heard()
         what = str(m.data.get("kind" if m.topic == SEEN[1] else "name"))
         try:
-            if m.topic == SEEN[1]:
-                source.add(KINDS[what](**as_fields(m.data["fields"])), what)
+            if m.topic == SEEN[1] and what in ("depth", "thruster"):
+                source.drop(what, NOT_USED)
+            elif m.topic == SEEN[1]:
+                reading = KINDS[what](**as_fields(m.data["fields"]))
+                inbox.feed(reading)
+                if isinstance(reading, SonarPing) and len(reading.hit) != len(reading.range_m):
+                    raise ValueError(what)
+                source.add(reading, what)
             else:
                 sender = m.data["system"], m.data["component"]
                 telemetry.take(what, m.data["fields"], m.time_s, what, sender)
@@ -333,7 +346,7 @@ def read_a50(source: Source, config: Config) -> None:
     """Lines of JSON, each perhaps behind the time when it came: seconds, ISO 8601, or a clock's."""
     dvl = config.sensors.dvl
     device = A50(_Piece(), math.radians(dvl.yaw_deg), dvl.fom_most_m_s, dvl.latency_s)
-    played, come_s = Played(source, device, "a line"), 0.0
+    played, clock, come_s = Played(source, device, "a line"), _Clock(), 0.0
     for row in read_lines(source.path, MOST_BYTES, longest=4 * LONGEST):
         line = row.strip()
         if not line:
@@ -345,7 +358,7 @@ def read_a50(source: Source, config: Config) -> None:
             source.drop("a line", "no JSON object")
             continue
         found = _TIME.match(line[:at])
-        come_s = _clock_s(found[1]) if found else _told_s(said, come_s)
+        come_s = clock(found[1]) if found else _told_s(said, come_s)
         played.hear(line[at:] + b"\n", come_s)
 
 
@@ -360,6 +373,21 @@ def _told_s(said: dict[str, Any], before_s: float) -> float:
 
 def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
+
+
+class _Clock:
+    """[s] of times as written; those of a clock go on after midnight."""
+
+    def __init__(self) -> None:
+        self._day_s = self._last_s = 0.0
+
+    def __call__(self, text: bytes) -> float:
+        told_s = _clock_s(text)
+        if not told_s < 2.0 * _HALF_DAY_S:
+            return told_s
+        self._day_s += 2.0 * _HALF_DAY_S * (told_s < self._last_s - _HALF_DAY_S)
+        self._last_s = told_s
+        return self._day_s + told_s
 
 
 def _clock_s(text: bytes) -> float:
@@ -384,14 +412,10 @@ _HALF_DAY_S = 43_200.0
 
 def read_ping_viewer(source: Source, config: Config) -> None:
     """Ping Viewer's recording, by the clock that it wrote."""
-    played, day_s, last_s = ping360(source, config), 0.0, 0.0
+    played, clock = ping360(source, config), _Clock()
     for time, message in _pairs(source):
         source.heard()
-        clock_s = _clock_s(time.replace(b"\0", b""))
-        if clock_s < last_s - _HALF_DAY_S:
-            day_s += 2.0 * _HALF_DAY_S  # midnight
-        last_s = clock_s if math.isfinite(clock_s) else last_s
-        played.hear(message, day_s + clock_s)
+        played.hear(message, clock(time.replace(b"\0", b"")))
 
 
 def reach_m(path: Path) -> float:
