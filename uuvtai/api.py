@@ -177,11 +177,11 @@ def evaluate(
     from uuvtai.evaluation.results import Request
 
     named = [*_named(agents), *_named(planners, "planner")]
-    _check(1, episodes=episodes, agents=len(named))
+    _check(1, episodes=episodes, num_envs=num_envs, agents=len(named))
     _check(0, record=record)
     request = Request.typed(
         _scene(world, sensors, vehicle, overrides), named,
-        seeds=_seeds(seeds), episodes=episodes, record=record, explain=explain,
+        seeds=_seeds(seeds), episodes=int(episodes), record=int(record), explain=explain,
         num_envs=num_envs, device=device, run_dir=_path(run_dir),
     )  # fmt: skip
     return Evaluation(*compare(request, Progress()))
@@ -208,7 +208,7 @@ def sweep(
     from uuvtai.evaluation import sweep as sweeps
     from uuvtai.evaluation.grid import Grid, SweepRequest, checked, grid_of
 
-    _check(1, episodes=episodes, workers=workers, agents=len(_several(agents)))
+    _check(1, episodes=episodes, workers=workers, num_envs=num_envs, agents=len(_several(agents)))
     engine = sweeps.engine_of("local", workers, "")
     own = {} if isinstance(grid, str) else {axis: tuple(_several(values)) for axis, values in grid.items()}
     axes = grid_of([grid]) if isinstance(grid, str) else checked(Grid(own))
@@ -243,6 +243,7 @@ def train(
     from uuvtai.evaluation.evaluate import evaluate_now
     from uuvtai.learning import runner
 
+    _check(1, iterations=iterations)
     own = None if reward is None else own_reward(_name(reward, ""))
     options: dict[str, Any] = {"iterations": iterations, "device": device, "reward": own}
     if resume is not None:
@@ -287,13 +288,16 @@ def _scene(
     world: str | None, sensors: str | None, vehicle: str | None, overrides: Overrides | None
 ) -> SceneOptions:
     changes: Any = list((overrides or {}).items())
-    return SceneOptions(world, sensors, vehicle, overrides=changes)
+    given: Any = [None if one is None else os.fspath(one) for one in (world, sensors, vehicle)]
+    return SceneOptions(*given, overrides=changes)
 
 
-def _check(least: int, **counts: int) -> None:
+def _check(least: int, **counts: int | None) -> None:
     """SettingError for what is no count."""
     for name, value in counts.items():
-        if not hasattr(value, "__index__") or value < least:
+        if value is not None and (
+            isinstance(value, bool) or not hasattr(value, "__index__") or value < least
+        ):
             raise SettingError(f"{name}={value!r}: must be a whole number, at least {least}")
 
 

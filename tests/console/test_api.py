@@ -123,16 +123,19 @@ def test_functions_and_classes_of_a_file_are_agents_and_others_are_refused(run, 
             uuvtai.evaluate(wrong)
 
 
-def test_bad_input_is_refused_as_by_the_command():
+def test_bad_input_is_refused_as_by_the_command(tmp_path):
     for error, words in (
         ("episodes=0: .* at least 1", {"episodes": 0}),
         ("episodes='8': must be a whole number", {"episodes": "8"}),
+        ("episodes=True: must be", {"episodes": True}),
+        ("num_envs=1.5: must be a whole", {"num_envs": 1.5}),
         ("record=-1: .* at least 0", {"record": -1}),
         ("seeds=0: .* at least 1", {"seeds": []}),
         ("agents=0: .* at least 1", {"agents": []}),
         ("negative", {"seeds": -1}),
         ("given twice", {"seeds": [1, 1]}),
         ("did you mean 'pool'", {"world": "poool"}),
+        ("no such file", {"world": tmp_path / "nowhere.yaml"}),
         ("n_dynamc", {"overrides": {"world.n_dynamc": 3}}),
     ):
         with pytest.raises(ValueError, match=error):

@@ -155,6 +155,15 @@ def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
     assert trainer.env.guard.bad_in_a_row == 1
 
 
+def test_a_policy_whose_actions_are_not_finite_ends_the_training():
+    trainer = trainer_of(PointEnv(), config_of(distillation={"schedule": [[0, 0]]}))
+    trainer.iterate()
+    with torch.no_grad():
+        trainer.policy.actor[0].weight.fill_(math.nan)
+    with pytest.raises(TrainingError, match=r"smaller ppo\.learning_rate"):
+        trainer.iterate()
+
+
 def test_the_world_models_columns_can_be_left_out():
     trainer = trainer_of(PointEnv(), config_of(world_model={"as_features": False}))
     trainer.iterate()

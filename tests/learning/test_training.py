@@ -118,6 +118,16 @@ def test_a_run_leaves_a_complete_folder(points, tmp_path):
     assert all(interval[0] <= rate <= interval[1] for rate, interval in rates if rate is not None)
 
 
+def test_a_run_goes_on_to_as_many_iterations_as_it_began_with(points, tmp_path):
+    run = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        train(TrainRequest(config=config_of(), run_dir=run, iterations=9), Quiet(press_at=7))
+    document, _ = train(TrainRequest(resume=run), watch := Quiet())
+    assert document["iterations"] == 9 and watch.began[1] == 9
+    document, _ = train(TrainRequest(resume=run, iterations=10), Quiet())
+    assert document["iterations"] == run_json(run)["iterations"] == 10
+
+
 def test_an_interrupt_finishes_the_iteration_and_saves(points, tmp_path):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     watch = Quiet(press_at=3)
@@ -181,7 +191,7 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_goes_on(points, tmp_pat
     with (cut / "checkpoints/step_000004/training.safetensors").open("r+b") as file:
         file.truncate(100)
     watch = Quiet()
-    train(TrainRequest(resume=cut), watch)
+    train(TrainRequest(resume=cut, iterations=6), watch)
     assert any("was cut off" in text for text in watch.notes)
     assert watch.began == (2, 6)
     train(TrainRequest(config=config_of(), run_dir=whole), Quiet())

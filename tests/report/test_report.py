@@ -764,7 +764,7 @@ def test_a_page_is_not_written_through_a_link(tmp_path, kind, blank):
     run = samples.write_run(tmp_path / "run", eval__result=EVALUATED)
     (tmp_path / "outside").mkdir()
     (tmp_path / "outside" / "agents.png").write_text("precious")
-    places = {"page": "page.html", "figures": "figures", "figure": "figures/agents.png"}
+    places = {"page": "page.html", "figures": "page_figures", "figure": "page_figures/agents.png"}
     link = tmp_path / places[kind]
     link.parent.mkdir(exist_ok=True)
     link.symlink_to(tmp_path / "outside" if kind == "figures" else tmp_path / "outside" / "agents.png")

@@ -144,6 +144,8 @@ def test_sleep_waits_for_the_vehicle():
 def test_a_vehicle_elsewhere_is_not_followed():
     with pytest.raises(LinkError, match="--rate 1"):
         FollowedEndpoint(LinkPlace("192.168.2.2", 14550, True), 1)
+    with pytest.raises(LinkError, match="on this computer"):
+        FollowedEndpoint(LinkPlace("localhost.example.com", 14550, True), 1)
 
 
 # ------------------------------------------------------------------------------------------ the three of them

@@ -275,7 +275,7 @@ class FaultsGroup:
         """UsageError."""
         from uuvtai.vehicle.replay import Faults, outage_of
 
-        parsing.refuse_less("--fault-seed", self.fault_seed, 0)
+        parsing.refuse_less("--fault-seed", self.fault_seed, 0, 2**31 - 1)
         return Faults(self.drop, self.jitter, tuple(map(outage_of, self.lose or [])), self.fault_seed)
 
 

@@ -26,7 +26,7 @@ def seeds(option: str, text: str) -> list[int]:
     from uuvtai.config.base import folded_seed
 
     given = [_integer(option, item, None) for item in text.split(",")]
-    if low := [seed for seed in given if seed < -(2**31)]:
+    if low := [seed for seed in given if seed < 0]:
         raise UsageError(f"{option} {low[0]}: must be 0 or more")
     return [folded_seed(seed) for seed in given]
 
@@ -59,10 +59,11 @@ def numbers(option: str, text: str | None, count: int) -> list[float] | None:
     return values
 
 
-def refuse_less(option: str, value: int, least: int) -> None:
-    """UsageError for a value below ``least``."""
-    if value < least:
-        raise UsageError(f"{option} {value}: must be at least {least}")
+def refuse_less(option: str, value: int, least: int, most: int = 1_000_000) -> None:
+    """UsageError for a count below ``least``, or of more than memory holds."""
+    if not least <= value <= most:
+        told = f"at least {least}" if value < least else f"at most {most:,}"
+        raise UsageError(f"{option} {value}: must be {told}")
 
 
 def refuse_no_duration(option: str, seconds: float) -> None:

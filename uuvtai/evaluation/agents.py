@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from uuvtai.sim.sim import Sim
 
 
-TRUTH = "truth"
-"""suffix of a tree's name: an oracle whose tracks of moving obstacles are the truth"""
+TRUTH = "truth"  # suffix of a tree's name: an oracle whose tracks of moving obstacles are the truth
 
 _STACK = (
     "tracking", "forecast", "height", "mapping", "clearance", "voronoi", "quiet", "route", "behavior",

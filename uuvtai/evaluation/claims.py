@@ -246,8 +246,7 @@ def _softened(share: Share) -> float:
     return p * (1.0 - p) / (share.n + 2)
 
 
-MARGIN = 0.1
-"""how far a rate may fall behind another one that it is said to come near"""
+MARGIN = 0.1  # how far a rate may fall behind another one that it is said to come near
 
 
 def compared(a: Estimate, b: Estimate, factor: float = 1.0, margin: float = 0.0) -> Finding:

@@ -330,8 +330,7 @@ def _reach(pos: Array, obstacles: Obstacles) -> Array:
 
 
 WINDOW_S = 4.0  # How far back the facts look; a time "ago" that is None lies farther back or never was.
-LEAD_S = 1.0
-"""Forecasts are judged by what they said this long before the end: to react, and to get away."""
+LEAD_S = 1.0  # Forecasts are judged by what they said this long before the end: to react, and to get away.
 SIGHT_S = (1.5, 0.5)
 """Without a forecast LEAD_S before the end, why in this interval: out of the fan, hidden, not tracked."""
 TURN_RAD = math.radians(30.0)  # A corner: the obstacle's course changes by more between two samples.

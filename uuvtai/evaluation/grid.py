@@ -17,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from uuvtai.common.errors import SettingError
 from uuvtai.common.presets import preset_names
 from uuvtai.config import Config
+from uuvtai.config.base import LARGEST
 from uuvtai.config.loader import ConfigError, load_config, parsed_yaml, read_preset
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ def _check_values(name: str, values: Sequence[Value]) -> None:
             raise ConfigError(
                 f"--grid {name}: {value!r} is no number of obstacles; give whole numbers from 0"
             )
-        if name == "v" and (not number or not 0 <= value < float("inf")):
+        if name == "v" and (not number or not 0 <= value <= LARGEST):
             raise ConfigError(
                 f"--grid v: {value!r} is no speed; give numbers in m/s, for example --grid v=0.2,0.6"
             )

@@ -18,8 +18,7 @@ from uuvtai.logs.run_folder import RunFolderError, write_atomic
 METHODS = ("paper", "ppo", "constant_20", "no_risk_scaling", "no_world_model")
 """presets that are trained; in the ablation's table ``paper`` is "Full" and ``ppo`` is "BT distill\""""
 _TEN_HZ, _HOLD_STEPS = "_10hz", 5  # methods whose decisions last five control steps, on as many env-steps
-ENV_STEPS = 512
-"""of an iteration: 8 envs x 64 decisions at 50 Hz"""
+ENV_STEPS = 512  # of an iteration: 8 envs x 64 decisions at 50 Hz
 EVALUATION_SEED = 90010
 """never trained or tuned on; for published figures alone: do not look while you change things"""
 RETIRED_SEEDS = range(90001, 90010)  # test seeds of old that tuning has met since (``research/LOG.md``)

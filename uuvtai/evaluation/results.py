@@ -308,8 +308,7 @@ def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, i
 # ---- What ``uuv eval`` was asked for: an object, and the file by which an interrupted evaluation goes on.
 
 REQUEST_FILE = "eval/request.json"
-ORACLE = "oracle"
-"""agent that is asked, and does not drive: the privileged upper bound"""
+ORACLE = "oracle"  # agent that is asked, and does not drive: the privileged upper bound
 
 _MAX_BYTES = 1 << 22
 _GIVE = "give the folder that an interrupted 'uuv eval' printed"

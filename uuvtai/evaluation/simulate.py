@@ -47,8 +47,7 @@ from uuvtai.sim.plant import Plant
 from uuvtai.sim.sim import Sim
 from uuvtai.state.vehicle import VehicleState
 
-CONTROL_DT_S = 0.02
-"""Samples are this far apart, or one substep where that is longer."""
+CONTROL_DT_S = 0.02  # Samples are this far apart, or one substep where that is longer.
 
 _MAX_STEPS = 10_000_000
 _MAX_COMPONENT = 1e6
@@ -253,10 +252,8 @@ def drive(config: Config, trial: Trial, name: str) -> dict[str, list]:
 # ---- ``uuv watch``: episodes at the clock's pace, for pages or Foxglove; ``uuv drive``: one in which a
 # person drives.
 
-LAYOUT = PRESET_DIR / "layout" / "navigation.json"
-"""for Foxglove and Lichtblick"""
-PERSON = "human"
-"""who drives by hand, in tables and files"""
+LAYOUT = PRESET_DIR / "layout" / "navigation.json"  # for Foxglove and Lichtblick
+PERSON = "human"  # who drives by hand, in tables and files
 
 
 @dataclass(frozen=True)

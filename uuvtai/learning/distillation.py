@@ -115,13 +115,10 @@ class Distillation(AdamLearner):
 # actor's mean is fitted to what the tree would do. The tree drives first, then the student more and more.
 
 
-WAVE_EPISODES = 256
-"""episodes of a wave, at most ``train.num_envs``"""
-PASSES, LAST_PASSES = 2, 6
-"""through all samples after a wave, and after the last one"""
+WAVE_EPISODES = 256  # episodes of a wave, at most ``train.num_envs``
+PASSES, LAST_PASSES = 2, 6  # through all samples after a wave, and after the last one
 MINIBATCH, RATE = 512, 1e-3
-SEED = 7_000_003
-"""added to ``train.seed`` for episodes and draws of the warm start"""
+SEED = 7_000_003  # added to ``train.seed`` for episodes and draws of the warm start
 
 
 def wish_of(command: Tensor, ego: Tensor, vehicle_cfg: VehicleConfig) -> Tensor:
@@ -141,8 +138,7 @@ class Student(SetAgent):
     def __init__(self, actor: SetActor, sim: Sim, config: LearningConfig, generator: torch.Generator) -> None:
         super().__init__(actor, sim, config)
         self.simulator, self._generator = sim, generator
-        self.tree_share = 1.0
-        """chance that the tree drives, beta of DAgger"""
+        self.tree_share = 1.0  # chance that the tree drives, beta of DAgger
         self.samples: list[tuple[Tensor, ...]] = []
         """obstacles, own columns and (n, 3) the tree's wish of n decisions"""
         self._with_tree = torch.ones(sim.num_envs, dtype=torch.bool)

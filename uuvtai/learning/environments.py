@@ -112,8 +112,7 @@ class Simulated(Environment):
         return self.guard.values(OBSERVATION, obs, self._norm.mean[: self.env.num_obs].float(), counted)
 
 
-BANK_SEED = 4242
-"""of the scenarios to learn from; those of evaluations come from ``train.evaluate_seed``"""
+BANK_SEED = 4242  # of the scenarios to learn from; those of evaluations come from ``train.evaluate_seed``
 
 
 class InSurrogate(Environment):

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 # (Bishop 1994). Each future is a whole way: its places share one weight.
 
 
-TIMES_S = torch.arange(1, enums.ANCHORS + 1) * enums.ANCHOR_S
-"""[s] ahead, of the places that it tells"""
+TIMES_S = torch.arange(1, enums.ANCHORS + 1) * enums.ANCHOR_S  # [s] ahead, of the places that it tells
 _LEAST_M, _MOST = 0.03, 4.0  # [m] smallest deviation; largest, as a part of the way that an obstacle can go
 
 
@@ -122,8 +121,7 @@ def scores_of(mixture: Mixture, truth: Tensor) -> dict[str, float]:
 # forecast from, and to judge one. The truth serves learning alone; what drives sees columns of tracks.
 
 
-EVERY_STEPS = 25
-"""a track is looked at so often, in control steps"""
+EVERY_STEPS = 25  # a track is looked at so often, in control steps
 _OBSTACLE_M = 0.5  # a track belongs to a moving obstacle this close to where it is forecast now,
 _SPEED_S = 0.3  # the nearest of them, a m/s of difference in velocity counting as so many metres
 _STEP_S = 0.02
@@ -185,8 +183,7 @@ def _moments(sim: Sim, envs: list[int], paths: list[list[dict[str, Any]]], now_s
     return torch.from_numpy(sim.rows(sim.s.mixture.column, envs)[row, track]), torch.from_numpy(truth)
 
 
-MEMORY, MINIBATCH = 2**21, 512
-"""moments of tracks that are kept to learn from, and of one step"""
+MEMORY, MINIBATCH = 2**21, 512  # moments of tracks that are kept to learn from, and of one step
 _LEAST_RATE = 0.02  # part of the learning rate that is left at the end
 
 

@@ -50,8 +50,7 @@ def linear(n_in: int, n_out: int, gain: float, generator: torch.Generator) -> nn
 
 CACHE_ROWS = 2048
 """rows in one pass on a CPU: what a network makes of them, or their float64 copy, stays in the cache"""
-MIN_STD = 1e-2
-"""least deviation of a column, in its unit: a constant column must not become noise"""
+MIN_STD = 1e-2  # least deviation of a column, in its unit: a constant column must not become noise
 
 
 class Moments(NamedTuple):
@@ -392,8 +391,7 @@ class AdamLearner:
 # iteration after iteration an error.
 
 
-PREFIX = "non_finite/"
-"""of the metrics that count what was replaced; they are there only when something was"""
+PREFIX = "non_finite/"  # of the metrics that count what was replaced; they are there only when something was
 OBSERVATION = "observation"
 _ROWS_TOLD = 4
 

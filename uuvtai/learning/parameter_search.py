@@ -76,8 +76,7 @@ class NumberSearch:
 
 
 Array = np.ndarray
-PAIR_CORRELATION = 0.4
-"""of the scores of two trials of one episode: as measured in the fast gauntlet"""
+PAIR_CORRELATION = 0.4  # of the scores of two trials of one episode: as measured in the fast gauntlet
 SLOPE_SD, BEND_MEAN, BEND_SD = 0.02, -0.01, 0.01
 """what is expected of the terms per ``spread`` and per its square"""
 
@@ -209,6 +208,8 @@ class ParameterSearchTrainer(EpisodeTrainer):
         """Raises ConfigError for scenes that are neither slow nor fast."""
         from uuvtai.envs.vector_env import ObservationColumn
 
+        if config.train.num_envs % 2:
+            raise ConfigError("train.num_envs: trials come in pairs; give an even number")
         super().__init__(config, sims)
         self.observation_table = (ObservationColumn("tree", slice(0, 4), "1", "body", "what the tree asks"),)
         self._scenes = config.parameter_search.scenes

@@ -17,8 +17,7 @@ from uuvtai.learning.networks import NUM_ACTIONS, ActorCritic
 from uuvtai.learning.world_model import N_FEATURES, WorldModel
 
 Device = torch.device | str
-CHUNK = 64
-"""rows that go through the networks together"""
+CHUNK = 64  # rows that go through the networks together
 
 
 class AgentDecision(NamedTuple):

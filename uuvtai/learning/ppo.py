@@ -16,8 +16,7 @@ from uuvtai.learning.distillation import imitation_error
 from uuvtai.learning.networks import CACHE_ROWS, AdamLearner, Policy, View, entropy, log_prob, moments_of
 from uuvtai.learning.rollout import Rollout
 
-ADAM_EPS = 1e-5
-"""as in most PPO implementations (Huang et al. 2022, detail 3)"""
+ADAM_EPS = 1e-5  # as in most PPO implementations (Huang et al. 2022, detail 3)
 RATE_FACTOR, RATE_BOUNDS = 1.5, (1e-5, 2e-3)
 """steps of the KL-adaptive learning rate (rsl_rl), and its bounds (EC)"""
 DECAY_FROM, LEAST_RATE = 0.5, 0.1

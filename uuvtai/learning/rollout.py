@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from uuvtai.common.enums import COLLIDED, OUTCOMES
-from uuvtai.learning.networks import Policy, View
+from uuvtai.learning.networks import Policy, TrainingError, View
 
 
 class Step(NamedTuple):
@@ -113,6 +113,10 @@ def collect(
     sums = RolloutSums(len(env.outcomes), len(env.reward_terms), env.device)
     for t in range(rollout.steps):
         step = policy.act(env.view, generator)
+        if not bool(torch.isfinite(step.action).all()):
+            raise TrainingError(
+                "the policy's actions are not finite: begin anew with a smaller ppo.learning_rate"
+            )
         rollout.note(t, env.view | step._asdict())
         between = time.perf_counter()
         end = env.step(step.action, sums)
@@ -137,8 +141,7 @@ def final_value(policy: Policy, step: Step) -> Tensor:
 # Counts of a rollout, and the figures of the episodes that ended last.
 
 
-WINDOW = 100
-"""episodes at least that a figure is the mean of, once there were so many (as other trainers do)"""
+WINDOW = 100  # episodes at least that a figure is the mean of, once there were so many (as other trainers do)
 
 
 class RolloutSums:

@@ -9,7 +9,7 @@ import shlex
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -36,10 +36,8 @@ if TYPE_CHECKING:
 
 Metrics = dict[str, float]
 
-CONFIG, REWARD = "config.yaml", "reward.json"
-"""of a run folder"""
-SCORE = "eval/success_rate"
-"""metric by which a checkpoint is the best"""
+CONFIG, REWARD = "config.yaml", "reward.json"  # of a run folder
+SCORE = "eval/success_rate"  # metric by which a checkpoint is the best
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class TrainRequest:
     overrides: Overrides | None = None
     """changes of the resumed run's config"""
     iterations: int | None = None
-    """done in all; None = ``train.iterations``, over which the schedules run in any case"""
+    """done in all; None = as it began, then ``train.iterations``, over which schedules run in any case"""
     device: str = "auto"
     run_dir: Path | None = None
     reward: RewardSource | None = None
@@ -116,6 +114,10 @@ def _train(
         found = checkpoint.newest(folder.path, watch.note, resumable=True)
         _check_reward(folder.path, request.reward)
     total = request.iterations or config.train.iterations
+    kept = folder.record().get("iterations") if folder and found else None
+    if not request.iterations and isinstance(kept, int) and found and found.step < kept:
+        total = kept  # as the run began
+    request = replace(request, iterations=total)
     if folder and found and found.step >= total:
         folder.settle(found.step >= config.train.iterations)
         done, more = f"{found.step} of {total} iterations", f"--iterations {2 * found.step}"
@@ -137,6 +139,7 @@ def _train(
         folder.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
         if request.overrides:
             folder.write(CONFIG, to_yaml(config))
+    folder.keep({"iterations": total})
     run = _Run(trainer, config, folder, watch, evaluate, request)
     with folder.recorded(), contextlib.closing(run), signals.StopEvent() as pressed:
         if not run.go(pressed):

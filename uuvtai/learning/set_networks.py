@@ -15,12 +15,9 @@ from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.learning.networks import Policy, RunningNorm, View, mlp
 from uuvtai.learning.policy_agent import network
 
-NUM_WISHES = 3
-"""ahead, left, up: parts of the fastest velocity, in the mirrored world"""
-MOST_WISH = 2.0
-"""wishes beyond it are cut off before they are carried out"""
-AT_DIRECTION = slice(3, 5)
-"""columns of ``own`` with the unit vector to the look-ahead point of the route"""
+NUM_WISHES = 3  # ahead, left, up: parts of the fastest velocity, in the mirrored world
+MOST_WISH = 2.0  # wishes beyond it are cut off before they are carried out
+AT_DIRECTION = slice(3, 5)  # columns of ``own`` with the unit vector to the look-ahead point of the route
 _SUM_SCALE = 0.3  # sums over the obstacles are a few times as large as a maximum
 
 

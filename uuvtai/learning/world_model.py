@@ -15,15 +15,11 @@ from uuvtai.learning.networks import NUM_ACTIONS, AdamLearner, RunningNorm, mlp
 
 N_TARGET = 24
 """first columns of the observation: goal, heading error, velocity, yaw rate, depth, tilt, 12 sector ranges"""
-N_FEATURES = 2
-"""residual, uncertainty"""
+N_FEATURES = 2  # residual, uncertainty
 
-LOG_VAR_BOUNDS = (-12.0, 6.0)
-"""of a target in SI units; approached smoothly, so that no gradient dies"""
-SKILL = "world_model/skill/"
-"""before the name of a target in metrics.jsonl"""
-LARGEST_ERROR = 100.0
-"""of a target, in SI units: one that is further off counts as so far"""
+LOG_VAR_BOUNDS = (-12.0, 6.0)  # of a target in SI units; approached smoothly, so that no gradient dies
+SKILL = "world_model/skill/"  # before the name of a target in metrics.jsonl
+LARGEST_ERROR = 100.0  # of a target, in SI units: one that is further off counts as so far
 _OUT_GAIN = 0.01  # of the decoder: at birth it says 0 with variance one
 
 
@@ -151,8 +147,7 @@ class WorldModelLearner(AdamLearner):
         }
 
 
-INSIDE_90 = 1.6448536269514722
-"""standard deviations on either side of a Gaussian's mean that hold 90 % of it"""
+INSIDE_90 = 1.6448536269514722  # standard deviations on either side of a Gaussian's mean that hold 90 % of it
 
 
 def calibration(mean: Tensor, log_var: Tensor, target: Tensor) -> tuple[float, float]:

@@ -152,6 +152,10 @@ class LiveServer(contextlib.AbstractContextManager["LiveServer"]):
     def __init__(self, host: str, port: int, origins: Collection[str]) -> None:
         """``port`` 0: a free one, see ``port``; ``origins``: of web pages that may connect beside those of
         this host. Raises LiveError."""
+        if not host:
+            raise LiveError(
+                "--host: is empty, which would serve the whole network; leave it out for 127.0.0.1"
+            )
         self._origins, self._lock = {*origins}, threading.Condition()
         self._clients: list[Client] = []
         self._sockets: set[Any] = set()

@@ -36,6 +36,8 @@ def picture(
     """
     out = Path(out)
     checked_suffix(out, (".png",), "picture")
+    if not 320 <= width_px <= 3840:
+        raise LogError(f"--width {width_px}: must be from 320 to 3840")
     found = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not found:
         raise LogError("uuv log render: give at least one log")

@@ -131,7 +131,7 @@ class RunFolder:
 
     def go_on(self, since: dict[str, Any]) -> None:
         """Mark a held run as running again; ``since``: from where. Raises RunFolderError for no record."""
-        self._record = self._read_record()
+        self._record = self.record()
         resumed = {
             "argv": sys.argv,
             "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
@@ -144,12 +144,18 @@ class RunFolder:
 
     def settle(self, is_complete: bool) -> None:
         """Of a held folder with nothing left to do: say how its run ended, where a kill kept it from that."""
-        record = self._read_record()
+        record = self.record()
         if record.get("status") == "running":
             ended = ("finished", 0) if is_complete else ("interrupted", signals.exit_code())
             self.write_json(_RECORD, record | dict(zip(("status", "exit"), ended, strict=True)))
 
-    def _read_record(self) -> dict[str, Any]:
+    def keep(self, facts: dict[str, Any]) -> None:
+        """Add to the run's record. Raises RunFolderError."""
+        self._record |= facts
+        self.write_json(_RECORD, self._record)
+
+    def record(self) -> dict[str, Any]:
+        """As it stands in the folder. Raises RunFolderError for none."""
         file = self.path / _RECORD
         why = "it is no record of a run"
         try:

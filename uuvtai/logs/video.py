@@ -58,7 +58,7 @@ def video(
     """
     out = Path(out)
     suffix = checked_suffix(out, tuple(FORMATS), "video")
-    width_px, fps = width_px or FORMATS[suffix][0], fps or FORMATS[suffix][1]
+    width_px, fps = (FORMATS[suffix][n] if one is None else one for n, one in enumerate((width_px, fps)))
     given = ("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)
     for name, value, (least, most) in given:
         if not least <= value <= most:

@@ -329,7 +329,7 @@ class Report:
 
 def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Report:
     """Write the page of a run folder to ``out`` (default: its report.html) and its figures as PNG to
-    ``figures/`` beside the page.
+    ``figures/`` beside the page (of another name: ``NAME_figures/``).
 
     Several folders make one page, for which ``out`` must be given: trainings (seeds of an agent, or agents)
     are compared in one section, what the other folders hold follows, an evaluation beside the training that
@@ -353,7 +353,8 @@ def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Re
     with damage_named(runs[0] if len(runs) == 1 else target):
         page = _of_several(runs) if len(runs) > 1 else _of_run(runs[0])
         html, pngs = render(replace(page, sections=trimmed(page.sections)))
-    figures = [target.parent / FIGURES / f"{name}.png" for name in pngs]
+    beside = FIGURES if target.name == PAGE else f"{target.stem}_{FIGURES}"
+    figures = [target.parent / beside / f"{name}.png" for name in pngs]
     for figure in figures:
         _refuse_place(figure, runs, force)
     return _write(target, html, dict(zip(figures, pngs.values(), strict=True)))
@@ -377,8 +378,8 @@ def _refuse_place(target: Path, runs: list[Path], force: bool) -> None:
             renewed = force or len(runs) == 1
         elif place.is_relative_to(run) and place.exists() and place.suffix != ".html":
             raise FileError(f"{target}: is part of the run {run.name}; give --out another name")
-    if target.parent.is_symlink() and target.parent.name == FIGURES:
-        raise FileError(f"{target.parent}: is a link; give --out a place whose {FIGURES}/ is a folder")
+    if target.parent.is_symlink() and target.parent.name.endswith(FIGURES):
+        raise FileError(f"{target.parent}: is a link; give --out a place where it is a folder")
     refuse_output(target, [], renewed)
 
 

@@ -25,13 +25,10 @@ class Handover:
     """
 
     def __init__(self, system: int, limits: SafetyLimits, pretended: bool) -> None:
-        self.engaged = False
-        """whether a velocity has been asked for"""
-        self.ended = False
-        """whether the vehicle was given back, or never had; nothing is said any more"""
+        self.engaged = False  # whether a velocity has been asked for
+        self.ended = False  # whether the vehicle was given back, or never had; nothing is said any more
         self.lost = ""
-        self.mode = mavlink.GUIDED
-        """in which it is driven"""
+        self.mode = mavlink.GUIDED  # in which it is driven
         self._system, self._limits, self._pretended = system, limits, pretended
         self._leaving = False
         self._asked: dict[str, tuple[float, int]] = {}  # request -> (when it was asked for last, how often)

@@ -126,14 +126,13 @@ class Endpoint(AbstractContextManager["Endpoint"]):
 
 # ---- An endpoint that keeps the vehicle's clock: for a simulated one, be it slower or faster than ours.
 
-SILENT_S = 5.0
-"""by our clock: who told no time for so long is followed no further, lest time stand still"""
+SILENT_S = 5.0  # by our clock: who told no time for so long is followed no further, lest time stand still
 MOST_WAITING = 512  # datagrams between two steps; older ones are lost
 _FARTHEST_S = 5.0  # a time that jumps by more has begun anew
 _MAGIC, _HEAD, _ENDS = 0xFD, 10, 2  # MAVLink 2: first byte, bytes before and behind the payload
 _SIGNED, _SIGNATURE = 1, 13
 _AUTOPILOT, _HEARTBEAT, _ATTITUDE = 1, 0, 30
-_LOOPBACK = ("127.", "localhost")
+_LOOPBACK = re.compile(r"localhost|127(\.\d{1,3}){3}")
 
 
 class FollowedEndpoint(Endpoint):
@@ -150,7 +149,7 @@ class FollowedEndpoint(Endpoint):
     ) -> None:
         """``system``: the vehicle's id. ``wall``: our clock; ``pause``: waits for a datagram, a little.
         Raises LinkError, also for a place that is not on this computer."""
-        if not place.host.startswith(_LOOPBACK):
+        if not _LOOPBACK.fullmatch(place.host):
             raise LinkError(
                 f"--rate 0: follows the clock of a simulated vehicle on this computer, not of {place.host}; "
                 "give --rate 1"
@@ -338,8 +337,7 @@ class MavCodec:
         self._as_operator = self._dialect.MAVLink(None, srcSystem=operator, srcComponent=component)
         self.senders = {(system, component), (operator, component)}
         """ours: what comes back from there is an echo"""
-        self.broken = self.echoes = 0
-        """pieces of datagrams that were no message; heartbeats by our own id"""
+        self.broken = self.echoes = 0  # pieces of datagrams that were no message; heartbeats by our own id
 
     def decode(self, datagram: bytes) -> list[MavMessage]:
         """Messages of one datagram; nothing is carried over to the next one."""

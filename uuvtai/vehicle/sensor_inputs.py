@@ -150,8 +150,7 @@ class MotionWatch:
         self._views, self._estimated = views, numbers.estimated
         self._dt, self._gravity = numbers.dt_s, numbers.gravity_m_s2
         self.sums = MotionSums()
-        self._before = self.expected = self._own()
-        """after the last step; now, by the accelerometer"""
+        self._before = self.expected = self._own()  # after the last step; now, by the accelerometer
 
     def note_walls(self, step: int) -> None:
         """Before ``step``: what the last one's scan has corrected."""

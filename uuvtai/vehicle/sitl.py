@@ -88,10 +88,8 @@ class Instance:
         self._count: int | None = None
         self._answered_s, self._answer, self._rate_hz = 0.0, b"", 0
         self._forget()
-        self.counts: Counter[str] = Counter()
-        """by turn, and 'bad' packets"""
-        self.time_s = 0.0
-        """since the episode's or ArduSub's beginning"""
+        self.counts: Counter[str] = Counter()  # by turn, and 'bad' packets
+        self.time_s = 0.0  # since the episode's or ArduSub's beginning
         self.outcome, self._ended_s = "", 0.0
         self.joined_late = False
         """whether a thruster turned in the first packet: ArduSub drove in another water"""
@@ -420,12 +418,10 @@ class SitlPort:
         self._operator = SimulatedOperator(self._system) if plan.operator else None
         self._peer: Address | None = None
         self._heard_s = float("-inf")
-        self.paced_from_s = 0.0
-        """by the clock, when the water's time was 0"""
+        self.paced_from_s = 0.0  # by the clock, when the water's time was 0
         port, pilot = plan.port + NEXT_PORT * number, plan.emulated.get("autopilot")
         self.notes = ServingNotes(number, port, time.monotonic(), pilot is not None)
-        self.autopilot: StandIn | None = None
-        """in ArduSub's place"""
+        self.autopilot: StandIn | None = None  # in ArduSub's place
         try:
             if pilot is not None:
                 at = plan.host, pilot + NEXT_PORT * number

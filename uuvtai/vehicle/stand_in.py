@@ -13,8 +13,7 @@ from uuvtai.common.files import parsed_json
 from uuvtai.vehicle import mavlink
 from uuvtai.vehicle.telemetry import AUTOPILOT, FRAMES, NEUTRAL_US, SPAN_US
 
-RATE_HZ, LOOP_HZ = 200, 50
-"""packets to the physics; steps of its own"""
+RATE_HZ, LOOP_HZ = 200, 50  # packets to the physics; steps of its own
 _MAGIC, _MANUAL, _ARMED = 18458, 19, 128  # of a packet with 16 channels; first mode; flag of a heartbeat
 _AIR_HPA, _WATER_HPA_M = 1013.25, 97.8057  # by metre of depth: 997 kg/m^3
 _PUSH, _PUSH_SUM = np.array([0.35, 1.2, 1.2, 1.5]), np.array([0.3, 0.5, 0.5, 0.8])

@@ -272,8 +272,7 @@ class StartFix:
     def __init__(self, config: Config, typed: tuple[float, float, float]) -> None:
         """``typed``: start (x, y, z) [m] world; the attitudes fed have the heading as typed."""
         self.result: StartFound | None = None
-        self.first_s = math.inf
-        """time of the first scan that counts"""
+        self.first_s = math.inf  # time of the first scan that counts
         self.waits_for = "nothing has been seen yet"
         """why there is no result yet, and what the operator may do"""
         self._config, self._typed = config, np.array(typed[:2])

@@ -15,8 +15,7 @@ from uuvtai.config.loader import ConfigError
 from uuvtai.learning.checkpoint import Checkpoint
 from uuvtai.report.tables import rate, sensing, text_table
 
-RESULT = Path("eval/result.json")
-"""what ``uuv eval`` leaves in its run folder"""
+RESULT = Path("eval/result.json")  # what ``uuv eval`` leaves in its run folder
 _MAX_BYTES = 256 << 20
 _GIVE = "give the run folder that 'uuv eval RUN' printed"
 

@@ -27,8 +27,7 @@ from uuvtai.learning.export.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, Arra
 from uuvtai.logs.container import sync_folder
 from uuvtai.logs.run_folder import RunFolderError, write_atomic
 
-EXTRA = "uuvtai[export]"
-"""extra that brings ONNX"""
+EXTRA = "uuvtai[export]"  # extra that brings ONNX
 
 
 class ExportError(UserError, PolicyError):

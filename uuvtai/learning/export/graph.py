@@ -27,12 +27,9 @@ _INNER |= {"sparse_initializer", "sparse_tensor", "sparse_tensors"}
 OPSETS = range(9, 27)
 _DTYPES = {1: np.float32, 10: np.float16, 11: np.float64}
 MAX_NODES = 5000
-MAX_BYTES = 64 << 20
-"""of the graph with its weights: ONNX Runtime holds them about four times"""
-MAX_VALUES = 256 << 20
-"""[bytes] all values between the operators together, eight bytes a number"""
-MAX_WORK = 1 << 34
-"""multiplications of all matrix products, and values as well, of all calls together"""
+MAX_BYTES = 64 << 20  # of the graph with its weights: ONNX Runtime holds them about four times
+MAX_VALUES = 256 << 20  # [bytes] all values between the operators together, eight bytes a number
+MAX_WORK = 1 << 34  # multiplications of all matrix products, and values as well, of all calls together
 _RANK = 8
 
 

@@ -221,12 +221,10 @@ class Instrument(ABC):
 
     def __init__(self, channel: Channel) -> None:
         self.channel, self._last = channel, b""  # of what stamps: a relay without it may say one for ever
-        self.heard = 0
-        """messages that were understood"""
+        self.heard = 0  # messages that were understood
         self.refused: Counter[str] = Counter()
         """why something was not used -> how often; at most ``MOST_KINDS`` reasons"""
-        self.clock = SourceClock()
-        """of a device that stamps what it tells"""
+        self.clock = SourceClock()  # of a device that stamps what it tells
         self.fom_m_s: float | None = None
         """of a DVL that tells it: figure of merit of its last valid velocity"""
 

@@ -38,8 +38,7 @@ class Frames:
 
     def __init__(self) -> None:
         self._rest = b""
-        self.broken = 0
-        """wrong sums, and lengths that no frame has"""
+        self.broken = 0  # wrong sums, and lengths that no frame has
 
     def take(self, piece: bytes) -> list[tuple[int, bytes]]:
         """(number, payload) of the frames that are whole now."""

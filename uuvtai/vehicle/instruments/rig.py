@@ -39,8 +39,7 @@ class Rig(AbstractContextManager["Rig"]):
 
     def __init__(self, config: Config, typed: Mapping[str, str]) -> None:
         """``typed``: place by option name. Raises LinkError, SettingError."""
-        self.replaced = frozenset(typed)
-        """kinds of messages that MAVLink's senders no longer tell"""
+        self.replaced = frozenset(typed)  # kinds of messages that MAVLink's senders no longer tell
         self._lever = np.array(config.sensors.dvl.position_b_m)
         self._sources: dict[InstrumentPlace, tuple[Instrument, set[str]]] = {}
         try:

@@ -64,8 +64,7 @@ class Source:
     def __init__(self, path: Path, kind: str) -> None:
         self.path, self.kind, self.messages = path, kind, 0
         self.readings: list[Told] = []
-        self.dropped: Counter[tuple[str, str]] = Counter()
-        """(message or topic, why) -> how many"""
+        self.dropped: Counter[tuple[str, str]] = Counter()  # (message or topic, why) -> how many
 
     def heard(self) -> None:
         """One more message. Raises RecordingError for more than are read."""
@@ -125,10 +124,8 @@ class Telemetry:
         self._intake = _NamedIntake(config, (x, y, z), None, system, replaced=replaced)
         self._parameters: dict[str, float] = {}
         self._pulses: list[Pulses] = []
-        self.is_armed = True
-        """until somebody says otherwise"""
-        self.only_places = False
-        """whether LOCAL_POSITION_NED tells no velocity"""
+        self.is_armed = True  # until somebody says otherwise
+        self.only_places = False  # whether LOCAL_POSITION_NED tells no velocity
 
     def take(
         self, name: str, fields: dict[str, Any], come_s: float, what: str, sender: tuple[int, int] = _OWN
