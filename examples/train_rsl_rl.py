@@ -76,4 +76,4 @@ def _acting(runner: OnPolicyRunner) -> Act:
 
 
 if __name__ == "__main__":
-    main(train, play, iterations=40)
+    main(train, play, iterations=36)

@@ -52,4 +52,4 @@ def _acting(model: PPO, envs: VecNormalize) -> Act:
 
 
 if __name__ == "__main__":
-    main(train, play, iterations=40)
+    main(train, play, iterations=36)

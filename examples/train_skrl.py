@@ -97,4 +97,4 @@ def _acting(agent: PPO) -> Act:
 
 
 if __name__ == "__main__":
-    main(train, play, iterations=40)
+    main(train, play, iterations=36)

@@ -95,4 +95,4 @@ def _acting(spread: nn.Module, loc: torch.Tensor, scale: torch.Tensor) -> Act:
 
 
 if __name__ == "__main__":
-    main(train, play, iterations=40)
+    main(train, play, iterations=36)

@@ -58,7 +58,8 @@ def video(
     """
     out = Path(out)
     suffix = checked_suffix(out, tuple(FORMATS), "video")
-    width_px, fps = (FORMATS[suffix][n] if one is None else one for n, one in enumerate((width_px, fps)))
+    width_px = FORMATS[suffix][0] if width_px is None else width_px
+    fps = FORMATS[suffix][1] if fps is None else fps
     given = ("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)
     for name, value, (least, most) in given:
         if not least <= value <= most:
