@@ -177,7 +177,7 @@ def refuse_links_in(folder: Path) -> None:
                 if entry.is_symlink() or _is_junction(entry):
                     raise FileError(
                         f"{entry.path}: is a link; what a link leads to is not ours to read, write or "
-                        "delete: remove the link"
+                        "delete: give a run folder, without links"
                     )
                 if count > _MAX_ENTRIES:
                     raise FileError(f"{folder}: holds more than {_MAX_ENTRIES:,} files; no run folder does")
@@ -263,11 +263,12 @@ def output_beside(sources: Sequence[Path], out: Path | None, suffix: str, force:
     return target
 
 
-def refuse_output(out: Path, inputs: Iterable[Path], force: bool) -> None:
+def refuse_output(out: Path, inputs: Iterable[Path], force: bool | None) -> None:
     """Raise FileError where ``out`` must not be written: one of ``inputs``, or already there and ``force`` is
     not set.
 
     A link, a folder or a device there is refused with ``force`` too, and so is an input by another name.
+    None: the command knows no --force.
     """
     for given in inputs:
         if _same(out, given):
@@ -281,7 +282,8 @@ def refuse_output(out: Path, inputs: Iterable[Path], force: bool) -> None:
     if not stat.S_ISREG(found.st_mode):
         raise FileError(f"{out}: is {_kind(found.st_mode)}; give --out the name of a new file")
     if not force:
-        raise FileError(f"{out}: is already there; give another --out, or --force to replace it")
+        more = "" if force is None else ", or --force to replace it"
+        raise FileError(f"{out}: is already there; give another --out{more}")
 
 
 def _no_constant(text: str) -> float:

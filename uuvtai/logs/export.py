@@ -67,7 +67,7 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
 def _refuse_place(out: Path) -> None:
     """Raise LogError or FileError for a place that is taken: a log's names must not meet anybody's files."""
     if out.is_symlink() or not out.is_dir():
-        refuse_output(out, [], force=False)
+        refuse_output(out, [], force=None)
     elif any(out.iterdir()):
         raise LogError(f"{out}: is a folder that is not empty; give a new or an empty one with --out DIR")
 
