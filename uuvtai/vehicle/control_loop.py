@@ -364,7 +364,7 @@ class OnboardLoop:
                 else:
                     self._take(sender, message, come_s)
         if self._codec.echoes > self.tally.sent["HEARTBEAT"] + _ECHOES:
-            self._intake.refuse("another program speaks as we do: does a second uuv pilot run")
+            self._intake.refuse("another program speaks as we do: does a second uuv pilot run?")
         if not self._is_leaving:
             for instrument, reading in self._rig.poll(come_s, self._rate_b):
                 try:

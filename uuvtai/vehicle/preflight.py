@@ -115,7 +115,7 @@ def judged(name: str, value: float, config: Config, operator: int, has_sticks: b
         return BAD, f"the ground station that it obeys is not {operator}: --operator {value:g}"
     wanted = {"VISO_TYPE": 1, "EK3_SRC1_VELXY": 6}.get(name, value)
     if value != wanted:
-        joystick = ", and the operator's hand it back: switch the joystick off" if has_sticks else ""
+        joystick = ", and the operator's sticks hand it back: switch the joystick off" if has_sticks else ""
         return BAD if has_sticks else NOTE, f"not {wanted}: {guided}{joystick}"
     return OK, ""
 
@@ -355,11 +355,12 @@ class Preflight:
         depth_m = self._depths_m.get("SCALED_PRESSURE2", next(iter(self._depths_m.values()), math.nan))
         off_m, floor_m = abs(depth_m + self._start_z_m), -self._config.world.tank.z_m[0]
         told = f"{depth_m:.2f} m deep if the air has 1013 hPa, --start says {-self._start_z_m:.2f}"
-        if is_alone := "SCALED_PRESSURE2" not in self._depths_m:
-            told = f"{told}; SCALED_PRESSURE alone may be the hull's own: is the depth sensor connected"
+        is_alone = "SCALED_PRESSURE2" not in self._depths_m
+        hull = "; by SCALED_PRESSURE alone, which may be the hull's own: is the depth sensor connected?"
+        more = hull if is_alone else ""
         if not off_m <= _DEPTH_M[not is_alone]:
-            return BAD, f"{told} in a tank of {floor_m:g} m: measure again, or another sensor speaks"
-        return (NOTE if off_m > _DEPTH_M[0] or is_alone else OK), told
+            return BAD, f"{told} in a tank of {floor_m:g} m: measure again, or another sensor speaks{more}"
+        return (NOTE if off_m > _DEPTH_M[0] or is_alone else OK), told + more
 
     def _battery(self, heard: Heard) -> tuple[str, str]:
         volts, share, limits = heard.battery_v, heard.battery_share, self._limits
