@@ -105,6 +105,24 @@ def test_what_cannot_be_checked_is_refused(true, typed, rate, why):
 
 
 @pytest.mark.parametrize(
+    ("told", "is_found"), [((0.05, 0.02), True), ((0.3, 0.0), False), ((-0.5, 0.3), False)]
+)
+def test_less_of_a_wall_is_enough_where_it_stands_as_typed(told, is_found):
+    """0.9 m of the only end wall in reach, between obstacles."""
+    config, true = (
+        load_config("pool", "nominal", overrides={"sensors.sonar.max_range_m": 12.0}),
+        (15.0, 3.0, 0.4),
+    )
+    between = tuple((17.5, 3.0 + side * off, 0.35) for side in (-1, 1) for off in (0.575, 1.275))
+    typed = (true[0] + told[0], true[1] + told[1])
+    fix, pose = played(config, true, typed, 0.0, rate=0.0, obstacles=between, dt=0.25)
+    if is_found:
+        assert not fix.result.refusal and off(fix.result, pose, 0.0)[0] < 0.1
+    else:
+        assert "x 0 nor at x 20" in fix.result.refusal
+
+
+@pytest.mark.parametrize(
     ("at", "yaw_deg", "way"),
     [
         ((2.0, 3.5), 0, 1),

@@ -33,7 +33,9 @@ _SEARCH_RAYS, _FARTHEST_M = 800, 60.0
 FLOOR_M, FLOOR_RAD = 0.02, math.radians(0.3)  # what a fix is never better than: errors that rays share
 _INDEPENDENT = 100  # rays count as no more measurements than this
 _WALL_RAYS, _WALL_M = 12, 1.5
-"""a wall is seen by so many returns at least, that lie so far apart: larger than the face of an obstacle"""
+"""a wall is seen by so many returns at least, that lie so far apart: larger than the face of an obstacle;
+half as far where it stands as typed"""
+_AS_TYPED_M = 0.1
 _WIDE_RAD = math.radians(12.0)  # sectors that are wider are rangefinders, which measure along their axis
 _NEAREST = np.array([0.0, 0.0, 0.56, 0.85, 1.03, 1.16, 1.27, 1.35, 1.42])
 """standard deviations by which the least of so many normal values falls short of their mean"""
@@ -361,7 +363,7 @@ class StartFix:
     def _judged(self, rays: Rays, fit: Fit, rival: Fit | None, typed: np.ndarray) -> StartFound | None:
         tank, at = self._config.world.tank, self._track.at
         pose, covariance, residual = fit.pose, *covariance_of(fit)
-        wrong = misfit(self._config, rays, fit, residual) or unseen(self._config, rays, fit)
+        wrong = misfit(self._config, rays, fit, residual) or unseen(self._config, rays, fit, typed)
         if tank.shape == "circle" and not wrong:
             pose, covariance, wrong = turned_by_typed(tank, pose, covariance, typed)
         deviations = np.sqrt(np.diag(covariance))
@@ -426,16 +428,18 @@ def misfit(config: Config, rays: Rays, fit: Fit, residual: float) -> str:
     return f"{what}: off by {residual:.2f} m" if residual > 0.06 + 1.5 * noise else ""
 
 
-def unseen(config: Config, rays: Rays, fit: Fit) -> str:
+def unseen(config: Config, rays: Rays, fit: Fit, typed: np.ndarray) -> str:
     """Which walls are missing for a fix; '' = none."""
     tank = config.world.tank
+    as_typed = (np.abs(fit.pose - typed)[:2] < _AS_TYPED_M) & (tank.shape != "circle")
     ends = rays.ends()
     there = set()
     for wall in np.unique(fit.wall[fit.fits]):
         points = ends[fit.fits & (fit.wall == wall)]
         long = np.ptp(points, 0) if len(points) else np.zeros(2)
         sizes = tank.y_m if wall < 2 else tank.x_m
-        if len(points) >= _WALL_RAYS and math.hypot(*long) >= min(_WALL_M, 0.6 * (sizes[1] - sizes[0])):
+        least_m = min(_WALL_M, 0.6 * (sizes[1] - sizes[0])) / (1 + as_typed[wall // 2])
+        if len(points) >= _WALL_RAYS and math.hypot(*long) >= least_m:
             there.add(int(wall))
     if tank.shape == "circle":
         return "" if there else "the wall is hardly in view"
