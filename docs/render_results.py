@@ -90,7 +90,7 @@ def evaluations(root: Path) -> str:
 
 def _evaluated(row: Document) -> list[str]:
     agents, own = row["agents"], row["agents"][row["shows"]]
-    ends = " / ".join(str(own["outcomes"][end]) for end in ("collision", "ttc", "out_of_tank", "timeout"))
+    ends = "/".join(str(own["outcomes"][end]) for end in ("collision", "ttc", "out_of_tank", "timeout"))
     best, policy = (_beside(agents, name) + _p(row, name) for name in ("best", "policy"))
     planner = f"{_percent(agents['planner'], 'success')} %" if "planner" in agents else "-"
     causes = ", ".join(f"{cause['label']} {cause['count']}" for cause in own["causes"][:2])
@@ -135,7 +135,7 @@ def _beside(agents: Document, name: str) -> str:
 
 
 def _both(agent: Document) -> str:
-    return f"{_percent(agent, 'success')} / {_percent(agent, *COLLIDED)}"
+    return f"{_percent(agent, 'success')}/{_percent(agent, *COLLIDED)}"
 
 
 def sweep_commands(root: Path) -> str:
@@ -192,7 +192,7 @@ def _weighted(cells: Cells) -> str:
         sum(w * pooled([cell], *ends).rate for w, cell in zip(weights, cells, strict=True)) / sum(weights)
         for ends in (("success",), COLLIDED)
     ]
-    return " / ".join(f"{100 * share:.1f}" for share in rates)
+    return "/".join(f"{100 * share:.1f}" for share in rates)
 
 
 def _moderate(cells: Cells) -> Cells:

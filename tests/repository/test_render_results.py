@@ -163,7 +163,7 @@ def test_an_evaluation_is_kept_in_its_row_alone(copy, tmp_path):
     assert agents["best"] == before["rows"][1]["agents"]["best"]
     assert all("bt" not in (pair["a"], pair["b"]) for pair in after["rows"][1]["paired"])
     assert (
-        "| `pool` (6, 0.6) | 997/1000 = 99.7 % [99.1, 99.9] | 0.2 % [0.1, 0.7] | 1 / 1 / 0 / 1 |"
+        "| `pool` (6, 0.6) | 997/1000 = 99.7 % [99.1, 99.9] | 0.2 % [0.1, 0.7] | 1/1/0/1 |"
         in (render_results.pages(copy)[ROBUSTNESS])
     )
     with pytest.raises(ValueError, match="there are pool_0"):

@@ -264,16 +264,15 @@ def compared(a: Estimate, b: Estimate, factor: float = 1.0, margin: float = 0.0)
 # ------------------------------------------------------------------------------------------------- Table main
 
 
-def of_table_main(by_method: dict[str, list[dict[str, Any]]], note: str = "") -> list[Claim]:
-    """Claims about methods and ablations; entries of ``uuv eval`` by method, one per training seed. ``note``
-    goes behind each text."""
+def of_table_main(by_method: dict[str, list[dict[str, Any]]]) -> list[Claim]:
+    """Claims about methods and ablations; entries of ``uuv eval`` by method, one per training seed."""
     success = {name: of_method(entries, "success") for name, entries in by_method.items()}
     collision = {name: of_method(entries, *COLLIDED) for name, entries in by_method.items()}
     ours, plain = success["paper"], success["ppo"]
     times = [seconds(tts_s(by_method[name])) for name in ("paper", "ppo")]
     returns = [over_seeds([entry["return_mean"] for entry in by_method[name]]) for name in ("ppo", "paper")]
     without = "over PPO without distillation"
-    found = [
+    return [
         claim(
             f"Curriculum distillation raises success {without}",
             "0.87 against 0.20",
@@ -312,7 +311,6 @@ def of_table_main(by_method: dict[str, list[dict[str, Any]]], note: str = "") ->
             if a in success and b in success
         ],
     ]
-    return [replace(c, text=c.text + note) for c in found]
 
 
 def _beside_tree(method: list[dict[str, Any]], tree: list[dict[str, Any]]) -> list[Claim]:
@@ -398,12 +396,12 @@ LOSSES = {"world_model/reconstruction_loss": "Reconstruction", "world_model/dyna
 _SKILL = "world_model/skill/"  # that of learning.world_model, which takes torch to import
 
 
-def of_training(trainings: Sequence[dict[str, Any]], note: str = "") -> list[Claim]:
+def of_training(trainings: Sequence[dict[str, Any]]) -> list[Claim]:
     """Whether the world model's losses fall; ``training_facts`` of the method's trainings."""
     claims = []
     for key, name in LOSSES.items():
         ends = [facts["losses"][key] for facts in trainings if key in facts["losses"]]
-        text = f"{name} loss falls and settles{note}"
+        text = f"{name} loss falls and settles"
         if not ends or len(ends) < len(trainings):
             claims.append(Claim(text, "curve", "-", OPEN, reason="too few iterations"))
             continue

@@ -99,7 +99,7 @@ def main_table(document: dict[str, Any]) -> Rows:
         printed = claims.TABLE_MAIN.get(name)
         theirs = ["-"] * 4
         if printed:
-            shares = f"{printed.success:.2f} / {printed.collision:.2f}"
+            shares = f"{printed.success:.2f}/{printed.collision:.2f}"
             theirs = [shares, f"{printed.episode_return}", f"{printed.tts_s} s", f"{printed.mean_time_s} s"]
         all_s = mean([m["time_mean_s"] for m in entries if m["time_mean_s"] is not None])
         arrived = [m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None]
@@ -157,9 +157,12 @@ _SKILL = (
 def results_page(*documents: dict[str, Any]) -> str:
     """The whole page of ``uuv reproduce --json`` documents; their claims are one family of tests."""
     judged = iter(claims.judged([Claim(**claim) for document in documents for claim in document["claims"]]))
-    parts = [f"# Results\n{_HOW}"]
+    parts = [f"# Results\n{_HOW}", _TTS, _SCALE, _SKILL]
+    shown: set[str] = set()  # agents that are not trained drive alike at every budget
     for document in documents:
-        own = document | {"claims": [vars(next(judged)) for _ in document["claims"]]}
+        main = {name: found for name, found in document["table_main"].items() if name not in shown}
+        shown |= {name for name, found in main.items() if "trained_steps" not in found[0]}
+        own = document | {"claims": [vars(next(judged)) for _ in document["claims"]], "table_main": main}
         parts += [_head(own), *(part(own) for name, part in _PARTS.items() if own.get(name))]
     told = "\n".join(f"- {text}" for text in claims.INCONSISTENCIES)
     return "\n\n".join([*parts, f"## Where the paper's figures do not add up\n{told}"]) + "\n"
@@ -172,9 +175,8 @@ def _head(document: dict[str, Any]) -> str:
     trained = f" (trained or evaluated at: {others})" if others else ""
     return (
         f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit "
-        f"{document['git_sha'] or 'unknown'}{trained}, {machine['cpu']}, {machine['cores']} cores. RUN is "
-        "the reproduction's folder. All drive on the paper's stack, `bt` too; the evaluations' seed, "
-        f"{seed}, {tuned}."
+        f"{document['git_sha'] or 'unknown'}{trained}, {machine['cpu']}, {machine['cores']} cores. The "
+        f"evaluations' seed, {seed}, {tuned}."
     )
 
 
@@ -190,7 +192,8 @@ _HOW = (
     "test (intervals: Wilson's, 95 %). Episodes of one number go together in all cells of a grid: only as "
     "many count as independent ones would say the same. Claims without a p value set one number beside "
     "another: one run, one machine, no test. The paper's rates are of another simulator: one that is reached "
-    "says nothing about who is better. Not judged: when a training converges, trajectories, larger margins."
+    "says nothing about who is better. Not judged: when a training converges, trajectories, larger margins. "
+    "All drive on the paper's stack, `bt` too; RUN is a reproduction's folder."
 )
 
 
@@ -208,28 +211,29 @@ def _main(document: dict[str, Any]) -> str:
     told += [document["commands"][at] for at in ("eval/NAME-SEED", "eval/main")]
     commands = "\n".join(f"`{command}`" for command in told)
     title = f"{_titled('Table main and ablations', document)}\n{commands}"
-    return f"{title}\n\n{trained} {_TTS}\n\n" + text_table(*main_table(document))
+    return f"{title}\n\n{trained}\n\n" + text_table(*main_table(document))
 
 
 _RUN, _EXAMPLES = Path("RUN"), ("train/paper-0", "train/paper_10hz-0")  # trainings whose commands are shown
 
 
 def _mechanism(document: dict[str, Any]) -> str:
-    tables = [f"{caption}\n\n{text_table(*table)}" for caption, table in mechanism_tables(document)]
+    tables = [text_table(*table) for _, table in mechanism_tables(document)]
     return "\n\n".join([_titled("Mechanism", document), *tables])
 
 
 def _sweep(document: dict[str, Any]) -> str:
-    """Rows: agent, S and D; columns: speeds; cells: success / collision in %."""
+    """Rows: S and D; columns: speeds; cells: success/collision in %, of one agent after the other."""
     cells = document["sweep"]["cells"]
     speeds = list(dict.fromkeys(cell["v_m_s"] for cell in cells))
-    lines: dict[tuple[Any, ...], dict[Any, str]] = {}
+    lines: dict[tuple[Any, ...], dict[Any, list[str]]] = {}
     for cell in cells:
-        rates = f"{100 * pooled([cell], 'success').rate:.0f} / {100 * pooled([cell], *COLLIDED).rate:.0f}"
-        lines.setdefault((cell["agent"], cell["S"], cell["D"]), {})[cell["v_m_s"]] = rates
-    rows = [[*map(str, key), *(found.get(v, "") for v in speeds)] for key, found in lines.items()]
-    head = ["agent", "S", "D", *("nothing moves" if v is None else f"v = {v} m/s" for v in speeds)]
-    note = f"`{document['commands']['sweep/pool']}`\n\nsuccess / collision in %"
+        rates = f"{100 * pooled([cell], 'success').rate:.0f}/{100 * pooled([cell], *COLLIDED).rate:.0f}"
+        lines.setdefault((cell["S"], cell["D"]), {}).setdefault(cell["v_m_s"], []).append(rates)
+    rows = [[*map(str, key), *(", ".join(found.get(v, ())) for v in speeds)] for key, found in lines.items()]
+    head = ["S", "D", *("nothing moves" if v is None else f"v = {v} m/s" for v in speeds)]
+    agents = " and ".join(f"`{name}`" for name in dict.fromkeys(cell["agent"] for cell in cells))
+    note = f"`{document['commands']['sweep/pool']}`\n\nsuccess/collision in % of {agents}"
     return f"## Sweep\n{note}\n\n" + text_table(head, rows)
 
 
@@ -437,8 +441,8 @@ def _entry(agent: dict[str, Any]) -> dict[str, Any]:
 
 def claims_of(document: dict[str, Any]) -> list[Claim]:
     """The paper's claims, judged by what the document holds of methods, sweep, times and transfer."""
-    note, main, distilled = BUDGETS[document["budget"]].note, document["table_main"], METHODS[0]
-    found = [*claims.of_table_main(main, note), *claims.of_training(document["mechanism"][distilled], note)]
+    main, distilled = document["table_main"], METHODS[0]
+    found = [*claims.of_table_main(main), *claims.of_training(document["mechanism"][distilled])]
     if document["sweep"]:
         policy = f"{distilled}-0"
         for name in (policy, "bt"):

@@ -30,8 +30,6 @@ class Budget:
     """the paper's 1,200 are 614,400 env-steps"""
     training_seeds: int
     episodes: int  # per agent in Table main
-    note: str = ""
-    """behind the claims about methods"""
     methods: tuple[str, ...] = (*METHODS, f"paper{_TEN_HZ}", f"ppo{_TEN_HZ}")
     sweep_episodes: int = 0
     """per cell; 0 = trainings and Table main alone"""
@@ -45,7 +43,7 @@ class Budget:
 BUDGETS = {
     "quick": Budget(120, 2, 100, sweep_episodes=8, profile_seconds=4.0),
     "paper": Budget(1200, 5, 500, sweep_episodes=64, profile_seconds=10.0),
-    "tenfold": Budget(12_000, 3, 500, ", at ten times the env-steps", METHODS[:3]),
+    "tenfold": Budget(12_000, 3, 500, METHODS[:3]),
 }
 
 
