@@ -635,7 +635,7 @@ def as_driven(config: Config, plan: FlightPlan) -> Config:
     simulator, for an autopilot follows late; it believes in no camera where no instrument has one."""
     (low, high), limits = config.world.tank.z_m, plan.limits
     room = min(high + limits.depth_m[0], -limits.depth_m[1] - low)
-    gap = max(config.behavior.edge_gap_m, room) + safety.FENCE_ROOM_M
+    gap = max(config.behavior.edge_gap_m, room) + safety.FENCE_ROOM_M[1]
     keys: dict[str, dict[str, object]] = {"behavior": {"edge_gap_m": gap}}
     if not plan.instruments.get("sonar", "").startswith(HAVE_IMAGES):
         keys |= {"camera_tracking": {"use_camera": False}, "height": {"use_camera": False}}

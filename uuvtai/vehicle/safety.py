@@ -235,9 +235,9 @@ def decide(
 
 # ------------------------------------------------------------------------------------------------- the limits
 
-FENCE_RATE_HZ, FENCE_ROOM_M = 0.5, 0.05
-"""towards the fence no faster than this times the distance to a line so far within it, which a vehicle that
-follows late, or errors of its place, may overrun"""
+FENCE_RATE_HZ, FENCE_ROOM_M = (0.5, 1.5), (0.05, 0.02)
+"""towards the fence (box, depths) no faster than this times the distance to a line so far within it, which a
+vehicle that follows late, or errors of its place, may overrun. Depths are held well, and water is not deep"""
 
 
 def allowed(wanted: Velocity, view: VehicleView, limits: SafetyLimits) -> Velocity:
@@ -250,9 +250,9 @@ def allowed(wanted: Velocity, view: VehicleView, limits: SafetyLimits) -> Veloci
     cos, sin = math.cos(yaw), math.sin(yaw)
     x, y, z = view.pos_w
     low_x, low_y, high_x, high_y = limits.box_m
-    east = _within(cos * surge - sin * sway, x - low_x, high_x - x)
-    north = _within(sin * surge + cos * sway, y - low_y, high_y - y)
-    heave = _within(heave, z + limits.depth_m[1], -limits.depth_m[0] - z)
+    east = _within(cos * surge - sin * sway, x - low_x, high_x - x, 0)
+    north = _within(sin * surge + cos * sway, y - low_y, high_y - y, 0)
+    heave = _within(heave, z + limits.depth_m[1], -limits.depth_m[0] - z, 1)
     return cos * east + sin * north, -sin * east + cos * north, heave, turn
 
 
@@ -279,8 +279,10 @@ def outside_m(pos_w: tuple[float, float, float], limits: SafetyLimits) -> float:
     return max(sides) if all(map(math.isfinite, sides)) else math.inf
 
 
-def _within(speed: float, room_below: float, room_above: float) -> float:
-    least, most = (FENCE_RATE_HZ * max(room - FENCE_ROOM_M, 0.0) for room in (room_below, room_above))
+def _within(speed: float, room_below: float, room_above: float, way: int) -> float:
+    """``way``: 0 = level, 1 = up and down."""
+    rooms = (max(room - FENCE_ROOM_M[way], 0.0) for room in (room_below, room_above))
+    least, most = (FENCE_RATE_HZ[way] * room for room in rooms)
     return max(-least, min(most, speed))
 
 
