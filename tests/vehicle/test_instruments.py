@@ -725,6 +725,21 @@ def test_what_a_sitl_instrument_says_the_pilot_hears():
     assert all(one.hit[0] == 1 and abs(one.range_m[0] - 4.0) < 0.05 for one in beams)
 
 
+def test_a_beam_of_a_sitl_ping360_is_as_wide_as_the_heads(monkeypatch):
+    config, heard = emulated(load_config("pool", "ping360"), ("ping360",)), []
+    ranges, hit = np.full(400, 4.0), np.ones(400, int)
+    ranges[10], hit[13] = 2.0, 0
+
+    def step(self, now_s, echo):
+        heard.extend(echo(math.radians(0.9 * number)) for number in range(8, 14))
+
+    monkeypatch.setattr(FakePing360, "step", step)
+    fake = FakeRig(config, {"ping360": free_port()}, "127.0.0.1", 0)
+    fake.step(0.0, 1.0, {"scan.range_m": ranges, "scan.hit": hit}.__getitem__)
+    fake.close()
+    assert heard == [4.0, 2.0, 2.0, 2.0, 4.0, 4.0]
+
+
 def test_a_sitl_3d15_shows_what_its_camera_sees():
     """A wall across at 4 m, and a bar above to port that only some rows see."""
     port = free_port()

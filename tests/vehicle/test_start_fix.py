@@ -138,6 +138,27 @@ def test_it_turns_to_the_nearest_corner(at, yaw_deg, way):
     assert fix.way_round() == way
 
 
+def test_obstacles_that_might_be_a_wall_where_beams_see_through_it_are_no_second_place():
+    """From (12.5, 2.4) a metre of the end wall is in view, and faces of obstacles before it."""
+    config = load_config("pool", "ping360", overrides={"sensors.sonar.max_range_m": 12.0})
+    true, still, sonar = (12.5, 2.4, 0.3), np.zeros(3), config.sensors.sonar
+    obstacles = ((19.3, 0.6, 0.45), (19.3, 5.2, 0.45), (19.3, 4.2, 0.4), (16.0, 1.7, 0.35))
+    rng, fix, nearest = np.random.default_rng(1), StartFix(config, (*true[:2], -0.8)), np.full(200, math.inf)
+    for side in (-1, 0, 1):  # of a beam
+        yaws = true[2] + side * sonar.half_width_rad + sonar.turn_rad(sonar.n_ray) * np.arange(4)
+        fans = np.array([ranges(config, (*true[:2], yaw), rng, obstacles) for yaw in yaws])
+        nearest = np.minimum(nearest, np.where(fans[:, 1] > 0, fans[:, 0], math.inf).ravel()[:200])
+    for k in range(400):
+        time_s, beam = k * sonar.step_us / 1e6, [k % 200]
+        fix.feed(ImuReading(time_s, np.array([0.0, 0.0, true[2]]), still, still))
+        fix.feed(DvlReading(time_s, still))
+        hit = np.isfinite(nearest[beam])
+        fix.feed(SonarPing(time_s, np.where(hit, nearest[beam], 12.0), hit, np.zeros(0), beam[0]))
+    assert fix.result is not None and not fix.result.refusal
+    far, degrees = off(fix.result, true, 0.0)
+    assert far < 0.02 and degrees < 0.2
+
+
 @pytest.mark.parametrize(("beams", "is_found"), [(200, True), (64, False)])
 def test_a_head_that_looks_all_around_finds_the_start_at_rest(beams, is_found):
     config, true, still = load_config("pool", "ping360"), (4.0, 2.2, 0.4), np.zeros(3)

@@ -357,13 +357,19 @@ class StartFix:
         guess = around if tank.shape == "circle" else candidates
         found = [refined(self._config, few, pose) for pose in guess(tank, few.ends()[few.hit], typed)]
         best, *others = sorted(found, key=lambda fit: -fit.score)
-        rival = next((f for f in others if _apart(f.pose, best.pose) and f.score > 0.8 * best.score), None)
+        near = (f for f in others if _apart(f.pose, best.pose) and f.score > 0.8 * best.score)
+        rival = next((f for f in near if not self._wrong(few, f, f.pose)), None)
         return self._judged(rays, refined(self._config, rays, best.pose), rival, typed)
+
+    def _wrong(self, rays: Rays, fit: Fit, typed: np.ndarray) -> str:
+        """Why a fit is none; '' = it is one."""
+        _, residual = covariance_of(fit)
+        return misfit(self._config, rays, fit, residual) or unseen(self._config, rays, fit, typed)
 
     def _judged(self, rays: Rays, fit: Fit, rival: Fit | None, typed: np.ndarray) -> StartFound | None:
         tank, at = self._config.world.tank, self._track.at
         pose, covariance, residual = fit.pose, *covariance_of(fit)
-        wrong = misfit(self._config, rays, fit, residual) or unseen(self._config, rays, fit, typed)
+        wrong = self._wrong(rays, fit, typed)
         if tank.shape == "circle" and not wrong:
             pose, covariance, wrong = turned_by_typed(tank, pose, covariance, typed)
         deviations = np.sqrt(np.diag(covariance))

@@ -312,5 +312,8 @@ class FakeRig:
 
 
 def _met(sonar_cfg: SonarConfig, range_m: np.ndarray, hit: np.ndarray, bearing: float) -> float:
-    beam = round(bearing / sonar_cfg.beam_step_rad) % sonar_cfg.n_ray
-    return float(range_m[beam]) if hit[beam] else math.inf
+    """The nearest that a beam as wide as the head's meets."""
+    step, half = math.degrees(sonar_cfg.beam_step_rad), 0.5 * sonar_cfg.beam_width_deg
+    middle, reach = round(math.degrees(bearing) / step), int(half / step + 1e-6)
+    beams = np.arange(middle - reach, middle + reach + 1) % sonar_cfg.n_ray
+    return float(np.where(hit[beams], range_m[beams], math.inf).min())
