@@ -168,6 +168,7 @@ _REST_S, _LOOK_RAD_S, _SWEEP_RAD_S = 5.0, 0.5, 0.3
 """where the walls that are seen at rest do not tell the start for so long, the vehicle turns on the spot; the
 last: where a head turns, too"""
 _UNKNOWN = (math.nan, math.nan, math.nan)
+_NEARER_M = 0.1  # than the goal's radius, so that it is near wherever it is
 _REACHED, _INTERRUPTED, _CALIBRATED = "goal reached", "interrupted", "calibrated"
 _T = TypeVar("_T")
 _FAREWELLS = (_REACHED, "time is up", _INTERRUPTED)
@@ -550,7 +551,7 @@ class OnboardLoop:
 
     def _farewell(self, now_s: float, command: PilotCommand) -> str:
         goal, radius = self._plan.mission.goal, self._config.episode.goal_radius_m
-        sure_m = radius - min(0.5 * radius, 2.0 * command.place_sigma_m)  # near, wherever it is
+        sure_m = radius - min(0.5 * radius, max(2.0 * command.place_sigma_m, _NEARER_M))
         if self._handover.engaged and math.dist(command.pos_w.tolist(), goal) <= sure_m:
             return _REACHED
         if self._calibration is not None and (self._calibration.found or self._calibration.refusal):
