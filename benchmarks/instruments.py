@@ -418,6 +418,8 @@ def _flown(waters: Waters, pilot: Process, say: Callable[[str], None], number: i
                 left_s = min(left_s, link.autopilot.time_s + _AFTER_S)
         while not pilot.has_ended:  # it gives the vehicle back
             link.advance()
+            if link.autopilot.time_s > 3 * _LONGEST_EPISODE_S:
+                raise RuntimeError(f"instance {number}: the pilot does not end: {pilot.lines[-1:]}")
     last = [line for line in pilot.lines if not line.startswith("ended")][-1:]
     time_s = f"{link.autopilot.time_s:.1f} s, {link.hurried} times not waited for"
     say(f"{number}: {end or 'not ended'}, {time_s}; {last}")

@@ -49,7 +49,7 @@ def test_until_the_start_is_known_it_only_turns(tmp_path, sees_around):
     flight.close()
 
 
-@pytest.mark.parametrize(("depth_m", "gap_m"), [((0.2, 1.4), 0.22), ((0.05, 1.55), 0.22), ((0.4, 1.3), 0.32)])
+@pytest.mark.parametrize(("depth_m", "gap_m"), [((0.2, 1.4), 0.22), ((0.05, 1.55), 0.2), ((0.4, 1.3), 0.32)])
 def test_the_stack_plans_within_the_fence(tmp_path, depth_m, gap_m):
     plan = dataclasses.replace(
         plan_of(None, tmp_path / "a.mcap"), limits=dataclasses.replace(LIMITS, depth_m=depth_m)

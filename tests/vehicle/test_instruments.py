@@ -323,8 +323,8 @@ def test_a_head_scans_there_and_back_and_all_around_when_asked_to(own):
     for begun_s, whole, beams in ((0.0, False, SONAR.n_ray), (60.0, True, 200), (120.0, False, SONAR.n_ray)):
         assert sonar.look_around(whole)
         found.clear()
-        spent_s = until(partial(step, begun_s=begun_s), found, lambda them: len(them) >= 400)
-        assert spent_s > 400 * 0.035  # a step of the head takes its time
+        spent_s = until(partial(step, begun_s=begun_s), found, lambda them: len(them) >= 450)
+        assert spent_s > 450 * 0.035  # a step of the head takes its time
         assert {one.first_beam for one in found} == set(range(beams))
         for one in found:
             bearing = SONAR.first_beam_rad + one.first_beam * SONAR.beam_step_rad

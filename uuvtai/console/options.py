@@ -370,7 +370,9 @@ FenceBox = Annotated[
 ]
 FenceDepth = Annotated[
     str | None,
-    Option("--depth", metavar="MIN,MAX", help="Fence: depths \\[m] \\[default: the tank, 0.2 m within]."),
+    Option(
+        "--depth", metavar="MIN,MAX", help="Fence: depths \\[m] \\[default: the hull 1 cm within the tank]."
+    ),
 ]
 MostSpeed = Annotated[float, Option("--max-speed", help="Highest horizontal speed \\[m/s].")]
 LeastBattery = Annotated[float, _more("--battery", help="Surface below this voltage \\[V].")]

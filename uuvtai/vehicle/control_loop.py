@@ -33,7 +33,7 @@ from uuvtai.vehicle.telemetry import AUTOPILOT, COMPANION, Heard, Intake, Sender
 # ---- What ``uuv pilot`` was told, checked before anything is opened or compiled.
 
 _ECHOES = 3  # more of our own heartbeats than we sent are another's
-EDGE_M = 0.2  # the fence's depths keep so far from surface and floor of the tank where none are typed
+EDGE_M = 0.01  # the fence keeps the hull so far from surface and floor of the tank where no depths are typed
 MOST_SPEED_M_S = 2.0
 _USUAL_S = {"fly": math.inf, "check": CHECK_S, "calibrate": calibrate.LONGEST_S}
 _DRY = {"fly": "dry run", "check": "check", "calibrate": "calibration"}
@@ -133,9 +133,10 @@ def _limits(
     """As typed; where nothing is, the tank's and the vehicle's own."""
     tank, vehicle = config.world.tank, config.vehicle
     low_x, low_y, high_x, high_y = box or (tank.x_m[0], tank.y_m[0], tank.x_m[1], tank.y_m[1])
+    edge_m = vehicle.hull_radius_m + EDGE_M
     return safety.SafetyLimits(
         box_m=(low_x, low_y, high_x, high_y),
-        depth_m=(depth[0], depth[1]) if depth else (EDGE_M - tank.z_m[1], -tank.z_m[0] - EDGE_M),
+        depth_m=(depth[0], depth[1]) if depth else (edge_m - tank.z_m[1], -tank.z_m[0] - edge_m),
         speed_m_s=max_speed,
         heave_m_s=min(max_speed, vehicle.max_heave_m_s),
         yaw_rate_rad_s=vehicle.max_yaw_rate_rad_s,
@@ -632,11 +633,11 @@ def fly(
 
 
 def as_driven(config: Config, plan: FlightPlan) -> Config:
-    """The stack plans for depths that the fence allows, and farther from floor and surface than in the
-    simulator, for an autopilot follows late; it believes in no camera where no instrument has one."""
+    """The stack plans for depths that the fence allows, and believes in no camera where no instrument has
+    one."""
     (low, high), limits = config.world.tank.z_m, plan.limits
     room = min(high + limits.depth_m[0], -limits.depth_m[1] - low)
-    gap = max(config.behavior.edge_gap_m, room) + safety.FENCE_ROOM_M[1]
+    gap = max(config.behavior.edge_gap_m, room + safety.FENCE_ROOM_M[1])
     keys: dict[str, dict[str, object]] = {"behavior": {"edge_gap_m": gap}}
     if not plan.instruments.get("sonar", "").startswith(HAVE_IMAGES):
         keys |= {"camera_tracking": {"use_camera": False}, "height": {"use_camera": False}}

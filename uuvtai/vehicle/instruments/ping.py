@@ -153,6 +153,7 @@ class Ping360(Instrument):
     def look_around(self, whole: bool) -> bool:
         if self._whole != (whole or self._sonar.is_ring):
             self._whole, self._asked_s = not self._whole, -math.inf
+            self._beam, self._way = 0, 1  # the one that was asked for last may lie beside the fan
         return True
 
     def close(self) -> None:
