@@ -87,8 +87,8 @@ def _item(claim: dict[str, Any]) -> Described:
 # ---- Tables of a reproduction, and all of them as Markdown: docs/results.md is such a page.
 
 _TTS = (
-    "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the "
-    "episodes that arrive, has no peer in the paper."
+    "TTS is the paper's: mean time of all episodes / rate of success. The mean time of successes has no peer "
+    "in the paper."
 )
 
 
@@ -193,7 +193,8 @@ _HOW = (
     "many count as independent ones would say the same. Claims without a p value set one number beside "
     "another: one run, one machine, no test. The paper's rates are of another simulator: one that is reached "
     "says nothing about who is better. Not judged: when a training converges, trajectories, larger margins. "
-    "All drive on the paper's stack, `bt` too; RUN is a reproduction's folder."
+    "All drive on the paper's stack, `bt` too; RUN is a reproduction's folder. "
+    "Agents that are not trained stand in the first table alone."
 )
 
 

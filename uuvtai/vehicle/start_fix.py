@@ -35,7 +35,7 @@ _INDEPENDENT = 100  # rays count as no more measurements than this
 _WALL_RAYS, _WALL_M = 12, 1.5
 """a wall is seen by so many returns at least, that lie so far apart: larger than the face of an obstacle;
 half as far where it stands as typed"""
-_AS_TYPED_M = 0.1
+_AS_TYPED_M = 0.1  # and so much off at most
 _WIDE_RAD = math.radians(12.0)  # sectors that are wider are rangefinders, which measure along their axis
 _NEAREST = np.array([0.0, 0.0, 0.56, 0.85, 1.03, 1.16, 1.27, 1.35, 1.42])
 """standard deviations by which the least of so many normal values falls short of their mean"""
