@@ -237,7 +237,7 @@ def decide(
 
 FENCE_RATE_HZ, FENCE_ROOM_M = (0.5, 1.5), (0.05, 0.02)
 """towards the fence (box, depths) no faster than this times the distance to a line so far within it, which a
-vehicle that follows late, or errors of its place, may overrun; depth is held better, and pools are flat"""
+vehicle that follows late, or errors of its place, may overrun; depth is held better, and pools are shallow"""
 
 
 def allowed(wanted: Velocity, view: VehicleView, limits: SafetyLimits) -> Velocity:
