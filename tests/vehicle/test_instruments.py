@@ -177,18 +177,18 @@ def ping360(*pieces: bytes) -> ping.Ping360:
 
 @pytest.mark.parametrize("number", [definitions.PING360_DEVICE_DATA, definitions.PING360_AUTO_DEVICE_DATA])
 def test_a_profile_of_the_makers_package_is_a_beam(number):
-    (found,) = ping360(device_data(200 + 63, 3.0, number)).poll(5.0)
+    (found,) = ping360(device_data(200 + 62, 3.0, number)).poll(5.0)
     assert found.first_beam == 0 and found.hit.tolist() == [1.0]  # clockwise of ahead: the right edge
     assert found.range_m[0] == pytest.approx(3.0, abs=0.02)
     assert found.time_s == pytest.approx(5.0 - 25e-9 * PERIOD * 1200)
-    (ahead,) = ping360(device_data(200 - 63, 3.0, number)).poll(5.0)
+    (ahead,) = ping360(device_data(200 - 62, 3.0, number)).poll(5.0)
     assert ahead.first_beam == SONAR.n_ray - 1
 
 
 def test_a_quiet_profile_is_free_water_and_a_loud_one_is_unknown():
-    (free,) = ping360(device_data(201, math.inf)).poll(1.0)
+    (free,) = ping360(device_data(202, math.inf)).poll(1.0)
     assert free.hit.tolist() == [0.0] and free.range_m[0] == SONAR.max_range_m
-    noisy = made(2300, angle=201, sample_period=PERIOD, number_of_samples=1200, data_length=1200,
+    noisy = made(2300, angle=202, sample_period=PERIOD, number_of_samples=1200, data_length=1200,
                  data=bytearray(np.linspace(255, 20, 1200).astype(np.uint8).tobytes()))  # fmt: skip
     sonar = ping360(noisy)
     assert sonar.poll(1.0) == [] and any("neither" in why for why in sonar.refused)
@@ -202,11 +202,11 @@ def test_a_transducer_that_is_dead_or_deaf_tells_of_no_free_water(level):
 def test_profiles_that_come_together_were_taken_one_after_the_other():
     shapes = {"range_m": (1,), "hit": (1,), "doppler_m_s": (0,), "first_beam": ()}
     inbox, found = Inbox({f"sonar.{name}": shape for name, shape in shapes.items()}), []
-    for each in ping360(*(device_data(201 + 2 * k, 3.0) for k in range(3))).poll(5.0):
+    for each in ping360(*(device_data(202 + 4 * k, 3.0) for k in range(3))).poll(5.0):
         inbox.feed(each)
     while each := inbox.newest("sonar", 5.0, in_turn=True):
         found.append(each.first_beam)
-    assert found == [31, 30, 29] and inbox.tallies["sonar"].late == 0
+    assert found == [15, 14, 13] and inbox.tallies["sonar"].late == 0
 
 
 def test_an_echo_within_the_ring_down_is_none():
@@ -216,19 +216,19 @@ def test_an_echo_within_the_ring_down_is_none():
 @pytest.mark.parametrize(("period", "count"), [(PERIOD, 900), (2000, 200), (0, 1200), (65535, 10)])
 def test_a_profile_that_another_program_asked_for_is_not_used(period, count):
     data = bytearray(profile(3.0, 0.5 * 25e-9 * max(period, 1) * 1500.0)[:count])
-    other = made(2300, angle=201, sample_period=period, number_of_samples=count, data_length=count, data=data)
+    other = made(2300, angle=202, sample_period=period, number_of_samples=count, data_length=count, data=data)
     sonar = ping360(other)
     assert sonar.poll(1.0) == [] and any("another program" in why for why in sonar.refused)
 
 
-@pytest.mark.parametrize("angle", [200 + 63 + 2, 202])
+@pytest.mark.parametrize("angle", [200 + 62 + 4, 201])
 def test_an_angle_that_no_beam_has_is_not_used(angle):
     sonar = ping360(device_data(angle, 3.0))
     assert sonar.poll(1.0) == [] and "an angle between the beams" in sonar.refused
 
 
 def test_frames_are_found_among_pieces_wrong_sums_and_noise():
-    frames, whole = ping.Frames(), device_data(201, 2.0)
+    frames, whole = ping.Frames(), device_data(202, 2.0)
     wrong = whole[:-1] + bytes([whole[-1] ^ 1])
     stream = b"BRxBR" + wrong + b"noise" + whole + b"BR\xff\xff\x00\x00\x00\x00" + whole + b"B"
     found = []
@@ -247,13 +247,13 @@ def test_requests_are_those_of_the_makers_package():
     (asked,) = sonar.channel.sent
     told = PingMessage(msg_data=bytearray(asked))
     assert told.verify_checksum() and told.message_id == definitions.PING360_AUTO_TRANSMIT
-    assert (told.start_angle, told.stop_angle, told.num_steps, told.number_of_samples) == (137, 263, 2, 1199)
+    assert (told.start_angle, told.stop_angle, told.num_steps, told.number_of_samples) == (138, 262, 4, 1199)
     sonar.poll(0.5)
     assert len(sonar.channel.sent) == 1
     sonar.poll(1.1)  # no answer: asked beam by beam
     told = PingMessage(msg_data=bytearray(sonar.channel.sent[-1]))
     assert told.verify_checksum() and told.message_id == definitions.PING360_TRANSDUCER
-    assert told.angle == 263 and told.transmit == 1
+    assert told.angle == 262 and told.transmit == 1
 
 
 # ---------------------------------------------------------------------------------------------- the network
@@ -317,18 +317,19 @@ def test_a_head_scans_there_and_back_and_all_around_when_asked_to(own):
     sonar = ping.Ping360(channel, SONAR, 200.0, 0.3, 1500.0)
 
     def step(now_s, begun_s):
-        fake.step(begun_s + now_s, lambda bearing: 3.0 + 0.5 * bearing)
+        fake.step(begun_s + now_s, lambda bearing: 3.0 + math.sin(bearing + 0.5))
         found.extend(sonar.poll(begun_s + now_s))
 
-    for begun_s, whole, beams in ((0.0, False, SONAR.n_ray), (60.0, True, 200), (120.0, False, SONAR.n_ray)):
+    fan, circle = set(range(SONAR.n_ray)), {gradian / 4 for gradian in range(400)}
+    for begun_s, whole, beams in ((0.0, False, fan), (60.0, True, circle), (120.0, False, fan)):
         assert sonar.look_around(whole)
         found.clear()
         spent_s = until(partial(step, begun_s=begun_s), found, lambda them: len(them) >= 450)
         assert spent_s > 450 * 0.035  # a step of the head takes its time
-        assert {one.first_beam for one in found} == set(range(beams))
+        assert {one.first_beam for one in found} == beams  # all around as finely as it can
         for one in found:
             bearing = SONAR.first_beam_rad + one.first_beam * SONAR.beam_step_rad
-            expected = 3.0 + 0.5 * math.remainder(bearing, math.tau)
+            expected = 3.0 + math.sin(bearing + 0.5)
             assert one.hit[0] == 1.0 and one.range_m[0] == pytest.approx(expected, abs=0.03)
     sonar.close()
     fake.close()

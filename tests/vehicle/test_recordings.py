@@ -93,14 +93,14 @@ def ping360(path, begin_s=0.0, wide=False, seconds=SECONDS, number=AUTO_DEVICE_D
     out += text("abc") + struct.pack(">I", 0xFFFFFFFF) + text("v2") + text("Linux") + text("5")
     out += struct.pack(">ii", 1, 2)
     head, period, samples = FakePing360("127.0.0.1", 0), 276, 1200
-    gradians = [*range(137, 265, 2), *range(261, 137, -2)]
+    gradians = [*range(138, 266, 4), *range(258, 138, -4)]
     for k in range(round(seconds / 0.05)):
         time_s, gradian = 0.05 * k, gradians[k % len(gradians)]
         bearing = -math.radians(0.9 * (gradian - 200))
         profile = head.profile(echo_m(time_s, bearing), 0.5 * 25e-9 * period * 1500.0, samples)
         about = struct.pack("<BBHHHH", 1, 1, gradian, 30, period, 740)
         if number == AUTO_DEVICE_DATA:
-            about += struct.pack("<HHBB", 136, 264, 2, 0)
+            about += struct.pack("<HHBB", 138, 262, 4, 0)
         message = frame(number, about + struct.pack("<HH", samples, samples) + profile, source=2)
         minutes, rest = divmod(begin_s + time_s, 60.0)
         out += text(f"{int(minutes // 60):02}:{int(minutes % 60):02}:{rest:06.3f}")
@@ -450,12 +450,12 @@ def test_other_sonars_of_a_bag(tmp_path, capfd):
     """An echo of a Ping360 counts before a scan, a scan before a cloud."""
     profile = np.full(1200, 3, np.uint8)
     profile[500:506] = 200
-    echo = {"angle": -math.radians(18.9) + math.pi, "range": 6, "speed_of_sound": 1500, "gain": 1}
+    echo = {"angle": -math.radians(19.8) + math.pi, "range": 6, "speed_of_sound": 1500, "gain": 1}
     kind = "ping360_sonar_msgs/msg/SonarEcho"
     found = read_kind(kind, "/echo", tmp_path, capfd, *MATCHED, **echo, intensities=profile)
     (_, ping), *_ = told(found, "/sonar/scan")
     assert ping["ranges"] == [pytest.approx(503 * 6 / 1200, abs=0.03)] and len(ping["ranges"]) == 1
-    assert ping["start_angle"] == pytest.approx(math.radians(18.9), abs=0.001)
+    assert ping["start_angle"] == pytest.approx(math.radians(19.8), abs=0.001)
     assert dropped(found)["/scan (sensor_msgs/msg/LaserScan)"] == (20, "/echo tells it")
     points = np.array([[3.0, 1.0, 0.1], [4.0, 1.33, 0.0], [2.0, 0.0, 5.0]], "<f4")
     fields = [made(False, "sensor_msgs/msg/PointField", name=n, offset=4 * i, datatype=7, count=1)

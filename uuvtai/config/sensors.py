@@ -142,7 +142,7 @@ class SonarConfig(Section):
         """Whether the beams go all around."""
         return self.horizontal_aperture_deg == 360.0
 
-    def turn_rad(self, beams: int) -> float:
+    def turn_rad(self, beams: float) -> float:
         """[rad] from one beam to the one that comes so many after it."""
         if self.is_ring:
             return 2.0 * math.pi * beams / self.n_ray

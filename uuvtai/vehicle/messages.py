@@ -56,9 +56,10 @@ class SonarPing:
     doppler_m_s: np.ndarray
     """(n_ray,) [m/s] rate of change of the distance to what returned, own motion included; empty where the
     sonar measures none (``sensors.sonar.doppler``)"""
-    first_beam: int = 0
+    first_beam: float = 0
     """number of the first of these beams; 0 unless the beam is a mechanical one. That may look beside its fan
-    (beams counted on around the circle): the start is checked by those, the stack does not see them"""
+    (beams counted on around the circle) or between two beams (a fraction): the start is checked by those, the
+    stack does not see them"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,10 +148,10 @@ def _shapes(numbers: PilotNumbers) -> dict[str, tuple[int, ...]]:
 
 
 def _is_seen(ping: SonarPing, numbers: PilotNumbers) -> bool:
-    """Whether beams do not lie beside the fan. ValueError for those that the sonar does not have."""
+    """Whether beams lie neither beside the fan nor between. ValueError for those that the sonar has not."""
     n, is_ring = np.size(ping.range_m), numbers.circle == numbers.beams
     there = 0 <= ping.first_beam < numbers.circle and n <= numbers.beams
-    there = there and (is_ring or ping.first_beam + n <= numbers.circle)
+    there = there and (is_ring or math.floor(ping.first_beam) + n <= numbers.circle)
     if numbers.mechanical and not (there and n == np.size(ping.hit) > 0):
         raise ValueError(
             f"sonar: {n} ranges and {np.size(ping.hit)} hits from beam {ping.first_beam} on are no "
@@ -159,4 +159,5 @@ def _is_seen(ping: SonarPing, numbers: PilotNumbers) -> bool:
         )
     if not numbers.mechanical and ping.first_beam != 0:
         raise ValueError("sonar: first_beam is for a mechanical beam (sensors.sonar.mechanical)")
-    return not numbers.mechanical or is_ring or ping.first_beam + n <= numbers.beams
+    within = ping.first_beam % 1 == 0 and (is_ring or ping.first_beam + n <= numbers.beams)
+    return within or not numbers.mechanical

@@ -150,7 +150,7 @@ class Preflight:
         self._last, self._same = dict[str, bytes](), Counter[str]()  # reading; how often it came again
         self._span: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # smallest and largest place, or depth
         self._says: Counter[str] = Counter()  # what the autopilot complains of
-        self._beams, self._echoes, self._near, self._looked = 0, 0, 0, set[int]()
+        self._beams, self._echoes, self._near, self._looked = 0, 0, 0, set[float]()
         self._steps, self._undecided, self._held, self._broken = 0, 0, Counter[str](), Counter[str]()
         self._from_s = 0.0  # they count from then on, and not while it warms up
         self._now: Collection[str] = ()  # rules that are broken in the last step
@@ -227,7 +227,7 @@ class Preflight:
             hit, ranges = np.asarray(reading.hit) > 0, np.asarray(reading.range_m)
             self._beams, self._echoes = self._beams + len(hit), self._echoes + int(hit.sum())
             self._near += int((hit & (ranges < _RINGS_M)).sum())
-            self._looked.update(range(reading.first_beam, reading.first_beam + len(hit)))
+            self._looked.update(reading.first_beam + beam for beam in range(len(hit)))
 
     def begun(self, now_s: float) -> None:
         """The walls have told the start: the stack runs freely from now on, and the heading that they have

@@ -324,14 +324,14 @@ class FedSensors:
         scan["fresh"][0] = 0
         if isinstance(ping, SonarPing) and (then := self._pose_at("sonar", self._pings, ping.time_s)):
             hit, n = np.asarray(ping.hit) > 0, len(ping.range_m)
-            beams = (ping.first_beam + np.arange(n)) % scan["hit"].shape[1]
+            beams = (int(ping.first_beam) + np.arange(n)) % scan["hit"].shape[1]
             scan["range_m"][0, beams] = np.where(
                 hit, np.clip(ping.range_m, 0.0, self._sonar_m), self._sonar_m
             )
             doppler = np.where(hit, ping.doppler_m_s, 0.0) if len(ping.doppler_m_s) else 0.0
             scan["doppler_m_s"][0, beams] = doppler
             scan["hit"][0, beams], scan["fresh"][0] = hit, 1
-            scan["new_from"][0], scan["new_count"][0] = ping.first_beam, n
+            scan["new_from"][0], scan["new_count"][0] = int(ping.first_beam), n
             scan["ping_step"][0] = self._step_of(ping.time_s)
             for name, value in self._corrected(then, ping.time_s).items():
                 scan[name][0] = value

@@ -31,6 +31,7 @@ _TURN_RAD, _REST_S = math.radians(4.0), 0.5  # a scan is kept when turned or wai
 _CELL_M, _STEP_RAD = 0.05, math.radians(1.0)  # of the histograms
 _SEARCH_RAYS, _FARTHEST_M = 800, 60.0
 FLOOR_M, FLOOR_RAD = 0.02, math.radians(0.3)  # what a fix is never better than: errors that rays share
+_SECTORS, _LOOKED = 36, 30  # of a circle, and along how many of them a head that turns has to look before
 _INDEPENDENT = 100  # rays count as no more measurements than this
 _WALL_RAYS, _WALL_M = 12, 1.5
 """a wall is seen by so many returns at least, that lie so far apart: larger than the face of an obstacle;
@@ -281,6 +282,7 @@ class StartFix:
         self._track, self._rays = Track(), deque[tuple[float, float, Rays]]()
         """scans that are kept: (time, yaw, rays)"""
         self._next_s, self._scans = -math.inf, 0
+        self._turns_head = False  # beside its fan, or between its beams
 
     def feed(self, message: SensorMessage) -> None:
         """A message of the pilot's, in any order."""
@@ -326,6 +328,7 @@ class StartFix:
         self.first_s = min(self.first_s, ping.time_s)
         self._keep(ping, *then)
         since_s, sonar = ping.time_s - self.first_s, self._config.sensors.sonar
+        self._turns_head |= ping.first_beam % 1 > 0 or ping.first_beam >= sonar.n_ray
         if ping.time_s >= self._next_s and since_s >= max(_LEAST_S, sonar.sweep_s) and self._rays:
             self._next_s = ping.time_s + max(_EVERY_S, 0.05 * since_s)
             self.result = self._sought()
@@ -349,6 +352,10 @@ class StartFix:
         at, tank = self._track.at, self._config.world.tank
         rays = Rays.joined([rays for _, _, rays in self._rays])
         rays = replace(rays, from_m=rays.from_m - at)
+        looked = np.unique(np.rint(rays.bearing.mean(1) * (_SECTORS / math.tau)) % _SECTORS)
+        if self._turns_head and len(looked) < _LOOKED:
+            self.waits_for = "the sonar has not looked all around"
+            return None
         if rays.hit.sum() < 2 * _WALL_RAYS:
             self.waits_for = "the sonar sees hardly anything: turn the vehicle around slowly"
             return None

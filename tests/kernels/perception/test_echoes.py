@@ -20,7 +20,7 @@ from uuvtai.kernels.perception import localization, mapping, sensor_model, track
 from uuvtai.kernels.perception.io import EchoesIO, LocalizationIO, MappingIO, TrackingIO
 from uuvtai.sim.setup import load_bounds
 
-SENSORS = load_config("pool", "ping360").sensors
+SENSORS = load_config("pool", "ping360", overrides={"sensors.sonar.n_ray": 64}).sensors
 SONAR = SENSORS.sonar
 POND, RULES = TankConfig(x_m=(0.0, 12.0), y_m=(0.0, 8.0)), EpisodeConfig()
 MAP, CAMERA = MappingConfig(), DepthConfig(rows=6, cols=16)

@@ -83,31 +83,31 @@ def test_a_log_holds_each_beam_once_and_a_video_paints_the_last_sweep(driven):
     assert {len(ranges) for ranges, _, _, _ in scans} == {1}
     told_rad = np.array([away[0] for _, away, _, _ in scans])
     k = np.arange(len(scans))
-    beam = np.minimum(k % 126, 126 - k % 126)
+    beam = np.minimum(k % 62, 62 - k % 62)
     np.testing.assert_allclose(told_rad, SONAR.first_beam_rad + beam * SONAR.beam_step_rad, atol=1e-6)
     newest = list(recording["/sonar/scan"].until(3.0))
-    assert newest[0][3] <= 3.0 < newest[0][3] + 0.05 and len(newest) > 64
+    assert newest[0][3] <= 3.0 < newest[0][3] + 0.05 and len(newest) > SONAR.n_ray
     artist = FrameArtist(recording, 1000)
     ink = [(artist.frame(time_s) == np.array(ECHO)).all(-1).sum() for time_s in (0.1, 3.0)]
     assert ink[1] > 2 * ink[0] > 0
 
 
 def test_a_log_tells_the_beams_of_this_step_alone():
-    values = {"scan.new_from": np.int32(63), "scan.new_count": np.int32(1), "scan.ping_step": np.int32(3)}
-    values |= {"scan.hit": np.ones(64, np.int32), "scan.range_m": np.linspace(1, 2, 64, dtype=np.float32)}
-    values |= {"scan.intensity": np.full(64, 0.5, np.float32), "scan.doppler_m_s": np.zeros(64, np.float32)}
+    values = {"scan.new_from": np.int32(31), "scan.new_count": np.int32(1), "scan.ping_step": np.int32(3)}
+    values |= {"scan.hit": np.ones(32, np.int32), "scan.range_m": np.linspace(1, 2, 32, dtype=np.float32)}
+    values |= {"scan.intensity": np.full(32, 0.5, np.float32), "scan.doppler_m_s": np.zeros(32, np.float32)}
     values |= {"scan.ping_vel_b": np.zeros(3, np.float32)}
     moment = Moment(EpisodeHeader("bt", Config(sensors=SensorsConfig(sonar=SONAR)), "", {}), values)
     scan, doppler = (json.loads(row.encode(moment)) for row in SONAR_ROWS[:2])
     assert scan["ranges"] == [2.0] and scan["intensities"] == [0.5] and doppler["velocity"] == []
-    assert scan["start_angle"] == scan["end_angle"] == pytest.approx(np.radians(56.7))
+    assert scan["start_angle"] == scan["end_angle"] == pytest.approx(np.radians(55.8))
 
 
 @pytest.mark.parametrize(
     ("ping", "message"),
     [
         (SonarPing(0.0, np.ones(2), np.ones(1), np.zeros(0), 3), "2 ranges and 1 hits from beam 3"),
-        (SonarPing(0.0, np.ones(2), np.ones(2), np.zeros(0), 199), "are no beams of 64"),
+        (SonarPing(0.0, np.ones(2), np.ones(2), np.zeros(0), 99), "are no beams of 32"),
         (SonarPing(0.0, np.ones(1), np.ones(1), np.zeros(0), -1), "from beam -1"),
         (SonarPing(0.0, np.ones(0), np.ones(0), np.zeros(0), 0), "0 ranges"),
         (SonarPing(0.0, 1.0, 1.0, np.zeros(0)), r"range_m must have the shape"),
@@ -120,7 +120,7 @@ def test_a_pilot_refuses_beams_that_the_sonar_does_not_have(alone, monkeypatch, 
     with pytest.raises(ValueError, match=message):
         pilot.feed(ping)
     fed = pilot.tallies["sonar"].fed
-    for beam in (63, 64, 199):  # the last two lie beside the fan
+    for beam in (31, 32, 99, 99.75, 3.25):  # all but the first lie beside the fan, or between its beams
         pilot.feed(SonarPing(0.0, np.ones(1), np.ones(1), np.zeros(0), beam))
     assert pilot.tallies["sonar"].fed == fed + 1 and pilot.tallies["sonar"].bad == 0
 
@@ -130,4 +130,4 @@ def test_a_scan_of_too_many_beams_is_refused(mechanical):
     numbers = replace(numbers_of(CONFIG, read_tree("bt")), mechanical=mechanical)
     pilot = SimpleNamespace(numbers=numbers, _inbox=Inbox(_shapes(numbers)))
     with pytest.raises(ValueError, match="sonar"):
-        FedPilot.feed(pilot, SonarPing(0.0, np.ones(65), np.ones(65), np.zeros(0)))
+        FedPilot.feed(pilot, SonarPing(0.0, np.ones(33), np.ones(33), np.zeros(0)))

@@ -244,10 +244,8 @@ def messages_in(packed: Any, image: tuple[int, ...]) -> list[tuple[int, SensorMe
 
 
 def _value(kind: str, name: str, flat: np.ndarray, image: tuple[int, ...]) -> Any:
-    if name == "time_s" or (kind, name) == ("pressure", "depth_m"):
+    if name in ("time_s", "first_beam") or (kind, name) == ("pressure", "depth_m"):
         return float(flat[0])
-    if name == "first_beam":
-        return int(flat[0])
     return flat.reshape(image) if kind == "depth" else flat
 
 

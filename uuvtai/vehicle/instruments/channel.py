@@ -233,7 +233,7 @@ class Instrument(ABC):
         """What has come, in body axes about the instrument's own place; ``now_s`` by the pilot's clock."""
 
     def look_around(self, whole: bool) -> bool:
-        """See all around, or again what is configured; False where nothing turns by itself."""
+        """See all around, finely, or again what is configured; False where nothing turns by itself."""
         return False
 
     def close(self) -> None:

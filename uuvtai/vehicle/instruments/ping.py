@@ -123,10 +123,11 @@ class Ping360(Instrument):
                 f"sensors.sonar: {sonar_cfg.n_ray} beams in {sonar_cfg.horizontal_aperture_deg:g} degrees "
                 "are no steps of 1 to 10 gradians of one turned beam; take --sensors ping360"
             )
-        self._whole, self._circle = sonar_cfg.is_ring, sonar_cfg.circle_beams
-        """whether it turns all around; beams of a turn"""
+        self._whole, self._stride = sonar_cfg.is_ring, self._step
+        """whether it turns all around; gradians that it turns by"""
         self._asked_s = self._heard_s = -math.inf
-        self._by_itself, self._beam, self._way = True, 0, 1
+        self._by_itself, self._way = True, 1
+        self._at = 0  # [gradian] from beam 0 to the one that is asked for next
         self._turns = self._astray = 0
         """changes of the way of asking since it answered last; beams beside those asked for since then"""
         seconds = 2.0 * sonar_cfg.max_range_m / sound_m_s
@@ -151,9 +152,10 @@ class Ping360(Instrument):
         return found
 
     def look_around(self, whole: bool) -> bool:
-        if self._whole != (whole or self._sonar.is_ring):
-            self._whole, self._asked_s = not self._whole, -math.inf
-            self._beam, self._way = 0, 1  # the one that was asked for last may lie beside the fan
+        stride = 1 if whole else self._step
+        if self._stride != stride:
+            self._whole, self._stride, self._asked_s = whole or self._sonar.is_ring, stride, -math.inf
+            self._at, self._way = 0, 1  # what was asked for last may lie beside the fan
         return True
 
     def close(self) -> None:
@@ -168,12 +170,12 @@ class Ping360(Instrument):
             self._by_itself, self._turns = not self._by_itself, self._turns + 1
         is_new = self._asked_s == -math.inf or self._astray >= self._MOST_ASTRAY
         if self._by_itself and (is_silent or is_new):
-            first, last = (self._gradian(beam) for beam in (self._sonar.n_ray - 1, 0))
+            first, last = (self._gradian(at) for at in ((self._sonar.n_ray - 1) * self._step, 0))
             if self._whole:
-                first, last = first % self._step, 399
-            self._send(AUTO_TRANSMIT, struct.pack("<HH", first, last) + bytes([self._step, 0]), now_s)
+                first, last = first % self._stride, 399
+            self._send(AUTO_TRANSMIT, struct.pack("<HH", first, last) + bytes([self._stride, 0]), now_s)
         elif not self._by_itself and (is_silent or self._heard_s >= self._asked_s):
-            self._send(TRANSDUCER, struct.pack("<BB", 1, 0), now_s, self._gradian(self._beam))
+            self._send(TRANSDUCER, struct.pack("<BB", 1, 0), now_s, self._gradian(self._at))
 
     def _send(self, number: int, rest: bytes, now_s: float, gradian: int | None = None) -> None:
         """A request, with how far and how long to listen."""
@@ -184,10 +186,9 @@ class Ping360(Instrument):
         if self.channel.write(frame(number, mode_gain + angle + listening + rest)):
             self._asked_s, self._astray = now_s, 0
 
-    def _gradian(self, beam: int) -> int:
-        """The device's angle of a beam."""
-        bearing = math.degrees(self._sonar.first_beam_rad + beam * self._sonar.beam_step_rad)
-        return round(self._zero - bearing / 0.9) % 400
+    def _gradian(self, at: int) -> int:
+        """The device's angle so far from beam 0."""
+        return round(self._zero - math.degrees(self._sonar.first_beam_rad) / 0.9 - at) % 400
 
     def _ping(self, number: int, payload: bytes, now_s: float) -> SonarPing | None:
         head = {DEVICE_DATA: 14, AUTO_DEVICE_DATA: 20}.get(number)
@@ -203,35 +204,33 @@ class Ping360(Instrument):
         bin_m = 0.5 * TICK_S * period * self._sound
         if len(profile) * bin_m < 0.98 * self._sonar.max_range_m or bin_m > _SMOOTH_M:
             return self.refuse("a profile shorter or coarser than was asked for: another program's request?")
-        beam = self._beam_at(angle)
-        if beam is None:
+        at = self._at_angle(angle)
+        if at is None:
             self._astray += 1
             return self.refuse("an angle between the beams")
         if not self._by_itself:
-            self._next(beam)
+            self._next(at)
         range_m = first_echo(profile, bin_m, self._blind)
         if math.isnan(range_m):
             return self.refuse("a profile neither with an echo nor quiet")
         hit = float(range_m <= self._sonar.max_range_m)
         listened_s = TICK_S * period * len(profile)
         nearest = np.array([min(range_m, self._sonar.max_range_m)])
-        return SonarPing(now_s - listened_s, nearest, np.array([hit]), np.zeros(0), beam)
+        return SonarPing(now_s - listened_s, nearest, np.array([hit]), np.zeros(0), at / self._step)
 
-    def _beam_at(self, gradian: int) -> int | None:
-        """The beam that looks there; None for an angle between two, or beside all that are asked for."""
+    def _at_angle(self, gradian: int) -> int | None:
+        """[gradian] from beam 0; None between, or beside, all that are asked for."""
         off = (self._zero - gradian - math.degrees(self._sonar.first_beam_rad) / 0.9) % 400
-        beam = off / self._step
-        near = round(beam)
-        if abs(beam - near) * self._step > 0.5:
+        at = round(off / self._stride) * self._stride
+        if abs(off - at) > 0.5:
             return None
-        near %= self._circle
-        return near if self._whole or near < self._sonar.n_ray else None
+        at %= 400
+        return at if self._whole or at <= (self._sonar.n_ray - 1) * self._step else None
 
-    def _next(self, beam: int) -> None:
+    def _next(self, at: int) -> None:
         """Of a fan there and back, else round and round."""
-        last = self._sonar.n_ray - 1
         if self._whole:
-            self._beam = (beam + 1) % self._circle
+            self._at = (at + self._stride) % 400
             return
-        self._way = -1 if beam >= last else 1 if beam <= 0 else self._way
-        self._beam = beam + self._way
+        self._way = -1 if at >= (self._sonar.n_ray - 1) * self._step else 1 if at <= 0 else self._way
+        self._at = at + self._way * self._step

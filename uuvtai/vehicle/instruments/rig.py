@@ -155,5 +155,4 @@ class JsonUdp(Instrument):
 def as_fields(said: Mapping[str, Any]) -> dict[str, Any]:
     """A message's fields as JSON has them. ValueError, TypeError, OverflowError."""
     arrays = {name: np.array(value, np.float64) for name, value in said.items()}
-    whole = {"first_beam": int}
-    return {name: a if a.ndim else whole.get(name, float)(float(a)) for name, a in arrays.items()}
+    return {name: a if a.ndim else float(a) for name, a in arrays.items()}
