@@ -87,7 +87,7 @@ def test_a_seed_that_was_tuned_on_is_called_so(copy):
     for seed, said in ((EVALUATION_SEED, "No tuning used this seed"), (90008, "was looked at while tuning")):
         (copy / EVALUATIONS).write_text(json.dumps(document | {"seed": seed}))
         assert said in render_results.measured(copy)
-        assert "2026-11-30, commits b96314c, c0daae9, d753341." in render_results.measured(copy)
+        assert "2026-11-30, commits 95ec97f, b96314c, c0daae9, d753341." in render_results.measured(copy)
 
 
 def test_the_newest_speed_of_a_kind_is_shown_and_marked_unless_it_is_of_todays_code(copy):
