@@ -31,7 +31,7 @@ _TURN_RAD, _REST_S = math.radians(4.0), 0.5  # a scan is kept when turned or wai
 _CELL_M, _STEP_RAD = 0.05, math.radians(1.0)  # of the histograms
 _SEARCH_RAYS, _FARTHEST_M = 800, 60.0
 FLOOR_M, FLOOR_RAD = 0.02, math.radians(0.3)  # what a fix is never better than: errors that rays share
-_SECTORS, _LOOKED = 36, 30  # of a circle, and along how many of them a head that turns has to look before
+_SECTORS, _LOOKED = 36, 30  # of a circle; along so many a turning head has to look before a fix is sought
 _INDEPENDENT = 100  # rays count as no more measurements than this
 _WALL_RAYS, _WALL_M = 12, 1.5
 """a wall is seen by so many returns at least, that lie so far apart: larger than the face of an obstacle;
@@ -282,7 +282,7 @@ class StartFix:
         self._track, self._rays = Track(), deque[tuple[float, float, Rays]]()
         """scans that are kept: (time, yaw, rays)"""
         self._next_s, self._scans = -math.inf, 0
-        self._turns_head = False  # beside its fan, or between its beams
+        self._turns_head = False  # whether a beam came from beside the fan, or from between its beams
 
     def feed(self, message: SensorMessage) -> None:
         """A message of the pilot's, in any order."""
