@@ -37,7 +37,11 @@ BINARY = "UUV_ARDUSUB"
 RATE_HZ = 400
 ALT_HOLD, GUIDED = 2, 4
 PORT, SENSORS, OPERATOR = 29002, 24660, 24560
-_SCENE = {"world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6}
+_SCENE = {
+    "world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6, "sensors.sonar.period_steps": 5,
+    "camera_tracking.use_camera": False, "height.use_camera": False, "mapping.depth_hit": 0.0,
+}  # fmt: skip
+"""as the pilot has it: scans as often as MAVLink tells them, no camera"""
 PARAMETERS = Path(__file__).resolve().parent.parent / "examples/ardusub.parm"
 """beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm)"""
 

@@ -60,10 +60,11 @@ def test_the_stack_plans_within_the_fence(tmp_path, depth_m, gap_m):
 @pytest.mark.parametrize(
     ("sonar", "has"), [({}, False), ({"sonar": "ping360:h"}, False), ({"sonar": "3d15:h"}, True)]
 )
-def test_the_stack_believes_in_no_camera_that_is_not_there(tmp_path, sonar, has):
+def test_the_stack_believes_in_nothing_that_does_not_come(tmp_path, sonar, has):
     found = as_driven(
         link_config(), dataclasses.replace(plan_of(None, tmp_path / "a.mcap"), instruments=sonar)
     )
+    assert found.sensors.sonar.period_steps == 5, "no scans every 20 ms"
     assert found.camera_tracking.use_camera == found.height.use_camera == (found.mapping.depth_hit > 0) == has
 
 

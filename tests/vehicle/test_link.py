@@ -41,6 +41,7 @@ from uuvtai.vehicle.telemetry import (
 )
 
 DT = 0.02
+_DELTA = {"time_delta_usec": 100_000, "angle_delta": [0.0] * 3, "confidence": 100.0}
 COARSE = 0.1
 """[s] of a step where no step of its own counts"""
 CONFIG = link_config()
@@ -233,6 +234,27 @@ def test_the_height_of_a_position_is_the_pressure_sensors():
     assert found[0].pos_w[2] == pytest.approx(START[2] + 0.5)
     later = taken(intake, "LOCAL_POSITION_NED", 4.0, z=-0.2, time_boot_ms=4000, **place)
     assert later[0].pos_w[2] == pytest.approx(START[2] + 0.2), "an old depth tells nothing"
+
+
+def test_depths_by_turns_early_and_late_make_no_jumps():
+    """Climbing by 0.4 m/s while the sensor's values are 10 and 90 ms old by turns."""
+    intake = Intake(link_config(**{"sensors.localization": "truth"}), START, math.radians(90))
+    attitude(intake, yaw=math.radians(90))
+    place = {"vx": 0.0, "vy": 0.0, "vz": 0.0, "x": 0.0, "y": 0.0, "z": 0.0}
+    hpa = CONFIG.vehicle.water_density_kg_m3 * CONFIG.vehicle.gravity_m_s2 / 100
+    rest, climb = {"press_diff": 0.0, "temperature": 20}, {"position_delta": [0.0, 0.0, -0.04]}
+    heights = []
+    for tick in range(60):
+        now_s = 0.05 * tick
+        stamp = {"time_boot_ms": round(1e3 * now_s)}
+        if tick % 2 == 0:
+            taken(intake, "VISION_POSITION_DELTA", now_s, **climb, **_DELTA, time_usec=round(1e6 * now_s))
+            risen_m = 0.4 * max(0.0, now_s - (0.01, 0.09)[tick // 2 % 2])
+            taken(intake, "SCALED_PRESSURE2", now_s, press_abs=1100.0 - risen_m * hpa, **rest, **stamp)
+        (found, *_) = taken(intake, "LOCAL_POSITION_NED", now_s, **place, **stamp)
+        heights.append(found.pos_w[2] - START[2])
+    off = np.array(heights) - 0.4 * 0.05 * np.arange(60)
+    assert np.abs(off).max() < 0.04 and np.abs(np.diff(off)[20:]).max() < 0.005
 
 
 def test_depth_is_zeroed_at_the_start_and_the_sensor_in_the_water_counts(intake):

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 # names file and line.
 
 
-MAX_BYTES = 1 << 20
-"""of a tree's file"""
+MAX_BYTES = 1 << 20  # of a tree's file
 _MAX_DEPTH = 64
 _ENCODINGS = (None, "utf-8", "us-ascii", "iso-8859-1", "utf-16")
 """that the parser itself knows; for others it would ask Python, which knows some that are no character
@@ -107,8 +106,7 @@ def read_elements(text: bytes, source: str) -> Element:
 # A tree as flat preorder arrays, and the way into the kernels' table.
 
 
-UNSET = -1.0
-"""Value of a port that is not given: the leaf takes its usual number."""
+UNSET = -1.0  # Value of a port that is not given: the leaf takes its usual number.
 
 
 @dataclass(frozen=True)

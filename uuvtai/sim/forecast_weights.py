@@ -18,10 +18,8 @@ if TYPE_CHECKING:  # a forecast is learnt without Taichi
     from uuvtai.compile.memory import Put
     from uuvtai.state import MixtureState
 
-BUILT_IN = "built-in"
-"""name of the network that comes with the package"""
-WEIGHTS = "forecast.safetensors"
-"""file of a run folder, and of what is built in"""
+BUILT_IN = "built-in"  # name of the network that comes with the package
+WEIGHTS = "forecast.safetensors"  # file of a run folder, and of what is built in
 SHAPES = {
     "bias_in": (N_HIDDEN,), "weight_in": (N_COLUMN, N_HIDDEN),
     "bias_mid": (N_HIDDEN,), "weight_mid": (N_HIDDEN, N_HIDDEN),

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float]
 
-RANGE_M = 1.0
-"""longest edge of the tree"""
+RANGE_M = 1.0  # longest edge of the tree
 _STEP_CELLS = 0.5  # States along a motion are checked this often [cells].
 
 _PAD = 0.51 * _STEP_CELLS

@@ -89,8 +89,7 @@ def controllable_axes(wrench_of_thrust: np.ndarray) -> list[int]:
 # Scenarios seen from the host: body slots, the table of explicit obstacles, faults.
 
 
-N_CORNER = 5
-"""Most waypoints of a random path."""
+N_CORNER = 5  # Most waypoints of a random path.
 
 _KINDS = {name: kind for kind, name in KIND_NAMES.items()}
 

@@ -37,13 +37,11 @@ class At:
 
 
 EGO_WIDTH = 26
-TRACK_WIDTH = 9
-"""of what the surrogate's tracker remembers of a body (``sensing_model.sense_surrogate``)"""
+TRACK_WIDTH = 9  # of what the surrogate's tracker remembers of a body (``sensing_model.sense_surrogate``)
 RAW_WIDTH = 14
 """of an obstacle as a tracker delivers it: x, y, vx, vy, turn rate, radius, free water above, below, time
 unseen, displacement in 1 s (2), in 2 s (2), 1 = there"""
-TRUTH_WIDTH = 10
-"""of an obstacle as only the critic sees it, in training"""
+TRUTH_WIDTH = 10  # of an obstacle as only the critic sees it, in training
 
 
 @dataclass(frozen=True, eq=False)

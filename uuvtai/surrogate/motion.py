@@ -55,8 +55,7 @@ def wished_velocity(action, flip, vehicle_cfg: Const[VehicleConfig]):
     return ti.Vector([ahead, left, out[2] * vehicle_cfg.max_heave_m_s])
 
 
-NEAR_M = 1.5
-"""obstacles whose surface is farther cannot matter to termination check or reward within a step"""
+NEAR_M = 1.5  # obstacles whose surface is farther cannot matter to termination check or reward within a step
 
 
 @ti.func
@@ -189,8 +188,7 @@ def earned(nearer_m, nearest_m, ended, io: Bundle[Rules]):
 # followed by the simulator's rules (``kernels/planning/route.py``). Its rows are x, y and the length left.
 
 
-WINDOW_M = 1.5
-"""so far ahead of the last foot the new one is looked for"""
+WINDOW_M = 1.5  # so far ahead of the last foot the new one is looked for
 
 
 @ti.func

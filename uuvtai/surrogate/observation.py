@@ -12,11 +12,9 @@ from uuvtai.surrogate.arrays import RAW_WIDTH, At, ObserverIO
 from uuvtai.surrogate.motion import hull_command, part, wished_velocity
 
 CONTROL_S = 0.02
-SIGHT_M = 4.3
-"""rays end here"""
+SIGHT_M = 4.3  # rays end here
 MARCHES = 14
-LARGEST_TURN = 3.5
-"""[rad/s] a forecast that bends more has a corner in it"""
+LARGEST_TURN = 3.5  # [rad/s] a forecast that bends more has a corner in it
 
 
 @ti.func
@@ -141,8 +139,7 @@ SET_TABLE = tuple(
 )
 """for a checkpoint's manifest: the vehicle's own columns, then one obstacle's after the other"""
 
-HULL_M = 0.22
-"""hull radius and half of its half length"""
+HULL_M = 0.22  # hull radius and half of its half length
 
 
 @ti.func

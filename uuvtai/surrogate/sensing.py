@@ -14,25 +14,20 @@ from uuvtai.surrogate.motion import aim, part, path_places
 from uuvtai.surrogate.observation import put_row, write_columns_of
 
 RANGE_M = 12.0
-FAN_SLOPE = 0.1763
-"""the sonar's fan: 10 degrees up and down"""
+FAN_SLOPE = 0.1763  # the sonar's fan: 10 degrees up and down
 CAMERA_RANGE_M, HEIGHT_RANGE_M = 4.0, 3.0
 """the camera sees an obstacle up to the first, and knows how high it is up to the second"""
-SPELL = 10
-"""decisions for which an obstacle is seen equally badly:"""
+SPELL = 10  # decisions for which an obstacle is seen equally badly:
 BEST, SPREAD, MISSED, MISSED_HIDDEN = 0.35, 0.325, 0.985, 0.94
 """first, and second over one minus a uniform number; no track beyond the third, or the fourth out of sight"""
 BORN_S, SETTLED_S = 0.05, 0.07
 """seen so long, times how badly: a track; its velocity across the line of sight is known"""
-TURN_KNOWN_S = 0.8
-"""seen so long, its turn rate is known"""
-LOST_S, LOST_HEIGHT_S = 2.5, 6.0
-"""out of sight so long a track ends, later where its height is known"""
+TURN_KNOWN_S = 0.8  # seen so long, its turn rate is known
+LOST_S, LOST_HEIGHT_S = 2.5, 6.0  # out of sight so long a track ends, later where its height is known
 POSITION_SIGMA, VELOCITY_SIGMA_M_S, VELOCITY_SIGMA_S = 0.0042, 0.009, 0.0062
 """errors of the tracks, times how badly: of position per metre of distance; of velocity at no distance, and
 per metre. EC, as are the constants around: by quantiles of the simulator's tracks"""
-CAMERA_ALONE = 12.0
-"""times as badly is an obstacle seen that the camera sees and the sonar does not"""
+CAMERA_ALONE = 12.0  # times as badly is an obstacle seen that the camera sees and the sonar does not
 QUICKEST, SLOWER, LAG_S = 0.6, 1.1, 0.04
 """share of a change of velocity that is seen at once, less beyond the middle uniform number; place lags"""
 HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.04
@@ -42,8 +37,7 @@ FIRST_NORMAL = 1024
 UNBOUNDED_M = 99.0
 RAY_SLACK = 0.01
 """of the angle between two rays, by which an obstacle is looked for wider than it is: rounding"""
-COLUMN_M = 1.6
-"""free water above and below is cut off here"""
+COLUMN_M = 1.6  # free water above and below is cut off here
 RAYS = [[math.cos(angle), math.sin(angle)] for angle in (i * TWO_PI / N_RAY for i in range(N_RAY))]
 """unit vectors (x, y)"""
 

@@ -22,8 +22,7 @@ from uuvtai.sim.stages import bind
 from uuvtai.surrogate import motion, safety, sensing
 from uuvtai.surrogate.arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, At, Rules
 
-BATCH = 256
-"""envs of the simulator that draws"""
+BATCH = 256  # envs of the simulator that draws
 
 
 @dataclass(frozen=True)

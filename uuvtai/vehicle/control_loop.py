@@ -632,13 +632,19 @@ def fly(
         return loop.document(), loop.failure
 
 
+_SCAN_S = 0.1  # between two scans, at least: as a multibeam's, and as MAVLink tells them
+
+
 def as_driven(config: Config, plan: FlightPlan) -> Config:
-    """The stack plans for depths that the fence allows, and believes in no camera where no instrument has
-    one."""
+    """The stack plans for depths that the fence allows, takes scans to come no more often than they do, and
+    believes in no camera where no instrument has one."""
     (low, high), limits = config.world.tank.z_m, plan.limits
     room = min(high + limits.depth_m[0], -limits.depth_m[1] - low)
     gap = max(config.behavior.edge_gap_m, room + safety.FENCE_ROOM_M[1])
     keys: dict[str, dict[str, object]] = {"behavior": {"edge_gap_m": gap}}
+    if not (sonar := config.sensors.sonar).mechanical:
+        period = max(sonar.period_steps, round(_SCAN_S / config.episode.control_dt_s))
+        keys["sensors"] = {"sonar": sonar.model_copy(update={"period_steps": period})}
     if not plan.instruments.get("sonar", "").startswith(HAVE_IMAGES):
         keys |= {"camera_tracking": {"use_camera": False}, "height": {"use_camera": False}}
         keys["mapping"] = {"depth_hit": 0.0}

@@ -222,7 +222,8 @@ class FedSensors:
         self.loses_velocity = not numbers.estimated
         self._dvl_valid, self._dvl_step = 0, -KEPT
         """what the DVL has said in its last turn, and when it last said anything"""
-        self._fix_step, self._fix_w, self._fix_steps = -KEPT, np.zeros(3, np.float32), KEPT
+        self._fix_step, self._fix_w, self._fix_steps = -KEPT, np.zeros(3, np.float32), float(KEPT)
+        self._fix_s = -KEPT * self._dt
         self._fix_vel_w = np.zeros(3, np.float32)
         """[m/s] change up to the newest position, from the one so many steps before it"""
 
@@ -295,7 +296,8 @@ class FedSensors:
         """[m/s] by the newest two positions, in float32 as the simulator's own kernel has it."""
         step, pos_w = self._step_of(fix.time_s), np.asarray(fix.pos_w, np.float32)
         if step > self._fix_step:
-            self._fix_steps = step - self._fix_step
+            self._fix_steps = round((fix.time_s - self._fix_s) / self._dt, 3)  # 20 a second are 2.5 apart
+            self._fix_s = fix.time_s
             self._fix_vel_w = (pos_w - self._fix_w) * np.float32(1.0 / (self._fix_steps * self._dt))
             self._fix_step, self._fix_w = step, pos_w
 

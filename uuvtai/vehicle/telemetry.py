@@ -243,6 +243,7 @@ _ARMED = 128
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: what we are
 _STICK_MOVED = 200  # of 1000
 MOST_KINDS = 64  # senders of a kind of message that are told apart, and reasons why messages are left out
+_DEPTH_PART = 0.2  # of the error that a reading of the depth corrects (EC)
 _FRESH_S = 1.0  # a source that was heard within this time is preferred to a lesser one
 _BATTERY_S = 10.0  # of two tellers of a voltage the lower one counts, while it is heard so often
 _MOST_NAMED = 4
@@ -309,7 +310,7 @@ class Intake:
         self._newest: dict[str, float] = {}
         self._force_b: tuple[float, np.ndarray] | None = None
         self._zero: dict[str, float] = {}
-        self._depth = -math.inf, 0.0  # (time, newest depth [m] of the pressure sensor)
+        self._depth = -math.inf, 0.0  # (time of the pressure's newest reading, depth [m] by it)
         self._origin: np.ndarray | None = None
         self._place = -math.inf, np.zeros(3)  # (time, newest position as it was told)
         self._volts: dict[str, tuple[float, float]] = {}
@@ -433,11 +434,7 @@ class Intake:
             heard.rpy, heard.rpy_s = (float(rpy[0]), float(rpy[1]), float(rpy[2])), time_s
             heard.yaw_rate, heard.yaw_rate_s = float(rate[2]), time_s
         kept = self._force_b
-        gravity = self._config.vehicle.gravity_m_s2
-        roll, pitch = rpy[:2]
-        rest = gravity * np.array(
-            [-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)]
-        )
+        rest = self._config.vehicle.gravity_m_s2 * _upwards(*rpy[:2])
         force = kept[1] if kept is not None and time_s - kept[0] < _FRESH_S else rest
         return [onboard.ImuReading(time_s, rpy, rate, force)]
 
@@ -487,8 +484,9 @@ class Intake:
         found: list[onboard.SensorMessage] = []
         if self._config.sensors.localization != "estimated":
             where = np.array(self._start) + place - self._origin
-            if abs(time_s - self._depth[0]) < _FRESH_S:  # the autopilot's own height lags behind a climb
-                where[2] = -self._depth[1]
+            since_s, depth = self._depth  # the autopilot's own height lags behind a climb
+            if abs(time_s - since_s) < _FRESH_S:
+                where[2] = (time_s - since_s) * self._rise_m_s(time_s) - depth
             found.append(onboard.PositionFix(time_s, where))
         newest_s = max(self._newest.get(name, -math.inf) for name in _VELOCITIES)
         if time_s - newest_s > _FRESH_S and "dvl" not in self._replaced:
@@ -496,6 +494,12 @@ class Intake:
             cos, sin = math.cos(yaw), math.sin(yaw)
             found += self._velocity(time_s, (cos * east + sin * north, cos * north - sin * east, up))
         return found
+
+    def _rise_m_s(self, time_s: float) -> float:
+        """By the newest velocity in body axes; 0 where none is fresh."""
+        heard = self.heard
+        is_known = heard.vel_b is not None and abs(time_s - heard.vel_b_s) < _FRESH_S
+        return float(_upwards(*heard.rpy[:2]) @ heard.vel_b) if is_known else 0.0
 
     def _has_jumped(self, time_s: float, place: np.ndarray) -> bool:
         last_s, last = self._place
@@ -517,7 +521,12 @@ class Intake:
         vehicle = self._config.vehicle
         depth = _PASCAL * float(fields["press_abs"]) / (vehicle.water_density_kg_m3 * vehicle.gravity_m_s2)
         zero = self._zero.setdefault(name, depth + self._start[2])
-        self._depth = time_s, depth - zero
+        late_s, expected = time_s - self._depth[0], self._depth[1]
+        if late_s < _FRESH_S:  # no jumps in a climb, where the sensor's values come by turns early and late
+            expected -= late_s * self._rise_m_s(time_s)
+            self._depth = time_s, expected + _DEPTH_PART * (depth - zero - expected)
+        else:
+            self._depth = time_s, depth - zero
         return [onboard.PressureReading(time_s, depth - zero)]
 
     def _obstacles(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
@@ -588,3 +597,8 @@ def _turned(north: float, east: float, down: float, heading: float) -> tuple[flo
 
 def wrapped(angle: float) -> float:
     return math.atan2(math.sin(angle), math.cos(angle))
+
+
+def _upwards(roll: float, pitch: float) -> np.ndarray:
+    """(3,) The world's z axis in body axes."""
+    return np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
