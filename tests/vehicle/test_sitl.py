@@ -193,7 +193,8 @@ class StillWater:
         beams = CONFIG.sensors.sonar.n_ray
         return {
             "ego.dvl_fresh": np.array(1), "ego.dvl_b": np.array([0.3, -0.1, 0.2]), "ego.rate_b": np.zeros(3),
-            "scan.range_m": np.full(beams, 4.0), "scan.hit": np.ones(beams, int),
+            "scan.range_m": np.full(beams, 4.0), "scan.hit": np.ones(beams, int), "scan.fresh": np.array(1),
+            "clock.step": np.array(7), "scan.ping_step": np.array(7),
         }[name]  # fmt: skip
 
 
@@ -277,6 +278,29 @@ def test_a_sensor_that_has_lost_the_bottom_says_nothing():
         0.0, 0.8, lambda name: np.array(0) if name == "ego.dvl_fresh" else water.value(name, 0)
     )
     assert "VISION_POSITION_DELTA" not in {order.kind for order in said}
+
+
+@pytest.mark.parametrize("waits", range(5))
+def test_readings_are_told_when_they_are_taken(waits):
+    """However long the water has waited for the vehicle; a sonar that is a step late tells of its ping."""
+    sensors, water, told = ReportedSensors(CONFIG), StillWater(), Counter()
+    for step in range(50):
+        clock = max(0, step - waits)
+        now = {
+            "ego.dvl_fresh": clock % 5 == 0,
+            "scan.fresh": clock % 5 == 1 or clock == 0,
+            "clock.step": clock,
+        }
+        now["scan.ping_step"] = max(0, clock - 1)
+        for order in sensors.report(
+            0.02 * step,
+            0.8,
+            lambda name, now=now: np.array(now[name]) if name in now else water.value(name, 0),
+        ):
+            told[order.kind] += 1
+            if order.kind == "OBSTACLE_DISTANCE" and clock:
+                assert order.fields["time_usec"] == pytest.approx(20_000 * (step - 1), abs=1)
+    assert told["VISION_POSITION_DELTA"] >= 9 and told["OBSTACLE_DISTANCE"] >= 9
 
 
 @pytest.mark.parametrize("own", [(), ("dvl",), ("sonar",), ("dvl", "sonar")])

@@ -77,25 +77,29 @@ class ReportedSensors:
     def __init__(self, config: Config, silent: Collection[str] = ()) -> None:
         """``silent``: what speaks its own protocol, of 'dvl' and 'sonar'."""
         sensors, self._silent = config.sensors, silent
-        dt = config.episode.control_dt_s
-        self._sonar = sensors.sonar
-        self._dvl_steps = max(LEAST_STEPS, sensors.dvl.period_steps)
-        self._scan_steps = max(LEAST_STEPS, sensors.sonar.period_steps)
-        self._dvl_s = self._dvl_steps * dt
-        self._steps = 0
+        self._dt, self._sonar = config.episode.control_dt_s, sensors.sonar
+        self._dvl_s = max(LEAST_STEPS, sensors.dvl.period_steps) * self._dt
+        self._steps, self._told = 0, {"dvl": -LEAST_STEPS, "sonar": -LEAST_STEPS}
 
     def report(self, time_s: float, altitude_m: float, value: Value) -> list[Order]:
         """Messages of this step; ``value`` gives arrays of the vehicle by 'struct.field'."""
         found = []
-        is_due = self._steps % self._dvl_steps == 0 and int(value("ego.dvl_fresh"))
-        if "dvl" not in self._silent and is_due:
+        if self._is_due("dvl", value("ego.dvl_fresh")):
             found.append(self._velocity(time_s, value("ego.dvl_b"), value("ego.rate_b")))
-        if "sonar" not in self._silent and self._steps % self._scan_steps == 0:
-            found.append(self._scan(time_s, value("scan.range_m"), value("scan.hit")))
+        if self._is_due("sonar", value("scan.fresh")):
+            late_s = float(value("clock.step") - value("scan.ping_step")) * self._dt
+            found.append(self._scan(time_s - late_s, value("scan.range_m"), value("scan.hit")))
         if self._steps % LEAST_STEPS == 0:
             found.append(_altitude(time_s, altitude_m))
         self._steps += 1
         return found
+
+    def _is_due(self, name: str, fresh: np.ndarray) -> bool:
+        """A new reading: the water's steps begin when the vehicle is driven, ours before."""
+        due = name not in self._silent and bool(fresh) and self._steps - self._told[name] >= LEAST_STEPS
+        if due:
+            self._told[name] = self._steps
+        return due
 
     def _velocity(self, time_s: float, vel_b: np.ndarray, rate_b: np.ndarray) -> Order:
         fields = {
