@@ -255,6 +255,10 @@ def test_depths_by_turns_early_and_late_make_no_jumps():
         heights.append(found.pos_w[2] - START[2])
     off = np.array(heights) - 0.4 * 0.05 * np.arange(60)
     assert np.abs(off).max() < 0.04 and np.abs(np.diff(off)[20:]).max() < 0.005
+    for now_s, hpas in ((3.0, 9000.0), (3.1, 1100.0), (-90.0, 1100.0)):  # a spike; an old clock
+        taken(intake, "SCALED_PRESSURE2", now_s, press_abs=hpas, time_boot_ms=0, **rest)
+        (found, *_) = taken(intake, "LOCAL_POSITION_NED", now_s, **place, time_boot_ms=0)
+    assert found.pos_w[2] == pytest.approx(START[2]), "one spike and no clock is remembered"
 
 
 def test_depth_is_zeroed_at_the_start_and_the_sensor_in_the_water_counts(intake):

@@ -243,7 +243,7 @@ _ARMED = 128
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: what we are
 _STICK_MOVED = 200  # of 1000
 MOST_KINDS = 64  # senders of a kind of message that are told apart, and reasons why messages are left out
-_DEPTH_PART = 0.2  # of the error that a reading of the depth corrects (EC)
+_DEPTH_PART, _DEPTH_OFF_M = 0.2, 0.3  # corrected of a depth's error; more: the reading is taken (EC)
 _FRESH_S = 1.0  # a source that was heard within this time is preferred to a lesser one
 _BATTERY_S = 10.0  # of two tellers of a voltage the lower one counts, while it is heard so often
 _MOST_NAMED = 4
@@ -521,12 +521,11 @@ class Intake:
         vehicle = self._config.vehicle
         depth = _PASCAL * float(fields["press_abs"]) / (vehicle.water_density_kg_m3 * vehicle.gravity_m_s2)
         zero = self._zero.setdefault(name, depth + self._start[2])
-        late_s, expected = time_s - self._depth[0], self._depth[1]
-        if late_s < _FRESH_S:  # no jumps in a climb, where the sensor's values come by turns early and late
-            expected -= late_s * self._rise_m_s(time_s)
-            self._depth = time_s, expected + _DEPTH_PART * (depth - zero - expected)
-        else:
-            self._depth = time_s, depth - zero
+        late_s, found = time_s - self._depth[0], depth - zero
+        off = found - self._depth[1] + late_s * self._rise_m_s(time_s)
+        if abs(late_s) < _FRESH_S and abs(off) < _DEPTH_OFF_M:  # in a climb early and late by turns
+            found -= (1.0 - _DEPTH_PART) * off
+        self._depth = time_s, found
         return [onboard.PressureReading(time_s, depth - zero)]
 
     def _obstacles(self, fields: Fields, time_s: float) -> list[onboard.SensorMessage]:
